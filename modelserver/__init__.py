@@ -1,0 +1,3 @@
+"""ModelServer."""
+
+from modelserver.version import __version__ as __version__

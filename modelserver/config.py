@@ -1,0 +1,1 @@
+"""The vehicle file: typed, strict. An unknown key is an error with the nearest known name."""

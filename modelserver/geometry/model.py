@@ -1,0 +1,298 @@
+"""Model: bodies and constraints as one immutable graph that answers where a frame is in another."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from enum import StrEnum
+
+import numpy as np
+
+from modelserver.errors import (
+    NotConnectedError,
+    Problem,
+    UnknownBodyError,
+    UnknownFrameError,
+    nearest_names,
+    shown,
+)
+from modelserver.geometry import names
+from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
+from modelserver.geometry.topology import Crossing, Topology
+from modelserver.spatial import covariance
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.so3 import Array
+from modelserver.spatial.transformation import Transformation
+
+CACHE_SIZE = 65536
+"""Static answers kept. When full the oldest goes: the pairs a vehicle asks for are few and come again."""
+
+
+class Search(StrEnum):
+    """How a path is looked for: the shortest one, or the report's own search (4.6.2)."""
+
+    BREADTH_FIRST = "breadth_first"
+    DEPTH_FIRST = "depth_first"
+
+
+class Model:
+    """The geometry of a vehicle. Build one with `ModelBuilder` or `modelserver.load_model`.
+
+    `bodies`, `constraints`, `problems` are tuples in the order of the file; the first body is the root.
+    `revision` is a hash of everything in the model that can change an answer or a list.
+    """
+
+    __slots__ = (
+        "_answers",
+        "_bodies",
+        "_from_root",
+        "_looped",
+        "_topology",
+        "bodies",
+        "constraints",
+        "description",
+        "name",
+        "problems",
+        "revision",
+    )
+
+    def __init__(
+        self,
+        bodies: tuple[Body, ...],
+        constraints: tuple[Constraint, ...],
+        name: str = "",
+        description: str = "",
+        problems: tuple[Problem, ...] = (),
+    ):
+        self.bodies = bodies
+        self.constraints = constraints
+        self.name = name
+        self.description = description
+        self.problems = problems
+        self.revision = _revision(bodies, constraints)
+        self._bodies = {body.name: body for body in bodies}
+        self._topology = Topology(bodies, constraints)
+        self._answers: dict[tuple[str, str], Transformation] = {}
+        self._from_root = self._place_bodies()
+        looped = {closing.constraint for closing in self._topology.loop_closures()}
+        self._looped = frozenset(
+            assembly
+            for assembly in range(len(self._topology.assemblies))
+            for constraint in constraints
+            if constraint.name in looped and self._from_root[names.split(constraint.from_)[0]][0] == assembly
+        )
+
+    def _place_bodies(self) -> dict[str, tuple[int, Pose]]:
+        """Return for each body its assembly's number and the pose of its origin in that assembly's first body."""
+        placed: dict[str, tuple[int, Pose]] = {}
+        for number, assembly in enumerate(self._topology.assemblies):
+            placed[assembly[0]] = (number, Pose.identity())
+            for body, crossing in self._topology.spread(assembly[0]):
+                placed[names.split(crossing.leaves)[0]] = (
+                    number,
+                    placed[body][1] @ self._topology.step(crossing),
+                )
+        return placed
+
+    @property
+    def root(self) -> Body:
+        """The first body in the file."""
+        return self.bodies[0]
+
+    @property
+    def assemblies(self) -> tuple[tuple[str, ...], ...]:
+        """Groups of bodies joined by constraints; the root's comes first, the others are orphans."""
+        return self._topology.assemblies
+
+    def body(self, name: str) -> Body:
+        """Return the body of that name. Raises UnknownBodyError with the nearest names."""
+        found = self._bodies.get(name)
+        if found is None:
+            raise UnknownBodyError(f"the model has no body {shown(name)}", nearest_names(name, self._bodies))
+        return found
+
+    def frame(self, name: str) -> BodyFrame:
+        """Return the frame of a full name. Raises UnknownBodyError or UnknownFrameError with the nearest names."""
+        body, frame = self._split(name)
+        return body.frame(frame.name)
+
+    def get_body_list(self) -> list[str]:
+        """Return the names of the bodies, root first."""
+        return [body.name for body in self.bodies]
+
+    def get_body_frame_list(self, body: str) -> list[str]:
+        """Return the names of a body's frames. Raises UnknownBodyError."""
+        return [frame.name for frame in self.body(body)]
+
+    def get_transformation(self, frame_of_interest: str, frame_of_reference: str) -> Transformation:
+        """Return the pose of `frame_of_interest` in `frame_of_reference` by the shortest path (eq. 11-13).
+
+        Both are full names, `Body:Frame`. Raises UnknownBodyError, UnknownFrameError or NotConnectedError.
+        """
+        try:
+            return self._answers[frame_of_interest, frame_of_reference]
+        except KeyError:
+            return self._answer(frame_of_interest, frame_of_reference)
+
+    def find_path(
+        self, frame_of_interest: str, frame_of_reference: str, search: Search = Search.BREADTH_FIRST
+    ) -> tuple[Crossing, ...]:
+        """Return the constraints crossed from the frame of reference to the frame of interest.
+
+        Raises UnknownBodyError, UnknownFrameError or NotConnectedError.
+        """
+        body, frame = self._split(frame_of_reference)
+        target, _ = self._split(frame_of_interest)
+        if search is Search.BREADTH_FIRST:
+            path = self._topology.breadth_first(body.name, target.name)
+        else:
+            path = self._topology.depth_first(body.name, frame.name, frame_of_interest)
+        if path is None:
+            raise self._not_connected(target.name, body.name)
+        return path
+
+    def along(
+        self, path: Iterable[Crossing], frame_of_interest: str, frame_of_reference: str
+    ) -> Transformation:
+        """Return the transformation that a path of `find_path` builds, edge by edge (eq. 12 and 13).
+
+        Its covariance is that of the edges' sigmas, None where an edge states none.
+        """
+        body, start = self._split(frame_of_reference)
+        pose = Pose.identity()
+        cov: Array = np.zeros((6, 6))
+        known = True
+
+        def go(edge: Pose, sigma: Sigma | None, inverted: bool) -> None:
+            nonlocal pose, cov, known
+            step = edge.inverse() if inverted else edge
+            if edge == _IDENTITY and sigma is None:
+                return
+            if sigma is None:
+                known = False
+            elif known:
+                edge_cov = covariance.invert(edge, sigma.covariance) if inverted else sigma.covariance
+                cov = covariance.compose(pose, cov, step, edge_cov)
+            pose = pose @ step
+
+        inside = start
+        for crossing in path:
+            leaving = self.frame(crossing.enters)
+            if leaving is not inside:
+                go(inside.pose, inside.sigma, inverted=True)
+                go(leaving.pose, leaving.sigma, inverted=False)
+            go(crossing.constraint.pose, crossing.constraint.sigma, inverted=not crossing.forward)
+            inside = self.frame(crossing.leaves)
+        target = self.frame(frame_of_interest)
+        if target is not inside:
+            go(inside.pose, inside.sigma, inverted=True)
+            go(target.pose, target.sigma, inverted=False)
+        return Transformation(
+            frame_of_interest,
+            frame_of_reference,
+            pose,
+            cov if known else None,
+            model_revision=self.revision,
+        )
+
+    def _split(self, name: str) -> tuple[Body, BodyFrame]:
+        try:
+            body_name, frame_name = names.split(name)
+        except ValueError:
+            everything = (names.joined(body.name, frame.name) for body in self.bodies for frame in body)
+            raise UnknownFrameError(
+                f"{shown(name)} is not a frame: frames are named Body:Frame", nearest_names(name, everything)
+            ) from None
+        found = self._bodies.get(body_name)
+        if found is None:
+            near = nearest_names(body_name, self._bodies)
+            raise UnknownBodyError(
+                f"the model has no body {shown(body_name)}",
+                (
+                    names.joined(body, frame_name) if self._bodies[body].has_frame(frame_name) else body
+                    for body in near
+                ),
+            )
+        return found, found.frame(frame_name)
+
+    def _answer(self, frame_of_interest: str, frame_of_reference: str) -> Transformation:
+        """Work out a pair that was not asked for before, and keep it."""
+        body_R, frame_R = self._split(frame_of_reference)
+        body_I, frame_I = self._split(frame_of_interest)
+        if frame_R is frame_I:
+            pose = Pose.identity()
+        elif body_R is body_I:
+            pose = frame_R.pose.inverse() @ frame_I.pose
+        else:
+            assembly_R, X_root_R = self._from_root[body_R.name]
+            assembly_I, X_root_I = self._from_root[body_I.name]
+            if assembly_R != assembly_I:
+                raise self._not_connected(body_I.name, body_R.name)
+            if assembly_R in self._looped:
+                path = self.find_path(frame_of_interest, frame_of_reference)
+                return self._keep(self.along(path, frame_of_interest, frame_of_reference))
+            pose = (X_root_R @ frame_R.pose).inverse() @ (X_root_I @ frame_I.pose)
+
+        def path_covariance() -> Array | None:
+            path = self.find_path(frame_of_interest, frame_of_reference)
+            return self.along(path, frame_of_interest, frame_of_reference).covariance
+
+        return self._keep(
+            Transformation(
+                frame_of_interest, frame_of_reference, pose, path_covariance, model_revision=self.revision
+            )
+        )
+
+    def _keep(self, answer: Transformation) -> Transformation:
+        if len(self._answers) >= CACHE_SIZE:
+            del self._answers[next(iter(self._answers))]
+        self._answers[answer.frame_of_interest, answer.frame_of_reference] = answer
+        return answer
+
+    def _not_connected(self, body_I: str, body_R: str) -> NotConnectedError:
+        def assembly(body: str) -> str:
+            mates = self._topology.assemblies[self._from_root[body][0]]
+            return ", ".join(mates[:6]) + (", ..." if len(mates) > 6 else "")
+
+        return NotConnectedError(
+            f"no constraints lead from {body_R} to {body_I}: {body_R} is joined with [{assembly(body_R)}], "
+            f"{body_I} with [{assembly(body_I)}]"
+        )
+
+    def __repr__(self) -> str:
+        frames = sum(len(body.frames) for body in self.bodies)
+        return (
+            f"<Model {self.name or 'unnamed'}: {len(self.bodies)} bodies, {frames} frames, "
+            f"{len(self.constraints)} constraints, revision {self.revision}>"
+        )
+
+
+_IDENTITY = Pose.identity()
+
+
+def _revision(bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> str:
+    """Return 16 hex digits of a SHA-256 over names, poses and sigmas; floats enter exactly (repr round-trips)."""
+
+    def sigma(value: Sigma | None) -> object:
+        return None if value is None else (value.position, value.rotation)
+
+    def pose(value: Pose | None) -> object:
+        return None if value is None else (value.xyz, value.wxyz)
+
+    content = (
+        [
+            (
+                body.name,
+                pose(body.pose),
+                body.inertia,
+                [(frame.name, pose(frame.pose), frame.description, sigma(frame.sigma)) for frame in body],
+            )
+            for body in bodies
+        ],
+        [
+            (each.name, each.from_, each.to, pose(each.pose), each.joint, sigma(each.sigma))
+            for each in constraints
+        ],
+    )
+    return hashlib.sha256(json.dumps(content, separators=(",", ":")).encode()).hexdigest()[:16]

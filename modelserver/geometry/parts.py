@@ -1,0 +1,138 @@
+"""Bodies, frames and constraints as immutable values (report 4.2 to 4.4)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+
+from modelserver.errors import UnknownFrameError, nearest_names, shown
+from modelserver.geometry import names
+from modelserver.spatial import covariance
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.so3 import Array, Vector3
+
+
+@dataclass(frozen=True, slots=True)
+class Sigma:
+    """Standard deviations of a survey or a mount, along the axes of the parent frame.
+
+    `position` in metres, `rotation` in radians. Raises ValueError for a negative or non-finite one.
+    """
+
+    position: Vector3 = (0.0, 0.0, 0.0)
+    rotation: Vector3 = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for value in self.position + self.rotation:
+            if not math.isfinite(value) or value < 0:
+                raise ValueError(f"a sigma is finite and not negative, got {value}")
+
+    @property
+    def covariance(self) -> Array:
+        """The diagonal covariance (6, 6)."""
+        return covariance.from_sigmas(self.position, self.rotation)
+
+
+class JointType(StrEnum):
+    """How a constraint lets its two frames move. Only fixed ones are served so far."""
+
+    FIXED = "fixed"
+
+
+@dataclass(frozen=True, slots=True)
+class BodyFrame:
+    """A frame of interest on a body: `pose` is its place in body coordinates (the report's A_ij).
+
+    The body's own coordinates are its origin; a frame named Origin usually stands there.
+    """
+
+    name: str
+    pose: Pose = field(default_factory=Pose.identity)
+    description: str = ""
+    sigma: Sigma | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """A rigid assembly: named frames around one origin.
+
+    `pose` is the optional transform of the whole body that a 2005 file may carry; it is kept and written
+    back, and takes no part in relations between frames. `inertia` is the 6x6 spatial inertia in body
+    coordinates, rows of 6 (the report's InertiaMatrix), or None. Copying a body is `renamed`: values are shared.
+    Raises ValueError for two frames of one name, or an inertia that is not 6x6 and finite.
+    """
+
+    name: str
+    frames: tuple[BodyFrame, ...] = ()
+    description: str = ""
+    pose: Pose | None = None
+    inertia: tuple[tuple[float, ...], ...] | None = None
+    _by_name: dict[str, BodyFrame] = field(init=False, repr=False, compare=False, hash=False)
+
+    def __post_init__(self) -> None:
+        by_name: dict[str, BodyFrame] = {}
+        for frame in self.frames:
+            if frame.name in by_name:
+                raise ValueError(f"body {self.name} has two frames named {frame.name}")
+            by_name[frame.name] = frame
+        object.__setattr__(self, "_by_name", by_name)
+        if self.inertia is not None:
+            rows = self.inertia
+            if [len(row) for row in rows] != [6] * 6 or not all(map(math.isfinite, sum(rows, ()))):
+                raise ValueError(f"the inertia of body {self.name} is not 6 rows of 6 finite numbers")
+
+    def frame(self, name: str) -> BodyFrame:
+        """Return the frame of that name. Raises UnknownFrameError with the nearest names."""
+        found = self._by_name.get(name)
+        if found is None:
+            raise UnknownFrameError(
+                f"body {self.name} has no frame {shown(name)}",
+                (names.joined(self.name, near) for near in nearest_names(name, self._by_name)),
+            )
+        return found
+
+    def has_frame(self, name: str) -> bool:
+        """Return whether the body has a frame of that name."""
+        return name in self._by_name
+
+    def with_frame(self, frame: BodyFrame) -> Body:
+        """Return this body with one frame more. Raises ValueError for a name that is taken."""
+        return replace(self, frames=(*self.frames, frame))
+
+    def without_frame(self, name: str) -> Body:
+        """Return this body without the frame of that name. Raises UnknownFrameError."""
+        gone = self.frame(name)
+        return replace(self, frames=tuple(frame for frame in self.frames if frame is not gone))
+
+    def renamed(self, name: str) -> Body:
+        """Return a copy under another name, with all its frames: a second camera, say."""
+        return replace(self, name=name)
+
+    def __iter__(self) -> Iterator[BodyFrame]:
+        return iter(self.frames)
+
+
+@dataclass(frozen=True, slots=True)
+class Constraint:
+    """A joint between two frames: `pose` is the place of frame `to` in frame `from_` (the report's T_k).
+
+    `from_` and `to` are full names, `Body:Frame`. Crossing it from `to` to `from_` takes the inverse.
+    """
+
+    name: str
+    from_: str
+    to: str
+    pose: Pose = field(default_factory=Pose.identity)
+    description: str = ""
+    sigma: Sigma | None = None
+    joint: JointType = JointType.FIXED
+
+    def other_end(self, frame: str) -> str:
+        """Return the full name of the frame at the other end. Raises ValueError for a frame not in it."""
+        if frame == self.from_:
+            return self.to
+        if frame == self.to:
+            return self.from_
+        raise ValueError(f"constraint {self.name} does not join {frame}")

@@ -1,0 +1,1 @@
+"""Localization: from sensor samples to the vehicle's pose and how sure it is. Pure."""

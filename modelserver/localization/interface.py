@@ -1,0 +1,27 @@
+"""What the core asks of a localizer, whichever it is."""
+
+from __future__ import annotations
+
+from typing import Protocol, Self, TypeAlias
+
+from modelserver.messages import Estimate, OriginLatched, Rejected, Sample
+
+Note: TypeAlias = Rejected | OriginLatched
+"""What a localizer has to say beside its estimate: a sample it did not use and why, the origin it has set."""
+
+
+class Localizer(Protocol):
+    """An immutable value: all that has been concluded from the samples so far. No clock: time comes in samples."""
+
+    def take(self, sample: Sample) -> tuple[Self, tuple[Note, ...]]:
+        """Return what is concluded with one sample more, and what there is to say about it."""
+        ...
+
+    def estimate(self, utime: int) -> Estimate:
+        """Return the base frame's pose predicted to `utime`, from nothing but the samples taken."""
+        ...
+
+    @property
+    def utime(self) -> int:
+        """The instant of the newest sample taken, 0 before the first."""
+        ...

@@ -1,0 +1,183 @@
+"""Rotations as unit quaternions (Hamilton, scalar first), in plain floats.
+
+A quaternion is a tuple `(w, x, y, z)`. Plain floats, not arrays: at this size an array costs ten times
+the arithmetic, and these functions stand in the hot loop.
+
+Sources: J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017 (product, exponential,
+logarithm); S. Shepperd, "Quaternion from rotation matrix", 1978 (largest-component branch).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+Vector3: TypeAlias = tuple[float, float, float]
+Quaternion: TypeAlias = tuple[float, float, float, float]
+Array: TypeAlias = npt.NDArray[np.float64]
+
+IDENTITY: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+
+def normalized(q: Quaternion) -> Quaternion:
+    """Return `q` at unit length with w >= 0.
+
+    A quaternion that is already unit within rounding keeps its bits, so that storing and reading back is exact.
+    Raises ValueError for a zero or non-finite quaternion.
+    """
+    w, x, y, z = q
+    squared = w * w + x * x + y * y + z * z
+    if not math.isfinite(squared) or squared < 1e-300:
+        raise ValueError(f"a quaternion must be finite and not zero, got {q}")
+    scale = 1.0
+    if abs(squared - 1.0) > 4e-16:
+        scale = 1.0 / math.sqrt(squared)
+    if w < 0.0 or (w == 0.0 and (x, y, z) < (0.0, 0.0, 0.0)):
+        scale = -scale
+    if scale == 1.0:
+        return q
+    # + 0.0 turns a negative zero into zero
+    return (w * scale + 0.0, x * scale + 0.0, y * scale + 0.0, z * scale + 0.0)
+
+
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Return the rotation `b` followed by `a`: R(a) R(b)."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+def conjugate(q: Quaternion) -> Quaternion:
+    """Return the inverse rotation."""
+    return (q[0], -q[1], -q[2], -q[3])
+
+
+def rotate(q: Quaternion, v: Vector3) -> Vector3:
+    """Return R(q) v."""
+    w, x, y, z = q
+    vx, vy, vz = v
+    tx = 2.0 * (y * vz - z * vy)
+    ty = 2.0 * (z * vx - x * vz)
+    tz = 2.0 * (x * vy - y * vx)
+    return (
+        vx + w * tx + y * tz - z * ty,
+        vy + w * ty + z * tx - x * tz,
+        vz + w * tz + x * ty - y * tx,
+    )
+
+
+def matrix_rows(q: Quaternion) -> tuple[Vector3, Vector3, Vector3]:
+    """Return the rows of the rotation matrix R(q)."""
+    w, x, y, z = q
+    xx, yy, zz = x * x, y * y, z * z
+    xy, xz, yz = x * y, x * z, y * z
+    wx, wy, wz = w * x, w * y, w * z
+    return (
+        (1.0 - 2.0 * (yy + zz), 2.0 * (xy - wz), 2.0 * (xz + wy)),
+        (2.0 * (xy + wz), 1.0 - 2.0 * (xx + zz), 2.0 * (yz - wx)),
+        (2.0 * (xz - wy), 2.0 * (yz + wx), 1.0 - 2.0 * (xx + yy)),
+    )
+
+
+def from_matrix(R: npt.ArrayLike) -> Quaternion:
+    """Return the unit quaternion of a rotation matrix (3, 3), which must be one: see `nearest_rotation`."""
+    m = np.asarray(R, dtype=float)
+    (a, b, c), (d, e, f), (g, h, i) = m.tolist()
+    trace = a + e + i
+    largest = max(trace, a, e, i)
+    if largest == trace:
+        q = (1.0 + trace, h - f, c - g, d - b)
+    elif largest == a:
+        q = (h - f, 1.0 + a - e - i, b + d, c + g)
+    elif largest == e:
+        q = (c - g, b + d, 1.0 - a + e - i, f + h)
+    else:
+        q = (d - b, c + g, f + h, 1.0 - a - e + i)
+    return normalized(q)
+
+
+def from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
+    """Return the rotation of fixed-axis roll, pitch, yaw in radians: Rz(yaw) Ry(pitch) Rx(roll)."""
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    return normalized(
+        (
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        )
+    )
+
+
+def to_rpy(q: Quaternion) -> Vector3:
+    """Return fixed-axis roll, pitch, yaw in radians, pitch within +-pi/2.
+
+    At pitch = +-pi/2 roll and yaw turn about one axis; roll is then 0 and yaw carries both.
+    """
+    w, _, _, z = q
+    (r00, _, _), (r10, _, _), (r20, r21, r22) = matrix_rows(q)
+    horizontal = math.hypot(r00, r10)
+    if horizontal < 1e-9:
+        # with roll 0 the quaternion's w and z alone carry yaw, at full precision
+        yaw = math.remainder(2.0 * math.atan2(z, w), math.tau)
+        return (0.0, math.copysign(math.pi / 2, -r20), yaw)
+    return (math.atan2(r21, r22), math.atan2(-r20, horizontal), math.atan2(r10, r00))
+
+
+def exponential(v: Vector3) -> Quaternion:
+    """Return the rotation by |v| radians about v (the exponential map)."""
+    x, y, z = v
+    angle = math.sqrt(x * x + y * y + z * z)
+    # sin(a/2)/a by its series below 1e-4 rad, where the quotient loses digits
+    s = 0.5 - angle * angle / 48.0 if angle < 1e-4 else math.sin(angle / 2) / angle
+    return normalized((math.cos(angle / 2), x * s, y * s, z * s))
+
+
+def logarithm(q: Quaternion) -> Vector3:
+    """Return the rotation vector of `q`, its length within [0, pi]: the inverse of `exponential`."""
+    w, x, y, z = q if q[0] >= 0 else (-q[0], -q[1], -q[2], -q[3])
+    n = math.sqrt(x * x + y * y + z * z)
+    s = 2.0 / w * (1.0 - n * n / (3.0 * w * w)) if n < 1e-6 else 2.0 * math.atan2(n, w) / n
+    return (x * s, y * s, z * s)
+
+
+def slerp(a: Quaternion, b: Quaternion, fraction: float) -> Quaternion:
+    """Return the rotation `fraction` of the way from `a` to `b` at constant rate, the short way round."""
+    x, y, z = logarithm(normalized(multiply(conjugate(a), b)))
+    return normalized(multiply(a, exponential((x * fraction, y * fraction, z * fraction))))
+
+
+def nearest_rotation(M: npt.ArrayLike) -> tuple[Array, float]:
+    """Return the rotation matrix nearest to `M` (3, 3), and how far `M` was from one.
+
+    The distance is the largest entry of |M'M - I|. Nearest in the Frobenius norm, by the polar
+    decomposition (N. Higham, "Computing the polar decomposition", 1986). Raises ValueError where `M` is not
+    finite, is singular or is a reflection: no rotation is meant by it.
+    """
+    m = np.asarray(M, dtype=float)
+    if m.shape != (3, 3) or not np.isfinite(m).all():
+        raise ValueError("a rotation matrix has 3 rows of 3 finite numbers")
+    deviation = float(np.abs(m.T @ m - np.eye(3)).max())
+    U, s, Vt = np.linalg.svd(m)
+    if s[-1] < 1e-6:
+        raise ValueError("the matrix is singular, so it is no rotation")
+    R = U @ Vt
+    if np.linalg.det(R) < 0:
+        raise ValueError("the matrix is a reflection (determinant -1): an axis points the wrong way")
+    return R, deviation
+
+
+def skew(v: npt.ArrayLike) -> Array:
+    """Return the matrix (3, 3) of the cross product: skew(v) u = v x u."""
+    x, y, z = np.asarray(v, dtype=float).tolist()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,0 +1,206 @@
+"""Transformation: a pose that knows its two frames, its time, its validity and how sure it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from modelserver.errors import FrameMismatchError
+from modelserver.spatial import covariance as cov
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.so3 import Array
+
+
+class Transformation:
+    """The pose of `frame_of_interest` in `frame_of_reference`: `X_RI` for interest I and reference R.
+
+    Frames are named `Body:Frame`. `covariance` is (6, 6) along the axes of the frame of reference, or None
+    where nobody stated how sure the parts are. `utime` is microseconds since the Unix epoch, 0 for a
+    relation that does not change with time. `valid` is false where `invalid_reasons` has a bit set (see
+    `modelserver.messages.Invalid`). `pose_epoch` and `origin_id` are 0 where no world frame is involved.
+    Immutable; arrays returned are read-only.
+    """
+
+    __slots__ = (
+        "_covariance",
+        "frame_of_interest",
+        "frame_of_reference",
+        "invalid_reasons",
+        "model_revision",
+        "origin_id",
+        "pose",
+        "pose_epoch",
+        "utime",
+    )
+
+    frame_of_interest: str
+    frame_of_reference: str
+    pose: Pose
+    utime: int
+    invalid_reasons: int
+    pose_epoch: int
+    origin_id: int
+    model_revision: str
+    _covariance: Array | Callable[[], Array | None] | None
+
+    def __init__(
+        self,
+        frame_of_interest: str,
+        frame_of_reference: str,
+        pose: Pose,
+        covariance: Array | Callable[[], Array | None] | None = None,
+        utime: int = 0,
+        invalid_reasons: int = 0,
+        pose_epoch: int = 0,
+        origin_id: int = 0,
+        model_revision: str = "",
+    ):
+        """Take the values; `covariance` may be a function that works it out when it is first looked at."""
+        put = object.__setattr__
+        put(self, "frame_of_interest", frame_of_interest)
+        put(self, "frame_of_reference", frame_of_reference)
+        put(self, "pose", pose)
+        put(self, "_covariance", covariance)
+        put(self, "utime", utime)
+        put(self, "invalid_reasons", invalid_reasons)
+        put(self, "pose_epoch", pose_epoch)
+        put(self, "origin_id", origin_id)
+        put(self, "model_revision", model_revision)
+
+    @property
+    def covariance(self) -> Array | None:
+        """The covariance (6, 6): x, y, z, about x, about y, about z, along the axes of the reference."""
+        found = self._covariance
+        if callable(found):
+            found = found()
+            object.__setattr__(self, "_covariance", found)
+        if found is not None:
+            found.flags.writeable = False
+        return found
+
+    @property
+    def valid(self) -> bool:
+        """Whether no reason speaks against using it."""
+        return self.invalid_reasons == 0
+
+    @property
+    def matrix(self) -> Array:
+        """The homogeneous transform (4, 4)."""
+        return self.pose.matrix
+
+    @property
+    def position(self) -> Array:
+        """The position (3) in metres."""
+        return self.pose.position
+
+    @property
+    def quaternion(self) -> Array:
+        """The unit quaternion (4), scalar first, w >= 0."""
+        return self.pose.quaternion
+
+    @property
+    def rotation(self) -> Array:
+        """The rotation matrix (3, 3)."""
+        return self.pose.rotation
+
+    @property
+    def rpy(self) -> Array:
+        """Fixed-axis roll, pitch, yaw (3) in radians."""
+        return self.pose.rpy
+
+    @property
+    def state_vector(self) -> Array:
+        """The 7-vector `px py pz qs qx qy qz`."""
+        return self.pose.state_vector
+
+    def inverse(self) -> Transformation:
+        """Return the pose of the frame of reference in the frame of interest."""
+
+        def inverted() -> Array | None:
+            mine = self.covariance
+            return None if mine is None else cov.invert(self.pose, mine)
+
+        return Transformation(
+            self.frame_of_reference,
+            self.frame_of_interest,
+            self.pose.inverse(),
+            inverted,
+            self.utime,
+            self.invalid_reasons,
+            self.pose_epoch,
+            self.origin_id,
+            self.model_revision,
+        )
+
+    def __matmul__(self, other: Transformation) -> Transformation:
+        """Return `X_AB @ X_BC = X_AC`.
+
+        The covariances are taken as independent. Raises FrameMismatchError where the frames in the middle
+        differ, or where the two hold at different times, pose epochs or origins.
+        """
+        if not isinstance(other, Transformation):
+            return NotImplemented
+        if self.frame_of_interest != other.frame_of_reference:
+            raise FrameMismatchError(
+                f"cannot chain: the left side ends at {self.frame_of_interest} but the right side starts at "
+                f"{other.frame_of_reference}. Ask for the right side in {self.frame_of_interest}, or invert one."
+            )
+        for what, mine, theirs in (
+            ("utime", self.utime, other.utime),
+            ("pose_epoch", self.pose_epoch, other.pose_epoch),
+            ("origin_id", self.origin_id, other.origin_id),
+        ):
+            if mine and theirs and mine != theirs:
+                raise FrameMismatchError(
+                    f"cannot chain: the left side has {what} {mine}, the right side {theirs}. Ask for both at one time."
+                )
+
+        def composed() -> Array | None:
+            first, second = self.covariance, other.covariance
+            if first is None or second is None:
+                return None
+            return cov.compose(self.pose, first, other.pose, second)
+
+        return Transformation(
+            other.frame_of_interest,
+            self.frame_of_reference,
+            self.pose @ other.pose,
+            composed,
+            self.utime or other.utime,
+            self.invalid_reasons | other.invalid_reasons,
+            self.pose_epoch or other.pose_epoch,
+            self.origin_id or other.origin_id,
+            self.model_revision if self.model_revision == other.model_revision else "",
+        )
+
+    def _values(self) -> tuple[object, ...]:
+        covariance = self.covariance
+        return (
+            self.frame_of_interest,
+            self.frame_of_reference,
+            self.pose,
+            None if covariance is None else covariance.tobytes(),
+            self.utime,
+            self.invalid_reasons,
+            self.pose_epoch,
+            self.origin_id,
+            self.model_revision,
+        )
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Transformation) and self._values() == other._values()
+
+    def __hash__(self) -> int:
+        return hash((self.frame_of_interest, self.frame_of_reference, self.pose, self.utime))
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise AttributeError("a Transformation is immutable; make a new one")
+
+    def __delattr__(self, name: str) -> None:
+        raise AttributeError("a Transformation is immutable; make a new one")
+
+    def __repr__(self) -> str:
+        return f"<Transformation {self}>"
+
+    def __str__(self) -> str:
+        invalid = "" if self.valid else f" (invalid: reasons {self.invalid_reasons:#x})"
+        return f"{self.frame_of_interest} in {self.frame_of_reference}: {self.pose}{invalid}"

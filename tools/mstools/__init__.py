@@ -1,0 +1,1 @@
+"""The `modelserver` command, one module a subcommand."""
