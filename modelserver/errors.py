@@ -8,9 +8,12 @@ class that the server meant.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import heapq
+import operator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
+from itertools import islice, repeat
 
 
 class Status(IntEnum):
@@ -51,7 +54,9 @@ class Source:
     element: str = ""
 
     def __str__(self) -> str:
-        place = f"{self.file}:{self.line}" if self.line else self.file
+        place = self.file
+        if self.line:
+            place = f"{self.file}:{self.line}" if self.file else f"line {self.line}"
         return f"{place} ({self.element})" if place and self.element else place or self.element
 
 
@@ -90,19 +95,46 @@ class Problem:
         return f"{head}{self.severity}: {self.message}{tail}{fix}"
 
 
+KNOWN_NAMES = 20_000
+COMPARED_LENGTH = 100
+COMPARED_NAMES = 16
+COMPARED_PAIRS = 12
+"""Bounds of `nearest_names`: names it looks at, their length, those compared in full, pairs of letters looked for."""
+
+
 def nearest_names(name: str, known: Iterable[str], count: int = 3) -> tuple[str, ...]:
     """Return the known names most like `name`, best first; case is no difference.
 
-    Names longer than 200 characters are not compared: the cost of a comparison grows with the product
-    of the lengths, and such names come from strangers.
+    The cost is bounded, since mistyped names come from strangers too: names longer than 100 characters are
+    not compared, and of many known names only those that share most pairs of letters with `name` are
+    compared in full. 10,000 known names take about 10 ms.
     """
-    if len(name) > 200:
+    if not name or len(name) > COMPARED_LENGTH:
         return ()
+    wanted = name.casefold()
     by_folded: dict[str, str] = {}
-    for candidate in known:
+    for candidate in islice(known, KNOWN_NAMES):
         by_folded.setdefault(candidate.casefold(), candidate)
-    found = difflib.get_close_matches(name.casefold(), by_folded, n=count, cutoff=0.6)
-    return tuple(by_folded[key] for key in found)
+    # a similarity of 0.6, 2 M / (a + b), cannot be reached by names that differ more than this in length
+    shortest, longest = len(wanted) * 3 / 7, len(wanted) * 7 / 3
+    candidates = [each for each in by_folded if shortest <= len(each) <= longest]
+    if len(candidates) > COMPARED_NAMES:
+        candidates = _sharing_most(wanted, candidates)
+    return tuple(by_folded[key] for key in difflib.get_close_matches(wanted, candidates, n=count, cutoff=0.6))
+
+
+def _sharing_most(wanted: str, candidates: list[str]) -> list[str]:
+    """Return the few candidates that hold most of the pairs of letters in `wanted`; of equals, those nearest in length.
+
+    The loops over the candidates run in C.
+    """
+    pairs = list(dict.fromkeys(wanted[i : i + 2] for i in range(max(1, len(wanted) - 1))))
+    # evenly spread over the name where there are too many
+    pairs = pairs[:: -(-len(pairs) // COMPARED_PAIRS)]
+    shared = map(sum, zip(*(map(operator.contains, candidates, repeat(pair)) for pair in pairs), strict=True))
+    lengths = map(abs, map(operator.sub, map(len, candidates), repeat(len(wanted))))
+    ranked = zip(map(operator.neg, shared), lengths, range(len(candidates)), strict=True)
+    return [candidates[index] for _, _, index in heapq.nsmallest(COMPARED_NAMES, ranked)]
 
 
 def shown(name: str, limit: int = 80) -> str:
@@ -127,6 +159,9 @@ class ConfigError(ModelServerError):
         self.problems = tuple(problems)
         super().__init__("\n".join(str(problem) for problem in self.problems))
 
+    def __reduce__(self) -> tuple[Callable[..., ConfigError], tuple[object, ...]]:
+        return type(self), (self.problems,)
+
 
 class GeometryError(ModelServerError):
     """A geometry file, or a model built in a program, breaks a rule. `problems` lists every finding."""
@@ -136,6 +171,9 @@ class GeometryError(ModelServerError):
         errors = [problem for problem in self.problems if problem.severity is Severity.ERROR]
         super().__init__("\n".join(str(problem) for problem in errors))
 
+    def __reduce__(self) -> tuple[Callable[..., GeometryError], tuple[object, ...]]:
+        return type(self), (self.problems,)
+
 
 class WireError(ModelServerError, ValueError):
     """Bytes from the bus are no message of the type that the channel carries. `reason` is one word."""
@@ -143,6 +181,9 @@ class WireError(ModelServerError, ValueError):
     def __init__(self, reason: str, message: str):
         self.reason = reason
         super().__init__(message)
+
+    def __reduce__(self) -> tuple[Callable[..., WireError], tuple[object, ...]]:
+        return type(self), (self.reason, str(self))
 
 
 class QueryError(ModelServerError):
@@ -216,6 +257,10 @@ class ServerError(QueryError):
     """The server failed on its side; its log holds the cause."""
 
     status = Status.INTERNAL
+
+
+class BusError(ModelServerError):
+    """The message bus cannot be joined."""
 
 
 class NoServerError(ModelServerError, TimeoutError):

@@ -8,9 +8,10 @@ nan for a number and None for a vector or a matrix.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 from modelserver.errors import Status
 from modelserver.spatial.pose import Pose
@@ -111,6 +112,10 @@ class Quality(IntFlag):
     HELD = 8
     CORRELATION_UNKNOWN = 16
     REVERSING = 32
+
+
+VALID = Invalid(0)
+NO_FLAGS = Quality(0)
 
 
 # --- what comes in ------------------------------------------------------------------------------------------
@@ -214,10 +219,8 @@ class JointsSample:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """The clock, as an event: monotonic time in nanoseconds beside utime; `late` in seconds after its due time."""
+    """The clock has reached a due time, `late` seconds after it; `missed` due times before it were skipped."""
 
-    monotonic_ns: int
-    utime: int
     late: float = 0.0
     missed: int = 0
 
@@ -242,6 +245,21 @@ class RequestHeader:
     request_id: int
     reply_channel: str
 
+    def is_answerable(self, prefix: str) -> bool:
+        """Return whether a server may speak on the reply channel: within its prefix, plain, not too long."""
+        channel = self.reply_channel
+        return (
+            len(prefix) < len(channel) <= MAX_CHANNEL_LENGTH
+            and channel.startswith(prefix)
+            and _PLAIN_NAME.fullmatch(channel) is not None
+        )
+
+
+MAX_CHANNEL_LENGTH = 63
+"""LCM refuses longer names."""
+
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9_]+")
+
 
 @dataclass(frozen=True, slots=True)
 class TimeQuery:
@@ -256,6 +274,7 @@ class TimeQuery:
 class GetTransformation:
     """Where is `frame_of_interest` in `frame_of_reference`?"""
 
+    channel: ClassVar[str] = "PLATFORM_GET_TRANSFORMATION"
     header: RequestHeader
     frame_of_interest: str
     frame_of_reference: str
@@ -266,6 +285,7 @@ class GetTransformation:
 class GetBodyList:
     """Which bodies are there?"""
 
+    channel: ClassVar[str] = "PLATFORM_GET_BODY_LIST"
     header: RequestHeader
 
 
@@ -273,6 +293,7 @@ class GetBodyList:
 class GetBodyFrameList:
     """Which frames has a body?"""
 
+    channel: ClassVar[str] = "PLATFORM_GET_BODY_FRAME_LIST"
     header: RequestHeader
     body: str
 
@@ -281,6 +302,7 @@ class GetBodyFrameList:
 class GetStateVector:
     """Where is the vehicle in the world, as a 7-vector?"""
 
+    channel: ClassVar[str] = "POSE_GET_STATE_VECTOR"
     header: RequestHeader
     time: TimeQuery = TimeQuery()
 
@@ -289,6 +311,7 @@ class GetStateVector:
 class GetHTransform:
     """Where is the vehicle in the world, or with `inverse` the world in the vehicle?"""
 
+    channel: ClassVar[str] = "POSE_GET_H_TRANSFORM"
     header: RequestHeader
     inverse: bool = False
     time: TimeQuery = TimeQuery()
@@ -298,15 +321,14 @@ class GetHTransform:
 class GetHistory:
     """Where was the vehicle in the world between two times?"""
 
+    channel: ClassVar[str] = "POSE_GET_HISTORY"
     header: RequestHeader
     start_utime: int
     end_utime: int
     rate_hz: float
 
 
-Request: TypeAlias = (
-    GetTransformation | GetBodyList | GetBodyFrameList | GetStateVector | GetHTransform | GetHistory
-)
+Request: TypeAlias = GetTransformation | GetBodyList | GetBodyFrameList | GetStateVector | GetHTransform | GetHistory
 Event: TypeAlias = Sample | Request | Tick | Rejected
 
 # --- what goes out ------------------------------------------------------------------------------------------
@@ -341,7 +363,7 @@ class PoseAnswer:
 
     transformation: Transformation
     origin: Origin | None = None
-    quality: Quality = Quality(0)
+    quality: Quality = NO_FLAGS
     horizontal_bound: float = NAN
     heading_bound: float = NAN
     seconds_to_limit: float = NAN
@@ -427,6 +449,8 @@ class Health:
 
     utime: int
     uptime: float
+    version: str
+    vehicle: str
     model_revision: str
     state: int
     invalid_reasons: Invalid
@@ -478,8 +502,8 @@ class Estimate:
     utm: Pose | None = None
     covariance: tuple[float, ...] | None = field(default=None, repr=False)
     odom_covariance: tuple[float, ...] | None = field(default=None, repr=False)
-    invalid: Invalid = Invalid(0)
-    quality: Quality = Quality(0)
+    invalid: Invalid = VALID
+    quality: Quality = NO_FLAGS
     pose_epoch: int = 0
     origin: Origin | None = None
     horizontal_bound: float = NAN

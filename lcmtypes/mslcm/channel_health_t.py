@@ -18,7 +18,11 @@ class channel_health_t(object):
 
     def __init__(self):
         self.channel = ""
-        """ LCM Type: string """
+        """
+        Name of the channel, with the vehicle's prefix.
+        LCM Type: string
+        """
+
         self.count = 0
         """
         Messages taken since the start.
@@ -27,13 +31,13 @@ class channel_health_t(object):
 
         self.rate_hz = 0.0
         """
-        Messages a second over the last report's interval.
+        Messages a second over the last report's interval, Hz.
         LCM Type: double
         """
 
         self.age = 0.0
         """
-        Seconds since the last one; nan = none yet.
+        Time since the last message, seconds; nan = none yet.
         LCM Type: double
         """
 

@@ -10,7 +10,7 @@ import struct
 import mslcm
 
 class get_body_list_request_t(object):
-    """ Platform.getBodyList: the names of all bodies. """
+    """ Platform.getBodyList: the names of all bodies. Answered by name_list_reply_t. """
 
     __slots__ = ["header"]
 
@@ -20,7 +20,11 @@ class get_body_list_request_t(object):
 
     def __init__(self):
         self.header = mslcm.request_header_t()
-        """ LCM Type: mslcm.request_header_t """
+        """
+        Which request, and where the answer goes.
+        LCM Type: mslcm.request_header_t
+        """
+
 
     def encode(self):
         buf = BytesIO()

@@ -11,7 +11,7 @@ import mslcm
 
 class get_h_transform_request_t(object):
     """
-    Pose.getHTransform and Pose.getHTransformInv: the vehicle's pose in the world, or the world's in the vehicle.
+    Pose.getHTransform and Pose.getHTransformInv: the vehicle's base frame in World:UTM, or World:UTM in the base frame.
     Answered by get_transformation_reply_t.
     """
 
@@ -23,11 +23,23 @@ class get_h_transform_request_t(object):
 
     def __init__(self):
         self.header = mslcm.request_header_t()
-        """ LCM Type: mslcm.request_header_t """
+        """
+        Which request, and where the answer goes.
+        LCM Type: mslcm.request_header_t
+        """
+
         self.inverse = False
-        """ LCM Type: boolean """
+        """
+        false: the base frame in World:UTM. true: World:UTM in the base frame.
+        LCM Type: boolean
+        """
+
         self.time = mslcm.time_query_t()
-        """ LCM Type: mslcm.time_query_t """
+        """
+        What time is meant.
+        LCM Type: mslcm.time_query_t
+        """
+
 
     def encode(self):
         buf = BytesIO()

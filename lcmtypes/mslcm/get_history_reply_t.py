@@ -10,6 +10,7 @@ import struct
 import mslcm
 
 class get_history_reply_t(object):
+    """ Reply to get_history_request_t. """
 
     __slots__ = ["header", "num_poses", "poses"]
 
@@ -19,9 +20,17 @@ class get_history_reply_t(object):
 
     def __init__(self):
         self.header = mslcm.reply_header_t()
-        """ LCM Type: mslcm.reply_header_t """
+        """
+        How the request ended.
+        LCM Type: mslcm.reply_header_t
+        """
+
         self.num_poses = 0
-        """ LCM Type: int32_t """
+        """
+        Number of poses; 0 unless header.status is OK.
+        LCM Type: int32_t
+        """
+
         self.poses = []
         """
         At start, start + 1/rate, ... up to end; times that are not held are left out.

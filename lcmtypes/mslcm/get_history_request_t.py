@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class get_history_request_t(object):
-    """ Pose.getHistory: the vehicle's poses in the world between two times at an even rate. """
+    """
+    Pose.getHistory: the vehicle's base frame in World:UTM between two times at an even rate.
+    Answered by get_history_reply_t.
+    """
 
     __slots__ = ["header", "start_utime", "end_utime", "rate_hz"]
 
@@ -20,15 +23,23 @@ class get_history_request_t(object):
 
     def __init__(self):
         self.header = mslcm.request_header_t()
-        """ LCM Type: mslcm.request_header_t """
+        """
+        Which request, and where the answer goes.
+        LCM Type: mslcm.request_header_t
+        """
+
         self.start_utime = 0
         """
-        First and last time, microseconds since the Unix epoch (UTC), start <= end.
+        First time, microseconds since the Unix epoch (UTC).
         LCM Type: int64_t
         """
 
         self.end_utime = 0
-        """ LCM Type: int64_t """
+        """
+        Last time, microseconds since the Unix epoch (UTC), not before start_utime.
+        LCM Type: int64_t
+        """
+
         self.rate_hz = 0.0
         """
         Poses a second, Hz, positive. More than 1,000 poses in one request are refused.

@@ -10,6 +10,7 @@ import struct
 import mslcm
 
 class get_state_vector_reply_t(object):
+    """ Reply to get_state_vector_request_t. """
 
     __slots__ = ["header", "pose"]
 
@@ -19,10 +20,14 @@ class get_state_vector_reply_t(object):
 
     def __init__(self):
         self.header = mslcm.reply_header_t()
-        """ LCM Type: mslcm.reply_header_t """
+        """
+        How the request ended.
+        LCM Type: mslcm.reply_header_t
+        """
+
         self.pose = mslcm.pose_vector_t()
         """
-        Meaningful when header.status is OK.
+        The base frame in World:UTM. Meaningful only when header.status is OK.
         LCM Type: mslcm.pose_vector_t
         """
 

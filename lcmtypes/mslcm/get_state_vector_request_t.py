@@ -10,7 +10,7 @@ import struct
 import mslcm
 
 class get_state_vector_request_t(object):
-    """ Pose.getStateVector: the vehicle's pose in the world as a 7-vector. """
+    """ Pose.getStateVector: the vehicle's base frame in World:UTM as a 7-vector. Answered by get_state_vector_reply_t. """
 
     __slots__ = ["header", "time"]
 
@@ -20,9 +20,17 @@ class get_state_vector_request_t(object):
 
     def __init__(self):
         self.header = mslcm.request_header_t()
-        """ LCM Type: mslcm.request_header_t """
+        """
+        Which request, and where the answer goes.
+        LCM Type: mslcm.request_header_t
+        """
+
         self.time = mslcm.time_query_t()
-        """ LCM Type: mslcm.time_query_t """
+        """
+        What time is meant.
+        LCM Type: mslcm.time_query_t
+        """
+
 
     def encode(self):
         buf = BytesIO()

@@ -10,7 +10,7 @@ import struct
 import mslcm
 
 class get_transformation_reply_t(object):
-    """ Also the reply to get_h_transform_request_t. """
+    """ Reply to get_transformation_request_t and get_h_transform_request_t. """
 
     __slots__ = ["header", "transform"]
 
@@ -20,10 +20,14 @@ class get_transformation_reply_t(object):
 
     def __init__(self):
         self.header = mslcm.reply_header_t()
-        """ LCM Type: mslcm.reply_header_t """
+        """
+        How the request ended.
+        LCM Type: mslcm.reply_header_t
+        """
+
         self.transform = mslcm.pose_transform_t()
         """
-        Meaningful when header.status is OK.
+        The pose asked for. Meaningful only when header.status is OK.
         LCM Type: mslcm.pose_transform_t
         """
 

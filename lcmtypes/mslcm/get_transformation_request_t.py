@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class get_transformation_request_t(object):
-    """ Platform.getTransformation: the pose of frame_of_interest in frame_of_reference. """
+    """
+    Platform.getTransformation: the pose of frame_of_interest in frame_of_reference.
+    Answered by get_transformation_reply_t.
+    """
 
     __slots__ = ["header", "frame_of_interest", "frame_of_reference", "time"]
 
@@ -20,17 +23,30 @@ class get_transformation_request_t(object):
 
     def __init__(self):
         self.header = mslcm.request_header_t()
-        """ LCM Type: mslcm.request_header_t """
+        """
+        Which request, and where the answer goes.
+        LCM Type: mslcm.request_header_t
+        """
+
         self.frame_of_interest = ""
         """
-        Full names, Body:Frame. World:UTM, World:ENU and Odom:Origin are known beside the file's.
+        The frame whose pose is asked for: full name, Body:Frame. World:UTM, World:ENU and Odom:Origin are known
+        beside the geometry file's.
         LCM Type: string
         """
 
         self.frame_of_reference = ""
-        """ LCM Type: string """
+        """
+        The frame it is to be expressed in: full name, as above.
+        LCM Type: string
+        """
+
         self.time = mslcm.time_query_t()
-        """ LCM Type: mslcm.time_query_t """
+        """
+        What time is meant.
+        LCM Type: mslcm.time_query_t
+        """
+
 
     def encode(self):
         buf = BytesIO()

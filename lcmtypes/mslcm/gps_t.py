@@ -22,19 +22,33 @@ class gps_t(object):
     __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, [9], [3], [9], None, None, None, None, None, None, None]
 
     FIX_NONE = 0
-    """ Fix types. NONE: coordinates, if any, must not be used. """
+    """ No fix: coordinates, if any, must not be used. """
     FIX_2D = 1
+    """ Position only in the horizontal, height held or unknown. """
     FIX_3D = 2
+    """ Position from the satellites alone. """
     FIX_DIFFERENTIAL = 3
+    """ Position with code corrections (differential, SBAS). """
     FIX_RTK_FLOAT = 4
+    """ Carrier phase, ambiguities not fixed. """
     FIX_RTK_FIXED = 5
+    """ Carrier phase, ambiguities fixed. """
     FIX_DEAD_RECKONING = 6
+    """ The receiver extrapolates without satellites. """
 
     def __init__(self):
         self.header = mslcm.sensor_header_t()
-        """ LCM Type: mslcm.sensor_header_t """
+        """
+        When and by whom; header.utime is the instant the position holds for.
+        LCM Type: mslcm.sensor_header_t
+        """
+
         self.fix_type = 0
-        """ LCM Type: int8_t """
+        """
+        What the fix rests on: one of FIX_NONE to FIX_DEAD_RECKONING.
+        LCM Type: int8_t
+        """
+
         self.satellites = 0
         """
         Satellites used in the solution; -1 = not said.
@@ -43,22 +57,34 @@ class gps_t(object):
 
         self.hdop = 0.0
         """
-        Dilutions of precision, no unit.
+        Horizontal dilution of precision, no unit.
         LCM Type: double
         """
 
         self.vdop = 0.0
-        """ LCM Type: double """
+        """
+        Vertical dilution of precision, no unit.
+        LCM Type: double
+        """
+
         self.pdop = 0.0
-        """ LCM Type: double """
+        """
+        Position dilution of precision, no unit.
+        LCM Type: double
+        """
+
         self.latitude_deg = 0.0
         """
-        Geodetic latitude and longitude on WGS 84, degrees, north and east positive.
+        Geodetic latitude on WGS 84, degrees, north positive, -90 to 90.
         LCM Type: double
         """
 
         self.longitude_deg = 0.0
-        """ LCM Type: double """
+        """
+        Geodetic longitude on WGS 84, degrees, east positive, -180 to 180.
+        LCM Type: double
+        """
+
         self.height_ellipsoidal = 0.0
         """
         Height above the WGS 84 ellipsoid, metres, up positive.
@@ -73,7 +99,7 @@ class gps_t(object):
 
         self.undulation = 0.0
         """
-        Geoid's height above the ellipsoid, metres: height_ellipsoidal = height_msl + undulation.
+        Geoid's height above the ellipsoid, metres, up positive: height_ellipsoidal = height_msl + undulation.
         LCM Type: double
         """
 
@@ -85,7 +111,7 @@ class gps_t(object):
 
         self.velocity = [ 0.0 for dim0 in range(3) ]
         """
-        Velocity of the antenna along true east, true north, up, m/s.
+        Velocity of the antenna over ground along true east, true north, up, m/s.
         LCM Type: double[3]
         """
 
@@ -97,7 +123,8 @@ class gps_t(object):
 
         self.velocity_latency = 0.0
         """
-        Age of the velocity at utime, seconds: some receivers report one of the recent past.
+        Seconds, not negative: velocity, speed and course hold for header.utime minus this. Some receivers report
+        a velocity of the recent past.
         LCM Type: double
         """
 
@@ -108,23 +135,36 @@ class gps_t(object):
         """
 
         self.speed_sigma = 0.0
-        """ LCM Type: double """
+        """
+        Standard deviation of speed, m/s.
+        LCM Type: double
+        """
+
         self.course = 0.0
         """
-        Direction of motion, radians, counter-clockwise from true east (not a compass course).
+        Direction of motion over ground, radians, counter-clockwise from true east (not a compass course), -pi to pi.
         LCM Type: double
         """
 
         self.course_sigma = 0.0
-        """ LCM Type: double """
+        """
+        Standard deviation of course, radians.
+        LCM Type: double
+        """
+
         self.heading = 0.0
         """
-        Direction of the antenna baseline of a dual-antenna receiver, radians, counter-clockwise from true east.
+        Direction of the antenna baseline of a dual-antenna receiver, from the antenna whose position is given to the
+        other one, radians, counter-clockwise from true east (not a compass heading), -pi to pi.
         LCM Type: double
         """
 
         self.heading_sigma = 0.0
-        """ LCM Type: double """
+        """
+        Standard deviation of heading, radians.
+        LCM Type: double
+        """
+
 
     def encode(self):
         buf = BytesIO()

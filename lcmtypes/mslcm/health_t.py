@@ -10,7 +10,7 @@ import struct
 import mslcm
 
 class health_t(object):
-    """ How the daemon is, once a second. """
+    """ How the daemon is, once a second. Counts are since the start. """
 
     __slots__ = ["utime", "uptime", "version", "vehicle", "model_revision", "state", "invalid_reasons", "invalid_text", "pose_epoch", "origin_id", "poses_published", "requests_answered", "requests_parked", "ticks_missed", "handler_errors", "tick_lateness_p50", "tick_lateness_max", "num_channels", "channels", "num_rejected", "rejected"]
 
@@ -19,77 +19,139 @@ class health_t(object):
     __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_channels"], None, ["num_rejected"]]
 
     STARTING = 0
-    """ STARTING: no valid pose was published yet. RUNNING: the last one was valid. DEGRADED: it was not. """
+    """ No valid pose was published yet. """
     RUNNING = 1
+    """ The last pose was valid. """
     DEGRADED = 2
+    """ There was a valid pose, but the last one was not. """
 
     def __init__(self):
         self.utime = 0
         """
-        Microseconds since the Unix epoch (UTC).
+        When the report was made, microseconds since the Unix epoch (UTC).
         LCM Type: int64_t
         """
 
         self.uptime = 0.0
         """
-        Seconds since the daemon started.
+        Time since the daemon started, seconds.
         LCM Type: double
         """
 
         self.version = ""
-        """ LCM Type: string """
+        """
+        Version of the daemon.
+        LCM Type: string
+        """
+
         self.vehicle = ""
-        """ LCM Type: string """
+        """
+        Name of the vehicle, from the vehicle file.
+        LCM Type: string
+        """
+
         self.model_revision = ""
-        """ LCM Type: string """
+        """
+        Content hash of the geometry in use.
+        LCM Type: string
+        """
+
         self.state = 0
-        """ LCM Type: int8_t """
+        """
+        STARTING, RUNNING or DEGRADED.
+        LCM Type: int8_t
+        """
+
         self.invalid_reasons = 0
         """
-        Of the last pose, as in pose_transform_t.
+        Why the last pose may not be used, bit by bit as in pose_transform_t; 0 = it may.
         LCM Type: int32_t
         """
 
         self.invalid_text = ""
         """
-        The same in words, for people who watch.
+        The same in words, for people who watch; empty when it may be used.
         LCM Type: string
         """
 
         self.pose_epoch = 0
-        """ LCM Type: int32_t """
+        """
+        Discontinuities of the world pose, as in pose_transform_t.
+        LCM Type: int32_t
+        """
+
         self.origin_id = 0
-        """ LCM Type: int64_t """
+        """
+        Names the origin of World:UTM, as in pose_transform_t; 0 = none.
+        LCM Type: int64_t
+        """
+
         self.poses_published = 0
         """
-        Poses published, requests answered and parked, ticks missed, exceptions caught in handlers, since the start.
+        Poses published.
         LCM Type: int64_t
         """
 
         self.requests_answered = 0
-        """ LCM Type: int64_t """
+        """
+        Requests answered, whatever the status.
+        LCM Type: int64_t
+        """
+
         self.requests_parked = 0
-        """ LCM Type: int32_t """
+        """
+        Requests that wait for data right now.
+        LCM Type: int32_t
+        """
+
         self.ticks_missed = 0
-        """ LCM Type: int64_t """
+        """
+        Ticks of the timer that were skipped because the loop came too late.
+        LCM Type: int64_t
+        """
+
         self.handler_errors = 0
-        """ LCM Type: int64_t """
+        """
+        Exceptions caught in handlers.
+        LCM Type: int64_t
+        """
+
         self.tick_lateness_p50 = 0.0
         """
-        Lateness of the ticks since the last report, seconds.
+        Median lateness of the ticks since the last report, seconds; nan = no tick.
         LCM Type: double
         """
 
         self.tick_lateness_max = 0.0
-        """ LCM Type: double """
+        """
+        Greatest lateness of a tick since the last report, seconds; nan = no tick.
+        LCM Type: double
+        """
+
         self.num_channels = 0
-        """ LCM Type: int32_t """
+        """
+        Number of channels listened to.
+        LCM Type: int32_t
+        """
+
         self.channels = []
-        """ LCM Type: mslcm.channel_health_t[num_channels] """
+        """
+        Traffic of each channel.
+        LCM Type: mslcm.channel_health_t[num_channels]
+        """
+
         self.num_rejected = 0
-        """ LCM Type: int32_t """
+        """
+        Number of kinds of rejected input.
+        LCM Type: int32_t
+        """
+
         self.rejected = []
-        """ LCM Type: mslcm.rejected_count_t[num_rejected] """
+        """
+        What was rejected, by channel and reason.
+        LCM Type: mslcm.rejected_count_t[num_rejected]
+        """
+
 
     def encode(self):
         buf = BytesIO()

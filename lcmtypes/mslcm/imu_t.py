@@ -19,55 +19,76 @@ class imu_t(object):
     __dimensions__ = [None, [3], [9], [3], [9], [3], None, None, [4], [9], None]
 
     REFERENCE_NONE = 0
-    """
-    What the unit's own orientation is measured against.
-    NONE: it gives no orientation. ENU: x true or magnetic east, z up. NED: x north, z down.
-    """
+    """ The unit gives no orientation. """
     REFERENCE_ENU = 1
+    """ Reference axes x east, y north, z up; magnetic or true as yaw_source says. """
     REFERENCE_NED = 2
+    """ Reference axes x north, y east, z down; magnetic or true as yaw_source says. """
     YAW_NONE = 0
-    """ Where the unit's yaw comes from. NONE: its zero is arbitrary and drifts (vertical gyro). """
+    """ The zero of the yaw is arbitrary and drifts (vertical gyro). """
     YAW_MAGNETIC = 1
+    """ The yaw is against magnetic north. """
     YAW_TRUE = 2
+    """ The yaw is against true north. """
 
     def __init__(self):
         self.header = mslcm.sensor_header_t()
-        """ LCM Type: mslcm.sensor_header_t """
+        """
+        When and by whom.
+        LCM Type: mslcm.sensor_header_t
+        """
+
         self.angular_velocity = [ 0.0 for dim0 in range(3) ]
         """
-        Angular velocity with respect to inertial space, rad/s, right-hand rule.
+        Angular velocity of the sensor with respect to inertial space, along the sensor's axes, rad/s, right-hand rule.
         LCM Type: double[3]
         """
 
         self.angular_velocity_covariance = [ 0.0 for dim0 in range(9) ]
-        """ LCM Type: double[9] """
+        """
+        Covariance of the angular velocity, row-major, along the sensor's axes, (rad/s)2.
+        LCM Type: double[9]
+        """
+
         self.specific_force = [ 0.0 for dim0 in range(3) ]
         """
-        Specific force, m/s2: at rest it points up, against gravity, with 9.81.
+        Specific force along the sensor's axes, m/s2: at rest it points up, against gravity, with 9.81.
         LCM Type: double[3]
         """
 
         self.specific_force_covariance = [ 0.0 for dim0 in range(9) ]
-        """ LCM Type: double[9] """
+        """
+        Covariance of the specific force, row-major, along the sensor's axes, (m/s2)2.
+        LCM Type: double[9]
+        """
+
         self.magnetic_field = [ 0.0 for dim0 in range(3) ]
         """
-        Magnetic field, tesla.
+        Magnetic field along the sensor's axes, tesla.
         LCM Type: double[3]
         """
 
         self.orientation_reference = 0
-        """ LCM Type: int8_t """
+        """
+        What the unit's own orientation is measured against: one of REFERENCE_NONE, REFERENCE_ENU, REFERENCE_NED.
+        LCM Type: int8_t
+        """
+
         self.yaw_source = 0
-        """ LCM Type: int8_t """
+        """
+        Where the unit's yaw comes from: one of YAW_NONE, YAW_MAGNETIC, YAW_TRUE.
+        LCM Type: int8_t
+        """
+
         self.orientation = [ 0.0 for dim0 in range(4) ]
         """
-        The unit's own orientation: quaternion of its sensor frame in its reference, scalar first (w x y z).
+        The unit's own orientation: unit quaternion of its sensor frame in its reference, scalar first (w x y z).
         LCM Type: double[4]
         """
 
         self.orientation_covariance = [ 0.0 for dim0 in range(9) ]
         """
-        Covariance of the orientation about the axes of its reference, row-major, rad2.
+        Covariance of the orientation about the (fixed) axes of its reference, row-major, rad2.
         LCM Type: double[9]
         """
 

@@ -10,7 +10,7 @@ import struct
 import mslcm
 
 class joints_t(object):
-    """ Positions of joints (constraints that move). What was not measured is nan. """
+    """ Positions of joints (constraints that move). Arrays have one entry for each joint; what was not measured is nan. """
 
     __slots__ = ["header", "num_joints", "names", "position", "position_sigma", "rate", "rate_sigma"]
 
@@ -20,9 +20,17 @@ class joints_t(object):
 
     def __init__(self):
         self.header = mslcm.sensor_header_t()
-        """ LCM Type: mslcm.sensor_header_t """
+        """
+        When and by whom.
+        LCM Type: mslcm.sensor_header_t
+        """
+
         self.num_joints = 0
-        """ LCM Type: int32_t """
+        """
+        Number of joints, 0 to 1,024.
+        LCM Type: int32_t
+        """
+
         self.names = []
         """
         Names of the constraints in the geometry file.
@@ -36,15 +44,23 @@ class joints_t(object):
         """
 
         self.position_sigma = []
-        """ LCM Type: double[num_joints] """
+        """
+        Standard deviation of position, radians or metres.
+        LCM Type: double[num_joints]
+        """
+
         self.rate = []
         """
-        Rate of the position: rad/s or m/s.
+        Rate of the position, rad/s or m/s, along the joint's positive sense.
         LCM Type: double[num_joints]
         """
 
         self.rate_sigma = []
-        """ LCM Type: double[num_joints] """
+        """
+        Standard deviation of rate, rad/s or m/s.
+        LCM Type: double[num_joints]
+        """
+
 
     def encode(self):
         buf = BytesIO()

@@ -20,12 +20,20 @@ class name_list_reply_t(object):
 
     def __init__(self):
         self.header = mslcm.reply_header_t()
-        """ LCM Type: mslcm.reply_header_t """
+        """
+        How the request ended.
+        LCM Type: mslcm.reply_header_t
+        """
+
         self.num_names = 0
-        """ LCM Type: int32_t """
+        """
+        Number of names; 0 unless header.status is OK.
+        LCM Type: int32_t
+        """
+
         self.names = []
         """
-        In the order of the geometry file.
+        Names of bodies, or of the frames of one body without the body's name; in the order of the geometry file.
         LCM Type: string[num_names]
         """
 

@@ -20,23 +20,37 @@ class pose_transform_t(object):
     __dimensions__ = [None, None, None, [4, 4], [36], [3], None, None, None, None, None, None, None, None, None, None, None]
 
     NO_FIX = 1
-    """ Why not, bit by bit: """
+    """ No usable fix yet. """
     NO_IMU = 2
+    """ No inertial sample yet. """
     NO_ORIGIN = 4
+    """ The origin is not set yet: still averaging fixes. """
     NOT_MOVED_YET = 8
+    """ Heading is not known before the vehicle moves. """
     STATIONARY_HEADING = 16
+    """ Heading has drifted too long at rest. """
     STALE_GPS = 32
+    """ The last usable fix is too old. """
     STALE_IMU = 64
+    """ The last inertial sample is too old. """
     GPS_REJECTED = 128
+    """ Fixes arrive but the gates refuse them. """
     BOUND_EXCEEDED = 256
+    """ A bound passes the configured limit. """
     CLOCK_STEPPED = 512
+    """ The clock stepped; time is being taken up anew. """
     HEADING_FROM_GYRO = 1
-    """ What a user should know although the pose may be used, bit by bit: """
+    """ Heading is carried by the gyro: the vehicle stands or crawls. """
     PREDICTED = 2
+    """ Later than the last sample: carried on by the motion model. """
     INTERPOLATED = 4
+    """ Between two samples. """
     HELD = 8
+    """ The last known value before the time asked for. """
     CORRELATION_UNKNOWN = 16
+    """ The covariance is an upper bound. """
     REVERSING = 32
+    """ The vehicle is taken to drive backwards. """
 
     def __init__(self):
         self.utime = 0
@@ -47,15 +61,21 @@ class pose_transform_t(object):
 
         self.frame_of_interest = ""
         """
-        Full names, Body:Frame. World:UTM is grid east, grid north, up, with its origin at initial_utm.
+        The frame whose pose this is: full name, Body:Frame.
         LCM Type: string
         """
 
         self.frame_of_reference = ""
-        """ LCM Type: string """
+        """
+        The frame it is expressed in: full name, Body:Frame. World:UTM is grid east, grid north, up, with its origin
+        at initial_utm. World:ENU is true east, true north, up at the same point. Odom:Origin drifts and never jumps.
+        LCM Type: string
+        """
+
         self.h_transform = [ [ 0.0 for dim1 in range(4) ] for dim0 in range(4) ]
         """
-        Homogeneous transform, row by row: maps points of the frame of interest to the frame of reference. Metres.
+        Homogeneous transform, row by row, translation in metres:
+        maps points of the frame of interest to the frame of reference.
         LCM Type: double[4][4]
         """
 
@@ -75,7 +95,7 @@ class pose_transform_t(object):
 
         self.utm_zone = 0
         """
-        UTM zone, 1 to 60, pinned when the origin is set; 0 = not known.
+        UTM zone, 1 to 60, pinned when the origin is set; 0 where initial_utm is nan.
         LCM Type: int8_t
         """
 
@@ -87,13 +107,14 @@ class pose_transform_t(object):
 
         self.origin_id = 0
         """
-        Names the origin: changes when initial_utm does. 0 = none.
+        Names the origin: changes when initial_utm does. 0 where initial_utm is nan.
         LCM Type: int64_t
         """
 
         self.pose_epoch = 0
         """
-        Counts the discontinuities of the world pose. Poses of two epochs must not be compared.
+        Counts the discontinuities of the world pose; poses of two epochs must not be compared.
+        0 where no world frame is involved.
         LCM Type: int32_t
         """
 
@@ -105,31 +126,30 @@ class pose_transform_t(object):
 
         self.invalid_reasons = 0
         """
-        the clock stepped; time is being taken up anew
+        Why the pose may not be used, bit by bit: NO_FIX to CLOCK_STEPPED. 0 = it may.
         LCM Type: int32_t
         """
 
         self.quality_flags = 0
         """
-        the vehicle is taken to drive backwards
+        What a user should know although the pose may be used, bit by bit: HEADING_FROM_GYRO to REVERSING.
         LCM Type: int32_t
         """
 
         self.horizontal_bound = 0.0
         """
-        Protection bounds: the error is taken to be within, at the configured risk. nan = not known.
+        The horizontal position error is taken to be within this, at the configured risk, metres. nan = not known.
         LCM Type: double
         """
 
         self.heading_bound = 0.0
         """
-        metres
+        The heading error is taken to be within this either way, at the configured risk, radians. nan = not known.
         LCM Type: double
         """
 
         self.seconds_to_limit = 0.0
         """
-        radians
         Seconds until a configured limit is passed if nothing more arrives; nan = not known.
         LCM Type: double
         """

@@ -8,7 +8,10 @@ from io import BytesIO
 import struct
 
 class pose_vector_t(object):
-    """ Pose of one frame in another as the 7-vector of the report's PoseVectorIDL. """
+    """
+    Pose of one frame in another as the 7-vector of the PoseVectorIDL of DRDC TR 2005-240.
+    Everything beside the vector is as in pose_transform_t, constants included.
+    """
 
     __slots__ = ["utime", "frame_of_interest", "frame_of_reference", "vec", "covariance", "initial_utm", "utm_zone", "utm_north", "origin_id", "pose_epoch", "pose_valid", "invalid_reasons", "quality_flags", "horizontal_bound", "heading_bound", "seconds_to_limit", "model_revision"]
 
@@ -19,67 +22,107 @@ class pose_vector_t(object):
     def __init__(self):
         self.utime = 0
         """
-        The instant the pose holds for, microseconds since the Unix epoch (UTC).
+        The instant the pose holds for, microseconds since the Unix epoch (UTC); 0 = it does not change with time.
         LCM Type: int64_t
         """
 
         self.frame_of_interest = ""
         """
-        Full names, Body:Frame.
+        The frame whose pose this is: full name, Body:Frame.
         LCM Type: string
         """
 
         self.frame_of_reference = ""
-        """ LCM Type: string """
+        """
+        The frame it is expressed in: full name, Body:Frame.
+        LCM Type: string
+        """
+
         self.vec = [ 0.0 for dim0 in range(7) ]
         """
-        px py pz (metres) and the unit quaternion qs qx qy qz (scalar first, qs >= 0).
+        px py pz (metres) and the unit quaternion qs qx qy qz (scalar first, qs >= 0) of the frame of interest in the
+        frame of reference.
         LCM Type: double[7]
         """
 
         self.covariance = [ 0.0 for dim0 in range(36) ]
         """
-        Covariance as in pose_transform_t. nan = not known.
+        Covariance (6 by 6, not of the 7-vector), row-major: x, y, z (m), about x, about y, about z (rad), along the axes
+        of the frame of reference, rotation applied on the left (fixed axes). nan = not known.
         LCM Type: double[36]
         """
 
         self.initial_utm = [ 0.0 for dim0 in range(3) ]
         """
-        Origin of World:UTM, zone and hemisphere, origin id and epoch, validity and flags as in pose_transform_t.
+        Origin of World:UTM: grid easting, grid northing, height above the ellipsoid, metres.
+        nan where no world frame is involved or the origin is not known yet.
         LCM Type: double[3]
         """
 
         self.utm_zone = 0
-        """ LCM Type: int8_t """
+        """
+        UTM zone, 1 to 60, pinned when the origin is set; 0 where initial_utm is nan.
+        LCM Type: int8_t
+        """
+
         self.utm_north = False
-        """ LCM Type: boolean """
+        """
+        Whether the zone is of the northern hemisphere.
+        LCM Type: boolean
+        """
+
         self.origin_id = 0
-        """ LCM Type: int64_t """
+        """
+        Names the origin: changes when initial_utm does. 0 where initial_utm is nan.
+        LCM Type: int64_t
+        """
+
         self.pose_epoch = 0
-        """ LCM Type: int32_t """
+        """
+        Counts the discontinuities of the world pose; poses of two epochs must not be compared.
+        0 where no world frame is involved.
+        LCM Type: int32_t
+        """
+
         self.pose_valid = False
-        """ LCM Type: boolean """
+        """
+        Whether the pose may be used: invalid_reasons is 0.
+        LCM Type: boolean
+        """
+
         self.invalid_reasons = 0
-        """ LCM Type: int32_t """
+        """
+        Why the pose may not be used, bit by bit as in pose_transform_t; 0 = it may.
+        LCM Type: int32_t
+        """
+
         self.quality_flags = 0
-        """ LCM Type: int32_t """
+        """
+        What a user should know although the pose may be used, bit by bit as in pose_transform_t.
+        LCM Type: int32_t
+        """
+
         self.horizontal_bound = 0.0
-        """ LCM Type: double """
+        """
+        The horizontal position error is taken to be within this, at the configured risk, metres. nan = not known.
+        LCM Type: double
+        """
+
         self.heading_bound = 0.0
         """
-        metres
+        The heading error is taken to be within this either way, at the configured risk, radians. nan = not known.
         LCM Type: double
         """
 
         self.seconds_to_limit = 0.0
         """
-        radians
+        Seconds until a configured limit is passed if nothing more arrives; nan = not known.
         LCM Type: double
         """
 
         self.model_revision = ""
         """
-        seconds
+        Content hash of the geometry that the answer rests on.
         LCM Type: string
         """
 

@@ -8,7 +8,7 @@ from io import BytesIO
 import struct
 
 class rejected_count_t(object):
-    """ How many messages of one channel were rejected for one reason since the start. """
+    """ How much input of one channel was rejected for one reason since the start. """
 
     __slots__ = ["channel", "reason", "count"]
 
@@ -30,7 +30,11 @@ class rejected_count_t(object):
         """
 
         self.count = 0
-        """ LCM Type: int64_t """
+        """
+        How many, since the start.
+        LCM Type: int64_t
+        """
+
 
     def encode(self):
         buf = BytesIO()

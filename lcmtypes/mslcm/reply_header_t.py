@@ -8,7 +8,7 @@ from io import BytesIO
 import struct
 
 class reply_header_t(object):
-    """ First member of every reply. """
+    """ How a request ended. First member of every reply. """
 
     __slots__ = ["request_id", "utime", "status", "message", "num_nearest", "nearest", "model_revision"]
 
@@ -17,17 +17,27 @@ class reply_header_t(object):
     __dimensions__ = [None, None, None, None, None, ["num_nearest"], None]
 
     OK = 0
-    """ How it ended. """
+    """ Answered; the rest of the reply counts. """
     UNKNOWN_BODY = 1
+    """ The model has no body of that name; see nearest. """
     UNKNOWN_FRAME = 2
+    """ The body has no frame of that name, or the name is not Body:Frame; see nearest. """
     NOT_CONNECTED = 3
+    """ Both frames exist but no chain of constraints joins them. """
     NO_POSE = 4
+    """ A world frame was asked for before the vehicle's pose is known; ask again later. """
     TOO_OLD = 5
+    """ The time asked for lies before what is held. """
     TOO_NEW = 6
+    """ The time asked for lies after what is held, and the policy forbids to predict. """
     MALFORMED = 7
+    """ The request makes no sense: an unknown policy, a negative wait, a range that ends before it starts. """
     REFUSED_LOAD = 8
+    """ The server is loaded and did not take the request; ask again later. """
     LIMIT = 9
+    """ The request asks for more than the server gives at once. """
     INTERNAL = 10
+    """ The server failed on its side; its log holds the cause. """
 
     def __init__(self):
         self.request_id = 0
@@ -43,7 +53,11 @@ class reply_header_t(object):
         """
 
         self.status = 0
-        """ LCM Type: int16_t """
+        """
+        How the request ended: OK to INTERNAL. Take a number you do not know for INTERNAL.
+        LCM Type: int16_t
+        """
+
         self.message = ""
         """
         What went wrong and what to do, for a person; empty when status is OK.
@@ -52,12 +66,16 @@ class reply_header_t(object):
 
         self.num_nearest = 0
         """
-        Known names close to one that is not known, best first.
+        Number of nearest names.
         LCM Type: int32_t
         """
 
         self.nearest = []
-        """ LCM Type: string[num_nearest] """
+        """
+        Known names close to one that is not known, best first.
+        LCM Type: string[num_nearest]
+        """
+
         self.model_revision = ""
         """
         Content hash of the geometry that the answer rests on.

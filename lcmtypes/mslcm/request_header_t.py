@@ -8,7 +8,7 @@ from io import BytesIO
 import struct
 
 class request_header_t(object):
-    """ First member of every request. """
+    """ Which request, and where the answer goes. First member of every request. """
 
     __slots__ = ["request_id", "reply_channel"]
 
@@ -19,13 +19,14 @@ class request_header_t(object):
     def __init__(self):
         self.request_id = 0
         """
-        Random, chosen by the client; comes back in the reply.
+        Random, chosen by the client; comes back in the reply. A repeated request keeps its id.
         LCM Type: int64_t
         """
 
         self.reply_channel = ""
         """
-        Channel to answer on. Must start with the server's reply prefix (REPLY_) and have 63 characters at most.
+        Channel to answer on: starts with the server's reply prefix (REPLY_) and more, letters, digits and underscores
+        only, 63 characters at most. One for each client program, the same at every start.
         LCM Type: string
         """
 

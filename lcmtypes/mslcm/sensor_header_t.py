@@ -19,7 +19,7 @@ class sensor_header_t(object):
     def __init__(self):
         self.utime = 0
         """
-        Instant of measurement, microseconds since the Unix epoch (UTC, host's clock).
+        Instant of measurement, microseconds since the Unix epoch (UTC, host's clock), positive.
         LCM Type: int64_t
         """
 
@@ -31,7 +31,7 @@ class sensor_header_t(object):
 
         self.host_utime = 0
         """
-        When the host received the sample, microseconds since the Unix epoch (UTC, host's clock).
+        When the host received the sample, microseconds since the Unix epoch (UTC, host's clock); 0 = not known.
         LCM Type: int64_t
         """
 
@@ -49,7 +49,7 @@ class sensor_header_t(object):
 
         self.source = ""
         """
-        Name of the source as the vehicle file knows it, e.g. gps.
+        Name of the source as the vehicle file knows it, e.g. gps; 64 characters at most.
         LCM Type: string
         """
 

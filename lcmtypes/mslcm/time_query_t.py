@@ -17,13 +17,13 @@ class time_query_t(object):
     __dimensions__ = [None, None, None]
 
     INTERPOLATED = 0
-    """
-    INTERPOLATED: exact or between two held values, else an error. LATEST: as at = 0.
-    HELD: the last value at or before `at`. PREDICTED: as INTERPOLATED, and carried on past the last sample.
-    """
+    """ Exact or between two held values, else an error. """
     LATEST = 1
+    """ As at = 0, whatever `at` says. """
     HELD = 2
+    """ The last value at or before `at`. """
     PREDICTED = 3
+    """ As INTERPOLATED, and carried on by the motion model past the last sample. """
 
     def __init__(self):
         self.at = 0
@@ -33,10 +33,14 @@ class time_query_t(object):
         """
 
         self.policy = 0
-        """ LCM Type: int8_t """
+        """
+        Which answer is accepted when `at` is given: INTERPOLATED, LATEST, HELD or PREDICTED.
+        LCM Type: int8_t
+        """
+
         self.wait_ms = 0
         """
-        How long the server may wait for data that cover `at`, milliseconds; 0 = answer at once.
+        How long the server may wait for data that cover `at`, milliseconds, not negative; 0 = answer at once.
         LCM Type: int32_t
         """
 

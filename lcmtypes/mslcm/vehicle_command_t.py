@@ -31,19 +31,19 @@ class vehicle_command_t(object):
 
         self.seq = 0
         """
-        Counts the commands of this source.
+        Counts the commands of this source, from 0.
         LCM Type: int64_t
         """
 
         self.source = ""
         """
-        Who commands.
+        Name of who commands.
         LCM Type: string
         """
 
         self.forward_speed = 0.0
         """
-        Forward speed, m/s, forward positive.
+        Speed of the vehicle's base frame along its x axis (forward), m/s, forward positive.
         LCM Type: double
         """
 

@@ -19,17 +19,29 @@ class vehicle_status_t(object):
     __dimensions__ = [None, None, None, None, None, None, None, None]
 
     MODE_UNKNOWN = 0
-    """ Who drives. EMERGENCY_STOP: nobody, and it must not move. """
+    """ The controller does not say. """
     MODE_MANUAL = 1
+    """ A person drives. """
     MODE_AUTONOMOUS = 2
+    """ A program drives. """
     MODE_EMERGENCY_STOP = 3
+    """ Nobody drives, and the vehicle must not move. """
     MODE_FAULT = 4
+    """ The controller has a fault and takes no commands. """
 
     def __init__(self):
         self.header = mslcm.sensor_header_t()
-        """ LCM Type: mslcm.sensor_header_t """
+        """
+        When and by whom.
+        LCM Type: mslcm.sensor_header_t
+        """
+
         self.mode = 0
-        """ LCM Type: int8_t """
+        """
+        Who drives: one of MODE_UNKNOWN to MODE_FAULT.
+        LCM Type: int8_t
+        """
+
         self.forward_speed = 0.0
         """
         Forward speed as the controller measures it, m/s, forward positive; nan = not said.
@@ -62,7 +74,7 @@ class vehicle_status_t(object):
 
         self.commands_refused = 0
         """
-        Commands refused since start: out of limits, too old, or from a stranger.
+        Commands refused since the controller started: out of limits, too old, or from a stranger.
         LCM Type: int64_t
         """
 

@@ -19,16 +19,27 @@ class wheels_t(object):
     __dimensions__ = [None, None, ["num_wheels"], ["num_wheels"], ["num_wheels"], ["num_wheels"], ["num_wheels"], ["num_wheels"], ["num_wheels"]]
 
     BACKWARD = -1
-    """ Direction of rotation as the encoder tells it. """
+    """ The wheel turns backward. """
     STOPPED = 0
+    """ The wheel does not turn. """
     FORWARD = 1
+    """ The wheel turns forward. """
     UNKNOWN = 2
+    """ The encoder does not tell. """
 
     def __init__(self):
         self.header = mslcm.sensor_header_t()
-        """ LCM Type: mslcm.sensor_header_t """
+        """
+        When and by whom.
+        LCM Type: mslcm.sensor_header_t
+        """
+
         self.num_wheels = 0
-        """ LCM Type: int32_t """
+        """
+        Number of wheels, 0 to 1,024.
+        LCM Type: int32_t
+        """
+
         self.names = []
         """
         Names of the wheels, as the vehicle file knows them, e.g. front_left.
@@ -42,7 +53,11 @@ class wheels_t(object):
         """
 
         self.travel_sigma = []
-        """ LCM Type: double[num_wheels] """
+        """
+        Standard deviation of travel, metres.
+        LCM Type: double[num_wheels]
+        """
+
         self.speed = []
         """
         Speed of the wheel's contact point over ground without slip, m/s, forward positive.
@@ -50,12 +65,21 @@ class wheels_t(object):
         """
 
         self.speed_sigma = []
-        """ LCM Type: double[num_wheels] """
+        """
+        Standard deviation of speed, m/s.
+        LCM Type: double[num_wheels]
+        """
+
         self.direction = []
-        """ LCM Type: int8_t[num_wheels] """
+        """
+        Direction of rotation as the encoder tells it: one of BACKWARD, STOPPED, FORWARD, UNKNOWN.
+        LCM Type: int8_t[num_wheels]
+        """
+
         self.steering = []
         """
-        Steering angle of the wheel about the vehicle's up axis, radians, to the left positive; 0 = not steered.
+        Steering angle of the wheel about the vehicle's up axis, radians, to the left positive; 0 = not steered,
+        nan = steered but not measured.
         LCM Type: double[num_wheels]
         """
 

@@ -14,6 +14,7 @@ A file format fills one and adds the problems it met on the way; a program may d
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from modelserver.errors import GeometryError, Problem, Severity, Source, nearest_names, shown
@@ -28,6 +29,12 @@ NOWHERE = Source()
 LOOP_METRES = 1e-6
 LOOP_RADIANS = 1e-6
 """A loop that closes better than this is said to close exactly."""
+
+LISTED = 12
+"""Names that a message lists at most."""
+
+SUGGESTED = 100
+"""Constraint ends for which nearest names are looked up; a file with more wrong has another illness."""
 
 
 @dataclass(slots=True)
@@ -64,6 +71,11 @@ class ModelBuilder:
         self.problems: list[Problem] = []
         self._bodies: list[BodyBuilder] = []
         self._constraints: list[tuple[Constraint, Source]] = []
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether neither a body nor a constraint was added."""
+        return not self._bodies and not self._constraints
 
     def body(
         self,
@@ -105,15 +117,11 @@ class ModelBuilder:
         """Note a problem that was met while reading."""
         self.problems.append(Problem(severity, message, source, fix, nearest))
 
-    def error(
-        self, message: str, source: Source = NOWHERE, fix: str = "", nearest: tuple[str, ...] = ()
-    ) -> None:
+    def error(self, message: str, source: Source = NOWHERE, fix: str = "", nearest: tuple[str, ...] = ()) -> None:
         """Note a problem that makes the model unusable."""
         self.problem(Severity.ERROR, message, source, fix, nearest)
 
-    def warning(
-        self, message: str, source: Source = NOWHERE, fix: str = "", nearest: tuple[str, ...] = ()
-    ) -> None:
+    def warning(self, message: str, source: Source = NOWHERE, fix: str = "", nearest: tuple[str, ...] = ()) -> None:
         """Note a problem that the model can live with."""
         self.problem(Severity.WARNING, message, source, fix, nearest)
 
@@ -135,8 +143,7 @@ class ModelBuilder:
         bodies = review.bodies()
         bodies, constraints = review.connections(bodies, review.constraints(bodies))
         problems = tuple(
-            problem
-            for _, problem in sorted(enumerate(review.problems), key=lambda item: (item[1].line, item[0]))
+            problem for _, problem in sorted(enumerate(review.problems), key=lambda item: (item[1].line, item[0]))
         )
         if any(problem.severity is Severity.ERROR for problem in problems):
             return None, problems
@@ -151,6 +158,7 @@ class _Review:
         self.repair = repair
         self.problems = list(builder.problems)
         self.places: dict[str, Source] = {}
+        self.suggested = 0
 
     def fault(self, message: str, source: Source, fix: str, nearest: tuple[str, ...] = ()) -> None:
         """Report something badly formed: an error, or with repair the warning that it was removed."""
@@ -171,9 +179,7 @@ class _Review:
                 self.fault(f"{label}: {fault}", draft.source, "give it a plain name, e.g. FrontCamera")
                 continue
             if draft.name in names.RESERVED_BODIES:
-                self.fault(
-                    f"{label}: the service keeps this name for its world frames", draft.source, "rename it"
-                )
+                self.fault(f"{label}: the service keeps this name for its world frames", draft.source, "rename it")
                 continue
             if draft.name in kept:
                 first = self.places[draft.name]
@@ -198,7 +204,8 @@ class _Review:
             except ValueError as error:
                 self.fault(f"{label}: {error}", draft.source, "write 6 rows of 6 numbers, or leave it out")
                 kept[draft.name] = Body(draft.name, frames, draft.description, draft.pose)
-        if not kept:
+        if not kept and not any(problem.severity is Severity.ERROR for problem in self.problems):
+            # where a file could not be read, that is the one thing worth saying
             self.note(
                 Severity.ERROR,
                 "there is no body",
@@ -250,7 +257,9 @@ class _Review:
                 continue
             by_name[constraint.name] = source
             ends = (("From", constraint.from_), ("To", constraint.to))
-            if not all([self._end_exists(label, sense, end, bodies, source) for sense, end in ends]):
+            # a list, so that both ends are looked at
+            exist = [self._end_exists(label, sense, end, bodies, source) for sense, end in ends]
+            if not all(exist):
                 continue
             if constraint.from_ == constraint.to:
                 self.fault(
@@ -284,32 +293,33 @@ class _Review:
         try:
             body, frame = names.split(end)
         except ValueError:
-            everything = [names.joined(body.name, frame.name) for body in bodies.values() for frame in body]
-            near = nearest_names(end, everything)
-            self.fault(
-                f"{label}: {sense} {shown(end)} is not of the form Body:Frame", source, _use(near), near
-            )
+            everything = (names.joined(body.name, frame.name) for body in bodies.values() for frame in body)
+            near = self._nearest(end, everything)
+            self.fault(f"{label}: {sense} {shown(end)} is not of the form Body:Frame", source, _use(near), near)
             return False
         if body not in bodies:
             near = tuple(
                 names.joined(name, frame) if bodies[name].has_frame(frame) else name
-                for name in nearest_names(body, bodies)
+                for name in self._nearest(body, bodies)
             )
-            self.fault(
-                f"{label}: {sense} names body {shown(body)}, which does not exist", source, _use(near), near
-            )
+            self.fault(f"{label}: {sense} names body {shown(body)}, which does not exist", source, _use(near), near)
             return False
         if not bodies[body].has_frame(frame):
-            known = [each.name for each in bodies[body]]
-            near = tuple(names.joined(body, name) for name in nearest_names(frame, known))
+            known = [each.name for each in bodies[body].frames[: LISTED + 1]]
+            frames = (each.name for each in bodies[body])
+            near = tuple(names.joined(body, name) for name in self._nearest(frame, frames))
             self.fault(
                 f"{label}: {sense} names frame {shown(frame)}, which body {body} does not have",
                 source,
-                _use(near) if near else f"body {body} has: {', '.join(known)}",
+                _use(near) if near else f"body {body} has: {_few(known)}",
                 near,
             )
             return False
         return True
+
+    def _nearest(self, name: str, known: Iterable[str]) -> tuple[str, ...]:
+        self.suggested += 1
+        return nearest_names(name, known) if self.suggested <= SUGGESTED else ()
 
     def connections(
         self, bodies: dict[str, Body], placed: tuple[tuple[Constraint, Source], ...]
@@ -336,7 +346,7 @@ class _Review:
             exact = metres < LOOP_METRES and radians < LOOP_RADIANS
             self.note(
                 Severity.WARNING,
-                f"constraint {closing.constraint} closes a loop through {', '.join(closing.bodies)}; "
+                f"constraint {closing.constraint} closes a loop through {_few(closing.bodies)}; "
                 + (
                     "it closes exactly"
                     if exact
@@ -355,6 +365,11 @@ class _Review:
 
 def _first_at(place: Source) -> str:
     return f" (first at {place})" if str(place) else ""
+
+
+def _few(several: Sequence[str]) -> str:
+    """Return the first of several names: a file of 10,000 frames must not make a message of 10,000 names."""
+    return ", ".join(several[:LISTED]) + (f", ... ({len(several)} in all)" if len(several) > LISTED else "")
 
 
 def _use(near: tuple[str, ...]) -> str:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import OrderedDict
 from collections.abc import Iterable
 from enum import StrEnum
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +28,8 @@ from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array
 from modelserver.spatial.transformation import Transformation
 
-CACHE_SIZE = 65536
-"""Static answers kept. When full the oldest goes: the pairs a vehicle asks for are few and come again."""
+CACHE_SIZE = 16384
+"""Static answers kept, about 1 kB each. When full the oldest goes: a vehicle asks for few pairs, again and again."""
 
 
 class Search(StrEnum):
@@ -36,11 +39,20 @@ class Search(StrEnum):
     DEPTH_FIRST = "depth_first"
 
 
+class _Place(NamedTuple):
+    """Where a frame stands in its assembly; `X_RF` is its pose in the assembly's first body."""
+
+    assembly: int
+    body: Body
+    frame: BodyFrame
+    X_RF: Pose
+
+
 class Model:
     """The geometry of a vehicle. Build one with `ModelBuilder` or `modelserver.load_model`.
 
     `bodies`, `constraints`, `problems` are tuples in the order of the file; the first body is the root.
-    `revision` is a hash of everything in the model that can change an answer or a list.
+    `revision` is a hash of everything in the model that can change an answer or a list. Immutable.
     """
 
     __slots__ = (
@@ -48,6 +60,7 @@ class Model:
         "_bodies",
         "_from_root",
         "_looped",
+        "_places",
         "_topology",
         "bodies",
         "constraints",
@@ -73,15 +86,11 @@ class Model:
         self.revision = _revision(bodies, constraints)
         self._bodies = {body.name: body for body in bodies}
         self._topology = Topology(bodies, constraints)
-        self._answers: dict[tuple[str, str], Transformation] = {}
+        # An OrderedDict drops its oldest in constant time; a dict walks over all that was dropped before.
+        self._answers: OrderedDict[tuple[str, str], Transformation] = OrderedDict()
+        self._places: dict[str, _Place] = {}
         self._from_root = self._place_bodies()
-        looped = {closing.constraint for closing in self._topology.loop_closures()}
-        self._looped = frozenset(
-            assembly
-            for assembly in range(len(self._topology.assemblies))
-            for constraint in constraints
-            if constraint.name in looped and self._from_root[names.split(constraint.from_)[0]][0] == assembly
-        )
+        self._looped = frozenset(self._from_root[closing.bodies[0]][0] for closing in self._topology.loop_closures())
 
     def _place_bodies(self) -> dict[str, tuple[int, Pose]]:
         """Return for each body its assembly's number and the pose of its origin in that assembly's first body."""
@@ -152,14 +161,12 @@ class Model:
             raise self._not_connected(target.name, body.name)
         return path
 
-    def along(
-        self, path: Iterable[Crossing], frame_of_interest: str, frame_of_reference: str
-    ) -> Transformation:
+    def along(self, path: Iterable[Crossing], frame_of_interest: str, frame_of_reference: str) -> Transformation:
         """Return the transformation that a path of `find_path` builds, edge by edge (eq. 12 and 13).
 
         Its covariance is that of the edges' sigmas, None where an edge states none.
         """
-        body, start = self._split(frame_of_reference)
+        _, start = self._split(frame_of_reference)
         pose = Pose.identity()
         cov: Array = np.zeros((6, 6))
         known = True
@@ -209,46 +216,48 @@ class Model:
             near = nearest_names(body_name, self._bodies)
             raise UnknownBodyError(
                 f"the model has no body {shown(body_name)}",
-                (
-                    names.joined(body, frame_name) if self._bodies[body].has_frame(frame_name) else body
-                    for body in near
-                ),
+                (names.joined(body, frame_name) if self._bodies[body].has_frame(frame_name) else body for body in near),
             )
         return found, found.frame(frame_name)
 
     def _answer(self, frame_of_interest: str, frame_of_reference: str) -> Transformation:
         """Work out a pair that was not asked for before, and keep it."""
-        body_R, frame_R = self._split(frame_of_reference)
-        body_I, frame_I = self._split(frame_of_interest)
-        if frame_R is frame_I:
+        reference = self._places.get(frame_of_reference) or self._place(frame_of_reference)
+        interest = self._places.get(frame_of_interest) or self._place(frame_of_interest)
+        if reference is interest:
             pose = Pose.identity()
-        elif body_R is body_I:
-            pose = frame_R.pose.inverse() @ frame_I.pose
-        else:
-            assembly_R, X_root_R = self._from_root[body_R.name]
-            assembly_I, X_root_I = self._from_root[body_I.name]
-            if assembly_R != assembly_I:
-                raise self._not_connected(body_I.name, body_R.name)
-            if assembly_R in self._looped:
-                path = self.find_path(frame_of_interest, frame_of_reference)
-                return self._keep(self.along(path, frame_of_interest, frame_of_reference))
-            pose = (X_root_R @ frame_R.pose).inverse() @ (X_root_I @ frame_I.pose)
-
-        def path_covariance() -> Array | None:
+        elif reference.body is interest.body:
+            pose = reference.frame.pose.inverse() @ interest.frame.pose
+        elif reference.assembly != interest.assembly:
+            raise self._not_connected(interest.body.name, reference.body.name)
+        elif reference.assembly in self._looped:
             path = self.find_path(frame_of_interest, frame_of_reference)
-            return self.along(path, frame_of_interest, frame_of_reference).covariance
-
-        return self._keep(
-            Transformation(
-                frame_of_interest, frame_of_reference, pose, path_covariance, model_revision=self.revision
-            )
+            pose = self.along(path, frame_of_interest, frame_of_reference).pose
+        else:
+            pose = reference.X_RF.inverse() @ interest.X_RF
+        answer = Transformation(
+            frame_of_interest,
+            frame_of_reference,
+            pose,
+            partial(self._path_covariance, frame_of_interest, frame_of_reference),
+            model_revision=self.revision,
         )
-
-    def _keep(self, answer: Transformation) -> Transformation:
         if len(self._answers) >= CACHE_SIZE:
-            del self._answers[next(iter(self._answers))]
-        self._answers[answer.frame_of_interest, answer.frame_of_reference] = answer
+            self._answers.popitem(last=False)
+        self._answers[frame_of_interest, frame_of_reference] = answer
         return answer
+
+    def _place(self, name: str) -> _Place:
+        """Work out where a frame stands when it is first asked for, and keep it: one for each frame at most."""
+        body, frame = self._split(name)
+        assembly, X_RB = self._from_root[body.name]
+        place = _Place(assembly, body, frame, X_RB @ frame.pose)
+        self._places[name] = place
+        return place
+
+    def _path_covariance(self, frame_of_interest: str, frame_of_reference: str) -> Array | None:
+        path = self.find_path(frame_of_interest, frame_of_reference)
+        return self.along(path, frame_of_interest, frame_of_reference).covariance
 
     def _not_connected(self, body_I: str, body_R: str) -> NotConnectedError:
         def assembly(body: str) -> str:
@@ -259,6 +268,17 @@ class Model:
             f"no constraints lead from {body_R} to {body_I}: {body_R} is joined with [{assembly(body_R)}], "
             f"{body_I} with [{assembly(body_I)}]"
         )
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if hasattr(self, name):
+            raise AttributeError("a Model is immutable; build a new one")
+        object.__setattr__(self, name, value)
+
+    def __delattr__(self, name: str) -> None:
+        raise AttributeError("a Model is immutable; build a new one")
+
+    def __reduce__(self) -> tuple[type[Model], tuple[object, ...]]:
+        return (Model, (self.bodies, self.constraints, self.name, self.description, self.problems))
 
     def __repr__(self) -> str:
         frames = sum(len(body.frames) for body in self.bodies)
@@ -272,7 +292,7 @@ _IDENTITY = Pose.identity()
 
 
 def _revision(bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> str:
-    """Return 16 hex digits of a SHA-256 over names, poses and sigmas; floats enter exactly (repr round-trips)."""
+    """Return 16 hex digits of a SHA-256 over what answers and lists hold; floats enter exactly (repr round-trips)."""
 
     def sigma(value: Sigma | None) -> object:
         return None if value is None else (value.position, value.rotation)
@@ -284,15 +304,13 @@ def _revision(bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> 
         [
             (
                 body.name,
+                body.description,
                 pose(body.pose),
                 body.inertia,
                 [(frame.name, pose(frame.pose), frame.description, sigma(frame.sigma)) for frame in body],
             )
             for body in bodies
         ],
-        [
-            (each.name, each.from_, each.to, pose(each.pose), each.joint, sigma(each.sigma))
-            for each in constraints
-        ],
+        [(each.name, each.from_, each.to, pose(each.pose), each.joint, sigma(each.sigma)) for each in constraints],
     )
     return hashlib.sha256(json.dumps(content, separators=(",", ":")).encode()).hexdigest()[:16]

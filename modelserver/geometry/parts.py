@@ -25,9 +25,14 @@ class Sigma:
     rotation: Vector3 = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for value in self.position + self.rotation:
-            if not math.isfinite(value) or value < 0:
-                raise ValueError(f"a sigma is finite and not negative, got {value}")
+        for what in ("position", "rotation"):
+            values = tuple([float(value) for value in getattr(self, what)])
+            if len(values) != 3:
+                raise ValueError(f"the {what} sigma is 3 numbers, got {len(values)}")
+            for value in values:
+                if not math.isfinite(value * value) or value < 0:
+                    raise ValueError(f"a sigma is finite and not negative, got {value}")
+            object.__setattr__(self, what, values)
 
     @property
     def covariance(self) -> Array:
@@ -79,9 +84,10 @@ class Body:
             by_name[frame.name] = frame
         object.__setattr__(self, "_by_name", by_name)
         if self.inertia is not None:
-            rows = self.inertia
+            rows = tuple([tuple([float(value) for value in row]) for row in self.inertia])
             if [len(row) for row in rows] != [6] * 6 or not all(map(math.isfinite, sum(rows, ()))):
                 raise ValueError(f"the inertia of body {self.name} is not 6 rows of 6 finite numbers")
+            object.__setattr__(self, "inertia", rows)
 
     def frame(self, name: str) -> BodyFrame:
         """Return the frame of that name. Raises UnknownFrameError with the nearest names."""

@@ -140,9 +140,10 @@ class Topology:
         """Return the path that the report's search finds (4.6.2), None where there is none.
 
         Starting at `body:frame`, each frame of the body is compared with `target` (a full name); one that
-        does not match and is constrained goes on the path stack and its constraint is crossed; a frame that
-        is on the stack already closes a cycle and its branch is left. Order is that of the file, so the
-        path need not be the shortest. Raises LimitError after a million frames.
+        does not match and is constrained goes on the path stack, its constraint is crossed and the attached
+        frame examined, then those of its body; a frame that is on the stack already closes a cycle and its
+        branch is left. Order is that of the file, so the path need not be the shortest. Raises LimitError
+        after a million frames.
         """
         if names.joined(body, frame) == target:
             return ()
@@ -172,6 +173,8 @@ class Topology:
             if crossing is None or name in on_path or crossing.leaves in on_path:
                 continue
             path.append(crossing)
+            if crossing.leaves == target:
+                return tuple(path)
             on_path.add(name)
             entered = names.split(crossing.leaves)[0]
             here.append(entered)
@@ -198,5 +201,6 @@ def _loop(reached: dict[str, tuple[str, Crossing]], a: str, b: str) -> tuple[str
         return line
 
     line_a, line_b = ancestors(a), ancestors(b)
-    shared = next(body for body in line_a if body in set(line_b))
+    above_b = set(line_b)
+    shared = next(body for body in line_a if body in above_b)
     return (*line_a[: line_a.index(shared) + 1], *reversed(line_b[: line_b.index(shared)]))

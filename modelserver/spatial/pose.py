@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Iterable
 from typing import Self, TypeGuard
 
@@ -19,8 +20,24 @@ def _frozen(values: object) -> Array:
     return array
 
 
+def _floats(values: Iterable[float], meant: str) -> tuple[float, ...]:
+    """Return the values as floats. Raises ValueError, saying what was meant, where they are no flat row of numbers."""
+    try:
+        # + 0.0 turns a negative zero into zero, so that equal poses have equal bits
+        found = tuple([float(value) + 0.0 for value in values])
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{meant}, got {reprlib.repr(values)}") from None
+    if isinstance(values, np.ndarray) and values.ndim != 1:
+        raise ValueError(f"{meant}, got an array of shape {values.shape}")
+    return found
+
+
 def _is_vector3(values: tuple[float, ...]) -> TypeGuard[Vector3]:
     return len(values) == 3
+
+
+def _is_quaternion(values: tuple[float, ...]) -> TypeGuard[Quaternion]:
+    return len(values) == 4
 
 
 class Pose:
@@ -33,6 +50,7 @@ class Pose:
     """
 
     __slots__ = ("_p", "_q")
+    __array_ufunc__ = None  # numpy must not take part in products: an array beside a Pose is a TypeError
 
     _p: Vector3
     _q: Quaternion
@@ -46,21 +64,21 @@ class Pose:
 
         Raises ValueError for a wrong count, a number that is not finite, or a zero quaternion.
         """
-        p = tuple(float(value) for value in position)
-        q = tuple(float(value) for value in quaternion)
+        p = _floats(position, "a position is 3 finite numbers in metres")
+        q = _floats(quaternion, "a quaternion is 4 numbers, scalar first")
         if not _is_vector3(p) or not all(map(math.isfinite, p)):
-            raise ValueError(f"a position is 3 finite numbers in metres, got {p}")
-        if len(q) != 4:
-            raise ValueError(f"a quaternion is 4 numbers, scalar first, got {q}")
-        object.__setattr__(self, "_p", p)
-        object.__setattr__(self, "_q", so3.normalized(q))
+            raise ValueError(f"a position is 3 finite numbers in metres, got {reprlib.repr(p)}")
+        if not _is_quaternion(q):
+            raise ValueError(f"a quaternion is 4 numbers, scalar first, got {reprlib.repr(q)}")
+        _put_p(self, p)
+        _put_q(self, so3.normalized(q))
 
     @classmethod
     def _of(cls, p: Vector3, q: Quaternion) -> Self:
         """Build from values that are already floats and a quaternion that is already unit, w >= 0."""
         self = object.__new__(cls)
-        object.__setattr__(self, "_p", p)
-        object.__setattr__(self, "_q", q)
+        _put_p(self, p)
+        _put_q(self, q)
         return self
 
     @classmethod
@@ -76,10 +94,10 @@ class Pose:
         matrix is singular or a reflection, or where the last row is not 0 0 0 1.
         """
         m = np.asarray(matrix, dtype=float)
-        if m.shape not in ((3, 4), (4, 4)) or not np.isfinite(m).all():
-            raise ValueError(
-                f"a homogeneous transform is a finite (4, 4) or (3, 4) matrix, got shape {m.shape}"
-            )
+        if m.shape not in ((3, 4), (4, 4)):
+            raise ValueError(f"a homogeneous transform is a (4, 4) or (3, 4) matrix, got shape {m.shape}")
+        if not np.isfinite(m).all():
+            raise ValueError(f"a homogeneous transform has finite numbers only, got {m.tolist()}")
         if m.shape == (4, 4) and not np.allclose(m[3], (0.0, 0.0, 0.0, 1.0), rtol=0, atol=1e-9):
             raise ValueError(f"the last row of a homogeneous transform is 0 0 0 1, got {m[3].tolist()}")
         rotation, deviation = so3.nearest_rotation(m[:3, :3])
@@ -88,9 +106,7 @@ class Pose:
         return cls(m[:3, 3].tolist(), so3.from_matrix(rotation))
 
     @classmethod
-    def from_rpy(
-        cls, position: Iterable[float], roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0
-    ) -> Self:
+    def from_rpy(cls, position: Iterable[float], roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> Self:
         """Return the pose at `position` turned by fixed-axis roll, pitch, yaw in radians."""
         if not (math.isfinite(roll) and math.isfinite(pitch) and math.isfinite(yaw)):
             raise ValueError(f"roll, pitch and yaw must be finite, got {roll}, {pitch}, {yaw}")
@@ -99,7 +115,7 @@ class Pose:
     @classmethod
     def from_state_vector(cls, vector: Iterable[float]) -> Self:
         """Return the pose of a 7-vector `px py pz qs qx qy qz` (report eq. 4)."""
-        values = [float(value) for value in vector]
+        values = _floats(vector, "a state vector is 7 numbers, px py pz qs qx qy qz")
         if len(values) != 7:
             raise ValueError(f"a state vector is 7 numbers, px py pz qs qx qy qz, got {len(values)}")
         return cls(values[:3], values[3:])
@@ -209,3 +225,8 @@ class Pose:
         x, y, z = self._p
         roll, pitch, yaw = (math.degrees(angle) for angle in so3.to_rpy(self._q))
         return f"position ({x:.3f}, {y:.3f}, {z:.3f}) m, roll {roll:.2f} pitch {pitch:.2f} yaw {yaw:.2f} deg"
+
+
+# Setting a slot by its descriptor passes by the guard above, at half the cost of object.__setattr__.
+_put_p = Pose.__dict__["_p"].__set__
+_put_q = Pose.__dict__["_q"].__set__

@@ -21,6 +21,9 @@ Array: TypeAlias = npt.NDArray[np.float64]
 
 IDENTITY: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
+UNIT = 2e-15
+"""A squared length this near to 1 is 1 within rounding: what one normalization leaves is 1.1e-15 at most."""
+
 
 def normalized(q: Quaternion) -> Quaternion:
     """Return `q` at unit length with w >= 0.
@@ -30,11 +33,18 @@ def normalized(q: Quaternion) -> Quaternion:
     """
     w, x, y, z = q
     squared = w * w + x * x + y * y + z * z
-    if not math.isfinite(squared) or squared < 1e-300:
-        raise ValueError(f"a quaternion must be finite and not zero, got {q}")
     scale = 1.0
-    if abs(squared - 1.0) > 4e-16:
+    if abs(squared - 1.0) <= UNIT:
+        if w > 0.0:
+            return q
+    elif 1e-200 < squared < 1e200:
         scale = 1.0 / math.sqrt(squared)
+    else:
+        # the squares overflow or vanish: bring the largest component to 1 first
+        largest = max(map(abs, q))
+        if not all(map(math.isfinite, q)) or largest == 0.0:
+            raise ValueError(f"a quaternion must be finite and not zero, got {q}")
+        return normalized((w / largest, x / largest, y / largest, z / largest))
     if w < 0.0 or (w == 0.0 and (x, y, z) < (0.0, 0.0, 0.0)):
         scale = -scale
     if scale == 1.0:
@@ -87,10 +97,9 @@ def matrix_rows(q: Quaternion) -> tuple[Vector3, Vector3, Vector3]:
     )
 
 
-def from_matrix(R: npt.ArrayLike) -> Quaternion:
-    """Return the unit quaternion of a rotation matrix (3, 3), which must be one: see `nearest_rotation`."""
-    m = np.asarray(R, dtype=float)
-    (a, b, c), (d, e, f), (g, h, i) = m.tolist()
+def from_rows(rows: tuple[Vector3, Vector3, Vector3]) -> Quaternion:
+    """Return the unit quaternion of the rows of a rotation matrix, which must be one: see `nearest_rotation`."""
+    (a, b, c), (d, e, f), (g, h, i) = rows
     trace = a + e + i
     largest = max(trace, a, e, i)
     if largest == trace:
@@ -102,6 +111,11 @@ def from_matrix(R: npt.ArrayLike) -> Quaternion:
     else:
         q = (d - b, c + g, f + h, 1.0 - a - e + i)
     return normalized(q)
+
+
+def from_matrix(R: npt.ArrayLike) -> Quaternion:
+    """Return the unit quaternion of a rotation matrix (3, 3), which must be one: see `nearest_rotation`."""
+    return from_rows(np.asarray(R, dtype=float).tolist())
 
 
 def from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
@@ -122,22 +136,31 @@ def from_rpy(roll: float, pitch: float, yaw: float) -> Quaternion:
 def to_rpy(q: Quaternion) -> Vector3:
     """Return fixed-axis roll, pitch, yaw in radians, pitch within +-pi/2.
 
-    At pitch = +-pi/2 roll and yaw turn about one axis; roll is then 0 and yaw carries both.
+    At pitch = +-pi/2 roll and yaw turn about one axis; roll is then 0 and yaw carries both. Full precision
+    up to there: half the sum and half the difference of roll and yaw are read from the quaternion directly
+    (E. Bernardes and S. Viollet, "Quaternion to Euler angles conversion", 2022).
     """
-    w, _, _, z = q
-    (r00, _, _), (r10, _, _), (r20, r21, r22) = matrix_rows(q)
-    horizontal = math.hypot(r00, r10)
-    if horizontal < 1e-9:
-        # with roll 0 the quaternion's w and z alone carry yaw, at full precision
-        yaw = math.remainder(2.0 * math.atan2(z, w), math.tau)
-        return (0.0, math.copysign(math.pi / 2, -r20), yaw)
-    return (math.atan2(r21, r22), math.atan2(-r20, horizontal), math.atan2(r10, r00))
+    w, x, y, z = q
+    up = math.hypot(w - y, x + z)  # 0 at pitch = pi/2, where the sum of roll and yaw means nothing
+    down = math.hypot(w + y, x - z)  # 0 at pitch = -pi/2, and so the difference
+    pitch = math.atan2(2.0 * (w * y - x * z), up * down)
+    if up < 1e-12 or down < 1e-12:
+        return (0.0, pitch, math.remainder(2.0 * math.atan2(z, w), math.tau))
+    half_sum = math.atan2(x + z, w - y)
+    half_difference = math.atan2(x - z, w + y)
+    return (
+        math.remainder(half_sum + half_difference, math.tau),
+        pitch,
+        math.remainder(half_sum - half_difference, math.tau),
+    )
 
 
 def exponential(v: Vector3) -> Quaternion:
     """Return the rotation by |v| radians about v (the exponential map)."""
     x, y, z = v
     angle = math.sqrt(x * x + y * y + z * z)
+    if not math.isfinite(angle):
+        raise ValueError(f"a rotation vector must be finite, got {v}")
     # sin(a/2)/a by its series below 1e-4 rad, where the quotient loses digits
     s = 0.5 - angle * angle / 48.0 if angle < 1e-4 else math.sin(angle / 2) / angle
     return normalized((math.cos(angle / 2), x * s, y * s, z * s))
@@ -167,7 +190,10 @@ def nearest_rotation(M: npt.ArrayLike) -> tuple[Array, float]:
     m = np.asarray(M, dtype=float)
     if m.shape != (3, 3) or not np.isfinite(m).all():
         raise ValueError("a rotation matrix has 3 rows of 3 finite numbers")
-    deviation = float(np.abs(m.T @ m - np.eye(3)).max())
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = float(np.abs(m.T @ m - np.eye(3)).max())
+    if not math.isfinite(deviation):
+        raise ValueError("the entries of the matrix are too large for a rotation")
     U, s, Vt = np.linalg.svd(m)
     if s[-1] < 1e-6:
         raise ValueError("the matrix is singular, so it is no rotation")

@@ -4,10 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
 from modelserver.errors import FrameMismatchError
 from modelserver.spatial import covariance as cov
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array
+
+
+def _kept(covariance: Array) -> Array:
+    """Return a read-only copy, so that what the caller does to its array later changes nothing here."""
+    kept = np.array(covariance, dtype=float)
+    if kept.shape != (6, 6):
+        raise ValueError(f"a covariance has shape (6, 6), got {kept.shape}")
+    kept.flags.writeable = False
+    return kept
 
 
 class Transformation:
@@ -55,6 +66,8 @@ class Transformation:
         model_revision: str = "",
     ):
         """Take the values; `covariance` may be a function that works it out when it is first looked at."""
+        if covariance is not None and not callable(covariance):
+            covariance = _kept(covariance)
         put = object.__setattr__
         put(self, "frame_of_interest", frame_of_interest)
         put(self, "frame_of_reference", frame_of_reference)
@@ -72,9 +85,9 @@ class Transformation:
         found = self._covariance
         if callable(found):
             found = found()
+            if found is not None:
+                found = _kept(found)
             object.__setattr__(self, "_covariance", found)
-        if found is not None:
-            found.flags.writeable = False
         return found
 
     @property
@@ -191,6 +204,22 @@ class Transformation:
 
     def __hash__(self) -> int:
         return hash((self.frame_of_interest, self.frame_of_reference, self.pose, self.utime))
+
+    def __reduce__(self) -> tuple[type[Transformation], tuple[object, ...]]:
+        return (
+            Transformation,
+            (
+                self.frame_of_interest,
+                self.frame_of_reference,
+                self.pose,
+                self.covariance,
+                self.utime,
+                self.invalid_reasons,
+                self.pose_epoch,
+                self.origin_id,
+                self.model_revision,
+            ),
+        )
 
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError("a Transformation is immutable; make a new one")

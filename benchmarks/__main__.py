@@ -1,0 +1,58 @@
+"""Lists and runs the benchmarks.
+
+    python -m benchmarks              run them all
+    python -m benchmarks NAME ...     run some
+    python -m benchmarks --list       say what there is
+
+Each is a module of this package with a function `main() -> int`: 0 = run and within its bounds, 1 = run and out
+of bounds, 77 = skipped, with the reason printed. Its docstring's first line says what it measures.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+SKIPPED = 77
+
+
+def names() -> list[str]:
+    return sorted(path.stem for path in Path(__file__).parent.glob("[a-z]*.py") if _has_main(path))
+
+
+def _has_main(path: Path) -> bool:
+    return any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in _tree(path).body) and (
+        path.stem != "__main__"
+    )
+
+
+def _tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def summary(name: str) -> str:
+    doc = ast.get_docstring(_tree(Path(__file__).with_name(f"{name}.py"))) or ""
+    return doc.partition("\n")[0]
+
+
+def main(arguments: Sequence[str]) -> int:
+    known = names()
+    if "--list" in arguments:
+        print("\n".join(f"{name:20} {summary(name)}" for name in known))
+        return 0
+    unknown = [name for name in arguments if name not in known]
+    if unknown:
+        print(f"no benchmark {', '.join(unknown)}; there are: {', '.join(known)}", file=sys.stderr)
+        return 2
+    codes = []
+    for name in arguments or known:
+        print(f"== {name}: {summary(name)}", flush=True)
+        codes.append(importlib.import_module(f"benchmarks.{name}").main())
+    return 1 if any(code not in (0, SKIPPED) for code in codes) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,222 @@
+"""Platform: the client. Its methods look local; each asks the daemon and waits for the reply."""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+import sys
+import threading
+import time
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from modelserver.errors import NoServerError, Status, WireError, error_for_status
+from modelserver.messages import (
+    MAX_CHANNEL_LENGTH,
+    GetBodyFrameList,
+    GetBodyList,
+    GetHistory,
+    GetHTransform,
+    GetStateVector,
+    GetTransformation,
+    HistoryReply,
+    NameListReply,
+    Policy,
+    PoseAnswer,
+    ReplyHeader,
+    RequestHeader,
+    StateVectorReply,
+    TimeQuery,
+    TransformReply,
+)
+from modelserver.spatial.transformation import Transformation
+from modelserver.wire.channels import REPLY_PREFIX, literal
+from modelserver.wire.codec import decode, encode
+from modelserver.wire.provider import open_lcm, resolve_url
+
+R = TypeVar("R", TransformReply, NameListReply, StateVectorReply, HistoryReply)
+
+_REPLY_TYPES = {
+    TransformReply: "get_transformation_reply_t",
+    NameListReply: "name_list_reply_t",
+    StateVectorReply: "get_state_vector_reply_t",
+    HistoryReply: "get_history_reply_t",
+}
+
+
+class Platform:
+    """Asks the running service.
+
+        with modelserver.Platform() as platform:
+            platform.get_transformation("Digiclops:ImagePlane", "World:UTM")
+
+    It has an LCM instance of its own, so it may be used inside another instance's handler, and by several
+    threads (one asks at a time). `url` is the LCM provider, by default $LCM_DEFAULT_URL, else loopback.
+    `timeout` is how long one try waits for its reply, seconds; `retries` how many more tries follow.
+    `name` names this program on the bus; its reply channel is made of it.
+    """
+
+    def __init__(
+        self,
+        url: str = "",
+        *,
+        channel_prefix: str = "",
+        reply_prefix: str = REPLY_PREFIX,
+        timeout: float = 1.0,
+        retries: int = 2,
+        name: str = "",
+    ):
+        if not timeout > 0:
+            raise ValueError(f"timeout is above 0 s, got {timeout}")
+        if retries < 0:
+            raise ValueError(f"retries is 0 or more, got {retries}")
+        self.url = resolve_url(url)
+        self.timeout = timeout
+        self.retries = retries
+        self._prefix = channel_prefix
+        # stable for a program, not random: every process on the bus keeps each channel name it ever saw
+        self.reply_channel = _reply_channel(reply_prefix, name or os.path.basename(sys.argv[0] or "python"))
+        self._lock = threading.Lock()
+        self._lcm = open_lcm(self.url)
+        self._open = True
+        self._subscription = self._lcm.subscribe(literal(self.reply_channel), self._take)
+        self._subscription.set_queue_capacity(0)
+        self._fresh: list[bytes] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave the bus. Further questions raise ValueError."""
+        with self._lock:
+            if self._open:
+                self._lcm.unsubscribe(self._subscription)
+                self._open = False
+
+    def get_transformation(
+        self,
+        frame_of_interest: str,
+        frame_of_reference: str,
+        *,
+        at: int = 0,
+        policy: Policy = Policy.INTERPOLATED,
+        wait_ms: int = 0,
+    ) -> Transformation:
+        """Return the pose of `frame_of_interest` in `frame_of_reference`.
+
+        `at` is a time in microseconds since the Unix epoch, 0 for the latest common one; `policy` says what is
+        accepted for an answer there; `wait_ms` how long the server may wait for data that cover it.
+        Raises NoServerError, or the QueryError that the server meant.
+        """
+        return self.get_pose(
+            frame_of_interest, frame_of_reference, at=at, policy=policy, wait_ms=wait_ms
+        ).transformation
+
+    def get_pose(
+        self,
+        frame_of_interest: str,
+        frame_of_reference: str,
+        *,
+        at: int = 0,
+        policy: Policy = Policy.INTERPOLATED,
+        wait_ms: int = 0,
+    ) -> PoseAnswer:
+        """Return what `get_transformation` does, with the origin, the bounds and the flags beside it."""
+        request = GetTransformation(
+            self._header(), frame_of_interest, frame_of_reference, TimeQuery(at, policy, wait_ms)
+        )
+        return _found(self._ask(request, TransformReply, wait_ms).answer)
+
+    def get_body_list(self) -> list[str]:
+        """Return the names of the bodies, root first. Raises NoServerError."""
+        return list(self._ask(GetBodyList(self._header()), NameListReply).names)
+
+    def get_body_frame_list(self, body: str) -> list[str]:
+        """Return the names of a body's frames. Raises NoServerError, UnknownBodyError."""
+        return list(self._ask(GetBodyFrameList(self._header(), body), NameListReply).names)
+
+    def get_state_vector(
+        self, *, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
+    ) -> Transformation:
+        """Return the vehicle's pose in World:UTM, through its 7-vector. Raises as `get_transformation`."""
+        request = GetStateVector(self._header(), TimeQuery(at, policy, wait_ms))
+        return _found(self._ask(request, StateVectorReply, wait_ms).answer).transformation
+
+    def get_h_transform(
+        self, *, inverse: bool = False, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
+    ) -> Transformation:
+        """Return the vehicle's pose in World:UTM, or with `inverse` the world's in the vehicle.
+
+        Raises as `get_transformation`.
+        """
+        request = GetHTransform(self._header(), inverse, TimeQuery(at, policy, wait_ms))
+        return _found(self._ask(request, TransformReply, wait_ms).answer).transformation
+
+    def get_history(self, start_utime: int, end_utime: int, rate_hz: float) -> list[Transformation]:
+        """Return the vehicle's poses in World:UTM at an even rate; times not held are left out.
+
+        Raises NoServerError, NoPoseError, LimitError (more than 1,000 poses), MalformedRequestError.
+        """
+        request = GetHistory(self._header(), start_utime, end_utime, rate_hz)
+        return [answer.transformation for answer in self._ask(request, HistoryReply).answers]
+
+    def _header(self) -> RequestHeader:
+        return RequestHeader(secrets.randbits(63), self.reply_channel)
+
+    def _take(self, channel: str, data: bytes) -> None:
+        self._fresh.append(data)
+
+    def _ask(self, request: Any, reply_kind: type[R], wait_ms: int = 0) -> R:
+        """Send a request until its reply comes. Asking twice does no harm: requests change nothing."""
+        data = encode(request)
+        channel = f"{self._prefix}{request.channel}"
+        patience = self.timeout + wait_ms * 1e-3
+        with self._lock:
+            if not self._open:
+                raise ValueError("this Platform is closed")
+            for _ in range(1 + self.retries):
+                self._lcm.publish(channel, data)
+                reply = self._await(request.header.request_id, reply_kind, patience)
+                if reply is not None:
+                    header: ReplyHeader = reply.header
+                    if header.status is not Status.OK:
+                        raise error_for_status(header.status, header.message, header.nearest)
+                    return reply
+        raise NoServerError(
+            f"no reply on {self.reply_channel} to a request on {channel} at {self.url} after "
+            f"{1 + self.retries} tries of {patience:g} s. Is the daemon running (modelserver run -c vehicle.yaml), "
+            "on this bus ($LCM_DEFAULT_URL) and with this channel prefix?"
+        )
+
+    def _await(self, request_id: int, reply_kind: type[R], patience: float) -> R | None:
+        deadline = time.monotonic() + patience
+        while (left := deadline - time.monotonic()) > 0:
+            if not self._lcm.handle_timeout(max(1, int(left * 1000))):
+                continue
+            for data in self._fresh:
+                try:
+                    reply = decode(_REPLY_TYPES[reply_kind], data)
+                except WireError:
+                    continue  # a reply of another kind: to an earlier question that was given up
+                if reply.header.request_id == request_id:
+                    self._fresh.clear()
+                    return reply  # type: ignore[no-any-return]
+            self._fresh.clear()
+        return None
+
+
+def _found(answer: PoseAnswer | None) -> PoseAnswer:
+    if answer is None:
+        raise WireError("malformed", "the server said OK but sent no pose")
+    return answer
+
+
+def _reply_channel(prefix: str, program: str) -> str:
+    plain = re.sub(r"[^A-Za-z0-9]+", "_", program).strip("_").upper() or "CLIENT"
+    return f"{prefix}{plain}"[:MAX_CHANNEL_LENGTH]

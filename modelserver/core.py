@@ -1,0 +1,430 @@
+"""The core: a deterministic state machine, `step(state, event, now) -> (state, outputs)`. Pure.
+
+Live and replay run this same function: the same events at the same instants give the same outputs. Time enters
+only with events. Nothing that comes from the bus can raise out of `step`; what cannot be used is counted by
+channel and reason, and the counts go out with the health report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
+
+from modelserver.errors import QueryError, Status
+from modelserver.geometry import names
+from modelserver.geometry.model import Model
+from modelserver.history import History
+from modelserver.localization.interface import Localizer
+from modelserver.messages import (
+    ChannelHealth,
+    Event,
+    GetBodyFrameList,
+    GetBodyList,
+    GetHistory,
+    GetHTransform,
+    GetStateVector,
+    GetTransformation,
+    GpsSample,
+    Health,
+    HistoryReply,
+    ImuSample,
+    Invalid,
+    JointsSample,
+    NameListReply,
+    Output,
+    Policy,
+    PublishHealth,
+    PublishPose,
+    Rejected,
+    Reply,
+    ReplyHeader,
+    Request,
+    Sample,
+    SendReply,
+    StateVectorReply,
+    Tick,
+    TransformReply,
+    WheelsSample,
+)
+from modelserver.platform import PlatformView
+from modelserver.version import __version__
+
+FUTURE_LIMIT_S: Final = 1.0
+"""A sample stamped this far ahead of the host's clock is refused: one of the two clocks is wrong."""
+
+MAX_COUNTERS: Final = 256
+"""Distinct causes of rejection that are told apart; further ones are counted together."""
+
+LATENESS_KEPT: Final = 512
+
+STARTING, RUNNING, DEGRADED = 0, 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class Instant:
+    """When an event is handled: the host's monotonic clock in nanoseconds, and its time of day as utime."""
+
+    monotonic_ns: int
+    utime: int
+
+
+@dataclass(frozen=True, slots=True)
+class CoreSettings:
+    """What does not change while the core runs; see `modelserver.config` for the meanings."""
+
+    base_frame: str
+    vehicle: str = ""
+    publish: Literal["timer", "event"] = "timer"
+    health_period_ns: int = 1_000_000_000
+    history_s: float = 60.0
+    parked_requests: int = 64
+    wait_ms: int = 2000
+    reply_prefix: str = "REPLY_"
+
+
+@dataclass(frozen=True, slots=True)
+class Parked:
+    """A request that waits for data: asked at `asked_ns`, answered as best it can at `until_ns`."""
+
+    request: GetTransformation | GetStateVector | GetHTransform
+    until_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """Messages of one source: how many, the last one's arrival, and how many there were at the last report."""
+
+    count: int = 0
+    last_ns: int = 0
+    reported: int = 0
+
+
+class CoreState(NamedTuple):
+    """All that the core knows. Make the first one with `start`.
+
+    A NamedTuple, not a dataclass like the rest: its successor is made for every event, at a third of the cost.
+    """
+
+    settings: CoreSettings
+    model: Model
+    localizer: Localizer | None
+    history: History
+    started_ns: int
+    parked: tuple[Parked, ...] = ()
+    rejected: Mapping[tuple[str, str], int] = MappingProxyType({})
+    traffic: Mapping[str, Traffic] = MappingProxyType({})
+    lateness: tuple[float, ...] = ()
+    health_due_ns: int = 0
+    health_sent_ns: int = 0
+    poses_published: int = 0
+    requests_answered: int = 0
+    ticks_missed: int = 0
+    handler_errors: int = 0
+    run_state: int = STARTING
+
+    @property
+    def view(self) -> PlatformView:
+        """The platform as it is known now."""
+        return PlatformView(self.model, self.settings.base_frame, self.localizer, self.history)
+
+
+Outputs: TypeAlias = tuple[Output, ...]
+Step: TypeAlias = tuple[CoreState, Outputs]
+
+
+def start(settings: CoreSettings, model: Model, localizer: Localizer | None, now: Instant) -> CoreState:
+    """Return the first state. Raises UnknownBodyError or UnknownFrameError where the model lacks the base frame."""
+    model.frame(settings.base_frame)
+    return CoreState(
+        settings, model, localizer, History(settings.history_s), now.monotonic_ns, health_due_ns=now.monotonic_ns
+    )
+
+
+def step(state: CoreState, event: Event, now: Instant) -> Step:
+    """Return the state after an event, and what is to be sent."""
+    return _HANDLERS[type(event)](state, event, now)
+
+
+# --- samples ------------------------------------------------------------------------------------------------
+
+
+def _sample(state: CoreState, sample: Sample, now: Instant) -> Step:
+    source = f"sensor:{sample.header.source}"
+    state = _note_traffic(state, source, now)
+    if sample.header.utime > now.utime + FUTURE_LIMIT_S * 1e6:
+        return _count(state, source, "future"), ()
+    if state.localizer is None:
+        return state, ()
+    localizer, notes = state.localizer.take(sample)
+    outputs: list[Output] = []
+    for note in notes:
+        if isinstance(note, Rejected):
+            state = _count(state, note.channel, note.reason)
+        else:
+            outputs.append(note)
+    if localizer is state.localizer:
+        return state, tuple(outputs)
+    state = state._replace(localizer=localizer)
+    if isinstance(sample, GpsSample | ImuSample):
+        estimate = localizer.estimate(localizer.utime)
+        state = state._replace(history=state.history.extended(estimate))
+        if state.settings.publish == "event":
+            state, pose = _publish(state, localizer.utime)
+            outputs.append(pose)
+        if state.parked:
+            state, replies = _answer_parked(state, now)
+            outputs.extend(replies)
+    return state, tuple(outputs)
+
+
+def _publish(state: CoreState, utime: int) -> tuple[CoreState, PublishPose]:
+    assert state.localizer is not None
+    estimate = state.localizer.estimate(utime)
+    view = state.view
+    world = view.broadcast(estimate, names.WORLD_UTM)
+    run_state = RUNNING if world.transformation.valid else DEGRADED
+    if run_state == DEGRADED and state.run_state == STARTING:
+        run_state = STARTING
+    state = state._replace(poses_published=state.poses_published + 1, run_state=run_state)
+    return state, PublishPose(world, view.broadcast(estimate, names.ODOM))
+
+
+# --- time ---------------------------------------------------------------------------------------------------
+
+
+def _tick(state: CoreState, tick: Tick, now: Instant) -> Step:
+    outputs: list[Output] = []
+    state = state._replace(
+        lateness=(*state.lateness[-LATENESS_KEPT + 1 :], tick.late),
+        ticks_missed=state.ticks_missed + tick.missed,
+    )
+    if state.settings.publish == "timer" and state.localizer is not None:
+        state, pose = _publish(state, now.utime)
+        outputs.append(pose)
+    if state.parked:
+        state, replies = _answer_parked(state, now)
+        outputs.extend(replies)
+    if now.monotonic_ns >= state.health_due_ns:
+        state, health = _report(state, now)
+        outputs.append(health)
+    return state, tuple(outputs)
+
+
+def _report(state: CoreState, now: Instant) -> tuple[CoreState, PublishHealth]:
+    elapsed = (now.monotonic_ns - state.health_sent_ns) * 1e-9 if state.health_sent_ns else 0.0
+    late = sorted(state.lateness) or [0.0]
+    estimate = None if state.localizer is None else state.localizer.estimate(now.utime)
+    channels = tuple(_channel_health(name, traffic, elapsed, now) for name, traffic in sorted(state.traffic.items()))
+    health = Health(
+        utime=now.utime,
+        uptime=(now.monotonic_ns - state.started_ns) * 1e-9,
+        version=__version__,
+        vehicle=state.settings.vehicle,
+        model_revision=state.model.revision,
+        state=state.run_state,
+        invalid_reasons=Invalid(0) if estimate is None else estimate.invalid,
+        pose_epoch=0 if estimate is None else estimate.pose_epoch,
+        origin_id=0 if estimate is None or estimate.origin is None else estimate.origin.origin_id,
+        poses_published=state.poses_published,
+        requests_answered=state.requests_answered,
+        requests_parked=len(state.parked),
+        ticks_missed=state.ticks_missed,
+        handler_errors=state.handler_errors,
+        tick_lateness_p50=late[len(late) // 2],
+        tick_lateness_max=late[-1],
+        channels=channels,
+        rejected=tuple((channel, reason, count) for (channel, reason), count in sorted(state.rejected.items())),
+    )
+    state = state._replace(
+        traffic={name: replace(traffic, reported=traffic.count) for name, traffic in state.traffic.items()},
+        lateness=(),
+        health_sent_ns=now.monotonic_ns,
+        # from now, not from the due time: after a pause one report is enough
+        health_due_ns=now.monotonic_ns + state.settings.health_period_ns,
+    )
+    return state, PublishHealth(health)
+
+
+def _channel_health(name: str, traffic: Traffic, elapsed: float, now: Instant) -> ChannelHealth:
+    rate = (traffic.count - traffic.reported) / elapsed if elapsed > 0 else 0.0
+    return ChannelHealth(name, traffic.count, rate, (now.monotonic_ns - traffic.last_ns) * 1e-9)
+
+
+# --- requests -----------------------------------------------------------------------------------------------
+
+
+def _request(state: CoreState, request: Request, now: Instant) -> Step:
+    if not request.header.is_answerable(state.settings.reply_prefix):
+        return _count(state, request.channel, "reply_channel"), ()
+    if isinstance(request, GetTransformation | GetStateVector | GetHTransform) and _must_wait(state, request):
+        if len(state.parked) < state.settings.parked_requests:
+            wait_ms = min(request.time.wait_ms, state.settings.wait_ms)
+            parked = Parked(request, now.monotonic_ns + wait_ms * 1_000_000)
+            return state._replace(parked=(*state.parked, parked)), ()
+        state = _count(state, request.channel, "load")
+        refusal = _failed(
+            request,
+            Status.REFUSED_LOAD,
+            f"{len(state.parked)} requests wait already, as many as may (limits.parked_requests); ask without wait_ms",
+            now,
+            state,
+        )
+        return state, (SendReply(request.header.reply_channel, refusal),)
+    return state._replace(requests_answered=state.requests_answered + 1), (answer(state, request, now),)
+
+
+def _must_wait(state: CoreState, request: GetTransformation | GetStateVector | GetHTransform) -> bool:
+    """Whether a request asked for a time that is yet to come, and gave time to wait for it."""
+    time = request.time
+    if not time.wait_ms or state.localizer is None:
+        return False
+    if isinstance(request, GetTransformation) and not (
+        _of_world(request.frame_of_interest) or _of_world(request.frame_of_reference)
+    ):
+        return False
+    if time.at and time.policy is not Policy.LATEST:
+        return not state.view.covers(time.at)
+    return not len(state.history)
+
+
+def _of_world(frame: str) -> bool:
+    return frame.partition(":")[0] in names.RESERVED_BODIES
+
+
+def _answer_parked(state: CoreState, now: Instant) -> tuple[CoreState, list[Output]]:
+    """Answer the parked requests whose data have come or whose time is up."""
+    still: list[Parked] = []
+    replies: list[Output] = []
+    for parked in state.parked:
+        if now.monotonic_ns < parked.until_ns and _must_wait(state, parked.request):
+            still.append(parked)
+        else:
+            replies.append(answer(state, parked.request, now))
+    if replies:
+        state = state._replace(parked=tuple(still), requests_answered=state.requests_answered + len(replies))
+    return state, replies
+
+
+def answer(state: CoreState, request: Request, now: Instant) -> SendReply:
+    """Return the reply to a request, at once. A question that cannot be answered gives a reply that says why."""
+    try:
+        reply = _ANSWERS[type(request)](state, request, now)
+    except QueryError as error:
+        reply = _failed(request, error.status, str(error), now, state, error.nearest)
+    return SendReply(request.header.reply_channel, reply)
+
+
+def _ok(state: CoreState, request: Request, now: Instant) -> ReplyHeader:
+    return ReplyHeader(request.header.request_id, now.utime, model_revision=state.model.revision)
+
+
+def _get_transformation(state: CoreState, request: GetTransformation, now: Instant) -> Reply:
+    found = state.view.transformation(request.frame_of_interest, request.frame_of_reference, request.time)
+    return TransformReply(_ok(state, request, now), found)
+
+
+def _get_h_transform(state: CoreState, request: GetHTransform, now: Instant) -> Reply:
+    ends = (state.settings.base_frame, names.WORLD_UTM)
+    interest, reference = reversed(ends) if request.inverse else ends
+    found = state.view.transformation(interest, reference, request.time)
+    return TransformReply(_ok(state, request, now), found)
+
+
+def _get_state_vector(state: CoreState, request: GetStateVector, now: Instant) -> Reply:
+    return StateVectorReply(_ok(state, request, now), state.view.vehicle_pose(request.time))
+
+
+def _get_history(state: CoreState, request: GetHistory, now: Instant) -> Reply:
+    found = state.view.vehicle_history(request.start_utime, request.end_utime, request.rate_hz)
+    return HistoryReply(_ok(state, request, now), found)
+
+
+def _get_body_list(state: CoreState, request: GetBodyList, now: Instant) -> Reply:
+    bodies = state.model.bodies
+    return NameListReply(
+        _ok(state, request, now), tuple(body.name for body in bodies), tuple(body.description for body in bodies)
+    )
+
+
+def _get_body_frame_list(state: CoreState, request: GetBodyFrameList, now: Instant) -> Reply:
+    frames = state.model.body(request.body).frames
+    return NameListReply(
+        _ok(state, request, now), tuple(frame.name for frame in frames), tuple(frame.description for frame in frames)
+    )
+
+
+def _failed(
+    request: Request, status: Status, message: str, now: Instant, state: CoreState, nearest: tuple[str, ...] = ()
+) -> Reply:
+    header = ReplyHeader(request.header.request_id, now.utime, status, message, nearest, state.model.revision)
+    return _REPLY_KINDS[type(request)](header)
+
+
+def refuse(state: CoreState, request: Request, now: Instant) -> Outputs:
+    """Return the refusal of a request that the server has no time for."""
+    if not request.header.is_answerable(state.settings.reply_prefix):
+        return ()
+    message = "the server is loaded and did not take the request; ask again later"
+    return (SendReply(request.header.reply_channel, _failed(request, Status.REFUSED_LOAD, message, now, state)),)
+
+
+# --- counting -----------------------------------------------------------------------------------------------
+
+
+def _rejected(state: CoreState, rejected: Rejected, now: Instant) -> Step:
+    return _count(state, rejected.channel, rejected.reason), ()
+
+
+def _count(state: CoreState, channel: str, reason: str) -> CoreState:
+    key = (channel, reason)
+    if key not in state.rejected and len(state.rejected) >= MAX_COUNTERS:
+        key = ("*", "other")
+    counts = dict(state.rejected)
+    counts[key] = counts.get(key, 0) + 1
+    errors = state.handler_errors + (reason == "handler")
+    return state._replace(rejected=counts, handler_errors=errors)
+
+
+def _note_traffic(state: CoreState, source: str, now: Instant) -> CoreState:
+    known = state.traffic.get(source)
+    if known is None and len(state.traffic) >= MAX_COUNTERS:
+        return state
+    known = known or Traffic()
+    updated = Traffic(known.count + 1, now.monotonic_ns, known.reported)
+    return state._replace(traffic={**state.traffic, source: updated})
+
+
+_HANDLERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], Step]]] = {
+    GpsSample: _sample,
+    ImuSample: _sample,
+    WheelsSample: _sample,
+    JointsSample: _sample,
+    Tick: _tick,
+    Rejected: _rejected,
+    GetTransformation: _request,
+    GetBodyList: _request,
+    GetBodyFrameList: _request,
+    GetStateVector: _request,
+    GetHTransform: _request,
+    GetHistory: _request,
+}
+
+_ANSWERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], Reply]]] = {
+    GetTransformation: _get_transformation,
+    GetBodyList: _get_body_list,
+    GetBodyFrameList: _get_body_frame_list,
+    GetStateVector: _get_state_vector,
+    GetHTransform: _get_h_transform,
+    GetHistory: _get_history,
+}
+
+_REPLY_KINDS: Final[Mapping[type, Callable[[ReplyHeader], Reply]]] = {
+    GetTransformation: TransformReply,
+    GetBodyList: NameListReply,
+    GetBodyFrameList: NameListReply,
+    GetStateVector: StateVectorReply,
+    GetHTransform: TransformReply,
+    GetHistory: HistoryReply,
+}

@@ -1,0 +1,119 @@
+"""Which form a file is in: told by what it holds, for names of files lie."""
+
+from __future__ import annotations
+
+import gc
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import PurePath
+
+from modelserver.errors import Source, shown
+from modelserver.formats.saved import Saved
+from modelserver.geometry.builder import ModelBuilder
+from modelserver.geometry.model import Model
+
+FORMS = ("yaml", "miro", "miro-frames")
+"""Forms that `save` writes: YAML, Miro body and constraint XML, Miro frame-tree XML."""
+
+_ENDINGS = {".yaml": "yaml", ".yml": "yaml", ".xml": "miro"}
+
+_ELSEWHERE = {
+    "robot": "this looks like URDF, which is not read yet",
+    "sdf": "this looks like SDF, which is not read yet",
+    "config_group": "this is Miro's compile-time parameter file; the run-time file holds the geometry",
+}
+
+
+def form_of_path(path: str | os.PathLike[str]) -> str:
+    """Return the form to write to a file of that name. Raises ValueError for an ending that names none."""
+    ending = PurePath(path).suffix.lower()
+    if ending not in _ENDINGS:
+        raise ValueError(
+            f"{shown(ending)} names no form; endings are {', '.join(_ENDINGS)}"
+            if ending
+            else f"a file name without an ending names no form; endings are {', '.join(_ENDINGS)}"
+        )
+    return _ENDINGS[ending]
+
+
+def read(content: bytes, file: str = "", variables: Mapping[str, str] | None = None) -> ModelBuilder:
+    """Return a builder with what `content` holds and every problem met; never raises for what is in it.
+
+    `file` is named in problems.
+    """
+    builder = ModelBuilder()
+    text = content.removeprefix(b"\xef\xbb\xbf").lstrip()
+    if not text:
+        builder.error("the file is empty", Source(file), "see docs/geometry-files.md for an example to begin with")
+    elif text.startswith(b"<") or PurePath(file).suffix.lower() == ".xml":
+        _read_xml(content, builder, file, variables or {})
+    else:
+        from modelserver.formats import yaml_form
+
+        with _collector_paused():
+            yaml_form.load(content, builder, file)
+    return builder
+
+
+@contextmanager
+def _collector_paused() -> Iterator[None]:
+    """Keep the garbage collector from walking the growing tree again and again: it doubles the time of a parse.
+
+    All that a parse makes stays alive until its end, so there is nothing to find; sizes are bounded.
+    """
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
+
+
+def _read_xml(content: bytes, builder: ModelBuilder, file: str, variables: Mapping[str, str]) -> None:
+    # lxml is imported where it is needed: a YAML file must not pay for it
+    from modelserver.formats import frame_tree_xml, miro_xml, xml_document
+    from modelserver.formats.spelling import label
+
+    root = xml_document.parse(content, builder, file)
+    if root is None:
+        return
+    name = xml_document.tag(root)
+    first = Source(file, xml_document.line(root), f"<{label(name)}>")
+    if name in _ELSEWHERE:
+        builder.error(_ELSEWHERE[name], first, "give a file in one of Miro's forms, or YAML")
+        return
+    if next(root.iter("{*}config_group"), None) is not None:
+        builder.error(_ELSEWHERE["config_group"], first, "give the file with BodyName and ConstraintName in it")
+        return
+    has_tree = next(frame_tree_xml.instances(root), None) is not None
+    before = len(builder.problems)
+    if has_tree:
+        frame_tree_xml.load(root, builder, file, variables)
+        return
+    miro_xml.load(root, builder, file)
+    if builder.is_empty and not any(problem.severity == "error" for problem in builder.problems[before:]):
+        builder.error(
+            "there is no geometry in this file: no parameter BodyName, no instance of type FrameRpyParameters"
+            + ("" if name == "config" else f", and the outermost element is {label(name)}, not config"),
+            first,
+            "a geometry file is <config><section><parameter> with bodies; see docs/geometry-files.md",
+        )
+
+
+def save(model: Model, form: str) -> Saved:
+    """Return the text of `model` in one of `FORMS`, and what that form cannot hold. Raises ValueError."""
+    if form == "yaml":
+        from modelserver.formats import yaml_text
+
+        return yaml_text.save(model)
+    if form == "miro":
+        from modelserver.formats import miro_text
+
+        return miro_text.save(model)
+    if form == "miro-frames":
+        from modelserver.formats import frame_tree_text
+
+        return frame_tree_text.save(model)
+    raise ValueError(f"{shown(form)} is no form; forms are {', '.join(FORMS)}")

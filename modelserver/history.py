@@ -1,0 +1,152 @@
+"""Time-indexed estimates: bounded, immutable to their holder, cheap to extend. Pure."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+
+from modelserver.errors import TooNewError, TooOldError
+from modelserver.messages import Estimate, Quality
+from modelserver.spatial.pose import Pose
+
+
+class History:
+    """Estimates of the last seconds, by time. Immutable: `extended` returns the longer one.
+
+    Both share one list and differ in how far they look into it; extending an old one, whose list has grown
+    since, copies. So the usual course of things, each the successor of the last, costs no copy.
+    """
+
+    __slots__ = ("_end", "_estimates", "_horizon", "_start", "_times")
+
+    def __init__(self, seconds: float):
+        self._times: list[int] = []
+        self._estimates: list[Estimate] = []
+        self._start = 0
+        self._end = 0
+        self._horizon = round(seconds * 1e6)
+
+    def __len__(self) -> int:
+        return self._end - self._start
+
+    @property
+    def first(self) -> int:
+        """The oldest time held. Only when not empty."""
+        return self._times[self._start]
+
+    @property
+    def last(self) -> int:
+        """The newest time held. Only when not empty."""
+        return self._times[self._end - 1]
+
+    @property
+    def newest(self) -> Estimate:
+        """The newest estimate. Only when not empty."""
+        return self._estimates[self._end - 1]
+
+    def extended(self, estimate: Estimate) -> History:
+        """Return the history with one estimate more.
+
+        One that is not newer than the last takes the places of all that are not older than it: it knows more,
+        or time has stepped back and two times must not be mixed.
+        """
+        longer = History.__new__(History)
+        longer._horizon = self._horizon
+        start, end = self._start, self._end
+        while end > start and self._times[end - 1] >= estimate.utime:
+            end -= 1
+        oldest = estimate.utime - self._horizon
+        while start < end and self._times[start] < oldest:
+            start += 1
+        fresh = end != len(self._times)
+        if fresh or (start > 1024 and start > end - start):
+            # an old history is extended, or more is past than held: copy what is held
+            longer._times = self._times[start:end]
+            longer._estimates = self._estimates[start:end]
+            start, end = 0, end - start
+        else:
+            longer._times = self._times
+            longer._estimates = self._estimates
+        longer._times.append(estimate.utime)
+        longer._estimates.append(estimate)
+        longer._start, longer._end = start, end + 1
+        return longer
+
+    def at(self, utime: int) -> Estimate:
+        """Return the estimate at a time, interpolated between the two around it.
+
+        Raises TooOldError, TooNewError. Where a new epoch begins between the two, the earlier is held: what
+        lies between two epochs was nobody's pose.
+        """
+        self.check_span(utime)
+        after = bisect_right(self._times, utime, self._start, self._end)
+        before = self._estimates[after - 1]
+        if before.utime == utime or after == self._end:
+            return before
+        return interpolated(before, self._estimates[after], utime)
+
+    def held(self, utime: int) -> Estimate:
+        """Return the newest estimate not newer than a time. Raises TooOldError."""
+        if self._times[self._start] > utime:
+            raise TooOldError(self._span(utime, "before"))
+        return self._estimates[bisect_right(self._times, utime, self._start, self._end) - 1]
+
+    def check_span(self, utime: int) -> None:
+        """Raise TooOldError or TooNewError where a time lies outside what is held."""
+        if utime > self.last:
+            raise TooNewError(
+                self._span(utime, "after") + "; ask with policy PREDICTED, or give the server wait_ms to wait"
+            )
+        if utime < self.first:
+            raise TooOldError(self._span(utime, "before"))
+
+    def _span(self, utime: int, side: str) -> str:
+        edge = self.last if side == "after" else self.first
+        return (
+            f"{utime} is {abs(utime - edge) / 1e6:.3f} s {side} what is held: {self.first} to {self.last} "
+            f"({(self.last - self.first) / 1e6:.1f} s)"
+        )
+
+
+def interpolated(a: Estimate, b: Estimate, utime: int) -> Estimate:
+    """Return the estimate at a time between two: position linear, rotation at constant rate."""
+    if a.pose_epoch != b.pose_epoch or a.origin != b.origin:
+        return at_time(a, utime, Quality.HELD)
+    fraction = (utime - a.utime) / (b.utime - a.utime)
+
+    def between(first: Pose | None, second: Pose | None) -> Pose | None:
+        return None if first is None or second is None else first.interpolate(second, fraction)
+
+    return Estimate(
+        utime,
+        a.odom.interpolate(b.odom, fraction),
+        between(a.enu, b.enu),
+        between(a.utm, b.utm),
+        b.covariance,
+        b.odom_covariance,
+        a.invalid | b.invalid,
+        a.quality | b.quality | Quality.INTERPOLATED,
+        b.pose_epoch,
+        b.origin,
+        max(a.horizontal_bound, b.horizontal_bound),
+        max(a.heading_bound, b.heading_bound),
+        b.seconds_to_limit,
+    )
+
+
+def at_time(estimate: Estimate, utime: int, flag: Quality) -> Estimate:
+    """Return an estimate restamped to a time, with a flag that says how it came there."""
+    return Estimate(
+        utime,
+        estimate.odom,
+        estimate.enu,
+        estimate.utm,
+        estimate.covariance,
+        estimate.odom_covariance,
+        estimate.invalid,
+        estimate.quality | flag,
+        estimate.pose_epoch,
+        estimate.origin,
+        estimate.horizontal_bound,
+        estimate.heading_bound,
+        estimate.seconds_to_limit,
+    )

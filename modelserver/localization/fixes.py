@@ -1,0 +1,288 @@
+"""What has been concluded from fixes, and the step that one more fix makes: anchor, speed, course, origin."""
+
+from __future__ import annotations
+
+import cmath
+import math
+from dataclasses import dataclass, field, replace
+
+from modelserver.geodesy import LocalFrame, ecef_from_geodetic
+from modelserver.localization import track
+from modelserver.localization.bounds import grown
+from modelserver.localization.gate import GoodFix
+from modelserver.localization.heading import Course, Heading
+from modelserver.localization.motion import Motion, cross
+from modelserver.localization.place import Anchor, Jumps, jump_limit, lever_arm
+from modelserver.localization.settings import RawSettings
+from modelserver.localization.track import TrackFix
+from modelserver.messages import GpsSample
+from modelserver.spatial import so3
+from modelserver.spatial.so3 import Vector3
+
+WORK_REACH = 200.0
+"""Metres from the working frame's origin at which it is set anew: so near, its vertical and its north are the
+vehicle's to 3e-5 rad."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fixes:
+    """The state drawn from fixes.
+
+    `work` is a tangent plane near the vehicle in which positions are kept; `anchor` the last good fix; `recent`
+    and `stretch` the fixes for speed and for course; `refusals` counts the fixes refused since the last good one.
+    """
+
+    work: LocalFrame | None = None
+    anchor: Anchor | None = None
+    recent: tuple[TrackFix, ...] = ()
+    stretch: tuple[TrackFix, ...] = ()
+    jumps: Jumps = field(default_factory=Jumps)
+    refusals: int = 0
+
+    def forgotten(self) -> Fixes:
+        """Return the state without the stretches: their path is broken."""
+        return replace(self, recent=(), stretch=()) if self.recent or self.stretch else self
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What one fix did: the new states, whether the world pose jumped, and a word where a part was refused."""
+
+    fixes: Fixes
+    heading: Heading
+    speed: float = 0.0
+    speed_sigma: float = 0.0
+    slow: bool = False
+    jumped: bool = False
+    refused: str = ""
+    ecef: Vector3 = (0.0, 0.0, 0.0)
+
+
+def take(
+    fixes: Fixes,
+    heading: Heading,
+    sample: GpsSample,
+    fix: GoodFix,
+    motion: Motion,
+    standing: bool,
+    lever: Vector3,
+    fallback_height: float,
+    settings: RawSettings,
+) -> Step:
+    """Return what is concluded with one good fix more; `motion` is the base frame's at the fix's instant.
+
+    `lever` is the antenna's place in the base frame. A fix that told no height has the height carried to it,
+    or `fallback_height` before any was told.
+    """
+    utime = sample.header.utime
+    direction = cmath.rect(1.0, heading.offset) if heading.known else 1.0 + 0j
+    arm, arm_up = lever_arm(motion, lever)
+    swing, _ = lever_arm(motion, cross(motion.rate, lever))
+    fix, ecef = _complete(fixes, fix, motion, arm_up, fallback_height, settings)
+    fixes, heading = _near(fixes, heading, fix, ecef)
+    assert fixes.work is not None
+    east, north, up = fixes.work.from_ecef(ecef)
+    place = complex(east, north)
+
+    jumped = False
+    before = fixes.anchor
+    if before is not None:
+        dt = (utime - before.utime) * 1e-6
+        carried = known = before.place
+        speed_sigma = None
+        if heading.known and motion.speed_utime:
+            base, _, _ = before.base(motion, direction)
+            carried, speed_sigma = base + direction * arm, motion.speed_sigma
+        off = abs(place - carried)
+        limit = jump_limit(dt, before.fix.sigma, fix.sigma, speed_sigma, settings)
+        climb = settings.jump_sigmas * math.sqrt(before.fix.up_variance + fix.up_variance)
+        if off > limit or abs(up - before.up) > climb + settings.maximum_speed * dt:
+            jumps = fixes.jumps.refused(utime, place, fix.sigma, settings)
+            if jumps.count < settings.jump_fixes:
+                return Step(replace(fixes, jumps=jumps, refusals=fixes.refusals + 1), heading, refused="jump")
+            jumped = True
+        elif dt > settings.gps_timeout:
+            # back after an outage: what a fix on time would not have been allowed is a discontinuity
+            jumped = off > jump_limit(settings.gps_timeout, before.fix.sigma, fix.sigma, speed_sigma, settings) or (
+                speed_sigma is None and abs(place - known) > limit
+            )
+        if jumped:
+            fixes = fixes.forgotten()
+
+    anchor = Anchor(utime, place, up, fix, motion, arm, arm_up)
+    newest = TrackFix(utime, place, fix.sigma, motion.path, arm, motion.yaw)
+    recent = track.kept(fixes.recent, newest, settings.speed_window + settings.standing_time)
+    stretch = track.kept(fixes.stretch, newest, settings.course_window)
+    velocity = _velocity(sample, settings)
+    slow = (
+        track.slow(recent, settings)
+        if velocity is None
+        else abs(_at_base(velocity.vector, heading, motion, swing)) <= max(settings.standing_speed, velocity.sigma)
+    )
+    refused = ""
+    if standing:
+        # the path of rate alone runs on at rest: a stretch must not reach back into it
+        stretch = (newest,)
+        speed, speed_sigma = 0.0, settings.standing_speed / 2.0
+    else:
+        heading, met = _course(heading, velocity, stretch, motion, swing, settings)
+        if met is not None:
+            stretch = (newest,)
+            refused = "course" if met is Course.REFUSED else ""
+            jumped = jumped or (met is Course.ANEW and fixes.anchor is not None and direction != 1.0)
+        speed, speed_sigma = _speed(heading, velocity, recent, motion, swing, settings)
+    return Step(
+        Fixes(fixes.work, anchor, recent, stretch),
+        heading,
+        speed,
+        speed_sigma,
+        slow,
+        jumped,
+        refused,
+        ecef,
+    )
+
+
+def _complete(
+    fixes: Fixes, fix: GoodFix, motion: Motion, arm_up: float, fallback_height: float, settings: RawSettings
+) -> tuple[GoodFix, Vector3]:
+    """Return the fix with a height, and its earth-centred position."""
+    if math.isnan(fix.height):
+        before = fixes.anchor
+        height, variance = fallback_height, settings.assumed_height_sigma**2
+        if before is not None:
+            age = max((motion.utime - before.utime) * 1e-6, 0.0)
+            height = before.fix.height + motion.z - before.motion.z + arm_up - before.lever_up
+            variance = min(before.fix.up_variance + grown(age, motion.speed_sigma, settings), variance)
+        fix = replace(fix, height=height, up_variance=variance)
+    return fix, ecef_from_geodetic(fix.latitude_deg, fix.longitude_deg, fix.height)
+
+
+def _near(fixes: Fixes, heading: Heading, fix: GoodFix, ecef: Vector3) -> tuple[Fixes, Heading]:
+    """Return the states in a working frame that is near the fix: the same one, or one set anew at it."""
+    old = fixes.work
+    if old is not None and math.dist(old.ecef, ecef) <= WORK_REACH:
+        return fixes, heading
+    work = LocalFrame.at(fix.latitude_deg, fix.longitude_deg, fix.height)
+    if old is None:
+        return replace(fixes, work=work), heading
+    level = fixes.anchor.up if fixes.anchor is not None else 0.0
+
+    def moved(place: complex, up: float = level) -> tuple[complex, float]:
+        x, y, z = work.from_ecef(old.to_ecef((place.real, place.imag, up)))
+        return complex(x, y), z
+
+    def again(track_fixes: tuple[TrackFix, ...]) -> tuple[TrackFix, ...]:
+        return tuple(replace(each, place=moved(each.place)[0]) for each in track_fixes)
+
+    anchor = fixes.anchor
+    if anchor is not None:
+        place, up = moved(anchor.place, anchor.up)
+        anchor = replace(anchor, place=place, up=up)
+    turned = so3.logarithm(so3.normalized(work.rotation_of(old)))[2]
+    return (
+        Fixes(
+            work,
+            anchor,
+            again(fixes.recent),
+            again(fixes.stretch),
+            replace(fixes.jumps, place=moved(fixes.jumps.place)[0]) if fixes.jumps.count else fixes.jumps,
+            fixes.refusals,
+        ),
+        replace(heading, offset=math.remainder(heading.offset + turned, math.tau)),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Velocity:
+    """The antenna's velocity as the receiver told it, east + i north, m/s; `age` at the fix's instant, s."""
+
+    vector: complex
+    sigma: float
+    course_sigma: float
+    age: float
+
+
+def _velocity(sample: GpsSample, settings: RawSettings) -> _Velocity | None:
+    """Return the receiver's own velocity, or that of its speed and course; None where it told neither."""
+    age = sample.velocity_latency if 0.0 <= sample.velocity_latency <= 2.0 else 0.0
+    sigma, course_sigma = settings.velocity_sigma, math.nan
+    if sample.velocity is not None:
+        vector = complex(sample.velocity[0], sample.velocity[1])
+        stated = sample.velocity_covariance
+        if stated is not None and 0.0 < stated[0] < math.inf and 0.0 < stated[4] < math.inf:
+            sigma = math.sqrt(max(stated[0], stated[4]))
+    elif math.isfinite(sample.speed) and math.isfinite(sample.course):
+        vector = sample.speed * complex(math.cos(sample.course), math.sin(sample.course))
+        sigma = sample.speed_sigma if 0.0 < sample.speed_sigma < math.inf else sigma
+        course_sigma = sample.course_sigma
+    else:
+        return None
+    if not abs(vector) <= 2.0 * settings.maximum_speed:
+        return None
+    if not (course_sigma > 0.0):
+        course_sigma = sigma / max(abs(vector), 1e-3)
+    return _Velocity(vector, sigma, course_sigma, age)
+
+
+def _at_base(vector: complex, heading: Heading, motion: Motion, swing: complex) -> complex:
+    """Return the base frame's velocity: the antenna's without its `swing`, what turning gives it along Odom's axes."""
+    if heading.known:
+        direction = cmath.rect(1.0, heading.offset)
+    elif abs(vector) > 0.0:
+        direction = vector / abs(vector) * cmath.rect(1.0, -motion.yaw)
+    else:
+        return vector
+    return vector - direction * swing
+
+
+def _course(
+    heading: Heading,
+    velocity: _Velocity | None,
+    stretch: tuple[TrackFix, ...],
+    motion: Motion,
+    swing: complex,
+    settings: RawSettings,
+) -> tuple[Heading, Course | None]:
+    """Return the heading after this fix's course, and what became of it; None where there was none to take."""
+    if velocity is not None:
+        vector = _at_base(velocity.vector, heading, motion, swing)
+        if abs(vector) < settings.course_speed or velocity.course_sigma > settings.course_sigma_limit:
+            return heading, None
+        # the course is of the instant the velocity was measured: heading has turned since
+        offset = cmath.phase(vector) - (motion.yaw - motion.yaw_rate * velocity.age)
+        return heading.met(offset, velocity.course_sigma**2, settings)
+    direction = cmath.rect(1.0, heading.offset) if heading.known else None
+    found = track.course(stretch, direction, settings)
+    if found is None or found[1] > settings.course_sigma_limit:
+        return heading, None
+    # the stretch tells the offset of its middle; an error of the bias has turned it since
+    half = 0.5 * (stretch[-1].utime - stretch[0].utime) * 1e-6
+    return heading.met(found[0], found[1] ** 2 + heading.bias_variance * half * half, settings)
+
+
+def _speed(
+    heading: Heading,
+    velocity: _Velocity | None,
+    recent: tuple[TrackFix, ...],
+    motion: Motion,
+    swing: complex,
+    settings: RawSettings,
+) -> tuple[float, float]:
+    """Return the speed along heading and its sigma: the receiver's, else that of recent fixes.
+
+    Before heading is known the motion is taken as forward, and what is not clearly motion as none.
+    """
+    direction = cmath.rect(1.0, heading.offset) if heading.known else 0j
+    if velocity is not None:
+        vector, sigma = _at_base(velocity.vector, heading, motion, swing), velocity.sigma
+        along = (vector * cmath.rect(1.0, -motion.yaw) * direction.conjugate()).real
+    else:
+        slope = track.best_speed(recent, direction, settings)
+        if slope is None:
+            return 0.0, settings.maximum_speed / 2.0
+        vector, sigma = slope.velocity, slope.sigma
+        along = (vector * direction.conjugate()).real
+    if not heading.known:
+        along = abs(vector) if abs(vector) > 3.0 * sigma else 0.0
+    return max(-settings.maximum_speed, min(along, settings.maximum_speed)), sigma

@@ -1,0 +1,95 @@
+"""Which fixes are good enough to be used, and how sure they are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from modelserver.geodesy import NORTHERN_LIMIT, SOUTHERN_LIMIT
+from modelserver.localization.settings import RawSettings
+from modelserver.messages import FixType, GpsSample
+
+_LEAST_VARIANCE = 1e-6
+"""m2: no receiver is sure to better than a millimetre."""
+
+_VERTICAL_SHARE = 1.6
+"""Vertical over horizontal sigma where the receiver does not tell: satellites stand above the horizon only."""
+
+
+@dataclass(frozen=True, slots=True)
+class GoodFix:
+    """The position of an antenna, degrees and ellipsoidal metres (nan: not told), with its covariance, m2.
+
+    `east_variance`, `north_variance`, `cross` and `up_variance` are along true east, north, up.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height: float
+    east_variance: float
+    north_variance: float
+    cross: float
+    up_variance: float
+
+    @property
+    def sigma(self) -> float:
+        """Sigma of each horizontal axis, root mean square, metres."""
+        return math.sqrt(0.5 * (self.east_variance + self.north_variance))
+
+
+def judge(sample: GpsSample, settings: RawSettings) -> GoodFix | str:
+    """Return the fix, or in one word why it is not good enough.
+
+    Words: no_fix, satellites, dilution, sigma, range (no place on Earth, latitude 0 with longitude 0, beyond
+    UTM), nan.
+    """
+    latitude, longitude = sample.latitude_deg, sample.longitude_deg
+    # dead reckoning is the receiver's guess, made from what this localizer has itself
+    if sample.fix_type < settings.minimum_fix_type or sample.fix_type == FixType.DEAD_RECKONING:
+        return "no_fix"
+    if not (math.isfinite(latitude) and math.isfinite(longitude)):
+        return "nan"
+    if not (SOUTHERN_LIMIT <= latitude <= NORTHERN_LIMIT and -180.0 <= longitude <= 360.0):
+        return "range"
+    if abs(latitude) < 1e-7 and abs(longitude) < 1e-7:
+        return "range"  # what receivers and drivers say when they know nothing
+    if 0 <= sample.satellites < settings.minimum_satellites:
+        return "satellites"
+    if sample.hdop > settings.maximum_hdop:
+        return "dilution"
+    height = sample.height_ellipsoidal
+    if math.isnan(height):
+        height = sample.height_msl + sample.undulation
+    if math.isinf(height) or abs(height) > 1e5:
+        return "range"
+    east, north, cross, up = _covariance(sample, settings)
+    fix = GoodFix(latitude, longitude, height, east, north, cross, up)
+    return fix if fix.sigma <= settings.maximum_sigma else "sigma"
+
+
+def _covariance(sample: GpsSample, settings: RawSettings) -> tuple[float, float, float, float]:
+    """Return variances east, north, covariance, variance up: the receiver's, else range error times dilution."""
+    stated = sample.position_covariance
+    if stated is not None:
+        east, cross, north, up = stated[0], stated[1], stated[4], stated[8]
+        if 0.0 < east < math.inf and 0.0 < north < math.inf:
+            if not cross * cross < east * north:
+                cross = 0.0
+            if not 0.0 < up < math.inf:
+                up = _VERTICAL_SHARE**2 * 0.5 * (east + north)
+            least = _LEAST_VARIANCE
+            return max(east, least), max(north, least), cross, max(up, least)
+    kind = sample.fix_type
+    if kind == FixType.RTK_FIXED:
+        uere = settings.uere_rtk_fixed
+    elif kind == FixType.RTK_FLOAT:
+        uere = settings.uere_rtk_float
+    elif kind == FixType.DIFFERENTIAL:
+        uere = settings.uere_differential
+    else:
+        uere = settings.uere
+    hdop = sample.hdop if sample.hdop > 0.0 else settings.assumed_hdop
+    vdop = sample.vdop if 0.0 < sample.vdop < math.inf else _VERTICAL_SHARE * hdop
+    # HDOP is of both axes together: each has its part (uere hdop)^2 / 2
+    each = max(0.5 * (uere * hdop) ** 2, _LEAST_VARIANCE)
+    return each, each, 0.0, max((uere * vdop) ** 2, _LEAST_VARIANCE)

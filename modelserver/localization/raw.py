@@ -1,0 +1,304 @@
+"""Raw mode: the pose straight from GPS and IMU, ignoring odometry (report 7.2, C7).
+
+Position is the last good fix, brought to the base frame and carried on by speed along heading; roll and pitch
+are the inertial unit's; heading is the GPS course while moving and the gyro's in between. See
+docs/localization.md for the equations and the limits.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from dataclasses import dataclass, field, replace
+
+from modelserver.geodesy import Geodesy, geodetic_from_ecef
+from modelserver.localization import attitude, fixes, gate
+from modelserver.localization.fixes import Fixes
+from modelserver.localization.heading import Heading
+from modelserver.localization.interface import Note
+from modelserver.localization.motion import Motion, between, yaw_rate
+from modelserver.localization.mounts import Mounts
+from modelserver.localization.origin import Capture
+from modelserver.localization.settings import RawSettings
+from modelserver.localization.stamps import Stamps, Verdict
+from modelserver.localization.still import Stillness
+from modelserver.localization.world import Projected, estimate
+from modelserver.messages import Estimate, GpsSample, ImuSample, Origin, OriginLatched, Rejected, Sample
+from modelserver.spatial.so3 import Vector3
+
+_HISTORY_STEP = 20_000
+_HISTORY_LENGTH = 2_000_000
+"""Microseconds between the motions kept, and how far back they reach: fixes arrive late."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawLocalizer:
+    """The localizer of raw mode: an immutable value. Make the first with `start`."""
+
+    mounts: Mounts
+    settings: RawSettings
+    projected: Projected | None = None
+    motion: Motion | None = None
+    history: tuple[Motion, ...] = field(default=(), repr=False)
+    heading: Heading = field(default_factory=Heading)
+    stillness: Stillness = field(default_factory=Stillness)
+    tilt_bias: tuple[float, float] = (0.0, 0.0)
+    fixes: Fixes = field(default_factory=Fixes)
+    capture: Capture = field(default_factory=Capture)
+    imu_stamps: Stamps = field(default_factory=Stamps)
+    gps_stamps: Stamps = field(default_factory=Stamps)
+    imu_utime: int | None = None
+    pose_epoch: int = 0
+    stepped: bool = False
+    newest: int = 0
+
+    @classmethod
+    def start(cls, mounts: Mounts, settings: RawSettings | None = None, origin: Origin | None = None) -> RawLocalizer:
+        """Return a localizer that has seen nothing yet.
+
+        `origin` is the configured or persisted one; None captures it from the first good fixes. Raises
+        GeodesyError for an origin that is no place.
+        """
+        settings = settings or RawSettings()
+        return cls(
+            mounts,
+            settings,
+            None if origin is None else Projected(Geodesy(origin)),
+            heading=Heading(bias_variance=settings.gyro_bias_sigma**2),
+        )
+
+    @property
+    def utime(self) -> int:
+        """The instant of the newest sample taken, 0 before the first."""
+        return self.newest
+
+    @property
+    def origin(self) -> Origin | None:
+        """The origin of World:UTM, None before it is set."""
+        return None if self.projected is None else self.projected.geodesy.origin
+
+    def take(self, sample: Sample) -> tuple[RawLocalizer, tuple[Note, ...]]:
+        """Return what is concluded with one sample more, and what there is to say about it.
+
+        Wheels and joints are ignored. Notes are `Rejected("sensor:<source>", reason)` with one of the reasons
+        order, duplicate, future (its stamp); nan, range (its numbers); gap (an inertial sample after a gap:
+        the turn in it is not known); no_fix, satellites, dilution, sigma, jump (a fix); course (a fix whose
+        course was not used) and `OriginLatched`.
+        """
+        if isinstance(sample, ImuSample):
+            return self._take_imu(sample)
+        if isinstance(sample, GpsSample):
+            return self._take_gps(sample)
+        return self, ()
+
+    def estimate(self, utime: int) -> Estimate:
+        """Return the base frame's pose at `utime`: predicted past the newest sample, held before the oldest kept."""
+        return estimate(self, utime)
+
+    # --- inertial samples -----------------------------------------------------------------------------------
+
+    def _take_imu(self, sample: ImuSample) -> tuple[RawLocalizer, tuple[Note, ...]]:
+        utime, settings = sample.header.utime, self.settings
+        stamps, verdict = self.imu_stamps.take(utime, settings)
+        if verdict is Verdict.STEPPED_BACK:
+            self = self._begun_anew(utime)
+        elif verdict is not Verdict.GOOD:
+            return replace(self, imu_stamps=stamps), _refused(sample, verdict.value)
+        inertial = attitude.read(sample, self.mounts.X_base_imu)
+        if isinstance(inertial, str):
+            return replace(self, imu_stamps=stamps), _refused(sample, inertial)
+        heading, still, before = self.heading, self.stillness, self.motion
+        bx, by = self.tilt_bias
+        wx, wy, wz = inertial.rate
+        rate = (wx - bx, wy - by, wz - heading.bias)
+        notes: tuple[Note, ...] = ()
+        known_fixes = self.fixes
+        if before is None or self.imu_utime is None:
+            # the first one: there is nothing to integrate from, but it tells where up is
+            if before is None:
+                before = Motion(utime)
+            motion = before.advanced(utime, (0.0, 0.0, 0.0), settings)
+            heading = heading.carried((utime - before.utime) * 1e-6, settings, measured=False)
+            known_fixes = known_fixes.forgotten()
+            up = attitude.first_up(inertial) or motion.up
+        else:
+            dt = (utime - self.imu_utime) * 1e-6
+            a, b, c = before.rate
+            gap = dt > settings.rate_hold
+            mean = before.rate if gap else (0.5 * (a + rate[0]), 0.5 * (b + rate[1]), 0.5 * (c + rate[2]))
+            motion = before.advanced(utime, mean, settings)
+            heading = _carried(heading, (utime - before.utime) * 1e-6, settings)
+            if gap:
+                notes = _refused(sample, "gap")
+                known_fixes = known_fixes.forgotten()
+            speed = motion.speed
+            lever = self.mounts.X_base_imu.xyz
+            up = inertial.up or motion.up
+            if inertial.up is None and inertial.force is not None:
+                up = attitude.corrected(up, inertial.force, rate, speed, lever, dt, settings)
+            wz_level = yaw_rate(rate, up)
+            short = min(dt, settings.rate_hold)
+            still = still.felt(utime, wz_level, short, math.sqrt(heading.bias_variance), settings)
+            if still.standing(utime, settings):
+                heading = heading.stood(wz_level, max(settings.gyro_noise**2 / short, still.variance))
+                gain = short / (settings.tilt_time + short)
+                bx, by = bx + gain * rate[0], by + gain * rate[1]
+                if speed:
+                    motion = replace(motion, speed=0.0, speed_sigma=0.5 * settings.standing_speed)
+        motion = motion.with_attitude(up, rate)
+        return (
+            RawLocalizer(
+                self.mounts,
+                settings,
+                self.projected,
+                motion,
+                _kept(self.history, motion),
+                heading,
+                still,
+                (bx, by),
+                known_fixes,
+                self.capture,
+                stamps,
+                self.gps_stamps,
+                utime,
+                self.pose_epoch,
+                self.stepped,
+                max(self.newest, utime),
+            ),
+            notes,
+        )
+
+    # --- fixes ----------------------------------------------------------------------------------------------
+
+    def _take_gps(self, sample: GpsSample) -> tuple[RawLocalizer, tuple[Note, ...]]:
+        utime, settings = sample.header.utime, self.settings
+        stamps, verdict = self.gps_stamps.take(utime, settings)
+        if verdict is Verdict.STEPPED_BACK:
+            self = self._begun_anew(utime)
+        elif verdict is not Verdict.GOOD:
+            return replace(self, gps_stamps=stamps), _refused(sample, verdict.value)
+        fix = gate.judge(sample, settings)
+        if not isinstance(fix, str) and self.projected is not None and not self.projected.reaches(fix):
+            fix = "range"
+        if isinstance(fix, str):
+            refused = replace(self.fixes, refusals=self.fixes.refusals + 1)
+            return replace(self, gps_stamps=stamps, fixes=refused), _refused(sample, fix)
+
+        motion, heading = self.motion or Motion(utime), self.heading
+        ahead = (utime - motion.utime) * 1e-6
+        if ahead > settings.rate_hold:
+            # no inertial samples: what was predicted so far is what Odom keeps
+            heading = _carried(heading, ahead, settings)
+            motion = motion.advanced(utime, motion.rate, settings)
+        then = self.motion_at(utime, motion)
+        step = fixes.take(
+            self.fixes,
+            heading,
+            sample,
+            fix,
+            then,
+            self.stillness.standing(utime, settings),
+            self.mounts.X_base_antenna.xyz,
+            0.0 if self.origin is None else self.origin.height,
+            settings,
+        )
+        notes = _refused(sample, step.refused) if step.refused else ()
+        result = replace(
+            self,
+            motion=motion,
+            fixes=step.fixes,
+            heading=step.heading,
+            gps_stamps=stamps,
+            pose_epoch=self.pose_epoch + (1 if step.jumped else 0),
+        )
+        if step.refused == "jump":
+            return result, notes
+        result, latched = result._placed(utime, step.ecef, fix.sigma)
+        return (
+            replace(
+                result,
+                motion=replace(motion, speed=step.speed, speed_utime=utime, speed_sigma=step.speed_sigma),
+                stillness=replace(self.stillness, slow=step.slow),
+                stepped=self.stepped and not step.heading.known,
+                newest=max(self.newest, utime),
+            ),
+            notes + latched,
+        )
+
+    def _placed(self, utime: int, ecef: Vector3, sigma: float) -> tuple[RawLocalizer, tuple[Note, ...]]:
+        """Return the localizer with the origin set, where it can be, and its axes at the new fix."""
+        notes: tuple[Note, ...] = ()
+        capture, projected = self.capture, self.projected
+        if projected is None:
+            capture, origin = capture.take(utime, ecef, sigma, self.settings)
+            if origin is not None:
+                projected = Projected(Geodesy(origin))
+                notes = (OriginLatched(origin),)
+        if projected is not None and self.fixes.work is not None:
+            latitude, longitude, _ = geodetic_from_ecef(ecef)
+            projected = projected.at(latitude, longitude, self.fixes.work)
+        return replace(self, capture=capture, projected=projected), notes
+
+    # --- shared ---------------------------------------------------------------------------------------------
+
+    def motion_at(self, utime: int, newest: Motion) -> Motion:
+        """Return the motion at `utime`: predicted from `newest`, or looked up in what is kept."""
+        if utime >= newest.utime or not self.history:
+            return newest.advanced(utime, newest.rate, self.settings)
+        after = newest
+        for motion in reversed(self.history):
+            if motion.utime <= utime:
+                return between(motion, after, utime)
+            after = motion
+        return after
+
+    @property
+    def direction(self) -> complex:
+        """exp(i offset): turns Odom's horizontal axes to east and north; 1 before heading is known."""
+        return cmath.rect(1.0, self.heading.offset) if self.heading.known else 1.0 + 0j
+
+    def _begun_anew(self, utime: int) -> RawLocalizer:
+        """Return the localizer after its clock was set back: only Odom, the origin and the biases stay."""
+        motion = self.motion
+        if motion is not None:
+            motion = replace(motion, utime=utime, rate=(0.0, 0.0, 0.0), speed=0.0, speed_utime=0)
+        return replace(
+            self,
+            motion=motion,
+            history=(),
+            heading=Heading(bias=self.heading.bias, bias_variance=self.heading.bias_variance),
+            stillness=Stillness(),
+            fixes=Fixes(),
+            imu_stamps=Stamps(),
+            gps_stamps=Stamps(),
+            imu_utime=None,
+            pose_epoch=self.pose_epoch + 1,
+            stepped=True,
+            newest=utime,
+        )
+
+
+def _refused(sample: ImuSample | GpsSample, reason: str) -> tuple[Note, ...]:
+    return (Rejected(f"sensor:{sample.header.source}", reason),)
+
+
+def _carried(heading: Heading, dt: float, settings: RawSettings) -> Heading:
+    """Return the heading `dt` on: measured as long as a rate is held, unknown after."""
+    if dt <= settings.rate_hold:
+        return heading.carried(dt, settings)
+    return heading.carried(settings.rate_hold, settings).carried(dt - settings.rate_hold, settings, measured=False)
+
+
+def _kept(history: tuple[Motion, ...], motion: Motion) -> tuple[Motion, ...]:
+    """Return the history with a motion more, thinned and bounded."""
+    if not history:
+        return (motion,)
+    if motion.utime - history[-1].utime < _HISTORY_STEP:
+        return history
+    if motion.utime - history[0].utime > _HISTORY_LENGTH:
+        oldest = motion.utime - _HISTORY_LENGTH
+        first = 1
+        while first < len(history) and history[first].utime < oldest:
+            first += 1
+        return (*history[first:], motion)
+    return (*history, motion)

@@ -1,0 +1,40 @@
+"""Whether the vehicle stands: the gyro is quiet and the fixes do not move, for a while."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from modelserver.localization.settings import RawSettings
+
+
+@dataclass(frozen=True, slots=True)
+class Stillness:
+    """Running mean and variance of the yaw rate (bias taken off), and since when it has been quiet.
+
+    `slow` is what the newest fix said.
+    """
+
+    mean: float = 0.0
+    variance: float = 1.0
+    quiet_utime: int | None = None
+    slow: bool = False
+
+    def felt(self, utime: int, rate: float, dt: float, bias_sigma: float, settings: RawSettings) -> Stillness:
+        """Return the stillness with one yaw rate more, rad/s.
+
+        Mean and variance fade with half the standing time. The rate may be off zero by the bias not known yet.
+        """
+        gain = dt / (0.5 * settings.standing_time + dt)
+        off = rate - self.mean
+        mean = self.mean + gain * off
+        variance = (1.0 - gain) * (self.variance + gain * off * off)
+        quiet = variance <= settings.standing_rate**2 and abs(mean) <= settings.standing_rate + 3.0 * bias_sigma
+        since = (self.quiet_utime if self.quiet_utime is not None else utime) if quiet else None
+        # a loud gyro is a moving vehicle at once; that it stands needs a fix again
+        return Stillness(mean, variance, since, self.slow and quiet)
+
+    def standing(self, utime: int, settings: RawSettings) -> bool:
+        """Return whether the vehicle stands at `utime`."""
+        return (
+            self.slow and self.quiet_utime is not None and (utime - self.quiet_utime) * 1e-6 >= settings.standing_time
+        )

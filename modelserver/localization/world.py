@@ -1,0 +1,178 @@
+"""From the state of raw mode to an estimate: pose in Odom, ENU and UTM, validity, bounds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from modelserver.geodesy import Geodesy, GeodesyError, LocalFrame, about_up, geodetic_from_ecef
+from modelserver.localization import bounds
+from modelserver.localization.gate import GoodFix
+from modelserver.localization.heading import UNKNOWN_VARIANCE
+from modelserver.localization.motion import Motion
+from modelserver.messages import NAN, Estimate, Invalid, Quality
+from modelserver.spatial import so3
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.so3 import Quaternion
+
+if TYPE_CHECKING:
+    from modelserver.localization.raw import RawLocalizer
+
+_CONVERGENCE_REACH = 100.0
+"""Metres from the last fix within which its convergence serves: it changes by 1.6e-5 rad times tan(latitude)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Projected:
+    """The origin's geodesy with what it says at the last fix, worked out once for all poses until the next.
+
+    `tangent_from_work` turns the working frame's axes to World:ENU's; `convergence` those at the vehicle to
+    World:UTM's.
+    """
+
+    geodesy: Geodesy
+    tangent_from_work: Quaternion = so3.IDENTITY
+    convergence: float = 0.0
+
+    def reaches(self, fix: GoodFix) -> bool:
+        """Return whether the pinned zone serves the place of a fix."""
+        try:
+            self.geodesy.utm_from_geodetic(fix.latitude_deg, fix.longitude_deg, 0.0)
+        except GeodesyError:
+            return False
+        return True
+
+    def at(self, latitude_deg: float, longitude_deg: float, work: LocalFrame) -> Projected:
+        """Return the same with the vehicle at another place."""
+        return Projected(
+            self.geodesy,
+            self.geodesy.tangent.rotation_of(work),
+            self.geodesy.convergence(latitude_deg, longitude_deg),
+        )
+
+
+def estimate(state: RawLocalizer, utime: int) -> Estimate:
+    """Return the pose of the base frame at `utime`, from nothing but the state."""
+    settings, newest, anchor = state.settings, state.motion, state.fixes.anchor
+    invalid = _invalid(state, utime)
+    if newest is None:
+        return Estimate(utime, Pose.identity(), invalid=invalid, pose_epoch=state.pose_epoch, origin=state.origin)
+    motion = state.motion_at(utime, newest)
+    quality = _quality(state, utime, motion)
+    odom = motion.pose
+    odom_covariance = bounds.odom_covariance(motion.position_variance, motion.yaw_variance, settings)
+    if anchor is None:
+        return Estimate(
+            utime,
+            odom,
+            odom_covariance=odom_covariance,
+            invalid=invalid,
+            quality=quality,
+            pose_epoch=state.pose_epoch,
+            origin=state.origin,
+        )
+
+    heading = state.heading
+    heading_variance = UNKNOWN_VARIANCE
+    if heading.known:
+        ahead = (utime - newest.utime) * 1e-6
+        held = min(ahead, settings.rate_hold)
+        heading = heading.carried(held, settings).carried(ahead - held, settings, measured=False)
+        heading_variance = heading.variance
+    age = max((utime - anchor.utime) * 1e-6, 0.0)
+    sigma_v = newest.speed_sigma
+    growth = bounds.grown(age, sigma_v, settings)
+    place, up, arm = anchor.base(motion, state.direction)
+    covariance = bounds.covariance(anchor.fix, growth, arm, heading_variance, settings)
+    variance = bounds.longest(covariance[0], covariance[7], covariance[1])
+    k_horizontal, k_heading = bounds.factors(settings.risk)
+    horizontal_bound = k_horizontal * math.sqrt(variance)
+    heading_bound = min(k_heading * math.sqrt(heading_variance), math.pi)
+    if heading.known and heading_bound > settings.heading_limit:
+        standing = state.stillness.standing(utime, settings)
+        invalid |= Invalid.STATIONARY_HEADING if standing else Invalid.BOUND_EXCEEDED
+    if horizontal_bound > settings.horizontal_limit:
+        invalid |= Invalid.BOUND_EXCEEDED
+
+    enu = utm = None
+    if state.projected is not None and state.fixes.work is not None:
+        enu, utm = _world_poses(state, state.projected, state.fixes.work, odom.wxyz, place, up)
+    remaining = min(
+        settings.gps_timeout - age,
+        settings.imu_timeout - (utime - (state.imu_utime or utime)) * 1e-6,
+        bounds.seconds_to_horizontal_limit(variance - growth, age, sigma_v, settings),
+    )
+    return Estimate(
+        utime,
+        odom,
+        enu,
+        utm,
+        covariance,
+        odom_covariance,
+        invalid,
+        quality,
+        state.pose_epoch,
+        state.origin,
+        horizontal_bound,
+        heading_bound,
+        NAN if invalid else max(remaining, 0.0),
+    )
+
+
+def _world_poses(
+    state: RawLocalizer, projected: Projected, work: LocalFrame, q_odom: Quaternion, place: complex, up: float
+) -> tuple[Pose, Pose] | tuple[None, None]:
+    """Return the pose in World:ENU and in World:UTM, each from the earth-centred position; None out of reach."""
+    geodesy = projected.geodesy
+    ecef = work.to_ecef((place.real, place.imag, up))
+    convergence = projected.convergence
+    q = q_odom
+    if state.heading.known:
+        q = so3.multiply(about_up(state.heading.offset), q)
+    try:
+        position = geodesy.relative(geodesy.utm_from_ecef(ecef))
+        anchor = state.fixes.anchor
+        if anchor is not None and abs(place - anchor.place) > _CONVERGENCE_REACH:
+            latitude, longitude, _ = geodetic_from_ecef(ecef)
+            convergence = geodesy.convergence(latitude, longitude)
+    except GeodesyError:
+        return None, None
+    return (
+        Pose(geodesy.tangent.from_ecef(ecef), so3.multiply(projected.tangent_from_work, q)),
+        Pose(position, so3.multiply(about_up(convergence), q)),
+    )
+
+
+def _invalid(state: RawLocalizer, utime: int) -> Invalid:
+    settings, anchor, imu = state.settings, state.fixes.anchor, state.imu_utime
+    invalid = 0
+    if anchor is None:
+        invalid |= 1  # NO_FIX
+    elif (utime - anchor.utime) * 1e-6 > settings.gps_timeout:
+        invalid |= 32  # STALE_GPS
+    if imu is None:
+        invalid |= 2  # NO_IMU
+    elif (utime - imu) * 1e-6 > settings.imu_timeout:
+        invalid |= 64  # STALE_IMU
+    if state.projected is None:
+        invalid |= 4  # NO_ORIGIN
+    if not state.heading.known:
+        invalid |= 8  # NOT_MOVED_YET
+    if state.fixes.refusals >= settings.refusals:
+        invalid |= 128  # GPS_REJECTED
+    if state.stepped:
+        invalid |= 512  # CLOCK_STEPPED
+    return Invalid(invalid)
+
+
+def _quality(state: RawLocalizer, utime: int, motion: Motion) -> Quality:
+    settings = state.settings
+    quality = 0
+    if state.stillness.standing(utime, settings) or abs(motion.speed) < settings.course_speed:
+        quality |= 1  # HEADING_FROM_GYRO
+    if utime > state.newest:
+        quality |= 2  # PREDICTED
+    if motion.speed < -max(motion.speed_sigma, settings.standing_speed):
+        quality |= 32  # REVERSING
+    return Quality(quality)

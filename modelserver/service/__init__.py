@@ -1,0 +1,1 @@
+"""The daemon: bus, clocks, loop, and what it keeps across restarts."""

@@ -1,0 +1,84 @@
+"""The bus: what the loop needs of LCM, and the real one."""
+
+from __future__ import annotations
+
+import select
+from collections.abc import Callable
+from typing import Protocol, TypeAlias
+
+from modelserver.wire.channels import literal
+from modelserver.wire.provider import open_lcm, resolve_url
+
+Handler: TypeAlias = Callable[[str, bytes], None]
+
+
+class Inbox(Protocol):
+    """One queue of incoming messages. Messages are handed to their handlers only within `drain`."""
+
+    def subscribe(self, channel: str, handler: Handler) -> None:
+        """Hand every message of exactly `channel` to `handler`."""
+        ...
+
+    def drain(self, limit: int) -> int:
+        """Hand over what has come, at most `limit` messages, without waiting; return how many."""
+        ...
+
+
+class Bus(Protocol):
+    """Two inboxes, so that a flood of requests cannot hold up a sensor, and a way out."""
+
+    @property
+    def sensors(self) -> Inbox:
+        """Where samples come in."""
+        ...
+
+    @property
+    def requests(self) -> Inbox:
+        """Where requests come in."""
+        ...
+
+    def publish(self, channel: str, data: bytes) -> None:
+        """Send a message to everyone."""
+        ...
+
+    def wait(self, seconds: float) -> None:
+        """Return when something has come or the time is up."""
+        ...
+
+
+class LcmInbox:
+    """An inbox on an LCM instance of its own."""
+
+    def __init__(self, url: str):
+        self.lcm = open_lcm(url)
+        self.fileno = self.lcm.fileno()
+
+    def subscribe(self, channel: str, handler: Handler) -> None:
+        """Hand every message of exactly `channel` to `handler`."""
+        subscription = self.lcm.subscribe(literal(channel), handler)
+        # 0 is no limit: LCM would drop silently, the loop refuses and counts
+        subscription.set_queue_capacity(0)
+
+    def drain(self, limit: int) -> int:
+        """Hand over what has come, at most `limit` messages, without waiting; return how many."""
+        handle = self.lcm.handle_timeout
+        for count in range(limit):
+            if not handle(0):
+                return count
+        return limit
+
+
+class LcmBus:
+    """The real bus. Make it after forking, never before: LCM has a thread of its own."""
+
+    def __init__(self, url: str = ""):
+        self.url = resolve_url(url)
+        self.sensors: LcmInbox = LcmInbox(self.url)
+        self.requests: LcmInbox = LcmInbox(self.url)
+        self._files = (self.sensors.fileno, self.requests.fileno)
+        self.publish = self.requests.lcm.publish
+
+    def wait(self, seconds: float) -> None:
+        """Return when something has come or the time is up."""
+        # select, not poll: its timeout is in microseconds where poll's is in milliseconds
+        select.select(self._files, (), (), seconds)

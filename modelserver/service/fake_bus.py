@@ -1,0 +1,65 @@
+"""A bus within one process, for tests: delivers at once, in order, and loses nothing."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from modelserver.service.bus import Handler
+from modelserver.service.clock import FakeClock
+
+
+class FakeInbox:
+    """One queue of a `FakeBus`."""
+
+    def __init__(self) -> None:
+        self._handlers: dict[str, list[Handler]] = {}
+        self._queue: deque[tuple[str, bytes]] = deque()
+
+    def subscribe(self, channel: str, handler: Handler) -> None:
+        """Hand every message of exactly `channel` to `handler`."""
+        self._handlers.setdefault(channel, []).append(handler)
+
+    def put(self, channel: str, data: bytes) -> None:
+        """Queue a message for those who listen to its channel."""
+        if channel in self._handlers:
+            self._queue.append((channel, data))
+
+    def drain(self, limit: int) -> int:
+        """Hand over what has come, at most `limit` messages; return how many."""
+        count = 0
+        while self._queue and count < limit:
+            channel, data = self._queue.popleft()
+            count += 1
+            for handler in self._handlers[channel]:
+                handler(channel, data)
+        return count
+
+    @property
+    def pending(self) -> int:
+        """Messages that wait to be drained."""
+        return len(self._queue)
+
+
+class FakeBus:
+    """Both inboxes and all that was published; `wait` lets the fake clock run on to its deadline."""
+
+    def __init__(self, clock: FakeClock):
+        self._clock = clock
+        self.sensors = FakeInbox()
+        self.requests = FakeInbox()
+        self.published: list[tuple[str, bytes]] = []
+
+    def publish(self, channel: str, data: bytes) -> None:
+        """Send a message to everyone, oneself included."""
+        self.published.append((channel, data))
+        self.sensors.put(channel, data)
+        self.requests.put(channel, data)
+
+    def wait(self, seconds: float) -> None:
+        """Let the clock run on where nothing is pending."""
+        if not (self.sensors.pending or self.requests.pending):
+            self._clock.advance(max(seconds, 0.0))
+
+    def said(self, channel: str) -> list[bytes]:
+        """Return the messages that were published on a channel."""
+        return [data for name, data in self.published if name == channel]

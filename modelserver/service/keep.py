@@ -1,0 +1,82 @@
+"""What the daemon keeps across restarts: the captured origin. Written whole or not at all."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from modelserver.messages import Origin
+
+log = logging.getLogger(__name__)
+
+VERSION = 1
+
+
+def default_directory() -> Path:
+    """Return where state is kept unless the vehicle file says otherwise: systemd's choice, else the user's."""
+    given = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    if given:
+        return Path(given)
+    base = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(base) / "modelserver"
+
+
+class OriginKeeper:
+    """Keeps the origin of one vehicle in a file."""
+
+    def __init__(self, directory: Path, vehicle: str):
+        safe = "".join(character if character.isalnum() or character in "-_" else "_" for character in vehicle)
+        self.path = directory / f"origin-{safe}.json"
+
+    def load(self) -> Origin | None:
+        """Return the kept origin; None where there is none or the file is damaged, which is logged."""
+        try:
+            text = self.path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            return None
+        except (OSError, UnicodeDecodeError) as error:
+            log.warning("the kept origin in %s cannot be read (%s); a new one will be captured", self.path, error)
+            return None
+        try:
+            return _origin(json.loads(text))
+        except (ValueError, KeyError, TypeError) as error:
+            log.warning("the kept origin in %s is damaged (%s); a new one will be captured", self.path, error)
+            return None
+
+    def save(self, origin: Origin) -> None:
+        """Keep an origin. A disk that refuses is logged: the daemon goes on, a restart captures anew."""
+        content = json.dumps({"version": VERSION, **dataclasses.asdict(origin)}, indent=1)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            # a temporary file, synced and renamed: a power cut leaves the old file or the new one
+            with tempfile.NamedTemporaryFile(
+                "w", encoding="utf-8", dir=self.path.parent, prefix=self.path.name, delete=False
+            ) as file:
+                file.write(content + "\n")
+                file.flush()
+                os.fsync(file.fileno())
+            Path(file.name).replace(self.path)
+        except OSError as error:
+            log.warning("the origin cannot be kept in %s: %s; a restart will capture a new one", self.path, error)
+
+
+def _origin(content: dict[str, Any]) -> Origin:
+    if content["version"] != VERSION:
+        raise ValueError(f"version {content['version']} is not {VERSION}")
+    easting, northing, height = (float(content[name]) for name in ("easting", "northing", "height"))
+    zone, north, origin_id = content["zone"], content["north"], content["origin_id"]
+    if (
+        not isinstance(zone, int)
+        or not 1 <= zone <= 60
+        or not isinstance(north, bool)
+        or not isinstance(origin_id, int)
+    ):
+        raise ValueError("zone, north or origin_id is not what it should be")
+    if not all(abs(number) < 2e7 for number in (easting, northing, height)):
+        raise ValueError("coordinates out of range")
+    return Origin(easting, northing, height, zone, north, origin_id)

@@ -1,0 +1,41 @@
+"""Logging that a flood of one cause cannot fill."""
+
+from __future__ import annotations
+
+import logging
+
+from modelserver.service.clock import Clock
+
+PERIOD_S = 5.0
+MAX_CAUSES = 256
+
+
+class RateLimited:
+    """Logs a cause at most once in five seconds, and says how often it was silent since."""
+
+    def __init__(self, logger: logging.Logger, clock: Clock):
+        self._logger = logger
+        self._clock = clock
+        self._next_ns: dict[str, int] = {}
+        self._silenced: dict[str, int] = {}
+
+    def warning(self, cause: str, message: str, *values: object) -> None:
+        """Log a warning."""
+        self._log(logging.WARNING, cause, message, values, trace=False)
+
+    def exception(self, cause: str, message: str, *values: object) -> None:
+        """Log an error with the trace of the exception that is being handled."""
+        self._log(logging.ERROR, cause, message, values, trace=True)
+
+    def _log(self, level: int, cause: str, message: str, values: tuple[object, ...], trace: bool) -> None:
+        now = self._clock.monotonic_ns()
+        if cause not in self._next_ns and len(self._next_ns) >= MAX_CAUSES:
+            cause = "other"
+        if now < self._next_ns.get(cause, 0):
+            self._silenced[cause] = self._silenced.get(cause, 0) + 1
+            return
+        self._next_ns[cause] = now + round(PERIOD_S * 1e9)
+        silenced = self._silenced.pop(cause, 0)
+        if silenced:
+            message += f" (and {silenced} times more since the last line)"
+        self._logger.log(level, message, *values, exc_info=trace)

@@ -1,0 +1,190 @@
+"""The loop: one thread that hands what comes from the bus to the core, and what the core says to the bus."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from modelserver import core
+from modelserver.core import CoreState, Instant
+from modelserver.errors import WireError
+from modelserver.geometry import names
+from modelserver.messages import (
+    Event,
+    OriginLatched,
+    Output,
+    PublishHealth,
+    PublishPose,
+    Rejected,
+    SendReply,
+    Tick,
+)
+from modelserver.service.bus import Bus
+from modelserver.service.clock import Clock
+from modelserver.service.log import RateLimited
+from modelserver.wire.channels import REQUESTS
+from modelserver.wire.codec import decode, encode
+
+log = logging.getLogger(__name__)
+
+SENSORS_PER_PASS = 2000
+"""Samples taken before the clock is looked at again: a flood of samples must not stop the ticks."""
+
+REFUSALS_PER_PASS = 64
+"""Refusals that are answered in one pass; further ones are only counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoopSettings:
+    """How the loop runs.
+
+    period_ns: between ticks. sensors: type name for each channel that is heard.
+    channel_prefix, queued_requests, requests_per_pass: see `modelserver.config`.
+    """
+
+    period_ns: int
+    sensors: Mapping[str, str] = field(default_factory=dict)
+    channel_prefix: str = ""
+    queued_requests: int = 256
+    requests_per_pass: int = 16
+
+
+class Loop:
+    """Serves one core on one bus. `run` returns when it is told to `stop`."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        clock: Clock,
+        state: CoreState,
+        settings: LoopSettings,
+        on_origin: Callable[[OriginLatched], None] = lambda note: None,
+    ):
+        self.state = state
+        self._bus = bus
+        self._clock = clock
+        self._settings = settings
+        self._on_origin = on_origin
+        self._log = RateLimited(log, clock)
+        self._queue: deque[tuple[str, str, bytes]] = deque()
+        self._refusals_left = REFUSALS_PER_PASS
+        self._due_ns = clock.monotonic_ns()
+        self._stopping = False
+        prefix = settings.channel_prefix
+        self._pose, self._pose_vector = f"{prefix}POSE", f"{prefix}POSE_VECTOR"
+        self._odom, self._health = f"{prefix}POSE_ODOM", f"{prefix}MODELSERVER_HEALTH"
+        for channel, type_name in settings.sensors.items():
+            bus.sensors.subscribe(channel, self._sensor_handler(type_name))
+        for request in REQUESTS:
+            bus.requests.subscribe(f"{prefix}{request.name}", self._request_handler(request.type_name))
+
+    def run(self) -> None:
+        """Serve until `stop` is called."""
+        while not self._stopping:
+            self.turn()
+
+    def stop(self) -> None:
+        """Make `run` return after the pass that is under way. May be called from a signal handler."""
+        self._stopping = True
+
+    def turn(self) -> None:
+        """Make one pass: sensors, the tick when it is due, requests within their budget, then wait."""
+        busy = self._bus.sensors.drain(SENSORS_PER_PASS) == SENSORS_PER_PASS
+        self._tick_if_due()
+        self._refusals_left = REFUSALS_PER_PASS
+        self._bus.requests.drain(self._settings.queued_requests)
+        for _ in range(min(self._settings.requests_per_pass, len(self._queue))):
+            channel, type_name, data = self._queue.popleft()
+            self._decode_and_step(channel, type_name, data)
+        if not busy and not self._queue and not self._stopping:
+            self._bus.wait(max(0.0, (self._due_ns - self._clock.monotonic_ns()) * 1e-9))
+
+    def _tick_if_due(self) -> None:
+        late_ns = self._clock.monotonic_ns() - self._due_ns
+        if late_ns < 0:
+            return
+        # a tick that was missed is skipped and counted: catching up would burst old poses
+        missed = late_ns // self._settings.period_ns
+        self._due_ns += (missed + 1) * self._settings.period_ns
+        self._guarded("tick", lambda: self._step(Tick(late_ns * 1e-9, missed), self._clock.now()))
+
+    def _sensor_handler(self, type_name: str) -> Callable[[str, bytes], None]:
+        def handle(channel: str, data: bytes) -> None:
+            self._decode_and_step(channel, type_name, data)
+
+        return handle
+
+    def _request_handler(self, type_name: str) -> Callable[[str, bytes], None]:
+        def handle(channel: str, data: bytes) -> None:
+            if len(self._queue) < self._settings.queued_requests:
+                self._queue.append((channel, type_name, data))
+            else:
+                self._refuse(channel, type_name, data)
+
+        return handle
+
+    def _refuse(self, channel: str, type_name: str, data: bytes) -> None:
+        def refuse() -> None:
+            now = self._clock.now()
+            self._step(Rejected(channel, "load"), now)
+            if self._refusals_left > 0:
+                self._refusals_left -= 1
+                self._send(core.refuse(self.state, decode(type_name, data), now))
+
+        self._guarded(channel, refuse)
+
+    def _decode_and_step(self, channel: str, type_name: str, data: bytes) -> None:
+        self._guarded(channel, lambda: self._step(decode(type_name, data), self._clock.now()))
+
+    def _guarded(self, channel: str, action: Callable[[], None]) -> None:
+        """Run what a message or a tick asks for; an exception is counted and logged, and never leaves the bus."""
+        try:
+            action()
+        except WireError as error:
+            self._step(Rejected(channel, error.reason), self._clock.now())
+            self._log.warning(f"{channel}:{error.reason}", "rejected a message on %s: %s", channel, error)
+        except Exception:
+            self._step(Rejected(channel, "handler"), self._clock.now())
+            self._log.exception(f"{channel}:handler", "an error of the server's own while handling %s", channel)
+
+    def _step(self, event: Event, now: Instant) -> None:
+        self.state, outputs = core.step(self.state, event, now)
+        if outputs:
+            self._send(outputs)
+
+    def _send(self, outputs: tuple[Output, ...]) -> None:
+        for output in outputs:
+            _SENDERS[type(output)](self, output)
+
+    def _send_reply(self, output: SendReply) -> None:
+        self._bus.publish(output.channel, encode(output.reply))
+
+    def _send_pose(self, output: PublishPose) -> None:
+        self._bus.publish(self._pose, encode(output.world))
+        self._bus.publish(self._pose_vector, encode(output.world, "pose_vector_t"))
+        self._bus.publish(self._odom, encode(output.odom))
+
+    def _send_health(self, output: PublishHealth) -> None:
+        self._bus.publish(self._health, encode(output.health))
+
+    def _send_origin(self, output: OriginLatched) -> None:
+        origin = output.origin
+        log.info(
+            "origin of %s set at %.3f E %.3f N %.3f m, zone %d%s",
+            names.WORLD_UTM,
+            *origin.initial_utm,
+            origin.zone,
+            "N" if origin.north else "S",
+        )
+        self._on_origin(output)
+
+
+_SENDERS: Mapping[type, Callable[[Loop, Any], None]] = {
+    SendReply: Loop._send_reply,
+    PublishPose: Loop._send_pose,
+    PublishHealth: Loop._send_health,
+    OriginLatched: Loop._send_origin,
+}

@@ -1,0 +1,116 @@
+"""A satellite receiver: fixes at the antenna, with an error that lingers and one that does not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from modelserver.geodesy import Geodesy, LocalFrame
+from modelserver.messages import NAN, FixType, GpsSample
+from modelserver.simulation import rigid
+from modelserver.simulation.noise import GaussMarkov, Noise, diagonal
+from modelserver.simulation.stamps import Timing, headers
+from modelserver.simulation.trajectory import Trajectory
+from modelserver.spatial import so3
+from modelserver.spatial.pose import Pose
+
+GPS_EPOCH = 315_964_800_000_000 - 18_000_000
+"""utime at which GPS time shows 0, the 18 leap seconds since 2017 taken off: what receivers stamp with."""
+
+_LEAST_SIGMA = 1e-3
+"""No receiver claims less, metres and m/s; also what a filter needs to divide by."""
+
+
+_TIMING = Timing(4.0, latency=0.06, jitter=0.01)
+_PROMPT = Timing(4.0)
+
+
+@dataclass(frozen=True, slots=True)
+class GpsModel:
+    """How good the receiver is. Metres, m/s, seconds; the defaults are those of the report's differential one.
+
+    lingering_sigma: of a Gauss-Markov error of each horizontal axis with `time_constant` (multipath, corrections'
+    age). white_sigma: of the error new in each fix. vertical: how many times worse height and climb are.
+    velocity_sigma: of each horizontal axis. velocity_latency: age of the velocity at the fix's utime.
+    outages: seconds since the start, from and to, in which there is no fix.
+    undulation: geoid's height above the ellipsoid, nan for a receiver that does not tell.
+    """
+
+    timing: Timing = _TIMING
+    lingering_sigma: float = 0.03
+    time_constant: float = 60.0
+    white_sigma: float = 0.01
+    vertical: float = 1.5
+    velocity_sigma: float = 0.03
+    velocity_latency: float = 0.0
+    fix_type: FixType = FixType.DIFFERENTIAL
+    satellites: int = 9
+    hdop: float = 0.9
+    outages: tuple[tuple[float, float], ...] = ()
+    undulation: float = NAN
+
+    @classmethod
+    def noise_free(cls, timing: Timing = _PROMPT) -> GpsModel:
+        """Return a receiver without error."""
+        return cls(timing, lingering_sigma=0.0, white_sigma=0.0, velocity_sigma=0.0)
+
+
+def fixes(
+    model: GpsModel, trajectory: Trajectory, X_VA: Pose, geodesy: Geodesy, start_utime: int, seed: int, source: str
+) -> Iterator[GpsSample]:
+    """Yield the fixes, for ever. `X_VA` is the antenna's pose in the vehicle's moving frame.
+
+    Position is true on the ellipsoid; velocity is along true east, north and up of the antenna's own place.
+    """
+    noise = Noise(seed, f"gps/{source}")
+    scales = (1.0, 1.0, model.vertical)
+    lingering = [GaussMarkov(model.lingering_sigma * scale, model.time_constant, noise) for scale in scales]
+    position_sigma = max(math.hypot(model.lingering_sigma, model.white_sigma), _LEAST_SIGMA)
+    velocity_sigma = max(model.velocity_sigma, _LEAST_SIGMA)
+    position_covariance = diagonal(*(position_sigma * scale for scale in scales))
+    velocity_covariance = diagonal(*(velocity_sigma * scale for scale in scales))
+    stamps = headers(model.timing, start_utime, GPS_EPOCH, source, Noise(seed, f"gps/{source}/arrival"))
+    for header in stamps:
+        # drawn for fixes in an outage too, so that an outage leaves the later fixes as they were
+        error = [
+            process.step(1.0 / model.timing.rate_hz) + noise.normal(model.white_sigma * scale)
+            for process, scale in zip(lingering, scales, strict=True)
+        ]
+        velocity_error = noise.vector(model.velocity_sigma)
+        t = (header.utime - start_utime) * 1e-6
+        if any(begin <= t < end for begin, end in model.outages):
+            yield GpsSample(header, FixType.NONE, NAN, NAN, satellites=0)
+            continue
+        x, y, z = rigid.pose(trajectory.at(t), X_VA).xyz
+        latitude, longitude, height = geodesy.geodetic_from_enu((x + error[0], y + error[1], z + error[2]))
+        local = LocalFrame.at(latitude, longitude, height).rotation_of(geodesy.tangent)
+        ve, vn, vu = so3.rotate(local, rigid.velocity(trajectory.at(t - model.velocity_latency), X_VA.xyz))
+        ve += velocity_error[0]
+        vn += velocity_error[1]
+        vu += velocity_error[2] * model.vertical
+        speed = math.hypot(ve, vn)
+        yield GpsSample(
+            header,
+            model.fix_type,
+            latitude,
+            longitude,
+            height_ellipsoidal=height,
+            height_msl=height - model.undulation,
+            undulation=model.undulation,
+            satellites=model.satellites,
+            hdop=model.hdop,
+            vdop=model.hdop * model.vertical,
+            pdop=model.hdop * math.hypot(1.0, model.vertical),
+            position_covariance=position_covariance,
+            velocity=(ve, vn, vu),
+            velocity_covariance=velocity_covariance,
+            velocity_latency=model.velocity_latency,
+            speed=speed,
+            speed_sigma=velocity_sigma,
+            course=math.atan2(vn, ve),
+            # beside a velocity as small as its error every course is alike likely
+            course_sigma=min(velocity_sigma / speed, math.pi / math.sqrt(3.0))
+            if speed > 0
+            else math.pi / math.sqrt(3.0),
+        )

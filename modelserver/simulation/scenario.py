@@ -1,0 +1,137 @@
+"""Simulation: a vehicle of a geometry model on a drive, what its sensors say, and where it really was."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from modelserver.geodesy import Geodesy
+from modelserver.geometry.model import Model
+from modelserver.messages import GpsSample, ImuSample, Origin, WheelsSample
+from modelserver.simulation import gps, imu, rigid, wheels
+from modelserver.simulation.gps import GpsModel
+from modelserver.simulation.imu import ImuModel
+from modelserver.simulation.trajectory import Trajectory
+from modelserver.simulation.wheels import WheelsModel
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.so3 import Vector3, conjugate, rotate
+
+START_UTIME = 1_750_000_000_000_000
+"""When a simulation starts unless told otherwise: a whole second in June 2025."""
+
+Event = GpsSample | ImuSample | WheelsSample
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """The base frame at one instant, without error.
+
+    `enu` is its pose in World:ENU and `utm` in World:UTM, both relative to the origin. `latitude_deg`,
+    `longitude_deg`, `height` are the same place on the ellipsoid. `velocity` and `acceleration` are along east, north,
+    up of the origin; `twist` is the velocity and the angular velocity along the axes of the base frame.
+    `yaw` is the vehicle's, counter-clockwise from true east, not wrapped; `yaw_rate` is about up.
+    """
+
+    utime: int
+    enu: Pose
+    utm: Pose
+    latitude_deg: float
+    longitude_deg: float
+    height: float
+    velocity: Vector3
+    acceleration: Vector3
+    twist: tuple[Vector3, Vector3]
+    yaw: float
+    yaw_rate: float
+
+
+class Simulation:
+    """One run. The same arguments give the same samples, however they are asked for.
+
+    The trajectory is driven by `rolling_frame`, the frame whose x axis points along the way: that which does not
+    slide sideways, on a vehicle that steers its front wheels the middle of the rear axle. Unless named it is the base
+    frame. It moves on the tangent plane of the origin, its z up. Where the sensors sit comes from the model.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        base_frame: str,
+        trajectory: Trajectory,
+        origin: Origin,
+        *,
+        gps_frame: str | None = None,
+        imu_frame: str | None = None,
+        wheel_frames: Mapping[str, str] | None = None,
+        rolling_frame: str | None = None,
+        seed: int = 1,
+        start_utime: int = START_UTIME,
+        gps_model: GpsModel | None = None,
+        imu_model: ImuModel | None = None,
+        wheels_model: WheelsModel | None = None,
+    ):
+        """Take the vehicle, its drive and its sensors; a sensor without frame is not there.
+
+        `wheel_frames` has the frame of each wheel's contact point by the wheel's name. `origin` is that of the
+        world frames and of the drive's east and north. Raises UnknownBodyError, UnknownFrameError or
+        NotConnectedError for frames that the model does not have or join.
+        """
+        rolling = rolling_frame or base_frame
+
+        def mounted(frame: str) -> Pose:
+            return model.get_transformation(frame, rolling).pose
+
+        self.trajectory = trajectory
+        self.geodesy = Geodesy(origin)
+        self.start_utime = start_utime
+        self._X_VB = mounted(base_frame)
+        sensors: list[Iterator[Event]] = []
+        common = (self.geodesy, start_utime, seed)
+        if imu_frame is not None:
+            sensors.append(imu.readings(imu_model or ImuModel(), trajectory, mounted(imu_frame), *common, "imu"))
+        if wheel_frames:
+            contacts = {name: mounted(frame).xyz for name, frame in wheel_frames.items()}
+            sensors.append(
+                wheels.turns(wheels_model or WheelsModel(), trajectory, contacts, start_utime, seed, "wheels")
+            )
+        if gps_frame is not None:
+            sensors.append(gps.fixes(gps_model or GpsModel(), trajectory, mounted(gps_frame), *common, "gps"))
+        self._arrivals = heapq.merge(*sensors, key=lambda sample: sample.header.host_utime)
+        self._next: Event | None = next(self._arrivals, None)
+        self._until = start_utime
+
+    def events(self, duration: float) -> Iterator[Event]:
+        """Return the samples that arrive in the next `duration` seconds, in the order of arrival (host_utime).
+
+        Each call goes on where the last one ended; what is left unread of one comes with the next.
+        """
+        self._until += round(duration * 1e6)
+        return self._up_to(self._until)
+
+    def _up_to(self, until: int) -> Iterator[Event]:
+        while self._next is not None and self._next.header.host_utime < until:
+            sample = self._next
+            self._next = next(self._arrivals, None)
+            yield sample
+
+    def truth(self, utime: int) -> Truth:
+        """Return where the base frame is at `utime`; before and after the drive it stands."""
+        motion = self.trajectory.at((utime - self.start_utime) * 1e-6)
+        enu = rigid.pose(motion, self._X_VB)
+        latitude, longitude, height = self.geodesy.geodetic_from_enu(enu.xyz)
+        velocity = rigid.velocity(motion, self._X_VB.xyz)
+        to_base = conjugate(enu.wxyz)
+        return Truth(
+            utime,
+            enu,
+            self.geodesy.pose_in_utm(enu),
+            latitude,
+            longitude,
+            height,
+            velocity,
+            rigid.acceleration(motion, self._X_VB.xyz),
+            (rotate(to_base, velocity), rotate(to_base, (0.0, 0.0, motion.yaw_rate))),
+            motion.yaw,
+            motion.yaw_rate,
+        )

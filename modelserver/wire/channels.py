@@ -1,0 +1,86 @@
+"""The channels of the service: one table for daemon, clients, drivers and documentation."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+
+DEFAULT_URL = "udpm://239.255.76.67:7667?ttl=0"
+"""Loopback only: nothing leaves the machine unless a vehicle file or $LCM_DEFAULT_URL says so."""
+
+REPLY_PREFIX = "REPLY_"
+
+
+class Way(StrEnum):
+    """Who speaks on a channel."""
+
+    SENSOR = "sensor"
+    REQUEST = "request"
+    BROADCAST = "broadcast"
+    COMMAND = "command"
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A channel: its name without prefix, the type it carries, who speaks, how often, what for."""
+
+    name: str
+    type_name: str
+    way: Way
+    rate: str
+    about: str
+
+
+CHANNELS = (
+    Channel("GPS", "gps_t", Way.SENSOR, "1-20 Hz", "fixes of the satellite receiver"),
+    Channel("IMU", "imu_t", Way.SENSOR, "30-200 Hz", "rates, specific force, field, own orientation"),
+    Channel("WHEELS", "wheels_t", Way.SENSOR, "10-100 Hz", "travel, speed and direction of each wheel"),
+    Channel("JOINTS", "joints_t", Way.SENSOR, "50 Hz and more", "positions and rates of joints"),
+    Channel("VEHICLE_STATUS", "vehicle_status_t", Way.SENSOR, "1-20 Hz", "what the vehicle controller says"),
+    Channel("VEHICLE_COMMAND", "vehicle_command_t", Way.COMMAND, "10 Hz and more", "wish to the vehicle controller"),
+    Channel("POSE", "pose_transform_t", Way.BROADCAST, "timer or event", "base frame in World:UTM"),
+    Channel("POSE_VECTOR", "pose_vector_t", Way.BROADCAST, "with POSE", "the same as a 7-vector"),
+    Channel("POSE_ODOM", "pose_transform_t", Way.BROADCAST, "with POSE", "base frame in Odom:Origin, never jumps"),
+    Channel("MODELSERVER_HEALTH", "health_t", Way.BROADCAST, "1 Hz", "state, traffic, rejected input"),
+    Channel(
+        "PLATFORM_GET_TRANSFORMATION",
+        "get_transformation_request_t",
+        Way.REQUEST,
+        "on demand",
+        "answered by get_transformation_reply_t",
+    ),
+    Channel(
+        "PLATFORM_GET_BODY_LIST", "get_body_list_request_t", Way.REQUEST, "on demand", "answered by name_list_reply_t"
+    ),
+    Channel(
+        "PLATFORM_GET_BODY_FRAME_LIST",
+        "get_body_frame_list_request_t",
+        Way.REQUEST,
+        "on demand",
+        "answered by name_list_reply_t",
+    ),
+    Channel(
+        "POSE_GET_STATE_VECTOR",
+        "get_state_vector_request_t",
+        Way.REQUEST,
+        "on demand",
+        "answered by get_state_vector_reply_t",
+    ),
+    Channel(
+        "POSE_GET_H_TRANSFORM",
+        "get_h_transform_request_t",
+        Way.REQUEST,
+        "on demand",
+        "answered by get_transformation_reply_t",
+    ),
+    Channel("POSE_GET_HISTORY", "get_history_request_t", Way.REQUEST, "on demand", "answered by get_history_reply_t"),
+)
+
+BY_NAME = {channel.name: channel for channel in CHANNELS}
+REQUESTS = tuple(channel for channel in CHANNELS if channel.way is Way.REQUEST)
+
+
+def literal(channel: str) -> str:
+    """Return the regular expression that matches `channel` alone: LCM takes subscriptions for patterns."""
+    return re.escape(channel)

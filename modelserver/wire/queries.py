@@ -1,0 +1,132 @@
+"""The question for a transformation, and the replies that carry poses, packed by hand (see `packed`)."""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+from modelserver.errors import Status
+from modelserver.messages import (
+    GetTransformation,
+    HistoryReply,
+    ReplyHeader,
+    RequestHeader,
+    StateVectorReply,
+    TransformReply,
+)
+from modelserver.wire import fields, poses
+from modelserver.wire.packed import LENGTH, check_end, read_text, text
+from mslcm.get_history_reply_t import get_history_reply_t
+from mslcm.get_state_vector_reply_t import get_state_vector_reply_t
+from mslcm.get_transformation_reply_t import get_transformation_reply_t
+from mslcm.get_transformation_request_t import get_transformation_request_t
+
+_REQUEST_ID = struct.Struct(">q")
+_TIME = struct.Struct(">qbi")
+_REPLY_HEAD = struct.Struct(">qqh")
+
+_REQUEST: Final[bytes] = get_transformation_request_t._get_packed_fingerprint()
+_TRANSFORM_REPLY: Final[bytes] = get_transformation_reply_t._get_packed_fingerprint()
+_VECTOR_REPLY: Final[bytes] = get_state_vector_reply_t._get_packed_fingerprint()
+_HISTORY_REPLY: Final[bytes] = get_history_reply_t._get_packed_fingerprint()
+
+
+def write_request(request: GetTransformation) -> bytes:
+    """Return the bytes of a get_transformation_request_t."""
+    time = request.time
+    return b"%b%b%b%b%b%b" % (
+        _REQUEST,
+        _REQUEST_ID.pack(request.header.request_id),
+        text(request.header.reply_channel),
+        text(request.frame_of_interest),
+        text(request.frame_of_reference),
+        _TIME.pack(time.at, time.policy, time.wait_ms),
+    )
+
+
+def read_request(data: bytes) -> GetTransformation:
+    """Return the request in the bytes of a get_transformation_request_t. Raises WireError, struct.error."""
+    (request_id,) = _REQUEST_ID.unpack_from(data, 8)
+    channel, at = read_text(data, 16)
+    interest, at = read_text(data, at)
+    reference, at = read_text(data, at)
+    time = fields.time_query(*_TIME.unpack_from(data, at))
+    check_end(data, at + _TIME.size)
+    return GetTransformation(RequestHeader(request_id, channel), interest, reference, time)
+
+
+def write_transform_reply(reply: TransformReply) -> bytes:
+    """Return the bytes of a get_transformation_reply_t."""
+    body = poses.NO_TRANSFORM if reply.answer is None else poses.transform_body(reply.answer)
+    return _TRANSFORM_REPLY + _header(reply.header) + body
+
+
+def read_transform_reply(data: bytes) -> TransformReply:
+    """Return the reply in the bytes of a get_transformation_reply_t. Raises WireError, struct.error."""
+    header, at = _read_header(data)
+    if header.status is not Status.OK:
+        poses.check_no_transform(data, at)
+        return TransformReply(header)
+    answer, end = poses.read_transform_body(data, at)
+    check_end(data, end)
+    return TransformReply(header, answer)
+
+
+def write_state_vector_reply(reply: StateVectorReply) -> bytes:
+    """Return the bytes of a get_state_vector_reply_t."""
+    body = poses.NO_VECTOR if reply.answer is None else poses.vector_body(reply.answer)
+    return _VECTOR_REPLY + _header(reply.header) + body
+
+
+def read_state_vector_reply(data: bytes) -> StateVectorReply:
+    """Return the reply in the bytes of a get_state_vector_reply_t. Raises WireError, struct.error."""
+    header, at = _read_header(data)
+    if header.status is not Status.OK:
+        poses.check_no_vector(data, at)
+        return StateVectorReply(header)
+    answer, end = poses.read_vector_body(data, at)
+    check_end(data, end)
+    return StateVectorReply(header, answer)
+
+
+def write_history_reply(reply: HistoryReply) -> bytes:
+    """Return the bytes of a get_history_reply_t."""
+    bodies = b"".join(map(poses.vector_body, reply.answers))
+    return b"%b%b%b%b" % (_HISTORY_REPLY, _header(reply.header), LENGTH.pack(len(reply.answers)), bodies)
+
+
+def read_history_reply(data: bytes) -> HistoryReply:
+    """Return the reply in the bytes of a get_history_reply_t. Raises WireError, struct.error."""
+    header, at = _read_header(data)
+    (count,) = LENGTH.unpack_from(data, at)
+    at += LENGTH.size
+    answers = []
+    for _ in range(count):
+        answer, at = poses.read_vector_body(data, at)
+        answers.append(answer)
+    check_end(data, at)
+    return HistoryReply(header, tuple(answers))
+
+
+def _header(header: ReplyHeader) -> bytes:
+    return b"%b%b%b%b%b" % (
+        _REPLY_HEAD.pack(header.request_id, header.utime, header.status),
+        text(header.message),
+        LENGTH.pack(len(header.nearest)),
+        b"".join(map(text, header.nearest)),
+        text(header.model_revision),
+    )
+
+
+def _read_header(data: bytes) -> tuple[ReplyHeader, int]:
+    request_id, utime, status = _REPLY_HEAD.unpack_from(data, 8)
+    message, at = read_text(data, 8 + _REPLY_HEAD.size)
+    (count,) = LENGTH.unpack_from(data, at)
+    at += LENGTH.size
+    nearest = []
+    for _ in range(count):
+        name, at = read_text(data, at)
+        nearest.append(name)
+    revision, at = read_text(data, at)
+    known = fields.member(Status, status, "status")
+    return ReplyHeader(request_id, utime, known, message, tuple(nearest), revision), at

@@ -1,0 +1,23 @@
+"""What every test may use."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+# The same examples on every run and every machine; a loaded machine must not fail a test by its slowness.
+settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=50)
+settings.load_profile("repeatable")
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of recorded real data; the test is skipped where it is absent."""
+    given = os.environ.get("MODELSERVER_DATA")
+    place = Path(given) if given else Path(__file__).resolve().parents[1] / "../shared/data"
+    if not place.is_dir():
+        pytest.skip(f"the recorded data are not at {place}; set MODELSERVER_DATA to their folder")
+    return place.resolve()

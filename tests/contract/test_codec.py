@@ -1,0 +1,177 @@
+"""The codec on values written by hand: nothing is lost, and damaged bytes are refused with a reason."""
+
+from __future__ import annotations
+
+import struct
+import tracemalloc
+from typing import Any
+
+import pytest
+
+import mslcm
+from modelserver.errors import WireError
+from modelserver.wire.codec import decode, encode, type_names
+from support_wire import EXAMPLES, same
+
+CASES = [
+    pytest.param(type_name, value, id=f"{type_name}-{number}")
+    for type_name, values in EXAMPLES.items()
+    for number, value in enumerate(values)
+]
+TYPES = sorted(EXAMPLES)
+
+
+def test_given_the_codec_then_every_type_has_examples() -> None:
+    assert sorted(type_names()) == TYPES
+
+
+@pytest.mark.parametrize(("type_name", "value"), CASES)
+def test_given_a_value_when_encoded_and_decoded_then_it_is_the_same(type_name: str, value: Any) -> None:
+    assert same(decode(type_name, encode(value, type_name)), value)
+
+
+@pytest.mark.parametrize(("type_name", "value"), CASES)
+def test_given_a_value_when_encoded_then_the_generated_type_reads_it(type_name: str, value: Any) -> None:
+    data = encode(value, type_name)
+    assert getattr(mslcm, type_name).decode(data).encode() == data
+
+
+@pytest.mark.parametrize(("type_name", "value"), CASES)
+def test_given_a_message_cut_at_any_length_when_decoded_then_it_is_refused(type_name: str, value: Any) -> None:
+    data = encode(value, type_name)
+    for length in range(len(data)):
+        with pytest.raises(WireError) as caught:
+            decode(type_name, data[:length])
+        assert caught.value.reason == ("fingerprint" if length < 8 else "truncated")
+
+
+@pytest.mark.parametrize(("type_name", "value"), CASES)
+def test_given_bytes_after_a_message_when_decoded_then_it_is_refused(type_name: str, value: Any) -> None:
+    for tail in (b"\0", b"x", b"\0" * 100):
+        with pytest.raises(WireError) as caught:
+            decode(type_name, encode(value, type_name) + tail)
+        assert caught.value.reason == "malformed"
+
+
+@pytest.mark.parametrize("type_name", TYPES)
+def test_given_every_other_type_when_decoded_then_the_fingerprint_is_refused(type_name: str) -> None:
+    for other in TYPES:
+        if other != type_name:
+            with pytest.raises(WireError) as caught:
+                decode(type_name, encode(EXAMPLES[other][-1], other))
+            assert caught.value.reason == "fingerprint"
+
+
+@pytest.mark.parametrize(("type_name", "value"), CASES)
+def test_given_any_bit_flipped_when_decoded_then_nothing_but_wire_error_is_raised(type_name: str, value: Any) -> None:
+    data = encode(value, type_name)
+    for place in range(0, len(data), _step(data)):
+        for bit in (0, 6, 7):
+            damaged = bytearray(data)
+            damaged[place] ^= 1 << bit
+            _decode_any(type_name, bytes(damaged))
+
+
+@pytest.mark.parametrize(("type_name", "value"), CASES)
+def test_given_a_huge_count_anywhere_when_decoded_then_little_memory_is_used(type_name: str, value: Any) -> None:
+    data = encode(value, type_name)
+    tracemalloc.start()
+    try:
+        for count in (0x7FFFFFFF, 0xFFFFFFFF):
+            for place in range(8, len(data) - 3, _step(data)):
+                _decode_any(type_name, data[:place] + struct.pack(">I", count) + data[place + 4 :])
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 4 << 20
+
+
+def _step(data: bytes) -> int:
+    """Every byte of a short message; every fifth of a long one, which is mostly numbers, reaches all alignments."""
+    return 1 if len(data) < 400 else 5
+
+
+def _decode_any(type_name: str, data: bytes) -> None:
+    """Decode bytes that may be no message, and look at all of what came out."""
+    try:
+        value = decode(type_name, data)
+    except WireError as error:
+        assert error.reason in ("fingerprint", "truncated", "malformed")
+    else:
+        assert repr(value)
+
+
+# --- single rules -------------------------------------------------------------------------------------------
+
+
+def _message(type_name: str, **fields: Any) -> bytes:
+    """Return the bytes of a full example with some fields of the wire type changed; `a__b` reaches inside."""
+    message = getattr(mslcm, type_name).decode(encode(EXAMPLES[type_name][-1], type_name))
+    for path, value in fields.items():
+        *outer, name = path.split("__")
+        target = message
+        for step in outer:
+            target = getattr(target, step)
+        setattr(target, name, value)
+    return bytes(message.encode())
+
+
+@pytest.mark.parametrize(
+    ("type_name", "fields"),
+    [
+        ("gps_t", {"fix_type": 99}),
+        ("gps_t", {"header__utime": 0}),
+        ("gps_t", {"header__utime": -1}),
+        ("gps_t", {"header__utime": 1 << 62}),
+        ("gps_t", {"header__host_utime": -5}),
+        ("gps_t", {"header__source": "s" * 65}),
+        ("imu_t", {"orientation_reference": 3}),
+        ("imu_t", {"yaw_source": -1}),
+        ("wheels_t", {"direction": [3, 0]}),
+        ("get_transformation_request_t", {"time__policy": 4}),
+        ("get_transformation_request_t", {"time__wait_ms": -1}),
+        ("get_transformation_request_t", {"time__at": -1}),
+        ("get_history_request_t", {"start_utime": -1}),
+        ("get_history_request_t", {"end_utime": 1 << 62}),
+        ("get_transformation_reply_t", {"transform__h_transform": [[0.0] * 4] * 4}),
+        ("pose_transform_t", {"h_transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 2.0]]}),
+        ("pose_transform_t", {"h_transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]}),
+        ("pose_transform_t", {"h_transform": [[1, 0, 0, float("inf")], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}),
+        ("pose_transform_t", {"h_transform": [[1e308, 0, 0, 0], [0, 1e308, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}),
+        ("pose_vector_t", {"vec": [0.0] * 7}),
+        ("pose_vector_t", {"vec": [float("nan")] * 7}),
+        ("pose_vector_t", {"vec": [0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0]}),
+    ],
+)
+def test_given_a_number_that_cannot_be_when_decoded_then_it_is_malformed(
+    type_name: str, fields: dict[str, Any]
+) -> None:
+    with pytest.raises(WireError) as caught:
+        decode(type_name, _message(type_name, **fields))
+    assert caught.value.reason == "malformed"
+
+
+@pytest.mark.parametrize(
+    ("type_name", "fields"),
+    [
+        ("health_t", {"num_channels": -1, "channels": []}),
+        ("health_t", {"num_rejected": -1, "rejected": []}),
+        ("name_list_reply_t", {"num_names": -1, "names": [], "descriptions": []}),
+        ("name_list_reply_t", {"header__num_nearest": -1, "header__nearest": []}),
+    ],
+)
+def test_given_a_negative_count_when_decoded_then_it_is_malformed(type_name: str, fields: dict[str, Any]) -> None:
+    with pytest.raises(WireError) as caught:
+        decode(type_name, _message(type_name, **fields))
+    assert caught.value.reason == "malformed"
+
+
+def test_given_flags_of_a_later_version_when_decoded_then_they_are_kept() -> None:
+    value = decode("pose_transform_t", _message("pose_transform_t", invalid_reasons=1 << 20 | 1, quality_flags=1 << 21))
+    assert value.transformation.invalid_reasons == 1 << 20 | 1
+    assert value.quality == 1 << 21
+
+
+def test_given_text_that_is_not_utf8_when_decoded_then_nothing_breaks() -> None:
+    data = encode(EXAMPLES["get_body_frame_list_request_t"][0]).replace(b"Raptor", b"R\xff\xfeptor"[:6])
+    assert decode("get_body_frame_list_request_t", data).body == "R��pto"

@@ -1,0 +1,179 @@
+"""The committed wire contract: generated code, fingerprints and comments belong to the .lcm files."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import subprocess
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mslcm
+from modelserver import errors, messages
+from modelserver.messages import Origin, PoseAnswer, Quality
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.transformation import Transformation
+from modelserver.wire.codec import encode, type_names
+from mstools.lcm_wheel import binary, type_files
+
+ROOT = Path(__file__).resolve().parents[2]
+TYPES = ROOT / "lcmtypes"
+NAMES = sorted(path.stem for path in TYPES.glob("*.lcm"))
+ONE_PACKET = 1472
+"""Bytes of UDP payload that one Ethernet frame holds: more is fragmented by IP."""
+
+
+@pytest.fixture(scope="module")
+def generator() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("generate_types", ROOT / "tools" / "generate_types.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def generated(generator: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("generated")
+    generator.generate(TYPES, folder)
+    return folder
+
+
+def test_given_lcm_files_when_generated_anew_then_the_committed_python_is_the_same(generated: Path) -> None:
+    shown = subprocess.run([binary("lcm-gen"), "--version"], capture_output=True, text=True)
+    version = re.search(r"\d+\.\d+\.\d+", shown.stdout + shown.stderr)
+    committed = re.search(r"lcm-gen (\S+)", (TYPES / "mslcm" / "__init__.py").read_text(encoding="utf-8"))
+    assert version is not None
+    assert committed is not None
+    if version[0] != committed[1]:
+        pytest.skip(
+            f"lcm-gen {version[0]} is here, {committed[1]} wrote the committed files; fingerprints are compared"
+        )
+    fresh = {path.name: path.read_bytes() for path in (generated / "mslcm").glob("*.py")}
+    old = {path.name: path.read_bytes() for path in (TYPES / "mslcm").glob("*.py")}
+    assert sorted(old) == sorted(fresh), "run: make types"
+    changed = [name for name in fresh if fresh[name] != old[name]]
+    assert changed == [], "run: make types"
+
+
+def test_given_lcm_files_when_generated_anew_then_contract_lock_is_the_same(
+    generator: ModuleType, generated: Path
+) -> None:
+    fingerprints = generator.read_fingerprints(generated, NAMES)
+    lock = (TYPES / "contract.lock").read_text(encoding="utf-8")
+    assert lock == generator.lock_text(fingerprints), "a type changed: run make types, and read contract.lock"
+    assert generator.read_lock(lock) == fingerprints
+
+
+def test_given_the_installed_package_then_its_fingerprints_are_those_of_contract_lock(generator: ModuleType) -> None:
+    lock = generator.read_lock((TYPES / "contract.lock").read_text(encoding="utf-8"))
+    assert {name: getattr(mslcm, name)._get_packed_fingerprint().hex() for name in NAMES} == lock
+
+
+def test_given_two_types_then_their_fingerprints_differ(generator: ModuleType) -> None:
+    # LCM leaves the type's own name out of the fingerprint: equal fields would make two types one on the bus.
+    lock = generator.read_lock((TYPES / "contract.lock").read_text(encoding="utf-8"))
+    assert len(set(lock.values())) == len(lock) == len(NAMES)
+
+
+def test_given_type_files_then_the_tools_find_all_of_them() -> None:
+    assert [path.stem for path in type_files()] == NAMES
+
+
+# --- comments -----------------------------------------------------------------------------------------------
+
+
+def uncommented(text: str) -> list[str]:
+    """Return the structs, fields and constants of an .lcm file that have no comment on the line above.
+
+    Above, not beside: lcm-gen gives a comment at the end of a line to the field that comes next.
+    """
+    missing = []
+    above = ""
+    for line in map(str.strip, text.splitlines()):
+        code, _, beside = line.partition("//")
+        if code and (beside or ("{" not in code and "}" not in code and not above.startswith("//"))):
+            missing.append(line)
+        above = line
+    return [line for line in missing if not line.startswith("package")]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_given_a_type_then_a_comment_stands_above_it_and_each_of_its_fields(name: str) -> None:
+    text = (TYPES / f"{name}.lcm").read_text(encoding="utf-8")
+    assert uncommented(text) == []
+    assert f"struct {name}\n{{" in text
+
+
+@pytest.mark.parametrize(
+    ("text", "missing"),
+    [
+        ("package a;\n\n// What.\nstruct b\n{\n    // Metres.\n    double c;\n}\n", []),
+        ("package a;\n\nstruct b\n{\n}\n", ["struct b"]),
+        ("// What.\nstruct b\n{\n    double c;\n    // Metres.\n    double d;\n}\n", ["double c;"]),
+        ("// What.\nstruct b\n{\n    // Metres.\n    double c;\n    double d;\n}\n", ["double d;"]),
+        ("// What.\nstruct b\n{\n    // C.\n    double c; // metres\n}\n", ["double c; // metres"]),
+        ("// What.\nstruct b\n{\n    // C.\n\n    double c;\n}\n", ["double c;"]),
+    ],
+)
+def test_given_a_field_without_comment_then_the_check_names_it(text: str, missing: list[str]) -> None:
+    assert uncommented(text) == missing
+
+
+# --- numbers that stand twice -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "wire", "prefix"),
+    [
+        (errors.Status, mslcm.reply_header_t, ""),
+        (messages.Policy, mslcm.time_query_t, ""),
+        (messages.Invalid, mslcm.pose_transform_t, ""),
+        (messages.Quality, mslcm.pose_transform_t, ""),
+        (messages.Direction, mslcm.wheels_t, ""),
+        (messages.OrientationReference, mslcm.imu_t, "REFERENCE_"),
+        (messages.YawSource, mslcm.imu_t, "YAW_"),
+        (messages.FixType, mslcm.gps_t, "FIX_"),
+    ],
+)
+def test_given_an_enumeration_then_the_wire_has_the_same_numbers(kind: Any, wire: Any, prefix: str) -> None:
+    def on_wire(name: str) -> str:
+        return name if name.startswith(prefix) else prefix + name
+
+    assert {on_wire(each.name): getattr(wire, on_wire(each.name)) for each in kind} == {
+        on_wire(each.name): int(each) for each in kind
+    }
+
+
+def test_given_all_enumerations_then_no_constant_of_a_type_is_left_out() -> None:
+    known = {
+        mslcm.reply_header_t: len(errors.Status),
+        mslcm.time_query_t: len(messages.Policy),
+        mslcm.pose_transform_t: len(messages.Invalid) + len(messages.Quality),
+        mslcm.wheels_t: len(messages.Direction),
+        mslcm.imu_t: len(messages.OrientationReference) + len(messages.YawSource),
+        mslcm.gps_t: len(messages.FixType),
+    }
+    assert known == {wire: sum(name.isupper() for name in vars(wire)) for wire in known}
+
+
+# --- sizes --------------------------------------------------------------------------------------------------
+
+
+def test_given_frame_names_of_63_characters_when_a_pose_is_encoded_then_one_packet_holds_it() -> None:
+    name = "B" * 31 + ":" + "F" * 31
+    transformation = Transformation(name, name, Pose((1.0, 2.0, 3.0)), np.eye(6), 1, 0, 1, 1, "sha256:" + "0" * 64)
+    answer = PoseAnswer(transformation, Origin(5e5, 5e6, 100.0, 18, True, 1), Quality(0), 1.0, 0.1, 10.0)
+    # LCM puts 8 bytes and the channel's name before a message.
+    overhead = 8 + 63 + 1
+    for type_name in ("pose_transform_t", "pose_vector_t"):
+        assert len(encode(answer, type_name)) + overhead < ONE_PACKET
+
+
+def test_given_the_codec_then_every_type_of_the_core_is_known() -> None:
+    assert set(type_names()) <= set(NAMES)

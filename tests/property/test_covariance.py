@@ -1,0 +1,111 @@
+"""Covariance transport against Monte Carlo: the convention is X = (p + dp, exp(dtheta) R), fixed axes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from modelserver.spatial import Pose, Transformation, covariance
+
+SAMPLES = 40_000
+SMALL = 1e-4
+"""Perturbations so small that second order, about SMALL * SMALL, is lost in the noise of the samples."""
+
+PLACES = {
+    "ordinary": (Pose.from_rpy((1.0, -2.0, 0.5), 0.3, -0.4, 2.0), Pose.from_rpy((-0.7, 3.0, 1.1), -1.0, 0.2, 0.6)),
+    "half turns": (Pose((2.0, 0.0, 1.0), (0, 0, 0, 1)), Pose((0.5, 4.0, 0.0), (0, 1, 0, 0))),
+    "no rotation": (Pose((5.0, 1.0, 0.0)), Pose((0.0, 7.0, -1.0))),
+    "gimbal lock": (Pose.from_rpy((0.2, 0.1, 3.0), 0.5, np.pi / 2, 0.1), Pose.from_rpy((1, 1, 1), 0, -np.pi / 2, 0)),
+}
+
+
+def some_covariance(seed):
+    square = np.random.default_rng(seed).normal(size=(6, 6))
+    return SMALL**2 * (square @ square.T + 0.1 * np.eye(6))
+
+
+def samples_of(pose, cov, seed):
+    """Return positions (n, 3) and rotations of `pose` perturbed by `cov`."""
+    d = np.random.default_rng(seed).multivariate_normal(np.zeros(6), cov, SAMPLES, method="cholesky")
+    return np.array(pose.xyz) + d[:, :3], Rotation.from_rotvec(d[:, 3:]) * Rotation.from_matrix(pose.rotation)
+
+
+def covariance_of(mean, positions, rotations):
+    """Return the covariance of samples about `mean`, in the convention."""
+    turned = (rotations * Rotation.from_matrix(mean.rotation).inv()).as_rotvec()
+    d = np.hstack([positions - np.array(mean.xyz), turned])
+    return d.T @ d / len(d)
+
+
+def assert_alike(found, sampled):
+    """Compare as correlations: the standard error of each sampled entry is at most sqrt(2 / n) of its scale."""
+    scale = np.sqrt(np.diag(found))
+    np.testing.assert_allclose(
+        sampled / np.outer(scale, scale), found / np.outer(scale, scale), atol=5 * (2 / SAMPLES) ** 0.5
+    )
+    np.testing.assert_array_equal(found, found.T)
+    assert np.linalg.eigvalsh(found).min() > -1e-20
+
+
+@pytest.mark.parametrize("where", PLACES)
+def test_compose_agrees_with_monte_carlo(where):
+    X_AB, X_BC = PLACES[where]
+    cov_AB, cov_BC = some_covariance(1), some_covariance(2)
+    p_AB, R_AB = samples_of(X_AB, cov_AB, 3)
+    p_BC, R_BC = samples_of(X_BC, cov_BC, 4)
+    sampled = covariance_of(X_AB @ X_BC, p_AB + R_AB.apply(p_BC), R_AB * R_BC)
+    assert_alike(covariance.compose(X_AB, cov_AB, X_BC, cov_BC), sampled)
+
+
+@pytest.mark.parametrize("where", PLACES)
+def test_invert_agrees_with_monte_carlo(where):
+    X_AB, _ = PLACES[where]
+    cov_AB = some_covariance(5)
+    p, R = samples_of(X_AB, cov_AB, 6)
+    sampled = covariance_of(X_AB.inverse(), -R.inv().apply(p), R.inv())
+    assert_alike(covariance.invert(X_AB, cov_AB), sampled)
+
+
+@pytest.mark.parametrize("where", PLACES)
+def test_laws_that_hold_exactly(where):
+    X_AB, X_BC = PLACES[where]
+    cov_AB, cov_BC = some_covariance(7), some_covariance(8)
+    tight = {"rtol": 1e-9, "atol": 1e-18}
+    twice = covariance.invert(X_AB.inverse(), covariance.invert(X_AB, cov_AB))
+    np.testing.assert_allclose(twice, cov_AB, **tight)
+    # the inverse of a chain is the chain of the inverses
+    forward = covariance.invert(X_AB @ X_BC, covariance.compose(X_AB, cov_AB, X_BC, cov_BC))
+    backward = covariance.compose(
+        X_BC.inverse(), covariance.invert(X_BC, cov_BC), X_AB.inverse(), covariance.invert(X_AB, cov_AB)
+    )
+    np.testing.assert_allclose(forward, backward, **tight)
+    # a chain of three may be taken in either order
+    X_CD, cov_CD = Pose.from_rpy((1, 2, 3), 0.1, 0.2, 0.3), some_covariance(9)
+    left = covariance.compose(X_AB @ X_BC, covariance.compose(X_AB, cov_AB, X_BC, cov_BC), X_CD, cov_CD)
+    right = covariance.compose(X_AB, cov_AB, X_BC @ X_CD, covariance.compose(X_BC, cov_BC, X_CD, cov_CD))
+    np.testing.assert_allclose(left, right, **tight)
+    # an exact right side adds nothing but the lever arm
+    np.testing.assert_allclose(covariance.compose(X_AB, cov_AB, Pose.identity(), np.zeros((6, 6))), cov_AB, **tight)
+    # turning the axes is what an exact rotation on the left does
+    turn = Pose((0, 0, 0), X_AB.wxyz)
+    np.testing.assert_allclose(
+        covariance.rotated(turn.rotation, cov_BC), covariance.compose(turn, np.zeros((6, 6)), X_BC, cov_BC), **tight
+    )
+
+
+def test_a_lever_arm_turns_a_heading_error_into_a_sideways_error():
+    heading = covariance.from_sigmas((0.0, 0.0, 0.0), (0.0, 0.0, 0.01))
+    found = covariance.compose(Pose.identity(), heading, Pose((10.0, 0.0, 0.0)), np.zeros((6, 6)))
+    assert np.sqrt(np.diag(found)) == pytest.approx([0, 0.1, 0, 0, 0, 0.01])
+    assert found[1, 5] == pytest.approx(0.1 * 0.01)
+
+
+def test_transformations_carry_it_along():
+    X_AB, X_BC = PLACES["ordinary"]
+    cov_AB, cov_BC = some_covariance(1), some_covariance(2)
+    ab, bc = Transformation("b:b", "a:a", X_AB, cov_AB), Transformation("c:c", "b:b", X_BC, cov_BC)
+    np.testing.assert_allclose((ab @ bc).covariance, covariance.compose(X_AB, cov_AB, X_BC, cov_BC))
+    np.testing.assert_allclose(ab.inverse().covariance, covariance.invert(X_AB, cov_AB))
+    assert (ab @ Transformation("c:c", "b:b", X_BC)).covariance is None
+    assert Transformation("c:c", "b:b", X_BC).inverse().covariance is None

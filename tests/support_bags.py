@@ -1,0 +1,152 @@
+"""Small ROS bags, written for a test."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TYPES = {
+    "fix": "sensor_msgs/msg/NavSatFix",
+    "imu": "sensor_msgs/msg/Imu",
+    "odom": "nav_msgs/msg/Odometry",
+    "joints": "sensor_msgs/msg/JointState",
+    "text": "std_msgs/msg/String",
+}
+
+START_NS = 1_700_000_000_000_000_000
+
+
+class Ros:
+    """Makes messages of one version of ROS, and writes them into a bag."""
+
+    def __init__(self, version: int = 1):
+        from rosbags.typesys import Stores, get_typestore
+
+        self.version = version
+        self.store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+
+    def of(self, type_name: str, /, **fields: Any) -> Any:
+        return self.store.types[type_name](**fields)
+
+    def header(self, stamp_ns: int) -> Any:
+        time = self.of("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        more = {"seq": 0} if self.version == 1 else {}
+        return self.of("std_msgs/msg/Header", stamp=time, frame_id="x", **more)
+
+    def vector(self, values: Sequence[float], name: str = "Vector3") -> Any:
+        return self.of(f"geometry_msgs/msg/{name}", **dict(zip("xyz", map(float, values), strict=True)))
+
+    def quaternion(self, wxyz: Sequence[float]) -> Any:
+        return self.of("geometry_msgs/msg/Quaternion", **dict(zip("wxyz", map(float, wxyz), strict=True)))
+
+    def fix(
+        self,
+        stamp_ns: int = START_NS,
+        place: tuple[float, float, float] = (42.0, -71.0, -20.0),
+        status: int = 1,
+        covariance: Sequence[float] = (0.81, 0, 0, 0, 0.81, 0, 0, 0, 3.24),
+        covariance_type: int = 1,
+    ) -> Any:
+        state = self.of("sensor_msgs/msg/NavSatStatus", status=status, service=1)
+        return self.of(
+            TYPES["fix"],
+            header=self.header(stamp_ns),
+            status=state,
+            latitude=place[0],
+            longitude=place[1],
+            altitude=place[2],
+            position_covariance=np.array(covariance, float),
+            position_covariance_type=covariance_type,
+        )
+
+    def imu(
+        self,
+        stamp_ns: int = START_NS,
+        rate: Sequence[float] = (0.0, 0.1, 0.0),
+        force: Sequence[float] = (0.0, 9.81, 0.0),
+        wxyz: Sequence[float] = (1, 0, 0, 0),
+        first_covariances: Sequence[float] = (1.0, 1.0, 1.0),
+    ) -> Any:
+        """Return an Imu; the first covariances are those of orientation, rate and force."""
+
+        def covariance(first: float) -> Any:
+            return np.array([first, 0, 0, 0, 1, 0, 0, 0, 1], float)
+
+        orientation, turn, push = map(covariance, first_covariances)
+        return self.of(
+            TYPES["imu"],
+            header=self.header(stamp_ns),
+            orientation=self.quaternion(wxyz),
+            orientation_covariance=orientation,
+            angular_velocity=self.vector(rate),
+            angular_velocity_covariance=turn,
+            linear_acceleration=self.vector(force),
+            linear_acceleration_covariance=push,
+        )
+
+    def odom(
+        self,
+        stamp_ns: int = START_NS,
+        place: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        yaw: float = 0.0,
+        speed: float = 0.0,
+        turn: float = 0.0,
+        sideways: float = 0.0,
+        variances: tuple[float, float] = (0.0, 0.0),
+    ) -> Any:
+        covariance = np.zeros(36)
+        covariance[0], covariance[35] = variances
+        pose = self.of(
+            "geometry_msgs/msg/Pose",
+            position=self.vector(place, "Point"),
+            orientation=self.quaternion((np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))),
+        )
+        twist = self.of(
+            "geometry_msgs/msg/Twist",
+            linear=self.vector((speed, sideways, 0.0)),
+            angular=self.vector((0.0, 0.0, turn)),
+        )
+        return self.of(
+            TYPES["odom"],
+            header=self.header(stamp_ns),
+            child_frame_id="base_link",
+            pose=self.of("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance),
+            twist=self.of("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=covariance),
+        )
+
+    def joints(self, stamp_ns: int, names: list[str], position: list[float], velocity: list[float]) -> Any:
+        return self.of(
+            TYPES["joints"],
+            header=self.header(stamp_ns),
+            name=names,
+            position=np.array(position, float),
+            velocity=np.array(velocity, float),
+            effort=np.array([], float),
+        )
+
+    def text(self, words: str) -> Any:
+        return self.of(TYPES["text"], data=words)
+
+    def write(self, path: Path, messages: Iterable[tuple[str, int, Any]]) -> Path:
+        """Write a bag of messages: topic, time of reception in nanoseconds, message. Returns its path."""
+        if self.version == 1:
+            from rosbags.rosbag1 import Writer as Writer1
+
+            writer: Any = Writer1(path)
+            serialize = self.store.serialize_ros1
+        else:
+            from rosbags.rosbag2 import Writer as Writer2
+
+            writer = Writer2(path, version=9)
+            serialize = self.store.serialize_cdr
+        with writer:
+            topics: dict[str, Any] = {}
+            for topic, received_ns, message in messages:
+                kind = message.__msgtype__
+                if topic not in topics:
+                    topics[topic] = writer.add_connection(topic, kind, typestore=self.store)
+                writer.write(topics[topic], received_ns, serialize(message, kind))
+        return path

@@ -1,0 +1,178 @@
+"""Values of every wire type, and their comparison, for tests of the codec."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from modelserver.errors import Status
+from modelserver.messages import (
+    ChannelHealth,
+    Direction,
+    FixType,
+    GetBodyFrameList,
+    GetBodyList,
+    GetHistory,
+    GetHTransform,
+    GetStateVector,
+    GetTransformation,
+    GpsSample,
+    Health,
+    HistoryReply,
+    ImuSample,
+    Invalid,
+    JointSample,
+    JointsSample,
+    NameListReply,
+    OrientationReference,
+    Origin,
+    Policy,
+    PoseAnswer,
+    Quality,
+    ReplyHeader,
+    RequestHeader,
+    SensorHeader,
+    StateVectorReply,
+    TimeQuery,
+    TransformReply,
+    WheelSample,
+    WheelsSample,
+    YawSource,
+)
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.transformation import Transformation
+
+UTIME = 1_700_000_000_123_456
+_SENSOR = SensorHeader(UTIME, "front", 7, UTIME + 900, 123_456, 1e-4)
+_REQUEST = RequestHeader(-(1 << 63), "REPLY_TEST")
+_OK = ReplyHeader((1 << 63) - 1, UTIME, model_revision="ab12")
+_UNKNOWN = ReplyHeader(1, UTIME, Status.UNKNOWN_FRAME, "no frame 'Raptor:GC'", ("Raptor:CG", "Räptor:CG"), "ab12")
+_TIME = TimeQuery(UTIME, Policy.PREDICTED, 250)
+_NINE = (1.0, 0.1, 0.2, 0.1, 2.0, 0.3, 0.2, 0.3, 3.0)
+
+
+def answer(epoch: int = 3) -> PoseAnswer:
+    """Return a pose with all that can stand beside it."""
+    return PoseAnswer(
+        Transformation(
+            "Raptor:CG",
+            "World:UTM",
+            Pose.from_rpy((12.5, -3.25, 1.0), 0.01, -0.02, 2.5),
+            np.arange(36.0).reshape(6, 6),
+            UTIME,
+            int(Invalid.STALE_GPS | Invalid.CLOCK_STEPPED),
+            epoch,
+            -77,
+            "ab12",
+        ),
+        Origin(445_000.5, 5_030_000.25, 71.5, 18, True, -77),
+        Quality.PREDICTED | Quality.REVERSING,
+        1.5,
+        0.05,
+        12.0,
+    )
+
+
+def bare_answer() -> PoseAnswer:
+    """Return a pose that does not change, with nothing beside it."""
+    return PoseAnswer(Transformation("Camera:Image", "Raptor:CG", Pose((0.299, -0.056, 0.433))))
+
+
+EXAMPLES: dict[str, tuple[Any, ...]] = {
+    "gps_t": (
+        GpsSample(_SENSOR, FixType.NONE, math.nan, math.nan),
+        GpsSample(
+            _SENSOR, FixType.RTK_FIXED, 45.5, -75.25, 71.5, 105.5, -34.0, 12, 0.8, 1.1, 1.4, _NINE, (1.0, -2.0, 0.5),
+            _NINE, 0.05, 2.25, 0.1, -1.5, 0.02, 3.0, 0.01,
+        ),
+    ),
+    "imu_t": (
+        ImuSample(_SENSOR),
+        ImuSample(
+            _SENSOR, (0.1, 0.2, 0.3), (0.0, 0.0, 9.81), (1e-5, 2e-5, -4e-5), (1.0, 0.0, 0.0, 0.0),
+            OrientationReference.NED, YawSource.MAGNETIC, _NINE, _NINE, _NINE, 36.5,
+        ),
+        # all zeros is a measurement, not silence
+        ImuSample(_SENSOR, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    ),
+    "wheels_t": (
+        WheelsSample(_SENSOR, ()),
+        WheelsSample(
+            _SENSOR,
+            (WheelSample("left", 10.5, 0.1, -1.0, 0.05, Direction.BACKWARD, 0.3), WheelSample("right")),
+        ),
+    ),
+    "joints_t": (
+        JointsSample(_SENSOR, ()),
+        JointsSample(_SENSOR, (JointSample("nod", -0.336, 0.001, 1.5, 0.1), JointSample("boom", 0.25))),
+    ),
+    "get_transformation_request_t": (
+        GetTransformation(_REQUEST, "Raptor:CG", "World:UTM"),
+        GetTransformation(_REQUEST, "", "Räptor:CG", _TIME),
+    ),
+    "get_body_list_request_t": (GetBodyList(_REQUEST), GetBodyList(RequestHeader(0, ""))),
+    "get_body_frame_list_request_t": (GetBodyFrameList(_REQUEST, "Raptor"), GetBodyFrameList(_REQUEST, "")),
+    "get_state_vector_request_t": (GetStateVector(_REQUEST), GetStateVector(_REQUEST, _TIME)),
+    "get_h_transform_request_t": (GetHTransform(_REQUEST), GetHTransform(_REQUEST, True, _TIME)),
+    "get_history_request_t": (GetHistory(_REQUEST, UTIME, UTIME + 1_000_000, 10.0),),
+    "get_transformation_reply_t": (
+        TransformReply(_UNKNOWN),
+        TransformReply(_OK, answer()),
+        TransformReply(_OK, bare_answer()),
+    ),
+    "get_state_vector_reply_t": (StateVectorReply(_UNKNOWN), StateVectorReply(_OK, answer())),
+    "name_list_reply_t": (NameListReply(_UNKNOWN), NameListReply(_OK, ("Raptor", "Camera"), ("the vehicle", ""))),
+    "get_history_reply_t": (
+        HistoryReply(_UNKNOWN),
+        HistoryReply(_OK, (answer(1), answer(2), bare_answer())),
+    ),
+    "health_t": (
+        Health(
+            UTIME, 0.5, "0.1.0", "raptor", "ab12", 0, Invalid.NO_FIX | Invalid.NO_IMU, 0, 0, 0, 0, 0, 0, 0,
+            math.nan, math.nan,
+        ),
+        Health(
+            UTIME, 99.5, "0.1.0", "raptor", "ab12", 1, Invalid(0), 2, -77, 4950, 12, 1, 3, 1, 1e-4, 2e-3,
+            (ChannelHealth("GPS", 99, 1.0, 0.4), ChannelHealth("IMU", 0, 0.0, math.nan)),
+            (("GPS", "truncated", 4), ("sensor:gps", "stale", 1)),
+        ),
+    ),
+    "pose_transform_t": (answer(), bare_answer()),
+    "pose_vector_t": (answer(), bare_answer()),
+}  # fmt: skip
+"""Values of each type: with everything that can be left out left out, and with everything given."""
+
+
+def same(left: Any, right: Any) -> bool:
+    """Return whether two values of the core are equal; nan equals nan, rotations are compared to 1e-12."""
+    if isinstance(left, Transformation):
+        return (
+            isinstance(right, Transformation)
+            and left.pose.is_close(right.pose, 0.0, 1e-12)
+            and (left.covariance is None) == (right.covariance is None)
+            and (left.covariance is None or np.array_equal(left.covariance, right.covariance, equal_nan=True))
+            and all(
+                getattr(left, name) == getattr(right, name)
+                for name in (
+                    "frame_of_interest",
+                    "frame_of_reference",
+                    "utime",
+                    "invalid_reasons",
+                    "pose_epoch",
+                    "origin_id",
+                    "model_revision",
+                )
+            )
+        )
+    if type(left) is not type(right):
+        return False
+    if dataclasses.is_dataclass(left):
+        return all(same(getattr(left, each.name), getattr(right, each.name)) for each in dataclasses.fields(left))
+    if isinstance(left, tuple):
+        return len(left) == len(right) and all(map(same, left, right))
+    if isinstance(left, float):
+        return left == right or (math.isnan(left) and math.isnan(right))
+    return bool(left == right)

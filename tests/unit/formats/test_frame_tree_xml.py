@@ -1,0 +1,157 @@
+"""Miro frame-tree XML: grouping into bodies, variables, duplicates."""
+
+import math
+
+import pytest
+from support_formats import line_of, only_problem, problems_of, read, tree, tree_frame
+
+from modelserver.errors import Severity
+from modelserver.spatial import Pose
+
+ROVER = tree(
+    tree_frame("Rover"),
+    tree_frame("Mast", "Rover", Z="-1.2", Yaw="90"),
+    tree_frame("Camera", "Mast", X="0.1", Pitch="-10"),
+    tree_frame("Antenna", "Rover", Y="0.3"),
+)
+
+
+@pytest.fixture(autouse=True)
+def _no_rover_name(monkeypatch):
+    monkeypatch.delenv("MRN", raising=False)
+
+
+def test_roots_and_frames_that_carry_others_are_bodies_and_leaves_are_their_frames():
+    model = read(ROVER)
+    assert model.get_body_list() == ["Rover", "Mast"]
+    assert model.get_body_frame_list("Rover") == ["Origin", "Mast", "Antenna"]
+    assert model.get_body_frame_list("Mast") == ["Origin", "Camera"]
+    (joint,) = model.constraints
+    assert (joint.name, joint.from_, joint.to) == ("MastFixed", "Rover:Mast", "Mast:Origin")
+    assert joint.pose == Pose.identity()
+    assert model.problems == ()
+
+
+def test_angles_are_degrees_about_fixed_axes_and_what_is_left_out_is_0():
+    model = read(ROVER)
+    found = model.get_transformation("Mast:Camera", "Rover:Origin")
+    expected = Pose.from_rpy((0, 0, -1.2), yaw=math.radians(90)) @ Pose.from_rpy((0.1, 0, 0), pitch=math.radians(-10))
+    assert found.pose.is_close(expected, 1e-15, 1e-15)
+    turned = read(tree(tree_frame("A"), tree_frame("B", "A", Roll="30", Pitch="20", Yaw="10"))).frame("A:B").pose
+    assert turned.rpy == pytest.approx([math.radians(30), math.radians(20), math.radians(10)], abs=1e-15)
+
+
+def test_a_root_is_first_though_its_child_stands_before_it():
+    model = read(tree(tree_frame("Leaf", "Mast"), tree_frame("Mast", "Rover"), tree_frame("Rover")))
+    assert model.root.name == "Rover"
+
+
+def test_several_roots_load_and_the_others_are_orphans():
+    problem = only_problem(tree(tree_frame("A"), tree_frame("B")), Severity.WARNING)
+    assert "B is an orphan" in problem.message
+
+
+def test_a_variable_comes_from_the_option_before_the_environment(monkeypatch):
+    text = ROVER.replace("Rover", "$MRN")
+    monkeypatch.setenv("MRN", "FromEnvironment")
+    assert read(text).root.name == "FromEnvironment"
+    assert read(text, variables={"MRN": "K11"}).root.name == "K11"
+    assert read(text.replace("$MRN", "${MRN}x"), variables={"MRN": "K11"}).root.name == "K11x"
+
+
+def test_an_undefined_variable_in_names_is_one_warning_and_stays_as_written():
+    text = ROVER.replace("Rover", "$MRN")
+    problem = only_problem(text, Severity.WARNING)
+    assert problem.line == line_of(text, "$MRN")
+    assert "used 3 times" in problem.message
+    assert "--set MRN=NAME" in problem.fix
+    assert read(text).get_transformation("Mast:Camera", "$MRN:Origin")
+    near = only_problem(text, Severity.WARNING, variables={"MNR": "K11"})
+    assert near.nearest == ("MNR",)
+
+
+def test_an_undefined_variable_in_a_number_is_an_error():
+    text = ROVER.replace('value="0.3"', 'value="$WIDTH"')
+    problem = only_problem(text)
+    assert problem.element == "frame Antenna, Y"
+    assert problem.line == line_of(text, "$WIDTH")
+    assert "--set WIDTH=NUMBER" in problem.fix
+    assert read(text, variables={"WIDTH": "0.25"}).frame("Rover:Antenna").pose.xyz == (0.0, 0.25, 0.0)
+
+
+def test_a_frame_twice_keeps_the_first_and_says_how_far_apart_they_are():
+    text = ROVER.replace("</section>", tree_frame("Camera", "Mast", X="0.6", Pitch="-13") + "</section>")
+    problem = only_problem(text, Severity.WARNING)
+    lines = [number for number, line in enumerate(text.split("\n"), 1) if 'name="Camera"' in line]
+    assert problem.line == lines[1]
+    assert f"on line {lines[0]} and on line {lines[1]}" in problem.message
+    assert "0.5 m and 3 deg apart" in problem.message
+    assert "the first stands" in problem.message
+    assert read(text).frame("Mast:Camera").pose.xyz == (0.1, 0.0, 0.0)
+
+
+def test_a_missing_parent_offers_the_nearest():
+    text = ROVER.replace('value="Mast" name="Parent"', 'value="Mats" name="Parent"')
+    problem = only_problem(text)
+    assert problem.nearest == ("Mast",)
+    assert problem.fix == "write Mast"
+    assert problem.element == "frame Camera, Parent"
+    assert problem.line == line_of(text, "Mats")
+
+
+def test_parents_in_a_circle_are_an_error_that_lists_them():
+    text = tree(tree_frame("A"), tree_frame("B", "D"), tree_frame("C", "B"), tree_frame("D", "C"), tree_frame("E", "D"))
+    problem = only_problem(text)
+    assert "B in D in C in B" in problem.message
+    assert "outside the circle" in problem.fix
+    assert "A in A" in only_problem(tree(tree_frame("A", "A"))).message
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        ("ten", "X: 'ten' is not a number"),
+        ("", "X: '' is not a number"),
+        ("nan", "not a finite number"),
+        ("1 2", "not a number"),
+    ],
+)
+def test_a_bad_number_is_named_with_its_line(value, said):
+    text = ROVER.replace('value="0.1"', f'value="{value}"')
+    problem = only_problem(text)
+    assert said in problem.message
+    assert problem.element == "frame Camera, X"
+    assert problem.line == line_of(text, f'"{value}" name="X"')
+    assert "metres" in problem.fix
+
+
+def test_an_unknown_parameter_is_a_warning_with_the_nearest():
+    problem = only_problem(ROVER.replace('name="Pitch"', 'name="Pich"'), Severity.WARNING)
+    assert problem.nearest == ("Pitch",)
+
+
+def test_a_name_that_disagrees_with_its_instance_is_a_warning():
+    text = ROVER.replace('value="-1.2" name="Z"', 'value="Pole" name="Name"').replace(
+        'value="0.1" name="X"', 'value="Camera" name="Name"'
+    )
+    problem = only_problem(text, Severity.WARNING)
+    assert "Mast stands" in problem.message
+    assert problem.element == "frame Mast, Name"
+
+
+def test_a_child_named_origin_is_an_error():
+    assert "named Origin" in only_problem(ROVER.replace("Camera", "Origin")).message
+
+
+def test_instances_of_other_types_are_noted_and_other_frames_warned_of():
+    extra = (
+        '<instance type="rapid::CameraParameters" name="x"/><instance type="rapid::FrameMatrixParameters" name="y"/>'
+    )
+    found = problems_of(ROVER.replace("</section>", extra + "</section>"))
+    assert [problem.severity for problem in found] == [Severity.NOTE, Severity.WARNING]
+
+
+def test_a_chain_of_thousands_of_frames_needs_no_recursion():
+    frames = [tree_frame("F0"), *(tree_frame(f"F{n}", f"F{n - 1}", X="1") for n in range(1, 3000))]
+    model = read(tree(*frames))
+    assert model.get_transformation("F2998:F2999", "F0:Origin").pose.xyz == (2999.0, 0.0, 0.0)

@@ -1,0 +1,326 @@
+"""Every rule of a model (report 4.5), the place each breach is reported at, and what the 2005 server would do."""
+
+from __future__ import annotations
+
+import pytest
+
+from modelserver.errors import GeometryError, Severity, Source
+from modelserver.geometry import BodyFrame, ModelBuilder
+from modelserver.spatial import Pose
+
+
+def at(line):
+    return Source("cart.xml", line, f"element {line}")
+
+
+def cart():
+    """Return a good builder of Cart, Mast and Camera in a row, with a place for each thing."""
+    builder = ModelBuilder("cart")
+    builder.body("Cart", source=at(1)).frame("Origin", source=at(2)).frame("Top", Pose((0, 0, 1)), source=at(3))
+    builder.body("Mast", source=at(4)).frame("Foot", source=at(5)).frame("Head", Pose((0, 0, 2)), source=at(6))
+    builder.body("Camera", source=at(7)).frame("Mount", source=at(8)).frame("Lens", Pose((0.1, 0, 0)), source=at(9))
+    builder.constraint("MastFixed", "Cart:Top", "Mast:Foot", source=at(10))
+    builder.constraint("CameraFixed", "Mast:Head", "Camera:Mount", source=at(11))
+    return builder
+
+
+def one_error(builder):
+    with pytest.raises(GeometryError) as caught:
+        builder.build()
+    (problem,) = [each for each in caught.value.problems if each.severity is Severity.ERROR]
+    assert problem.message in str(caught.value)
+    assert problem.fix
+    return problem
+
+
+def one_warning(model):
+    (problem,) = model.problems
+    assert problem.severity is Severity.WARNING
+    assert problem.fix
+    return problem
+
+
+def test_a_good_model_has_no_problems_and_answers():
+    model = cart().build()
+    assert model.problems == ()
+    assert model.root.name == "Cart"
+    assert model.get_body_list() == ["Cart", "Mast", "Camera"]
+    assert model.get_body_frame_list("Camera") == ["Mount", "Lens"]
+    assert model.get_transformation("Camera:Lens", "Cart:Origin").pose == Pose((0.1, 0, 3))
+
+
+def test_no_body_at_all():
+    assert "no body" in one_error(ModelBuilder()).message
+    with pytest.raises(GeometryError, match="no body"):
+        ModelBuilder().build(repair=True)
+
+
+def test_one_body_is_worth_a_warning():
+    builder = ModelBuilder()
+    builder.body("Only", source=at(4)).frame("Origin")
+    problem = one_warning(builder.build())
+    assert "one body, Only" in problem.message
+    assert problem.line == 4
+
+
+def test_a_body_without_a_frame():
+    builder = cart()
+    builder.body("Bare", source=at(20))
+    problem = one_error(builder)
+    assert "body 'Bare' has no frame" in problem.message
+    assert (problem.file, problem.line, problem.element) == ("cart.xml", 20, "element 20")
+    model = builder.build(repair=True)
+    assert model.get_body_list() == ["Cart", "Mast", "Camera"]
+    assert one_warning(model).message.endswith("removed")
+
+
+def test_two_bodies_of_one_name_say_both_places():
+    builder = cart()
+    builder.body("Mast", source=at(20)).frame("Other")
+    problem = one_error(builder)
+    assert problem.message == "body 'Mast' is defined twice (first at cart.xml:4 (element 4))"
+    assert problem.line == 20
+    model = builder.build(repair=True)
+    assert model.get_body_frame_list("Mast") == ["Foot", "Head"]
+    assert one_warning(model).line == 20
+
+
+def test_two_frames_of_one_name_say_both_places():
+    builder = cart()
+    builder._bodies[1].frame("Head", Pose((9, 9, 9)), source=at(20))
+    problem = one_error(builder)
+    assert problem.message == "frame 'Head' of body 'Mast' is defined twice (first at cart.xml:6 (element 6))"
+    assert problem.line == 20
+    assert builder.build(repair=True).frame("Mast:Head").pose == Pose((0, 0, 2))
+
+
+def test_two_constraints_of_one_name_say_both_places():
+    builder = cart()
+    builder.constraint("MastFixed", "Camera:Lens", "Cart:Origin", source=at(20))
+    problem = one_error(builder)
+    assert problem.message == "constraint 'MastFixed' is defined twice (first at cart.xml:10 (element 10))"
+    assert problem.line == 20
+    assert len(builder.build(repair=True).constraints) == 2
+
+
+@pytest.mark.parametrize(
+    ("from_", "to", "said", "nearest"),
+    [
+        ("Cart:Orgin", "Camera:Lens", "From names frame 'Orgin', which body Cart does not have", ("Cart:Origin",)),
+        ("Cart:Origin", "Camra:Lens", "To names body 'Camra', which does not exist", ("Camera:Lens",)),
+        ("Cart:Origin", "Camra:Lenz", "To names body 'Camra', which does not exist", ("Camera",)),
+        ("CartOrigin", "Camera:Lens", "From 'CartOrigin' is not of the form Body:Frame", ("Cart:Origin",)),
+        ("", "Camera:Lens", "From '' is not of the form Body:Frame", ()),
+        (":", "Camera:Lens", "From ':' is not of the form Body:Frame", ()),
+        ("Cart:", "Camera:Lens", "From 'Cart:' is not of the form Body:Frame", ()),
+        (":Origin", "Camera:Lens", "From ':Origin' is not of the form Body:Frame", ()),
+        ("Cart:Origin:x", "Camera:Lens", "From 'Cart:Origin:x' is not of the form Body:Frame", ("Cart:Origin",)),
+        ("cart:Origin", "Camera:Lens", "From names body 'cart', which does not exist", ("Cart:Origin",)),
+    ],
+)
+def test_a_constraint_end_that_does_not_exist_is_named_with_the_nearest(from_, to, said, nearest):
+    builder = cart()
+    builder.constraint("Extra", from_, to, source=at(20))
+    problem = one_error(builder)
+    assert problem.message == f"constraint 'Extra': {said}"
+    assert problem.line == 20
+    assert problem.nearest[: len(nearest)] == nearest
+    if nearest:
+        assert problem.fix == f"write {nearest[0]}"
+        assert nearest[0] in str(problem)
+    repaired = builder.build(repair=True)
+    assert [each.name for each in repaired.constraints] == ["MastFixed", "CameraFixed"]
+    assert one_warning(repaired).message.endswith("; removed")
+
+
+def test_both_wrong_ends_are_reported_at_once():
+    builder = cart()
+    builder.constraint("Extra", "Cart:Nope", "Nobody:x", source=at(20))
+    with pytest.raises(GeometryError) as caught:
+        builder.build()
+    assert [("From" in each.message, "To" in each.message) for each in caught.value.problems] == [
+        (True, False),
+        (False, True),
+    ]
+
+
+def test_from_equals_to():
+    builder = cart()
+    builder.constraint("Extra", "Camera:Lens", "Camera:Lens", source=at(20))
+    problem = one_error(builder)
+    assert problem.message == "constraint 'Extra': From equals To (Camera:Lens)"
+    assert problem.line == 20
+
+
+def test_a_constraint_inside_one_body():
+    builder = cart()
+    builder.constraint("Extra", "Camera:Lens", "Camera:Mount", source=at(20))
+    assert "joins two frames of one body, Camera:Lens and Camera:Mount" in one_error(builder).message
+    assert len(builder.build(repair=True).constraints) == 2
+
+
+def test_a_second_constraint_on_a_frame_says_where_the_first_is():
+    builder = cart()
+    builder.constraint("Extra", "Cart:Origin", "Camera:Mount", source=at(20))
+    problem = one_error(builder)
+    assert problem.message == (
+        "constraint 'Extra': frame Camera:Mount already has constraint CameraFixed "
+        "(first at cart.xml:11 (element 11)); a frame has one at most"
+    )
+    assert problem.line == 20
+    assert [each.name for each in builder.build(repair=True).constraints] == ["MastFixed", "CameraFixed"]
+
+
+def test_a_name_that_a_broken_constraint_took_is_not_free():
+    builder = cart()
+    builder.constraint("Extra", "Cart:Nope", "Camera:Lens", source=at(20))
+    builder.constraint("Extra", "Cart:Origin", "Camera:Lens", source=at(21))
+    with pytest.raises(GeometryError) as caught:
+        builder.build()
+    assert [each.line for each in caught.value.problems] == [20, 21]
+
+
+@pytest.mark.parametrize("name", ["World", "Odom"])
+def test_the_services_own_bodies_are_refused(name):
+    builder = cart()
+    builder.body(name, source=at(20)).frame("Origin")
+    assert "keeps this name" in one_error(builder).message
+
+
+def test_orphans_are_warned_of_and_answer_inside_their_assembly():
+    builder = cart()
+    builder.body("Trailer", source=at(20)).frame("Hitch").frame("Bed", Pose((-1, 0, 0)))
+    builder.body("Crate", source=at(21)).frame("Bottom")
+    builder.constraint("CrateFixed", "Trailer:Bed", "Crate:Bottom", source=at(22))
+    model = builder.build()
+    assert [(each.severity, each.line) for each in model.problems] == [(Severity.WARNING, 20), (Severity.WARNING, 21)]
+    assert "body Trailer is an orphan" in model.problems[0].message
+    assert "answers only inside its own assembly" in model.problems[0].message
+    assert model.assemblies == (("Cart", "Mast", "Camera"), ("Trailer", "Crate"))
+    assert model.get_transformation("Crate:Bottom", "Trailer:Hitch").pose == Pose((-1, 0, 0))
+
+
+def test_repair_does_what_the_2005_server_did():
+    builder = cart()
+    builder.body("Trailer", source=at(20)).frame("Hitch").frame("Bed")
+    builder.body("Crate", source=at(21)).frame("Bottom")
+    builder.constraint("CrateFixed", "Trailer:Bed", "Crate:Bottom", source=at(22))
+    builder.constraint("Broken", "Cart:Nope", "Crate:Bottom", source=at(23))
+    builder.constraint("Second", "Cart:Top", "Crate:Bottom", source=at(24))
+    model = builder.build(repair=True)
+    assert model.get_body_list() == ["Cart", "Mast", "Camera"]
+    assert [each.name for each in model.constraints] == ["MastFixed", "CameraFixed"]
+    assert {each.severity for each in model.problems} == {Severity.WARNING}
+    assert all(each.message.endswith("removed") for each in model.problems)
+    # in the order of the file; the second constraint breaks the rule at both its ends
+    assert [each.line for each in model.problems] == [20, 21, 23, 24, 24]
+
+
+def test_a_repaired_model_is_a_good_one():
+    builder = cart()
+    builder.body("Trailer").frame("Hitch")
+    builder.constraint("Broken", "Cart:Nope", "Trailer:Hitch")
+    repaired = builder.build(repair=True)
+    assert repaired.revision == cart().build().revision
+
+
+def test_errors_met_while_reading_come_first_by_line_and_stop_the_build():
+    builder = cart()
+    builder.error("row 2 has 3 numbers", at(9), "write 4")
+    builder.warning("rotation mended", at(3))
+    builder.constraint("Extra", "Camera:Lens", "Camera:Lens", source=at(5))
+    with pytest.raises(GeometryError) as caught:
+        builder.build()
+    assert [each.line for each in caught.value.problems] == [3, 5, 9]
+    assert "rotation mended" not in str(caught.value)
+    with pytest.raises(GeometryError):
+        builder.build(repair=True)
+
+
+def test_what_a_broken_constraint_leaves_unconnected_is_not_complained_of():
+    builder = ModelBuilder()
+    builder.body("A").frame("a")
+    builder.body("B").frame("b")
+    builder.constraint("AB", "A:a", "B:wrong")
+    assert "B:wrong" not in one_error(builder).message
+
+
+def test_building_twice_gives_the_same():
+    builder = cart()
+    builder.body("Lonely").frame("x")
+    first, second = builder.build(), builder.build()
+    assert first.problems == second.problems
+    assert first.revision == second.revision
+
+
+def loop(miss):
+    """Return a triangle of bodies whose last constraint misses by `miss`."""
+    builder = ModelBuilder()
+    for name in "ABC":
+        builder.body(name).frame("in").frame("out", Pose.from_rpy((1, 0, 0), yaw=2.0943951023931953))
+    builder.constraint("AB", "A:out", "B:in")
+    builder.constraint("BC", "B:out", "C:in")
+    builder.constraint("CA", "C:out", "A:in", miss, source=at(30))
+    return builder
+
+
+def test_a_loop_that_closes_is_reported_as_exact():
+    model = loop(Pose()).build()
+    problem = one_warning(model)
+    # A reaches B and C each in one step, so it is the constraint between those two that is left over
+    assert problem.message.startswith("constraint BC closes a loop through C, A, B; it closes exactly")
+
+
+def test_a_loop_that_does_not_close_says_by_how_much():
+    model = loop(Pose.from_rpy((0.003, 0.004, 0.0), yaw=0.01)).build()
+    message = one_warning(model).message
+    assert "going round misses by" in message
+    millimetres = float(message.split("misses by ")[1].split(" mm")[0])
+    degrees = float(message.split(" mm and ")[1].split(" deg")[0])
+    assert degrees == pytest.approx(0.573, abs=1e-3)
+    assert 5 < millimetres < 25  # 5 mm, and what 0.01 rad makes of it over a metre or so
+    # the shortest path answers: A to C crosses CA alone
+    assert [each.constraint.name for each in model.find_path("C:in", "A:in")] == ["CA"]
+    assert model.get_transformation("C:out", "A:in").pose.is_close(
+        Pose.from_rpy((0.003, 0.004, 0.0), yaw=0.01).inverse(), 1e-12, 1e-12
+    )
+
+
+def test_two_constraints_between_two_bodies_are_a_loop_of_two():
+    builder = ModelBuilder()
+    builder.body("A").frame("a").frame("b", Pose((0, 1, 0)))
+    builder.body("B").frame("a").frame("b", Pose((0, 1.001, 0)))
+    builder.constraint("one", "A:a", "B:a")
+    builder.constraint("two", "A:b", "B:b", source=at(3))
+    problem = one_warning(builder.build())
+    assert problem.message.startswith("constraint two closes a loop through A, B; going round misses by 1 mm and 0 deg")
+    assert problem.line == 3
+
+
+def test_a_loop_beside_the_root_leaves_the_other_assemblies_their_fast_answers():
+    builder = loop(Pose((0.5, 0, 0)))
+    builder.body("X").frame("x")
+    builder.body("Y").frame("y")
+    builder.constraint("XY", "X:x", "Y:y", Pose((1, 0, 0)))
+    model = builder.build()
+    assert model._looped == {0}
+    assert model.get_transformation("Y:y", "X:x").pose == Pose((1, 0, 0))
+
+
+def test_inertia_of_another_shape_is_refused_with_the_body_named():
+    builder = cart()
+    builder.body("Odd", inertia=((1.0, 2.0),), source=at(20)).frame("x")
+    problem = one_error(builder)
+    assert "inertia of body Odd is not 6 rows of 6" in problem.message
+    assert problem.line == 20
+
+
+def test_a_draft_body_may_share_frames_with_another():
+    builder = ModelBuilder()
+    first = builder.body("One").frame("o").frame("x", Pose((1, 0, 0)))
+    second = builder.body("Two")
+    second.frames.extend(first.frames)
+    builder.constraint("12", "One:x", "Two:o")
+    model = builder.build()
+    assert isinstance(model.frame("Two:x"), BodyFrame)
+    assert model.get_transformation("Two:x", "One:x").pose == Pose((1, 0, 0))

@@ -1,0 +1,217 @@
+"""Errors say where and what to do, cross process borders, and cost a stranger's request little."""
+
+from __future__ import annotations
+
+import pickle
+import time
+
+import pytest
+from support_geometry import star
+
+from modelserver import errors
+from modelserver.errors import (
+    ConfigError,
+    GeometryError,
+    Problem,
+    QueryError,
+    Severity,
+    Source,
+    Status,
+    UnknownBodyError,
+    UnknownFrameError,
+    WireError,
+    error_for_status,
+    nearest_names,
+    shown,
+)
+from modelserver.geometry import ModelBuilder, names
+
+LONG = "x" * 60_000
+ODD = [
+    "",
+    " ",
+    ":",
+    "::",
+    "a:b:c",
+    "\n",
+    "\x00:\x1b[31m",
+    "a\u202eb:c",
+    "\ud800:x",
+    "é:ü",
+    "💥:💥",
+    "%s:{0}",
+    "'\"\\:x",
+    LONG,
+    f"{LONG}:{LONG}",
+]
+
+
+def test_a_problem_reads_as_one_line():
+    problem = Problem(
+        Severity.ERROR, "no body 'Camra'", Source("cart.xml", 12, "constraint C"), "write Camera", ("Camera",)
+    )
+    assert str(problem) == "cart.xml:12 (constraint C): error: no body 'Camra' Nearest: Camera. Fix: write Camera"
+    assert str(Problem(Severity.NOTE, "plain")) == "note: plain"
+    assert str(Source("", 0, "body A")) == "body A"
+    assert str(Source("", 7)) == "line 7"
+    assert str(Source("a.xml")) == "a.xml"
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ConfigError([Problem(Severity.ERROR, "wrong"), Problem(Severity.WARNING, "odd")]),
+        GeometryError([Problem(Severity.ERROR, "wrong", Source("a", 1, "b"), "fix", ("c",))]),
+        WireError("short", "too few bytes"),
+        UnknownBodyError("no body", ["A", "B"]),
+    ],
+)
+def test_errors_survive_pickling(error):
+    back = pickle.loads(pickle.dumps(error))
+    assert type(back) is type(error)
+    assert str(back) == str(error)
+    assert vars(back) == vars(error)
+
+
+def test_each_status_but_ok_has_one_error_class_that_carries_it():
+    for status in Status:
+        if status is not Status.OK:
+            error = error_for_status(status, "message", ["near"])
+            assert error.status is status
+            assert error.nearest == ("near",)
+    assert type(error_for_status(99, "from a newer server")) is errors.ServerError
+    every = {cls for cls in vars(errors).values() if isinstance(cls, type) and issubclass(cls, QueryError)}
+    assert {type(error_for_status(status, "")) for status in Status} == every - {QueryError}
+
+
+def test_nearest_names_finds_typing_mistakes_whatever_their_case():
+    known = ["Raptor:CG", "Digiclops:ImagePlane", "FLEA:Origin", "FrontNoddingSICK:Origin"]
+    for typed in ("Digiclops:ImagePlan", "digiclops:imageplane", "Digiclops:ImgaePlane", "DigiclopsImagePlane"):
+        assert nearest_names(typed, known)[0] == "Digiclops:ImagePlane"
+    assert nearest_names("FLEA:Orgin", known)[0] == "FLEA:Origin"
+    assert nearest_names("zzz", known) == ()
+    assert nearest_names("x", []) == nearest_names("", known) == nearest_names(LONG, known) == ()
+    assert len(nearest_names("aaaa", [f"aaa{letter}" for letter in "bcdefgh"], count=2)) == 2
+
+
+def test_nearest_names_keeps_its_quality_among_ten_thousand():
+    known = [f"Hub:Mount{number:05d}" for number in range(9_999)] + ["Hub:FrontRail"]
+    for typed, meant in (
+        ("Hub:Muont01234", "Hub:Mount01234"),
+        ("hub:mount04321", "Hub:Mount04321"),
+        ("HubMount07531", "Hub:Mount07531"),
+        ("Hub:FrontRial", "Hub:FrontRail"),
+        ("Hub:FrontRails", "Hub:FrontRail"),
+    ):
+        assert nearest_names(typed, known)[0] == meant
+
+
+@pytest.mark.parametrize(
+    "typed", ["Hub:Mount1234", "Device0012:Orgin", "H", "ab" * 50, "0" * 100, "Hub:Mount01" * 2, "x" * 101, LONG]
+)
+def test_a_strangers_mistyped_name_costs_little_among_ten_thousand(typed):
+    model = star(10_000).build() if not _star else _star[0]
+    _star[:] = [model]
+    everything = [f"{body.name}:{frame.name}" for body in model.bodies for frame in body]
+
+    def ask(name):
+        with pytest.raises(QueryError):
+            model.get_transformation(name, "Hub:Mount00001")
+
+    for call in (
+        lambda: nearest_names(typed, everything),
+        lambda: ask(typed),
+        lambda: ask(f"Hub:{typed}"),
+        lambda: ask(f"{typed}:Origin"),
+    ):
+        assert least_seconds(call) < 0.050
+
+
+_star: list = []
+
+
+def least_seconds(call, times=4):
+    spent = []
+    for _ in range(times):
+        start = time.perf_counter()
+        call()
+        spent.append(time.perf_counter() - start)
+    return min(spent)
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_odd_names_are_refused_in_a_short_message_fit_for_a_terminal_and_the_wire(name):
+    builder = ModelBuilder()
+    builder.body("A").frame("a")
+    builder.body("B").frame("b")
+    model = builder.build()
+    for call in (
+        lambda: model.get_transformation(name, "A:a"),
+        lambda: model.get_transformation("A:a", f"A:{name}"),
+        lambda: model.find_path(name, "A:a"),
+        lambda: model.body(name),
+        lambda: model.root.frame(name),
+        lambda: model.frame(name),
+    ):
+        with pytest.raises((UnknownBodyError, UnknownFrameError)) as caught:
+            call()
+        assert len(str(caught.value)) < 400
+        assert str(caught.value).isprintable()
+        str(caught.value).encode()
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_a_file_of_odd_names_gives_short_messages(name):
+    builder = ModelBuilder()
+    builder.body(name).frame(name)
+    builder.body("A").frame(name).frame("a")
+    builder.constraint(name, name, name)
+    builder.constraint("c", name, f"A:{name}")
+    _, problems = builder.check()
+    _, repaired = builder.check(repair=True)
+    for problem in problems + repaired:
+        assert len(str(problem)) < 1200, problem
+        str(problem).encode()
+
+
+def test_names_in_files():
+    for good in ("A", "Front_Nodding-SICK.2", "é", "x" * names.MAX_LENGTH):
+        assert names.fault(good) == ""
+    for bad, why in (
+        ("", "empty"),
+        ("a:b", "colon"),
+        ("a b", "white space"),
+        ("a\u00a0b", "white space"),
+        ("a\x00", "printable"),
+        ("a\u202e", "printable"),
+        ("x" * (names.MAX_LENGTH + 1), "at most 200"),
+    ):
+        assert why in names.fault(bad)
+
+
+def test_shown_is_quoted_escaped_and_cut():
+    assert shown("a\n") == r"'a\n'"
+    assert shown("x" * 100) == f"'{'x' * 80}'... (100 characters)"
+
+
+def test_a_file_in_which_everything_is_wrong_is_checked_in_time():
+    builder = star(4_000)
+    for number in range(2_000):
+        builder.constraint(f"Bad{number}", f"Hubb:Mount{number}", f"Hub:Mont{number}")
+    start = time.perf_counter()
+    _, problems = builder.check()
+    assert len(problems) == 4_000
+    assert time.perf_counter() - start < 5
+    assert max(len(str(problem)) for problem in problems) < 800
+
+
+def test_ten_thousand_orphans_are_sorted_out_in_time():
+    builder = ModelBuilder()
+    for number in range(5_000):
+        builder.body(f"A{number}").frame("x")
+        builder.body(f"B{number}").frame("x")
+        builder.constraint(f"C{number}", f"A{number}:x", f"B{number}:x")
+    start = time.perf_counter()
+    model = builder.build()
+    assert time.perf_counter() - start < 5
+    assert len(model.assemblies) == 5_000

@@ -1,0 +1,270 @@
+"""The architecture, enforced: imports point one way, and what is pure touches neither clock, bus, disk nor log."""
+
+from __future__ import annotations
+
+import ast
+import graphlib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+VALUES = {"errors", "version", "spatial"}
+GEOMETRY = VALUES | {"geometry"}
+POSES = VALUES | {"messages", "geodesy", "history"}
+CORE = GEOMETRY | POSES | {"localization", "platform"}
+WIRE = VALUES | {"messages", "wire", "mslcm"}
+SERVICE = CORE | WIRE | {"core", "config", "formats"}
+
+MAY_IMPORT: dict[str, set[str]] = {
+    "version": set(),
+    "errors": set(),
+    "spatial": {"errors"},
+    "geometry": VALUES,
+    "messages": VALUES,
+    "geodesy": VALUES | {"messages"},
+    "history": VALUES | {"messages"},
+    "formats": GEOMETRY,
+    "localization": GEOMETRY | POSES,
+    "platform": CORE,
+    "core": CORE,
+    "simulation": GEOMETRY | {"messages", "geodesy"},
+    "config": GEOMETRY | {"messages", "localization"},
+    "wire": WIRE,
+    "service": SERVICE,
+    "client": WIRE | GEOMETRY | {"formats", "history", "platform"},
+    "msdrivers.protocol": VALUES | {"messages"},
+    "msdrivers.emulate": WIRE | {"geodesy", "simulation", "msdrivers.protocol"},
+    "msdrivers": WIRE | {"geodesy", "msdrivers.protocol", "msdrivers.emulate"},
+    "mslcm": set(),
+    "mstools": SERVICE | {"service", "client", "simulation", "msdrivers", "msdrivers.protocol", "msdrivers.emulate"},
+    # the public names, loaded when they are first used
+    "modelserver": VALUES | {"geometry", "messages", "formats", "client", "config"},
+}
+"""Package -> packages it may import, besides itself. Anything in modelserver/ goes by its name inside it."""
+
+PURE = {
+    "errors",
+    "spatial",
+    "geometry",
+    "geodesy",
+    "localization",
+    "messages",
+    "history",
+    "platform",
+    "core",
+    "simulation",
+    "msdrivers.protocol",
+}
+
+IMPURE_MODULES = {
+    "asyncio", "concurrent", "ctypes", "fcntl", "glob", "http", "importlib", "io", "lcm", "logging", "mmap",
+    "multiprocessing", "os", "pathlib", "pymodbus", "can", "queue", "requests", "sched", "secrets", "select",
+    "selectors", "serial", "shutil", "signal", "socket", "sqlite3", "ssl", "subprocess", "sys", "syslog", "tempfile",
+    "termios", "threading", "time", "urllib", "uuid", "warnings",
+}  # fmt: skip
+"""A clock, a bus, a disk, a thread, a log, or another process."""
+
+IMPURE_CALLS = {"open", "print", "input", "exec", "eval", "breakpoint", "__import__"}
+
+CLOCK_READS = {"now", "utcnow", "today"}
+
+
+def sources() -> list[Path]:
+    found = [path for folder in ("modelserver", "drivers", "tools") for path in (ROOT / folder).rglob("*.py")]
+    assert found, f"no source under {ROOT}"
+    return sorted(found)
+
+
+def module_of(path: Path) -> str:
+    """Return the dotted name that a file is imported by."""
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    if parts[0] in ("drivers", "tools"):
+        parts = parts[1:]
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def package_of(module: str) -> str:
+    """Return the key of MAY_IMPORT that a module of this project belongs to, empty for a foreign one."""
+    parts = module.split(".")
+    if parts[0] == "modelserver":
+        return parts[1] if len(parts) > 1 else "modelserver"
+    if parts[0] == "msdrivers" and parts[1:2] and f"msdrivers.{parts[1]}" in MAY_IMPORT:
+        return f"msdrivers.{parts[1]}"
+    return parts[0] if parts[0] in MAY_IMPORT else ""
+
+
+def imported(tree: ast.AST, module: str, is_package: bool) -> list[tuple[int, str]]:
+    """Return line and dotted name of everything imported, inside functions and TYPE_CHECKING blocks too."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [(node.lineno, alias.name) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                above = module.split(".")[: None if is_package and node.level == 1 else -node.level + is_package]
+                base = ".".join([*above, base] if base else above)
+            # `from modelserver import core` imports the module core; names of deeper modules stay in their package
+            found += [(node.lineno, f"{base}.{alias.name}") for alias in node.names]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module") and node.args:
+            first = node.args[0]
+            if isinstance(first, ast.Constant) and isinstance(first.value, str):
+                found.append((node.lineno, first.value))
+    return found
+
+
+def misdirected(tree: ast.AST, module: str, is_package: bool) -> list[tuple[int, str]]:
+    package = package_of(module)
+    if not package:
+        return []  # a script beside the packages
+    if package not in MAY_IMPORT:
+        return [
+            (1, f"package {package} is not in the table MAY_IMPORT of {Path(__file__).name}: give it its place there")
+        ]
+    allowed = MAY_IMPORT[package] | {package}
+    wrong = []
+    for line, name in imported(tree, module, is_package):
+        other = package_of(name)
+        if name.startswith("modelserver.") and other not in MAY_IMPORT:
+            other = "modelserver"  # a name that the package itself exports, e.g. __version__
+        if other and other not in allowed:
+            wrong.append((line, f"{package} imports {name}; it may import only {', '.join(sorted(allowed))}"))
+    return wrong
+
+
+def impure(tree: ast.AST, module: str, is_package: bool) -> list[tuple[int, str]]:
+    if package_of(module) not in PURE:
+        return []
+    wrong = [
+        (line, f"{module} is pure and imports {name}")
+        for line, name in imported(tree, module, is_package)
+        if name.split(".")[0] in IMPURE_MODULES
+    ]
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call):
+            continue
+        name = ast.unparse(node.func)
+        parts = name.split(".")
+        called = f"{module} is pure and calls {name}()"
+        if name in IMPURE_CALLS:
+            wrong.append((node.lineno, called))
+        elif parts[-1] in CLOCK_READS and {"datetime", "date"} & set(parts[:-1]):
+            wrong.append((node.lineno, f"{called}: time comes in with events"))
+        elif any(isinstance(inner, ast.Call) for inner in ast.walk(node.func)):
+            continue  # a method of what a call returned; that call is looked at by itself
+        elif (parts[0] == "random" or "random" in parts[:-1]) and not (
+            parts[-1] in ("Random", "default_rng", "Generator", "SeedSequence", "PCG64", "Philox") and node.args
+        ):
+            wrong.append((node.lineno, f"{called}: only a generator made with a seed is repeatable"))
+        elif parts[-1] in ("default_rng", "Random") and not node.args:
+            wrong.append((node.lineno, f"{called} without a seed"))
+    return wrong
+
+
+def findings(rule) -> list[str]:
+    report = []
+    for path in sources():
+        tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
+        report += [
+            f"{path.relative_to(ROOT)}:{line}: {message}"
+            for line, message in rule(tree, module_of(path), path.name == "__init__.py")
+        ]
+    return report
+
+
+def complain(report: list[str], rule: str) -> None:
+    if report:
+        pytest.fail(f"{rule}\n  " + "\n  ".join(report), pytrace=False)
+
+
+def test_imports_point_one_way():
+    complain(findings(misdirected), "Imports point one way (table MAY_IMPORT). These do not:")
+
+
+def test_pure_packages_touch_no_clock_bus_disk_thread_or_log():
+    complain(findings(impure), "Time, data and chance enter a pure package as arguments. These reach out:")
+
+
+def test_the_table_itself_has_no_circle():
+    graphlib.TopologicalSorter({package: others - {package} for package, others in MAY_IMPORT.items()}).prepare()
+    assert set(MAY_IMPORT) >= PURE
+    assert set().union(*MAY_IMPORT.values()) <= set(MAY_IMPORT)
+    # what is pure imports only what is pure, or the version
+    assert set().union(*(MAY_IMPORT[package] for package in PURE)) <= PURE | {"version"}
+
+
+@pytest.mark.parametrize(
+    ("module", "code", "said"),
+    [
+        (
+            "modelserver.spatial.pose",
+            "from modelserver.geometry import Model",
+            "spatial imports modelserver.geometry.Model",
+        ),
+        ("modelserver.core", "def f():\n    from modelserver import service", "core imports modelserver.service"),
+        ("modelserver.core", "from . import service", "core imports modelserver.service"),
+        ("modelserver.core", "from .wire import codec", "core imports modelserver.wire.codec"),
+        ("modelserver.core", "if TYPE_CHECKING:\n    import modelserver.wire", "core imports modelserver.wire"),
+        ("modelserver.core", "import mslcm", "core imports mslcm"),
+        ("modelserver.service.loop", "from mstools import cli", "service imports mstools.cli"),
+        ("modelserver.service.loop", "from ..client import remote", "service imports modelserver.client.remote"),
+        (
+            "modelserver.geometry.model",
+            "import importlib\nimportlib.import_module('modelserver.wire')",
+            "modelserver.wire",
+        ),
+        ("msdrivers.protocol.nmea", "from msdrivers import runner", "msdrivers.protocol imports msdrivers.runner"),
+        ("modelserver.novelty", "import math", "package novelty is not in the table"),
+    ],
+)
+def test_the_check_sees_what_points_the_wrong_way(module, code, said):
+    ((_, message),) = misdirected(ast.parse(code), module, False)
+    assert said in message
+
+
+@pytest.mark.parametrize(
+    ("module", "code"),
+    [
+        ("modelserver.spatial.pose", "from modelserver.spatial import so3\nfrom . import so3\nimport numpy"),
+        ("modelserver.core", "from modelserver import messages\nfrom modelserver.geometry.model import Model"),
+        ("modelserver.wire.codec", "from mslcm.gps_t import gps_t\nfrom modelserver import messages"),
+        ("msdrivers.gps", "from msdrivers.protocol import nmea\nfrom msdrivers import transport"),
+    ],
+)
+def test_the_check_lets_pass_what_points_the_right_way(module, code):
+    assert misdirected(ast.parse(code), module, False) == []
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import time",
+        "from time import monotonic",
+        "def f():\n    import socket",
+        "import logging.handlers",
+        "import threading",
+        "from os import path",
+        "open('x')",
+        "print('x')",
+        "datetime.now()",
+        "datetime.datetime.utcnow()",
+        "random.random()",
+        "random.Random()",
+        "np.random.normal(0, 1)",
+        "np.random.default_rng()",
+        "default_rng()",
+    ],
+)
+def test_the_check_sees_what_is_not_pure(code):
+    assert len(impure(ast.parse(code), "modelserver.core", False)) == 1
+    assert impure(ast.parse(code), "modelserver.service.loop", False) == []
+
+
+@pytest.mark.parametrize(
+    "code",
+    ["random.Random(3).gauss(0, 1)", "np.random.default_rng(seed)", "rng.random()", "import datetime", "f.open()"],
+)
+def test_the_check_lets_pass_what_is_pure(code):
+    assert impure(ast.parse(code), "modelserver.core", False) == []

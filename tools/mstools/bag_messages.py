@@ -1,0 +1,351 @@
+"""ROS messages as samples of this project: what each says, and what it leaves open. No bag is read here.
+
+Messages are taken by their fields, as any ROS library presents them; ROS 1 and 2 are alike in all that is used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Protocol
+
+import numpy as np
+
+from modelserver.messages import (
+    NAN,
+    Direction,
+    FixType,
+    GpsSample,
+    ImuSample,
+    JointSample,
+    JointsSample,
+    Matrix3,
+    OrientationReference,
+    Sample,
+    SensorHeader,
+    WheelSample,
+    WheelsSample,
+    YawSource,
+)
+from modelserver.spatial import so3
+from modelserver.spatial.so3 import Array
+
+STANDSTILL = 1e-3
+"""Speeds below, m/s, count as standing: controllers average, and leave dust of 1e-15."""
+
+
+class Kind(StrEnum):
+    """What a topic becomes: also the source's name, and in capitals the channel's."""
+
+    GPS = "gps"
+    IMU = "imu"
+    WHEELS = "wheels"
+    JOINTS = "joints"
+
+
+ROS_TYPES = {
+    "sensor_msgs/msg/NavSatFix": Kind.GPS,
+    "sensor_msgs/msg/Imu": Kind.IMU,
+    "nav_msgs/msg/Odometry": Kind.WHEELS,
+    "sensor_msgs/msg/JointState": Kind.JOINTS,
+}
+
+
+class Altitude(StrEnum):
+    """What NavSatFix.altitude is measured from."""
+
+    ELLIPSOIDAL = "ellipsoidal"
+    MSL = "msl"
+
+
+class ImuOrientation(StrEnum):
+    """What Imu.orientation is measured against; none leaves it out."""
+
+    NONE = "none"
+    ENU = "enu"
+    NED = "ned"
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What a bag does not say about itself."""
+
+    altitude: Altitude = Altitude.ELLIPSOIDAL
+    undulation: float = NAN
+    imu_orientation: ImuOrientation = ImuOrientation.NONE
+    track_width: float = 0.555
+
+
+class Converter(Protocol):
+    """Turns the messages of one topic into samples, in their order. `notes` is what to tell the user at the end."""
+
+    def convert(self, header: SensorHeader, message: Any) -> Sample:
+        """Return the sample of a message."""
+        ...
+
+    def notes(self) -> list[str]:
+        """Return what is worth knowing about what was converted, one line each."""
+        ...
+
+
+def converter(kind: Kind, options: Options) -> Converter:
+    """Return a new converter."""
+    match kind:
+        case Kind.GPS:
+            return GpsConverter(options.altitude, options.undulation)
+        case Kind.IMU:
+            return ImuConverter(options.imu_orientation)
+        case Kind.WHEELS:
+            return WheelsConverter(options.track_width)
+        case Kind.JOINTS:
+            return JointsConverter()
+
+
+# --- fixes --------------------------------------------------------------------------------------------------
+
+_FIX_TYPES = {
+    0: FixType.FIX_3D,
+    1: FixType.DIFFERENTIAL,  # satellite-based augmentation
+    # Ground-based augmentation: a differential fix at least. Drivers report RTK so as well; the message has no
+    # word for it, and its covariance says how good the fix is.
+    2: FixType.DIFFERENTIAL,
+}
+
+
+@dataclass(slots=True)
+class GpsConverter:
+    """NavSatFix. Heights are taken as the option says; a sample never holds both from one number."""
+
+    altitude: Altitude
+    undulation: float = NAN
+    _unknown_covariances: int = 0
+
+    def convert(self, header: SensorHeader, message: Any) -> GpsSample:
+        """Return the fix of a NavSatFix."""
+        latitude, longitude, height = float(message.latitude), float(message.longitude), float(message.altitude)
+        fix_type = _FIX_TYPES.get(int(message.status.status), FixType.NONE)
+        if not (math.isfinite(latitude) and math.isfinite(longitude)):
+            fix_type = FixType.NONE
+        elif fix_type is FixType.FIX_3D and not math.isfinite(height):
+            fix_type = FixType.FIX_2D
+        covariance = None if int(message.position_covariance_type) == 0 else _covariance(message.position_covariance)
+        self._unknown_covariances += covariance is None
+        msl = height if self.altitude is Altitude.MSL else NAN
+        return GpsSample(
+            header,
+            fix_type,
+            latitude,
+            longitude,
+            height_ellipsoidal=msl + self.undulation if self.altitude is Altitude.MSL else height,
+            height_msl=msl,
+            undulation=self.undulation,
+            position_covariance=covariance,
+        )
+
+    def notes(self) -> list[str]:
+        """Return what is worth knowing."""
+        lines = []
+        if self._unknown_covariances:
+            lines.append(f"{self._unknown_covariances} fixes do not say how good they are")
+        if self.altitude is Altitude.MSL and not math.isfinite(self.undulation):
+            lines.append("heights above the ellipsoid are not known: give --undulation with --altitude msl")
+        return lines
+
+
+# --- inertial -----------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class ImuConverter:
+    """Imu. A first covariance of -1 marks what the unit does not give (the message's own rule)."""
+
+    orientation: ImuOrientation
+    _count: int = 0
+    _force: float = 0.0
+    _turned: Array = field(default_factory=lambda: np.zeros(3))
+    _oriented: int = 0
+
+    def convert(self, header: SensorHeader, message: Any) -> ImuSample:
+        """Return the sample of an Imu."""
+        rate = _vector(message.angular_velocity, message.angular_velocity_covariance)
+        force = _vector(message.linear_acceleration, message.linear_acceleration_covariance)
+        quaternion = self._quaternion(message)
+        if force is not None:
+            self._count += 1
+            self._force += math.hypot(*force)
+            if quaternion is not None:
+                self._oriented += 1
+                self._turned += so3.rotate(quaternion, force)
+        reference = OrientationReference[self.orientation.name]
+        wanted = quaternion is not None and reference is not OrientationReference.NONE
+        return ImuSample(
+            header,
+            angular_velocity=rate,
+            specific_force=force,
+            orientation=quaternion if wanted else None,
+            orientation_reference=reference if wanted else OrientationReference.NONE,
+            # what turns the unit's yaw is not said either: its zero counts as arbitrary
+            yaw_source=YawSource.NONE,
+            angular_velocity_covariance=_covariance(message.angular_velocity_covariance),
+            specific_force_covariance=_covariance(message.linear_acceleration_covariance),
+            orientation_covariance=_covariance(message.orientation_covariance) if wanted else None,
+        )
+
+    @staticmethod
+    def _quaternion(message: Any) -> tuple[float, float, float, float] | None:
+        if float(message.orientation_covariance[0]) == -1.0:
+            return None
+        q = message.orientation
+        values = (float(q.w), float(q.x), float(q.y), float(q.z))
+        length = math.hypot(*values)
+        if not math.isfinite(length) or abs(length - 1.0) > 0.05:
+            return None  # all zeros is what drivers send that have none
+        w, x, y, z = (value / length for value in values)
+        return (w, x, y, z)
+
+    def notes(self) -> list[str]:
+        """Return what is worth knowing."""
+        lines = []
+        if self._count and not 8.5 < (mean := self._force / self._count) < 11.5:
+            lines.append(f"the specific force averages {mean:.2f} m/s2, not 9.81: another unit, or gravity taken out?")
+        if self._oriented:
+            up = self._turned[2] / self._oriented
+            seems = "enu" if up > 8.0 else "ned" if up < -8.0 else ""
+            if self.orientation is ImuOrientation.NONE:
+                hint = f"; by gravity it is of kind {seems}" if seems else ""
+                lines.append(f"the unit's own orientation is left out (--imu-orientation){hint}")
+            elif seems != self.orientation.value:
+                lines.append(
+                    f"the unit's orientation turns gravity's reaction to {up:+.1f} m/s2 along z: this does not look "
+                    f"like {self.orientation.value}"
+                )
+        return lines
+
+
+# --- wheels -------------------------------------------------------------------------------------------------
+
+
+class WheelsConverter:
+    """Odometry, as two virtual wheels `left` and `right` at half the track width to either side of the base.
+
+    Their speeds are those that the published twist gives two points of the base: v -+ w track/2. Their travel
+    comes from the steps of the published pose. The two differ in time: controllers average the twist (the
+    Husky's over ten cycles, half a second late), and do not average the pose. The encoders of a wheel that skids
+    read otherwise; what they read is not in the message.
+    """
+
+    def __init__(self, track_width: float):
+        self._half = track_width / 2
+        self._previous: tuple[int, Array, Array] | None
+        self._previous = None
+        self._travel = [0.0, 0.0]
+        self._jumps = 0
+        self._sideways = 0.0
+
+    def convert(self, header: SensorHeader, message: Any) -> WheelsSample:
+        """Return the sample of an Odometry."""
+        twist = message.twist.twist
+        speed, turn = float(twist.linear.x), float(twist.angular.z)
+        self._sideways = max(self._sideways, abs(float(twist.linear.y)))
+        way, angle = self._step(header.utime, message.pose.pose, speed, turn)
+        covariance = np.asarray(message.twist.covariance, float).reshape(6, 6)
+        wheels = []
+        for n, (name, arm) in enumerate((("left", -self._half), ("right", self._half))):
+            self._travel[n] += way + arm * angle
+            rolled = speed + arm * turn
+            spread = covariance[0, 0] + 2 * arm * covariance[0, 5] + arm * arm * covariance[5, 5]
+            known = covariance[0, 0] > 0 and covariance[5, 5] > 0 and spread > 0
+            wheels.append(
+                WheelSample(
+                    name,
+                    travel=self._travel[n],
+                    speed=rolled,
+                    speed_sigma=math.sqrt(spread) if known else NAN,
+                    direction=_direction(rolled),
+                )
+            )
+        return WheelsSample(header, tuple(wheels))
+
+    def _step(self, utime: int, pose: Any, speed: float, turn: float) -> tuple[float, float]:
+        """Return the way forward, metres, and the turn, radians, since the message before."""
+        place = np.array([pose.position.x, pose.position.y, pose.position.z], float)
+        q = pose.orientation
+        ahead = np.array(so3.rotate((float(q.w), float(q.x), float(q.y), float(q.z)), (1.0, 0.0, 0.0)))
+        good = bool(np.isfinite(place).all()) and 0.9 < float(np.linalg.norm(ahead)) < 1.1
+        before, self._previous = self._previous, (utime, place, ahead) if good else None
+        if before is None:
+            return (0.0, 0.0)
+        seconds = max(0.0, (utime - before[0]) * 1e-6)
+        by_twist = (speed * seconds, turn * seconds)
+        if not good:
+            return by_twist
+        middle = ahead + before[2]
+        length = float(np.linalg.norm(middle))
+        way = float((place - before[1]) @ middle) / length if length > 1e-6 else math.inf
+        if abs(way - by_twist[0]) > 1.0 + 5.0 * seconds:
+            self._jumps += 1  # the odometry was set anew: its pose says nothing of this step, its twist does
+            return by_twist
+        cross = before[2][0] * ahead[1] - before[2][1] * ahead[0]
+        return (way, math.atan2(cross, float(before[2][:2] @ ahead[:2])))
+
+    def notes(self) -> list[str]:
+        """Return what is worth knowing."""
+        lines = []
+        if self._jumps:
+            lines.append(f"the odometry's pose jumped {self._jumps} times; there the travel is that of its twist")
+        if self._sideways > 0.01:
+            lines.append(f"the base moves sideways at up to {self._sideways:.2f} m/s, which wheels cannot say")
+        return lines
+
+
+def _direction(speed: float) -> Direction:
+    if not math.isfinite(speed):
+        return Direction.UNKNOWN
+    if abs(speed) < STANDSTILL:
+        return Direction.STOPPED
+    return Direction.FORWARD if speed > 0 else Direction.BACKWARD
+
+
+# --- joints -------------------------------------------------------------------------------------------------
+
+
+class JointsConverter:
+    """JointState: names, positions and rates; efforts have no counterpart."""
+
+    def convert(self, header: SensorHeader, message: Any) -> JointsSample:
+        """Return the sample of a JointState."""
+        positions, rates = list(message.position), list(message.velocity)
+        return JointsSample(
+            header,
+            tuple(
+                JointSample(
+                    str(name),
+                    float(positions[n]) if n < len(positions) else NAN,
+                    rate=float(rates[n]) if n < len(rates) else NAN,
+                )
+                for n, name in enumerate(message.name)
+            ),
+        )
+
+    def notes(self) -> list[str]:
+        """Return what is worth knowing."""
+        return []
+
+
+# --- parts --------------------------------------------------------------------------------------------------
+
+
+def _covariance(values: Sequence[float]) -> Matrix3 | None:
+    """Return nine numbers, or None where they say nothing: -1 first, all zero, or not finite."""
+    a, b, c, d, e, f, g, h, i = (float(value) for value in values)
+    if not all(map(math.isfinite, (a, b, c, d, e, f, g, h, i))) or not (a > 0 and e > 0 and i > 0):
+        return None
+    return (a, b, c, d, e, f, g, h, i)
+
+
+def _vector(vector: Any, covariance: Sequence[float]) -> tuple[float, float, float] | None:
+    if float(covariance[0]) == -1.0:
+        return None
+    return (float(vector.x), float(vector.y), float(vector.z))

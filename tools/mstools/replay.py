@@ -1,0 +1,228 @@
+"""`modelserver replay`: a recorded log onto the bus, or straight through the localization."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Annotated, TextIO
+
+import typer
+
+from modelserver.errors import nearest_names, shown
+from modelserver.wire.eventlog import LogEvent, LogFile, RecordingError
+from mstools.asking import JsonOption, UrlOption
+from mstools.progress import progress
+
+TIMES_LIMIT = 64 << 20
+"""Largest file of times, bytes."""
+
+
+def command(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="LCM event log.")],
+    config: Annotated[Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file.")] = None,
+    poses: Annotated[
+        str, typer.Option(metavar="CSV", help="Work offline, and write the poses here; - is standard output.")
+    ] = "",
+    frame: Annotated[
+        str, typer.Option(metavar="BODY:FRAME", help="Frame whose pose is written. Default: the base frame.")
+    ] = "",
+    rate: Annotated[float, typer.Option(metavar="HZ", help="Poses a second.")] = 50.0,
+    at_times: Annotated[
+        Path | None, typer.Option("--at-times", metavar="FILE", help="Poses at these times: a utime a line, rising.")
+    ] = None,
+    speed: Annotated[
+        str, typer.Option(metavar="N", help="Times as fast as recorded; max: as fast as possible. On the bus only.")
+    ] = "1",
+    channel: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Only this channel; may be given again.")
+    ] = None,
+    url: UrlOption = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Feed a recorded log to the bus, or straight through the localization.
+
+    Onto the bus, messages go out unchanged at the pace of their arrival. Offline, with --poses, the daemon's core
+    takes them as fast as it can, and the pose of one frame in World:UTM is written for even or listed times, each
+    from nothing but what had arrived before it; docs/recordings.md says exactly what that means. A log that breaks
+    off in its last event is used up to there; for other damage the exit code is 1.
+
+    \b
+    Examples:
+      modelserver replay drive.lcm --speed 2
+      modelserver replay drive.lcm -c config/husky/vehicle.yaml --poses poses.csv --frame Antenna:PhaseCentre --rate 10
+    """
+    channels = frozenset(channel or ())
+    if poses:
+        if config is None:
+            raise typer.BadParameter("--poses needs the vehicle: -c FILE")
+        if not (math.isfinite(rate) and 0.0 < rate <= 10_000.0):
+            raise typer.BadParameter(f"a rate is above 0 and at most 10000 Hz, got {rate:g}")
+        offline(log, config, poses, frame, rate, at_times, channels, as_json)
+    else:
+        if frame or at_times is not None:
+            raise typer.BadParameter("--frame and --at-times go with --poses CSV")
+        to_bus(log, config, _speed(speed), channels, url, as_json)
+
+
+def to_bus(log: Path, config: Path | None, speed: float, channels: frozenset[str], url: str, as_json: bool) -> None:
+    """Send a log on the bus."""
+    from modelserver.config import load_config
+    from modelserver.service.clock import SystemClock
+    from modelserver.service.playback import Player
+    from modelserver.wire.provider import open_lcm, resolve_url
+
+    if not url and config is not None:
+        url = load_config(config).lcm.url
+    with LogFile(log) as recording:
+        bus = open_lcm(resolve_url(url))
+        player = Player(bus.publish, speed, SystemClock(), time.sleep)
+        try:
+            with progress(f"replaying {log.name}", recording.size) as show:
+                shown_at = 0.0
+
+                def seen(event: LogEvent) -> None:
+                    nonlocal shown_at
+                    if (now := time.monotonic()) > shown_at + 0.1:
+                        shown_at = now
+                        show(event.end)
+
+                player.play(_only(recording, channels), seen)
+        finally:
+            report = {"sent": player.sent, "seconds": player.span, "most_late": player.late}
+            words = (
+                f"{log}: {player.sent} messages sent, {player.span:.1f} s of the log, at most {player.late:.3f} s late"
+            )
+            typer.echo(json.dumps(report) if as_json else words)
+        _report_damage(recording)
+
+
+def offline(
+    log: Path,
+    config: Path,
+    poses: str,
+    frame: str,
+    rate: float,
+    at_times: Path | None,
+    channels: frozenset[str],
+    as_json: bool,
+) -> None:
+    """Write the poses of a frame from a log."""
+    # one thread works: those of the linear algebra would only cost time
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from modelserver.config import load_config
+    from modelserver.service.daemon import load_vehicle
+    from modelserver.service.offline import CSV_HEADER, Run
+
+    vehicle = load_vehicle(load_config(config))
+    times = None if at_times is None else read_times(at_times)
+    with LogFile(log) as recording:
+        run = Run(vehicle, _only(recording, channels), frame or vehicle.config.base_frame)
+        started = time.monotonic()
+        written = valid = 0
+        with _output(poses) as out, progress(f"replaying {log.name}", recording.size) as show:
+            out.write(CSV_HEADER + "\n")
+            for row in run.rows(times, rate):
+                out.write(row.csv() + "\n")
+                written += 1
+                valid += row.valid
+                if written % 256 == 0:
+                    show(run.position)
+        wall = time.monotonic() - started
+        span = (run.last_utime - run.first_utime) * 1e-6
+        report = {
+            "poses": written,
+            "valid": valid,
+            "events": run.events,
+            "samples": run.samples,
+            "seconds": span,
+            "wall_seconds": wall,
+            "real_time_factor": span / wall if wall > 0 else math.nan,
+            "rejected": [{"source": s, "reason": r, "count": n} for (s, r), n in sorted(run.rejected.items())],
+        }
+        lines = [
+            f"{written} poses of {run.frame}, {valid} valid, from {run.samples} of {run.events} messages; "
+            f"{span:.1f} s in {wall:.2f} s: {report['real_time_factor']:.0f} times real time"
+        ]
+        lines += [f"  not used: {n} of {s}, {r}" for (s, r), n in sorted(run.rejected.items())]
+        typer.echo(json.dumps(report) if as_json else "\n".join(lines), err=poses == "-")
+        _report_damage(recording)
+
+
+def read_times(path: Path) -> list[int]:
+    """Return the times that a file lists: one utime a line, rising; empty lines and # comments are passed over.
+
+    Raises RecordingError with the line for anything else, OSError.
+    """
+    if path.stat().st_size > TIMES_LIMIT:
+        raise RecordingError(f"{path}: larger than {TIMES_LIMIT >> 20} MiB: is this the file of times?")
+    times: list[int] = []
+    with path.open("r", encoding="utf-8", errors="replace") as file:
+        for number, line in enumerate(file, start=1):
+            text = line.partition("#")[0].strip()
+            if not text:
+                continue
+            if not (text.isascii() and text.isdigit()) or not 0 < (utime := int(text[:20])) < 1 << 61:
+                raise RecordingError(f"{path}:{number}: {shown(text, 40)} is no time in microseconds since 1970")
+            if times and utime < times[-1]:
+                raise RecordingError(
+                    f"{path}:{number}: {utime} is before {times[-1]}, the time above it; sort the file"
+                )
+            times.append(utime)
+    if not times:
+        raise RecordingError(f"{path}: lists no times")
+    return times
+
+
+def _only(recording: LogFile, channels: frozenset[str]) -> Iterator[LogEvent]:
+    """Yield the events of some channels, or of all. Raises RecordingError at the end where there were none."""
+    met: dict[str, None] = {}
+    found = not channels
+    for event in recording:
+        met[event.channel] = None
+        if not channels or event.channel in channels:
+            found = True
+            yield event
+    if not found:
+        raise RecordingError(f"{recording.path}: nothing on {_listed(channels)}. {_offer(channels, met)}")
+
+
+def _offer(wanted: Iterable[str], met: Iterable[str]) -> str:
+    near = [name for each in sorted(wanted) for name in nearest_names(each, met)]
+    return f"Nearest: {', '.join(near)}" if near else f"It has: {_listed(met)}"
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(sorted(names))
+
+
+def _output(poses: str) -> nullcontext[TextIO] | TextIO:
+    if poses == "-":
+        return nullcontext(typer.get_text_stream("stdout"))
+    return Path(poses).open("w", encoding="ascii", newline="\n")
+
+
+def _report_damage(recording: LogFile) -> None:
+    for each in recording.damage[:20]:
+        typer.echo(f"modelserver: {recording.path}: {each}", err=True)
+    if len(recording.damage) > 20:
+        typer.echo(f"modelserver: {recording.path}: {len(recording.damage) - 20} more damaged places", err=True)
+    if recording.torn:
+        raise typer.Exit(1)
+
+
+def _speed(text: str) -> float:
+    if text in ("max", "0"):
+        return math.inf
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0.0):
+        raise typer.BadParameter(f"a speed is a number above 0, or max, got {shown(text, 20)}", param_hint="--speed")
+    return value
