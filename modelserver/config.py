@@ -7,6 +7,7 @@ once: file, line, key, what is wrong, and for a mistyped key the nearest known o
 from __future__ import annotations
 
 import dataclasses
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args, get_type_hints
@@ -199,7 +200,8 @@ def parse_config(raw: bytes, name: str = "") -> VehicleConfig:
     if reader.problems:
         raise ConfigError(reader.problems)
     try:
-        return TypeAdapter(VehicleConfig).validate_python(values)
+        # by way of JSON: strict there means that "4" is no number, while a mapping still makes a section
+        return TypeAdapter(VehicleConfig).validate_json(json.dumps(values, default=str), strict=True)
     except ValidationError as error:
         raise ConfigError(reader.explain(detail) for detail in error.errors()) from None
 

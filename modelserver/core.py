@@ -41,6 +41,7 @@ from modelserver.messages import (
     Reply,
     ReplyHeader,
     Request,
+    RequestHeader,
     Sample,
     SendReply,
     StateVectorReply,
@@ -72,11 +73,15 @@ class Instant:
 
 @dataclass(frozen=True, slots=True)
 class CoreSettings:
-    """What does not change while the core runs; see `modelserver.config` for the meanings."""
+    """What does not change while the core runs; see `modelserver.config` for the meanings.
+
+    ticks_per_pose: in timer mode POSE goes out at every so-manieth tick, those that were missed counted.
+    """
 
     base_frame: str
     vehicle: str = ""
     publish: Literal["timer", "event"] = "timer"
+    ticks_per_pose: int = 1
     health_period_ns: int = 1_000_000_000
     history_s: float = 60.0
     parked_requests: int = 64
@@ -120,6 +125,7 @@ class CoreState(NamedTuple):
     health_sent_ns: int = 0
     poses_published: int = 0
     requests_answered: int = 0
+    ticks: int = 0
     ticks_missed: int = 0
     handler_errors: int = 0
     run_state: int = STARTING
@@ -157,20 +163,26 @@ def _sample(state: CoreState, sample: Sample, now: Instant) -> Step:
         return _count(state, source, "future"), ()
     if state.localizer is None:
         return state, ()
-    localizer, notes = state.localizer.take(sample)
+    before = state.localizer
+    localizer, notes = before.take(sample)
     outputs: list[Output] = []
+    refused = False
     for note in notes:
         if isinstance(note, Rejected):
             state = _count(state, note.channel, note.reason)
+            refused = True
         else:
             outputs.append(note)
-    if localizer is state.localizer:
+    if localizer is before:
         return state, tuple(outputs)
     state = state._replace(localizer=localizer)
-    if isinstance(sample, GpsSample | ImuSample):
+    # before the first sample that can be used there is no time that an estimate could hold for
+    if localizer.utime and isinstance(sample, GpsSample | ImuSample):
         estimate = localizer.estimate(localizer.utime)
         state = state._replace(history=state.history.extended(estimate))
-        if state.settings.publish == "event":
+        # a part may be refused of a sample that moves time on all the same
+        taken = not refused or localizer.utime != before.utime
+        if taken and state.settings.publish == "event":
             state, pose = _publish(state, localizer.utime)
             outputs.append(pose)
         if state.parked:
@@ -196,11 +208,15 @@ def _publish(state: CoreState, utime: int) -> tuple[CoreState, PublishPose]:
 
 def _tick(state: CoreState, tick: Tick, now: Instant) -> Step:
     outputs: list[Output] = []
+    # the first tick is one at which POSE is due
+    before, every = state.ticks - 1, state.settings.ticks_per_pose
     state = state._replace(
         lateness=(*state.lateness[-LATENESS_KEPT + 1 :], tick.late),
+        ticks=state.ticks + 1 + tick.missed,
         ticks_missed=state.ticks_missed + tick.missed,
     )
-    if state.settings.publish == "timer" and state.localizer is not None:
+    due = (before + 1 + tick.missed) // every > before // every
+    if due and state.settings.publish == "timer" and state.localizer is not None:
         state, pose = _publish(state, now.utime)
         outputs.append(pose)
     if state.parked:
@@ -364,10 +380,31 @@ def _failed(
 
 def refuse(state: CoreState, request: Request, now: Instant) -> Outputs:
     """Return the refusal of a request that the server has no time for."""
+    message = "the server is loaded and did not take the request; ask again later"
+    return _turned_down(state, request, Status.REFUSED_LOAD, message, now)
+
+
+def fail(state: CoreState, request: Request, now: Instant) -> Outputs:
+    """Return the reply to a request that an error of the server's own kept from being answered."""
+    return _turned_down(state, request, Status.INTERNAL, "the server failed on its side; its log says why", now)
+
+
+def turn_back(
+    state: CoreState, kind: type[Request], header: RequestHeader, message: str, now: Instant
+) -> Outputs:
+    """Return the reply to a request of which no more than the header could be made out."""
+    if not header.is_answerable(state.settings.reply_prefix):
+        return ()
+    reply = _REPLY_KINDS[kind](
+        ReplyHeader(header.request_id, now.utime, Status.MALFORMED, message, (), state.model.revision)
+    )
+    return (SendReply(header.reply_channel, reply),)
+
+
+def _turned_down(state: CoreState, request: Request, status: Status, message: str, now: Instant) -> Outputs:
     if not request.header.is_answerable(state.settings.reply_prefix):
         return ()
-    message = "the server is loaded and did not take the request; ask again later"
-    return (SendReply(request.header.reply_channel, _failed(request, Status.REFUSED_LOAD, message, now, state)),)
+    return (SendReply(request.header.reply_channel, _failed(request, status, message, now, state)),)
 
 
 # --- counting -----------------------------------------------------------------------------------------------

@@ -90,8 +90,8 @@ class Problem:
 
     def __str__(self) -> str:
         head = f"{self.source}: " if str(self.source) else ""
-        tail = f" Nearest: {', '.join(self.nearest)}." if self.nearest else ""
-        fix = f" Fix: {self.fix}" if self.fix else ""
+        tail = f"; nearest: {', '.join(self.nearest)}" if self.nearest else ""
+        fix = f"; fix: {self.fix}" if self.fix else ""
         return f"{head}{self.severity}: {self.message}{tail}{fix}"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 
 from modelserver.errors import TooNewError, TooOldError
-from modelserver.messages import Estimate, Quality
+from modelserver.messages import VALID, Estimate, Invalid, Quality
 from modelserver.spatial.pose import Pose
 
 
@@ -133,8 +133,8 @@ def interpolated(a: Estimate, b: Estimate, utime: int) -> Estimate:
     )
 
 
-def at_time(estimate: Estimate, utime: int, flag: Quality) -> Estimate:
-    """Return an estimate restamped to a time, with a flag that says how it came there."""
+def at_time(estimate: Estimate, utime: int, flag: Quality, invalid: Invalid = VALID) -> Estimate:
+    """Return an estimate restamped to a time, with a flag that says how it came there, and reasons against it added."""
     return Estimate(
         utime,
         estimate.odom,
@@ -142,7 +142,7 @@ def at_time(estimate: Estimate, utime: int, flag: Quality) -> Estimate:
         estimate.utm,
         estimate.covariance,
         estimate.odom_covariance,
-        estimate.invalid,
+        estimate.invalid | invalid,
         estimate.quality | flag,
         estimate.pose_epoch,
         estimate.origin,

@@ -93,8 +93,8 @@ class PlatformView:
         count = int((end_utime - start_utime) * 1e-6 * rate_hz + 1e-9) + 1
         if count > HISTORY_LIMIT:
             raise LimitError(f"{count} poses were asked for; at most {HISTORY_LIMIT} go in one reply. Ask in parts.")
-        if not len(self.history):
-            raise self._no_pose(Invalid.NO_IMU)
+        if self.localizer is None or not len(self.history):
+            raise self._no_pose()
         answers = []
         for n in range(count):
             utime = start_utime + round(n * 1e6 / rate_hz)
@@ -106,15 +106,17 @@ class PlatformView:
 
     def estimate(self, time: TimeQuery) -> Estimate:
         """Return the vehicle's estimate for a time. Raises NoPoseError, TooOldError, TooNewError."""
-        if self.localizer is None:
-            raise NoPoseError("the vehicle file names no GPS and IMU, so there is no pose in the world")
-        if not len(self.history):
-            raise self._no_pose(self.localizer.estimate(0).invalid)
+        if self.localizer is None or not len(self.history):
+            raise self._no_pose()
         if time.at == 0 or time.policy is Policy.LATEST:
             return self.history.newest
         if time.policy is Policy.HELD:
             held = self.history.held(time.at)
-            return held if held.utime == time.at else at_time(held, time.at, Quality.HELD)
+            if held.utime == time.at:
+                return held
+            # past the newest sample it is the silence since then that may speak against it
+            since = self.localizer.estimate(time.at).invalid if time.at > self.history.last else Invalid(0)
+            return at_time(held, time.at, Quality.HELD, since)
         if time.policy is Policy.PREDICTED and time.at > self.history.last:
             if time.at > self.history.last + PREDICTION_LIMIT_S * 1e6:
                 raise TooNewError(
@@ -172,7 +174,7 @@ class PlatformView:
     def _answer(
         self, interest: str, reference: str, pose: Pose, covariance: Array | None, estimate: Estimate
     ) -> PoseAnswer:
-        odom_only = reference == names.ODOM and not is_absolute(interest)
+        odom_only = names.ODOM in (interest, reference) and not (is_absolute(interest) or is_absolute(reference))
         invalid = estimate.invalid & _ODOM_INVALID if odom_only else estimate.invalid
         return PoseAnswer(
             Transformation(
@@ -193,7 +195,10 @@ class PlatformView:
             estimate.seconds_to_limit,
         )
 
-    def _no_pose(self, invalid: Invalid) -> NoPoseError:
+    def _no_pose(self) -> NoPoseError:
+        if self.localizer is None:
+            return NoPoseError("the vehicle file names no GPS and IMU, so there is no pose in the world")
+        invalid = self.localizer.estimate(0).invalid
         return NoPoseError(f"the vehicle's pose is not known yet: {invalid.explain() or 'no sensor sample yet'}")
 
 

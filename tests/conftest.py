@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+from support_lcm import reserved_url
 
 # The same examples on every run and every machine; a loaded machine must not fail a test by its slowness.
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=50)
@@ -21,3 +23,10 @@ def data_dir() -> Path:
     if not place.is_dir():
         pytest.skip(f"the recorded data are not at {place}; set MODELSERVER_DATA to their folder")
     return place.resolve()
+
+
+@pytest.fixture
+def lcm_url() -> Iterator[str]:
+    """An LCM provider on loopback that no other test uses."""
+    with reserved_url() as url:
+        yield url

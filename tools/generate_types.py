@@ -1,5 +1,9 @@
 #!/usr/bin/env python3
-"""Write lcmtypes/mslcm and lcmtypes/contract.lock anew from lcmtypes/*.lcm: `make types`."""
+"""Write what follows from the wire contract anew: `make types`.
+
+lcmtypes/mslcm and lcmtypes/contract.lock come from lcmtypes/*.lcm, the table of channels in docs/wire.md from
+modelserver/wire/channels.py.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +15,22 @@ import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from modelserver.wire.channels import CHANNELS, Way
 from mstools.lcm_wheel import binary
 
-TYPES = Path(__file__).resolve().parent.parent / "lcmtypes"
+ROOT = Path(__file__).resolve().parent.parent
+TYPES = ROOT / "lcmtypes"
+WIRE_PAGE = ROOT / "docs" / "wire.md"
+
+SPEAKERS = {
+    Way.SENSOR: "driver",
+    Way.REQUEST: "client",
+    Way.BROADCAST: "service",
+    Way.COMMAND: "controller's client",
+}
+
+TABLE_BEGIN = "<!-- channels: written by `make types` -->\n"
+TABLE_END = "<!-- end of channels -->\n"
 
 LOCK_HEADER = """\
 # The wire contract: every type and its fingerprint, which lcm-gen works out from the names, types and sizes of
@@ -55,8 +72,20 @@ def read_lock(text: str) -> dict[str, str]:
     return dict(re.findall(r"^(\w+) 0x([0-9a-f]{16})$", text, re.MULTILINE))
 
 
+def with_table(page: str) -> str:
+    """Return a page with the table of channels between its two marks written anew."""
+    before, _, rest = page.partition(TABLE_BEGIN)
+    _, _, after = rest.partition(TABLE_END)
+    rows = ["| channel | type | who speaks | how often | what |", "|---|---|---|---|---|"]
+    rows += [
+        f"| `{each.name}` | `{each.type_name}` | {SPEAKERS[each.way]} | {each.rate} | {each.about} |"
+        for each in CHANNELS
+    ]
+    return before + TABLE_BEGIN + "\n".join(rows) + "\n" + TABLE_END + after
+
+
 def main() -> int:
-    """Write both, and say what changed in the contract."""
+    """Write all of it, and say what changed in the contract."""
     names = [path.stem for path in sorted(TYPES.glob("*.lcm"))]
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
@@ -71,6 +100,7 @@ def main() -> int:
     lock = TYPES / "contract.lock"
     before = read_lock(lock.read_text(encoding="utf-8")) if lock.exists() else {}
     lock.write_text(lock_text(fingerprints), encoding="utf-8")
+    WIRE_PAGE.write_text(with_table(WIRE_PAGE.read_text(encoding="utf-8")), encoding="utf-8")
     for name in sorted(before.keys() | fingerprints.keys()):
         if before.get(name) != fingerprints.get(name):
             print(f"{name}: {before.get(name, 'new')} -> {fingerprints.get(name, 'gone')}")

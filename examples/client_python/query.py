@@ -73,7 +73,12 @@ def main(arguments: list[str]) -> int:
     request.header.request_id = secrets.randbits(63)
     request.header.reply_channel = REPLY_CHANNEL
     request.frame_of_interest, request.frame_of_reference = arguments
-    reply = ask(lcm.LCM(), request)  # the bus of $LCM_DEFAULT_URL, else LCM's own default, which stays on this machine
+    try:
+        bus = lcm.LCM()  # the bus of $LCM_DEFAULT_URL, else LCM's own default, which stays on this machine
+    except (OSError, RuntimeError) as error:
+        print(f"query: cannot join the bus: {error}", file=sys.stderr)
+        return 1
+    reply = ask(bus, request)
     if reply is None:
         print(f"query: no reply after {TRIES} tries of {TRY_SECONDS} s: is the server running?", file=sys.stderr)
         return 1

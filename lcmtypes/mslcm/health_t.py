@@ -118,13 +118,13 @@ class health_t(object):
 
         self.tick_lateness_p50 = 0.0
         """
-        Median lateness of the ticks since the last report, seconds; nan = no tick.
+        Median lateness of the ticks since the last report, seconds; 0 = no tick.
         LCM Type: double
         """
 
         self.tick_lateness_max = 0.0
         """
-        Greatest lateness of a tick since the last report, seconds; nan = no tick.
+        Greatest lateness of a tick since the last report, seconds; 0 = no tick.
         LCM Type: double
         """
 

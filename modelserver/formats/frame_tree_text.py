@@ -31,6 +31,11 @@ def save(model: Model) -> Saved:
     return Saved("\n".join(lines) + "\n", (*writer.renamings(), *_losses(model, writer.used)))
 
 
+def instance_names(model: Model) -> dict[str, str]:
+    """Return for each frame of `model`, by full name, the instance that stands for it in the file."""
+    return _Writer(model).named
+
+
 class _Writer:
     def __init__(self, model: Model):
         self.model = model
@@ -42,59 +47,61 @@ class _Writer:
         self.used = {crossing.constraint.name for crossing in self.came_by.values()}
         self.squarely = {body: self._squarely_on(body, crossing) for body, crossing in self.came_by.items()}
         """For each mounted body the frame it sits on, empty where it keeps an instance of its own."""
+        self.bodies = self._body_names()
         self.named = self._instance_names()
 
     def _squarely_on(self, body: str, crossing: Crossing) -> str:
         mount = names.split(crossing.enters)[1]
-        return crossing.enters if mount == body and self._origin_in_mount(crossing) == Pose.identity() else ""
+        return crossing.enters if mount == body != ORIGIN and self._origin_in_mount(crossing) == Pose.identity() else ""
 
     def _origin_in_mount(self, crossing: Crossing) -> Pose:
         return crossing.pose @ self.model.frame(crossing.leaves).pose.inverse()
 
+    def _body_names(self) -> dict[str, str]:
+        """Return each body's instance: its own name, but that no child may be named as what stands for its parent."""
+        taken = {body.name for body in self.model.bodies}
+        return {name: _free(name, taken) if name == ORIGIN and name in self.came_by else name for name in tuple(taken)}
+
     def _instance_names(self) -> dict[str, str]:
         """Return for each frame, by full name, the instance that stands for it."""
-        bodies = {body.name for body in self.model.bodies}
         count = Counter(frame.name for body in self.model.bodies for frame in body)
         merged = set(self.squarely.values())
         named: dict[str, str] = {}
-        taken = set(bodies)
+        taken = {ORIGIN, *self.bodies, *self.bodies.values()}
         for body in self.model.bodies:
             for frame in body:
                 full = names.joined(body.name, frame.name)
                 if frame.name == ORIGIN and frame.pose == Pose.identity():
-                    named[full] = body.name
+                    named[full] = self.bodies[body.name]
                 elif full in merged:
                     named[full] = frame.name
                 else:
-                    name = frame.name
-                    if count[name] > 1 or name in taken or name == ORIGIN:
-                        name = f"{body.name}.{frame.name}"
-                    while name in taken:
-                        name += "_"
-                    taken.add(name)
-                    named[full] = name
+                    shared = count[frame.name] > 1 or frame.name in taken
+                    named[full] = _free(f"{body.name}.{frame.name}" if shared else frame.name, taken)
         return named
 
     def instances(self) -> Iterator[str]:
         """Yield the lines of all instances, a body before its frames."""
         for body in self.model.bodies:
+            own = self.bodies[body.name]
             crossing = self.came_by.get(body.name)
             if crossing is None:
-                yield from _instance(body.name, "", body.pose or Pose.identity())
+                yield from _instance(own, "", body.pose or Pose.identity())
             elif not self.squarely[body.name]:
-                yield from _instance(body.name, self.named[crossing.enters], self._origin_in_mount(crossing))
+                yield from _instance(own, self.named[crossing.enters], self._origin_in_mount(crossing))
             for frame in body:
                 name = self.named[names.joined(body.name, frame.name)]
-                if name != body.name:
-                    yield from _instance(name, body.name, frame.pose)
+                if name != own:
+                    yield from _instance(name, own, frame.pose)
 
     def renamings(self) -> Iterator[str]:
         """Yield which frames get another name, and which bodies will not come back as bodies."""
         renamed = [
             f"{full} as {name}"
             for full, name in self.named.items()
-            if name not in (names.split(full)[1], names.split(full)[0])
+            if name not in (names.split(full)[1], self.bodies[names.split(full)[0]])
         ]
+        renamed += [f"body {name} as {own}" for name, own in self.bodies.items() if own != name]
         if renamed:
             yield f"frame names that are not unique in the whole model; written {some(renamed)}"
         carrying = {names.split(crossing.enters)[0] for crossing in self.came_by.values()}
@@ -103,7 +110,7 @@ class _Writer:
             for body in self.model.bodies
             if body.name in self.came_by
             and body.name not in carrying
-            and all(self.named[names.joined(body.name, frame.name)] == body.name for frame in body)
+            and all(self.named[names.joined(body.name, frame.name)] == self.bodies[body.name] for frame in body)
         ]
         if bare:
             yield f"that these are bodies, for nothing hangs on them: {some(bare)}"
@@ -127,6 +134,14 @@ def _losses(model: Model, used: set[str]) -> Iterator[str]:
     mounted = {names.split(end)[0] for each in model.constraints for end in (each.from_, each.to)}
     if posed := [body.name for body in model.bodies if body.pose is not None and body.name in mounted]:
         yield f"the own transform of {some(posed)}"
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """Return `name`, lengthened until nobody has it, and take it."""
+    while name in taken:
+        name += "_"
+    taken.add(name)
+    return name
 
 
 def _instance(name: str, parent: str, pose: Pose) -> Iterator[str]:

@@ -100,7 +100,7 @@ def children(element: Element) -> Iterator[Element]:
 
 
 def line(element: Element) -> int:
-    """Return the line the element stands on."""
+    """Return the line the element stands on; past line 65535 libxml2 knows it only within one."""
     # stubs miss that sourceline is a number or None
     number: Any = element.sourceline
     return int(number or 0)

@@ -90,6 +90,12 @@ class ModelBuilder:
         self._bodies.append(body)
         return body
 
+    def add(self, body: Body, source: Source = NOWHERE) -> BodyBuilder:
+        """Add a body that exists already, e.g. `camera.renamed("RearCamera")`; return its builder."""
+        draft = self.body(body.name, body.description, body.pose, body.inertia, source)
+        draft.frames.extend((frame, source) for frame in body)
+        return draft
+
     def constraint(
         self,
         name: str,

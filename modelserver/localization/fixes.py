@@ -218,10 +218,12 @@ def _velocity(sample: GpsSample, settings: RawSettings) -> _Velocity | None:
         course_sigma = sample.course_sigma
     else:
         return None
-    if not abs(vector) <= 2.0 * settings.maximum_speed:
+    # a velocity that knows nothing is none; neither is one surer than the axes of a vehicle are straight
+    if not (abs(vector) <= 2.0 * settings.maximum_speed and sigma <= settings.maximum_speed):
         return None
-    if not (course_sigma > 0.0):
+    if not course_sigma > 0.0:
         course_sigma = sigma / max(abs(vector), 1e-3)
+    course_sigma = max(course_sigma, settings.heading_floor)
     return _Velocity(vector, sigma, course_sigma, age)
 
 

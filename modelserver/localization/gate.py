@@ -12,6 +12,9 @@ from modelserver.messages import FixType, GpsSample
 _LEAST_VARIANCE = 1e-6
 """m2: no receiver is sure to better than a millimetre."""
 
+_MOST_VARIANCE = 1e8
+"""m2: a height with a sigma of 10 km is none."""
+
 _VERTICAL_SHARE = 1.6
 """Vertical over horizontal sigma where the receiver does not tell: satellites stand above the horizon only."""
 
@@ -78,7 +81,7 @@ def _covariance(sample: GpsSample, settings: RawSettings) -> tuple[float, float,
             if not 0.0 < up < math.inf:
                 up = _VERTICAL_SHARE**2 * 0.5 * (east + north)
             least = _LEAST_VARIANCE
-            return max(east, least), max(north, least), cross, max(up, least)
+            return max(east, least), max(north, least), cross, min(max(up, least), _MOST_VARIANCE)
     kind = sample.fix_type
     if kind == FixType.RTK_FIXED:
         uere = settings.uere_rtk_fixed
@@ -92,4 +95,4 @@ def _covariance(sample: GpsSample, settings: RawSettings) -> tuple[float, float,
     vdop = sample.vdop if 0.0 < sample.vdop < math.inf else _VERTICAL_SHARE * hdop
     # HDOP is of both axes together: each has its part (uere hdop)^2 / 2
     each = max(0.5 * (uere * hdop) ** 2, _LEAST_VARIANCE)
-    return each, each, 0.0, max((uere * vdop) ** 2, _LEAST_VARIANCE)
+    return each, each, 0.0, min(max(uere * vdop * uere * vdop, _LEAST_VARIANCE), _MOST_VARIANCE)

@@ -54,6 +54,7 @@ class Heading:
         variance = self.variance - 2.0 * self.covariance * dt_b + b * dt_b * dt_b + settings.gyro_noise**2 * dt_b
         if not measured:
             variance += (settings.gap_rate_sigma * dt_b) ** 2
+        variance = max(variance, settings.heading_floor**2)
         limit = settings.gyro_bias_sigma**2
         b_new = b + settings.gyro_bias_walk**2 * dt_b
         covariance = self.covariance - b * dt_b

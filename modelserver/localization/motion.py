@@ -18,6 +18,9 @@ from modelserver.spatial.so3 import Vector3
 
 LEVEL: Vector3 = (0.0, 0.0, 1.0)
 
+_LONGEST_PATH = 60.0
+"""Seconds of a gap that the path counts: no stretch of fixes is drawn across it, and a stamp may be wild."""
+
 
 @dataclass(frozen=True, slots=True)
 class Motion:
@@ -90,7 +93,7 @@ class Motion:
             yaw,
             up,
             self.rate,
-            self.path + arc * turning + straight * gap,
+            self.path + arc * turning + straight * min(gap, _LONGEST_PATH),
             self.speed,
             self.speed_utime,
             sigma,

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import logging
 import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
+from modelserver.geodesy import make_origin
 from modelserver.messages import Origin
 
 log = logging.getLogger(__name__)
 
 VERSION = 1
+
+MAX_BYTES = 4096
+"""Ten times what is written; more is no kept origin."""
 
 
 def default_directory() -> Path:
@@ -36,7 +40,8 @@ class OriginKeeper:
     def load(self) -> Origin | None:
         """Return the kept origin; None where there is none or the file is damaged, which is logged."""
         try:
-            text = self.path.read_text(encoding="utf-8")
+            with self.path.open("rb") as file:
+                text = file.read(MAX_BYTES).decode()
         except FileNotFoundError:
             return None
         except (OSError, UnicodeDecodeError) as error:
@@ -44,25 +49,27 @@ class OriginKeeper:
             return None
         try:
             return _origin(json.loads(text))
-        except (ValueError, KeyError, TypeError) as error:
-            log.warning("the kept origin in %s is damaged (%s); a new one will be captured", self.path, error)
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+            log.warning("the kept origin in %s is damaged (%r); a new one will be captured", self.path, error)
             return None
 
     def save(self, origin: Origin) -> None:
         """Keep an origin. A disk that refuses is logged: the daemon goes on, a restart captures anew."""
         content = json.dumps({"version": VERSION, **dataclasses.asdict(origin)}, indent=1)
+        # a temporary file, synced and renamed: a power cut leaves the old file or the new one. Its name is always
+        # the same, so that what a killed process leaves behind is written over, not added to
+        fresh = self.path.with_name(f"{self.path.name}.new")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            # a temporary file, synced and renamed: a power cut leaves the old file or the new one
-            with tempfile.NamedTemporaryFile(
-                "w", encoding="utf-8", dir=self.path.parent, prefix=self.path.name, delete=False
-            ) as file:
+            with fresh.open("w", encoding="utf-8") as file:
                 file.write(content + "\n")
                 file.flush()
                 os.fsync(file.fileno())
-            Path(file.name).replace(self.path)
+            fresh.replace(self.path)
         except OSError as error:
             log.warning("the origin cannot be kept in %s: %s; a restart will capture a new one", self.path, error)
+            with contextlib.suppress(OSError):
+                fresh.unlink(missing_ok=True)
 
 
 def _origin(content: dict[str, Any]) -> Origin:
@@ -70,13 +77,10 @@ def _origin(content: dict[str, Any]) -> Origin:
         raise ValueError(f"version {content['version']} is not {VERSION}")
     easting, northing, height = (float(content[name]) for name in ("easting", "northing", "height"))
     zone, north, origin_id = content["zone"], content["north"], content["origin_id"]
-    if (
-        not isinstance(zone, int)
-        or not 1 <= zone <= 60
-        or not isinstance(north, bool)
-        or not isinstance(origin_id, int)
-    ):
+    if type(zone) is not int or type(north) is not bool or type(origin_id) is not int:
         raise ValueError("zone, north or origin_id is not what it should be")
-    if not all(abs(number) < 2e7 for number in (easting, northing, height)):
-        raise ValueError("coordinates out of range")
-    return Origin(easting, northing, height, zone, north, origin_id)
+    origin = make_origin(easting, northing, height, zone, north)
+    if not 0 < origin_id < 1 << 63:
+        raise ValueError(f"origin_id {origin_id} is out of range")
+    # the id stays the one that was told to others, whatever this version would make of the numbers
+    return dataclasses.replace(origin, origin_id=origin_id)

@@ -53,8 +53,9 @@ class Row:
 class Run:
     """One pass through a recording. Iterate `rows`; the counts fill on the way.
 
-    `events` counts all events of the log, `samples` those that the core was given, `rejected` what was not
-    used, by channel or source and reason. `position` is where the log has been read to, in bytes.
+    `events` counts all events of the log, `samples` those that the core was given, `unheard` the channels that the
+    vehicle file does not name, `rejected` what was not used, by channel or source and reason. `position` is where
+    the log has been read to, in bytes.
     """
 
     vehicle: Vehicle
@@ -62,6 +63,7 @@ class Run:
     frame: str
     events: int = 0
     samples: int = 0
+    unheard: set[str] = field(default_factory=set)
     rejected: Mapping[tuple[str, str], int] = field(default_factory=dict)
     first_utime: int = 0
     last_utime: int = 0
@@ -100,6 +102,7 @@ class Run:
         self.position = event.end
         self.last_utime = max(self.last_utime, event.utime)
         if type_name is None:
+            self.unheard.add(event.channel)
             return
         self.samples += 1
         now = _instant(event.utime)

@@ -17,6 +17,7 @@ from modelserver import errors, messages
 from modelserver.messages import Origin, PoseAnswer, Quality
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.transformation import Transformation
+from modelserver.wire.channels import CHANNELS
 from modelserver.wire.codec import encode, type_names
 from mstools.lcm_wheel import binary, type_files
 
@@ -83,6 +84,18 @@ def test_given_two_types_then_their_fingerprints_differ(generator: ModuleType) -
 
 def test_given_type_files_then_the_tools_find_all_of_them() -> None:
     assert [path.stem for path in type_files()] == NAMES
+
+
+def test_given_the_channels_then_the_table_in_the_documentation_is_true(generator: ModuleType) -> None:
+    page = (ROOT / "docs" / "wire.md").read_text(encoding="utf-8")
+    assert generator.TABLE_BEGIN in page
+    assert generator.TABLE_END in page
+    assert page == generator.with_table(page), "run: make types"
+
+
+def test_given_the_channels_then_each_carries_a_type_of_the_contract() -> None:
+    assert {channel.type_name for channel in CHANNELS} <= set(NAMES)
+    assert all(len(channel.name) <= 63 and channel.name.isupper() for channel in CHANNELS)
 
 
 # --- comments -----------------------------------------------------------------------------------------------

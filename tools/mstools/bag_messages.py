@@ -78,6 +78,9 @@ class Options:
     track_width: float = 0.555
 
 
+DEFAULTS = Options()
+
+
 class Converter(Protocol):
     """Turns the messages of one topic into samples, in their order. `notes` is what to tell the user at the end."""
 

@@ -18,7 +18,7 @@ from modelserver.errors import nearest_names, shown
 from modelserver.messages import MAX_CHANNEL_LENGTH, SensorHeader
 from modelserver.wire import codec
 from modelserver.wire.eventlog import RecordingError
-from mstools.bag_messages import ROS_TYPES, Altitude, Converter, ImuOrientation, Kind, Options, converter
+from mstools.bag_messages import DEFAULTS, ROS_TYPES, Altitude, Converter, ImuOrientation, Kind, Options, converter
 from mstools.bag_reader import Bag, Topic, open_bag
 from mstools.progress import progress
 
@@ -116,7 +116,7 @@ class Report:
 def import_bag(
     bag_path: Path,
     log_path: Path,
-    options: Options = Options(),  # noqa: B008 - frozen
+    options: Options = DEFAULTS,
     kinds: Mapping[str, Kind] | None = None,
     prefix: str = "",
     force: bool = False,
@@ -128,8 +128,10 @@ def import_bag(
     """
     if log_path.exists() and not force:
         raise RecordingError(f"{log_path}: exists already; --force replaces it")
-    if log_path.is_dir() or not log_path.parent.is_dir():
-        raise RecordingError(f"{log_path}: not a place to write a file")
+    if log_path.is_dir():
+        raise RecordingError(f"{log_path}: is a folder; name a file in it")
+    if not log_path.parent.is_dir():
+        raise RecordingError(f"{log_path}: there is no folder {log_path.parent}")
     with open_bag(bag_path) as bag:
         chosen, reports = choose_topics(bag.topics, dict(kinds or {}), str(bag_path))
         part = log_path.with_name(f".{log_path.name}.{os.getpid()}.part")

@@ -120,6 +120,8 @@ def offline(
     from modelserver.service.offline import CSV_HEADER, Run
 
     vehicle = load_vehicle(load_config(config))
+    if vehicle.mounts is None:
+        raise RecordingError(f"{config}: names no GPS and IMU under sensors, so there is no pose in the world to write")
     times = None if at_times is None else read_times(at_times)
     with LogFile(log) as recording:
         run = Run(vehicle, _only(recording, channels), frame or vehicle.config.base_frame)
@@ -151,6 +153,9 @@ def offline(
         ]
         lines += [f"  not used: {n} of {s}, {r}" for (s, r), n in sorted(run.rejected.items())]
         typer.echo(json.dumps(report) if as_json else "\n".join(lines), err=poses == "-")
+        if not run.samples:
+            heard = _listed(vehicle.sensor_channels())
+            raise RecordingError(f"{log}: nothing on the vehicle's channels ({heard}); it has: {_listed(run.unheard)}")
         _report_damage(recording)
 
 

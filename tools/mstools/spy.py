@@ -52,7 +52,9 @@ def check_java() -> None:
     """Raise MissingToolError where lcm-spy could not open its window."""
     java = shutil.which("java")
     if java is None:
-        raise MissingToolError("lcm-spy needs Java, which is missing: sudo apt install default-jre default-jdk-headless")
+        raise MissingToolError(
+            "lcm-spy needs Java, which is missing: sudo apt install default-jre default-jdk-headless"
+        )
     libraries = Path(java).resolve().parent.parent / "lib"
     if (libraries / "libjava.so").exists() and not (libraries / "libawt_xawt.so").exists():
         raise MissingToolError("lcm-spy opens a window, and this Java has no windows: sudo apt install default-jre")

@@ -347,7 +347,7 @@ def test_a_bomb_of_templates_is_refused(monkeypatch):
     frames = ", ".join(f"f{n}: {{}}" for n in range(300))
     bodies = "".join(f"  b{n}: {{template: t}}\n" for n in range(5000))
     found = problems_of(f"templates:\n  t: {{frames: {{{frames}}}}}\nbodies:\n{bodies}")
-    assert ["more than 2000 frames" in problem.message for problem in found] == [True]
+    assert ["more than 2000 frames" in each.message for each in found if each.severity is Severity.ERROR] == [True]
 
 
 def test_anchors_and_aliases_may_be_used():

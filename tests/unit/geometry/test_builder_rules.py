@@ -324,3 +324,17 @@ def test_a_draft_body_may_share_frames_with_another():
     model = builder.build()
     assert isinstance(model.frame("Two:x"), BodyFrame)
     assert model.get_transformation("Two:x", "One:x").pose == Pose((1, 0, 0))
+
+
+def test_a_body_that_exists_is_added_again_under_another_name():
+    builder = cart()
+    camera = builder.build().body("Camera")
+    builder.body("Post").frame("Foot").frame("Head", Pose((0, 0, 1)))
+    builder.constraint("PostFixed", "Mast:Head2", "Post:Foot")
+    builder.add(camera.renamed("Spare"), source=at(30))
+    model = builder.check(repair=True)[0]
+    assert "Spare" not in model.get_body_list()  # an orphan, dropped with repair
+    builder.constraint("SpareFixed", "Camera:Lens", "Spare:Mount")
+    model = builder.check(repair=True)[0]
+    assert model.get_body_frame_list("Spare") == model.get_body_frame_list("Camera")
+    assert model.get_transformation("Spare:Lens", "Camera:Lens").pose == Pose((0.1, 0, 0))

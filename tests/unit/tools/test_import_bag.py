@@ -15,7 +15,7 @@ from modelserver.messages import Direction, FixType, ImuSample, OrientationRefer
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent, LogFile, RecordingError
 from mstools import cli
-from mstools.bag_messages import Altitude, ImuOrientation, Kind, Options
+from mstools.bag_messages import DEFAULTS, Altitude, ImuOrientation, Kind, Options
 from mstools.import_bag import import_bag
 
 TYPE_NAMES = {"GPS": "gps_t", "IMU": "imu_t", "WHEELS": "wheels_t", "JOINTS": "joints_t"}
@@ -33,14 +33,14 @@ def events(path: Path) -> list[LogEvent]:
     return found
 
 
-def imported(tmp_path: Path, ros: Ros, messages: list[tuple[str, int, Any]], options: Options = Options()) -> list[Any]:
+def imported(tmp_path: Path, ros: Ros, messages: list[tuple[str, int, Any]], options: Options = DEFAULTS) -> list[Any]:
     """Return the samples that messages become, in the log's order."""
     bag = ros.write(tmp_path / "a.bag", messages)
     import_bag(bag, tmp_path / "a.lcm", options)
     return [decode(TYPE_NAMES[event.channel], event.data) for event in events(tmp_path / "a.lcm")]
 
 
-def one(tmp_path: Path, ros: Ros, message: Any, options: Options = Options()) -> Any:
+def one(tmp_path: Path, ros: Ros, message: Any, options: Options = DEFAULTS) -> Any:
     (sample,) = imported(tmp_path, ros, [("/topic", START_NS + 5_000_000, message)], options)
     return sample
 
@@ -116,8 +116,12 @@ def test_given_two_inertial_units_when_imported_then_the_busier_is_taken_and_the
 ) -> None:
     bag = ros.write(
         tmp_path / "a.bag",
-        [("/one", START_NS, ros.imu()), *[("/two", START_NS + n, ros.imu()) for n in (1000, 2000)]]
-        + [("/chatter", START_NS + 5000, ros.text("hello"))],
+        [
+            ("/one", START_NS, ros.imu()),
+            ("/two", START_NS + 1000, ros.imu()),
+            ("/two", START_NS + 2000, ros.imu()),
+            ("/chatter", START_NS + 5000, ros.text("hello")),
+        ],
     )
     by_topic = {each.topic: each for each in import_bag(bag, tmp_path / "a.lcm").topics}
     assert by_topic["/two"].written == 2

@@ -1,0 +1,234 @@
+"""The codec on any value and any bytes."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+import mslcm
+from modelserver import messages
+from modelserver.errors import Status, WireError
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.transformation import Transformation
+from modelserver.wire.codec import decode, encode, type_names
+from modelserver.wire.fields import MAX_UTIME
+from support_wire import EXAMPLES, same
+
+int32 = st.integers(-(1 << 31), (1 << 31) - 1)
+int64 = st.integers(-(1 << 63), (1 << 63) - 1)
+count64 = st.integers(0, (1 << 63) - 1)
+utimes = st.integers(0, MAX_UTIME - 1)
+numbers = st.floats(allow_nan=True, allow_infinity=True)
+known = st.floats(allow_nan=False, allow_infinity=True)
+# what LCM can carry: text that UTF-8 can write
+texts = st.text(st.characters(exclude_categories=("Cs",)), max_size=20)
+
+
+def vectors(length: int) -> st.SearchStrategy[Any]:
+    # opposite infinities would add up to nan, which stands for no vector at all; no device sends them
+    return st.none() | st.tuples(*[st.floats(allow_nan=False, allow_infinity=False, width=32)] * length)
+
+
+sensor_headers = st.builds(
+    messages.SensorHeader,
+    st.integers(1, MAX_UTIME - 1),
+    st.text(st.characters(exclude_categories=("Cs",)), max_size=64),
+    int64,
+    utimes,
+    int64,
+    numbers,
+)
+request_headers = st.builds(messages.RequestHeader, int64, texts)
+times = st.builds(messages.TimeQuery, utimes, st.sampled_from(messages.Policy), st.integers(0, (1 << 31) - 1))
+
+
+def reply_headers(status: st.SearchStrategy[Status]) -> st.SearchStrategy[messages.ReplyHeader]:
+    return st.builds(messages.ReplyHeader, int64, int64, status, texts, st.lists(texts, max_size=3).map(tuple), texts)
+
+
+@st.composite
+def answers(draw: st.DrawFn) -> messages.PoseAnswer:
+    metres = st.floats(-1e9, 1e9)
+    quaternion = draw(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 1e-3))
+    covariance = draw(st.none() | st.lists(known, min_size=36, max_size=36))
+    origin = draw(st.none() | st.builds(messages.Origin, known, known, known, st.integers(1, 60), st.booleans(), int64))
+    return messages.PoseAnswer(
+        Transformation(
+            draw(texts),
+            draw(texts),
+            Pose(draw(st.tuples(metres, metres, metres)), quaternion),
+            None if covariance is None else np.array(covariance).reshape(6, 6),
+            draw(int64),
+            draw(st.integers(0, (1 << 31) - 1)),
+            draw(int32),
+            # the origin's id stands once on the wire
+            draw(int64) if origin is None else origin.origin_id,
+            draw(texts),
+        ),
+        origin,
+        messages.Quality(draw(st.integers(0, 63))),
+        *draw(st.tuples(numbers, numbers, numbers)),
+    )
+
+
+failed = reply_headers(st.sampled_from([status for status in Status if status is not Status.OK]))
+fine = reply_headers(st.just(Status.OK))
+names = st.lists(st.tuples(texts, texts), max_size=4)
+
+VALUES: dict[str, st.SearchStrategy[Any]] = {
+    "gps_t": st.builds(
+        messages.GpsSample,
+        sensor_headers,
+        st.sampled_from(messages.FixType),
+        *[numbers] * 5,
+        st.integers(-(1 << 15), (1 << 15) - 1),
+        *[numbers] * 3,
+        vectors(9),
+        vectors(3),
+        vectors(9),
+        *[numbers] * 7,
+    ),
+    "imu_t": st.builds(
+        messages.ImuSample,
+        sensor_headers,
+        vectors(3),
+        vectors(3),
+        vectors(3),
+        vectors(4),
+        st.sampled_from(messages.OrientationReference),
+        st.sampled_from(messages.YawSource),
+        vectors(9),
+        vectors(9),
+        vectors(9),
+        numbers,
+    ),
+    "wheels_t": st.builds(
+        messages.WheelsSample,
+        sensor_headers,
+        st.lists(
+            st.builds(messages.WheelSample, texts, *[numbers] * 4, st.sampled_from(messages.Direction), numbers),
+            max_size=6,
+        ).map(tuple),
+    ),
+    "joints_t": st.builds(
+        messages.JointsSample,
+        sensor_headers,
+        st.lists(st.builds(messages.JointSample, texts, *[numbers] * 4), max_size=6).map(tuple),
+    ),
+    "get_transformation_request_t": st.builds(messages.GetTransformation, request_headers, texts, texts, times),
+    "get_body_list_request_t": st.builds(messages.GetBodyList, request_headers),
+    "get_body_frame_list_request_t": st.builds(messages.GetBodyFrameList, request_headers, texts),
+    "get_state_vector_request_t": st.builds(messages.GetStateVector, request_headers, times),
+    "get_h_transform_request_t": st.builds(messages.GetHTransform, request_headers, st.booleans(), times),
+    "get_history_request_t": st.builds(messages.GetHistory, request_headers, utimes, utimes, numbers),
+    "get_transformation_reply_t": st.builds(messages.TransformReply, failed)
+    | st.builds(messages.TransformReply, fine, answers()),
+    "get_state_vector_reply_t": st.builds(messages.StateVectorReply, failed)
+    | st.builds(messages.StateVectorReply, fine, answers()),
+    "name_list_reply_t": st.builds(
+        lambda header, found: messages.NameListReply(
+            header, tuple(name for name, _ in found), tuple(about for _, about in found)
+        ),
+        fine | failed,
+        names,
+    ),
+    "get_history_reply_t": st.builds(messages.HistoryReply, fine | failed, st.lists(answers(), max_size=3).map(tuple)),
+    "health_t": st.builds(
+        messages.Health,
+        int64,
+        numbers,
+        texts,
+        texts,
+        texts,
+        st.integers(0, 2),
+        st.integers(0, 1023).map(messages.Invalid),
+        int32,
+        int64,
+        count64,
+        count64,
+        st.integers(0, (1 << 31) - 1),
+        count64,
+        count64,
+        numbers,
+        numbers,
+        st.lists(st.builds(messages.ChannelHealth, texts, count64, numbers, numbers), max_size=3).map(tuple),
+        st.lists(st.tuples(texts, texts, count64), max_size=3).map(tuple),
+    ),
+    "pose_transform_t": answers(),
+    "pose_vector_t": answers(),
+}
+
+typed_values = st.sampled_from(sorted(VALUES)).flatmap(lambda name: st.tuples(st.just(name), VALUES[name]))
+
+
+def test_given_the_codec_then_every_type_has_a_strategy() -> None:
+    assert sorted(VALUES) == sorted(type_names())
+
+
+@given(typed_values)
+def test_given_any_value_when_encoded_and_decoded_then_it_is_the_same(typed: tuple[str, Any]) -> None:
+    type_name, value = typed
+    assert same(decode(type_name, encode(value, type_name)), value)
+
+
+@given(typed_values)
+def test_given_any_value_when_encoded_then_the_generated_type_reads_and_writes_the_same_bytes(
+    typed: tuple[str, Any],
+) -> None:
+    type_name, value = typed
+    data = encode(value, type_name)
+    assert getattr(mslcm, type_name).decode(data).encode() == data
+
+
+@given(st.sampled_from(sorted(VALUES)), st.binary(max_size=600))
+def test_given_any_bytes_when_decoded_then_they_are_refused(type_name: str, data: bytes) -> None:
+    try:
+        decode(type_name, data)
+    except WireError as error:
+        assert error.reason == "fingerprint"
+    else:
+        raise AssertionError("random bytes had the right fingerprint")
+
+
+@given(st.sampled_from(sorted(VALUES)), st.binary(max_size=1500))
+def test_given_any_bytes_behind_a_fingerprint_when_decoded_then_only_wire_error_is_raised(
+    type_name: str, data: bytes
+) -> None:
+    _decode_any(type_name, getattr(mslcm, type_name)._get_packed_fingerprint() + data)
+
+
+@given(typed_values, st.data())
+def test_given_a_value_with_bytes_changed_when_decoded_then_only_wire_error_is_raised(
+    typed: tuple[str, Any], data: st.DataObject
+) -> None:
+    type_name, value = typed
+    damaged = bytearray(encode(value, type_name))
+    for _ in range(data.draw(st.integers(1, 4))):
+        place = data.draw(st.integers(8, len(damaged) - 1))
+        damaged[place] = data.draw(st.integers(0, 255))
+    _decode_any(type_name, bytes(damaged))
+
+
+def _decode_any(type_name: str, data: bytes) -> None:
+    """Decode; what is taken must be a value that can be looked at and sent on."""
+    try:
+        value = decode(type_name, data)
+    except WireError as error:
+        assert error.reason in ("truncated", "malformed")
+        return
+    assert repr(value)
+    assert same(decode(type_name, encode(value, type_name)), value)
+
+
+def test_given_an_example_of_each_type_then_same_tells_it_from_the_others() -> None:
+    values = [value for values in EXAMPLES.values() for value in values if not isinstance(value, messages.PoseAnswer)]
+    for left in range(len(values)):
+        for right in range(len(values)):
+            assert same(values[left], values[right]) == (left == right)
+    sample = EXAMPLES["gps_t"][1]
+    assert not same(sample, dataclasses.replace(sample, course=sample.course + 1e-9))

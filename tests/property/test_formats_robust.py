@@ -1,0 +1,97 @@
+"""Whatever the bytes, a file is a model or a GeometryError that says where and what to do."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support_formats import YAML, miro, models, tree, tree_frame
+
+from modelserver.errors import GeometryError, Severity
+from modelserver.formats import parse_model, save_model
+
+TREE = tree(tree_frame("$MRN"), tree_frame("Mast", "$MRN", X="1.5", Yaw="90"), tree_frame("Camera", "Mast", Roll="-3"))
+FILES = [YAML.encode(), miro().encode(), TREE.encode()]
+
+PIECES = [
+    *(b"<", b">", b'"', b"/>", b"<!--", b"-->", b"<!DOCTYPE x [", b"&amp;", b"&x;", b"<parameter>", b"]]>", b"<?x?>"),
+    *(
+        b"[",
+        b"]",
+        b"{",
+        b"}",
+        b": ",
+        b"- ",
+        b"\n",
+        b"\t",
+        b"&a ",
+        b"*a",
+        b"!!int ",
+        b"<<: ",
+        b"---\n",
+        b"|",
+        b"%",
+        b"#",
+    ),
+    *(
+        b"nan",
+        b"1e308",
+        b"-1e308",
+        b"1e-320",
+        b"99999999999999999999",
+        b"\x00",
+        b"\xff",
+        b"\xef\xbb\xbf",
+        b"\xed\xa0\x80",
+    ),
+    *(b"$MRN", b"${X}", b"World", b"Origin", b"Cart:Mast", b"name=", b"value=", b"Row1", b"xyz", b"quaternion"),
+]
+
+
+@st.composite
+def mutated(draw):
+    content = bytearray(draw(st.sampled_from(FILES)))
+    for _ in range(draw(st.integers(1, 6))):
+        at = draw(st.integers(0, len(content)))
+        length = draw(st.sampled_from((0, 0, 1, 3, 20, 200)))
+        content[at : at + length] = draw(st.sampled_from(PIECES) | st.binary(max_size=4))
+    return bytes(content)
+
+
+def assert_loads_or_says_why(content, file=""):
+    for repair in (False, True):
+        try:
+            model = parse_model(content, file, repair=repair)
+        except GeometryError as error:
+            problems = error.problems
+            wrong = True
+        else:
+            problems = model.problems
+            wrong = not model.bodies
+        assert wrong == any(problem.severity is Severity.ERROR for problem in problems)
+        for problem in problems:
+            assert problem.message
+            assert problem.fix or problem.severity is not Severity.ERROR
+            assert 0 <= problem.line <= content.count(b"\n") + content.count(b"\r") + 2
+
+
+@given(mutated())
+@settings(max_examples=250)
+def test_a_damaged_file_is_a_model_or_says_why_not(content):
+    assert_loads_or_says_why(content)
+
+
+@given(st.binary(max_size=200), st.sampled_from(["", "a.xml", "a.yaml"]))
+def test_any_bytes_are_a_model_or_say_why_not(content, file):
+    assert_loads_or_says_why(content, file)
+
+
+@given(st.text(max_size=200), st.sampled_from(["", "bodies: ", "<config>"]))
+def test_any_text_is_a_model_or_says_why_not(text, before):
+    assert_loads_or_says_why((before + text).encode())
+
+
+@pytest.mark.parametrize("form", ["yaml", "miro", "miro-frames"])
+@given(model=models(), part=st.floats(0, 1))
+@settings(max_examples=10)
+def test_a_file_cut_short_is_a_model_or_says_why_not(form, model, part):
+    content = save_model(model, form).text.encode()
+    assert_loads_or_says_why(content[: int(len(content) * part)])

@@ -1,0 +1,96 @@
+"""Whatever a model is, each form gives it back, but for what the form says it cannot hold."""
+
+from itertools import product
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support_formats import assert_same_transforms, models, read
+from support_spatial import rotations
+
+from modelserver.formats import save_model
+from modelserver.formats.frame_tree_text import instance_names
+from modelserver.formats.yaml_text import degrees_of
+from modelserver.spatial import Pose
+
+
+def folded(text):
+    return " ".join("".join(each if each.isprintable() else " " for each in text).split())
+
+
+def assert_same_poses(one, other):
+    """The poses as stored, to 1e-12: what the file holds, not only what follows from it."""
+    pairs = [(a.pose, b.pose) for x, y in zip(one.bodies, other.bodies, strict=True) for a, b in zip(x, y, strict=True)]
+    pairs += [(a.pose, b.pose) for a, b in zip(one.constraints, other.constraints, strict=True)]
+    pairs += [(a.pose or Pose(), b.pose or Pose()) for a, b in zip(one.bodies, other.bodies, strict=True)]
+    for a, b in pairs:
+        np.testing.assert_allclose(a.matrix, b.matrix, rtol=0, atol=1e-12)
+
+
+@given(models())
+@settings(max_examples=25)
+def test_yaml_gives_back_everything(model):
+    saved = save_model(model, "yaml")
+    again = read(saved.text)
+    assert saved.losses == ()
+    assert_same_poses(model, again)
+    assert_same_transforms(model, again)
+    assert (again.name, again.description) == (model.name, model.description)
+    for mine, theirs in zip(model.bodies, again.bodies, strict=True):
+        assert (mine.name, mine.description, mine.inertia) == (theirs.name, theirs.description, theirs.inertia)
+        assert (mine.pose is None) == (theirs.pose is None)
+        for a, b in zip(mine, theirs, strict=True):
+            assert (a.name, a.description, a.sigma, a.pose.xyz) == (b.name, b.description, b.sigma, b.pose.xyz)
+    for a, b in zip(model.constraints, again.constraints, strict=True):
+        assert (a.name, a.from_, a.to, a.description, a.sigma, a.joint) == (
+            b.name,
+            b.from_,
+            b.to,
+            b.description,
+            b.sigma,
+            b.joint,
+        )
+
+
+@given(models())
+@settings(max_examples=25)
+def test_miro_xml_gives_back_all_transforms_and_says_what_it_lost(model):
+    saved = save_model(model, "miro")
+    again = read(saved.text)
+    assert_same_poses(model, again)
+    assert_same_transforms(model, again)
+    frames = [frame for body in model.bodies for frame in body]
+    lost = " ".join(saved.losses)
+    assert ("sigmas of" in lost) == any(each.sigma for each in (*frames, *model.constraints))
+    assert ("inertia" in lost) == any(body.inertia is not None for body in model.bodies)
+    assert [folded(body.description) for body in model.bodies] == [body.description for body in again.bodies]
+    assert [frame.name for frame in frames] == [frame.name for body in again.bodies for frame in body]
+
+
+@given(models())
+@settings(max_examples=25)
+def test_a_frame_tree_has_every_frame_at_its_place(model):
+    again = read(save_model(model, "miro-frames").text)
+    frames = {f"{body.name}:{frame.name}": frame.name for body in again.bodies for frame in body}
+    by_instance = {frame: full for full, frame in frames.items() if frame != "Origin"}
+    by_instance |= {body.name: f"{body.name}:Origin" for body in again.bodies}
+    place = {full: by_instance[name] for full, name in instance_names(model).items()}
+    for a, b in product(place, repeat=2):
+        wanted = model.get_transformation(a, b).pose
+        # angles alone carry less near a pitch of 90 degrees than a quaternion does
+        assert again.get_transformation(place[a], place[b]).pose.is_close(wanted, 1e-5, 1e-6), (a, b)
+
+
+@given(rotations)
+@settings(max_examples=300)
+def test_angles_in_degrees_are_written_only_where_they_read_back(wxyz):
+    degrees = degrees_of(wxyz)
+    if degrees is not None:
+        back = Pose.from_rpy((0, 0, 0), *np.radians(degrees).tolist())
+        assert back.distance(Pose((0, 0, 0), wxyz))[1] <= 1e-12
+
+
+@given(st.tuples(*[st.integers(-89, 89).map(lambda tenth: tenth / 10)] * 3))
+def test_round_angles_are_written_round(angles):
+    wxyz = Pose.from_rpy((0, 0, 0), *np.radians(angles).tolist()).wxyz
+    assert degrees_of(wxyz) == angles

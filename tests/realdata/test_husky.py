@@ -1,0 +1,135 @@
+"""The Husky recording: imported, replayed, and held against its own fixes."""
+
+from __future__ import annotations
+
+import collections
+import itertools
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from support_recordings import HUSKY
+
+from benchmarks import husky_rmse
+from modelserver.config import load_config
+from modelserver.service.daemon import load_vehicle
+from modelserver.service.offline import Run
+from modelserver.wire.codec import decode
+from modelserver.wire.eventlog import LogFile
+from mstools.import_bag import Report, import_bag
+
+pytestmark = pytest.mark.realdata
+
+ANTENNA = "Antenna:PhaseCentre"
+
+
+@pytest.fixture(scope="session")
+def imported(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Report]:
+    log = tmp_path_factory.mktemp("husky") / "test1.lcm"
+    return log, import_bag(data_dir / "husky" / "test1.bag", log)
+
+
+@pytest.fixture(scope="session")
+def antenna(imported: tuple[Path, Report]) -> npt.NDArray[np.float64]:
+    """Time (s from the first event), east, north, up, valid: the antenna at 10 Hz."""
+    vehicle = load_vehicle(load_config(HUSKY))
+    with LogFile(imported[0]) as log:
+        run = Run(vehicle, log, ANTENNA)
+        rows = [(each.utime, each.easting, each.northing, each.up, each.valid) for each in run.rows(None, 10.0)]
+        start = run.first_utime
+    found = np.array(rows, float)
+    found[:, 0] = (found[:, 0] - start) * 1e-6
+    return found
+
+
+def test_given_the_bag_when_imported_then_every_message_is_in_the_log(imported: tuple[Path, Report]) -> None:
+    log, report = imported
+    assert {each.topic: (each.channel, each.written) for each in report.topics} == {
+        "/fix": ("GPS", 989),
+        "/imu/data": ("IMU", 11865),
+        "/husky_velocity_controller/odom": ("WHEELS", 3952),
+    }
+    with LogFile(log) as recording:
+        counts = collections.Counter(each.channel for each in recording)
+        assert recording.damage == []
+    assert counts == {"GPS": 989, "IMU": 11865, "WHEELS": 3952}
+    assert report.seconds == pytest.approx(395.3, abs=0.1)
+    assert "by gravity it is of kind enu" in report.text()
+
+
+def test_given_the_bag_when_imported_then_the_units_are_right(imported: tuple[Path, Report]) -> None:
+    with LogFile(imported[0]) as recording:
+        events = list(recording)
+    imu = [decode("imu_t", each.data) for each in events if each.channel == "IMU"]
+    force = np.mean([each.specific_force for each in imu], axis=0)
+    assert force[1] == pytest.approx(9.8, abs=0.3)  # up is the unit's y axis: the mount in config/husky rests on it
+    assert np.hypot(force[0], force[2]) < 1.0
+    gps = [decode("gps_t", each.data) for each in events if each.channel == "GPS"]
+    # the geoid lies 28 m below the ellipsoid there and the car park some metres above the sea
+    assert -30.0 < np.median([each.height_ellipsoidal for each in gps]) < -15.0
+    wheels = [decode("wheels_t", each.data) for each in events if each.channel == "WHEELS"]
+    way = np.mean([wheel.travel for wheel in wheels[-1].wheels])
+    assert way == pytest.approx(358.8, abs=0.5)
+    turned = np.subtract(*(wheel.travel for wheel in reversed(wheels[-1].wheels))) / 0.555
+    assert turned == pytest.approx(-3.46, abs=0.02)  # the same as the odometry's own yaw, end minus start
+
+
+def test_given_the_recording_when_replayed_then_the_pose_is_valid_soon_and_stays_so(
+    antenna: npt.NDArray[np.float64],
+) -> None:
+    valid = antenna[:, 4] > 0
+    assert antenna[np.argmax(valid), 0] < 15.0
+    assert valid[antenna[:, 0] > 15.0].mean() > 0.99
+
+
+def test_given_the_recording_when_replayed_then_the_antenna_follows_its_fixes_within_their_noise(
+    imported: tuple[Path, Report], antenna: npt.NDArray[np.float64]
+) -> None:
+    with LogFile(imported[0]) as recording:
+        fixes = husky_rmse.read_fixes(recording)
+    t = (fixes.utime - fixes.utime[0]) * 1e-6 + antenna[0, 0]
+    valid = antenna[antenna[:, 4] > 0]
+    scored = (t > valid[0, 0] + 1.0) & (t < valid[-1, 0])
+    place = np.column_stack([np.interp(t[scored], valid[:, 0], valid[:, k]) for k in (1, 2)])
+    off = np.hypot(*(place - fixes.place[scored]).T)
+    # the receiver states 0.9 m on each axis: 1.27 m horizontally, one standard deviation
+    assert np.sqrt((off**2).mean()) < 0.9
+    assert (off < 2 * 1.27).mean() > 0.99
+
+
+def test_given_withheld_fixes_when_replayed_then_the_way_between_fixes_is_carried_better_than_by_holding(
+    imported: tuple[Path, Report], tmp_path: Path
+) -> None:
+    scores = husky_rmse.run(imported[0], tmp_path)
+    ours = scores["modelserver"]
+    assert ours.missing == 0
+    assert ours.n > 450
+    assert ours.rmse < scores["last fix held"].rmse
+    assert ours.rmse < 0.9
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # the scorer leaves a file open
+def test_given_the_common_scorer_when_it_is_there_then_it_agrees_with_this_projects(data_dir: Path) -> None:
+    scorer = husky_rmse.common_scorer(data_dir)
+    if scorer is None:
+        pytest.skip(f"no scorer beside {data_dir}")
+    t = np.arange(100) * 0.4
+    place = np.column_stack([t * 1.0, np.sin(t)])
+    fixes = husky_rmse.Fixes(np.round(t * 1e6).astype(np.int64), place)
+    guess = husky_rmse.straight_on(fixes)
+    theirs, ours = husky_rmse.score(fixes, guess, scorer), husky_rmse.score(fixes, guess)
+    assert (theirs.n, theirs.missing) == (ours.n, ours.missing)
+    assert theirs.rmse == pytest.approx(ours.rmse, abs=1e-5)
+    assert theirs.max == pytest.approx(ours.max, abs=1e-5)
+
+
+def test_given_the_recording_when_replayed_twice_then_the_same_bits(imported: tuple[Path, Report]) -> None:
+    vehicle = load_vehicle(load_config(HUSKY))
+
+    def lines() -> list[str]:
+        with LogFile(imported[0]) as log:
+            first_minute = itertools.islice(log, 2500)
+            return [each.csv() for each in Run(vehicle, first_minute, ANTENNA).rows(None, 20.0)]
+
+    assert lines() == lines()

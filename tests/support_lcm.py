@@ -1,0 +1,101 @@
+"""The real bus and the real daemon for tests: a port of its own for each, waiting on events, ending by pid."""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import lcm
+
+PATIENCE_S = 30.0
+"""How long a test waits for what must come; only a failing one waits so long."""
+
+
+@contextmanager
+def reserved_url() -> Iterator[str]:
+    """Yield an LCM provider on loopback whose port no other test on this machine uses.
+
+    The port is held by a TCP socket of the same number: that leaves its UDP side to LCM. It lies below the ports
+    that the kernel hands out by itself.
+    """
+    with socket.socket() as holder:
+        for port in random.SystemRandom().sample(range(20_000, 32_000), 100):
+            try:
+                holder.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            yield f"udpm://239.255.76.67:{port}?ttl=0"
+            return
+    raise RuntimeError("no free port")
+
+
+def wait_until(bus: lcm.LCM, arrived: Callable[[], bool], seconds: float = PATIENCE_S) -> bool:
+    """Handle messages until `arrived`; return whether it did in time."""
+    deadline = time.monotonic() + seconds
+    while not arrived():
+        left = deadline - time.monotonic()
+        if left <= 0:
+            return False
+        bus.handle_timeout(int(min(left, 1.0) * 1000) + 1)
+    return True
+
+
+class Listener:
+    """Hears one channel; `heard` fills while messages are waited for."""
+
+    def __init__(self, url: str, channel: str):
+        self.heard: list[bytes] = []
+        self.bus = lcm.LCM(url)
+        self.bus.subscribe(re.escape(channel), lambda _, data: self.heard.append(data))
+
+    def wait(self, count: int = 1, seconds: float = PATIENCE_S) -> bool:
+        """Return whether `count` messages have been heard in time."""
+        return wait_until(self.bus, lambda: len(self.heard) >= count, seconds)
+
+
+@contextmanager
+def started(arguments: Sequence[str | Path], url: str, **options: object) -> Iterator[subprocess.Popen[str]]:
+    """Run a program on the bus at `url` until the block ends, then end it by its pid."""
+    environment = os.environ | {"LCM_DEFAULT_URL": url}
+    process: subprocess.Popen[str] = subprocess.Popen(
+        list(map(str, arguments)),
+        env=environment,
+        text=True,
+        **options,  # type: ignore[call-overload]
+    )
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.terminate()
+        try:
+            process.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            raise
+
+
+MODELSERVER = (sys.executable, "-c", "from mstools.cli import main; main()")
+"""The `modelserver` command of the environment that runs the tests."""
+
+
+@contextmanager
+def running_daemon(vehicle_file: Path, folder: Path) -> Iterator[str]:
+    """Run the daemon for a vehicle file, its state and log in `folder`; yield the URL of its bus once it speaks."""
+    log = folder / "daemon.log"
+    with reserved_url() as url, log.open("w") as errors:
+        listener = Listener(url, "MODELSERVER_HEALTH")
+        arguments = ("env", f"XDG_STATE_HOME={folder}", *MODELSERVER, "run", "-c", vehicle_file)
+        with started(arguments, url, stderr=errors) as process:
+            assert wait_until(listener.bus, lambda: bool(listener.heard) or process.poll() is not None), log.read_text()
+            assert process.poll() is None, log.read_text()
+            yield url

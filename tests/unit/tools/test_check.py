@@ -1,0 +1,127 @@
+"""`modelserver check`."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+from support_formats import YAML, miro, tree, tree_frame
+
+from mstools.cli import main
+
+BAD = YAML.replace("[0.2, 0, 1.1]", "[0.2, 0]").replace("to: Camera:Origin", "to: Camrea:Origin")
+NOTED = YAML.replace("modelserver: geometry/1\n", "")
+
+
+@pytest.fixture
+def check(tmp_path, capsys, monkeypatch):
+    """Return a function that checks texts, each in a file of its own, and gives exit code, output and errors."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("MRN", raising=False)
+
+    def run(*arguments, **files):
+        for name, text in files.items():
+            (tmp_path / name).write_text(text)
+        with pytest.raises(SystemExit) as ended:
+            main(["check", *files, *arguments])
+        out, err = capsys.readouterr()
+        return ended.value.code or 0, out, err
+
+    return run
+
+
+def test_a_clean_file_is_one_line_and_exit_0(check):
+    assert check(cart=YAML) == (0, "cart: 2 bodies, 3 frames, 1 constraint; clean\n", "")
+
+
+def test_every_problem_is_printed_with_place_fix_and_nearest_and_exit_1(check):
+    code, out, _ = check(cart=BAD)
+    assert code == 1
+    lines = out.splitlines()
+    assert lines[0] == "cart:6: error: xyz has 2 numbers, not 3"
+    assert lines[1] == "    in:      body Cart, frame Mast"
+    assert lines[2] == "    fix:     write xyz: [number, number, number], in metres"
+    assert lines[3].startswith("cart:11: error: ")
+    assert any(line.startswith("    nearest: Camera:Origin") for line in lines)
+    assert lines[-1] == "cart: 2 errors"
+
+
+def test_a_warning_exits_1_and_the_size_is_told(check):
+    code, out, _ = check(cart=YAML.replace("constraints:", "  Lamp: {frames: {Origin: }}\nconstraints:"))
+    assert code == 1
+    assert out.splitlines()[-1] == "cart: 3 bodies, 4 frames, 1 constraint; 1 warning"
+
+
+def test_notes_are_counted_printed_when_asked_for_and_change_no_exit_code(check):
+    assert check(cart=NOTED) == (0, "cart: 2 bodies, 3 frames, 1 constraint; clean; 1 note (--notes shows them)\n", "")
+    code, out, _ = check("--notes", cart=NOTED)
+    assert code == 0
+    assert "note: the file does not say which form it is in" in out
+
+
+def test_several_files_are_checked_though_one_is_missing(check):
+    code, out, _ = check("nowhere", "--set", "MRN=Rover", a=YAML, b=miro())
+    assert code == 1
+    assert "a: 2 bodies" in out
+    assert "b: 2 bodies" in out
+    assert "nowhere: error: the file cannot be read: No such file or directory" in out
+
+
+def test_set_fills_variables(check):
+    text = tree(tree_frame("$MRN"), tree_frame("Mast", "$MRN"), tree_frame("Camera", "Mast"))
+    code, out, _ = check(rover=text)
+    assert code == 1
+    assert "--set MRN=NAME" in out
+    assert check("--set", "MRN=K11", rover=text)[0] == 0
+
+
+@pytest.mark.parametrize("text", ["MRN", "=x", "M RN=x", "$MRN=x"])
+def test_a_malformed_set_is_wrong_usage(check, text):
+    code, _, err = check("--set", text, a=YAML)
+    assert code == 2
+    assert "NAME=VALUE" in err
+
+
+def test_no_file_is_wrong_usage(check):
+    assert check()[0] == 2
+
+
+def test_json_holds_all_for_scripts(check):
+    code, out, _ = check("--json", bad=BAD, good=NOTED)
+    assert code == 1
+    bad, good = json.loads(out)["files"]
+    assert (bad["file"], bad["clean"], bad["errors"], bad["model"]) == ("bad", False, 2, None)
+    assert bad["problems"][0] == {
+        "severity": "error",
+        "file": "bad",
+        "line": 6,
+        "element": "body Cart, frame Mast",
+        "message": "xyz has 2 numbers, not 3",
+        "fix": "write xyz: [number, number, number], in metres",
+        "nearest": [],
+    }
+    assert (good["clean"], good["notes"], good["model"]["frames"]) == (True, 1, 3)
+
+
+def test_control_characters_from_a_file_do_not_reach_the_terminal(check):
+    _, out, _ = check(cart=YAML.replace("Mast: {", '"Ma\\e[31mst\\x07": {'))
+    assert out
+    assert all(each.isprintable() for each in out.replace("\n", ""))
+
+
+def test_help_has_an_example(check):
+    code, out, _ = check("--help")
+    assert code == 0
+    assert "Example: modelserver check" in out
+
+
+def test_nothing_heavy_is_imported(tmp_path):
+    (tmp_path / "cart").write_text(YAML)
+    script = (
+        "import sys, mstools.cli as cli\n"
+        "try: cli.main(['check', 'cart'])\n"
+        "except SystemExit: print(*sys.modules, file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert "clean" in done.stdout
+    assert {"filterpy", "matplotlib", "scipy", "pyproj", "lxml", "lcm"}.isdisjoint(done.stderr.split())

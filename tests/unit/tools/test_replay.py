@@ -1,0 +1,278 @@
+from __future__ import annotations
+
+import json
+import math
+import os
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import lcm
+import pytest
+from support_recordings import EASTING, HEIGHT, HUSKY, LATENCY, NORTHING, SPEED, START, drive, write_log
+
+from modelserver.service import playback
+from mstools import cli
+from mstools.replay import read_times
+
+HEADER = "utime,easting,northing,up,qw,qx,qy,qz,pose_valid,invalid_reasons"
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run the command; return its exit code, standard output and error."""
+
+    def replay(*arguments: object) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as end:
+            cli.main(["replay", *(str(each) for each in arguments)])
+        out, err = capsys.readouterr()
+        return int(end.value.code or 0), out, err
+
+    return replay
+
+
+@pytest.fixture(scope="session")
+def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_log(tmp_path_factory.mktemp("recordings") / "drive.lcm", drive(40.0))
+
+
+def rows(path: Path) -> list[list[float]]:
+    lines = path.read_text().splitlines()
+    assert lines[0] == HEADER
+    return [[float(value) for value in line.split(",")] for line in lines[1:]]
+
+
+# --- offline ------------------------------------------------------------------------------------------------
+
+
+def test_given_a_drive_when_replayed_then_the_antenna_is_where_it_was(driven: Path, tmp_path: Path, run: Run) -> None:
+    out = tmp_path / "poses.csv"
+    code, words, err = run(driven, "-c", HUSKY, "--poses", out, "--frame", "Antenna:PhaseCentre", "--rate", 10)
+    assert (code, err) == (0, "")
+    assert "times real time" in words
+    found = rows(out)
+    assert [row[0] for row in found[:3]] == [START + LATENCY + n * 100_000 for n in range(3)]
+    assert len(found) == 400
+    assert math.isnan(found[0][1])
+    assert found[0][8:] == [0, 15]
+    utime, easting, northing, up, w, x, y, z, valid, reasons = found[-1]
+    assert (valid, reasons) == (1, 0)
+    assert easting == pytest.approx(EASTING + SPEED * (utime - START) * 1e-6, abs=0.1)
+    assert northing == pytest.approx(NORTHING, abs=0.1)
+    assert up == pytest.approx(HEIGHT, abs=0.1)
+    assert abs(2 * math.atan2(z, w)) < 0.03  # to the east
+    assert math.hypot(x, y) < 0.01
+
+
+def test_given_no_frame_when_replayed_then_it_is_the_base_frame(driven: Path, tmp_path: Path, run: Run) -> None:
+    for name, options in (("base.csv", ()), ("antenna.csv", ("--frame", "Antenna:PhaseCentre"))):
+        assert run(driven, "-c", HUSKY, "--poses", tmp_path / name, *options)[0] == 0
+    base, antenna = rows(tmp_path / "base.csv")[-1], rows(tmp_path / "antenna.csv")[-1]
+    assert antenna[1] - base[1] == pytest.approx(0.2475, abs=0.01)
+    assert antenna[3] - base[3] == pytest.approx(0.2231, abs=0.01)
+
+
+def test_given_the_same_log_when_replayed_twice_then_the_same_bytes(driven: Path, tmp_path: Path, run: Run) -> None:
+    for name in ("one.csv", "two.csv"):
+        assert run(driven, "-c", HUSKY, "--poses", tmp_path / name)[0] == 0
+    assert (tmp_path / "one.csv").read_bytes() == (tmp_path / "two.csv").read_bytes()
+
+
+def test_given_times_when_replayed_then_a_row_for_each_whatever_comes_after(
+    driven: Path, tmp_path: Path, run: Run
+) -> None:
+    at = START + 30_000_000
+    times = tmp_path / "times.txt"
+    times.write_text(f"# two of them\n\n{at}\n{at + 12_345}  # not on a sample\n")
+    shorter = write_log(tmp_path / "short.lcm", [each for each in drive(40.0) if each[0] < at + 12_345])
+    for log, name in ((driven, "whole.csv"), (shorter, "short.csv")):
+        assert run(log, "-c", HUSKY, "--poses", tmp_path / name, "--at-times", times)[0] == 0
+    assert [row[0] for row in rows(tmp_path / "whole.csv")] == [at, at + 12_345]
+    # what arrived later cannot have been used: without it the answer is the same to the bit
+    assert (tmp_path / "whole.csv").read_bytes() == (tmp_path / "short.csv").read_bytes()
+
+
+def test_given_standard_output_when_replayed_then_only_the_poses_go_there(driven: Path, run: Run) -> None:
+    code, out, err = run(driven, "-c", HUSKY, "--poses", "-", "--rate", 1)
+    assert code == 0
+    assert out.splitlines()[0] == HEADER
+    assert len(out.splitlines()) == 41
+    assert "times real time" in err
+
+
+def test_given_json_when_replayed_then_the_counts_are_for_scripts(tmp_path: Path, run: Run) -> None:
+    events = [*drive(5.0), (START + 6_000_000, "IMU", b"junk"), (START + 6_000_001, "OTHER", b"junk")]
+    log = write_log(tmp_path / "a.lcm", events)
+    code, out, _ = run(log, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--json")
+    report = json.loads(out)
+    assert code == 0
+    assert report["rejected"] == [{"source": "IMU", "reason": "fingerprint", "count": 1}]
+    assert (report["events"], report["samples"]) == (277, 276)
+    assert report["real_time_factor"] > 0
+
+
+def test_given_a_channel_when_replayed_offline_then_the_others_are_left_out(
+    driven: Path, tmp_path: Path, run: Run
+) -> None:
+    out = tmp_path / "p.csv"
+    assert run(driven, "-c", HUSKY, "--poses", out, "--channel", "IMU", "--rate", 1)[0] == 0
+    assert all(not row[8] for row in rows(out))
+
+
+# --- bad input ----------------------------------------------------------------------------------------------
+
+
+def test_given_a_log_that_breaks_off_when_replayed_then_the_rest_counts_and_it_is_told(
+    driven: Path, tmp_path: Path, run: Run
+) -> None:
+    log = tmp_path / "cut.lcm"
+    log.write_bytes(driven.read_bytes()[:-5])
+    code, _, err = run(log, "-c", HUSKY, "--poses", tmp_path / "p.csv")
+    assert code == 0
+    assert "breaks off after event 2199" in err
+    assert len(rows(tmp_path / "p.csv")) > 1900
+
+
+def test_given_damage_within_when_replayed_then_what_is_good_is_used_and_the_exit_code_tells(
+    driven: Path, tmp_path: Path, run: Run
+) -> None:
+    whole = driven.read_bytes()
+    broken = bytearray(whole)
+    broken[24:28] = struct.pack(">i", 0x7FFFFFFF)  # the first event's length: lcm's own reader dies of it
+    log = tmp_path / "broken.lcm"
+    log.write_bytes(broken)
+    code, words, err = run(log, "-c", HUSKY, "--poses", tmp_path / "p.csv")
+    assert code == 1
+    assert "bytes after event 0, at byte 0, are no event and were skipped" in err
+    assert "of 2199 messages" in words
+    assert rows(tmp_path / "p.csv")[-1][8] == 1
+
+
+def test_given_a_log_of_another_vehicle_when_replayed_then_both_sides_channels_are_told(
+    tmp_path: Path, run: Run
+) -> None:
+    log = write_log(tmp_path / "a.lcm", drive(1.0, prefix="NORTH_"))
+    code, _, err = run(log, "-c", HUSKY, "--poses", tmp_path / "p.csv")
+    assert code == 1
+    assert "nothing on the vehicle's channels (GPS, IMU, WHEELS); it has: NORTH_GPS, NORTH_IMU" in err
+
+
+def test_given_a_vehicle_without_sensors_when_replayed_then_it_says_what_is_missing(
+    driven: Path, tmp_path: Path, run: Run
+) -> None:
+    config = tmp_path / "v.yaml"
+    config.write_text(f"vehicle: V\ngeometry: {HUSKY.with_name('geometry.yaml')}\nbase_frame: Husky:Base\n")
+    code, _, err = run(driven, "-c", config, "--poses", tmp_path / "p.csv")
+    assert code == 1
+    assert "no GPS and IMU" in err
+
+
+@pytest.mark.parametrize("content", [b"", os.urandom(100_000), b"<Model/>"])
+def test_given_no_log_when_replayed_then_one_clear_error_and_no_poses(tmp_path: Path, run: Run, content: bytes) -> None:
+    log = tmp_path / "junk.lcm"
+    log.write_bytes(content)
+    code, out, err = run(log, "-c", HUSKY, "--poses", tmp_path / "p.csv")
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert "junk.lcm" in err
+    assert not (tmp_path / "p.csv").exists()
+
+
+def test_given_an_unknown_frame_when_replayed_then_the_nearest_is_offered_and_no_file_is_touched(
+    driven: Path, tmp_path: Path, run: Run
+) -> None:
+    out = tmp_path / "p.csv"
+    out.write_text("precious")
+    code, _, err = run(driven, "-c", HUSKY, "--poses", out, "--frame", "Antenna:PhaseCenter")
+    assert code == 1
+    assert "Antenna:PhaseCentre" in err
+    assert out.read_text() == "precious"
+
+
+def test_given_an_unknown_channel_when_replayed_then_the_nearest_is_offered(
+    driven: Path, tmp_path: Path, run: Run
+) -> None:
+    code, _, err = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--channel", "IMUU")
+    assert code == 1
+    assert "Nearest: IMU" in err
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("1\n2\nthree\n", ":3: 'three' is no time"),
+        ("5\n4\n", ":2: 4 is before 5"),
+        ("-1\n", ":1: '-1' is no time"),
+        ("0\n", ":1: '0' is no time"),
+        ("1.5\n", ":1: '1.5' is no time"),
+        ("9" * 30 + "\n", ":1: "),
+        ("\n# nothing\n", "lists no times"),
+        ("\x00\xff", ":1: "),
+    ],
+)
+def test_given_a_wrong_file_of_times_when_replayed_then_the_line_is_told(
+    driven: Path, tmp_path: Path, run: Run, text: str, words: str
+) -> None:
+    times = tmp_path / "times.txt"
+    times.write_text(text, encoding="latin-1")
+    code, _, err = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--at-times", times)
+    assert code == 1
+    assert words in err
+
+
+def test_given_times_with_comments_when_read_then_they_are_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "times.txt"
+    path.write_text("# utime\n1\n 2 # second\n2\n\n30")
+    assert read_times(path) == [1, 2, 2, 30]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--poses", "p.csv"],
+        ["--frame", "A:B"],
+        ["--at-times", "t"],
+        ["--speed", "fast"],
+        ["--speed", "-1"],
+        ["--speed", "nan"],
+        ["-c", "v.yaml", "--poses", "p.csv", "--rate", "0"],
+    ],
+)
+def test_given_wrong_options_when_replayed_then_usage(driven: Path, run: Run, options: list[str]) -> None:
+    assert run(driven, *options)[0] == 2
+
+
+# --- onto the bus -------------------------------------------------------------------------------------------
+
+
+def test_given_a_log_when_played_on_a_bus_then_the_same_bytes_arrive(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = 20_000 + os.getpid() % 20_000
+    url = f"udpm://239.255.76.67:{port}?ttl=0&recv_buf_size=4194304"
+    sent = [*drive(1.0), (START + 2_000_000, "OTHER", b"no message of ours")]
+    got: list[tuple[str, bytes]] = []
+    listener = lcm.LCM(url)
+    listener.subscribe(".*", lambda channel, data: got.append((channel, data))).set_queue_capacity(0)
+    code, words, _ = run(write_log(tmp_path / "a.lcm", sent), "--url", url, "--speed", "max")
+    end = time.monotonic() + 5.0
+    while len(got) < len(sent) and time.monotonic() < end:
+        listener.handle_timeout(100)
+    assert code == 0
+    assert f"{len(sent)} messages sent, 2.0 s of the log" in words
+    assert got == [(channel, data) for _, channel, data in sent]
+
+
+def test_given_an_interrupt_when_played_then_it_ends_with_the_count(
+    driven: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(player: playback.Player, *arguments: object) -> None:
+        player.sent = 3
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(playback.Player, "play", interrupted)
+    code, words, _ = run(driven, "--url", "memq://")
+    assert code == 130
+    assert "3 messages sent" in words
