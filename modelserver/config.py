@@ -22,6 +22,12 @@ _STRICT: ConfigDict = {"extra": "forbid", "allow_inf_nan": False}
 
 MAX_FILE_BYTES = 1 << 20
 
+MAX_DEPTH = 16
+"""No section nests deeper than 3. PyYAML's composer calls itself for each level, in C, and would end the process."""
+
+MAX_CHANNEL = 39
+"""Characters of a sensor's channel: LCM takes 63, and a prefix has up to 24."""
+
 
 @dataclass(frozen=True, slots=True)
 class LcmConfig:
@@ -65,6 +71,11 @@ class PublishConfig:
             raise ValueError(f"health_hz is between 0.01 and 100, got {self.health_hz:g}")
 
 
+def _check_channel(channel: str) -> None:
+    if not (0 < len(channel) <= MAX_CHANNEL and channel.isascii() and channel.isprintable() and " " not in channel):
+        raise ValueError(f"channel has 1 to {MAX_CHANNEL} printable ASCII characters, no spaces, got {shown(channel)}")
+
+
 @dataclass(frozen=True, slots=True)
 class SensorConfig:
     """One sensor: the channel it is heard on, and the frame of the geometry it is mounted at."""
@@ -72,6 +83,9 @@ class SensorConfig:
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     channel: str
     frame: str
+
+    def __post_init__(self) -> None:
+        _check_channel(self.channel)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +96,9 @@ class WheelsConfig:
     channel: str = "WHEELS"
     frames: dict[str, str] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        _check_channel(self.channel)
+
 
 @dataclass(frozen=True, slots=True)
 class SensorsConfig:
@@ -91,6 +108,12 @@ class SensorsConfig:
     gps: SensorConfig | None = None
     imu: SensorConfig | None = None
     wheels: WheelsConfig | None = None
+
+    def __post_init__(self) -> None:
+        channels = [each.channel for each in (self.gps, self.imu, self.wheels) if each is not None]
+        twice = {channel for channel in channels if channels.count(channel) > 1}
+        if twice:
+            raise ValueError(f"each sensor has a channel of its own; {shown(min(twice))} is given twice")
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +175,7 @@ class VehicleConfig:
 
     vehicle: name, for people. geometry: path of the geometry file, relative to this file.
     variables: values for the $NAMES in a frame-tree file. base_frame: the frame that POSE describes.
-    state_directory: where the captured origin is kept; empty for the user's state directory.
+    state_directory: where the captured origin is kept, relative to this file; empty for the user's state directory.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
@@ -172,13 +195,21 @@ class VehicleConfig:
 def load_config(path: str | Path) -> VehicleConfig:
     """Read a vehicle file. Raises ConfigError with every problem, OSError where it cannot be read.
 
-    The geometry's path comes back absolute.
+    The paths in it come back absolute.
     """
     path = Path(path)
     with path.open("rb") as file:
         raw = file.read(MAX_FILE_BYTES + 1)
     config = parse_config(raw, str(path))
-    return dataclasses.replace(config, geometry=str((path.parent / config.geometry).resolve()))
+
+    def absolute(given: str) -> str:
+        return str((path.parent / Path(given).expanduser()).resolve())
+
+    return dataclasses.replace(
+        config,
+        geometry=absolute(config.geometry),
+        state_directory=absolute(config.state_directory) if config.state_directory else "",
+    )
 
 
 def parse_config(raw: bytes, name: str = "") -> VehicleConfig:
@@ -186,6 +217,7 @@ def parse_config(raw: bytes, name: str = "") -> VehicleConfig:
     if len(raw) > MAX_FILE_BYTES:
         raise _one(name, 0, f"the file is larger than {MAX_FILE_BYTES >> 20} MiB", "is this the vehicle file?")
     try:
+        _check_shape(raw, name)
         node = yaml.compose(raw, Loader=yaml.CSafeLoader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -219,12 +251,13 @@ class _Reader:
 
     def value(self, node: yaml.Node, at: Path_) -> Any:
         self.lines.setdefault(at, node.start_mark.line + 1)
-        if len(at) > 16:
-            self.problem(at, "nested too deeply", "")
-            return None
         if isinstance(node, yaml.MappingNode):
             values: dict[str, Any] = {}
             for key_node, value_node in node.value:
+                if not isinstance(key_node, yaml.ScalarNode):
+                    self.lines[(*at, "?")] = key_node.start_mark.line + 1
+                    self.problem((*at, "?"), "a key is a name, not a list or a mapping", "write name: value")
+                    continue
                 key = str(key_node.value)
                 if key in values:
                     first = self.lines[(*at, key)]
@@ -232,7 +265,10 @@ class _Reader:
                     self.problem((*at, key), f"{key} is given twice (first on line {first})", "remove one")
                     continue
                 self.lines[(*at, key)] = key_node.start_mark.line + 1
-                values[key] = self.value(value_node, (*at, key))
+                value = self.value(value_node, (*at, key))
+                # a key with nothing after it counts as left out, as when all of a section is commented out
+                if value is not None:
+                    values[key] = value
             return values
         if isinstance(node, yaml.SequenceNode):
             return [self.value(each, (*at, index)) for index, each in enumerate(node.value)]
@@ -257,6 +293,12 @@ class _Reader:
             return Problem(Severity.ERROR, f"{at[-1]} is missing", self.place(at), f"add a line: {at[-1]}: ...")
         message = str(detail["msg"]).removeprefix("Value error, ")
         got = detail.get("input")
+        if detail["type"] == "value_error":
+            # found by the section as a whole; the message begins with the key that it is about
+            key = message.partition(" ")[0]
+            at = (*at, key) if (*at, key) in self.lines else at
+        elif detail["type"] in ("dataclass_type", "dict_type"):
+            message = "expected a mapping (key: value, one a line)"
         if detail["type"] != "value_error" and isinstance(got, (str, int, float, bool)):
             message += f", got {shown(str(got))}"
         return Problem(Severity.ERROR, message[:1].lower() + message[1:], self.place(at), "")
@@ -278,6 +320,22 @@ def _known_keys(at: Path_) -> list[str]:
         kind = hints.get(str(step))
         kind = next((each for each in (kind, *get_args(kind)) if dataclasses.is_dataclass(each)), None)
     return [each.name for each in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
+
+
+def _check_shape(raw: bytes, name: str) -> None:
+    """Raise ConfigError for what no vehicle file has and the composer cannot bear: deep nesting, aliases of aliases."""
+    depth = 0
+    for event in yaml.parse(raw, Loader=yaml.CSafeLoader):
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+            if depth > MAX_DEPTH:
+                line = event.start_mark.line + 1
+                raise _one(name, line, "nested too deeply", "look for brackets that are not closed")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        elif isinstance(event, yaml.AliasEvent):
+            line = event.start_mark.line + 1
+            raise _one(name, line, f"aliases (*{event.anchor}) are not read here", "write the value again")
 
 
 def _one(name: str, line: int, message: str, fix: str) -> ConfigError:

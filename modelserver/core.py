@@ -75,7 +75,7 @@ class Instant:
 class CoreSettings:
     """What does not change while the core runs; see `modelserver.config` for the meanings.
 
-    ticks_per_pose: in timer mode POSE goes out at every so-manieth tick, those that were missed counted.
+    ticks_per_pose: in timer mode POSE goes out at the first of each so many ticks; missed ones are counted too.
     """
 
     base_frame: str
@@ -113,9 +113,7 @@ class CoreState(NamedTuple):
     """
 
     settings: CoreSettings
-    model: Model
-    localizer: Localizer | None
-    history: History
+    view: PlatformView
     started_ns: int
     parked: tuple[Parked, ...] = ()
     rejected: Mapping[tuple[str, str], int] = MappingProxyType({})
@@ -131,9 +129,19 @@ class CoreState(NamedTuple):
     run_state: int = STARTING
 
     @property
-    def view(self) -> PlatformView:
-        """The platform as it is known now."""
-        return PlatformView(self.model, self.settings.base_frame, self.localizer, self.history)
+    def model(self) -> Model:
+        """The geometry in force."""
+        return self.view.model
+
+    @property
+    def localizer(self) -> Localizer | None:
+        """What has been concluded from the samples so far; None for a vehicle without GPS and IMU."""
+        return self.view.localizer
+
+    @property
+    def history(self) -> History:
+        """The estimates of the last seconds."""
+        return self.view.history
 
 
 Outputs: TypeAlias = tuple[Output, ...]
@@ -143,9 +151,8 @@ Step: TypeAlias = tuple[CoreState, Outputs]
 def start(settings: CoreSettings, model: Model, localizer: Localizer | None, now: Instant) -> CoreState:
     """Return the first state. Raises UnknownBodyError or UnknownFrameError where the model lacks the base frame."""
     model.frame(settings.base_frame)
-    return CoreState(
-        settings, model, localizer, History(settings.history_s), now.monotonic_ns, health_due_ns=now.monotonic_ns
-    )
+    view = PlatformView(model, settings.base_frame, localizer, History(settings.history_s))
+    return CoreState(settings, view, now.monotonic_ns, health_due_ns=now.monotonic_ns)
 
 
 def step(state: CoreState, event: Event, now: Instant) -> Step:
@@ -175,11 +182,11 @@ def _sample(state: CoreState, sample: Sample, now: Instant) -> Step:
             outputs.append(note)
     if localizer is before:
         return state, tuple(outputs)
-    state = state._replace(localizer=localizer)
     # before the first sample that can be used there is no time that an estimate could hold for
-    if localizer.utime and isinstance(sample, GpsSample | ImuSample):
-        estimate = localizer.estimate(localizer.utime)
-        state = state._replace(history=state.history.extended(estimate))
+    moved = localizer.utime and isinstance(sample, (GpsSample, ImuSample))
+    history = state.history.extended(localizer.estimate(localizer.utime)) if moved else state.history
+    state = state._replace(view=replace(state.view, localizer=localizer, history=history))
+    if moved:
         # a part may be refused of a sample that moves time on all the same
         taken = not refused or localizer.utime != before.utime
         if taken and state.settings.publish == "event":
@@ -274,7 +281,7 @@ def _channel_health(name: str, traffic: Traffic, elapsed: float, now: Instant) -
 def _request(state: CoreState, request: Request, now: Instant) -> Step:
     if not request.header.is_answerable(state.settings.reply_prefix):
         return _count(state, request.channel, "reply_channel"), ()
-    if isinstance(request, GetTransformation | GetStateVector | GetHTransform) and _must_wait(state, request):
+    if isinstance(request, _TIMED) and request.time.wait_ms and _must_wait(state, request):
         if len(state.parked) < state.settings.parked_requests:
             wait_ms = min(request.time.wait_ms, state.settings.wait_ms)
             parked = Parked(request, now.monotonic_ns + wait_ms * 1_000_000)
@@ -381,30 +388,27 @@ def _failed(
 def refuse(state: CoreState, request: Request, now: Instant) -> Outputs:
     """Return the refusal of a request that the server has no time for."""
     message = "the server is loaded and did not take the request; ask again later"
-    return _turned_down(state, request, Status.REFUSED_LOAD, message, now)
+    return _turned_down(state, type(request), request.header, Status.REFUSED_LOAD, message, now)
 
 
 def fail(state: CoreState, request: Request, now: Instant) -> Outputs:
     """Return the reply to a request that an error of the server's own kept from being answered."""
-    return _turned_down(state, request, Status.INTERNAL, "the server failed on its side; its log says why", now)
+    message = "the server failed on its side; its log says why"
+    return _turned_down(state, type(request), request.header, Status.INTERNAL, message, now)
 
 
-def turn_back(
-    state: CoreState, kind: type[Request], header: RequestHeader, message: str, now: Instant
+def turn_back(state: CoreState, kind: type[Request], header: RequestHeader, why: str, now: Instant) -> Outputs:
+    """Return the reply to a request that makes no sense beyond its header."""
+    return _turned_down(state, kind, header, Status.MALFORMED, why, now)
+
+
+def _turned_down(
+    state: CoreState, kind: type[Request], header: RequestHeader, status: Status, message: str, now: Instant
 ) -> Outputs:
-    """Return the reply to a request of which no more than the header could be made out."""
     if not header.is_answerable(state.settings.reply_prefix):
         return ()
-    reply = _REPLY_KINDS[kind](
-        ReplyHeader(header.request_id, now.utime, Status.MALFORMED, message, (), state.model.revision)
-    )
-    return (SendReply(header.reply_channel, reply),)
-
-
-def _turned_down(state: CoreState, request: Request, status: Status, message: str, now: Instant) -> Outputs:
-    if not request.header.is_answerable(state.settings.reply_prefix):
-        return ()
-    return (SendReply(request.header.reply_channel, _failed(request, status, message, now, state)),)
+    reply = ReplyHeader(header.request_id, now.utime, status, message, model_revision=state.model.revision)
+    return (SendReply(header.reply_channel, _REPLY_KINDS[kind](reply)),)
 
 
 # --- counting -----------------------------------------------------------------------------------------------
@@ -432,6 +436,9 @@ def _note_traffic(state: CoreState, source: str, now: Instant) -> CoreState:
     updated = Traffic(known.count + 1, now.monotonic_ns, known.reported)
     return state._replace(traffic={**state.traffic, source: updated})
 
+
+_TIMED: Final = (GetTransformation, GetStateVector, GetHTransform)
+"""Requests that ask about a time, and may wait for it."""
 
 _HANDLERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], Step]]] = {
     GpsSample: _sample,

@@ -11,6 +11,7 @@ import math
 import re
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
+from functools import lru_cache
 from typing import ClassVar, TypeAlias
 
 from modelserver.errors import Status
@@ -247,18 +248,22 @@ class RequestHeader:
 
     def is_answerable(self, prefix: str) -> bool:
         """Return whether a server may speak on the reply channel: within its prefix, plain, not too long."""
-        channel = self.reply_channel
-        return (
-            len(prefix) < len(channel) <= MAX_CHANNEL_LENGTH
-            and channel.startswith(prefix)
-            and _PLAIN_NAME.fullmatch(channel) is not None
-        )
+        return _is_answerable(self.reply_channel, prefix)
 
 
 MAX_CHANNEL_LENGTH = 63
 """LCM refuses longer names."""
 
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_]+")
+
+
+@lru_cache(maxsize=1024)
+def _is_answerable(channel: str, prefix: str) -> bool:
+    return (
+        len(prefix) < len(channel) <= MAX_CHANNEL_LENGTH
+        and channel.startswith(prefix)
+        and _PLAIN_NAME.fullmatch(channel) is not None
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import os
+import random
 import re
 import secrets
+import struct
 import sys
 import threading
 import time
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
-from modelserver.errors import NoServerError, Status, WireError, error_for_status
+import lcm
+
+from modelserver.errors import MalformedRequestError, NoServerError, Status, WireError, error_for_status
 from modelserver.messages import (
     MAX_CHANNEL_LENGTH,
     GetBodyFrameList,
@@ -43,6 +47,12 @@ _REPLY_TYPES = {
     StateVectorReply: "get_state_vector_reply_t",
     HistoryReply: "get_history_reply_t",
 }
+
+UNREAD_REPLIES: Final = 64
+"""Replies kept until they are looked at; further ones are lost."""
+
+LONGEST_WAIT_S: Final = 60.0
+"""LCM counts milliseconds in an int: a longer wait is made of several."""
 
 
 class Platform:
@@ -77,12 +87,16 @@ class Platform:
         self._prefix = channel_prefix
         # stable for a program, not random: every process on the bus keeps each channel name it ever saw
         self.reply_channel = _reply_channel(reply_prefix, name or os.path.basename(sys.argv[0] or "python"))
+        # ids need to differ between programs, not to be unguessable
+        self._ids = random.Random(secrets.randbits(128))
         self._lock = threading.Lock()
-        self._lcm = open_lcm(self.url)
-        self._open = True
-        self._subscription = self._lcm.subscribe(literal(self.reply_channel), self._take)
-        self._subscription.set_queue_capacity(0)
         self._fresh: list[bytes] = []
+        self._lcm: lcm.LCM | None = open_lcm(self.url)
+        fresh = self._fresh
+        # the handler does not hold this object: one that is forgotten, not closed, leaves the bus all the same
+        subscription = self._lcm.subscribe(literal(self.reply_channel), lambda _, data: fresh.append(data))
+        # between two questions only what others of this program's name are told can come: that is not gathered
+        subscription.set_queue_capacity(UNREAD_REPLIES)
 
     def __enter__(self) -> Self:
         return self
@@ -95,9 +109,7 @@ class Platform:
     def close(self) -> None:
         """Leave the bus. Further questions raise ValueError."""
         with self._lock:
-            if self._open:
-                self._lcm.unsubscribe(self._subscription)
-                self._open = False
+            self._lcm = None
 
     def get_transformation(
         self,
@@ -167,22 +179,25 @@ class Platform:
         return [answer.transformation for answer in self._ask(request, HistoryReply).answers]
 
     def _header(self) -> RequestHeader:
-        return RequestHeader(secrets.randbits(63), self.reply_channel)
-
-    def _take(self, channel: str, data: bytes) -> None:
-        self._fresh.append(data)
+        return RequestHeader(self._ids.getrandbits(63), self.reply_channel)
 
     def _ask(self, request: Any, reply_kind: type[R], wait_ms: int = 0) -> R:
         """Send a request until its reply comes. Asking twice does no harm: requests change nothing."""
-        data = encode(request)
+        try:
+            data = encode(request)
+        except (struct.error, TypeError, AttributeError, UnicodeEncodeError) as error:
+            raise MalformedRequestError(f"this question cannot be put into a message: {error}") from error
         channel = f"{self._prefix}{request.channel}"
         patience = self.timeout + wait_ms * 1e-3
         with self._lock:
-            if not self._open:
+            bus = self._lcm
+            if bus is None:
                 raise ValueError("this Platform is closed")
             for _ in range(1 + self.retries):
-                self._lcm.publish(channel, data)
-                reply = self._await(request.header.request_id, reply_kind, patience)
+                _discard_unread(bus)
+                self._fresh.clear()
+                bus.publish(channel, data)
+                reply = self._await(bus, request.header.request_id, reply_kind, patience)
                 if reply is not None:
                     header: ReplyHeader = reply.header
                     if header.status is not Status.OK:
@@ -194,10 +209,10 @@ class Platform:
             "on this bus ($LCM_DEFAULT_URL) and with this channel prefix?"
         )
 
-    def _await(self, request_id: int, reply_kind: type[R], patience: float) -> R | None:
+    def _await(self, bus: lcm.LCM, request_id: int, reply_kind: type[R], patience: float) -> R | None:
         deadline = time.monotonic() + patience
         while (left := deadline - time.monotonic()) > 0:
-            if not self._lcm.handle_timeout(max(1, int(left * 1000))):
+            if not bus.handle_timeout(max(1, int(min(left, LONGEST_WAIT_S) * 1000))):
                 continue
             for data in self._fresh:
                 try:
@@ -215,6 +230,12 @@ def _found(answer: PoseAnswer | None) -> PoseAnswer:
     if answer is None:
         raise WireError("malformed", "the server said OK but sent no pose")
     return answer
+
+
+def _discard_unread(bus: lcm.LCM) -> None:
+    for _ in range(UNREAD_REPLIES):
+        if not bus.handle_timeout(0):
+            return
 
 
 def _reply_channel(prefix: str, program: str) -> str:

@@ -34,6 +34,11 @@ def load(root: Element, builder: ModelBuilder, file: str) -> ModelBuilder:
     return builder
 
 
+def has_bodies(root: Element) -> bool:
+    """Return whether anything below `root` states a BodyName or a ConstraintName."""
+    return any(_name(each) in ("BodyName", "ConstraintName") for each in root.iter("{*}parameter"))
+
+
 class _Reader:
     def __init__(self, builder: ModelBuilder, file: str):
         self.builder = builder

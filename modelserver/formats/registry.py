@@ -46,13 +46,12 @@ def read(content: bytes, file: str = "", variables: Mapping[str, str] | None = N
     text = content.removeprefix(b"\xef\xbb\xbf").lstrip()
     if not text:
         builder.error("the file is empty", Source(file), "see docs/geometry-files.md for an example to begin with")
-    elif text.startswith(b"<") or PurePath(file).suffix.lower() == ".xml":
-        _read_xml(content, builder, file, variables or {})
     else:
-        from modelserver.formats import yaml_form
-
         with _collector_paused():
-            yaml_form.load(content, builder, file)
+            if text.startswith(b"<") or PurePath(file).suffix.lower() == ".xml":
+                _read_xml(content, builder, file, variables or {})
+            else:
+                _read_yaml(content, builder, file)
     return builder
 
 
@@ -71,8 +70,14 @@ def _collector_paused() -> Iterator[None]:
             gc.enable()
 
 
+def _read_yaml(content: bytes, builder: ModelBuilder, file: str) -> None:
+    # yaml and lxml are imported where they are needed: a file of one kind must not pay for the other
+    from modelserver.formats import yaml_form
+
+    yaml_form.load(content, builder, file)
+
+
 def _read_xml(content: bytes, builder: ModelBuilder, file: str, variables: Mapping[str, str]) -> None:
-    # lxml is imported where it is needed: a YAML file must not pay for it
     from modelserver.formats import frame_tree_xml, miro_xml, xml_document
     from modelserver.formats.spelling import label
 
@@ -87,11 +92,12 @@ def _read_xml(content: bytes, builder: ModelBuilder, file: str, variables: Mappi
     if next(root.iter("{*}config_group"), None) is not None:
         builder.error(_ELSEWHERE["config_group"], first, "give the file with BodyName and ConstraintName in it")
         return
-    has_tree = next(frame_tree_xml.instances(root), None) is not None
     before = len(builder.problems)
-    if has_tree:
+    if next(frame_tree_xml.instances(root), None) is not None:
         frame_tree_xml.load(root, builder, file, variables)
-        return
+        if not miro_xml.has_bodies(root):
+            return
+        # one configuration may hold both; nothing is passed over in silence
     miro_xml.load(root, builder, file)
     if builder.is_empty and not any(problem.severity == "error" for problem in builder.problems[before:]):
         builder.error(

@@ -125,11 +125,12 @@ def take(
         stretch = (newest,)
         speed, speed_sigma = 0.0, settings.standing_speed / 2.0
     else:
+        was_known = heading.known
         heading, met = _course(heading, velocity, stretch, motion, swing, settings)
         if met is not None:
             stretch = (newest,)
             refused = "course" if met is Course.REFUSED else ""
-            jumped = jumped or (met is Course.ANEW and fixes.anchor is not None and direction != 1.0)
+            jumped = jumped or (met is Course.ANEW and was_known)
         speed, speed_sigma = _speed(heading, velocity, recent, motion, swing, settings)
     return Step(
         Fixes(fixes.work, anchor, recent, stretch),

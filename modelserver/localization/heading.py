@@ -46,9 +46,15 @@ class Heading:
         return math.sqrt(self.variance)
 
     def carried(self, dt: float, settings: RawSettings, measured: bool = True) -> Heading:
-        """Return the heading `dt` seconds on; `measured` false where no gyro told of the turn."""
+        """Return the heading `dt` seconds on; `measured` false where no gyro told of the turn.
+
+        A step longer than `rate_hold` is measured only so far.
+        """
         if dt <= 0.0:
             return self
+        if measured and dt > settings.rate_hold:
+            held = self.carried(settings.rate_hold, settings)
+            return held.carried(dt - settings.rate_hold, settings, measured=False)
         b = self.bias_variance
         dt_b = min(dt, 1e4)
         variance = self.variance - 2.0 * self.covariance * dt_b + b * dt_b * dt_b + settings.gyro_noise**2 * dt_b

@@ -127,7 +127,7 @@ class RawLocalizer:
             gap = dt > settings.rate_hold
             mean = before.rate if gap else (0.5 * (a + rate[0]), 0.5 * (b + rate[1]), 0.5 * (c + rate[2]))
             motion = before.advanced(utime, mean, settings)
-            heading = _carried(heading, (utime - before.utime) * 1e-6, settings)
+            heading = heading.carried((utime - before.utime) * 1e-6, settings)
             if gap:
                 notes = _refused(sample, "gap")
                 known_fixes = known_fixes.forgotten()
@@ -188,7 +188,7 @@ class RawLocalizer:
         ahead = (utime - motion.utime) * 1e-6
         if ahead > settings.rate_hold:
             # no inertial samples: what was predicted so far is what Odom keeps
-            heading = _carried(heading, ahead, settings)
+            heading = heading.carried(ahead, settings)
             motion = motion.advanced(utime, motion.rate, settings)
         then = self.motion_at(utime, motion)
         step = fixes.take(
@@ -280,13 +280,6 @@ class RawLocalizer:
 
 def _refused(sample: ImuSample | GpsSample, reason: str) -> tuple[Note, ...]:
     return (Rejected(f"sensor:{sample.header.source}", reason),)
-
-
-def _carried(heading: Heading, dt: float, settings: RawSettings) -> Heading:
-    """Return the heading `dt` on: measured as long as a rate is held, unknown after."""
-    if dt <= settings.rate_hold:
-        return heading.carried(dt, settings)
-    return heading.carried(settings.rate_hold, settings).carried(dt - settings.rate_hold, settings, measured=False)
 
 
 def _kept(history: tuple[Motion, ...], motion: Motion) -> tuple[Motion, ...]:

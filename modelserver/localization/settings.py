@@ -48,8 +48,9 @@ class RawSettings:
     """The part of a fix's sigma that is new with each fix. The rest (orbit, clock, air, slow multipath) is
     shared by neighbouring fixes and falls out of differences; receiver noise is the smaller part of the range
     error budget (Kaplan and Hegarty, Understanding GPS, error budgets), so half is on the safe side."""
-    fix_error_time: float = 100.0
-    """Correlation time of that rest, seconds: slow multipath turns with the satellites, in minutes."""
+    fix_error_time: float = 10.0
+    """Correlation time of that rest, seconds. A standing antenna's multipath turns with the satellites, in
+    minutes; a moving one's changes with every few metres, in seconds: the course is drawn while moving."""
 
     # --- what the vehicle can do ---
 

@@ -76,10 +76,7 @@ def estimate(state: RawLocalizer, utime: int) -> Estimate:
     heading = state.heading
     heading_variance = UNKNOWN_VARIANCE
     if heading.known:
-        ahead = (utime - newest.utime) * 1e-6
-        held = min(ahead, settings.rate_hold)
-        heading = heading.carried(held, settings).carried(ahead - held, settings, measured=False)
-        heading_variance = heading.variance
+        heading_variance = heading.carried((utime - newest.utime) * 1e-6, settings).variance
     age = max((utime - anchor.utime) * 1e-6, 0.0)
     sigma_v = newest.speed_sigma
     growth = bounds.grown(age, sigma_v, settings)

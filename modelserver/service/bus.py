@@ -55,7 +55,13 @@ class LcmInbox:
 
     def subscribe(self, channel: str, handler: Handler) -> None:
         """Hand every message of exactly `channel` to `handler`."""
-        subscription = self.lcm.subscribe(literal(channel), handler)
+
+        def handle(name: str, data: bytes) -> None:
+            # a regular expression's end also matches before a line break at the end
+            if name == channel:
+                handler(name, data)
+
+        subscription = self.lcm.subscribe(literal(channel), handle)
         # 0 is no limit: LCM would drop silently, the loop refuses and counts
         subscription.set_queue_capacity(0)
 
@@ -75,10 +81,16 @@ class LcmBus:
         self.url = resolve_url(url)
         self.sensors: LcmInbox = LcmInbox(self.url)
         self.requests: LcmInbox = LcmInbox(self.url)
+        self._poll = select.poll()
+        for inbox in (self.sensors, self.requests):
+            self._poll.register(inbox.fileno, select.POLLIN)
         self._files = (self.sensors.fileno, self.requests.fileno)
         self.publish = self.requests.lcm.publish
 
     def wait(self, seconds: float) -> None:
         """Return when something has come or the time is up."""
-        # select, not poll: its timeout is in microseconds where poll's is in milliseconds
-        select.select(self._files, (), (), seconds)
+        # poll is the cheaper call but counts in milliseconds; select keeps the deadline to the microsecond
+        milliseconds = int(seconds * 1e3)
+        if milliseconds and self._poll.poll(milliseconds):
+            return
+        select.select(self._files, (), (), max(0.0, seconds - milliseconds * 1e-3))

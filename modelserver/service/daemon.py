@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import math
 import signal
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from modelserver.config import VehicleConfig
 from modelserver.core import CoreSettings, CoreState, Instant
 from modelserver.errors import ConfigError, Problem, QueryError, Severity, Source
 from modelserver.formats import load_model
-from modelserver.geodesy import make_origin
+from modelserver.geodesy import GeodesyError, make_origin
 from modelserver.geometry import Model
 from modelserver.localization.mounts import Mounts
 from modelserver.localization.raw import RawLocalizer
@@ -23,12 +24,13 @@ from modelserver.service.clock import SystemClock
 from modelserver.service.keep import OriginKeeper, default_directory
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.version import __version__
+from modelserver.wire.channels import CHANNELS, Way
 from modelserver.wire.provider import resolve_url
 
 log = logging.getLogger(__name__)
 
 HOUSEKEEPING_HZ = 50.0
-"""Ticks in event mode: for requests that wait and for the health report."""
+"""The least rate of ticks: for requests that wait, the health report and the order to stop."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,7 @@ class Vehicle:
             base_frame=config.base_frame,
             vehicle=config.vehicle,
             publish=config.publish.mode,
+            ticks_per_pose=self.ticks_per_pose(),
             health_period_ns=round(1e9 / config.publish.health_hz),
             history_s=config.limits.history_s,
             parked_requests=config.limits.parked_requests,
@@ -56,6 +59,16 @@ class Vehicle:
             reply_prefix=config.lcm.reply_prefix,
         )
         return core.start(settings, self.model, localizer, now)
+
+    def ticks_per_pose(self) -> int:
+        """Return how many ticks there are to a POSE in timer mode: more than one where POSE comes seldom."""
+        publish = self.config.publish
+        return math.ceil(HOUSEKEEPING_HZ / publish.rate_hz) if publish.mode == "timer" else 1
+
+    def tick_hz(self) -> float:
+        """Return the rate of ticks: a whole multiple of that of POSE."""
+        publish = self.config.publish
+        return publish.rate_hz * self.ticks_per_pose() if publish.mode == "timer" else HOUSEKEEPING_HZ
 
     def sensor_channels(self) -> dict[str, str]:
         """Return the wire type of each channel that sensors are heard on, with the prefix."""
@@ -83,12 +96,51 @@ def load_vehicle(config: VehicleConfig) -> Vehicle:
         except QueryError as error:
             fix = f"write {error.nearest[0]}" if error.nearest else f"see: modelserver bodies --model {config.geometry}"
             problems.append(Problem(Severity.ERROR, str(error), Source(element=key), fix, error.nearest))
+    problems += _channel_problems(config)
+    try:
+        configured_origin(config)
+    except GeodesyError as error:
+        problems.append(Problem(Severity.ERROR, str(error), Source(element="origin.initial_utm")))
     if problems:
         raise ConfigError(problems)
     mounts = None
     if gps is not None and imu is not None:
         mounts = Mounts.from_model(model, config.base_frame, gps.frame, imu.frame)
     return Vehicle(config, model, mounts)
+
+
+def _channel_problems(config: VehicleConfig) -> list[Problem]:
+    """Return what is wrong with the channels taken together."""
+    prefix, reply_prefix = config.lcm.channel_prefix, config.lcm.reply_prefix
+    sensors = config.sensors
+    heard = {
+        f"sensors.{key}.channel": f"{prefix}{each.channel}"
+        for key, each in (("gps", sensors.gps), ("imu", sensors.imu), ("wheels", sensors.wheels))
+        if each is not None
+    }
+    own = {f"{prefix}{channel.name}" for channel in CHANNELS}
+    problems = []
+    for key, channel in heard.items():
+        if channel in {f"{prefix}{each.name}" for each in CHANNELS if each.way is not Way.SENSOR}:
+            problems.append(
+                Problem(
+                    Severity.ERROR,
+                    f"{channel} is a channel that the service itself uses, no sensor's",
+                    Source(element=key),
+                    "give the sensor another channel",
+                )
+            )
+    spoken_on = sorted(name for name in own | set(heard.values()) if name.startswith(reply_prefix))
+    if spoken_on:
+        problems.append(
+            Problem(
+                Severity.ERROR,
+                f"with the reply prefix {reply_prefix} a request could make the server speak on {spoken_on[0]}",
+                Source(element="lcm.reply_prefix"),
+                "choose one that no other channel begins with, e.g. REPLY_",
+            )
+        )
+    return problems
 
 
 def configured_origin(config: VehicleConfig) -> Origin | None:
@@ -114,9 +166,8 @@ def run(vehicle: Vehicle, url: str = "") -> None:
             keeper.save(note.origin)
 
     bus = LcmBus(resolve_url(url or config.lcm.url))
-    rate_hz = config.publish.rate_hz if config.publish.mode == "timer" else HOUSEKEEPING_HZ
     settings = LoopSettings(
-        period_ns=round(1e9 / rate_hz),
+        period_ns=round(1e9 / vehicle.tick_hz()),
         sensors=vehicle.sensor_channels(),
         channel_prefix=config.lcm.channel_prefix,
         queued_requests=config.limits.queued_requests,
@@ -131,8 +182,10 @@ def run(vehicle: Vehicle, url: str = "") -> None:
         config.vehicle,
         vehicle.model,
         bus.url,
-        f"at {rate_hz:g} Hz" if config.publish.mode == "timer" else "on every sensor event",
+        f"at {config.publish.rate_hz:g} Hz" if config.publish.mode == "timer" else "on every sensor event",
     )
+    if vehicle.mounts is None:
+        log.warning("the vehicle file does not name both a GPS and an IMU: there is no pose in the world, and no POSE")
     if origin is not None:
         log.info("the origin kept from an earlier run is used: %s", origin)
     # what is loaded lives as long as the process: the collector need not look at it again

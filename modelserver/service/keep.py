@@ -7,6 +7,7 @@ import dataclasses
 import json
 import logging
 import os
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -56,20 +57,23 @@ class OriginKeeper:
     def save(self, origin: Origin) -> None:
         """Keep an origin. A disk that refuses is logged: the daemon goes on, a restart captures anew."""
         content = json.dumps({"version": VERSION, **dataclasses.asdict(origin)}, indent=1)
-        # a temporary file, synced and renamed: a power cut leaves the old file or the new one. Its name is always
-        # the same, so that what a killed process leaves behind is written over, not added to
-        fresh = self.path.with_name(f"{self.path.name}.new")
+        fresh: Path | None = None
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            with fresh.open("w", encoding="utf-8") as file:
+            # a temporary file, synced and renamed: a power cut leaves the old file or the new one
+            with tempfile.NamedTemporaryFile(
+                "w", encoding="utf-8", dir=self.path.parent, prefix=self.path.name, delete=False
+            ) as file:
+                fresh = Path(file.name)
                 file.write(content + "\n")
                 file.flush()
                 os.fsync(file.fileno())
             fresh.replace(self.path)
         except OSError as error:
             log.warning("the origin cannot be kept in %s: %s; a restart will capture a new one", self.path, error)
-            with contextlib.suppress(OSError):
-                fresh.unlink(missing_ok=True)
+            if fresh is not None:
+                with contextlib.suppress(OSError):
+                    fresh.unlink()
 
 
 def _origin(content: dict[str, Any]) -> Origin:

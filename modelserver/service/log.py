@@ -1,8 +1,9 @@
-"""Logging that a flood of one cause cannot fill."""
+"""Logging that a flood of one cause cannot fill, and in which a stranger's text cannot pass for more than text."""
 
 from __future__ import annotations
 
 import logging
+import traceback
 
 from modelserver.service.clock import Clock
 
@@ -36,6 +37,15 @@ class RateLimited:
             return
         self._next_ns[cause] = now + round(PERIOD_S * 1e9)
         silenced = self._silenced.pop(cause, 0)
+        text = message % tuple(plain(str(value)) for value in values)
         if silenced:
-            message += f" (and {silenced} times more since the last line)"
-        self._logger.log(level, message, *values, exc_info=trace)
+            text += f" (and {silenced} times more since the last line)"
+        if trace:
+            # indented, so that nothing in it can pass for a line of its own
+            text += "".join(f"\n    {plain(line)}" for line in traceback.format_exc().splitlines())
+        self._logger.log(level, "%s", text)
+
+
+def plain(text: str) -> str:
+    """Return `text` with everything escaped that a terminal or a log reader would take for more than text."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

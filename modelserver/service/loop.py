@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
+import struct
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_args
 
 from modelserver import core
 from modelserver.core import CoreState, Instant
@@ -19,18 +20,21 @@ from modelserver.messages import (
     PublishHealth,
     PublishPose,
     Rejected,
+    Request,
+    RequestHeader,
     SendReply,
     Tick,
 )
 from modelserver.service.bus import Bus
 from modelserver.service.clock import Clock
 from modelserver.service.log import RateLimited
-from modelserver.wire.channels import REQUESTS
+from modelserver.wire.channels import BY_NAME, REQUESTS
 from modelserver.wire.codec import decode, encode
+from modelserver.wire.packed import read_text
 
 log = logging.getLogger(__name__)
 
-SENSORS_PER_PASS = 2000
+SENSORS_PER_PASS = 100
 """Samples taken before the clock is looked at again: a flood of samples must not stop the ticks."""
 
 REFUSALS_PER_PASS = 64
@@ -71,6 +75,7 @@ class Loop:
         self._log = RateLimited(log, clock)
         self._queue: deque[tuple[str, str, bytes]] = deque()
         self._refusals_left = REFUSALS_PER_PASS
+        self._budget = 0
         self._due_ns = clock.monotonic_ns()
         self._stopping = False
         prefix = settings.channel_prefix
@@ -95,10 +100,11 @@ class Loop:
         busy = self._bus.sensors.drain(SENSORS_PER_PASS) == SENSORS_PER_PASS
         self._tick_if_due()
         self._refusals_left = REFUSALS_PER_PASS
+        self._budget = self._settings.requests_per_pass
+        while self._queue and self._budget:
+            self._budget -= 1
+            self._answer(*self._queue.popleft())
         self._bus.requests.drain(self._settings.queued_requests)
-        for _ in range(min(self._settings.requests_per_pass, len(self._queue))):
-            channel, type_name, data = self._queue.popleft()
-            self._decode_and_step(channel, type_name, data)
         if not busy and not self._queue and not self._stopping:
             self._bus.wait(max(0.0, (self._due_ns - self._clock.monotonic_ns()) * 1e-9))
 
@@ -109,17 +115,26 @@ class Loop:
         # a tick that was missed is skipped and counted: catching up would burst old poses
         missed = late_ns // self._settings.period_ns
         self._due_ns += (missed + 1) * self._settings.period_ns
-        self._guarded("tick", lambda: self._step(Tick(late_ns * 1e-9, missed), self._clock.now()))
+        try:
+            self._step(Tick(late_ns * 1e-9, missed), self._clock.now())
+        except Exception as error:
+            self._failed("tick", error)
 
     def _sensor_handler(self, type_name: str) -> Callable[[str, bytes], None]:
         def handle(channel: str, data: bytes) -> None:
-            self._decode_and_step(channel, type_name, data)
+            try:
+                self._step(decode(type_name, data), self._clock.now())
+            except Exception as error:
+                self._failed(channel, error)
 
         return handle
 
     def _request_handler(self, type_name: str) -> Callable[[str, bytes], None]:
         def handle(channel: str, data: bytes) -> None:
-            if len(self._queue) < self._settings.queued_requests:
+            if self._budget and not self._queue:
+                self._budget -= 1
+                self._answer(channel, type_name, data)
+            elif len(self._queue) < self._settings.queued_requests:
                 self._queue.append((channel, type_name, data))
             else:
                 self._refuse(channel, type_name, data)
@@ -127,27 +142,41 @@ class Loop:
         return handle
 
     def _refuse(self, channel: str, type_name: str, data: bytes) -> None:
-        def refuse() -> None:
-            now = self._clock.now()
-            self._step(Rejected(channel, "load"), now)
-            if self._refusals_left > 0:
-                self._refusals_left -= 1
-                self._send(core.refuse(self.state, decode(type_name, data), now))
+        now = self._clock.now()
+        self._step(Rejected(channel, "load"), now)
+        if self._refusals_left > 0:
+            self._refusals_left -= 1
+            try:
+                request = decode(type_name, data)
+            except Exception:
+                return  # counted already: as refused
+            self._send(core.refuse(self.state, request, now))
 
-        self._guarded(channel, refuse)
-
-    def _decode_and_step(self, channel: str, type_name: str, data: bytes) -> None:
-        self._guarded(channel, lambda: self._step(decode(type_name, data), self._clock.now()))
-
-    def _guarded(self, channel: str, action: Callable[[], None]) -> None:
-        """Run what a message or a tick asks for; an exception is counted and logged, and never leaves the bus."""
+    def _answer(self, channel: str, type_name: str, data: bytes) -> None:
+        """Answer a request, also one that makes no sense or that an error keeps from being answered."""
         try:
-            action()
-        except WireError as error:
-            self._step(Rejected(channel, error.reason), self._clock.now())
+            request = decode(type_name, data)
+        except Exception as error:
+            self._failed(channel, error)
+            header = _request_header(data) if isinstance(error, WireError) and error.reason == "malformed" else None
+            if header is not None:
+                kind = _REQUEST_KINDS[type_name]
+                self._send(core.turn_back(self.state, kind, header, str(error), self._clock.now()))
+            return
+        try:
+            self._step(request, self._clock.now())
+        except Exception as error:
+            self._failed(channel, error)
+            self._send(core.fail(self.state, request, self._clock.now()))
+
+    def _failed(self, channel: str, error: Exception) -> None:
+        """Count and log what went wrong with a message or a tick: an exception never leaves the bus."""
+        now = self._clock.now()
+        if isinstance(error, WireError):
+            self._step(Rejected(channel, error.reason), now)
             self._log.warning(f"{channel}:{error.reason}", "rejected a message on %s: %s", channel, error)
-        except Exception:
-            self._step(Rejected(channel, "handler"), self._clock.now())
+        else:
+            self._step(Rejected(channel, "handler"), now)
             self._log.exception(f"{channel}:handler", "an error of the server's own while handling %s", channel)
 
     def _step(self, event: Event, now: Instant) -> None:
@@ -157,7 +186,11 @@ class Loop:
 
     def _send(self, outputs: tuple[Output, ...]) -> None:
         for output in outputs:
-            _SENDERS[type(output)](self, output)
+            try:
+                _SENDERS[type(output)](self, output)
+            except Exception as error:
+                # one that cannot be sent must not take the others with it
+                self._failed(type(output).__name__, error)
 
     def _send_reply(self, output: SendReply) -> None:
         self._bus.publish(output.channel, encode(output.reply))
@@ -181,6 +214,17 @@ class Loop:
         )
         self._on_origin(output)
 
+
+def _request_header(data: bytes) -> RequestHeader | None:
+    """Return the header that every request begins with, None where not even that can be read."""
+    try:
+        channel, _ = read_text(data, 16)
+    except (WireError, struct.error):
+        return None
+    return RequestHeader(int.from_bytes(data[8:16], "big", signed=True), channel)
+
+
+_REQUEST_KINDS: Mapping[str, type[Request]] = {BY_NAME[kind.channel].type_name: kind for kind in get_args(Request)}
 
 _SENDERS: Mapping[type, Callable[[Loop, Any], None]] = {
     SendReply: Loop._send_reply,

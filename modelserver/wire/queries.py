@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from functools import lru_cache
 from typing import Final
 
 from modelserver.errors import Status
@@ -24,6 +25,10 @@ from mslcm.get_transformation_request_t import get_transformation_request_t
 _REQUEST_ID = struct.Struct(">q")
 _TIME = struct.Struct(">qbi")
 _REPLY_HEAD = struct.Struct(">qqh")
+
+_PLAIN: Final = text("") + LENGTH.pack(0)
+_PLAIN_AT: Final = 8 + _REPLY_HEAD.size
+"""No message and no nearest names: what a reply says that has an answer, and where it says so."""
 
 _REQUEST: Final[bytes] = get_transformation_request_t._get_packed_fingerprint()
 _TRANSFORM_REPLY: Final[bytes] = get_transformation_reply_t._get_packed_fingerprint()
@@ -47,12 +52,19 @@ def write_request(request: GetTransformation) -> bytes:
 def read_request(data: bytes) -> GetTransformation:
     """Return the request in the bytes of a get_transformation_request_t. Raises WireError, struct.error."""
     (request_id,) = _REQUEST_ID.unpack_from(data, 8)
-    channel, at = read_text(data, 16)
+    channel, interest, reference = _read_names(data[16 : -_TIME.size])
+    time = fields.time_query(*_TIME.unpack_from(data, len(data) - _TIME.size))
+    return GetTransformation(RequestHeader(request_id, channel), interest, reference, time)
+
+
+@lru_cache(maxsize=4096)
+def _read_names(data: bytes) -> tuple[str, str, str]:
+    """Return the three texts that fill `data`. Kept: clients ask the same question over and over."""
+    channel, at = read_text(data, 0)
     interest, at = read_text(data, at)
     reference, at = read_text(data, at)
-    time = fields.time_query(*_TIME.unpack_from(data, at))
-    check_end(data, at + _TIME.size)
-    return GetTransformation(RequestHeader(request_id, channel), interest, reference, time)
+    check_end(data, at)
+    return channel, interest, reference
 
 
 def write_transform_reply(reply: TransformReply) -> bytes:
@@ -109,6 +121,9 @@ def read_history_reply(data: bytes) -> HistoryReply:
 
 
 def _header(header: ReplyHeader) -> bytes:
+    if not header.message and not header.nearest:
+        head = _REPLY_HEAD.pack(header.request_id, header.utime, header.status)
+        return b"%b%b%b" % (head, _PLAIN, text(header.model_revision))
     return b"%b%b%b%b%b" % (
         _REPLY_HEAD.pack(header.request_id, header.utime, header.status),
         text(header.message),
@@ -120,7 +135,10 @@ def _header(header: ReplyHeader) -> bytes:
 
 def _read_header(data: bytes) -> tuple[ReplyHeader, int]:
     request_id, utime, status = _REPLY_HEAD.unpack_from(data, 8)
-    message, at = read_text(data, 8 + _REPLY_HEAD.size)
+    if status == 0 and data[_PLAIN_AT : _PLAIN_AT + len(_PLAIN)] == _PLAIN:
+        revision, at = read_text(data, _PLAIN_AT + len(_PLAIN))
+        return ReplyHeader(request_id, utime, model_revision=revision), at
+    message, at = read_text(data, _PLAIN_AT)
     (count,) = LENGTH.unpack_from(data, at)
     at += LENGTH.size
     nearest = []

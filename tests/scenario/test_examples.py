@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import subprocess
@@ -11,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support_lcm import running_daemon
 
 import modelserver as ms
-from support_lcm import running_daemon
 
 ROOT = Path(__file__).resolve().parents[2]
 RAPTOR = ROOT / "config" / "raptor"
@@ -33,20 +34,19 @@ def query(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     missing = [tool for tool in NEEDED[language] if shutil.which(tool) is None]
     if missing:
         pytest.skip(f"the {language} client needs {', '.join(missing)}")
-    return _built(language, tmp_path_factory.mktemp(language))
+    folder = tmp_path_factory.getbasetemp()
+    # parallel workers share one build: the parent folder of theirs is that of the whole run
+    folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+    with (folder / f"{language}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return _built(language, folder / f"client_{language}")
 
 
 def _built(language: str, folder: Path) -> Path:
-    """Build a client outside the source tree, as its README says."""
+    """Build a client outside the source tree, as its README says; make does nothing where it is built already."""
+    arguments = [f"BUILD={folder}", f"PYTHON={sys.executable}", "CFLAGS=-O0"]
     done = subprocess.run(
-        [
-            "make",
-            "-C",
-            ROOT / "examples" / f"client_{language}",
-            f"BUILD={folder}",
-            f"PYTHON={sys.executable}",
-            "CFLAGS=-O0",
-        ],
+        ["make", "-C", ROOT / "examples" / f"client_{language}", *arguments],
         capture_output=True,
         text=True,
         timeout=300,

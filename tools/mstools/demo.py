@@ -13,15 +13,16 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from types import FrameType
 from typing import IO, Annotated
 
 import typer
 
-import modelserver
-from modelserver.errors import ModelServerError, NoServerError
+from modelserver.errors import ModelServerError, NoServerError, QueryError
 from modelserver.messages import Invalid, PoseAnswer
+from modelserver.spatial.pose import Pose
 
 SEED = 20050901
 LEAD_SECONDS = 1.5
@@ -63,7 +64,7 @@ def vehicle_file() -> Path:
     """Return the Raptor's vehicle file: of the source tree, or as it was installed. Raises DemoError."""
     places = [
         Path(__file__).resolve().parents[2] / "config",
-        Path(modelserver.__file__).resolve().parent / "share" / "config",
+        Path(str(files("modelserver"))) / "share" / "config",
     ]
     for place in places:
         file = place / "raptor" / "vehicle.yaml"
@@ -202,7 +203,7 @@ def show(config: Path, url: str, seconds: float, children: Children) -> None:
         say("\n5. What it says to a slip")
         try:
             platform.get_transformation("Digiclop:ImagePlane", "Raptor:CG")
-        except modelserver.QueryError as error:
+        except QueryError as error:
             say(f"{error}. Nearest: {', '.join(error.nearest)}")
     say("\nDone. Next: modelserver run -c config/raptor/vehicle.yaml, then modelserver query Raptor:CG World:UTM")
 
@@ -240,7 +241,7 @@ def poses(url: str, channel: str, start_utime: int, seconds: float, children: Ch
         children.check()
 
 
-def row(pose: PoseAnswer, since: float, truth: modelserver.Pose, truth_origin: tuple[float, float, float]) -> str:
+def row(pose: PoseAnswer, since: float, truth: Pose, truth_origin: tuple[float, float, float]) -> str:
     """Return a line of the table: a pose, how far it is off the truth, and the bound it states."""
     found = pose.transformation
     if pose.origin is None:

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from support_formats import line_of, only_problem, problems_of, read, tree, tree_frame
+from support_formats import line_of, miro_body, miro_constraint, only_problem, problems_of, read, tree, tree_frame
 
 from modelserver.errors import Severity
 from modelserver.spatial import Pose
@@ -149,6 +149,13 @@ def test_instances_of_other_types_are_noted_and_other_frames_warned_of():
     )
     found = problems_of(ROVER.replace("</section>", extra + "</section>"))
     assert [problem.severity for problem in found] == [Severity.NOTE, Severity.WARNING]
+
+
+def test_bodies_beside_a_frame_tree_are_read_as_well():
+    bodies = miro_body("Lamp") + miro_constraint("LampFixed", "Rover:Antenna", "Lamp:Origin")
+    model = read(ROVER.replace("</section>", f"</section><section name='Geometry'>{bodies}</section>"))
+    assert model.get_body_list() == ["Rover", "Mast", "Lamp"]
+    assert model.problems == ()
 
 
 def test_a_chain_of_thousands_of_frames_needs_no_recursion():

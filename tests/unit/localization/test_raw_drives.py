@@ -54,7 +54,13 @@ def errors(drive, samples, settings=None, after=10.0, origin=ORIGIN, ahead=20_00
         roll, pitch, yaw = estimate.enu.rpy
         roll_t, pitch_t, yaw_t = truth.rpy
         found.append(
-            ((utime - START) * 1e-6, error, angle_error(yaw, yaw_t), math.hypot(roll - roll_t, pitch - pitch_t), estimate)
+            (
+                (utime - START) * 1e-6,
+                error,
+                angle_error(yaw, yaw_t),
+                math.hypot(roll - roll_t, pitch - pitch_t),
+                estimate,
+            )
         )
     return found
 
@@ -81,7 +87,12 @@ def test_figure_eight_is_followed_within_the_noise(velocity_sigma, reference):
 def test_position_is_exact_with_exact_sensors_whatever_the_lever_arms():
     drive = figure_eight()
     sensors = Sensors(
-        gps_sigma=0.02, gps_noise=0.0, velocity_sigma=0.005, gyro_noise=0.0, gyro_bias=(0, 0, 0), force_noise=0.0,
+        gps_sigma=0.02,
+        gps_noise=0.0,
+        velocity_sigma=0.005,
+        gyro_noise=0.0,
+        gyro_bias=(0, 0, 0),
+        force_noise=0.0,
         orientation=OrientationReference.ENU,
     )
     found = errors(drive, sensors.events(drive), after=10.0)
@@ -155,7 +166,8 @@ def test_driving_backwards_is_no_heading_jump(velocity_sigma):
 def test_gps_dropout_is_bridged_by_gyro_and_speed_and_said():
     drive = figure_eight()
     samples = [
-        s for s in Sensors(gps_sigma=0.1).events(drive)
+        s
+        for s in Sensors(gps_sigma=0.1).events(drive)
         if s.header.source == "imu" or not 30.0 < (s.header.utime - START) * 1e-6 < 34.0
     ]
     found = errors(drive, samples, after=20.0)
@@ -212,7 +224,8 @@ def test_a_lasting_jump_is_refused_then_believed_with_a_new_epoch():
 def test_a_stopped_imu_is_said_and_taken_up_again():
     drive = figure_eight(60.0)
     samples = [
-        s for s in Sensors().events(drive)
+        s
+        for s in Sensors().events(drive)
         if s.header.source == "gps" or not 30.0 < (s.header.utime - START) * 1e-6 < 33.0
     ]
     notes = []

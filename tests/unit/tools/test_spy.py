@@ -10,12 +10,12 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from support_lcm import MODELSERVER
 
 from modelserver.wire.channels import DEFAULT_URL
 from mstools import spy
 from mstools.cli import main
 from mstools.lcm_wheel import MissingToolError, type_files
-from support_lcm import MODELSERVER
 
 needs_javac = pytest.mark.skipif(shutil.which("javac") is None, reason="no Java compiler (default-jdk-headless)")
 
