@@ -326,15 +326,14 @@ def _check_shape(raw: bytes, name: str) -> None:
     """Raise ConfigError for what no vehicle file has and the composer cannot bear: deep nesting, aliases of aliases."""
     depth = 0
     for event in yaml.parse(raw, Loader=yaml.CSafeLoader):
+        line = event.start_mark.line + 1 if event.start_mark else 0
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
             if depth > MAX_DEPTH:
-                line = event.start_mark.line + 1
                 raise _one(name, line, "nested too deeply", "look for brackets that are not closed")
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
         elif isinstance(event, yaml.AliasEvent):
-            line = event.start_mark.line + 1
             raise _one(name, line, f"aliases (*{event.anchor}) are not read here", "write the value again")
 
 

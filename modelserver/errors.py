@@ -263,6 +263,10 @@ class BusError(ModelServerError):
     """The message bus cannot be joined."""
 
 
+class RecordingError(ModelServerError):
+    """A recording cannot be read, or is none."""
+
+
 class NoServerError(ModelServerError, TimeoutError):
     """No reply came in time: no server on this bus, or a bus that drops everything."""
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeAlias
 
-from modelserver.errors import ModelServerError
+from modelserver.errors import RecordingError
 from modelserver.messages import MAX_CHANNEL_LENGTH
 from modelserver.wire.fields import MAX_UTIME
 
@@ -26,10 +26,6 @@ _HEAD = struct.Struct(">Iqqii")  # sync word, event number, utime, lengths of ch
 _SYNC = struct.pack(">I", 0xEDA1DA01)
 
 Buffer: TypeAlias = bytes | mmap.mmap
-
-
-class RecordingError(ModelServerError):
-    """A recording cannot be read, or is none."""
 
 
 @dataclass(frozen=True, slots=True)

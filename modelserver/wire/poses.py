@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from math import isnan
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -81,12 +82,21 @@ def read_vector(data: bytes) -> PoseAnswer:
 def transform_body(answer: PoseAnswer) -> bytes:
     """Return the bytes of a pose_transform_t without its fingerprint."""
     transformation = answer.transformation
-    remembered = _WRITTEN.get(id(transformation))
-    if remembered is not None and remembered[0] is transformation:
-        return remembered[1]
+    # what stands beside the transformation is in the bytes too: only answers with nothing there share them
+    bare = (
+        answer.origin is None
+        and not answer.quality
+        and isnan(answer.horizontal_bound)
+        and isnan(answer.heading_bound)
+        and isnan(answer.seconds_to_limit)
+    )
+    if bare:
+        remembered = _WRITTEN.get(id(transformation))
+        if remembered is not None and remembered[0] is transformation:
+            return remembered[1]
     a, b, c, d = transformation.pose.matrix_rows()
     body = _body(_TRANSFORM, a + b + c + d, answer)
-    if not transformation.utime and answer.origin is None and transformation.model_revision:
+    if bare and not transformation.utime and transformation.model_revision:
         _remember(_WRITTEN, id(transformation), (transformation, body))
     return body
 

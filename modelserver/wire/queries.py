@@ -52,19 +52,26 @@ def write_request(request: GetTransformation) -> bytes:
 def read_request(data: bytes) -> GetTransformation:
     """Return the request in the bytes of a get_transformation_request_t. Raises WireError, struct.error."""
     (request_id,) = _REQUEST_ID.unpack_from(data, 8)
-    channel, interest, reference = _read_names(data[16 : -_TIME.size])
+    names = data[16 : -_TIME.size]
+    channel, interest, reference = _kept_names(names) if len(names) <= _KEPT_BYTES else _read_names(names)
     time = fields.time_query(*_TIME.unpack_from(data, len(data) - _TIME.size))
     return GetTransformation(RequestHeader(request_id, channel), interest, reference, time)
 
 
-@lru_cache(maxsize=4096)
 def _read_names(data: bytes) -> tuple[str, str, str]:
-    """Return the three texts that fill `data`. Kept: clients ask the same question over and over."""
+    """Return the three texts that fill `data`. Raises WireError, struct.error."""
     channel, at = read_text(data, 0)
     interest, at = read_text(data, at)
     reference, at = read_text(data, at)
     check_end(data, at)
     return channel, interest, reference
+
+
+_kept_names = lru_cache(maxsize=4096)(_read_names)
+"""The same, kept: clients ask the same question over and over."""
+
+_KEPT_BYTES: Final = 512
+"""Longer names are read anew: kept ones of 60 kB, sent by a stranger, would fill the memory."""
 
 
 def write_transform_reply(reply: TransformReply) -> bytes:

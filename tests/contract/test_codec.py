@@ -11,6 +11,9 @@ from support_wire import EXAMPLES, same
 
 import mslcm
 from modelserver.errors import WireError
+from modelserver.messages import GetTransformation, PoseAnswer, Quality, RequestHeader
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.transformation import Transformation
 from modelserver.wire.codec import decode, encode, type_names
 
 CASES = [
@@ -170,6 +173,25 @@ def test_given_flags_of_a_later_version_when_decoded_then_they_are_kept() -> Non
     value = decode("pose_transform_t", _message("pose_transform_t", invalid_reasons=1 << 20 | 1, quality_flags=1 << 21))
     assert value.transformation.invalid_reasons == 1 << 20 | 1
     assert value.quality == 1 << 21
+
+
+def test_given_one_relation_in_two_answers_when_encoded_then_each_keeps_what_stands_beside_it() -> None:
+    relation = Transformation("Camera:Image", "Raptor:CG", Pose(), model_revision="ab12")
+    for answer in (PoseAnswer(relation), PoseAnswer(relation, None, Quality.HELD, 1.5), PoseAnswer(relation)):
+        assert same(decode("pose_transform_t", encode(answer)), answer)
+
+
+def test_given_a_flood_of_long_frame_names_when_decoded_then_they_are_not_kept() -> None:
+    header = RequestHeader(1, "REPLY_TEST")
+    tracemalloc.start()
+    try:
+        for number in range(200):
+            request = GetTransformation(header, f"{number}:{'x' * 60_000}", "Raptor:CG")
+            assert decode("get_transformation_request_t", encode(request)) == request
+        held, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert held < 2 << 20
 
 
 def test_given_text_that_is_not_utf8_when_decoded_then_nothing_breaks() -> None:

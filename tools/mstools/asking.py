@@ -10,6 +10,7 @@ import typer
 from modelserver.errors import ModelServerError
 from modelserver.messages import Policy, PoseAnswer
 from mstools.options import parse_variables
+from mstools.output import print_problem
 
 ModelOption = Annotated[
     Path | None, typer.Option("--model", metavar="FILE", help="Ask this geometry file instead of the daemon.")
@@ -56,7 +57,7 @@ class FileAnswers:
 
         self._model = load_model(path, variables=parse_variables(settings))
         for problem in self._model.problems:
-            typer.echo(f"modelserver: {problem}", err=True)
+            print_problem(problem, err=True)
         self.get_body_list = self._model.get_body_list
         self.get_body_frame_list = self._model.get_body_frame_list
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from modelserver.wire.eventlog import RecordingError
+from modelserver.errors import RecordingError
 
 INSTALL = "pip install 'modelserver[bags]'"
 

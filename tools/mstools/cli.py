@@ -14,6 +14,7 @@ import typer
 
 from modelserver.errors import ConfigError, GeometryError, ModelServerError, QueryError
 from modelserver.version import __version__
+from mstools.output import print_problem, safe
 
 COMMANDS = {
     "demo": "Run the whole service on simulated sensors and watch it answer.",
@@ -36,7 +37,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         build(arguments)(arguments, prog_name="modelserver")
     except (GeometryError, ConfigError) as error:
-        _fail("\n".join(str(problem) for problem in error.problems))
+        for problem in error.problems:
+            print_problem(problem, err=True)
+        sys.exit(1)
     except QueryError as error:
         near = f". Nearest: {', '.join(error.nearest)}" if error.nearest else ""
         _fail(f"{error}{near}")
@@ -91,5 +94,5 @@ def _options(
 
 
 def _fail(message: str) -> None:
-    typer.echo(f"modelserver: {message}", err=True)
+    typer.echo(safe(f"modelserver: {message}"), err=True)
     sys.exit(1)

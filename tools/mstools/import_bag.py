@@ -14,10 +14,9 @@ from typing import Annotated
 import lcm
 import typer
 
-from modelserver.errors import nearest_names, shown
+from modelserver.errors import RecordingError, nearest_names, shown
 from modelserver.messages import MAX_CHANNEL_LENGTH, SensorHeader
 from modelserver.wire import codec
-from modelserver.wire.eventlog import RecordingError
 from mstools.bag_messages import DEFAULTS, ROS_TYPES, Altitude, Converter, ImuOrientation, Kind, Options, converter
 from mstools.bag_reader import Bag, Topic, open_bag
 from mstools.progress import progress

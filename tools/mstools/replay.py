@@ -13,8 +13,8 @@ from typing import Annotated, TextIO
 
 import typer
 
-from modelserver.errors import nearest_names, shown
-from modelserver.wire.eventlog import LogEvent, LogFile, RecordingError
+from modelserver.errors import RecordingError, nearest_names, shown
+from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools.asking import JsonOption, UrlOption
 from mstools.progress import progress
 

@@ -11,9 +11,10 @@ import lcm
 import pytest
 from support_bags import START_NS, Ros
 
+from modelserver.errors import RecordingError
 from modelserver.messages import Direction, FixType, ImuSample, OrientationReference, WheelsSample, YawSource
 from modelserver.wire.codec import decode
-from modelserver.wire.eventlog import LogEvent, LogFile, RecordingError
+from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools import cli
 from mstools.bag_messages import DEFAULTS, Altitude, ImuOrientation, Kind, Options
 from mstools.import_bag import import_bag

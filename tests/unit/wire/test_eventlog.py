@@ -7,7 +7,8 @@ from pathlib import Path
 import lcm
 import pytest
 
-from modelserver.wire.eventlog import Damage, LogEvent, LogFile, RecordingError, scan
+from modelserver.errors import RecordingError
+from modelserver.wire.eventlog import Damage, LogEvent, LogFile, scan
 
 SIZE = 28 + 2 + 20
 
