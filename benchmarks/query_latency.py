@@ -13,7 +13,7 @@ import lcm
 
 from benchmarks.support import RAPTOR, daemon, free_url, interleaved, process, ratio, verdict
 from modelserver.client.remote import Platform
-from modelserver.messages import GetTransformation
+from modelserver.messages import CHANNEL_OF, GetTransformation
 from modelserver.wire.channels import literal
 from modelserver.wire.provider import resolve_url
 
@@ -55,13 +55,13 @@ def captured(url: str, platform: Platform) -> tuple[bytes, bytes]:
     """Return the bytes of a request and its reply as they go over the bus."""
     seen: dict[str, bytes] = {}
     tap = lcm.LCM(resolve_url(url))
-    for channel in (GetTransformation.channel, platform.reply_channel):
+    for channel in (CHANNEL_OF[GetTransformation], platform.reply_channel):
         tap.subscribe(literal(channel), lambda channel, data: seen.__setitem__(channel, data))
     platform.get_transformation(INTEREST, REFERENCE)
     while len(seen) < 2:
         if not tap.handle_timeout(2000):
             raise TimeoutError("no request or reply was heard")
-    return seen[GetTransformation.channel], seen[platform.reply_channel]
+    return seen[CHANNEL_OF[GetTransformation]], seen[platform.reply_channel]
 
 
 def main() -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args, get_type_hints
@@ -289,6 +290,9 @@ class _Reader:
             near = nearest_names(str(at[-1]), known)
             fix = f"write {near[0]}" if near else f"known here: {', '.join(known)}"
             return Problem(Severity.ERROR, f"unknown key {shown(str(at[-1]))}", self.place(at), fix, near)
+        if detail["type"] == "missing" and isinstance(at[-1], int):
+            at = at[:-1]
+            return Problem(Severity.ERROR, f"{at[-1]} has too few numbers", self.place(at))
         if detail["type"] == "missing":
             return Problem(Severity.ERROR, f"{at[-1]} is missing", self.place(at), f"add a line: {at[-1]}: ...")
         message = str(detail["msg"]).removeprefix("Value error, ")
@@ -301,10 +305,18 @@ class _Reader:
             message = "expected a mapping (key: value, one a line)"
         if detail["type"] != "value_error" and isinstance(got, (str, int, float, bool)):
             message += f", got {shown(str(got))}"
+        if len(message) > 240:
+            message = f"{message[:240]}..."
         return Problem(Severity.ERROR, message[:1].lower() + message[1:], self.place(at), "")
 
 
+_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+", re.ASCII)
+"""Numbers such as 1e-3, which YAML 1.1 takes for text."""
+
+
 def _scalar(node: yaml.Node) -> Any:
+    if isinstance(node, yaml.ScalarNode) and not node.style and _EXPONENT.fullmatch(node.value):
+        return float(node.value)
     loader = yaml.CSafeLoader("")
     try:
         return loader.construct_object(node, deep=True)

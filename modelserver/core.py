@@ -18,6 +18,7 @@ from modelserver.geometry.model import Model
 from modelserver.history import History
 from modelserver.localization.interface import Localizer
 from modelserver.messages import (
+    CHANNEL_OF,
     ChannelHealth,
     Event,
     GetBodyFrameList,
@@ -122,11 +123,11 @@ class CoreState(NamedTuple):
     health_due_ns: int = 0
     health_sent_ns: int = 0
     poses_published: int = 0
-    requests_answered: int = 0
     ticks: int = 0
     ticks_missed: int = 0
     handler_errors: int = 0
     run_state: int = STARTING
+    requests_answered: int = 0  # stays last: see `_request`
 
     @property
     def model(self) -> Model:
@@ -221,6 +222,7 @@ def _tick(state: CoreState, tick: Tick, now: Instant) -> Step:
         lateness=(*state.lateness[-LATENESS_KEPT + 1 :], tick.late),
         ticks=state.ticks + 1 + tick.missed,
         ticks_missed=state.ticks_missed + tick.missed,
+        requests_answered=state.requests_answered + tick.answered,
     )
     due = (before + 1 + tick.missed) // every > before // every
     if due and state.settings.publish == "timer" and state.localizer is not None:
@@ -280,13 +282,13 @@ def _channel_health(name: str, traffic: Traffic, elapsed: float, now: Instant) -
 
 def _request(state: CoreState, request: Request, now: Instant) -> Step:
     if not request.header.is_answerable(state.settings.reply_prefix):
-        return _count(state, request.channel, "reply_channel"), ()
+        return _count(state, CHANNEL_OF[type(request)], "reply_channel"), ()
     if isinstance(request, _TIMED) and request.time.wait_ms and _must_wait(state, request):
         if len(state.parked) < state.settings.parked_requests:
             wait_ms = min(request.time.wait_ms, state.settings.wait_ms)
             parked = Parked(request, now.monotonic_ns + wait_ms * 1_000_000)
             return state._replace(parked=(*state.parked, parked)), ()
-        state = _count(state, request.channel, "load")
+        state = _count(state, CHANNEL_OF[type(request)], "load")
         refusal = _failed(
             request,
             Status.REFUSED_LOAD,
@@ -295,7 +297,9 @@ def _request(state: CoreState, request: Request, now: Instant) -> Step:
             state,
         )
         return state, (SendReply(request.header.reply_channel, refusal),)
-    return state._replace(requests_answered=state.requests_answered + 1), (answer(state, request, now),)
+    # what `_replace` does, at a third of its cost: this is done for every request
+    counted = CoreState._make((*state[:-1], state.requests_answered + 1))
+    return counted, (answer(state, request, now),)
 
 
 def _must_wait(state: CoreState, request: GetTransformation | GetStateVector | GetHTransform) -> bool:

@@ -17,6 +17,7 @@ import lcm
 
 from modelserver.errors import MalformedRequestError, NoServerError, Status, WireError, error_for_status
 from modelserver.messages import (
+    CHANNEL_OF,
     MAX_CHANNEL_LENGTH,
     GetBodyFrameList,
     GetBodyList,
@@ -51,6 +52,9 @@ _REPLY_TYPES = {
 UNREAD_REPLIES: Final = 64
 """Replies kept until they are looked at; further ones are lost."""
 
+IDLE_S: Final = 0.01
+"""After so long without a question the replies to others of this program's name are thrown away first."""
+
 LONGEST_WAIT_S: Final = 60.0
 """LCM counts milliseconds in an int: a longer wait is made of several."""
 
@@ -84,7 +88,7 @@ class Platform:
         self.url = resolve_url(url)
         self.timeout = timeout
         self.retries = retries
-        self._prefix = channel_prefix
+        self._channels = {kind: f"{channel_prefix}{channel}" for kind, channel in CHANNEL_OF.items()}
         # stable for a program, not random: every process on the bus keeps each channel name it ever saw
         self.reply_channel = _reply_channel(reply_prefix, name or os.path.basename(sys.argv[0] or "python"))
         # ids need to differ between programs, not to be unguessable
@@ -92,6 +96,7 @@ class Platform:
         self._lock = threading.Lock()
         self._fresh: list[bytes] = []
         self._lcm: lcm.LCM | None = open_lcm(self.url)
+        self._last_asked = 0.0
         fresh = self._fresh
         # the handler does not hold this object: one that is forgotten, not closed, leaves the bus all the same
         subscription = self._lcm.subscribe(literal(self.reply_channel), lambda _, data: fresh.append(data))
@@ -126,9 +131,9 @@ class Platform:
         accepted for an answer there; `wait_ms` how long the server may wait for data that cover it.
         Raises NoServerError, or the QueryError that the server meant.
         """
-        return self.get_pose(
-            frame_of_interest, frame_of_reference, at=at, policy=policy, wait_ms=wait_ms
-        ).transformation
+        time = TimeQuery(at, policy, wait_ms)
+        request = GetTransformation(self._header(), frame_of_interest, frame_of_reference, time)
+        return _found(self._ask(request, TransformReply, wait_ms).answer).transformation
 
     def get_pose(
         self,
@@ -140,9 +145,8 @@ class Platform:
         wait_ms: int = 0,
     ) -> PoseAnswer:
         """Return what `get_transformation` does, with the origin, the bounds and the flags beside it."""
-        request = GetTransformation(
-            self._header(), frame_of_interest, frame_of_reference, TimeQuery(at, policy, wait_ms)
-        )
+        time = TimeQuery(at, policy, wait_ms)
+        request = GetTransformation(self._header(), frame_of_interest, frame_of_reference, time)
         return _found(self._ask(request, TransformReply, wait_ms).answer)
 
     def get_body_list(self) -> list[str]:
@@ -187,17 +191,20 @@ class Platform:
             data = encode(request)
         except (struct.error, TypeError, AttributeError, UnicodeEncodeError) as error:
             raise MalformedRequestError(f"this question cannot be put into a message: {error}") from error
-        channel = f"{self._prefix}{request.channel}"
+        channel = self._channels[type(request)]
         patience = self.timeout + wait_ms * 1e-3
         with self._lock:
             bus = self._lcm
             if bus is None:
                 raise ValueError("this Platform is closed")
-            for _ in range(1 + self.retries):
-                _discard_unread(bus)
+            for tried in range(1 + self.retries):
+                begin = time.monotonic()
+                if tried or begin > self._last_asked + IDLE_S:
+                    _discard_unread(bus)
+                self._last_asked = begin
                 self._fresh.clear()
                 bus.publish(channel, data)
-                reply = self._await(bus, request.header.request_id, reply_kind, patience)
+                reply = self._await(bus, request.header.request_id, reply_kind, begin, patience)
                 if reply is not None:
                     header: ReplyHeader = reply.header
                     if header.status is not Status.OK:
@@ -209,11 +216,10 @@ class Platform:
             "on this bus ($LCM_DEFAULT_URL) and with this channel prefix?"
         )
 
-    def _await(self, bus: lcm.LCM, request_id: int, reply_kind: type[R], patience: float) -> R | None:
-        deadline = time.monotonic() + patience
-        while (left := deadline - time.monotonic()) > 0:
-            if not bus.handle_timeout(max(1, int(min(left, LONGEST_WAIT_S) * 1000))):
-                continue
+    def _await(self, bus: lcm.LCM, request_id: int, reply_kind: type[R], begin: float, patience: float) -> R | None:
+        left = patience
+        while left > 0:
+            bus.handle_timeout(max(1, int(min(left, LONGEST_WAIT_S) * 1000)))
             for data in self._fresh:
                 try:
                     reply = decode(_REPLY_TYPES[reply_kind], data)
@@ -223,6 +229,7 @@ class Platform:
                     self._fresh.clear()
                     return reply  # type: ignore[no-any-return]
             self._fresh.clear()
+            left = begin + patience - time.monotonic()
         return None
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import select
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Protocol, TypeAlias
 
 from modelserver.wire.channels import literal
@@ -52,21 +52,20 @@ class LcmInbox:
     def __init__(self, url: str):
         self.lcm = open_lcm(url)
         self.fileno = self.lcm.fileno()
+        self.may_have = True
+        """Whether something may have come; false only where `LcmBus.wait` has just seen that nothing has."""
 
     def subscribe(self, channel: str, handler: Handler) -> None:
         """Hand every message of exactly `channel` to `handler`."""
-
-        def handle(name: str, data: bytes) -> None:
-            # a regular expression's end also matches before a line break at the end
-            if name == channel:
-                handler(name, data)
-
-        subscription = self.lcm.subscribe(literal(channel), handle)
+        subscription = self.lcm.subscribe(literal(channel), handler)
         # 0 is no limit: LCM would drop silently, the loop refuses and counts
         subscription.set_queue_capacity(0)
 
     def drain(self, limit: int) -> int:
         """Hand over what has come, at most `limit` messages, without waiting; return how many."""
+        if not self.may_have:
+            self.may_have = True
+            return 0
         handle = self.lcm.handle_timeout
         for count in range(limit):
             if not handle(0):
@@ -84,13 +83,15 @@ class LcmBus:
         self._poll = select.poll()
         for inbox in (self.sensors, self.requests):
             self._poll.register(inbox.fileno, select.POLLIN)
-        self._files = (self.sensors.fileno, self.requests.fileno)
         self.publish = self.requests.lcm.publish
 
     def wait(self, seconds: float) -> None:
         """Return when something has come or the time is up."""
         # poll is the cheaper call but counts in milliseconds; select keeps the deadline to the microsecond
         milliseconds = int(seconds * 1e3)
-        if milliseconds and self._poll.poll(milliseconds):
-            return
-        select.select(self._files, (), (), max(0.0, seconds - milliseconds * 1e-3))
+        ready: Collection[int] = [file for file, _ in self._poll.poll(milliseconds)]
+        if not ready:
+            files = (self.sensors.fileno, self.requests.fileno)
+            ready, _, _ = select.select(files, (), (), max(0.0, seconds - milliseconds * 1e-3))
+        self.sensors.may_have = self.sensors.fileno in ready
+        self.requests.may_have = self.requests.fileno in ready

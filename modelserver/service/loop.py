@@ -7,13 +7,14 @@ import struct
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, get_args
+from typing import Any
 
 from modelserver import core
 from modelserver.core import CoreState, Instant
 from modelserver.errors import WireError
 from modelserver.geometry import names
 from modelserver.messages import (
+    CHANNEL_OF,
     Event,
     OriginLatched,
     Output,
@@ -31,6 +32,7 @@ from modelserver.service.log import RateLimited
 from modelserver.wire.channels import BY_NAME, REQUESTS
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.packed import read_text
+from modelserver.wire.timeless import TimelessReplies
 
 log = logging.getLogger(__name__)
 
@@ -76,6 +78,9 @@ class Loop:
         self._queue: deque[tuple[str, str, bytes]] = deque()
         self._refusals_left = REFUSALS_PER_PASS
         self._budget = 0
+        self._timeless = TimelessReplies()
+        self._answered = 0  # from `_timeless`, since the last tick
+        self._asked = b""  # the request that the core is answering
         self._due_ns = clock.monotonic_ns()
         self._stopping = False
         prefix = settings.channel_prefix
@@ -115,8 +120,9 @@ class Loop:
         # a tick that was missed is skipped and counted: catching up would burst old poses
         missed = late_ns // self._settings.period_ns
         self._due_ns += (missed + 1) * self._settings.period_ns
+        answered, self._answered = self._answered, 0
         try:
-            self._step(Tick(late_ns * 1e-9, missed), self._clock.now())
+            self._step(Tick(late_ns * 1e-9, missed, answered), self._clock.now())
         except Exception as error:
             self._failed("tick", error)
 
@@ -154,6 +160,12 @@ class Loop:
 
     def _answer(self, channel: str, type_name: str, data: bytes) -> None:
         """Answer a request, also one that makes no sense or that an error keeps from being answered."""
+        now = self._clock.now()
+        remembered = self._timeless.find(data, now.utime, self.state.view.model)
+        if remembered is not None:
+            self._bus.publish(*remembered)
+            self._answered += 1
+            return
         try:
             request = decode(type_name, data)
         except Exception as error:
@@ -161,13 +173,15 @@ class Loop:
             header = _request_header(data) if isinstance(error, WireError) and error.reason == "malformed" else None
             if header is not None:
                 kind = _REQUEST_KINDS[type_name]
-                self._send(core.turn_back(self.state, kind, header, str(error), self._clock.now()))
+                self._send(core.turn_back(self.state, kind, header, str(error), now))
             return
+        self._asked = data
         try:
-            self._step(request, self._clock.now())
+            self._step(request, now)
         except Exception as error:
             self._failed(channel, error)
-            self._send(core.fail(self.state, request, self._clock.now()))
+            self._send(core.fail(self.state, request, now))
+        self._asked = b""
 
     def _failed(self, channel: str, error: Exception) -> None:
         """Count and log what went wrong with a message or a tick: an exception never leaves the bus."""
@@ -193,7 +207,10 @@ class Loop:
                 self._failed(type(output).__name__, error)
 
     def _send_reply(self, output: SendReply) -> None:
-        self._bus.publish(output.channel, encode(output.reply))
+        encoded = encode(output.reply)
+        self._bus.publish(output.channel, encoded)
+        if self._asked:
+            self._timeless.learn(self._asked, output, encoded, self.state.model)
 
     def _send_pose(self, output: PublishPose) -> None:
         self._bus.publish(self._pose, encode(output.world))
@@ -224,7 +241,7 @@ def _request_header(data: bytes) -> RequestHeader | None:
     return RequestHeader(int.from_bytes(data[8:16], "big", signed=True), channel)
 
 
-_REQUEST_KINDS: Mapping[str, type[Request]] = {BY_NAME[kind.channel].type_name: kind for kind in get_args(Request)}
+_REQUEST_KINDS: Mapping[str, type[Request]] = {BY_NAME[channel].type_name: kind for kind, channel in CHANNEL_OF.items()}
 
 _SENDERS: Mapping[type, Callable[[Loop, Any], None]] = {
     SendReply: Loop._send_reply,

@@ -82,5 +82,8 @@ REQUESTS = tuple(channel for channel in CHANNELS if channel.way is Way.REQUEST)
 
 
 def literal(channel: str) -> str:
-    """Return the regular expression that matches `channel` alone: LCM takes subscriptions for patterns."""
-    return re.escape(channel)
+    """Return the regular expression that matches `channel` alone: LCM takes subscriptions for patterns.
+
+    LCM puts ^ and $ around it, and $ also matches before a line break at the end; \\z does not.
+    """
+    return re.escape(channel) + r"\z"

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import struct
-from math import isnan
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 
@@ -39,20 +38,13 @@ NO_VECTOR: Final[bytes] = pose_vector_t().encode()[8:]
 """What stands in a reply that carries no pose."""
 
 
-# Relations that do not change with time are asked for again and again: the bytes of those lately written, and the
-# answers lately read, are kept. The oldest go first.
+# Relations that do not change with time are asked for again and again: the bytes of those lately written are kept;
+# when there are too many, all go.
 _WRITTEN: Final[dict[int, tuple[Transformation, bytes]]] = {}
-_READ: Final[dict[bytes, PoseAnswer]] = {}
 _KEPT: Final = 4096
 
-K = TypeVar("K")
-V = TypeVar("V")
-
-
-def _remember(memory: dict[K, V], key: K, value: V) -> None:
-    if len(memory) >= _KEPT:
-        del memory[next(iter(memory))]
-    memory[key] = value
+_NOTHING: Final = PoseAnswer(Transformation("", "", Pose.identity()))[1:]
+"""What stands beside a relation that does not change: no origin, no flags, no bounds."""
 
 
 def write_transform(answer: PoseAnswer) -> bytes:
@@ -83,13 +75,7 @@ def transform_body(answer: PoseAnswer) -> bytes:
     """Return the bytes of a pose_transform_t without its fingerprint."""
     transformation = answer.transformation
     # what stands beside the transformation is in the bytes too: only answers with nothing there share them
-    bare = (
-        answer.origin is None
-        and not answer.quality
-        and isnan(answer.horizontal_bound)
-        and isnan(answer.heading_bound)
-        and isnan(answer.seconds_to_limit)
-    )
+    bare = answer[1:] == _NOTHING
     if bare:
         remembered = _WRITTEN.get(id(transformation))
         if remembered is not None and remembered[0] is transformation:
@@ -97,7 +83,9 @@ def transform_body(answer: PoseAnswer) -> bytes:
     a, b, c, d = transformation.pose.matrix_rows()
     body = _body(_TRANSFORM, a + b + c + d, answer)
     if bare and not transformation.utime and transformation.model_revision:
-        _remember(_WRITTEN, id(transformation), (transformation, body))
+        if len(_WRITTEN) >= _KEPT:
+            _WRITTEN.clear()
+        _WRITTEN[id(transformation)] = (transformation, body)
     return body
 
 
@@ -108,19 +96,12 @@ def vector_body(answer: PoseAnswer) -> bytes:
 
 
 def read_transform_body(data: bytes, at: int) -> tuple[PoseAnswer, int]:
-    """Return the pose that begins at `at` and fills the rest, and where it ends. Raises WireError, struct.error."""
-    body = data[at:]
-    remembered = _READ.get(body)
-    if remembered is not None:
-        return remembered, len(data)
+    """Return the pose that begins at `at`, and where it ends. Raises WireError, struct.error."""
     head, values, revision, end = _fields(_TRANSFORM, data, at)
     a, b, c, x, d, e, f, y, g, h, i, z, *last = values[:16]
     if last != [0.0, 0.0, 0.0, 1.0]:
         raise WireError("malformed", f"the last row of a homogeneous transform is 0 0 0 1, got {last}")
-    answer = _answer(head, _pose((x, y, z), ((a, b, c), (d, e, f), (g, h, i))), values[16:], revision)
-    if not head[0] and answer.origin is None and end == len(data):
-        _remember(_READ, body, answer)
-    return answer, end
+    return _answer(head, _pose((x, y, z), ((a, b, c), (d, e, f), (g, h, i))), values[16:], revision), end
 
 
 def read_vector_body(data: bytes, at: int) -> tuple[PoseAnswer, int]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import struct
 from functools import lru_cache
-from typing import Final
+from typing import Any, Final
 
 from modelserver.errors import Status
 from modelserver.messages import (
     GetTransformation,
     HistoryReply,
+    PoseAnswer,
     ReplyHeader,
     RequestHeader,
     StateVectorReply,
@@ -26,6 +27,14 @@ _REQUEST_ID = struct.Struct(">q")
 _TIME = struct.Struct(">qbi")
 _REPLY_HEAD = struct.Struct(">qqh")
 
+_STAMP = struct.Struct(">qq")
+_STAMPED: Final = 8 + _STAMP.size
+"""Where a reply goes on behind fingerprint, id and stamp."""
+
+_READ: Final[dict[bytes, tuple[Any, PoseAnswer]]] = {}
+_KEPT: Final = 1024
+"""Replies that hold for good, lately read: their bytes from `_STAMPED` on, the rest of the header, the answer."""
+
 _PLAIN: Final = text("") + LENGTH.pack(0)
 _PLAIN_AT: Final = 8 + _REPLY_HEAD.size
 """No message and no nearest names: what a reply says that has an answer, and where it says so."""
@@ -38,15 +47,18 @@ _HISTORY_REPLY: Final[bytes] = get_history_reply_t._get_packed_fingerprint()
 
 def write_request(request: GetTransformation) -> bytes:
     """Return the bytes of a get_transformation_request_t."""
-    time = request.time
-    return b"%b%b%b%b%b%b" % (
-        _REQUEST,
-        _REQUEST_ID.pack(request.header.request_id),
-        text(request.header.reply_channel),
-        text(request.frame_of_interest),
-        text(request.frame_of_reference),
-        _TIME.pack(time.at, time.policy, time.wait_ms),
-    )
+    header, interest, reference, time = request
+    short = len(interest) + len(reference) <= _KEPT_BYTES
+    names = (_kept_texts if short else _texts)(header.reply_channel, interest, reference)
+    return b"%b%b%b%b" % (_REQUEST, _REQUEST_ID.pack(header.request_id), names, _TIME.pack(*time))
+
+
+def _texts(channel: str, interest: str, reference: str) -> bytes:
+    """Return the three texts of a request."""
+    return text(channel) + text(interest) + text(reference)
+
+
+_kept_texts = lru_cache(maxsize=1024)(_texts)
 
 
 def read_request(data: bytes) -> GetTransformation:
@@ -82,12 +94,21 @@ def write_transform_reply(reply: TransformReply) -> bytes:
 
 def read_transform_reply(data: bytes) -> TransformReply:
     """Return the reply in the bytes of a get_transformation_reply_t. Raises WireError, struct.error."""
+    rest = data[_STAMPED:]
+    known = _READ.get(rest)
+    if known is not None:
+        request_id, utime = _STAMP.unpack_from(data, 8)
+        return TransformReply(ReplyHeader(request_id, utime, *known[0]), known[1])
     header, at = _read_header(data)
     if header.status is not Status.OK:
         poses.check_no_transform(data, at)
         return TransformReply(header)
     answer, end = poses.read_transform_body(data, at)
     check_end(data, end)
+    if not answer.transformation.utime and answer.origin is None:
+        if len(_READ) >= _KEPT:
+            _READ.clear()
+        _READ[rest] = (header[2:], answer)
     return TransformReply(header, answer)
 
 

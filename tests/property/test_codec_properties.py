@@ -127,9 +127,9 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
     "get_state_vector_request_t": st.builds(messages.GetStateVector, request_headers, times),
     "get_h_transform_request_t": st.builds(messages.GetHTransform, request_headers, st.booleans(), times),
     "get_history_request_t": st.builds(messages.GetHistory, request_headers, utimes, utimes, numbers),
-    "get_transformation_reply_t": st.builds(messages.TransformReply, failed)
+    "get_transformation_reply_t": failed.map(messages.TransformReply)
     | st.builds(messages.TransformReply, fine, answers()),
-    "get_state_vector_reply_t": st.builds(messages.StateVectorReply, failed)
+    "get_state_vector_reply_t": failed.map(messages.StateVectorReply)
     | st.builds(messages.StateVectorReply, fine, answers()),
     "name_list_reply_t": st.builds(
         lambda header, found: messages.NameListReply(

@@ -1,0 +1,231 @@
+"""What the loop needs of a bus holds for the real one and for the fake one."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+from support_lcm import PATIENCE_S, reserved_url
+
+from modelserver.errors import BusError
+from modelserver.service.bus import Bus, Inbox, LcmBus
+from modelserver.service.clock import Clock, FakeClock, SystemClock
+from modelserver.service.fake_bus import FakeBus
+from modelserver.wire.channels import CHANNELS
+
+ODD_CHANNELS = ["A.B", "A*", "A+", "(A)", "[A]", "A|B", "A-B", "^A$", "A{2}", "A?", "A\\B", "A/B", "#A", "A B", "."]
+
+
+class Rig:
+    """A bus with the clock that its waiting goes by."""
+
+    def __init__(self, bus: Bus, clock: Clock):
+        self.bus = bus
+        self.clock = clock
+        self.heard: list[tuple[str, bytes]] = []
+
+    def hear(self, channel: str, inbox: Inbox | None = None) -> None:
+        (inbox or self.bus.sensors).subscribe(channel, lambda name, data: self.heard.append((name, data)))
+
+    def drain_until(self, done: Callable[[], bool], inbox: Inbox | None = None) -> bool:
+        """Drain while waiting on the bus, until `done` or patience ends."""
+        inbox = inbox or self.bus.sensors
+        end = time.monotonic() + PATIENCE_S
+        while not done():
+            if time.monotonic() > end:
+                return False
+            if not inbox.drain(1000):
+                self.bus.wait(0.05)
+        return True
+
+    def settled(self) -> list[tuple[str, bytes]]:
+        """All that was heard until a last message has come through."""
+        self.bus.publish("LAST", b"")
+        assert self.drain_until(lambda: ("LAST", b"") in self.heard)
+        self.heard.remove(("LAST", b""))
+        return self.heard
+
+
+@pytest.fixture(params=["fake", "lcm"])
+def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
+    if request.param == "fake":
+        clock = FakeClock()
+        rig = Rig(FakeBus(clock), clock)
+        rig.hear("LAST")
+        yield rig
+        return
+    with reserved_url() as url:
+        rig = Rig(LcmBus(url), SystemClock())
+        rig.hear("LAST")
+        yield rig
+
+
+def test_given_a_message_then_those_who_listen_hear_channel_and_bytes(rig: Rig) -> None:
+    rig.hear("A")
+    rig.bus.publish("A", b"\x00\xffdata")
+    assert rig.settled() == [("A", b"\x00\xffdata")]
+
+
+def test_given_an_empty_and_a_large_message_then_both_come_whole(rig: Rig) -> None:
+    large = bytes(range(256)) * 1000
+    rig.hear("A")
+    rig.bus.publish("A", b"")
+    rig.bus.publish("A", large)
+    assert rig.settled() == [("A", b""), ("A", large)]
+
+
+def test_given_names_that_contain_a_channel_then_only_the_exact_one_is_heard(rig: Rig) -> None:
+    rig.hear("GPS")
+    for name in ("GPS2", "XGPS", "GP", "gps", "GPS ", " GPS", "GPS\n", "\nGPS", "G.S", "GPS|A"):
+        rig.bus.publish(name, b"wrong")
+    rig.bus.publish("GPS", b"right")
+    assert rig.settled() == [("GPS", b"right")]
+
+
+@pytest.mark.parametrize("channel", ODD_CHANNELS)
+def test_given_a_channel_of_characters_that_patterns_use_then_it_is_matched_literally(rig: Rig, channel: str) -> None:
+    rig.hear(channel)
+    others = [name for name in ("A", "AB", "AA", "B", "A1B", "AxB", *ODD_CHANNELS) if name != channel]
+    for name in others:
+        rig.bus.publish(name, b"wrong")
+    rig.bus.publish(channel, b"right")
+    assert rig.settled() == [(channel, b"right")]
+
+
+def test_given_many_messages_then_their_order_is_kept_across_channels(rig: Rig) -> None:
+    rig.hear("A")
+    rig.hear("B")
+    sent = [("AB"[n % 3 == 0], str(n).encode()) for n in range(500)]
+    for channel, data in sent:
+        rig.bus.publish(channel, data)
+    assert rig.settled() == sent
+
+
+def test_given_a_limit_then_a_drain_hands_over_no_more_and_says_how_many(rig: Rig) -> None:
+    rig.hear("A")
+    for n in range(10):
+        rig.bus.publish("A", bytes([n]))
+    counts = []
+    end = time.monotonic() + PATIENCE_S
+    while sum(counts) < 10 and time.monotonic() < end:
+        before = len(rig.heard)
+        counts.append(rig.bus.sensors.drain(3))
+        assert counts[-1] == len(rig.heard) - before <= 3
+        if not counts[-1]:
+            rig.bus.wait(0.05)
+    assert sum(counts) == 10
+    assert rig.bus.sensors.drain(3) == 0
+    assert rig.bus.sensors.drain(0) == 0
+
+
+def test_given_nothing_sent_then_a_drain_returns_at_once(rig: Rig) -> None:
+    rig.hear("A")
+    begun = time.monotonic()
+    assert rig.bus.sensors.drain(10) == 0
+    assert rig.bus.requests.drain(10) == 0
+    assert time.monotonic() - begun < 5.0
+
+
+def test_given_handlers_then_they_run_within_drain_only(rig: Rig) -> None:
+    rig.hear("A")
+    rig.bus.publish("A", b"1")
+    rig.bus.wait(0.2)
+    assert rig.heard == []
+    assert rig.drain_until(lambda: bool(rig.heard))
+
+
+def test_given_both_inboxes_then_each_has_its_own_queue(rig: Rig) -> None:
+    rig.hear("A", rig.bus.sensors)
+    rig.bus.requests.subscribe("A", lambda name, data: rig.heard.append(("request", data)))
+    rig.bus.publish("A", b"1")
+    assert rig.drain_until(lambda: rig.heard == [("A", b"1")])
+    assert rig.drain_until(lambda: rig.heard == [("A", b"1"), ("request", b"1")], rig.bus.requests)
+
+
+def test_given_two_handlers_on_a_channel_then_both_hear_it(rig: Rig) -> None:
+    rig.hear("A")
+    rig.hear("A")
+    rig.bus.publish("A", b"1")
+    assert rig.settled() == [("A", b"1"), ("A", b"1")]
+
+
+def test_given_a_handler_that_publishes_then_what_it_says_is_heard_too(rig: Rig) -> None:
+    rig.hear("ECHO")
+    echoed = []
+
+    def echo(channel: str, data: bytes) -> None:
+        rig.bus.publish("ECHO", data)
+        echoed.append(data)
+
+    rig.bus.requests.subscribe("A", echo)
+    rig.bus.sensors.subscribe("A", echo)
+    rig.bus.publish("A", b"1")
+    assert rig.drain_until(lambda: len(echoed) == 1)
+    assert rig.drain_until(lambda: len(echoed) == 2, rig.bus.requests)
+    assert rig.drain_until(lambda: len(rig.heard) == 2)
+    assert rig.heard == [("ECHO", b"1")] * 2
+
+
+def test_given_a_handler_that_raises_then_the_messages_after_it_are_not_lost(rig: Rig) -> None:
+    def failing(channel: str, data: bytes) -> None:
+        if data == b"1":
+            raise RuntimeError("on purpose")
+        rig.heard.append((channel, data))
+
+    rig.bus.sensors.subscribe("A", failing)
+    for data in (b"0", b"1", b"2"):
+        rig.bus.publish("A", data)
+    with pytest.raises(RuntimeError, match="on purpose"):
+        rig.drain_until(lambda: len(rig.heard) == 2)
+    assert rig.drain_until(lambda: rig.heard == [("A", b"0"), ("A", b"2")])
+
+
+def test_given_nothing_arrives_then_wait_returns_at_its_deadline(rig: Rig) -> None:
+    for seconds in (0.0, 0.0004, 0.009, 0.02, 0.0305):
+        # what is left of earlier messages may end one wait early
+        rig.bus.sensors.drain(100)
+        rig.bus.requests.drain(100)
+        before = rig.clock.monotonic_ns()
+        rig.bus.wait(seconds)
+        waited = (rig.clock.monotonic_ns() - before) * 1e-9
+        assert seconds - 1e-6 <= waited < seconds + 5.0
+
+
+@pytest.mark.parametrize("inbox", ["sensors", "requests"])
+def test_given_a_message_for_either_inbox_then_wait_returns_before_its_deadline(rig: Rig, inbox: str) -> None:
+    rig.hear("A", getattr(rig.bus, inbox))
+    rig.bus.publish("A", b"1")
+    before = rig.clock.monotonic_ns()
+    rig.bus.wait(PATIENCE_S)
+    assert (rig.clock.monotonic_ns() - before) * 1e-9 < PATIENCE_S / 2
+    assert rig.drain_until(lambda: bool(rig.heard), getattr(rig.bus, inbox))
+
+
+def test_given_messages_that_were_left_then_wait_returns_at_once(rig: Rig) -> None:
+    rig.hear("A")
+    for n in range(3):
+        rig.bus.publish("A", bytes([n]))
+    assert rig.drain_until(lambda: len(rig.heard) == 3)
+    for n in range(3):
+        rig.bus.publish("A", bytes([n]))
+    rig.bus.wait(PATIENCE_S)
+    end = time.monotonic() + PATIENCE_S
+    while len(rig.heard) < 4 and time.monotonic() < end:
+        rig.bus.sensors.drain(1)
+    before = rig.clock.monotonic_ns()
+    rig.bus.wait(PATIENCE_S)
+    assert (rig.clock.monotonic_ns() - before) * 1e-9 < PATIENCE_S / 2
+    assert rig.drain_until(lambda: len(rig.heard) == 6)
+
+
+def test_given_the_names_of_this_service_then_they_are_plain_and_short_enough_for_lcm_with_the_longest_prefix() -> None:
+    assert all(re.fullmatch("[A-Z_]+", channel.name) and len(channel.name) <= 63 - 24 for channel in CHANNELS)
+
+
+@pytest.mark.parametrize("url", ["nonsense://", "udpm://300.1.1.1:7667?ttl=0", "udpm://1.2.3.4:7667?ttl=0"])
+def test_given_a_bus_that_cannot_be_joined_then_the_error_says_what_to_look_at(url: str) -> None:
+    with pytest.raises(BusError, match="Try: ip route add") as caught:
+        LcmBus(url)
+    assert url in str(caught.value)

@@ -1,0 +1,204 @@
+"""A small vehicle for tests of the service: its files, samples of a straight drive, and a localizer by script."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from modelserver.core import CoreSettings, CoreState, Instant, start
+from modelserver.geodesy import Geodesy, origin_at
+from modelserver.geometry import Model, ModelBuilder, Sigma
+from modelserver.localization.interface import Note
+from modelserver.messages import (
+    VALID,
+    Estimate,
+    FixType,
+    GpsSample,
+    ImuSample,
+    Invalid,
+    Origin,
+    OriginLatched,
+    Quality,
+    Rejected,
+    RequestHeader,
+    Sample,
+    SensorHeader,
+)
+from modelserver.spatial import Pose
+
+START = 1_700_000_000_000_000
+ORIGIN = origin_at(50.27, -111.1, 700.0)
+GEODESY = Geodesy(ORIGIN)
+ME = RequestHeader(77, "REPLY_TEST")
+Fix: TypeAlias = GpsSample | ImuSample
+
+
+# --- the vehicle --------------------------------------------------------------------------------------------
+
+
+def cart(sigma: bool = False) -> Model:
+    """A cart with an antenna, an inertial unit and a camera, and a lamp that nothing joins to it."""
+    survey = Sigma((0.01, 0.02, 0.03), (0.001, 0.002, 0.003)) if sigma else None
+    builder = ModelBuilder("cart")
+    body = builder.body("Cart")
+    body.frame("Base")
+    body.frame("Antenna", Pose((-0.4, 0.2, 1.2)))
+    body.frame("Imu", Pose((0.1, 0.0, 0.3)))
+    body.frame("Mast", Pose.from_rpy((0.5, 0.1, 1.0), 0.0, 0.2, 0.3), sigma=survey)
+    builder.body("Camera").frame("Origin")
+    builder.constraint("Mounted", "Cart:Mast", "Camera:Origin", Pose.from_rpy((0, 0, 0.1), 0.1, 0, 0.5), sigma=survey)
+    builder.body("Lamp").frame("Origin")
+    return builder.build()
+
+
+GEOMETRY = """\
+modelserver: geometry/1
+name: cart
+bodies:
+  Cart:
+    frames:
+      Base:
+      Antenna: {xyz: [-0.4, 0.2, 1.2]}
+      Imu: {xyz: [0.1, 0, 0.3]}
+      Mast: {xyz: [0.5, 0.1, 1.0]}
+  Camera:
+    frames:
+      Origin:
+constraints:
+  Mounted: {from: Cart:Mast, to: Camera:Origin, xyz: [0, 0, 0.1]}
+"""
+
+VEHICLE = """\
+vehicle: cart
+geometry: geometry.yaml
+base_frame: Cart:Base
+state_directory: state
+sensors:
+  gps: {channel: GPS, frame: Cart:Antenna}
+  imu: {channel: IMU, frame: Cart:Imu}
+"""
+
+
+def write_vehicle(folder: Path, vehicle: str = VEHICLE, geometry: str = GEOMETRY) -> Path:
+    """Write both files; return the path of the vehicle file."""
+    (folder / "geometry.yaml").write_text(geometry)
+    path = folder / "vehicle.yaml"
+    path.write_text(vehicle)
+    return path
+
+
+# --- a straight drive ---------------------------------------------------------------------------------------
+
+
+def gps(utime: int, east: float = 0.0, speed: float = 2.0, source: str = "gps") -> GpsSample:
+    """A fix with the receiver's own velocity, `east` metres from the origin, driving east."""
+    latitude, longitude, height = GEODESY.geodetic_from_enu((east, 0.0, 0.0))
+    variance = 0.25
+    return GpsSample(
+        SensorHeader(utime, source),
+        FixType.FIX_3D,
+        latitude,
+        longitude,
+        height,
+        position_covariance=(variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, 4 * variance),
+        velocity=(speed, 0.0, 0.0),
+        velocity_covariance=(0.01, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.01),
+    )
+
+
+def imu(utime: int, source: str = "imu") -> ImuSample:
+    """What the inertial unit says on a level straight drive."""
+    return ImuSample(SensorHeader(utime, source), (0.0, 0.0, 0.0), (0.0, 0.0, 9.80665))
+
+
+def drive(seconds: float, start_utime: int = START, imu_hz: float = 50.0, gps_hz: float = 10.0) -> Iterator[Fix]:
+    """Samples of a drive due east at 2 m/s, by their stamps."""
+    every = round(imu_hz / gps_hz)
+    for n in range(round(seconds * imu_hz)):
+        t = n / imu_hz
+        utime = start_utime + round(t * 1e6)
+        yield imu(utime)
+        if n % every == 0:
+            yield gps(utime, 2.0 * t)
+
+
+# --- a localizer by script ----------------------------------------------------------------------------------
+
+
+_COVARIANCE = tuple(np.diag([0.04, 0.09, 0.16, 1e-4, 4e-4, 9e-4]).ravel().tolist())
+
+
+@dataclass(frozen=True)
+class Scripted:
+    """A localizer that does what a sample's source says.
+
+    `refuse:REASON` is refused; `latch` sets the origin; `ignore` changes nothing; `break` raises; anything else is
+    taken. It moves at 1 m/s and has a pose in the world from its first sample. `stale_s` after the newest sample its
+    estimates are invalid.
+    """
+
+    newest: int = 0
+    taken: int = 0
+    known: Origin | None = ORIGIN
+    epoch: int = 0
+    stale_s: float = 1.0
+    invalid: Invalid = VALID
+    covariance: tuple[float, ...] = _COVARIANCE
+
+    @property
+    def utime(self) -> int:
+        return self.newest
+
+    def take(self, sample: Sample) -> tuple[Scripted, tuple[Note, ...]]:
+        order, _, word = sample.header.source.partition(":")
+        if order == "break":
+            raise RuntimeError("an error of the localizer's own:\nFORGED line \x1b[31m")
+        if order == "ignore":
+            return self, ()
+        if order == "refuse":
+            return replace(self, taken=self.taken), (Rejected(f"sensor:{sample.header.source}", word),)
+        taken = replace(self, newest=sample.header.utime, taken=self.taken + 1)
+        if order == "latch":
+            return replace(taken, known=ORIGIN), (OriginLatched(ORIGIN),)
+        return taken, ()
+
+    def estimate(self, utime: int) -> Estimate:
+        if not self.newest:
+            return Estimate(utime, Pose.identity(), invalid=Invalid.NO_FIX | Invalid.NO_IMU)
+        x = (utime - START) * 1e-6
+        invalid = self.invalid
+        if utime > self.newest + self.stale_s * 1e6:
+            invalid |= Invalid.STALE_IMU | Invalid.STALE_GPS
+        if self.known is None:
+            return Estimate(utime, Pose((x, 0, 0)), invalid=invalid | Invalid.NO_ORIGIN, pose_epoch=self.epoch)
+        yaw = 0.01 * x
+        return Estimate(
+            utime,
+            Pose.from_rpy((x, 0.0, 0.0), 0.0, 0.0, yaw),
+            Pose.from_rpy((x + 100.0, 50.0, 5.0), 0.0, 0.0, yaw + 0.5),
+            Pose.from_rpy((x + 101.0, 51.0, 5.0), 0.0, 0.0, yaw + 0.52),
+            self.covariance,
+            tuple(np.diag([0.01, 0.01, 0.01, 1e-4, 1e-4, 1e-4]).ravel().tolist()),
+            invalid,
+            Quality.PREDICTED if utime > self.newest else Quality(0),
+            self.epoch,
+            self.known,
+            1.5,
+            0.1,
+            math.nan,
+        )
+
+
+def now_at(utime: int) -> Instant:
+    """The instant at which the host's clock says `utime`."""
+    return Instant((utime - START) * 1000 + 10_000_000_000, utime)
+
+
+def started(localizer: Scripted | None = Scripted(), **settings: object) -> CoreState:
+    """The core of the cart in its first state, at START."""
+    return start(CoreSettings("Cart:Base", "cart", **settings), cart(), localizer, now_at(START))  # type: ignore[arg-type]

@@ -1,0 +1,155 @@
+"""The vehicle file against its geometry: every disagreement is told at once, before anything is started."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from support_samples import GEOMETRY, ORIGIN, VEHICLE, now_at, write_vehicle
+from support_samples import START as START_UTIME
+
+from modelserver.config import load_config
+from modelserver.errors import ConfigError, GeometryError, Problem
+from modelserver.localization.raw import RawLocalizer
+from modelserver.service.daemon import Vehicle, configured_origin, load_vehicle
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def vehicle(folder: Path, text: str = VEHICLE, geometry: str = GEOMETRY) -> Vehicle:
+    return load_vehicle(load_config(write_vehicle(folder, text, geometry)))
+
+
+def problems(folder: Path, text: str, geometry: str = GEOMETRY) -> tuple[Problem, ...]:
+    with pytest.raises(ConfigError) as caught:
+        vehicle(folder, text, geometry)
+    return caught.value.problems
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("config/*/vehicle.yaml")), ids=lambda path: path.parent.name)
+def test_given_the_vehicles_of_this_project_then_they_load_whole(path: Path) -> None:
+    loaded = load_vehicle(load_config(path))
+    assert loaded.mounts is not None
+    assert loaded.sensor_channels() == {"GPS": "gps_t", "IMU": "imu_t", "WHEELS": "wheels_t"}
+    assert (loaded.tick_hz(), loaded.ticks_per_pose()) == (50.0, 1)
+
+
+def test_given_a_vehicle_then_its_core_starts_with_the_settings_of_its_file(tmp_path: Path) -> None:
+    text = VEHICLE + "publish: {mode: event, health_hz: 4}\nlimits: {history_s: 7, wait_ms: 5, parked_requests: 6}\n"
+    state = vehicle(tmp_path, text + "lcm: {reply_prefix: ANSWER_, channel_prefix: V1_}\n").core(now_at(START_UTIME))
+    settings = state.settings
+    assert (settings.base_frame, settings.vehicle, settings.publish) == ("Cart:Base", "cart", "event")
+    assert (settings.health_period_ns, settings.history_s, settings.wait_ms) == (250_000_000, 7.0, 5)
+    assert (settings.parked_requests, settings.reply_prefix) == (6, "ANSWER_")
+    assert isinstance(state.view.localizer, RawLocalizer)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key", "near"),
+    [
+        ("frame: Cart:Antenna", "frame: Cart:Antena", "sensors.gps.frame", "Cart:Antenna"),
+        ("frame: Cart:Imu", "frame: Crat:Imu", "sensors.imu.frame", "Cart:Imu"),
+        ("base_frame: Cart:Base", "base_frame: Cart:Bsae", "base_frame", "Cart:Base"),
+    ],
+)
+def test_given_a_frame_that_is_not_there_then_key_and_nearest_are_told(
+    tmp_path: Path, old: str, new: str, key: str, near: str
+) -> None:
+    found = problems(tmp_path, VEHICLE.replace(old, new))
+    assert found[0].element == key
+    assert near in found[0].nearest
+    assert found[0].fix == f"write {near}"
+
+
+def test_given_wheels_whose_frames_are_not_there_then_each_is_told(tmp_path: Path) -> None:
+    text = VEHICLE + "  wheels: {channel: W, frames: {left: Cart:Mast, right: Cart:Msat, rear: Cart}}\n"
+    found = problems(tmp_path, text)
+    assert [each.element for each in found] == ["sensors.wheels.frames.right", "sensors.wheels.frames.rear"]
+
+
+def test_given_a_base_frame_that_nothing_joins_to_the_sensors_then_it_is_refused(tmp_path: Path) -> None:
+    geometry = GEOMETRY.replace("constraints:", "  Lamp:\n    frames:\n      Origin:\nconstraints:")
+    found = problems(tmp_path, VEHICLE.replace("base_frame: Cart:Base", "base_frame: Lamp:Origin"), geometry)
+    assert [each.element for each in found] == ["sensors.gps.frame", "sensors.imu.frame"]
+    assert all("no constraints lead" in each.message for each in found)
+
+
+def test_given_a_world_frame_for_base_then_it_is_refused(tmp_path: Path) -> None:
+    assert problems(tmp_path, VEHICLE.replace("base_frame: Cart:Base", "base_frame: World:UTM"))
+
+
+def test_given_a_geometry_that_is_wrong_then_its_problems_are_told(tmp_path: Path) -> None:
+    with pytest.raises(GeometryError, match="Camrea"):
+        vehicle(tmp_path, geometry=GEOMETRY.replace("to: Camera:Origin", "to: Camrea:Origin"))
+    with pytest.raises(FileNotFoundError):
+        vehicle(tmp_path, VEHICLE.replace("geometry.yaml", "geometri.yaml"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "lcm: {reply_prefix: POS}\n",
+        "lcm: {reply_prefix: G}\n",
+        "lcm: {reply_prefix: MODELSERVER_HEALTH}\n",
+        "lcm: {reply_prefix: V1_, channel_prefix: V1_}\n",
+        "lcm: {reply_prefix: V1_PO, channel_prefix: V1_}\n",
+    ],
+)
+def test_given_a_reply_prefix_that_other_channels_begin_with_then_it_is_refused(tmp_path: Path, text: str) -> None:
+    (found,) = problems(tmp_path, VEHICLE + text)
+    assert found.element == "lcm.reply_prefix"
+    assert "could make the server speak on" in found.message
+
+
+@pytest.mark.parametrize("channel", ["POSE", "MODELSERVER_HEALTH", "PLATFORM_GET_BODY_LIST", "VEHICLE_COMMAND"])
+@pytest.mark.parametrize("prefix", ["", "lcm: {channel_prefix: V1_}\n"])
+def test_given_a_sensor_on_a_channel_of_the_service_then_it_is_refused(
+    tmp_path: Path, channel: str, prefix: str
+) -> None:
+    (found,) = problems(tmp_path, VEHICLE.replace("channel: GPS", f"channel: {channel}") + prefix)
+    assert found.element == "sensors.gps.channel"
+    assert channel in found.message
+
+
+def test_given_a_configured_origin_then_it_goes_before_a_kept_one(tmp_path: Path) -> None:
+    text = VEHICLE + "origin: {initial_utm: [445000, 5030000, 71], zone: 18, hemisphere: north}\n"
+    loaded = vehicle(tmp_path, text)
+    configured = configured_origin(loaded.config)
+    assert configured is not None
+    assert configured.initial_utm == (445000.0, 5030000.0, 71.0)
+    localizer = loaded.core(now_at(START_UTIME), ORIGIN).view.localizer
+    assert localizer is not None
+    assert localizer.estimate(START_UTIME).origin == configured
+    kept = vehicle(tmp_path).core(now_at(START_UTIME), ORIGIN).view.localizer
+    assert kept is not None
+    assert kept.estimate(START_UTIME).origin == ORIGIN
+
+
+@pytest.mark.parametrize("numbers", ["9e6, 5030000, 71", "445000, -1, 71", "445000, 2e7, 71"])
+def test_given_a_configured_origin_that_is_no_place_then_it_is_refused(tmp_path: Path, numbers: str) -> None:
+    numbers = numbers.replace("9e6", "9000000.0").replace("2e7", "20000000.0")
+    (found,) = problems(tmp_path, VEHICLE + f"origin: {{initial_utm: [{numbers}], zone: 18, hemisphere: north}}\n")
+    assert found.element == "origin.initial_utm"
+
+
+@pytest.mark.parametrize(
+    ("rate", "ticks", "tick_hz"), [(50, 1, 50), (200, 1, 200), (30, 2, 60), (10, 5, 50), (1, 50, 50), (0.1, 500, 50)]
+)
+def test_given_a_pose_rate_then_ticks_are_never_rarer_than_housekeeping_needs(
+    tmp_path: Path, rate: float, ticks: int, tick_hz: float
+) -> None:
+    loaded = vehicle(tmp_path, VEHICLE + f"publish: {{rate_hz: {rate}}}\n")
+    assert (loaded.ticks_per_pose(), loaded.tick_hz()) == (ticks, pytest.approx(tick_hz))
+
+
+def test_given_event_mode_then_ticks_are_for_housekeeping_alone(tmp_path: Path) -> None:
+    loaded = vehicle(tmp_path, VEHICLE + "publish: {mode: event, rate_hz: 5}\n")
+    assert (loaded.ticks_per_pose(), loaded.tick_hz()) == (1, 50.0)
+
+
+@pytest.mark.parametrize("left_out", ["gps", "imu"])
+def test_given_one_of_the_two_sensors_then_there_is_no_localizer(tmp_path: Path, left_out: str) -> None:
+    lines = [line for line in VEHICLE.splitlines(keepends=True) if not line.startswith(f"  {left_out}:")]
+    loaded = vehicle(tmp_path, "".join(lines))
+    assert loaded.mounts is None
+    assert loaded.core(now_at(START_UTIME)).view.localizer is None

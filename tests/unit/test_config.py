@@ -1,0 +1,299 @@
+"""The vehicle file: every problem at once, each with its line, its key and what to do; no bytes hang or crash it."""
+
+from __future__ import annotations
+
+import random
+import re
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from support_samples import VEHICLE, write_vehicle
+
+from modelserver.config import MAX_FILE_BYTES, VehicleConfig, load_config, parse_config
+from modelserver.errors import ConfigError, Problem, Severity
+
+ROOT = Path(__file__).resolve().parents[2]
+BASE = "vehicle: v\ngeometry: g.yaml\nbase_frame: A:B\n"
+
+
+def problems(text: str | bytes, base: str = BASE) -> tuple[Problem, ...]:
+    raw = base.encode() + (text.encode() if isinstance(text, str) else text)
+    with pytest.raises(ConfigError) as caught:
+        parse_config(raw, "vehicle.yaml")
+    found = caught.value.problems
+    assert found
+    assert all(each.severity is Severity.ERROR and each.file == "vehicle.yaml" and each.message for each in found)
+    assert all(len(str(each)) < 600 for each in found)
+    return found
+
+
+def problem(text: str | bytes, base: str = BASE) -> Problem:
+    (found,) = problems(text, base)
+    return found
+
+
+# --- what is good -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("config/*/vehicle.yaml")), ids=lambda path: path.parent.name)
+def test_given_the_vehicle_files_of_this_project_then_they_load(path: Path) -> None:
+    config = load_config(path)
+    assert config.vehicle
+    assert Path(config.geometry).is_file()
+
+
+def test_given_the_three_keys_then_the_rest_has_defaults() -> None:
+    config = parse_config(BASE.encode())
+    assert config == VehicleConfig("v", "g.yaml", "A:B")
+    assert (config.publish.mode, config.publish.rate_hz, config.limits.queued_requests) == ("timer", 50.0, 256)
+
+
+def test_given_every_key_then_each_is_taken() -> None:
+    config = parse_config(
+        (
+            BASE
+            + """\
+variables: {MRN: K11}
+lcm: {url: "memq://", channel_prefix: V1_, reply_prefix: ANSWER_}
+publish: {mode: event, rate_hz: 10, health_hz: 2.5}
+sensors:
+  gps: {channel: gps/front, frame: A:G}
+  imu: {channel: IMU.1, frame: A:I}
+  wheels: {channel: W, frames: {left: A:L}}
+origin: {initial_utm: [445000, 5030000.5, 71], zone: 18, hemisphere: south, keep: false}
+localization: {gps_timeout: 3}
+limits: {history_s: 10, parked_requests: 0, wait_ms: 0, queued_requests: 1, requests_per_pass: 1}
+"""
+        ).encode()
+    )
+    assert config.variables == {"MRN": "K11"}
+    assert config.origin.initial_utm == (445000.0, 5030000.5, 71.0)
+    assert config.sensors.wheels is not None
+    assert config.sensors.wheels.frames == {"left": "A:L"}
+    assert config.localization.gps_timeout == 3.0
+    assert config.limits.parked_requests == 0
+
+
+def test_given_relative_paths_then_they_are_relative_to_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_vehicle(tmp_path)
+    monkeypatch.chdir("/")
+    config = load_config(path)
+    assert config.geometry == str((tmp_path / "geometry.yaml").resolve())
+    assert config.state_directory == str((tmp_path / "state").resolve())
+
+
+def test_given_a_section_with_nothing_in_it_then_it_counts_as_left_out() -> None:
+    assert parse_config((BASE + "publish:\n  # rate_hz: 10\nsensors:\n  gps:\n").encode()) == parse_config(
+        BASE.encode()
+    )
+
+
+@pytest.mark.parametrize(("text", "value"), [("1e1", 10.0), ("+.5E+2", 50.0), ("5.e-1", 0.5), ("20", 20.0)])
+def test_given_a_number_with_an_exponent_then_it_is_a_number(text: str, value: float) -> None:
+    assert parse_config(f"{BASE}publish: {{rate_hz: {text}}}\n".encode()).publish.rate_hz == value
+
+
+def test_given_a_byte_order_mark_or_crlf_then_it_is_read() -> None:
+    assert parse_config(b"\xef\xbb\xbf" + BASE.replace("\n", "\r\n").encode()).vehicle == "v"
+
+
+# --- what is missing or unknown -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("missing", ["vehicle", "geometry", "base_frame"])
+def test_given_a_missing_key_then_it_is_named(missing: str) -> None:
+    base = "".join(line for line in BASE.splitlines(keepends=True) if not line.startswith(missing))
+    found = problem("", base)
+    assert (found.element, found.line) == (missing, 1)
+    assert missing in found.message
+    assert found.fix == f"add a line: {missing}: ..."
+
+
+@pytest.mark.parametrize(
+    ("text", "element", "line", "near"),
+    [
+        ("geometri: x\n", "geometri", 4, "geometry"),
+        ("lcm:\n  ulr: x\n", "lcm.ulr", 5, "url"),
+        ("publish:\n  mode: timer\n  rate: 5\n", "publish.rate", 6, "rate_hz"),
+        ("sensors:\n  gsp: {channel: GPS, frame: A:B}\n", "sensors.gsp", 5, "gps"),
+        ("sensors:\n  gps:\n    channel: G\n    frame: A:B\n    fram: A:B\n", "sensors.gps.fram", 8, "frame"),
+        ("sensors:\n  wheels:\n    chanel: W\n", "sensors.wheels.chanel", 6, "channel"),
+        ("origin:\n  kept: true\n", "origin.kept", 5, "keep"),
+        ("localization:\n  gps_timeot: 3\n", "localization.gps_timeot", 5, "gps_timeout"),
+        ("limits:\n  wait: 3\n", "limits.wait", 5, "wait_ms"),
+    ],
+)
+def test_given_an_unknown_key_at_any_level_then_line_key_and_nearest_are_told(
+    text: str, element: str, line: int, near: str
+) -> None:
+    found = problem(text)
+    assert (found.element, found.line) == (element, line)
+    assert found.nearest[0] == near
+    assert found.fix == f"write {near}"
+    assert "unknown key" in found.message
+
+
+def test_given_an_unknown_key_like_no_other_then_the_known_ones_are_told() -> None:
+    assert problem("publish: {zzzzzz: 1}\n").fix == "known here: mode, rate_hz, health_hz"
+
+
+def test_given_many_problems_then_all_are_told_at_once() -> None:
+    found = problems("vehicl: x\npublish: {mode: often, rate_hz: 0}\nlimits: {wait_ms: x}\nsensors: {gps: {}}\n")
+    assert [each.element for each in found] == [
+        "publish.mode",
+        "sensors.gps.channel",
+        "sensors.gps.frame",
+        "limits.wait_ms",
+        "vehicl",
+    ]
+    assert len({each.line for each in found}) == 4
+
+
+@pytest.mark.parametrize(
+    ("text", "element", "line", "first"),
+    [
+        ("vehicle: w\n", "vehicle", 4, 1),
+        ("publish:\n  rate_hz: 5\n  rate_hz: 6\n", "publish.rate_hz", 6, 5),
+        ("sensors:\n  gps: {channel: A, channel: B, frame: A:B}\n", "sensors.gps.channel", 5, 5),
+    ],
+)
+def test_given_a_key_twice_then_both_lines_are_told(text: str, element: str, line: int, first: int) -> None:
+    found = problem(text)
+    assert (found.element, found.line) == (element, line)
+    assert f"given twice (first on line {first})" in found.message
+
+
+# --- what is wrong with a value -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "element", "message"),
+    [
+        ("publish:\n  rate_hz: .nan", "publish.rate_hz", "finite"),
+        ("publish:\n  rate_hz: -.inf", "publish.rate_hz", "finite"),
+        ("publish:\n  rate_hz: 1e999", "publish.rate_hz", "number|finite"),
+        ("publish:\n  rate_hz: '50'", "publish.rate_hz", "number"),
+        ("publish:\n  rate_hz: true", "publish.rate_hz", "number"),
+        ("publish:\n  rate_hz: [50]", "publish.rate_hz", "number"),
+        ("publish:\n  rate_hz: 0.05", "publish.rate_hz", "between 0.1 and 1000, got 0.05"),
+        ("publish:\n  rate_hz: 100000", "publish.rate_hz", "between 0.1 and 1000, got 100000"),
+        ("publish:\n  health_hz: 0", "publish.health_hz", "between 0.01 and 100, got 0"),
+        ("publish:\n  mode: Timer", "publish.mode", "'timer' or 'event', got 'Timer'"),
+        ("limits:\n  wait_ms: 3.5", "limits.wait_ms", "integer"),
+        ("limits:\n  wait_ms: -1", "limits.wait_ms", "between 0 and 60000, got -1"),
+        ("limits:\n  queued_requests: 0", "limits.queued_requests", "between 1 and 65536"),
+        ("limits:\n  history_s: 0", "limits.history_s", "above 0"),
+        (f"limits:\n  wait_ms: {'9' * 5000}", "limits.wait_ms", "integer"),
+        (f"limits:\n  wait_ms: {'9' * 4000}", "limits.wait_ms", "integer|between"),
+        (f"limits:\n  history_s: {'9' * 400}", "limits.history_s", "number|finite"),
+        ("origin:\n  keep: 'yes'", "origin.keep", "boolean"),
+        ("origin:\n  zone: 61", "origin", "given together"),
+        ("origin:\n  initial_utm: [1, 2]", "origin.initial_utm", "too few numbers"),
+        ("origin:\n  initial_utm: [1, 2, north]", "origin.initial_utm.2", "number"),
+        ("variables:\n  MRN: 11", "variables.MRN", "string"),
+        ("variables: MRN", "variables", "mapping|object"),
+        ("publish: 50", "publish", "expected a mapping"),
+        ("publish: [50]", "publish", "expected a mapping"),
+        ("lcm:\n  reply_prefix: ''", "lcm.reply_prefix", "must not be empty"),
+        ("lcm:\n  reply_prefix: 'A B'", "lcm.reply_prefix", "letters, digits and underscores"),
+        ("lcm:\n  channel_prefix: Ä", "lcm.channel_prefix", "letters, digits and underscores"),
+        (f"lcm:\n  channel_prefix: {'A' * 25}", "lcm.channel_prefix", "at most 24"),
+        ("lcm:\n  channel_prefix: 'A.*'", "lcm.channel_prefix", "letters, digits and underscores"),
+        ("localization:\n  gps_timeout: -1", "localization.gps_timeout", "above 0"),
+        ("localization:\n  risk: 0.9", "localization.risk", "at most 0.5"),
+    ],
+)  # fmt: skip
+def test_given_a_value_that_cannot_be_then_line_key_and_why_are_told(text: str, element: str, message: str) -> None:
+    found = problems(text + "\n")[0]
+    assert found.element == element
+    assert found.line == (5 if "\n" in text and element != "origin" else 4)
+    assert re.search(message, found.message)
+    assert len(found.message) < 300
+
+
+def test_given_a_zone_that_is_none_then_it_is_refused() -> None:
+    found = problem("origin: {initial_utm: [445000, 5030000, 0], zone: 61, hemisphere: north}\n")
+    assert "1 to 60, got 61" in found.message
+
+
+@pytest.mark.parametrize("channel", ["''", "'A B'", "Ä", "A" * 40, '"A\\nB"', '"\\x00"'])
+@pytest.mark.parametrize("sensor", ["gps", "imu", "wheels"])
+def test_given_a_channel_that_lcm_cannot_carry_then_it_is_refused(sensor: str, channel: str) -> None:
+    frame = "" if sensor == "wheels" else ", frame: A:B"
+    found = problem(f"sensors:\n  {sensor}: {{channel: {channel}{frame}}}\n")
+    assert (found.element, found.line) == (f"sensors.{sensor}.channel", 5)
+    assert "printable ASCII" in found.message
+
+
+def test_given_two_sensors_on_one_channel_then_it_is_refused() -> None:
+    found = problem("sensors:\n  gps: {channel: X, frame: A:B}\n  imu: {channel: X, frame: A:C}\n")
+    assert "'X' is given twice" in found.message
+
+
+# --- what is no vehicle file at all -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"", "empty"),
+        (b"\n\n# nothing\n", "empty"),
+        (b"- a\n- b\n", "no mapping"),
+        (b"just words\n", "no mapping"),
+        (b"a: 1\n---\nb: 2\n", "another document"),
+        (b"\ta: 1\n", "not YAML"),
+        (b"a: [1\nb: 2\n", "not YAML"),
+        (b"a: \x00\n", "not YAML"),
+        (b"a: \xff\xfe\n", "not YAML"),
+        (b"\x7fELF\x02\x01\x01" + bytes(200), "not YAML"),
+        (b"<?xml version='1.0'?><a/>", "no mapping|not YAML"),
+        (b"? [a, b]\n: c\n", "a key is a name"),
+        (b"? {a: b}\n: c\n", "a key is a name"),
+        (b"a: &x 1\nb: *x\n", "aliases"),
+        (b"a: *nowhere\n", "alias"),
+        (b"a: &x [*x]\n", "aliases"),
+        (b"a: " + b"[" * 100_000, "nested too deeply"),
+        (b"a: " + b"{a: " * 100_000, "nested too deeply"),
+        (b"\n".join(b" " * n + b"a:" for n in range(300)), "nested too deeply"),
+        (b"a: " + b"x" * MAX_FILE_BYTES, "larger than 1 MiB"),
+    ],
+)
+def test_given_bytes_that_are_no_vehicle_file_then_one_clear_problem(text: bytes, message: str) -> None:
+    assert re.search(message, problem(text, "").message)
+
+
+def test_given_aliases_of_aliases_then_they_are_refused_before_they_are_written_out() -> None:
+    levels = "".join(f"k{n}: &k{n} [{', '.join([f'*k{n - 1}'] * 10)}]\n" for n in range(1, 15))
+    assert "aliases" in problem(f"k0: &k0 [x]\n{levels}").message
+
+
+def test_given_a_python_tag_then_nothing_is_built_from_it(tmp_path: Path) -> None:
+    trace = tmp_path / "trace"
+    found = problems(f'vehicle: !!python/object/apply:os.system ["touch {trace}"]\n', "")
+    assert found
+    assert not trace.exists()
+
+
+def test_given_damage_anywhere_then_nothing_but_config_error_is_raised() -> None:
+    rng = random.Random(3)
+    whole = (ROOT / "config" / "raptor" / "vehicle.yaml").read_bytes()
+    for _ in range(300):
+        damaged = bytearray(whole)
+        for _ in range(rng.choice((1, 3, 30))):
+            damaged[rng.randrange(len(damaged))] = rng.choice((0, 9, 10, 32, 34, 38, 42, 45, 58, 91, 123, 255, 65))
+        with suppress(ConfigError):
+            parse_config(bytes(damaged[: rng.randrange(len(damaged)) or None]), "x")
+
+
+def test_given_a_file_that_is_not_there_then_it_is_an_os_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        load_config(tmp_path / "none.yaml")
+    with pytest.raises(IsADirectoryError):
+        load_config(tmp_path)
+
+
+def test_given_the_cart_of_these_tests_then_it_loads(tmp_path: Path) -> None:
+    assert load_config(write_vehicle(tmp_path, VEHICLE)).base_frame == "Cart:Base"

@@ -1,0 +1,588 @@
+"""The core: each event gives the right outputs, whatever the localizer; nothing that comes in can break it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from support_samples import ME, ORIGIN, START, Scripted, cart, drive, gps, imu, now_at, started
+
+from modelserver import core
+from modelserver.core import MAX_COUNTERS, CoreSettings, CoreState, Instant, step
+from modelserver.errors import Status, UnknownBodyError, UnknownFrameError
+from modelserver.geometry import names
+from modelserver.localization.mounts import Mounts
+from modelserver.localization.raw import RawLocalizer
+from modelserver.messages import (
+    CHANNEL_OF,
+    Event,
+    GetBodyFrameList,
+    GetBodyList,
+    GetHistory,
+    GetHTransform,
+    GetStateVector,
+    GetTransformation,
+    Health,
+    HistoryReply,
+    Invalid,
+    JointsSample,
+    NameListReply,
+    OriginLatched,
+    Output,
+    Policy,
+    PublishHealth,
+    PublishPose,
+    Rejected,
+    Reply,
+    RequestHeader,
+    SendReply,
+    SensorHeader,
+    StateVectorReply,
+    Tick,
+    TimeQuery,
+    TransformReply,
+    WheelsSample,
+)
+from modelserver.wire.codec import encode
+
+S = 1_000_000
+REQUESTS = [
+    GetTransformation(ME, "Camera:Origin", "Cart:Base"),
+    GetTransformation(ME, "Camera:Origin", "World:UTM"),
+    GetBodyList(ME),
+    GetBodyFrameList(ME, "Cart"),
+    GetStateVector(ME),
+    GetHTransform(ME),
+    GetHTransform(ME, inverse=True),
+    GetHistory(ME, START, START + S, 10.0),
+]
+KINDS = [TransformReply, TransformReply, NameListReply, NameListReply, StateVectorReply, TransformReply, TransformReply,
+         HistoryReply]  # fmt: skip
+
+
+class Run:
+    """A core under way: `feed` events at times, look at what came out."""
+
+    def __init__(self, localizer: Any = Scripted(), **settings: object):  # noqa: B008
+        self.state: CoreState = started(localizer, **settings)
+        self.at = START
+
+    def feed(self, event: Event, at: float = 0.0) -> tuple[Output, ...]:
+        """Handle an event `at` seconds after START."""
+        self.at = START + round(at * S)
+        self.state, outputs = step(self.state, event, now_at(self.at))
+        return outputs
+
+    def samples(self, *times: float) -> None:
+        for each in times:
+            self.feed(imu(START + round(each * S)), each)
+
+    def ask(self, request: Any, at: float = 0.0) -> Reply:
+        (output,) = self.feed(request, at)
+        assert isinstance(output, SendReply)
+        assert output.channel == request.header.reply_channel
+        assert output.reply.header.request_id == request.header.request_id
+        return output.reply
+
+    def health(self, at: float = 0.0, tick: Tick = Tick()) -> Health:  # noqa: B008
+        """The report of a tick at which one is due."""
+        self.state = self.state._replace(health_due_ns=0)
+        return next(each.health for each in self.feed(tick, at) if isinstance(each, PublishHealth))
+
+    @property
+    def rejected(self) -> dict[tuple[str, str], int]:
+        return dict(self.state.rejected)
+
+
+def of_kind(outputs: tuple[Output, ...], kind: type) -> list[Any]:
+    return [each for each in outputs if isinstance(each, kind)]
+
+
+def addressed(request: Any, channel: str) -> Any:
+    """The same request with another reply channel."""
+    values = {name: getattr(request, name) for name in type(request).__match_args__}
+    return type(request)(**values | {"header": RequestHeader(1, channel)})
+
+
+def ahead(at: float, wait_ms: int = 500, policy: Policy = Policy.INTERPOLATED) -> GetTransformation:
+    return GetTransformation(ME, "Cart:Base", "World:UTM", TimeQuery(START + round(at * S), policy, wait_ms))
+
+
+# --- the start ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("frame", "error"), [("Cart:Bsae", UnknownFrameError), ("Crat:Base", UnknownBodyError)])
+def test_given_a_base_frame_that_is_not_there_then_the_core_does_not_start(frame: str, error: type[Exception]) -> None:
+    with pytest.raises(error, match=r"frame|body"):
+        core.start(CoreSettings(frame), cart(), None, now_at(START))
+
+
+# --- requests -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("request_", "kind"), list(zip(REQUESTS, KINDS, strict=True)))
+def test_given_each_request_then_it_is_answered_in_its_kind(request_: Any, kind: type) -> None:
+    run = Run()
+    run.samples(0, 0.5, 1)
+    reply = run.ask(request_, 1.25)
+    assert type(reply) is kind
+    assert reply.header.status is Status.OK
+    assert reply.header.utime == START + round(1.25 * S)
+    assert reply.header.model_revision == cart().revision
+    assert run.state.requests_answered == 1
+
+
+@pytest.mark.parametrize(("request_", "kind"), list(zip(REQUESTS, KINDS, strict=True)))
+def test_given_each_request_when_refused_or_failed_then_the_reply_is_of_its_kind(request_: Any, kind: type) -> None:
+    state = started()
+    for outputs, status in (
+        (core.refuse(state, request_, now_at(START)), Status.REFUSED_LOAD),
+        (core.fail(state, request_, now_at(START)), Status.INTERNAL),
+        (core.turn_back(state, type(request_), ME, "why", now_at(START)), Status.MALFORMED),
+    ):
+        (output,) = outputs
+        assert isinstance(output, SendReply)
+        assert (type(output.reply), output.channel) == (kind, "REPLY_TEST")
+        assert (output.reply.header.status, output.reply.header.request_id) == (status, 77)
+
+
+def test_given_the_lists_then_they_hold_the_names_in_the_order_of_the_model() -> None:
+    run = Run()
+    bodies, frames = run.ask(GetBodyList(ME)), run.ask(GetBodyFrameList(ME, "Cart"))
+    assert isinstance(bodies, NameListReply)
+    assert isinstance(frames, NameListReply)
+    assert bodies.names == ("Cart", "Camera", "Lamp")
+    assert frames.names == ("Base", "Antenna", "Imu", "Mast")
+    assert len(frames.descriptions) == 4
+
+
+def test_given_the_inverse_h_transform_then_it_is_the_world_in_the_vehicle() -> None:
+    run = Run()
+    run.samples(0, 1)
+    there, back = run.ask(GetHTransform(ME)), run.ask(GetHTransform(ME, inverse=True))
+    assert isinstance(there, TransformReply)
+    assert isinstance(back, TransformReply)
+    assert there.answer is not None
+    assert back.answer is not None
+    assert there.answer.transformation.frame_of_interest == "Cart:Base"
+    assert back.answer.transformation.frame_of_reference == "Cart:Base"
+    assert (there.answer.transformation @ back.answer.transformation).pose.is_close(
+        run.state.view.transformation("World:UTM", "World:UTM", TimeQuery()).transformation.pose, 1e-9, 1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("request_", "status", "near"),
+    [
+        (GetTransformation(ME, "Camrea:Origin", "Cart:Base"), Status.UNKNOWN_BODY, "Camera:Origin"),
+        (GetTransformation(ME, "Camera:Orign", "Cart:Base"), Status.UNKNOWN_FRAME, "Camera:Origin"),
+        (GetTransformation(ME, "World:UTN", "Cart:Base"), Status.UNKNOWN_FRAME, "World:UTM"),
+        (GetTransformation(ME, "Lamp:Origin", "Cart:Base"), Status.NOT_CONNECTED, ""),
+        (GetTransformation(ME, "x" * 60_000, "Cart:Base"), Status.UNKNOWN_FRAME, ""),
+        (GetBodyFrameList(ME, "Crat"), Status.UNKNOWN_BODY, "Cart"),
+        (GetTransformation(ME, "Cart:Base", "World:UTM", TimeQuery(START - 1)), Status.TOO_OLD, ""),
+        (GetTransformation(ME, "Cart:Base", "World:UTM", TimeQuery(START + 2 * S)), Status.TOO_NEW, ""),
+        (GetStateVector(ME, TimeQuery(START + 9 * S, Policy.PREDICTED)), Status.TOO_NEW, ""),
+        (GetHistory(ME, START, START + S, math.nan), Status.MALFORMED, ""),
+        (GetHistory(ME, START, START + 3600 * S, 100.0), Status.LIMIT, ""),
+    ],
+)
+def test_given_a_question_without_answer_then_the_reply_says_why(request_: Any, status: Status, near: str) -> None:
+    run = Run()
+    run.samples(0, 1)
+    header = run.ask(request_).header
+    assert header.status is status
+    assert header.message
+    assert len(header.message) < 400
+    assert near in ("", *header.nearest)
+    assert len(encode(run.ask(request_))) < 4096
+    assert run.state.requests_answered == 2
+
+
+@pytest.mark.parametrize("request_", [REQUESTS[1], REQUESTS[4], REQUESTS[5], REQUESTS[7]])
+@pytest.mark.parametrize("localizer", [None, Scripted()])
+def test_given_no_sample_yet_then_there_is_no_pose(request_: Any, localizer: Scripted | None) -> None:
+    assert Run(localizer).ask(request_).header.status is Status.NO_POSE
+
+
+@pytest.mark.parametrize(
+    "channel",
+    ["POSE", "GPS", "REPLY_", "REPLY", "", "reply_x", "XREPLY_A", "REPLY_" + "A" * 58, "REPLY_" + "A" * 200,
+     "REPLY_A B", "REPLY_A\n", "REPLY_Ä", "REPLY_.*", "REPLY_A\x00", "REPLY_A/B", "MODELSERVER_HEALTH"],
+)  # fmt: skip
+def test_given_a_reply_channel_outside_the_rules_then_it_is_counted_and_nothing_is_said(channel: str) -> None:
+    for request in REQUESTS:
+        run = Run()
+        odd = addressed(request, channel)
+        assert run.feed(odd) == ()
+        assert run.rejected == {(CHANNEL_OF[type(request)], "reply_channel"): 1}
+        assert core.refuse(run.state, odd, now_at(START)) == ()
+        assert core.fail(run.state, odd, now_at(START)) == ()
+        assert core.turn_back(run.state, type(odd), odd.header, "", now_at(START)) == ()
+
+
+@pytest.mark.parametrize("channel", ["REPLY_A", "REPLY_a_9", "REPLY_" + "A" * 57])
+def test_given_a_reply_channel_within_the_rules_then_it_is_answered(channel: str) -> None:
+    assert Run().ask(GetBodyList(RequestHeader(1, channel))).header.status is Status.OK
+
+
+def test_given_another_reply_prefix_then_only_that_is_answered() -> None:
+    run = Run(reply_prefix="ANSWER_")
+    assert run.feed(GetBodyList(ME)) == ()
+    assert run.ask(GetBodyList(RequestHeader(1, "ANSWER_ME"))).header.status is Status.OK
+
+
+# --- waiting ------------------------------------------------------------------------------------------------
+
+
+def test_given_a_time_to_come_and_a_wait_then_the_reply_comes_with_the_data() -> None:
+    run = Run()
+    run.samples(0, 1)
+    assert run.feed(ahead(1.4), 1.1) == ()
+    assert run.feed(Tick(), 1.2)[1:] == () or not of_kind(run.feed(Tick(), 1.2), SendReply)
+    assert not of_kind(run.feed(imu(START + round(1.3 * S)), 1.3), SendReply)
+    assert run.health(1.3).requests_parked == 1
+    (reply,) = of_kind(run.feed(imu(START + round(1.5 * S)), 1.5), SendReply)
+    assert reply.reply.header.status is Status.OK
+    assert reply.reply.answer.transformation.utime == START + round(1.4 * S)
+    assert run.state.parked == ()
+    assert run.state.requests_answered == 1
+
+
+def test_given_a_wait_that_ends_then_the_reply_says_too_new_at_the_next_tick() -> None:
+    run = Run()
+    run.samples(0, 1)
+    run.feed(ahead(3.0, wait_ms=500), 1.0)
+    assert not of_kind(run.feed(Tick(), 1.499), SendReply)
+    (reply,) = of_kind(run.feed(Tick(), 1.5), SendReply)
+    assert reply.reply.header.status is Status.TOO_NEW
+
+
+def test_given_a_wait_longer_than_allowed_then_it_is_cut() -> None:
+    run = Run(wait_ms=100)
+    run.samples(0, 1)
+    run.feed(ahead(3.0, wait_ms=2_000_000_000), 1.0)
+    assert of_kind(run.feed(Tick(), 1.1), SendReply)
+
+
+def test_given_a_clock_that_steps_then_waits_end_by_monotonic_time() -> None:
+    run = Run()
+    run.samples(0, 1)
+    run.feed(ahead(3.0, wait_ms=500), 1.0)
+    for utime, seconds, answered in ((START + 3600 * S, 1.4, False), (START - 3600 * S, 1.5, True)):
+        instant = Instant(now_at(START + round(seconds * S)).monotonic_ns, utime)
+        run.state, outputs = step(run.state, Tick(), instant)
+        assert bool(of_kind(outputs, SendReply)) is answered
+
+
+@pytest.mark.parametrize("wait_ms", [0, 500])
+def test_given_a_question_that_needs_no_waiting_then_it_is_answered_at_once(wait_ms: int) -> None:
+    run = Run()
+    run.samples(0, 1)
+    for question in (
+        GetTransformation(ME, "Camera:Origin", "Cart:Base", TimeQuery(START + 99 * S, wait_ms=wait_ms)),
+        GetTransformation(ME, "Cart:Base", "World:UTM", TimeQuery(START + S, wait_ms=wait_ms)),
+        GetTransformation(ME, "Cart:Base", "World:UTM", TimeQuery(0, wait_ms=wait_ms)),
+        GetTransformation(ME, "Cart:Base", "World:UTM", TimeQuery(START + 99 * S, Policy.LATEST, wait_ms)),
+        GetStateVector(ME, TimeQuery(START - 5 * S, wait_ms=wait_ms)),
+    ):
+        assert run.ask(question, 1.0)
+
+
+def test_given_no_sample_yet_and_a_wait_then_the_first_one_answers() -> None:
+    run = Run()
+    assert run.feed(GetHTransform(ME, time=TimeQuery(wait_ms=500))) == ()
+    (reply,) = of_kind(run.feed(imu(START + S), 0.3), SendReply)
+    assert reply.reply.header.status is Status.OK
+
+
+def test_given_no_sensors_then_nobody_waits_for_a_pose() -> None:
+    assert Run(None).ask(GetHTransform(ME, time=TimeQuery(wait_ms=500))).header.status is Status.NO_POSE
+
+
+def test_given_as_many_waiting_as_may_then_one_more_is_refused_and_counted() -> None:
+    run = Run(parked_requests=3)
+    run.samples(0, 1)
+    for _ in range(3):
+        assert run.feed(ahead(2.0), 1.0) == ()
+    reply = run.ask(ahead(2.0), 1.0)
+    assert reply.header.status is Status.REFUSED_LOAD
+    assert "limits.parked_requests" in reply.header.message
+    assert run.rejected == {("PLATFORM_GET_TRANSFORMATION", "load"): 1}
+    assert run.state.requests_answered == 0
+    # and a question that need not wait is still answered
+    assert run.ask(GetBodyList(ME), 1.0).header.status is Status.OK
+    assert len(of_kind(run.feed(imu(START + 2 * S), 2.0), SendReply)) == 3
+    assert run.state.requests_answered == 4
+
+
+def test_given_parking_forbidden_then_a_waiting_question_is_refused() -> None:
+    run = Run(parked_requests=0)
+    assert run.ask(ahead(2.0)).header.status is Status.REFUSED_LOAD
+
+
+# --- samples ------------------------------------------------------------------------------------------------
+
+
+def test_given_timer_mode_then_only_ticks_publish_the_pose_of_their_instant() -> None:
+    run = Run()
+    assert run.feed(imu(START), 0.0) == ()
+    poses = of_kind(run.feed(Tick(), 0.25), PublishPose)
+    assert len(poses) == 1
+    assert poses[0].world.transformation.utime == START + S // 4
+    assert poses[0].world.transformation.frame_of_reference == names.WORLD_UTM
+    assert poses[0].odom.transformation.frame_of_reference == names.ODOM
+    assert poses[0].world.origin == ORIGIN
+    assert run.state.poses_published == 1
+
+
+def test_given_event_mode_then_each_sample_taken_publishes_its_own_instant_and_ticks_nothing() -> None:
+    run = Run(publish="event")
+    for n, sample in enumerate((imu(START + 5), gps(START + 10), imu(START + 15))):
+        (pose,) = of_kind(run.feed(sample, 1.0), PublishPose)
+        assert pose.world.transformation.utime == START + 5 * (n + 1)
+    assert not of_kind(run.feed(Tick(), 1.0), PublishPose)
+
+
+@pytest.mark.parametrize("source", ["ignore", "refuse:nan"])
+def test_given_event_mode_then_a_sample_that_is_not_taken_publishes_nothing(source: str) -> None:
+    run = Run(publish="event")
+    assert run.feed(imu(START + 5, source)) == ()
+    assert len(run.state.history) == 0
+    run.feed(imu(START + 6))
+    assert run.feed(imu(START + 7, source)) == ()
+    assert run.state.history.last == START + 6
+
+
+def test_given_wheels_and_joints_then_they_count_as_traffic_and_publish_nothing() -> None:
+    run = Run(publish="event")
+    for kind in (WheelsSample, JointsSample):
+        assert not of_kind(run.feed(kind(SensorHeader(START, "w"), ())), PublishPose)
+    assert run.state.traffic["sensor:w"].count == 2
+    assert len(run.state.history) == 0
+
+
+def test_given_a_slow_pose_rate_then_ticks_in_between_serve_the_rest() -> None:
+    run = Run(ticks_per_pose=5)
+    run.samples(0)
+    published = [n for n in range(20) if of_kind(run.feed(Tick(), 0.02 * n), PublishPose)]
+    assert published == [0, 5, 10, 15]
+    # 3 ticks were missed on the way: tick 25 comes as the third
+    assert [bool(of_kind(run.feed(Tick(0.0, missed), 1.0), PublishPose)) for missed in (0, 3, 0)] == [True, False, True]
+
+
+def test_given_an_origin_that_is_latched_then_it_goes_out_once() -> None:
+    run = Run(Scripted(known=None))
+    assert of_kind(run.feed(gps(START, source="latch")), OriginLatched) == [OriginLatched(ORIGIN)]
+    assert run.feed(gps(START + 1)) == ()
+
+
+@pytest.mark.parametrize("ahead_us", [1_000_001, 10**12, (1 << 61) - 1 - START])
+def test_given_a_sample_from_the_future_then_it_is_counted_and_not_used(ahead_us: int) -> None:
+    run = Run(publish="event")
+    assert run.feed(imu(START + ahead_us)) == ()
+    assert run.rejected == {("sensor:imu", "future"): 1}
+    assert run.state.localizer == Scripted()
+    assert run.feed(imu(START + 1_000_000)) != ()
+
+
+def test_given_refused_samples_then_each_reason_is_counted_by_source() -> None:
+    run = Run()
+    for reason, count in (("nan", 3), ("jump", 2)):
+        for _ in range(count):
+            run.feed(imu(START, f"refuse:{reason}"))
+    assert run.rejected == {("sensor:refuse:nan", "nan"): 3, ("sensor:refuse:jump", "jump"): 2}
+
+
+def test_given_no_localizer_then_samples_are_counted_and_ticks_publish_no_pose() -> None:
+    run = Run(None)
+    run.samples(0, 1)
+    health = run.health(1)
+    assert [each.channel for each in health.channels] == ["sensor:imu"]
+    assert run.feed(Tick(), 2) == () or not of_kind(run.feed(Tick(), 2), PublishPose)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e300, -1e300])
+def test_given_numbers_that_cannot_be_then_raw_mode_goes_on_with_the_next_good_sample(bad: float) -> None:
+    localizer = RawLocalizer.start(Mounts.from_model(cart(), "Cart:Base", "Cart:Antenna", "Cart:Imu"), None, ORIGIN)
+    run = Run(localizer, publish="event")
+    outputs: list[Output] = []
+    odd: list[Any] = [
+        replace(imu(START), angular_velocity=(bad, 0.0, 0.0)),
+        replace(imu(START), specific_force=(0.0, bad, 0.0)),
+        replace(imu(START), orientation=(bad, 0.0, 0.0, 0.0)),
+        replace(gps(START), latitude_deg=bad),
+        replace(gps(START), longitude_deg=bad),
+        replace(gps(START), height_ellipsoidal=bad),
+        replace(gps(START), velocity=(bad, bad, bad)),
+        replace(gps(START), position_covariance=(bad,) * 9),
+    ]
+    for n, sample in enumerate(odd):
+        header = replace(sample.header, utime=START + n * 1000)
+        outputs.extend(run.feed(replace(sample, header=header), n * 1e-3))
+    for sample in drive(5.0, START + S):
+        outputs.extend(run.feed(sample, (sample.header.utime - START) / S))
+    outputs.extend(run.feed(Tick(), 6.0))
+    for output in outputs:
+        if isinstance(output, PublishPose):
+            assert encode(output.world)
+            assert encode(output.odom)
+            assert output.world.transformation.utime >= START
+            assert all(map(math.isfinite, output.world.transformation.pose.xyz))
+    reply = run.ask(GetStateVector(ME), 6.0)
+    assert reply.header.status is Status.OK
+
+
+# --- health -------------------------------------------------------------------------------------------------
+
+
+def test_given_the_first_tick_then_health_goes_out_and_then_once_a_period() -> None:
+    run = Run(health_period_ns=1_000_000_000)
+    due = [n for n in range(60) if of_kind(run.feed(Tick(), n * 0.05), PublishHealth)]
+    assert due == [0, 20, 40]
+
+
+def test_given_a_long_pause_then_one_report_is_enough() -> None:
+    run = Run()
+    run.feed(Tick(), 0.0)
+    reports = [len(of_kind(run.feed(Tick(), 60.0 + n * 0.02), PublishHealth)) for n in range(3)]
+    assert reports == [1, 0, 0]
+
+
+def test_given_traffic_then_health_tells_counts_rates_and_ages() -> None:
+    run = Run()
+    run.health(0.0)
+    for n in range(50):
+        run.feed(imu(START + n * 20_000), n * 0.02)
+    for n in range(5):
+        run.feed(gps(START + n * 200_000), n * 0.2)
+    by_name = {each.channel: each for each in run.health(1.0).channels}
+    assert (by_name["sensor:imu"].count, by_name["sensor:imu"].rate_hz) == (50, pytest.approx(50.0))
+    assert (by_name["sensor:gps"].count, by_name["sensor:gps"].rate_hz) == (5, pytest.approx(5.0))
+    assert by_name["sensor:gps"].age == pytest.approx(0.2)
+    # then they fall silent
+    silent = {each.channel: each for each in run.health(3.0).channels}
+    assert (silent["sensor:imu"].count, silent["sensor:imu"].rate_hz) == (50, 0.0)
+    assert silent["sensor:imu"].age == pytest.approx(3.0 - 0.98)
+
+
+def test_given_ticks_late_and_missed_then_health_tells_since_the_last_report() -> None:
+    run = Run()
+    run.health(0.0)
+    for late in (0.001, 0.002, 0.100):
+        run.feed(Tick(late, 2), 0.5)
+    health = run.health(0.9, Tick(0.003))
+    assert health.tick_lateness_max == pytest.approx(0.1)
+    assert health.tick_lateness_p50 == pytest.approx(0.003)
+    assert health.ticks_missed == 6
+    again = run.health(1.8, Tick(0.004))
+    assert (again.tick_lateness_max, again.ticks_missed) == (pytest.approx(0.004), 6)
+
+
+def test_given_what_was_done_then_health_tells_it() -> None:
+    run = Run(localizer=Scripted(epoch=4))
+    run.samples(0, 0.5)
+    run.ask(GetBodyList(ME))
+    run.feed(Rejected("GPS", "truncated"))
+    run.feed(Rejected("GPS", "truncated"))
+    run.feed(Rejected("tick", "handler"))
+    health = run.health(1.0)
+    assert (health.utime, health.uptime) == (START + S, pytest.approx(1.0))
+    assert (health.vehicle, health.model_revision) == ("cart", cart().revision)
+    assert (health.pose_epoch, health.origin_id) == (4, ORIGIN.origin_id)
+    assert (health.poses_published, health.requests_answered, health.handler_errors) == (1, 1, 1)
+    assert health.rejected == (("GPS", "truncated", 2), ("tick", "handler", 1))
+    assert encode(health)
+
+
+def test_given_poses_valid_and_not_then_the_state_goes_starting_running_degraded() -> None:
+    run = Run(Scripted(stale_s=1.0))
+    states = [run.health(0.0).state]
+    run.samples(0.1)
+    states += [run.health(0.2).state, run.health(9.0).state]
+    run.samples(9.1)
+    states.append(run.health(9.2).state)
+    assert states == [core.STARTING, core.RUNNING, core.DEGRADED, core.RUNNING]
+    assert run.health(30.0).invalid_reasons == Invalid.STALE_IMU | Invalid.STALE_GPS
+
+
+def test_given_endless_sources_and_reasons_then_the_counters_are_bounded_and_nothing_is_lost() -> None:
+    run = Run()
+    for n in range(1000):
+        run.feed(imu(START, f"refuse:{n}"))
+    assert len(run.rejected) <= MAX_COUNTERS + 1
+    assert sum(run.rejected.values()) == 1000
+    assert len(run.state.traffic) <= MAX_COUNTERS
+    health = run.health(1.0)
+    assert sum(count for _, _, count in health.rejected) == 1000
+    # one report is one message that LCM carries in a few pieces
+    assert len(encode(health)) < 64_000
+    # what was known before goes on being told apart
+    run.feed(imu(START, "refuse:0"))
+    assert run.rejected["sensor:refuse:0", "0"] == 2
+
+
+# --- determinism --------------------------------------------------------------------------------------------
+
+
+def journal() -> list[tuple[Event, Instant]]:
+    """A drive with requests of all kinds, odd samples, and a clock that steps."""
+    events: list[tuple[Event, Instant]] = []
+    for n, sample in enumerate(drive(12.0)):
+        at = now_at(sample.header.utime + 1500)
+        events.append((sample, at))
+        if n % 6 == 0:
+            events.append((Tick(1e-4, n % 5), at))
+        if n % 10 == 0:
+            events.append((REQUESTS[n // 10 % len(REQUESTS)], at))
+        if n % 25 == 0:
+            events.append((ahead((sample.header.utime - START) / S + 0.05, 300), at))
+        if n % 90 == 0:
+            events += [(imu(START + 7), at), (gps(START, 5e5), at), (Rejected("GPS", "truncated"), at)]
+    events += [(sample, now_at(sample.header.utime)) for sample in drive(6.0, START - 100 * S)]
+    return events
+
+
+def bits(events: list[tuple[Event, Instant]], publish: str) -> list[bytes]:
+    mounts = Mounts.from_model(cart(), "Cart:Base", "Cart:Antenna", "Cart:Imu")
+    state = started(RawLocalizer.start(mounts), publish=publish)  # type: ignore[arg-type]
+    said: list[bytes] = []
+    for event, now in events:
+        state, outputs = step(state, event, now)
+        for output in outputs:
+            match output:
+                case PublishPose(world, odom):
+                    said += [encode(world), encode(world, "pose_vector_t"), encode(odom)]
+                case SendReply(channel, reply):
+                    said += [channel.encode(), encode(reply)]
+                case PublishHealth(health):
+                    said.append(encode(health))
+                case OriginLatched(origin):
+                    said.append(repr(origin).encode())
+    return said
+
+
+@pytest.mark.parametrize("publish", ["timer", "event"])
+def test_given_the_same_events_then_the_outputs_are_the_same_bit_for_bit(publish: str) -> None:
+    events = journal()
+    first = bits(events, publish)
+    assert len(first) > 300
+    assert bits(events, publish) == first
+
+
+def test_given_an_old_state_then_it_can_be_carried_on_again_with_the_same_result() -> None:
+    run = Run()
+    run.samples(0, 1)
+    old = run.state
+    for _ in range(3):
+        state, _ = step(old, imu(START + 2 * S), now_at(START + 2 * S))
+        state, first = step(state, GetStateVector(ME), now_at(START + 2 * S))
+        state, _ = step(old, imu(START + 3 * S), now_at(START + 3 * S))
+        assert isinstance(first[0], SendReply)
+        assert isinstance(first[0].reply, StateVectorReply)
+        assert first[0].reply.answer is not None
+        assert first[0].reply.answer.transformation.utime == START + 2 * S
+    assert old.history.last == START + S
+    assert dict(old.rejected) == {}

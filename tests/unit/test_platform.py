@@ -1,0 +1,388 @@
+"""Platform: every pair of frames, at every kind of time, and each way in which there is no answer."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from support_samples import ORIGIN, START, Scripted, cart
+
+from modelserver.errors import (
+    LimitError,
+    MalformedRequestError,
+    NoPoseError,
+    NotConnectedError,
+    QueryError,
+    TooNewError,
+    TooOldError,
+    UnknownBodyError,
+    UnknownFrameError,
+)
+from modelserver.geometry import names
+from modelserver.history import History
+from modelserver.messages import Invalid, Policy, PoseAnswer, Quality, TimeQuery
+from modelserver.platform import HISTORY_LIMIT, PREDICTION_LIMIT_S, PlatformView
+from modelserver.spatial import Pose, so3
+
+S = 1_000_000
+NOW = TimeQuery()
+BASE, MAST, CAMERA = "Cart:Base", "Cart:Mast", "Camera:Origin"
+UTM, ENU, ODOM = names.WORLD_UTM, names.WORLD_ENU, names.ODOM
+FRAMES = (BASE, MAST, CAMERA, UTM, ENU, ODOM)
+WORLDS = (UTM, ENU, ODOM)
+
+
+def view(
+    seconds: int = 10, localizer: Scripted | None = None, sigma: bool = False, horizon: float = 60.0
+) -> PlatformView:
+    """The platform after `seconds` with a sample in each."""
+    localizer = localizer or Scripted()
+    held = History(horizon)
+    for n in range(seconds + 1):
+        localizer = Scripted(
+            START + n * S, n + 1, localizer.known, localizer.epoch, localizer.stale_s, localizer.invalid
+        )
+        held = held.extended(localizer.estimate(localizer.utime))
+    return PlatformView(cart(sigma), BASE, localizer, held)
+
+
+def ask(platform: PlatformView, interest: str, reference: str, time: TimeQuery = NOW) -> PoseAnswer:
+    return platform.transformation(interest, reference, time)
+
+
+# --- pairs --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("interest", "reference"), list(itertools.product(FRAMES, FRAMES)))
+def test_given_any_pair_then_the_reverse_is_its_inverse_in_pose_covariance_and_validity(
+    interest: str, reference: str
+) -> None:
+    platform = view(localizer=Scripted(invalid=Invalid.STALE_GPS | Invalid.NOT_MOVED_YET), sigma=True)
+    there, back = ask(platform, interest, reference), ask(platform, reference, interest)
+    assert there.transformation.frame_of_interest == interest
+    assert there.transformation.frame_of_reference == reference
+    assert (there.transformation.pose @ back.transformation.pose).is_close(Pose.identity(), 1e-9, 1e-12)
+    assert there.transformation.invalid_reasons == back.transformation.invalid_reasons
+    assert there.transformation.utime == back.transformation.utime
+    forth, inverted = there.transformation.covariance, back.transformation.inverse().covariance
+    assert (forth is None) == (inverted is None)
+    if forth is not None and inverted is not None:
+        assert np.allclose(forth, inverted, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "c"), [(CAMERA, MAST, UTM), (CAMERA, BASE, ODOM), (MAST, UTM, ODOM), (BASE, UTM, ENU)]
+)
+def test_given_three_frames_then_the_poses_chain(a: str, b: str, c: str) -> None:
+    platform = view()
+    X_CB, X_BA = ask(platform, b, c).transformation.pose, ask(platform, a, b).transformation.pose
+    assert (X_CB @ X_BA).is_close(ask(platform, a, c).transformation.pose, 1e-9, 1e-12)
+
+
+@pytest.mark.parametrize(("interest", "reference"), list(itertools.product((BASE, MAST, CAMERA), repeat=2)))
+def test_given_frames_of_the_vehicle_then_the_answer_is_static_and_needs_no_pose(interest: str, reference: str) -> None:
+    platform = PlatformView(cart(), BASE, None, History(1.0))
+    answer = ask(platform, interest, reference)
+    assert answer.transformation.pose == cart().get_transformation(interest, reference).pose
+    assert (answer.transformation.utime, answer.transformation.origin_id, answer.origin) == (0, 0, None)
+    assert answer.transformation.valid
+
+
+def test_given_the_base_frame_then_its_world_pose_is_the_localizers_own() -> None:
+    platform = view(10)
+    estimate = platform.history.newest
+    for world, pose in ((UTM, estimate.utm), (ENU, estimate.enu), (ODOM, estimate.odom)):
+        answer = ask(platform, BASE, world)
+        assert answer.transformation.pose == pose
+        assert answer.transformation.utime == START + 10 * S
+        assert answer.transformation.origin_id == ORIGIN.origin_id
+        assert answer.transformation.model_revision == platform.model.revision
+        assert answer.origin == ORIGIN
+
+
+def test_given_two_world_frames_then_their_relation_is_that_at_the_vehicle() -> None:
+    platform = view()
+    estimate = platform.history.newest
+    assert estimate.utm is not None
+    assert estimate.enu is not None
+    assert ask(platform, ENU, UTM).transformation.pose.is_close(estimate.utm @ estimate.enu.inverse())
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_given_a_frame_in_itself_then_it_is_exact_even_without_a_pose(world: str) -> None:
+    platform = PlatformView(cart(), BASE, None, History(1.0))
+    answer = ask(platform, world, world)
+    assert answer.transformation.pose == Pose.identity()
+    assert answer.transformation.valid
+    covariance = answer.transformation.covariance
+    assert covariance is not None
+    assert not covariance.any()
+
+
+# --- covariance ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("world", [UTM, ODOM])
+@pytest.mark.parametrize("inverse", [False, True])
+def test_given_a_mounted_frame_then_its_covariance_agrees_with_monte_carlo(world: str, inverse: bool) -> None:
+    platform = view()
+    answer = ask(platform, world, CAMERA) if inverse else ask(platform, CAMERA, world)
+    found = answer.transformation.covariance
+    assert found is not None
+
+    rng = np.random.default_rng(5)
+    estimate = platform.history.newest
+    X_WB = estimate.utm if world == UTM else estimate.odom
+    numbers = estimate.covariance if world == UTM else estimate.odom_covariance
+    assert X_WB is not None
+    X_BC = cart().get_transformation(CAMERA, BASE).pose
+    exact = answer.transformation.pose
+    errors = []
+    for d in rng.multivariate_normal(np.zeros(6), np.array(numbers).reshape(6, 6), 20_000):
+        turned = so3.normalized(so3.multiply(so3.exponential(tuple(d[3:])), X_WB.wxyz))
+        pose = Pose(np.add(X_WB.xyz, d[:3]), turned) @ X_BC
+        pose = pose.inverse() if inverse else pose
+        turn = so3.logarithm(so3.normalized(so3.multiply(pose.wxyz, so3.conjugate(exact.wxyz))))
+        errors.append([*np.subtract(pose.xyz, exact.xyz), *turn])
+    sampled = np.cov(np.array(errors).T)
+    scale = np.sqrt(np.outer(np.diag(found), np.diag(found)))
+    # second-order terms: with 0.03 rad at 100 m they are metres times 5e-4
+    assert np.max(np.abs(sampled - found) / scale) < (0.06 if inverse else 0.04)
+
+
+def test_given_no_covariance_then_none_is_made_up() -> None:
+    localizer = Scripted(START, 1)
+    bare = localizer.estimate(START)
+    held = History(60.0).extended(type(bare)(START, bare.odom, bare.enu, bare.utm, origin=ORIGIN))
+    platform = PlatformView(cart(), BASE, localizer, held)
+    for interest, reference in ((BASE, UTM), (CAMERA, UTM), (UTM, CAMERA), (CAMERA, ODOM)):
+        assert ask(platform, interest, reference).transformation.covariance is None
+
+
+def test_given_a_surveyed_mount_then_its_sigmas_add_to_the_vehicles() -> None:
+    bare, surveyed = (ask(view(sigma=sigma), CAMERA, UTM).transformation.covariance for sigma in (False, True))
+    assert bare is not None
+    assert surveyed is not None
+    assert np.all(np.diag(surveyed) > np.diag(bare))
+
+
+# --- validity -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("invalid", "odom"),
+    [
+        (Invalid.NO_FIX | Invalid.NO_ORIGIN, Invalid(0)),
+        (Invalid.STALE_GPS | Invalid.GPS_REJECTED, Invalid(0)),
+        (Invalid.NOT_MOVED_YET | Invalid.STATIONARY_HEADING | Invalid.BOUND_EXCEEDED, Invalid(0)),
+        (Invalid.STALE_IMU | Invalid.STALE_GPS, Invalid.STALE_IMU),
+        (Invalid.CLOCK_STEPPED, Invalid.CLOCK_STEPPED),
+    ],
+)
+def test_given_reasons_that_touch_only_the_world_then_odom_stays_valid_both_ways(
+    invalid: Invalid, odom: Invalid
+) -> None:
+    platform = view(localizer=Scripted(invalid=invalid))
+    for frame in (BASE, CAMERA):
+        assert ask(platform, frame, ODOM).transformation.invalid_reasons == odom
+        assert ask(platform, ODOM, frame).transformation.invalid_reasons == odom
+        assert ask(platform, frame, UTM).transformation.invalid_reasons == invalid
+        assert ask(platform, UTM, frame).transformation.invalid_reasons == invalid
+    # between Odom and the earth both count
+    assert ask(platform, ODOM, UTM).transformation.invalid_reasons == invalid
+    assert ask(platform, ENU, ODOM).transformation.invalid_reasons == invalid
+    assert platform.broadcast(platform.history.newest, ODOM).transformation.invalid_reasons == odom
+
+
+def test_given_no_sensors_then_world_frames_say_that_the_vehicle_file_names_none() -> None:
+    platform = PlatformView(cart(), BASE, None, History(1.0))
+    for interest, reference in ((CAMERA, UTM), (ENU, CAMERA), (BASE, ODOM), (UTM, ENU)):
+        with pytest.raises(NoPoseError, match="names no GPS and IMU"):
+            ask(platform, interest, reference)
+    with pytest.raises(NoPoseError, match="names no GPS and IMU"):
+        platform.vehicle_history(START, START + S, 1.0)
+
+
+def test_given_no_sample_yet_then_there_is_no_pose_and_the_reasons_are_told() -> None:
+    platform = PlatformView(cart(), BASE, Scripted(), History(1.0))
+    for time in (NOW, TimeQuery(START), TimeQuery(START, Policy.PREDICTED), TimeQuery(START, Policy.HELD)):
+        with pytest.raises(NoPoseError, match="no usable GPS fix yet; no inertial sample yet"):
+            ask(platform, CAMERA, UTM, time)
+    with pytest.raises(NoPoseError, match="no usable GPS fix yet"):
+        platform.vehicle_history(START, START + S, 1.0)
+
+
+def test_given_no_origin_yet_then_odom_answers_and_the_world_does_not() -> None:
+    platform = view(localizer=Scripted(known=None))
+    assert ask(platform, CAMERA, ODOM).transformation.valid
+    assert ask(platform, CAMERA, ODOM).origin is None
+    for pair in ((CAMERA, UTM), (ENU, CAMERA), (UTM, ENU), (ODOM, UTM)):
+        with pytest.raises(NoPoseError, match="the origin is not set yet"):
+            ask(platform, *pair)
+    broadcast = platform.broadcast(platform.history.newest, UTM)
+    assert not broadcast.transformation.valid
+    assert broadcast.transformation.covariance is None
+
+
+# --- names --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("frame", "error", "near"),
+    [
+        ("World:UTN", UnknownFrameError, "World:UTM"),
+        ("World:utm", UnknownFrameError, "World:UTM"),
+        ("World", UnknownFrameError, "World:ENU"),
+        ("Odom:Orgin", UnknownFrameError, "Odom:Origin"),
+        ("Odom:", UnknownFrameError, "Odom:Origin"),
+        ("Camera:Orgin", UnknownFrameError, "Camera:Origin"),
+        ("Camrea:Origin", UnknownBodyError, "Camera:Origin"),
+        ("Camera", UnknownFrameError, ""),
+        ("", UnknownFrameError, ""),
+    ],
+)
+@pytest.mark.parametrize("other", [BASE, UTM])
+@pytest.mark.parametrize("turned", [False, True])
+def test_given_a_mistyped_name_then_the_nearest_is_offered(
+    frame: str, error: type[QueryError], near: str, other: str, turned: bool
+) -> None:
+    with pytest.raises(error) as caught:
+        ask(view(), *((other, frame) if turned else (frame, other)))
+    if near:
+        assert near in caught.value.nearest
+
+
+def test_given_both_names_mistyped_then_it_is_an_error_even_without_a_pose() -> None:
+    platform = PlatformView(cart(), BASE, None, History(1.0))
+    with pytest.raises(UnknownFrameError):
+        ask(platform, "World:UTN", "World:ENV")
+    with pytest.raises(UnknownFrameError):
+        ask(platform, "World:UTN", "World:UTN")
+
+
+def test_given_a_frame_that_nothing_joins_to_the_base_then_the_world_is_not_connected() -> None:
+    platform = view()
+    assert ask(platform, "Lamp:Origin", "Lamp:Origin").transformation.valid
+    with pytest.raises(NotConnectedError, match="the world is known at Cart:Base only"):
+        ask(platform, "Lamp:Origin", UTM)
+    with pytest.raises(NotConnectedError, match="the world is known at Cart:Base only"):
+        ask(platform, ODOM, "Lamp:Origin")
+    with pytest.raises(NotConnectedError):
+        ask(platform, "Lamp:Origin", BASE)
+
+
+# --- times --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("policy", list(Policy))
+def test_given_a_time_that_is_held_then_every_policy_but_latest_answers_for_it(policy: Policy) -> None:
+    answer = ask(view(10), BASE, UTM, TimeQuery(START + 4 * S, policy))
+    latest = policy is Policy.LATEST
+    assert answer.transformation.utime == START + (10 if latest else 4) * S
+    assert answer.quality == Quality(0)
+
+
+def test_given_a_time_between_two_samples_then_policies_interpolate_or_hold() -> None:
+    at = START + 4 * S + S // 4
+    platform = view(10)
+    for policy in (Policy.INTERPOLATED, Policy.PREDICTED):
+        answer = ask(platform, BASE, ODOM, TimeQuery(at, policy))
+        assert answer.transformation.pose.xyz[0] == pytest.approx(4.25)
+        assert answer.quality == Quality.INTERPOLATED
+    answer = ask(platform, BASE, ODOM, TimeQuery(at, Policy.HELD))
+    assert answer.transformation.pose.xyz[0] == pytest.approx(4.0)
+    assert answer.quality == Quality.HELD
+    assert answer.transformation.utime == at
+
+
+def test_given_a_time_past_the_newest_then_policies_refuse_predict_or_hold() -> None:
+    at = START + 11 * S + S // 2
+    platform = view(10)
+    with pytest.raises(TooNewError, match=r"1\.500 s after"):
+        ask(platform, BASE, UTM, TimeQuery(at))
+    predicted = ask(platform, BASE, ODOM, TimeQuery(at, Policy.PREDICTED))
+    assert predicted.transformation.pose.xyz[0] == pytest.approx(11.5)
+    assert predicted.quality == Quality.PREDICTED
+    assert not predicted.transformation.valid
+    assert ask(platform, BASE, UTM, TimeQuery(at, Policy.LATEST)).transformation.utime == START + 10 * S
+
+
+def test_given_a_pose_held_past_the_newest_sample_then_silence_makes_it_invalid() -> None:
+    platform = view(10)
+    soon = ask(platform, BASE, UTM, TimeQuery(START + 10 * S + S // 2, Policy.HELD))
+    late = ask(platform, BASE, UTM, TimeQuery(START + 3600 * S, Policy.HELD))
+    assert soon.transformation.valid
+    assert Invalid.STALE_GPS & late.transformation.invalid_reasons
+    assert late.transformation.pose == soon.transformation.pose
+
+
+@pytest.mark.parametrize("policy", [Policy.INTERPOLATED, Policy.HELD, Policy.PREDICTED])
+def test_given_a_time_before_all_then_it_is_too_old(policy: Policy) -> None:
+    with pytest.raises(TooOldError, match="before what is held"):
+        ask(view(10), BASE, UTM, TimeQuery(START - 1, policy))
+
+
+def test_given_a_prediction_at_its_limit_then_beyond_is_too_new() -> None:
+    platform = view(10)
+    limit = START + 10 * S + round(PREDICTION_LIMIT_S * S)
+    assert ask(platform, BASE, UTM, TimeQuery(limit, Policy.PREDICTED)).transformation.utime == limit
+    for at in (limit + 1, (1 << 61) - 1):
+        with pytest.raises(TooNewError, match="5 s ahead at most"):
+            ask(platform, BASE, UTM, TimeQuery(at, Policy.PREDICTED))
+
+
+def test_given_static_frames_then_the_time_asked_plays_no_part() -> None:
+    assert ask(view(10), CAMERA, BASE, TimeQuery(1)).transformation.utime == 0
+
+
+def test_given_times_then_what_is_covered_is_told() -> None:
+    platform = view(10)
+    assert platform.covers(START + 10 * S)
+    assert platform.covers(START - S)
+    assert not platform.covers(START + 10 * S + 1)
+    assert not PlatformView(cart(), BASE, Scripted(), History(1.0)).covers(START)
+
+
+# --- history ------------------------------------------------------------------------------------------------
+
+
+def test_given_a_range_and_a_rate_then_the_times_are_even_and_only_held_ones_come() -> None:
+    answers = view(10).vehicle_history(START + 8 * S, START + 12 * S, 4.0)
+    assert [(each.transformation.utime - START) / S for each in answers] == [8 + n / 4 for n in range(9)]
+    assert all(each.transformation.frame_of_reference == UTM for each in answers)
+    assert all(each.transformation.frame_of_interest == BASE for each in answers)
+
+
+def test_given_a_range_of_one_instant_then_one_pose_comes() -> None:
+    assert len(view(10).vehicle_history(START + S, START + S, 50.0)) == 1
+
+
+def test_given_a_rate_that_divides_no_microsecond_then_the_times_do_not_drift() -> None:
+    answers = view(10).vehicle_history(START, START + 9 * S, 30.0)
+    assert len(answers) == 271
+    assert answers[-1].transformation.utime == START + 9 * S
+    assert answers[200].transformation.utime == START + round(200e6 / 30)
+
+
+def test_given_a_range_outside_what_is_held_then_nothing_comes() -> None:
+    assert view(10).vehicle_history(1, 1000, 1.0) == ()
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf"), 1e6, -float("inf")])
+def test_given_a_rate_that_cannot_be_then_the_request_is_malformed(rate: float) -> None:
+    with pytest.raises(MalformedRequestError, match="rate_hz"):
+        view().vehicle_history(START, START + S, rate)
+
+
+def test_given_a_range_that_ends_before_it_starts_then_the_request_is_malformed() -> None:
+    with pytest.raises(MalformedRequestError, match="before it starts"):
+        view().vehicle_history(START + 1, START, 1.0)
+
+
+def test_given_more_poses_than_go_in_a_reply_then_the_limit_is_named() -> None:
+    platform = view()
+    assert platform.vehicle_history(START, START + (HISTORY_LIMIT - 1) * 1000, 1000.0)
+    for end in (START + HISTORY_LIMIT * 1000, (1 << 61) - 1):
+        with pytest.raises(LimitError, match="at most 1000"):
+            platform.vehicle_history(START, end, 1000.0)
