@@ -176,6 +176,8 @@ class VehicleConfig:
 
     vehicle: name, for people. geometry: path of the geometry file, relative to this file.
     variables: values for the $NAMES in a frame-tree file. base_frame: the frame that POSE describes.
+    rolling_frame: the frame that moves along its own x axis when the vehicle turns: the middle of the rear axle of one
+        with steered front wheels, the middle of a skid-steered one. Empty for base_frame.
     state_directory: where the captured origin is kept, relative to this file; empty for the user's state directory.
     """
 
@@ -183,6 +185,7 @@ class VehicleConfig:
     vehicle: str
     geometry: str
     base_frame: str
+    rolling_frame: str = ""
     variables: dict[str, str] = field(default_factory=dict)
     state_directory: str = ""
     lcm: LcmConfig = field(default_factory=LcmConfig)

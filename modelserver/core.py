@@ -80,6 +80,7 @@ class CoreSettings:
     """
 
     base_frame: str
+    rolling_frame: str = ""
     vehicle: str = ""
     publish: Literal["timer", "event"] = "timer"
     ticks_per_pose: int = 1
@@ -150,9 +151,9 @@ Step: TypeAlias = tuple[CoreState, Outputs]
 
 
 def start(settings: CoreSettings, model: Model, localizer: Localizer | None, now: Instant) -> CoreState:
-    """Return the first state. Raises UnknownBodyError or UnknownFrameError where the model lacks the base frame."""
-    model.frame(settings.base_frame)
-    view = PlatformView(model, settings.base_frame, localizer, History(settings.history_s))
+    """Return the first state. Raises a QueryError where the model lacks the base frame or the rolling frame."""
+    view = PlatformView(model, settings.base_frame, localizer, History(settings.history_s), settings.rolling_frame)
+    model.get_transformation(view.base_frame, view.rolling_frame)
     return CoreState(settings, view, now.monotonic_ns, health_due_ns=now.monotonic_ns)
 
 

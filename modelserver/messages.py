@@ -161,8 +161,8 @@ class GpsSample:
     speed_sigma: float = NAN
     course: float = NAN
     course_sigma: float = NAN
-    heading: float = NAN
-    heading_sigma: float = NAN
+    baseline_yaw: float = NAN
+    baseline_yaw_sigma: float = NAN
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ localization works out for each world frame by geodesy at the vehicle's position
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -27,7 +28,7 @@ from modelserver.geometry import names
 from modelserver.geometry.model import Model
 from modelserver.history import History, at_time
 from modelserver.localization.interface import Localizer
-from modelserver.messages import Estimate, Invalid, Policy, PoseAnswer, Quality, TimeQuery
+from modelserver.messages import NAN, Estimate, Invalid, Policy, PoseAnswer, Quality, TimeQuery
 from modelserver.spatial import covariance as cov
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array
@@ -44,12 +45,21 @@ WORLD_FRAMES: Final = frozenset({names.WORLD_UTM, names.WORLD_ENU, names.ODOM})
 
 @dataclass(frozen=True, slots=True)
 class PlatformView:
-    """What is known now: the geometry, and where the vehicle has been."""
+    """What is known now: the geometry, and where the vehicle has been.
+
+    base_frame: the frame whose pose is asked for and published. rolling_frame: the frame that the estimates are of,
+    the point of the vehicle that moves along its own x axis; empty for the base frame.
+    """
 
     model: Model
     base_frame: str
     localizer: Localizer | None
     history: History
+    rolling_frame: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.rolling_frame:
+            object.__setattr__(self, "rolling_frame", self.base_frame)
 
     def transformation(self, frame_of_interest: str, frame_of_reference: str, time: TimeQuery) -> PoseAnswer:
         """Return where a frame is in another. Raises QueryError, each kind for its own cause."""
@@ -132,16 +142,9 @@ class PlatformView:
 
     def broadcast(self, estimate: Estimate, world: str) -> PoseAnswer:
         """Return the base frame's pose in a world frame, for publication: with reasons where there is none."""
-        pose = _POSE_IN[world](estimate)
-        covariance = estimate.odom_covariance if world == names.ODOM else estimate.covariance
-        known = pose is not None and covariance is not None
-        return self._answer(
-            self.base_frame,
-            world,
-            pose or Pose.identity(),
-            np.array(covariance).reshape(6, 6) if known else None,
-            estimate,
-        )
+        known = _POSE_IN[world](estimate) is not None
+        pose, covariance = self._in_world(self.base_frame, world, estimate) if known else (Pose.identity(), None)
+        return self._answer(self.base_frame, world, pose, covariance, estimate)
 
     def _static(self, frame_of_interest: str, frame_of_reference: str) -> PoseAnswer:
         """Return a relation within the vehicle: it does not change with time, so it has no stamp."""
@@ -155,9 +158,9 @@ class PlatformView:
     def _in_world(self, frame: str, world: str, estimate: Estimate) -> tuple[Pose, Array | None]:
         X_WB = _pose_in(world, estimate)
         numbers = estimate.odom_covariance if world == names.ODOM else estimate.covariance
-        if frame == self.base_frame:
+        if frame == self.rolling_frame:
             return X_WB, None if numbers is None else np.array(numbers).reshape(6, 6)
-        mounted = self.model.get_transformation(frame, self.base_frame)
+        mounted = self.model.get_transformation(frame, self.rolling_frame)
         if numbers is None:
             return X_WB @ mounted.pose, None
         # a mount without stated sigmas counts as exact here: the vehicle's own error is far larger
@@ -167,15 +170,18 @@ class PlatformView:
     def _check_carried(self, frame: str) -> None:
         """Raise where the frame does not exist, or nothing joins it to the frame whose pose is known."""
         try:
-            self.model.get_transformation(frame, self.base_frame)
+            self.model.get_transformation(frame, self.rolling_frame)
         except NotConnectedError as error:
-            raise NotConnectedError(f"the world is known at {self.base_frame} only: {error}") from None
+            raise NotConnectedError(f"the world is known at {self.rolling_frame} only: {error}") from None
 
     def _answer(
         self, interest: str, reference: str, pose: Pose, covariance: Array | None, estimate: Estimate
     ) -> PoseAnswer:
         odom_only = names.ODOM in (interest, reference) and not (is_absolute(interest) or is_absolute(reference))
+        origin = None if odom_only else estimate.origin
         invalid = estimate.invalid & _ODOM_INVALID if odom_only else estimate.invalid
+        of_vehicle = self.base_frame in (interest, reference) and not odom_only
+        horizontal, heading = self._bounds(estimate) if of_vehicle else (NAN, NAN)
         return PoseAnswer(
             Transformation(
                 interest,
@@ -185,15 +191,22 @@ class PlatformView:
                 estimate.utime,
                 int(invalid),
                 estimate.pose_epoch,
-                0 if estimate.origin is None else estimate.origin.origin_id,
+                0 if origin is None else origin.origin_id,
                 self.model.revision,
             ),
-            estimate.origin,
+            origin,
             estimate.quality,
-            estimate.horizontal_bound,
-            estimate.heading_bound,
-            estimate.seconds_to_limit,
+            horizontal,
+            heading,
+            NAN if odom_only else estimate.seconds_to_limit,
         )
+
+    def _bounds(self, estimate: Estimate) -> tuple[float, float]:
+        """Return the bounds at the base frame: a heading error swings it about the rolling frame."""
+        x, y, _ = self.model.get_transformation(self.base_frame, self.rolling_frame).pose.xyz
+        # a chord is no longer than its arc, nor than twice the arm
+        swing = math.hypot(x, y) * min(estimate.heading_bound, 2.0)
+        return estimate.horizontal_bound + swing, estimate.heading_bound
 
     def _no_pose(self) -> NoPoseError:
         if self.localizer is None:

@@ -201,4 +201,4 @@ def now_at(utime: int) -> Instant:
 
 def started(localizer: Scripted | None = Scripted(), **settings: object) -> CoreState:
     """The core of the cart in its first state, at START."""
-    return start(CoreSettings("Cart:Base", "cart", **settings), cart(), localizer, now_at(START))  # type: ignore[arg-type]
+    return start(CoreSettings("Cart:Base", vehicle="cart", **settings), cart(), localizer, now_at(START))  # type: ignore[arg-type]

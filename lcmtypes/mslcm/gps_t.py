@@ -15,7 +15,7 @@ class gps_t(object):
     The position is that of the antenna's phase centre.
     """
 
-    __slots__ = ["header", "fix_type", "satellites", "hdop", "vdop", "pdop", "latitude_deg", "longitude_deg", "height_ellipsoidal", "height_msl", "undulation", "position_covariance", "velocity", "velocity_covariance", "velocity_latency", "speed", "speed_sigma", "course", "course_sigma", "heading", "heading_sigma"]
+    __slots__ = ["header", "fix_type", "satellites", "hdop", "vdop", "pdop", "latitude_deg", "longitude_deg", "height_ellipsoidal", "height_msl", "undulation", "position_covariance", "velocity", "velocity_covariance", "velocity_latency", "speed", "speed_sigma", "course", "course_sigma", "baseline_yaw", "baseline_yaw_sigma"]
 
     __typenames__ = ["mslcm.sensor_header_t", "int8_t", "int16_t", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double", "double"]
 
@@ -152,16 +152,16 @@ class gps_t(object):
         LCM Type: double
         """
 
-        self.heading = 0.0
+        self.baseline_yaw = 0.0
         """
         Direction of the antenna baseline of a dual-antenna receiver, from the antenna whose position is given to the
         other one, radians, counter-clockwise from true east (not a compass heading), -pi to pi.
         LCM Type: double
         """
 
-        self.heading_sigma = 0.0
+        self.baseline_yaw_sigma = 0.0
         """
-        Standard deviation of heading, radians.
+        Standard deviation of baseline_yaw, radians.
         LCM Type: double
         """
 
@@ -179,7 +179,7 @@ class gps_t(object):
         buf.write(struct.pack('>9d', *self.position_covariance[:9]))
         buf.write(struct.pack('>3d', *self.velocity[:3]))
         buf.write(struct.pack('>9d', *self.velocity_covariance[:9]))
-        buf.write(struct.pack(">ddddddd", self.velocity_latency, self.speed, self.speed_sigma, self.course, self.course_sigma, self.heading, self.heading_sigma))
+        buf.write(struct.pack(">ddddddd", self.velocity_latency, self.speed, self.speed_sigma, self.course, self.course_sigma, self.baseline_yaw, self.baseline_yaw_sigma))
 
     @staticmethod
     def decode(data: bytes):
@@ -199,14 +199,14 @@ class gps_t(object):
         self.position_covariance = struct.unpack('>9d', buf.read(72))
         self.velocity = struct.unpack('>3d', buf.read(24))
         self.velocity_covariance = struct.unpack('>9d', buf.read(72))
-        self.velocity_latency, self.speed, self.speed_sigma, self.course, self.course_sigma, self.heading, self.heading_sigma = struct.unpack(">ddddddd", buf.read(56))
+        self.velocity_latency, self.speed, self.speed_sigma, self.course, self.course_sigma, self.baseline_yaw, self.baseline_yaw_sigma = struct.unpack(">ddddddd", buf.read(56))
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if gps_t in parents: return 0
         newparents = parents + [gps_t]
-        tmphash = (0x86bb3e2ca98b7ce+ mslcm.sensor_header_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x6fb13335eeebdc35+ mslcm.sensor_header_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -20,6 +20,9 @@ _FASTEST = 50.0
 _HARDEST = 500.0
 """m/s2: above the range of any accelerometer fit for a vehicle."""
 
+_NEAR_GRAVITY = 1.0
+"""m/s2: a tenth of g."""
+
 
 @dataclass(frozen=True, slots=True)
 class Inertial:
@@ -49,7 +52,22 @@ def read(sample: ImuSample, X_base_imu: Pose) -> Inertial | str:
         if max(map(abs, force)) > _HARDEST:
             return "range"
         force = so3.rotate(mount, force)
-    return Inertial(so3.rotate(mount, rate), force, _device_up(sample, mount))
+    up = _device_up(sample, mount)
+    if up is not None and force is not None and _contradicted(up, force):
+        return "orientation"
+    return Inertial(so3.rotate(mount, rate), force, up)
+
+
+def _contradicted(up: Vector3, force: Vector3) -> bool:
+    """Return whether a device's own vertical and its specific force cannot both be right.
+
+    Where |f| is near g, the two can be 60 degrees apart only under an acceleration of about g that happens to keep
+    |f|: no ground vehicle does that, but a wrong orientation reference or a stuck accelerometer does.
+    """
+    norm = math.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
+    if abs(norm - STANDARD_GRAVITY) > _NEAR_GRAVITY:
+        return False
+    return up[0] * force[0] + up[1] * force[1] + up[2] * force[2] < 0.5 * norm
 
 
 def _device_up(sample: ImuSample, mount: so3.Quaternion) -> Vector3 | None:

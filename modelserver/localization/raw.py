@@ -81,9 +81,10 @@ class RawLocalizer:
         """Return what is concluded with one sample more, and what there is to say about it.
 
         Wheels and joints are ignored. Notes are `Rejected("sensor:<source>", reason)` with one of the reasons
-        order, duplicate, future (its stamp); nan, range (its numbers); gap (an inertial sample after a gap:
-        the turn in it is not known); no_fix, satellites, dilution, sigma, jump (a fix); course (a fix whose
-        course was not used) and `OriginLatched`.
+        order, duplicate, future (its stamp); nan, range (its numbers); orientation (an inertial unit whose own
+        vertical and specific force contradict each other: its orientation reference is wrong, say); gap (an
+        inertial sample after a gap: the turn in it is not known); no_fix, satellites, dilution, sigma, jump (a
+        fix); course (a fix whose course was not used) and `OriginLatched`.
         """
         if isinstance(sample, ImuSample):
             return self._take_imu(sample)

@@ -49,6 +49,7 @@ class Vehicle:
             localizer = RawLocalizer.start(self.mounts, config.localization, configured_origin(config) or origin)
         settings = CoreSettings(
             base_frame=config.base_frame,
+            rolling_frame=config.rolling_frame,
             vehicle=config.vehicle,
             publish=config.publish.mode,
             ticks_per_pose=self.ticks_per_pose(),
@@ -87,6 +88,7 @@ def load_vehicle(config: VehicleConfig) -> Vehicle:
     problems = []
     gps, imu = config.sensors.gps, config.sensors.imu
     named = [("base_frame", config.base_frame)]
+    named += [("rolling_frame", config.rolling_frame)] if config.rolling_frame else []
     named += [(f"sensors.{key}.frame", each.frame) for key, each in (("gps", gps), ("imu", imu)) if each is not None]
     if config.sensors.wheels is not None:
         named += [(f"sensors.wheels.frames.{name}", frame) for name, frame in config.sensors.wheels.frames.items()]
@@ -105,7 +107,7 @@ def load_vehicle(config: VehicleConfig) -> Vehicle:
         raise ConfigError(problems)
     mounts = None
     if gps is not None and imu is not None:
-        mounts = Mounts.from_model(model, config.base_frame, gps.frame, imu.frame)
+        mounts = Mounts.from_model(model, config.rolling_frame or config.base_frame, gps.frame, imu.frame)
     return Vehicle(config, model, mounts)
 
 

@@ -47,8 +47,8 @@ def read_gps(message: gps_t) -> GpsSample:
         message.speed_sigma,
         message.course,
         message.course_sigma,
-        message.heading,
-        message.heading_sigma,
+        message.baseline_yaw,
+        message.baseline_yaw_sigma,
     )
 
 
@@ -72,8 +72,8 @@ def write_gps(sample: GpsSample) -> gps_t:
         "speed_sigma",
         "course",
         "course_sigma",
-        "heading",
-        "heading_sigma",
+        "baseline_yaw",
+        "baseline_yaw_sigma",
     ):
         setattr(message, name, getattr(sample, name))
     message.position_covariance = sample.position_covariance or fields.NAN9

@@ -107,7 +107,7 @@ def test_given_a_limit_then_a_drain_hands_over_no_more_and_says_how_many(rig: Ri
     rig.hear("A")
     for n in range(10):
         rig.bus.publish("A", bytes([n]))
-    counts = []
+    counts: list[int] = []
     end = time.monotonic() + PATIENCE_S
     while sum(counts) < 10 and time.monotonic() < end:
         before = len(rig.heard)

@@ -56,7 +56,7 @@ gps = st.builds(
     speed_sigma=number,
     course=number,
     course_sigma=number,
-    heading=number,
+    baseline_yaw=number,
 )
 imu = st.builds(
     ImuSample,

@@ -37,7 +37,7 @@ class Daemon:
 
     def platform(self, **options: Any) -> Platform:
         """A client with more patience than one outside tests needs."""
-        options = {"timeout": PATIENCE_S, "retries": 0, "name": "test"} | options
+        options = dict[str, Any](timeout=PATIENCE_S, retries=0, name="test") | options
         self._platforms.append(Platform(self.url, **options))
         return self._platforms[-1]
 

@@ -425,13 +425,14 @@ def test_given_a_daemon_that_was_stopped_then_missed_ticks_are_counted_and_no_po
         # while it stands, time passes: 0.6 s are 30 ticks
         daemon.platform(timeout=0.6).get_body_list()
     listener = Listener(daemon.url, "POSE")
+    continued = time.monotonic()
     daemon.process.send_signal(signal.SIGCONT)
     after = daemon.health(lambda health: health.ticks_missed >= before.ticks_missed + 25)
     assert after.tick_lateness_max >= 0.5
     while listener.bus.handle_timeout(0):
         pass
     utimes = [decode("pose_transform_t", data).transformation.utime for data in listener.heard]
-    assert len(utimes) <= 15  # health is due every 50 ms: a few ticks after the pause
+    assert len(utimes) <= 2 + (time.monotonic() - continued) / 0.02
     assert all(b - a >= 5_000 for a, b in itertools.pairwise(utimes))
     assert answers_well(daemon)
 
@@ -553,7 +554,12 @@ def test_given_a_flood_of_samples_then_requests_are_answered_and_poses_go_on(sta
     daemon = start_daemon()
     at = daemon.fed()
     samples = [encode(imu(at + n)) for n in range(1, 5001)]
-    flood = threading.Thread(target=lambda: [daemon.publish("IMU", data) for data in samples])
+
+    def publish_all() -> None:
+        for data in samples:
+            daemon.publish("IMU", data)
+
+    flood = threading.Thread(target=publish_all)
     flood.start()
     platform = daemon.platform()
     answered = [platform.get_body_list() for _ in range(20)]

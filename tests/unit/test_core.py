@@ -48,7 +48,7 @@ from modelserver.messages import (
 from modelserver.wire.codec import encode
 
 S = 1_000_000
-REQUESTS = [
+REQUESTS: list[Any] = [
     GetTransformation(ME, "Camera:Origin", "Cart:Base"),
     GetTransformation(ME, "Camera:Origin", "World:UTM"),
     GetBodyList(ME),

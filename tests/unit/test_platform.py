@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -96,9 +97,10 @@ def test_given_the_base_frame_then_its_world_pose_is_the_localizers_own() -> Non
         answer = ask(platform, BASE, world)
         assert answer.transformation.pose == pose
         assert answer.transformation.utime == START + 10 * S
-        assert answer.transformation.origin_id == ORIGIN.origin_id
         assert answer.transformation.model_revision == platform.model.revision
-        assert answer.origin == ORIGIN
+        # Odom has no place on earth
+        assert answer.origin == (None if world == ODOM else ORIGIN)
+        assert answer.transformation.origin_id == (0 if world == ODOM else ORIGIN.origin_id)
 
 
 def test_given_two_world_frames_then_their_relation_is_that_at_the_vehicle() -> None:
@@ -118,6 +120,37 @@ def test_given_a_frame_in_itself_then_it_is_exact_even_without_a_pose(world: str
     covariance = answer.transformation.covariance
     assert covariance is not None
     assert not covariance.any()
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_given_a_rolling_frame_then_the_estimates_are_of_it_and_the_base_frame_is_mounted_on_it(world: str) -> None:
+    plain = view()
+    platform = PlatformView(plain.model, BASE, plain.localizer, plain.history, MAST)
+    rolling, base = ask(platform, MAST, world), ask(platform, BASE, world)
+    assert rolling.transformation.pose == ask(plain, BASE, world).transformation.pose
+    mounted = cart().get_transformation(BASE, MAST).pose
+    assert base.transformation.pose.is_close(rolling.transformation.pose @ mounted)
+    published = platform.broadcast(platform.history.newest, world)
+    assert published.transformation.frame_of_interest == BASE
+    assert published.transformation.pose == base.transformation.pose
+    covariance = published.transformation.covariance
+    assert covariance is not None
+    assert np.array_equal(covariance, base.transformation.covariance)
+
+
+def test_given_bounds_then_they_stand_beside_the_base_frame_in_the_world_alone() -> None:
+    platform = view()
+    for pair in ((BASE, UTM), (ENU, BASE)):
+        answer = ask(platform, *pair)
+        assert (answer.horizontal_bound, answer.heading_bound) == (1.5, 0.1)
+    for pair in ((CAMERA, UTM), (BASE, ODOM), (ODOM, BASE), (ENU, UTM), (CAMERA, BASE)):
+        answer = ask(platform, *pair)
+        assert math.isnan(answer.horizontal_bound)
+        assert math.isnan(answer.heading_bound)
+    # a heading error swings the base frame about the rolling frame
+    swung = ask(PlatformView(platform.model, BASE, platform.localizer, platform.history, MAST), BASE, UTM)
+    assert 1.5 < swung.horizontal_bound <= 1.5 + 0.1 * 1.2
+    assert swung.heading_bound == 0.1
 
 
 # --- covariance ---------------------------------------------------------------------------------------------

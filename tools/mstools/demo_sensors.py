@@ -27,10 +27,7 @@ LAP_SECONDS = 25.0
 
 
 def simulation(config: VehicleConfig, start_utime: int, seconds: float, seed: int) -> Simulation:
-    """Return the drive: two seconds at rest, then round an eight for `seconds` or more.
-
-    The base frame is the point that does not slide sideways, which is what raw mode takes it for.
-    """
+    """Return the drive: two seconds at rest, then round an eight for `seconds` or more."""
     laps = math.ceil(seconds / LAP_SECONDS)
     sensors = config.sensors
     return Simulation(
@@ -41,6 +38,7 @@ def simulation(config: VehicleConfig, start_utime: int, seconds: float, seed: in
         gps_frame=sensors.gps.frame if sensors.gps else None,
         imu_frame=sensors.imu.frame if sensors.imu else None,
         wheel_frames=sensors.wheels.frames if sensors.wheels else None,
+        rolling_frame=config.rolling_frame or config.base_frame,
         seed=seed,
         start_utime=start_utime,
     )

@@ -227,12 +227,31 @@ def test_gravity_is_read_from_the_device_whatever_its_reference_and_mount(roll, 
     R_world_base = Rotation.from_euler("xyz", [roll, pitch, yaw])
     R_base_imu = Rotation.from_quat(MOUNTS.X_base_imu.wxyz, scalar_first=True)
     R = R_world_base * R_base_imu
+    force = tuple(R.inv().apply([0.0, 0.0, 9.8]))
     if reference == OrientationReference.NED:
         R = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]]) * R
-    sample = inertial(orientation=tuple(R.as_quat(scalar_first=True)), orientation_reference=reference)
+    sample = inertial(
+        orientation=tuple(R.as_quat(scalar_first=True)), orientation_reference=reference, specific_force=force
+    )
     found = read(sample, MOUNTS.X_base_imu)
     assert found.up == pytest.approx(tuple(R_world_base.inv().apply([0, 0, 1])), abs=1e-9)
     assert found.rate == pytest.approx(tuple(R_base_imu.apply([0.1, 0.2, 0.3])), abs=1e-12)
+
+
+def test_a_device_whose_vertical_contradicts_its_specific_force_is_refused():
+    # the right orientation of a level vehicle, said to be against the wrong reference: upside down
+    R = Rotation.from_quat(MOUNTS.X_base_imu.wxyz, scalar_first=True)
+    force = tuple(R.inv().apply([0.0, 0.0, 9.8]))
+    level = tuple(R.as_quat(scalar_first=True))
+    right = inertial(orientation=level, orientation_reference=OrientationReference.ENU, specific_force=force)
+    wrong = replace(right, orientation_reference=OrientationReference.NED)
+    assert read(right, MOUNTS.X_base_imu).up == pytest.approx((0.0, 0.0, 1.0))
+    assert read(wrong, MOUNTS.X_base_imu) == "orientation"
+    # hard braking tilts the force, but not that far; a shock is not near g and says nothing of where up is
+    braking = tuple(R.inv().apply([-6.0, 0.0, 9.8]))
+    assert read(replace(right, specific_force=braking), MOUNTS.X_base_imu).up is not None
+    shock = tuple(R.inv().apply([0.0, 0.0, -30.0]))
+    assert read(replace(right, specific_force=shock), MOUNTS.X_base_imu).up is not None
 
 
 @pytest.mark.parametrize("q", [(0.0,) * 4, (math.nan,) * 4, (2.0, 0.0, 0.0, 0.0)])

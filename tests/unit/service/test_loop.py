@@ -286,7 +286,7 @@ def test_given_random_bytes_on_any_channel_then_they_are_counted_and_the_next_go
     rig = Rig()
     good = {"GPS": encode(gps(START)), "IMU": encode(imu(START))}.get(channel) or encode(
         next(
-            kind(ME, *values)  # type: ignore[call-arg]
+            kind(ME, *values)
             for kind, values in (
                 (GetTransformation, ("Camera:Origin", "World:UTM")),
                 (GetBodyList, ()),
