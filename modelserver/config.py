@@ -144,7 +144,7 @@ class OriginConfig:
 class LimitsConfig:
     """What the server holds and does at most, so that strangers cannot starve the pose.
 
-    history_s: seconds of poses held for questions about the past.
+    history_s: seconds of poses held, at most 600, for questions about the past.
     parked_requests: requests that may wait for data at once. wait_ms: the longest wait granted, milliseconds.
     queued_requests: requests held between two passes of the loop; more are refused and counted.
     requests_per_pass: requests answered before sensors are looked at again.
@@ -158,8 +158,8 @@ class LimitsConfig:
     requests_per_pass: int = 16
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.history_s <= 3600.0:
-            raise ValueError(f"history_s is above 0 and at most 3600, got {self.history_s:g}")
+        if not 0.0 < self.history_s <= 600.0:
+            raise ValueError(f"history_s is above 0 and at most 600, got {self.history_s:g}")
         for name, low, high in (
             ("parked_requests", 0, 4096),
             ("wait_ms", 0, 60_000),

@@ -56,6 +56,9 @@ from modelserver.version import __version__
 FUTURE_LIMIT_S: Final = 1.0
 """A sample stamped this far ahead of the host's clock is refused: one of the two clocks is wrong."""
 
+HISTORY_STEP_US: Final = 4000
+"""Microseconds between the estimates held, at least: a flood of samples must not fill the memory."""
+
 MAX_COUNTERS: Final = 256
 """Distinct causes of rejection that are told apart; further ones are counted together."""
 
@@ -186,7 +189,9 @@ def _sample(state: CoreState, sample: Sample, now: Instant) -> Step:
         return state, tuple(outputs)
     # before the first sample that can be used there is no time that an estimate could hold for
     moved = localizer.utime and isinstance(sample, (GpsSample, ImuSample))
-    history = state.history.extended(localizer.estimate(localizer.utime)) if moved else state.history
+    history = state.history
+    if moved and (not len(history) or not 0 < localizer.utime - history.last < HISTORY_STEP_US):
+        history = history.extended(localizer.estimate(localizer.utime))
     state = state._replace(view=replace(state.view, localizer=localizer, history=history))
     if moved:
         # a part may be refused of a sample that moves time on all the same
@@ -349,19 +354,19 @@ def _ok(state: CoreState, request: Request, now: Instant) -> ReplyHeader:
 
 
 def _get_transformation(state: CoreState, request: GetTransformation, now: Instant) -> Reply:
-    found = state.view.transformation(request.frame_of_interest, request.frame_of_reference, request.time)
+    found = state.view.transformation(request.frame_of_interest, request.frame_of_reference, request.time, now.utime)
     return TransformReply(_ok(state, request, now), found)
 
 
 def _get_h_transform(state: CoreState, request: GetHTransform, now: Instant) -> Reply:
     ends = (state.settings.base_frame, names.WORLD_UTM)
     interest, reference = reversed(ends) if request.inverse else ends
-    found = state.view.transformation(interest, reference, request.time)
+    found = state.view.transformation(interest, reference, request.time, now.utime)
     return TransformReply(_ok(state, request, now), found)
 
 
 def _get_state_vector(state: CoreState, request: GetStateVector, now: Instant) -> Reply:
-    return StateVectorReply(_ok(state, request, now), state.view.vehicle_pose(request.time))
+    return StateVectorReply(_ok(state, request, now), state.view.vehicle_pose(request.time, now.utime))
 
 
 def _get_history(state: CoreState, request: GetHistory, now: Instant) -> Reply:

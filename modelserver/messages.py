@@ -255,7 +255,8 @@ class RequestHeader(NamedTuple):
 
     def is_answerable(self, prefix: str) -> bool:
         """Return whether a server may speak on the reply channel: within its prefix, plain, not too long."""
-        return _is_answerable(self.reply_channel, prefix)
+        # the length first: what is looked up is kept
+        return len(self.reply_channel) <= MAX_CHANNEL_LENGTH and _is_answerable(self.reply_channel, prefix)
 
 
 MAX_CHANNEL_LENGTH = 63
@@ -266,11 +267,7 @@ _PLAIN_NAME = re.compile(r"[A-Za-z0-9_]+")
 
 @lru_cache(maxsize=1024)
 def _is_answerable(channel: str, prefix: str) -> bool:
-    return (
-        len(prefix) < len(channel) <= MAX_CHANNEL_LENGTH
-        and channel.startswith(prefix)
-        and _PLAIN_NAME.fullmatch(channel) is not None
-    )
+    return len(channel) > len(prefix) and channel.startswith(prefix) and _PLAIN_NAME.fullmatch(channel) is not None
 
 
 class TimeQuery(NamedTuple):

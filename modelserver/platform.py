@@ -8,7 +8,7 @@ localization works out for each world frame by geodesy at the vehicle's position
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -28,7 +28,7 @@ from modelserver.geometry import names
 from modelserver.geometry.model import Model
 from modelserver.history import History, at_time
 from modelserver.localization.interface import Localizer
-from modelserver.messages import NAN, Estimate, Invalid, Policy, PoseAnswer, Quality, TimeQuery
+from modelserver.messages import NAN, VALID, Estimate, Invalid, Policy, PoseAnswer, Quality, TimeQuery
 from modelserver.spatial import covariance as cov
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array
@@ -61,8 +61,13 @@ class PlatformView:
         if not self.rolling_frame:
             object.__setattr__(self, "rolling_frame", self.base_frame)
 
-    def transformation(self, frame_of_interest: str, frame_of_reference: str, time: TimeQuery) -> PoseAnswer:
-        """Return where a frame is in another. Raises QueryError, each kind for its own cause."""
+    def transformation(
+        self, frame_of_interest: str, frame_of_reference: str, time: TimeQuery, now: int = 0
+    ) -> PoseAnswer:
+        """Return where a frame is in another. Raises QueryError, each kind for its own cause.
+
+        `now` is the utime at which it is asked: the latest pose is not valid where the sensors are silent since long.
+        """
         interest = frame_of_interest in WORLD_FRAMES
         reference = frame_of_reference in WORLD_FRAMES
         if not interest and not reference:
@@ -73,7 +78,7 @@ class PlatformView:
                 self._check_carried(frame)
         if frame_of_interest == frame_of_reference:
             return PoseAnswer(Transformation(frame_of_interest, frame_of_reference, Pose.identity(), _ZERO))
-        estimate = self.estimate(time)
+        estimate = self.estimate(time, now)
         if interest and reference:
             X_RB = _pose_in(frame_of_reference, estimate)
             X_IB = _pose_in(frame_of_interest, estimate)
@@ -86,9 +91,9 @@ class PlatformView:
             covariance = None if forth_cov is None else cov.invert(forth, forth_cov)
         return self._answer(frame_of_interest, frame_of_reference, pose, covariance, estimate)
 
-    def vehicle_pose(self, time: TimeQuery, world: str = names.WORLD_UTM) -> PoseAnswer:
-        """Return the base frame's pose in a world frame. Raises QueryError."""
-        return self.transformation(self.base_frame, world, time)
+    def vehicle_pose(self, time: TimeQuery, now: int = 0) -> PoseAnswer:
+        """Return the base frame's pose in World:UTM; as `transformation`."""
+        return self.transformation(self.base_frame, names.WORLD_UTM, time, now)
 
     def vehicle_history(self, start_utime: int, end_utime: int, rate_hz: float) -> tuple[PoseAnswer, ...]:
         """Return the base frame's poses in World:UTM at an even rate; times not held are left out.
@@ -114,12 +119,14 @@ class PlatformView:
                     answers.append(self.broadcast(estimate, names.WORLD_UTM))
         return tuple(answers)
 
-    def estimate(self, time: TimeQuery) -> Estimate:
-        """Return the vehicle's estimate for a time. Raises NoPoseError, TooOldError, TooNewError."""
+    def estimate(self, time: TimeQuery, now: int = 0) -> Estimate:
+        """Return the vehicle's estimate for a time, asked at `now`. Raises NoPoseError, TooOldError, TooNewError."""
         if self.localizer is None or not len(self.history):
             raise self._no_pose()
         if time.at == 0 or time.policy is Policy.LATEST:
-            return self.history.newest
+            newest = self.history.newest
+            silent = self.localizer.estimate(now).invalid & _STALE if now > newest.utime else VALID
+            return newest if silent in newest.invalid else replace(newest, invalid=newest.invalid | silent)
         if time.policy is Policy.HELD:
             held = self.history.held(time.at)
             if held.utime == time.at:
@@ -218,6 +225,8 @@ class PlatformView:
 _ZERO = np.zeros((6, 6))
 _ODOM_INVALID = Invalid.NO_IMU | Invalid.STALE_IMU | Invalid.CLOCK_STEPPED
 """What speaks against a pose in Odom: it needs no fix and no origin."""
+
+_STALE = Invalid.STALE_GPS | Invalid.STALE_IMU
 
 _POSE_IN = {
     names.WORLD_UTM: lambda estimate: estimate.utm,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import struct
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -22,7 +21,6 @@ from modelserver.messages import (
     PublishPose,
     Rejected,
     Request,
-    RequestHeader,
     SendReply,
     Tick,
 )
@@ -31,7 +29,7 @@ from modelserver.service.clock import Clock
 from modelserver.service.log import RateLimited
 from modelserver.wire.channels import BY_NAME, REQUESTS
 from modelserver.wire.codec import decode, encode
-from modelserver.wire.packed import read_text
+from modelserver.wire.requests import request_header
 from modelserver.wire.timeless import TimelessReplies
 
 log = logging.getLogger(__name__)
@@ -170,7 +168,7 @@ class Loop:
             request = decode(type_name, data)
         except Exception as error:
             self._failed(channel, error)
-            header = _request_header(data) if isinstance(error, WireError) and error.reason == "malformed" else None
+            header = request_header(data) if isinstance(error, WireError) and error.reason == "malformed" else None
             if header is not None:
                 kind = _REQUEST_KINDS[type_name]
                 self._send(core.turn_back(self.state, kind, header, str(error), now))
@@ -230,15 +228,6 @@ class Loop:
             "N" if origin.north else "S",
         )
         self._on_origin(output)
-
-
-def _request_header(data: bytes) -> RequestHeader | None:
-    """Return the header that every request begins with, None where not even that can be read."""
-    try:
-        channel, _ = read_text(data, 16)
-    except (WireError, struct.error):
-        return None
-    return RequestHeader(int.from_bytes(data[8:16], "big", signed=True), channel)
 
 
 _REQUEST_KINDS: Mapping[str, type[Request]] = {BY_NAME[channel].type_name: kind for kind, channel in CHANNEL_OF.items()}

@@ -8,11 +8,15 @@ from dataclasses import dataclass
 
 from modelserver.service.clock import Clock
 from modelserver.wire.eventlog import LogEvent
+from modelserver.wire.restamp import restamped
 
 
 @dataclass(slots=True)
 class Player:
-    """Publishes events `speed` times as fast as they were recorded (infinite: at once), bytes unchanged.
+    """Publishes events `speed` times as fast as they were recorded (infinite: at once).
+
+    Bytes go out unchanged; with `restamp` the stamps of sensor samples are moved by what the log is older than now,
+    so that to a daemon the sensors speak now.
 
     Each event has an absolute deadline on the monotonic clock, counted from the first, so delays do not add up.
     Where the log's time steps back, it goes on at once from there. The counts hold what was done so far, also
@@ -23,6 +27,7 @@ class Player:
     speed: float
     clock: Clock
     sleep: Callable[[float], object]
+    restamp: bool = False
     sent: int = 0
     late: float = 0.0
     first_utime: int = 0
@@ -30,10 +35,11 @@ class Player:
 
     def play(self, events: Iterable[LogEvent], seen: Callable[[LogEvent], object] = lambda event: None) -> None:
         """Publish all events; `seen` is told of each that was sent."""
-        start_ns, start_utime = self.clock.monotonic_ns(), 0
+        start_ns, start_utime, shift = self.clock.monotonic_ns(), 0, 0
         for event in events:
             if not self.sent:
                 self.first_utime = start_utime = event.utime
+                shift = self.clock.now().utime - event.utime
             elif event.utime < self.last_utime:
                 start_ns, start_utime = self.clock.monotonic_ns(), event.utime
             if not math.isinf(self.speed):
@@ -43,7 +49,7 @@ class Player:
                     self.sleep(wait)
                 else:
                     self.late = max(self.late, -wait)
-            self.publish(event.channel, event.data)
+            self.publish(event.channel, restamped(event.data, shift) if self.restamp else event.data)
             self.sent += 1
             self.last_utime = event.utime
             seen(event)

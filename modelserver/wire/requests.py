@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from modelserver.errors import Status
+import struct
+
+from modelserver.errors import Status, WireError
 from modelserver.messages import (
     GetBodyFrameList,
     GetBodyList,
@@ -15,6 +17,7 @@ from modelserver.messages import (
     TimeQuery,
 )
 from modelserver.wire import fields
+from modelserver.wire.packed import read_text
 from mslcm.get_body_frame_list_request_t import get_body_frame_list_request_t
 from mslcm.get_body_list_request_t import get_body_list_request_t
 from mslcm.get_h_transform_request_t import get_h_transform_request_t
@@ -24,6 +27,15 @@ from mslcm.name_list_reply_t import name_list_reply_t
 from mslcm.reply_header_t import reply_header_t
 from mslcm.request_header_t import request_header_t
 from mslcm.time_query_t import time_query_t
+
+
+def request_header(data: bytes) -> RequestHeader | None:
+    """Return the header that every request begins with, None where not even that can be read."""
+    try:
+        channel, _ = read_text(data, 16)
+    except (WireError, struct.error):
+        return None
+    return RequestHeader(int.from_bytes(data[8:16], "big", signed=True), channel)
 
 
 def _header(message: request_header_t) -> RequestHeader:

@@ -586,3 +586,13 @@ def test_given_an_old_state_then_it_can_be_carried_on_again_with_the_same_result
         assert first[0].reply.answer.transformation.utime == START + 2 * S
     assert old.history.last == START + S
     assert dict(old.rejected) == {}
+
+
+def test_given_a_flood_of_samples_then_estimates_are_held_at_intervals() -> None:
+    run = Run()
+    for n in range(1000):
+        run.samples(n * 0.0005)
+    held = len(run.state.history)
+    assert held == pytest.approx(500_000 / core.HISTORY_STEP_US, abs=1)
+    assert run.state.localizer is not None
+    assert run.state.localizer.utime - run.state.history.last < core.HISTORY_STEP_US

@@ -419,3 +419,17 @@ def test_given_more_poses_than_go_in_a_reply_then_the_limit_is_named() -> None:
     for end in (START + HISTORY_LIMIT * 1000, (1 << 61) - 1):
         with pytest.raises(LimitError, match="at most 1000"):
             platform.vehicle_history(START, end, 1000.0)
+
+
+def test_given_sensors_that_went_silent_then_the_latest_pose_is_not_valid_any_more() -> None:
+    platform = view(10)
+    newest = START + 10 * S
+    soon = platform.transformation(BASE, UTM, NOW, newest + 100_000)
+    assert soon.transformation.valid
+    late = platform.transformation(BASE, UTM, NOW, newest + 600 * S)
+    assert late.transformation.utime == newest
+    assert Invalid.STALE_IMU in Invalid(late.transformation.invalid_reasons)
+    assert late.transformation.pose == soon.transformation.pose
+    # a question about a time is about that time, whenever it is asked
+    then = platform.transformation(BASE, UTM, TimeQuery(newest - S), newest + 600 * S)
+    assert then.transformation.valid

@@ -8,6 +8,7 @@ from typing import Annotated, Protocol
 import typer
 
 from modelserver.errors import ModelServerError
+from modelserver.geometry import names
 from modelserver.messages import Policy, PoseAnswer
 from mstools.options import parse_variables
 from mstools.output import print_problem
@@ -20,7 +21,8 @@ UrlOption = Annotated[
 ]
 PrefixOption = Annotated[str, typer.Option("--prefix", metavar="TEXT", help="Channel prefix of the vehicle.")]
 TimeoutOption = Annotated[
-    float, typer.Option("--timeout", metavar="SECONDS", min=0.01, help="How long one try waits for the daemon.")
+    float,
+    typer.Option("--timeout", metavar="SECONDS", min=0.01, max=3600.0, help="How long one try waits for the daemon."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
 
@@ -71,7 +73,8 @@ class FileAnswers:
         wait_ms: int = 0,
     ) -> PoseAnswer:
         """Return where one frame is in another; time plays no part."""
-        if "World" in (frame_of_interest.partition(":")[0], frame_of_reference.partition(":")[0]):
+        asked = {frame.partition(":")[0] for frame in (frame_of_interest, frame_of_reference)}
+        if not asked.isdisjoint(names.RESERVED_BODIES):
             raise ModelServerError("a geometry file does not know where the vehicle is in the world; ask the daemon")
         return PoseAnswer(self._model.get_transformation(frame_of_interest, frame_of_reference))
 

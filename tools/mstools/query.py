@@ -61,11 +61,11 @@ def _utime(text: str) -> int:
         return int(text)
     try:
         when = datetime.fromisoformat(text)
-    except ValueError:
+        return round((when if when.tzinfo else when.astimezone()).timestamp() * 1e6)
+    except (ValueError, OverflowError, OSError):
         raise typer.BadParameter(
             f"{text!r} is neither microseconds since 1970 nor a time like 2026-11-21T08:30:00.5Z", param_hint="--at"
         ) from None
-    return round((when if when.tzinfo else when.astimezone()).timestamp() * 1e6)
 
 
 def describe(answer: PoseAnswer, matrix: bool = False) -> str:

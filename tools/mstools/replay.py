@@ -38,6 +38,9 @@ def command(
     speed: Annotated[
         str, typer.Option(metavar="N", help="Times as fast as recorded; max: as fast as possible. On the bus only.")
     ] = "1",
+    restamp: Annotated[
+        bool, typer.Option("--restamp", help="Move the stamps of samples to now, as if the sensors spoke now.")
+    ] = False,
     channel: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Only this channel; may be given again.")
     ] = None,
@@ -46,13 +49,15 @@ def command(
 ) -> None:
     """Feed a recorded log to the bus, or straight through the localization.
 
-    Onto the bus, messages go out unchanged at the pace of their arrival. Offline, with --poses, the daemon's core
-    takes them as fast as it can, and the pose of one frame in World:UTM is written for even or listed times, each
-    from nothing but what had arrived before it; docs/recordings.md says exactly what that means. A log that breaks
-    off in its last event is used up to there; for other damage the exit code is 1.
+    Onto the bus, messages go out at the pace of their arrival, unchanged; a daemon that publishes by timer takes
+    samples of another day for stale, so give it --restamp, or publish.mode: event in its vehicle file. Offline, with
+    --poses, the daemon's core takes them as fast as it can, and the pose of one frame in World:UTM is written for
+    even or listed times, each from nothing but what had arrived before it; docs/recordings.md says exactly what that
+    means. A log that breaks off in its last event is used up to there; for other damage the exit code is 1.
 
     \b
     Examples:
+      modelserver replay drive.lcm --restamp
       modelserver replay drive.lcm --speed 2
       modelserver replay drive.lcm -c config/husky/vehicle.yaml --poses poses.csv --frame Antenna:PhaseCentre --rate 10
     """
@@ -66,10 +71,21 @@ def command(
     else:
         if frame or at_times is not None:
             raise typer.BadParameter("--frame and --at-times go with --poses CSV")
-        to_bus(log, config, _speed(speed), channels, url, as_json)
+        factor = _speed(speed)
+        if restamp and factor != 1.0:
+            raise typer.BadParameter("--restamp goes with --speed 1: stamps must not run faster than the clock")
+        to_bus(log, config, factor, channels, url, as_json, restamp)
 
 
-def to_bus(log: Path, config: Path | None, speed: float, channels: frozenset[str], url: str, as_json: bool) -> None:
+def to_bus(
+    log: Path,
+    config: Path | None,
+    speed: float,
+    channels: frozenset[str],
+    url: str,
+    as_json: bool,
+    restamp: bool = False,
+) -> None:
     """Send a log on the bus."""
     from modelserver.config import load_config
     from modelserver.service.clock import SystemClock
@@ -80,7 +96,7 @@ def to_bus(log: Path, config: Path | None, speed: float, channels: frozenset[str
         url = load_config(config).lcm.url
     with LogFile(log) as recording:
         bus = open_lcm(resolve_url(url))
-        player = Player(bus.publish, speed, SystemClock(), time.sleep)
+        player = Player(bus.publish, speed, SystemClock(), time.sleep, restamp)
         try:
             with progress(f"replaying {log.name}", recording.size) as show:
                 shown_at = 0.0

@@ -160,10 +160,10 @@ def test_given_samples_and_requests_waiting_then_samples_are_handled_first() -> 
     rig = Rig()
     rig.send(GetStateVector(ME))
     for n in range(50):
-        rig.send(imu(START - S + n))
+        rig.send(imu(START - S + n * 10_000))
     rig.turns(1)
     (data,) = rig.bus.said("REPLY_TEST")
-    assert decode("get_state_vector_reply_t", data).answer.transformation.utime == START - S + 49
+    assert decode("get_state_vector_reply_t", data).answer.transformation.utime == START - S + 490_000
 
 
 def test_given_more_requests_than_the_budget_then_each_pass_answers_that_many() -> None:
