@@ -7,24 +7,17 @@ once: file, line, key, what is wrong, and for a mistyped key the nearest known o
 from __future__ import annotations
 
 import dataclasses
-import json
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args, get_type_hints
+from typing import ClassVar, Literal
 
-import yaml
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict
 
-from modelserver.errors import ConfigError, Problem, Severity, Source, nearest_names, shown
+from modelserver import config_reader
+from modelserver.errors import shown
 from modelserver.localization.settings import RawSettings
 
 _STRICT: ConfigDict = {"extra": "forbid", "allow_inf_nan": False}
-
-MAX_FILE_BYTES = 1 << 20
-
-MAX_DEPTH = 16
-"""No section nests deeper than 3. PyYAML's composer calls itself for each level, in C, and would end the process."""
 
 MAX_CHANNEL = 39
 """Characters of a sensor's channel: LCM takes 63, and a prefix has up to 24."""
@@ -203,7 +196,7 @@ def load_config(path: str | Path) -> VehicleConfig:
     """
     path = Path(path)
     with path.open("rb") as file:
-        raw = file.read(MAX_FILE_BYTES + 1)
+        raw = file.read(config_reader.MAX_BYTES + 1)
     config = parse_config(raw, str(path))
 
     def absolute(given: str) -> str:
@@ -218,139 +211,4 @@ def load_config(path: str | Path) -> VehicleConfig:
 
 def parse_config(raw: bytes, name: str = "") -> VehicleConfig:
     """Check the bytes of a vehicle file called `name`. Raises ConfigError with every problem."""
-    if len(raw) > MAX_FILE_BYTES:
-        raise _one(name, 0, f"the file is larger than {MAX_FILE_BYTES >> 20} MiB", "is this the vehicle file?")
-    try:
-        _check_shape(raw, name)
-        node = yaml.compose(raw, Loader=yaml.CSafeLoader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        what = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise _one(name, mark.line + 1 if mark else 0, f"not YAML: {what}", "check indentation and quotes") from None
-    except UnicodeDecodeError:
-        raise _one(name, 0, "not text in UTF-8", "is this the vehicle file?") from None
-    if not isinstance(node, yaml.MappingNode):
-        raise _one(name, 1, "the file is empty or no mapping", "start with: vehicle, geometry, base_frame")
-    reader = _Reader(name)
-    values = reader.value(node, ())
-    if reader.problems:
-        raise ConfigError(reader.problems)
-    try:
-        # by way of JSON: strict there means that "4" is no number, while a mapping still makes a section
-        return TypeAdapter(VehicleConfig).validate_json(json.dumps(values, default=str), strict=True)
-    except ValidationError as error:
-        raise ConfigError(reader.explain(detail) for detail in error.errors()) from None
-
-
-Path_ = tuple[str | int, ...]
-
-
-class _Reader:
-    """Turns YAML nodes into plain values, and remembers the line of each."""
-
-    def __init__(self, name: str):
-        self.name = name
-        self.lines: dict[Path_, int] = {}
-        self.problems: list[Problem] = []
-
-    def value(self, node: yaml.Node, at: Path_) -> Any:
-        self.lines.setdefault(at, node.start_mark.line + 1)
-        if isinstance(node, yaml.MappingNode):
-            values: dict[str, Any] = {}
-            for key_node, value_node in node.value:
-                if not isinstance(key_node, yaml.ScalarNode):
-                    self.lines[(*at, "?")] = key_node.start_mark.line + 1
-                    self.problem((*at, "?"), "a key is a name, not a list or a mapping", "write name: value")
-                    continue
-                key = str(key_node.value)
-                if key in values:
-                    first = self.lines[(*at, key)]
-                    self.lines[(*at, key)] = key_node.start_mark.line + 1
-                    self.problem((*at, key), f"{key} is given twice (first on line {first})", "remove one")
-                    continue
-                self.lines[(*at, key)] = key_node.start_mark.line + 1
-                value = self.value(value_node, (*at, key))
-                # a key with nothing after it counts as left out, as when all of a section is commented out
-                if value is not None:
-                    values[key] = value
-            return values
-        if isinstance(node, yaml.SequenceNode):
-            return [self.value(each, (*at, index)) for index, each in enumerate(node.value)]
-        return _scalar(node)
-
-    def problem(self, at: Path_, message: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
-        self.problems.append(Problem(Severity.ERROR, message, self.place(at), fix, nearest))
-
-    def place(self, at: Path_) -> Source:
-        line = next((self.lines[at[:n]] for n in range(len(at), -1, -1) if at[:n] in self.lines), 0)
-        return Source(self.name, line, ".".join(map(str, at)))
-
-    def explain(self, detail: Any) -> Problem:
-        """Turn one of pydantic's findings into a problem with its line and the nearest key."""
-        at: Path_ = tuple(detail["loc"])
-        if detail["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-            known = _known_keys(at[:-1])
-            near = nearest_names(str(at[-1]), known)
-            fix = f"write {near[0]}" if near else f"known here: {', '.join(known)}"
-            return Problem(Severity.ERROR, f"unknown key {shown(str(at[-1]))}", self.place(at), fix, near)
-        if detail["type"] == "missing" and isinstance(at[-1], int):
-            at = at[:-1]
-            return Problem(Severity.ERROR, f"{at[-1]} has too few numbers", self.place(at))
-        if detail["type"] == "missing":
-            return Problem(Severity.ERROR, f"{at[-1]} is missing", self.place(at), f"add a line: {at[-1]}: ...")
-        message = str(detail["msg"]).removeprefix("Value error, ")
-        got = detail.get("input")
-        if detail["type"] == "value_error":
-            # found by the section as a whole; the message begins with the key that it is about
-            key = message.partition(" ")[0]
-            at = (*at, key) if (*at, key) in self.lines else at
-        elif detail["type"] in ("dataclass_type", "dict_type"):
-            message = "expected a mapping (key: value, one a line)"
-        if detail["type"] != "value_error" and isinstance(got, (str, int, float, bool)):
-            message += f", got {shown(str(got))}"
-        if len(message) > 240:
-            message = f"{message[:240]}..."
-        return Problem(Severity.ERROR, message[:1].lower() + message[1:], self.place(at), "")
-
-
-_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+", re.ASCII)
-"""Numbers such as 1e-3, which YAML 1.1 takes for text."""
-
-
-def _scalar(node: yaml.Node) -> Any:
-    if isinstance(node, yaml.ScalarNode) and not node.style and _EXPONENT.fullmatch(node.value):
-        return float(node.value)
-    loader = yaml.CSafeLoader("")
-    try:
-        return loader.construct_object(node, deep=True)
-    except (yaml.YAMLError, ValueError):
-        return str(node.value)
-
-
-def _known_keys(at: Path_) -> list[str]:
-    """Return the keys known at a place in the file."""
-    kind: Any = VehicleConfig
-    for step in at:
-        hints = get_type_hints(kind) if dataclasses.is_dataclass(kind) else {}
-        kind = hints.get(str(step))
-        kind = next((each for each in (kind, *get_args(kind)) if dataclasses.is_dataclass(each)), None)
-    return [each.name for each in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
-
-
-def _check_shape(raw: bytes, name: str) -> None:
-    """Raise ConfigError for what no vehicle file has and the composer cannot bear: deep nesting, aliases of aliases."""
-    depth = 0
-    for event in yaml.parse(raw, Loader=yaml.CSafeLoader):
-        line = event.start_mark.line + 1 if event.start_mark else 0
-        if isinstance(event, yaml.CollectionStartEvent):
-            depth += 1
-            if depth > MAX_DEPTH:
-                raise _one(name, line, "nested too deeply", "look for brackets that are not closed")
-        elif isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
-        elif isinstance(event, yaml.AliasEvent):
-            raise _one(name, line, f"aliases (*{event.anchor}) are not read here", "write the value again")
-
-
-def _one(name: str, line: int, message: str, fix: str) -> ConfigError:
-    return ConfigError([Problem(Severity.ERROR, message, Source(name, line), fix)])
+    return config_reader.read(raw, name, VehicleConfig)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import random
 import re
 from contextlib import suppress
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 from support_samples import VEHICLE, write_vehicle
 
-from modelserver.config import MAX_FILE_BYTES, VehicleConfig, load_config, parse_config
+from modelserver.config import VehicleConfig, load_config, parse_config
+from modelserver.config_reader import MAX_BYTES
 from modelserver.errors import ConfigError, Problem, Severity
+from modelserver.localization.settings import RawSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 BASE = "vehicle: v\ngeometry: g.yaml\nbase_frame: A:B\n"
@@ -258,7 +262,7 @@ def test_given_two_sensors_on_one_channel_then_it_is_refused() -> None:
         (b"a: " + b"[" * 100_000, "nested too deeply"),
         (b"a: " + b"{a: " * 100_000, "nested too deeply"),
         (b"\n".join(b" " * n + b"a:" for n in range(300)), "nested too deeply"),
-        (b"a: " + b"x" * MAX_FILE_BYTES, "larger than 1 MiB"),
+        (b"a: " + b"x" * MAX_BYTES, "larger than 1 MiB"),
     ],
 )
 def test_given_bytes_that_are_no_vehicle_file_then_one_clear_problem(text: bytes, message: str) -> None:
@@ -297,3 +301,29 @@ def test_given_a_file_that_is_not_there_then_it_is_an_os_error(tmp_path: Path) -
 
 def test_given_the_cart_of_these_tests_then_it_loads(tmp_path: Path) -> None:
     assert load_config(write_vehicle(tmp_path, VEHICLE)).base_frame == "Cart:Base"
+
+
+def keys_of(kind: type) -> set[str]:
+    """The keys of a section and of those in it; raw mode's settings stand on another page."""
+    found = set()
+    for name, hint in get_type_hints(kind).items():
+        if name.startswith("__"):
+            continue
+        found.add(name)
+        for inner in (hint, *get_args(hint)):
+            if dataclasses.is_dataclass(inner) and inner is not RawSettings:
+                found |= keys_of(inner)
+    return found
+
+
+def test_given_the_page_on_the_vehicle_file_then_it_names_every_key_and_no_other() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "vehicle-file.md").read_text(encoding="utf-8")
+    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith(("| `", "| **`"))]
+    named = {name.strip("*` ") for row in rows for name in row.split(",")}
+    assert named == keys_of(VehicleConfig) - {"channel", "frame", "frames"}
+
+
+def test_given_the_page_on_localization_then_it_names_every_setting() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "localization.md").read_text(encoding="utf-8")
+    for each in dataclasses.fields(RawSettings):
+        assert f"`{each.name}`" in page

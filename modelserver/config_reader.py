@@ -1,0 +1,169 @@
+"""Reading a YAML file into typed, strict values: every problem at once, each with its line and the nearest key."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from typing import Any, TypeVar, get_args, get_type_hints
+
+import yaml
+from pydantic import TypeAdapter, ValidationError
+
+from modelserver.errors import ConfigError, Problem, Severity, Source, nearest_names, shown
+
+MAX_BYTES = 1 << 20
+
+MAX_DEPTH = 16
+"""No section nests deeper than 3. PyYAML's composer calls itself for each level, in C, and would end the process."""
+
+S = TypeVar("S")
+
+
+def read(raw: bytes, name: str, schema: type[S]) -> S:
+    """Return the values that the bytes of a file called `name` hold, as an instance of a dataclass.
+
+    Raises ConfigError with every problem.
+    """
+    if len(raw) > MAX_BYTES:
+        raise _one(name, 0, f"the file is larger than {MAX_BYTES >> 20} MiB", "is this the vehicle file?")
+    try:
+        _check_shape(raw, name)
+        node = yaml.compose(raw, Loader=yaml.CSafeLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        what = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise _one(name, mark.line + 1 if mark else 0, f"not YAML: {what}", "check indentation and quotes") from None
+    except UnicodeDecodeError:
+        raise _one(name, 0, "not text in UTF-8", "is this the vehicle file?") from None
+    if not isinstance(node, yaml.MappingNode):
+        required = [each.name for each in dataclasses.fields(schema) if _is_required(each)]  # type: ignore[arg-type]
+        raise _one(name, 1, "the file is empty or no mapping", f"start with: {', '.join(required)}")
+    reader = _Reader(name, schema)
+    values = reader.value(node, ())
+    if reader.problems:
+        raise ConfigError(reader.problems)
+    try:
+        # by way of JSON: strict there means that "4" is no number, while a mapping still makes a section
+        return TypeAdapter(schema).validate_json(json.dumps(values, default=str), strict=True)
+    except ValidationError as error:
+        raise ConfigError(reader.explain(detail) for detail in error.errors()) from None
+
+
+def _is_required(each: dataclasses.Field[Any]) -> bool:
+    return each.default is dataclasses.MISSING and each.default_factory is dataclasses.MISSING
+
+
+Path_ = tuple[str | int, ...]
+
+
+class _Reader:
+    """Turns YAML nodes into plain values, and remembers the line of each."""
+
+    def __init__(self, name: str, schema: type):
+        self.name = name
+        self.schema = schema
+        self.lines: dict[Path_, int] = {}
+        self.problems: list[Problem] = []
+
+    def value(self, node: yaml.Node, at: Path_) -> Any:
+        self.lines.setdefault(at, node.start_mark.line + 1)
+        if isinstance(node, yaml.MappingNode):
+            values: dict[str, Any] = {}
+            for key_node, value_node in node.value:
+                if not isinstance(key_node, yaml.ScalarNode):
+                    self.lines[(*at, "?")] = key_node.start_mark.line + 1
+                    self.problem((*at, "?"), "a key is a name, not a list or a mapping", "write name: value")
+                    continue
+                key = str(key_node.value)
+                if key in values:
+                    first = self.lines[(*at, key)]
+                    self.lines[(*at, key)] = key_node.start_mark.line + 1
+                    self.problem((*at, key), f"{key} is given twice (first on line {first})", "remove one")
+                    continue
+                self.lines[(*at, key)] = key_node.start_mark.line + 1
+                value = self.value(value_node, (*at, key))
+                # a key with nothing after it counts as left out, as when all of a section is commented out
+                if value is not None:
+                    values[key] = value
+            return values
+        if isinstance(node, yaml.SequenceNode):
+            return [self.value(each, (*at, index)) for index, each in enumerate(node.value)]
+        return _scalar(node)
+
+    def problem(self, at: Path_, message: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
+        self.problems.append(Problem(Severity.ERROR, message, self.place(at), fix, nearest))
+
+    def place(self, at: Path_) -> Source:
+        line = next((self.lines[at[:n]] for n in range(len(at), -1, -1) if at[:n] in self.lines), 0)
+        return Source(self.name, line, ".".join(map(str, at)))
+
+    def explain(self, detail: Any) -> Problem:
+        """Turn one of pydantic's findings into a problem with its line and the nearest key."""
+        at: Path_ = tuple(detail["loc"])
+        if detail["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+            known = _known_keys(self.schema, at[:-1])
+            near = nearest_names(str(at[-1]), known)
+            fix = f"write {near[0]}" if near else f"known here: {', '.join(known)}"
+            return Problem(Severity.ERROR, f"unknown key {shown(str(at[-1]))}", self.place(at), fix, near)
+        if detail["type"] == "missing" and isinstance(at[-1], int):
+            at = at[:-1]
+            return Problem(Severity.ERROR, f"{at[-1]} has too few numbers", self.place(at))
+        if detail["type"] == "missing":
+            return Problem(Severity.ERROR, f"{at[-1]} is missing", self.place(at), f"add a line: {at[-1]}: ...")
+        message = str(detail["msg"]).removeprefix("Value error, ")
+        got = detail.get("input")
+        if detail["type"] == "value_error":
+            # found by the section as a whole; the message begins with the key that it is about
+            key = message.partition(" ")[0]
+            at = (*at, key) if (*at, key) in self.lines else at
+        elif detail["type"] in ("dataclass_type", "dict_type"):
+            message = "expected a mapping (key: value, one a line)"
+        if detail["type"] != "value_error" and isinstance(got, (str, int, float, bool)):
+            message += f", got {shown(str(got))}"
+        if len(message) > 240:
+            message = f"{message[:240]}..."
+        return Problem(Severity.ERROR, message[:1].lower() + message[1:], self.place(at), "")
+
+
+_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+", re.ASCII)
+"""Numbers such as 1e-3, which YAML 1.1 takes for text."""
+
+
+def _scalar(node: yaml.Node) -> Any:
+    if isinstance(node, yaml.ScalarNode) and not node.style and _EXPONENT.fullmatch(node.value):
+        return float(node.value)
+    loader = yaml.CSafeLoader("")
+    try:
+        return loader.construct_object(node, deep=True)
+    except (yaml.YAMLError, ValueError):
+        return str(node.value)
+
+
+def _known_keys(schema: type, at: Path_) -> list[str]:
+    """Return the keys known at a place in the file."""
+    kind: Any = schema
+    for step in at:
+        hints = get_type_hints(kind) if dataclasses.is_dataclass(kind) else {}
+        kind = hints.get(str(step))
+        kind = next((each for each in (kind, *get_args(kind)) if dataclasses.is_dataclass(each)), None)
+    return [each.name for each in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
+
+
+def _check_shape(raw: bytes, name: str) -> None:
+    """Raise ConfigError for what no vehicle file has and the composer cannot bear: deep nesting, aliases of aliases."""
+    depth = 0
+    for event in yaml.parse(raw, Loader=yaml.CSafeLoader):
+        line = event.start_mark.line + 1 if event.start_mark else 0
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+            if depth > MAX_DEPTH:
+                raise _one(name, line, "nested too deeply", "look for brackets that are not closed")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        elif isinstance(event, yaml.AliasEvent):
+            raise _one(name, line, f"aliases (*{event.anchor}) are not read here", "write the value again")
+
+
+def _one(name: str, line: int, message: str, fix: str) -> ConfigError:
+    return ConfigError([Problem(Severity.ERROR, message, Source(name, line), fix)])
