@@ -79,10 +79,10 @@ class Vehicle:
         return {f"{prefix}{each.channel}": type_name for each, type_name in named if each is not None}
 
 
-def load_vehicle(config: VehicleConfig) -> Vehicle:
+def load_vehicle(config: VehicleConfig, file: str = "") -> Vehicle:
     """Load the geometry and check that it has every frame the vehicle file names.
 
-    Raises GeometryError, ConfigError, OSError.
+    `file` is the vehicle file's path, for the problems. Raises GeometryError, ConfigError, OSError.
     """
     model = load_model(config.geometry, variables=config.variables)
     problems = []
@@ -92,17 +92,21 @@ def load_vehicle(config: VehicleConfig) -> Vehicle:
     named += [(f"sensors.{key}.frame", each.frame) for key, each in (("gps", gps), ("imu", imu)) if each is not None]
     if config.sensors.wheels is not None:
         named += [(f"sensors.wheels.frames.{name}", frame) for name, frame in config.sensors.wheels.frames.items()]
+    base_stands = True
     for key, frame in named:
         try:
-            model.get_transformation(frame, config.base_frame)
+            model.frame(frame)
+            if base_stands:
+                model.get_transformation(frame, config.base_frame)
         except QueryError as error:
+            base_stands = base_stands and key != "base_frame"
             fix = f"write {error.nearest[0]}" if error.nearest else f"see: modelserver bodies --model {config.geometry}"
-            problems.append(Problem(Severity.ERROR, str(error), Source(element=key), fix, error.nearest))
-    problems += _channel_problems(config)
+            problems.append(Problem(Severity.ERROR, str(error), Source(file, element=key), fix, error.nearest))
+    problems += _channel_problems(config, file)
     try:
         configured_origin(config)
     except GeodesyError as error:
-        problems.append(Problem(Severity.ERROR, str(error), Source(element="origin.initial_utm")))
+        problems.append(Problem(Severity.ERROR, str(error), Source(file, element="origin.initial_utm")))
     if problems:
         raise ConfigError(problems)
     mounts = None
@@ -111,7 +115,7 @@ def load_vehicle(config: VehicleConfig) -> Vehicle:
     return Vehicle(config, model, mounts)
 
 
-def _channel_problems(config: VehicleConfig) -> list[Problem]:
+def _channel_problems(config: VehicleConfig, file: str) -> list[Problem]:
     """Return what is wrong with the channels taken together."""
     prefix, reply_prefix = config.lcm.channel_prefix, config.lcm.reply_prefix
     sensors = config.sensors
@@ -128,7 +132,7 @@ def _channel_problems(config: VehicleConfig) -> list[Problem]:
                 Problem(
                     Severity.ERROR,
                     f"{channel} is a channel that the service itself uses, no sensor's",
-                    Source(element=key),
+                    Source(file, element=key),
                     "give the sensor another channel",
                 )
             )
@@ -138,7 +142,7 @@ def _channel_problems(config: VehicleConfig) -> list[Problem]:
             Problem(
                 Severity.ERROR,
                 f"with the reply prefix {reply_prefix} a request could make the server speak on {spoken_on[0]}",
-                Source(element="lcm.reply_prefix"),
+                Source(file, element="lcm.reply_prefix"),
                 "choose one that no other channel begins with, e.g. REPLY_",
             )
         )

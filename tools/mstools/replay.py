@@ -135,7 +135,7 @@ def offline(
     from modelserver.service.daemon import load_vehicle
     from modelserver.service.offline import CSV_HEADER, Run
 
-    vehicle = load_vehicle(load_config(config))
+    vehicle = load_vehicle(load_config(config), str(config))
     if vehicle.mounts is None:
         raise RecordingError(f"{config}: names no GPS and IMU under sensors, so there is no pose in the world to write")
     times = None if at_times is None else read_times(at_times)

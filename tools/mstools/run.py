@@ -35,7 +35,7 @@ def command(
     from modelserver.service import daemon
 
     logging.basicConfig(level=log_level.upper(), format="%(levelname)s %(name)s: %(message)s")
-    vehicle = daemon.load_vehicle(load_config(config))
+    vehicle = daemon.load_vehicle(load_config(config), str(config))
     for problem in vehicle.model.problems:
         logging.getLogger("modelserver").warning("%s", problem)
     daemon.run(vehicle, url)
