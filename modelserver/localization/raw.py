@@ -7,22 +7,22 @@ docs/localization.md for the equations and the limits.
 
 from __future__ import annotations
 
-import cmath
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from modelserver.geodesy import Geodesy, geodetic_from_ecef
 from modelserver.localization import attitude, fixes, gate
 from modelserver.localization.fixes import Fixes
 from modelserver.localization.heading import Heading
 from modelserver.localization.interface import Note
-from modelserver.localization.motion import Motion, between, yaw_rate
+from modelserver.localization.motion import Motion, yaw_rate
 from modelserver.localization.mounts import Mounts
-from modelserver.localization.origin import Capture
+from modelserver.localization.projected import Projected
 from modelserver.localization.settings import RawSettings
 from modelserver.localization.stamps import Stamps, Verdict
+from modelserver.localization.state import RawState
 from modelserver.localization.still import Stillness
-from modelserver.localization.world import Projected, estimate
+from modelserver.localization.world import estimate
 from modelserver.messages import Estimate, GpsSample, ImuSample, Origin, OriginLatched, Rejected, Sample
 from modelserver.spatial.so3 import Vector3
 
@@ -32,25 +32,8 @@ _HISTORY_LENGTH = 2_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class RawLocalizer:
+class RawLocalizer(RawState):
     """The localizer of raw mode: an immutable value. Make the first with `start`."""
-
-    mounts: Mounts
-    settings: RawSettings
-    projected: Projected | None = None
-    motion: Motion | None = None
-    history: tuple[Motion, ...] = field(default=(), repr=False)
-    heading: Heading = field(default_factory=Heading)
-    stillness: Stillness = field(default_factory=Stillness)
-    tilt_bias: tuple[float, float] = (0.0, 0.0)
-    fixes: Fixes = field(default_factory=Fixes)
-    capture: Capture = field(default_factory=Capture)
-    imu_stamps: Stamps = field(default_factory=Stamps)
-    gps_stamps: Stamps = field(default_factory=Stamps)
-    imu_utime: int | None = None
-    pose_epoch: int = 0
-    stepped: bool = False
-    newest: int = 0
 
     @classmethod
     def start(cls, mounts: Mounts, settings: RawSettings | None = None, origin: Origin | None = None) -> RawLocalizer:
@@ -71,11 +54,6 @@ class RawLocalizer:
     def utime(self) -> int:
         """The instant of the newest sample taken, 0 before the first."""
         return self.newest
-
-    @property
-    def origin(self) -> Origin | None:
-        """The origin of World:UTM, None before it is set."""
-        return None if self.projected is None else self.projected.geodesy.origin
 
     def take(self, sample: Sample) -> tuple[RawLocalizer, tuple[Note, ...]]:
         """Return what is concluded with one sample more, and what there is to say about it.
@@ -241,22 +219,6 @@ class RawLocalizer:
         return replace(self, capture=capture, projected=projected), notes
 
     # --- shared ---------------------------------------------------------------------------------------------
-
-    def motion_at(self, utime: int, newest: Motion) -> Motion:
-        """Return the motion at `utime`: predicted from `newest`, or looked up in what is kept."""
-        if utime >= newest.utime or not self.history:
-            return newest.advanced(utime, newest.rate, self.settings)
-        after = newest
-        for motion in reversed(self.history):
-            if motion.utime <= utime:
-                return between(motion, after, utime)
-            after = motion
-        return after
-
-    @property
-    def direction(self) -> complex:
-        """exp(i offset): turns Odom's horizontal axes to east and north; 1 before heading is known."""
-        return cmath.rect(1.0, self.heading.offset) if self.heading.known else 1.0 + 0j
 
     def _begun_anew(self, utime: int) -> RawLocalizer:
         """Return the localizer after its clock was set back: only Odom, the origin and the biases stay."""

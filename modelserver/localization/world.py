@@ -3,56 +3,23 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from modelserver.geodesy import Geodesy, GeodesyError, LocalFrame, about_up, geodetic_from_ecef
+from modelserver.geodesy import GeodesyError, LocalFrame, about_up, geodetic_from_ecef
 from modelserver.localization import bounds
-from modelserver.localization.gate import GoodFix
 from modelserver.localization.heading import UNKNOWN_VARIANCE
 from modelserver.localization.motion import Motion
+from modelserver.localization.projected import Projected
+from modelserver.localization.state import RawState
 from modelserver.messages import NAN, Estimate, Invalid, Quality
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Quaternion
 
-if TYPE_CHECKING:
-    from modelserver.localization.raw import RawLocalizer
-
 _CONVERGENCE_REACH = 100.0
 """Metres from the last fix within which its convergence serves: it changes by 1.6e-5 rad times tan(latitude)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Projected:
-    """The origin's geodesy with what it says at the last fix, worked out once for all poses until the next.
-
-    `tangent_from_work` turns the working frame's axes to World:ENU's; `convergence` those at the vehicle to
-    World:UTM's.
-    """
-
-    geodesy: Geodesy
-    tangent_from_work: Quaternion = so3.IDENTITY
-    convergence: float = 0.0
-
-    def reaches(self, fix: GoodFix) -> bool:
-        """Return whether the pinned zone serves the place of a fix."""
-        try:
-            self.geodesy.utm_from_geodetic(fix.latitude_deg, fix.longitude_deg, 0.0)
-        except GeodesyError:
-            return False
-        return True
-
-    def at(self, latitude_deg: float, longitude_deg: float, work: LocalFrame) -> Projected:
-        """Return the same with the vehicle at another place."""
-        return Projected(
-            self.geodesy,
-            self.geodesy.tangent.rotation_of(work),
-            self.geodesy.convergence(latitude_deg, longitude_deg),
-        )
-
-
-def estimate(state: RawLocalizer, utime: int) -> Estimate:
+def estimate(state: RawState, utime: int) -> Estimate:
     """Return the pose of the base frame at `utime`, from nothing but the state."""
     settings, newest, anchor = state.settings, state.motion, state.fixes.anchor
     invalid = _invalid(state, utime)
@@ -118,7 +85,7 @@ def estimate(state: RawLocalizer, utime: int) -> Estimate:
 
 
 def _world_poses(
-    state: RawLocalizer, projected: Projected, work: LocalFrame, q_odom: Quaternion, place: complex, up: float
+    state: RawState, projected: Projected, work: LocalFrame, q_odom: Quaternion, place: complex, up: float
 ) -> tuple[Pose, Pose] | tuple[None, None]:
     """Return the pose in World:ENU and in World:UTM, each from the earth-centred position; None out of reach."""
     geodesy = projected.geodesy
@@ -141,7 +108,7 @@ def _world_poses(
     )
 
 
-def _invalid(state: RawLocalizer, utime: int) -> Invalid:
+def _invalid(state: RawState, utime: int) -> Invalid:
     settings, anchor, imu = state.settings, state.fixes.anchor, state.imu_utime
     invalid = 0
     if anchor is None:
@@ -163,7 +130,7 @@ def _invalid(state: RawLocalizer, utime: int) -> Invalid:
     return Invalid(invalid)
 
 
-def _quality(state: RawLocalizer, utime: int, motion: Motion) -> Quality:
+def _quality(state: RawState, utime: int, motion: Motion) -> Quality:
     settings = state.settings
     quality = 0
     if state.stillness.standing(utime, settings) or abs(motion.speed) < settings.course_speed:
