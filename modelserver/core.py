@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
-from modelserver.errors import QueryError, Status
+from modelserver.answers import answer, failure
+from modelserver.errors import Status
 from modelserver.geometry import names
 from modelserver.geometry.model import Model
 from modelserver.history import History
@@ -29,25 +30,19 @@ from modelserver.messages import (
     GetTransformation,
     GpsSample,
     Health,
-    HistoryReply,
     ImuSample,
     Invalid,
     JointsSample,
-    NameListReply,
     Output,
     Policy,
     PublishHealth,
     PublishPose,
     Rejected,
-    Reply,
-    ReplyHeader,
     Request,
     RequestHeader,
     Sample,
     SendReply,
-    StateVectorReply,
     Tick,
-    TransformReply,
     WheelsSample,
 )
 from modelserver.platform import PlatformView
@@ -295,17 +290,11 @@ def _request(state: CoreState, request: Request, now: Instant) -> Step:
             parked = Parked(request, now.monotonic_ns + wait_ms * 1_000_000)
             return state._replace(parked=(*state.parked, parked)), ()
         state = _count(state, CHANNEL_OF[type(request)], "load")
-        refusal = _failed(
-            request,
-            Status.REFUSED_LOAD,
-            f"{len(state.parked)} requests wait already, as many as may (limits.parked_requests); ask without wait_ms",
-            now,
-            state,
-        )
-        return state, (SendReply(request.header.reply_channel, refusal),)
+        why = f"{len(state.parked)} requests wait already, as many as may (limits.parked_requests); ask without wait_ms"
+        return state, _turned_down(state, type(request), request.header, Status.REFUSED_LOAD, why, now)
     # what `_replace` does, at a third of its cost: this is done for every request
     counted = CoreState._make((*state[:-1], state.requests_answered + 1))
-    return counted, (answer(state, request, now),)
+    return counted, (_reply(state, request, now),)
 
 
 def _must_wait(state: CoreState, request: GetTransformation | GetStateVector | GetHTransform) -> bool:
@@ -334,65 +323,14 @@ def _answer_parked(state: CoreState, now: Instant) -> tuple[CoreState, list[Outp
         if now.monotonic_ns < parked.until_ns and _must_wait(state, parked.request):
             still.append(parked)
         else:
-            replies.append(answer(state, parked.request, now))
+            replies.append(_reply(state, parked.request, now))
     if replies:
         state = state._replace(parked=tuple(still), requests_answered=state.requests_answered + len(replies))
     return state, replies
 
 
-def answer(state: CoreState, request: Request, now: Instant) -> SendReply:
-    """Return the reply to a request, at once. A question that cannot be answered gives a reply that says why."""
-    try:
-        reply = _ANSWERS[type(request)](state, request, now)
-    except QueryError as error:
-        reply = _failed(request, error.status, str(error), now, state, error.nearest)
-    return SendReply(request.header.reply_channel, reply)
-
-
-def _ok(state: CoreState, request: Request, now: Instant) -> ReplyHeader:
-    return ReplyHeader(request.header.request_id, now.utime, model_revision=state.model.revision)
-
-
-def _get_transformation(state: CoreState, request: GetTransformation, now: Instant) -> Reply:
-    found = state.view.transformation(request.frame_of_interest, request.frame_of_reference, request.time, now.utime)
-    return TransformReply(_ok(state, request, now), found)
-
-
-def _get_h_transform(state: CoreState, request: GetHTransform, now: Instant) -> Reply:
-    ends = (state.settings.base_frame, names.WORLD_UTM)
-    interest, reference = reversed(ends) if request.inverse else ends
-    found = state.view.transformation(interest, reference, request.time, now.utime)
-    return TransformReply(_ok(state, request, now), found)
-
-
-def _get_state_vector(state: CoreState, request: GetStateVector, now: Instant) -> Reply:
-    return StateVectorReply(_ok(state, request, now), state.view.vehicle_pose(request.time, now.utime))
-
-
-def _get_history(state: CoreState, request: GetHistory, now: Instant) -> Reply:
-    found = state.view.vehicle_history(request.start_utime, request.end_utime, request.rate_hz)
-    return HistoryReply(_ok(state, request, now), found)
-
-
-def _get_body_list(state: CoreState, request: GetBodyList, now: Instant) -> Reply:
-    bodies = state.model.bodies
-    return NameListReply(
-        _ok(state, request, now), tuple(body.name for body in bodies), tuple(body.description for body in bodies)
-    )
-
-
-def _get_body_frame_list(state: CoreState, request: GetBodyFrameList, now: Instant) -> Reply:
-    frames = state.model.body(request.body).frames
-    return NameListReply(
-        _ok(state, request, now), tuple(frame.name for frame in frames), tuple(frame.description for frame in frames)
-    )
-
-
-def _failed(
-    request: Request, status: Status, message: str, now: Instant, state: CoreState, nearest: tuple[str, ...] = ()
-) -> Reply:
-    header = ReplyHeader(request.header.request_id, now.utime, status, message, nearest, state.model.revision)
-    return _REPLY_KINDS[type(request)](header)
+def _reply(state: CoreState, request: Request, now: Instant) -> SendReply:
+    return SendReply(request.header.reply_channel, answer(state.view, request, now.utime))
 
 
 def refuse(state: CoreState, request: Request, now: Instant) -> Outputs:
@@ -417,8 +355,7 @@ def _turned_down(
 ) -> Outputs:
     if not header.is_answerable(state.settings.reply_prefix):
         return ()
-    reply = ReplyHeader(header.request_id, now.utime, status, message, model_revision=state.model.revision)
-    return (SendReply(header.reply_channel, _REPLY_KINDS[kind](reply)),)
+    return (SendReply(header.reply_channel, failure(state.view, kind, header, status, message, now.utime)),)
 
 
 # --- counting -----------------------------------------------------------------------------------------------
@@ -463,22 +400,4 @@ _HANDLERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], Step]]] = {
     GetStateVector: _request,
     GetHTransform: _request,
     GetHistory: _request,
-}
-
-_ANSWERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], Reply]]] = {
-    GetTransformation: _get_transformation,
-    GetBodyList: _get_body_list,
-    GetBodyFrameList: _get_body_frame_list,
-    GetStateVector: _get_state_vector,
-    GetHTransform: _get_h_transform,
-    GetHistory: _get_history,
-}
-
-_REPLY_KINDS: Final[Mapping[type, Callable[[ReplyHeader], Reply]]] = {
-    GetTransformation: TransformReply,
-    GetBodyList: NameListReply,
-    GetBodyFrameList: NameListReply,
-    GetStateVector: StateVectorReply,
-    GetHTransform: TransformReply,
-    GetHistory: HistoryReply,
 }

@@ -1,0 +1,119 @@
+"""The values that the core speaks: what comes in, what is asked, what goes out. Pure, immutable.
+
+Units, frames and signs are those of the wire types of the same names in `lcmtypes/`, where each field is
+described; the codec in `modelserver.wire` is the only place that knows both. What a device did not say is
+nan for a number and None for a vector or a matrix.
+
+Requests and replies are NamedTuples where the rest are dataclasses: they are made with every query, and a
+NamedTuple is made at a third of the cost.
+"""
+
+from modelserver.messages.estimates import Estimate, Origin
+from modelserver.messages.events import (
+    Event,
+    OriginLatched,
+    Output,
+    PublishHealth,
+    PublishPose,
+    Rejected,
+    SendReply,
+    Tick,
+)
+from modelserver.messages.flags import (
+    NAN,
+    NO_FLAGS,
+    VALID,
+    Direction,
+    FixType,
+    Invalid,
+    OrientationReference,
+    Policy,
+    Quality,
+    YawSource,
+)
+from modelserver.messages.health import ChannelHealth, Health
+from modelserver.messages.replies import (
+    HistoryReply,
+    NameListReply,
+    PoseAnswer,
+    Reply,
+    ReplyHeader,
+    StateVectorReply,
+    TransformReply,
+)
+from modelserver.messages.requests import (
+    CHANNEL_OF,
+    MAX_CHANNEL_LENGTH,
+    GetBodyFrameList,
+    GetBodyList,
+    GetHistory,
+    GetHTransform,
+    GetStateVector,
+    GetTransformation,
+    Request,
+    RequestHeader,
+    TimeQuery,
+)
+from modelserver.messages.samples import (
+    GpsSample,
+    ImuSample,
+    JointSample,
+    JointsSample,
+    Matrix3,
+    Sample,
+    SensorHeader,
+    WheelSample,
+    WheelsSample,
+)
+
+__all__ = [
+    "CHANNEL_OF",
+    "MAX_CHANNEL_LENGTH",
+    "NAN",
+    "NO_FLAGS",
+    "VALID",
+    "ChannelHealth",
+    "Direction",
+    "Estimate",
+    "Event",
+    "FixType",
+    "GetBodyFrameList",
+    "GetBodyList",
+    "GetHTransform",
+    "GetHistory",
+    "GetStateVector",
+    "GetTransformation",
+    "GpsSample",
+    "Health",
+    "HistoryReply",
+    "ImuSample",
+    "Invalid",
+    "JointSample",
+    "JointsSample",
+    "Matrix3",
+    "NameListReply",
+    "OrientationReference",
+    "Origin",
+    "OriginLatched",
+    "Output",
+    "Policy",
+    "PoseAnswer",
+    "PublishHealth",
+    "PublishPose",
+    "Quality",
+    "Rejected",
+    "Reply",
+    "ReplyHeader",
+    "Request",
+    "RequestHeader",
+    "Sample",
+    "SendReply",
+    "SensorHeader",
+    "StateVectorReply",
+    "Tick",
+    "TimeQuery",
+    "TransformReply",
+    "WheelSample",
+    "WheelsSample",
+    "YawSource",
+]

@@ -1,0 +1,54 @@
+"""What localization says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from modelserver.messages.flags import NAN, NO_FLAGS, VALID, Invalid, Quality
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.so3 import Vector3
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """The origin of World:UTM: grid coordinates in a pinned zone, ellipsoidal height, metres.
+
+    `origin_id` names it; it changes with any of the numbers.
+    """
+
+    easting: float
+    northing: float
+    height: float
+    zone: int
+    north: bool
+    origin_id: int
+
+    @property
+    def initial_utm(self) -> Vector3:
+        """Grid easting, grid northing, height above the ellipsoid, metres."""
+        return (self.easting, self.northing, self.height)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The base frame at one instant.
+
+    `odom` is its pose in Odom:Origin, `enu` in the tangent plane at the origin, `utm` in World:UTM; the last
+    two are None before the origin is known. `covariance` is 36 numbers, row-major, of the world pose along
+    east, north, up (of `utm` and `enu` alike: the convergence between their axes is below the noise that a
+    covariance states).
+    """
+
+    utime: int
+    odom: Pose
+    enu: Pose | None = None
+    utm: Pose | None = None
+    covariance: tuple[float, ...] | None = field(default=None, repr=False)
+    odom_covariance: tuple[float, ...] | None = field(default=None, repr=False)
+    invalid: Invalid = VALID
+    quality: Quality = NO_FLAGS
+    pose_epoch: int = 0
+    origin: Origin | None = None
+    horizontal_bound: float = NAN
+    heading_bound: float = NAN
+    seconds_to_limit: float = NAN

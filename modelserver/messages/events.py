@@ -1,0 +1,67 @@
+"""What the core is told, and what it says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+from modelserver.messages.estimates import Origin
+from modelserver.messages.health import Health
+from modelserver.messages.replies import PoseAnswer, Reply
+from modelserver.messages.requests import Request
+from modelserver.messages.samples import Sample
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """The clock has reached a due time, `late` seconds after it; `missed` due times before it were skipped.
+
+    `answered`: requests that were answered from what is remembered, without the core, since the last tick.
+    """
+
+    late: float = 0.0
+    missed: int = 0
+    answered: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """Something that came in and was not understood: counted by channel and reason."""
+
+    channel: str
+    reason: str
+
+
+Event: TypeAlias = Sample | Request | Tick | Rejected
+
+
+class SendReply(NamedTuple):
+    """Send `reply` on `channel`."""
+
+    channel: str
+    reply: Reply
+
+
+@dataclass(frozen=True, slots=True)
+class PublishPose:
+    """Broadcast the vehicle's pose in the world, and in Odom."""
+
+    world: PoseAnswer
+    odom: PoseAnswer
+
+
+@dataclass(frozen=True, slots=True)
+class PublishHealth:
+    """Broadcast how the daemon is."""
+
+    health: Health
+
+
+@dataclass(frozen=True, slots=True)
+class OriginLatched:
+    """The origin was set: keep it across restarts."""
+
+    origin: Origin
+
+
+Output: TypeAlias = SendReply | PublishPose | PublishHealth | OriginLatched
