@@ -20,6 +20,7 @@ from modelserver.history import History
 from modelserver.localization.interface import Localizer
 from modelserver.messages import (
     CHANNEL_OF,
+    VALID,
     ChannelHealth,
     Event,
     GetBodyFrameList,
@@ -50,6 +51,9 @@ from modelserver.version import __version__
 
 FUTURE_LIMIT_S: Final = 1.0
 """A sample stamped this far ahead of the host's clock is refused: one of the two clocks is wrong."""
+
+FUTURE_SAMPLES: Final = 3
+"""So many of them in a row are no strays: the host's clock was set back, and no pose is valid until one fits."""
 
 HISTORY_STEP_US: Final = 4000
 """Microseconds between the estimates held, at least: a flood of samples must not fill the memory."""
@@ -126,6 +130,7 @@ class CoreState(NamedTuple):
     ticks_missed: int = 0
     handler_errors: int = 0
     run_state: int = STARTING
+    futures: int = 0
     requests_answered: int = 0  # stays last: see `_request`
 
     @property
@@ -167,7 +172,13 @@ def _sample(state: CoreState, sample: Sample, now: Instant) -> Step:
     source = f"sensor:{sample.header.source}"
     state = _note_traffic(state, source, now)
     if sample.header.utime > now.utime + FUTURE_LIMIT_S * 1e6:
-        return _count(state, source, "future"), ()
+        state = _count(state._replace(futures=state.futures + 1), source, "future")
+        if state.futures >= FUTURE_SAMPLES:
+            # one clock was set: what is held is of another time than what is asked for now
+            state = state._replace(view=replace(state.view, doubt=Invalid.CLOCK_STEPPED))
+        return state, ()
+    if state.futures:
+        state = state._replace(futures=0, view=replace(state.view, doubt=VALID))
     if state.localizer is None:
         return state, ()
     before = state.localizer
@@ -250,7 +261,7 @@ def _report(state: CoreState, now: Instant) -> tuple[CoreState, PublishHealth]:
         vehicle=state.settings.vehicle,
         model_revision=state.model.revision,
         state=state.run_state,
-        invalid_reasons=Invalid(0) if estimate is None else estimate.invalid,
+        invalid_reasons=state.view.doubt | (VALID if estimate is None else estimate.invalid),
         pose_epoch=0 if estimate is None else estimate.pose_epoch,
         origin_id=0 if estimate is None or estimate.origin is None else estimate.origin.origin_id,
         poses_published=state.poses_published,

@@ -90,6 +90,11 @@ class History:
             raise TooOldError(self._span(utime, "before"))
         return self._estimates[bisect_right(self._times, utime, self._start, self._end) - 1]
 
+    def following(self, utime: int) -> Estimate | None:
+        """Return the oldest estimate newer than a time, None where there is none."""
+        after = bisect_right(self._times, utime, self._start, self._end)
+        return None if after == self._end else self._estimates[after]
+
     def check_span(self, utime: int) -> None:
         """Raise TooOldError or TooNewError where a time lies outside what is held."""
         if utime > self.last:

@@ -48,7 +48,8 @@ class PlatformView:
     """What is known now: the geometry, and where the vehicle has been.
 
     base_frame: the frame whose pose is asked for and published. rolling_frame: the frame that the estimates are of,
-    the point of the vehicle that moves along its own x axis; empty for the base frame.
+    the point of the vehicle that moves along its own x axis; empty for the base frame. doubt: what speaks against
+    every pose now, besides what its own estimate says.
     """
 
     model: Model
@@ -56,6 +57,7 @@ class PlatformView:
     localizer: Localizer | None
     history: History
     rolling_frame: str = ""
+    doubt: Invalid = VALID
 
     def __post_init__(self) -> None:
         if not self.rolling_frame:
@@ -131,8 +133,9 @@ class PlatformView:
             held = self.history.held(time.at)
             if held.utime == time.at:
                 return held
-            # past the newest sample it is the silence since then that may speak against it
-            since = self.localizer.estimate(time.at).invalid if time.at > self.history.last else Invalid(0)
+            # what silence there was since speaks against it: up to the next estimate, or up to the time asked
+            following = self.history.following(time.at)
+            since = (following or self.localizer.estimate(time.at)).invalid
             return at_time(held, time.at, Quality.HELD, since)
         if time.policy is Policy.PREDICTED and time.at > self.history.last:
             if time.at > self.history.last + PREDICTION_LIMIT_S * 1e6:
@@ -186,7 +189,7 @@ class PlatformView:
     ) -> PoseAnswer:
         odom_only = names.ODOM in (interest, reference) and not (is_absolute(interest) or is_absolute(reference))
         origin = None if odom_only else estimate.origin
-        invalid = estimate.invalid & _ODOM_INVALID if odom_only else estimate.invalid
+        invalid = self.doubt | (estimate.invalid & _ODOM_INVALID if odom_only else estimate.invalid)
         of_vehicle = self.base_frame in (interest, reference) and not odom_only
         horizontal, heading = self._bounds(estimate) if of_vehicle else (NAN, NAN)
         return PoseAnswer(

@@ -30,7 +30,7 @@ from modelserver.service.log import RateLimited
 from modelserver.wire.channels import BY_NAME, REQUESTS
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.requests import request_header
-from modelserver.wire.timeless import TimelessReplies
+from modelserver.wire.timeless import TIMELESS_TYPE, TimelessReplies
 
 log = logging.getLogger(__name__)
 
@@ -159,7 +159,9 @@ class Loop:
     def _answer(self, channel: str, type_name: str, data: bytes) -> None:
         """Answer a request, also one that makes no sense or that an error keeps from being answered."""
         now = self._clock.now()
-        remembered = self._timeless.find(data, now.utime, self.state.view.model)
+        remembered = None
+        if type_name == TIMELESS_TYPE:
+            remembered = self._timeless.find(data, now.utime, self.state.view.model)
         if remembered is not None:
             self._bus.publish(*remembered)
             self._answered += 1

@@ -16,6 +16,9 @@ from modelserver.wire.fields import MAX_UTIME
 from mslcm.get_transformation_reply_t import get_transformation_reply_t
 from mslcm.get_transformation_request_t import get_transformation_request_t
 
+TIMELESS_TYPE: Final = get_transformation_request_t.__name__
+"""The only kind of request whose answers are remembered."""
+
 _REQUEST: Final[bytes] = get_transformation_request_t._get_packed_fingerprint()
 _REPLY: Final[bytes] = get_transformation_reply_t._get_packed_fingerprint()
 _NAMES: Final = slice(16, -13)

@@ -596,3 +596,29 @@ def test_given_a_flood_of_samples_then_estimates_are_held_at_intervals() -> None
     assert held == pytest.approx(500_000 / core.HISTORY_STEP_US, abs=1)
     assert run.state.localizer is not None
     assert run.state.localizer.utime - run.state.history.last < core.HISTORY_STEP_US
+
+
+def test_given_a_host_clock_that_was_set_back_then_no_pose_is_valid_until_a_sample_fits() -> None:
+    run = Run()
+    run.samples(0.0, 0.1, 0.2)
+    run.feed(Tick(), 0.25)
+    for n in range(core.FUTURE_SAMPLES):
+        # the sensors' stamps go on; the host's clock was set back by 10 s
+        run.feed(imu(START + round((0.3 + n / 10) * S)), -9.7 + n / 10)
+    assert run.rejected["sensor:imu", "future"] == core.FUTURE_SAMPLES
+    (pose,) = of_kind(run.feed(Tick(), -9.0), PublishPose)
+    assert Invalid(pose.world.transformation.invalid_reasons) & Invalid.CLOCK_STEPPED
+    assert not pose.odom.transformation.valid
+    report = run.health(-8.9)
+    assert (report.state, report.invalid_reasons) == (core.DEGRADED, Invalid.CLOCK_STEPPED)
+    run.samples(0.9)
+    (pose,) = of_kind(run.feed(Tick(), 0.95), PublishPose)
+    assert pose.world.transformation.valid
+
+
+def test_given_one_stray_sample_of_the_future_then_poses_stay_valid() -> None:
+    run = Run()
+    run.samples(0.0, 0.1)
+    run.feed(imu(START + 100 * S), 0.15)
+    (pose,) = of_kind(run.feed(Tick(), 0.2), PublishPose)
+    assert pose.world.transformation.valid

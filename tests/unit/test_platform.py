@@ -433,3 +433,13 @@ def test_given_sensors_that_went_silent_then_the_latest_pose_is_not_valid_any_mo
     # a question about a time is about that time, whenever it is asked
     then = platform.transformation(BASE, UTM, TimeQuery(newest - S), newest + 600 * S)
     assert then.transformation.valid
+
+
+def test_given_a_gap_in_the_history_then_what_is_held_in_it_is_no_better_than_what_came_after() -> None:
+    good, late = Scripted(START, 1), Scripted(START + 30 * S, 2, invalid=Invalid.STALE_IMU)
+    history = History(60.0).extended(good.estimate(START)).extended(late.estimate(START + 30 * S))
+    platform = PlatformView(cart(), BASE, late, history)
+    within = ask(platform, BASE, UTM, TimeQuery(START + 10 * S, Policy.HELD))
+    assert Invalid.STALE_IMU in Invalid(within.transformation.invalid_reasons)
+    exact = ask(platform, BASE, UTM, TimeQuery(START, Policy.HELD))
+    assert exact.transformation.valid
