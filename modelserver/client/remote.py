@@ -56,7 +56,11 @@ IDLE_S: Final = 0.01
 """After so long without a question the replies to others of this program's name are thrown away first."""
 
 LONGEST_WAIT_S: Final = 60.0
+_LONGEST_WAIT_MS: Final = 60_000
 """LCM counts milliseconds in an int: a longer wait is made of several."""
+
+_ID: Final = slice(8, 16)
+"""Where every request and every reply carries the request's id: first, behind the fingerprint."""
 
 
 class Platform:
@@ -186,13 +190,22 @@ class Platform:
         return RequestHeader(self._ids.getrandbits(63), self.reply_channel)
 
     def _ask(self, request: Any, reply_kind: type[R], wait_ms: int = 0) -> R:
-        """Send a request until its reply comes. Asking twice does no harm: requests change nothing."""
+        """Return the reply to a request. Raises NoServerError, the QueryError that the server meant, WireError."""
         try:
             data = encode(request)
         except (struct.error, TypeError, AttributeError, UnicodeEncodeError) as error:
             raise MalformedRequestError(f"this question cannot be put into a message: {error}") from error
         channel = self._channels[type(request)]
-        patience = self.timeout + wait_ms * 1e-3
+        reply: R = decode(_REPLY_TYPES[reply_kind], self._exchange(channel, data, self.timeout + wait_ms * 1e-3))
+        header: ReplyHeader = reply.header
+        if header.status is not Status.OK:
+            raise error_for_status(header.status, header.message, header.nearest)
+        return reply
+
+    def _exchange(self, channel: str, request: bytes, patience: float) -> bytes:
+        """Send a request until its reply comes. Asking twice does no harm: requests change nothing."""
+        wanted = request[_ID]
+        fresh = self._fresh
         with self._lock:
             bus = self._lcm
             if bus is None:
@@ -202,35 +215,21 @@ class Platform:
                 if tried or begin > self._last_asked + IDLE_S:
                     _discard_unread(bus)
                 self._last_asked = begin
-                self._fresh.clear()
-                bus.publish(channel, data)
-                reply = self._await(bus, request.header.request_id, reply_kind, begin, patience)
-                if reply is not None:
-                    header: ReplyHeader = reply.header
-                    if header.status is not Status.OK:
-                        raise error_for_status(header.status, header.message, header.nearest)
-                    return reply
+                fresh.clear()
+                bus.publish(channel, request)
+                left = patience
+                while left > 0:
+                    bus.handle_timeout(int(left * 1000) + 1 if left < LONGEST_WAIT_S else _LONGEST_WAIT_MS)
+                    for reply in fresh:
+                        if reply[_ID] == wanted:
+                            return reply
+                    fresh.clear()
+                    left = begin + patience - time.monotonic()
         raise NoServerError(
             f"no reply on {self.reply_channel} to a request on {channel} at {self.url} after "
             f"{1 + self.retries} tries of {patience:g} s. Is the daemon running (modelserver run -c vehicle.yaml), "
             "on this bus ($LCM_DEFAULT_URL) and with this channel prefix?"
         )
-
-    def _await(self, bus: lcm.LCM, request_id: int, reply_kind: type[R], begin: float, patience: float) -> R | None:
-        left = patience
-        while left > 0:
-            bus.handle_timeout(max(1, int(min(left, LONGEST_WAIT_S) * 1000)))
-            for data in self._fresh:
-                try:
-                    reply = decode(_REPLY_TYPES[reply_kind], data)
-                except WireError:
-                    continue  # a reply of another kind: to an earlier question that was given up
-                if reply.header.request_id == request_id:
-                    self._fresh.clear()
-                    return reply  # type: ignore[no-any-return]
-            self._fresh.clear()
-            left = begin + patience - time.monotonic()
-        return None
 
 
 def _found(answer: PoseAnswer | None) -> PoseAnswer:

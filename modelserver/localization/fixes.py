@@ -13,6 +13,7 @@ from modelserver.localization.gate import GoodFix
 from modelserver.localization.heading import Course, Heading
 from modelserver.localization.motion import Motion, cross
 from modelserver.localization.place import Anchor, Jumps, jump_limit, lever_arm
+from modelserver.localization.rest import Rest, judged
 from modelserver.localization.settings import RawSettings
 from modelserver.localization.track import TrackFix
 from modelserver.messages import GpsSample
@@ -29,7 +30,8 @@ class Fixes:
     """The state drawn from fixes.
 
     `work` is a tangent plane near the vehicle in which positions are kept; `anchor` the last good fix; `recent`
-    and `stretch` the fixes for speed and for course; `refusals` counts the fixes refused since the last good one.
+    and `stretch` the fixes for speed and for course; `refusals` counts the fixes refused since the last good one;
+    `rest` is where the vehicle came to rest.
     """
 
     work: LocalFrame | None = None
@@ -38,6 +40,7 @@ class Fixes:
     stretch: tuple[TrackFix, ...] = ()
     jumps: Jumps = field(default_factory=Jumps)
     refusals: int = 0
+    rest: Rest | None = None
 
     def forgotten(self) -> Fixes:
         """Return the state without the stretches: their path is broken."""
@@ -67,21 +70,22 @@ def take(
     standing: bool,
     lever: Vector3,
     fallback_height: float,
+    turn_variance: float,
     settings: RawSettings,
 ) -> Step:
     """Return what is concluded with one good fix more; `motion` is the base frame's at the fix's instant.
 
     `lever` is the antenna's place in the base frame. A fix that told no height has the height carried to it,
-    or `fallback_height` before any was told.
+    or `fallback_height` before any was told (nan: none is known). `turn_variance` is that of the turn until the
+    fix's instant that no inertial sample told of yet. A refused fix leaves all but the counts as it was.
     """
     utime = sample.header.utime
     direction = cmath.rect(1.0, heading.offset) if heading.known else 1.0 + 0j
     arm, arm_up = lever_arm(motion, lever)
     swing, _ = lever_arm(motion, cross(motion.rate, lever))
     fix, ecef = _complete(fixes, fix, motion, arm_up, fallback_height, settings)
-    fixes, heading = _near(fixes, heading, fix, ecef)
-    assert fixes.work is not None
-    east, north, up = fixes.work.from_ecef(ecef)
+    work = fixes.work or LocalFrame.at(fix.latitude_deg, fix.longitude_deg, fix.height)
+    east, north, up = work.from_ecef(ecef)
     place = complex(east, north)
 
     jumped = False
@@ -98,7 +102,7 @@ def take(
         climb = settings.jump_sigmas * math.sqrt(before.fix.up_variance + fix.up_variance)
         if off > limit or abs(up - before.up) > climb + settings.maximum_speed * dt:
             jumps = fixes.jumps.refused(utime, place, fix.sigma, settings)
-            if jumps.count < settings.jump_fixes:
+            if not jumps.believed(settings):
                 return Step(replace(fixes, jumps=jumps, refusals=fixes.refusals + 1), heading, refused="jump")
             jumped = True
         elif dt > settings.gps_timeout:
@@ -107,18 +111,20 @@ def take(
                 speed_sigma is None and abs(place - known) > limit
             )
         if jumped:
-            fixes = fixes.forgotten()
+            fixes = replace(fixes.forgotten(), rest=None)
 
+    fixes, heading, work = _near(fixes, heading, fix, ecef)
+    east, north, up = work.from_ecef(ecef)
+    place = complex(east, north)
     anchor = Anchor(utime, place, up, fix, motion, arm, arm_up)
     newest = TrackFix(utime, place, fix.sigma, motion.path, arm, motion.yaw)
     recent = track.kept(fixes.recent, newest, settings.speed_window + settings.standing_time)
     stretch = track.kept(fixes.stretch, newest, settings.course_window)
     velocity = _velocity(sample, settings)
-    slow = (
-        track.slow(recent, settings)
-        if velocity is None
-        else abs(_at_base(velocity.vector, heading, motion, swing)) <= max(settings.standing_speed, velocity.sigma)
-    )
+    told = None if velocity is None else (_at_base(velocity.vector, heading, motion, swing), velocity.sigma)
+    slow = track.slow(recent, settings) if told is None else abs(told[0]) <= max(settings.standing_speed, told[1])
+    rest, heading, slow = judged(fixes.rest, slow, standing, newest, told, motion.speed, heading, settings)
+    standing = standing and slow
     refused = ""
     if standing:
         # the path of rate alone runs on at rest: a stretch must not reach back into it
@@ -126,14 +132,14 @@ def take(
         speed, speed_sigma = 0.0, settings.standing_speed / 2.0
     else:
         was_known = heading.known
-        heading, met = _course(heading, velocity, stretch, motion, swing, settings)
+        heading, met = _course(heading, velocity, stretch, motion, swing, turn_variance, settings)
         if met is not None:
             stretch = (newest,)
             refused = "course" if met is Course.REFUSED else ""
             jumped = jumped or (met is Course.ANEW and was_known)
         speed, speed_sigma = _speed(heading, velocity, recent, motion, swing, settings)
     return Step(
-        Fixes(fixes.work, anchor, recent, stretch),
+        Fixes(work, anchor, recent, stretch, rest=rest),
         heading,
         speed,
         speed_sigma,
@@ -151,22 +157,26 @@ def _complete(
     if math.isnan(fix.height):
         before = fixes.anchor
         height, variance = fallback_height, settings.assumed_height_sigma**2
+        if math.isnan(height):
+            height, variance = 0.0, settings.unknown_height_sigma**2
         if before is not None:
             age = max((motion.utime - before.utime) * 1e-6, 0.0)
             height = before.fix.height + motion.z - before.motion.z + arm_up - before.lever_up
-            variance = min(before.fix.up_variance + grown(age, motion.speed_sigma, settings), variance)
+            variance = min(
+                before.fix.up_variance + grown(age, motion.speed_sigma, settings), settings.unknown_height_sigma**2
+            )
         fix = replace(fix, height=height, up_variance=variance)
     return fix, ecef_from_geodetic(fix.latitude_deg, fix.longitude_deg, fix.height)
 
 
-def _near(fixes: Fixes, heading: Heading, fix: GoodFix, ecef: Vector3) -> tuple[Fixes, Heading]:
-    """Return the states in a working frame that is near the fix: the same one, or one set anew at it."""
+def _near(fixes: Fixes, heading: Heading, fix: GoodFix, ecef: Vector3) -> tuple[Fixes, Heading, LocalFrame]:
+    """Return the states in a working frame that is near the fix, and that frame: the same one, or one set anew."""
     old = fixes.work
     if old is not None and math.dist(old.ecef, ecef) <= WORK_REACH:
-        return fixes, heading
+        return fixes, heading, old
     work = LocalFrame.at(fix.latitude_deg, fix.longitude_deg, fix.height)
     if old is None:
-        return replace(fixes, work=work), heading
+        return replace(fixes, work=work), heading, work
     level = fixes.anchor.up if fixes.anchor is not None else 0.0
 
     def moved(place: complex, up: float = level) -> tuple[complex, float]:
@@ -189,8 +199,10 @@ def _near(fixes: Fixes, heading: Heading, fix: GoodFix, ecef: Vector3) -> tuple[
             again(fixes.stretch),
             replace(fixes.jumps, place=moved(fixes.jumps.place)[0]) if fixes.jumps.count else fixes.jumps,
             fixes.refusals,
+            None if fixes.rest is None else replace(fixes.rest, place=moved(fixes.rest.place)[0]),
         ),
         replace(heading, offset=math.remainder(heading.offset + turned, math.tau)),
+        work,
     )
 
 
@@ -245,6 +257,7 @@ def _course(
     stretch: tuple[TrackFix, ...],
     motion: Motion,
     swing: complex,
+    turn_variance: float,
     settings: RawSettings,
 ) -> tuple[Heading, Course | None]:
     """Return the heading after this fix's course, and what became of it; None where there was none to take."""
@@ -254,14 +267,15 @@ def _course(
             return heading, None
         # the course is of the instant the velocity was measured: heading has turned since
         offset = cmath.phase(vector) - (motion.yaw - motion.yaw_rate * velocity.age)
-        return heading.met(offset, velocity.course_sigma**2, settings)
+        return heading.met(offset, velocity.course_sigma**2 + turn_variance, settings)
     direction = cmath.rect(1.0, heading.offset) if heading.known else None
     found = track.course(stretch, direction, settings)
     if found is None or found[1] > settings.course_sigma_limit:
         return heading, None
     # the stretch tells the offset of its middle; an error of the bias has turned it since
     half = 0.5 * (stretch[-1].utime - stretch[0].utime) * 1e-6
-    return heading.met(found[0], found[1] ** 2 + heading.bias_variance * half * half, settings)
+    variance = found[1] ** 2 + heading.bias_variance * half * half + turn_variance
+    return heading.met(found[0], variance, settings)
 
 
 def _speed(

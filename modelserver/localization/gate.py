@@ -63,9 +63,14 @@ def judge(sample: GpsSample, settings: RawSettings) -> GoodFix | str:
     height = sample.height_ellipsoidal
     if math.isnan(height):
         height = sample.height_msl + sample.undulation
+    over_sea = math.isnan(height)
+    if over_sea:
+        height = sample.height_msl  # without undulation: off by as much as that is
     if math.isinf(height) or abs(height) > 1e5:
         return "range"
     east, north, cross, up = _covariance(sample, settings)
+    if over_sea:
+        up = max(up, settings.assumed_height_sigma**2)
     fix = GoodFix(latitude, longitude, height, east, north, cross, up)
     return fix if fix.sigma <= settings.maximum_sigma else "sigma"
 

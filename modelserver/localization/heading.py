@@ -17,6 +17,9 @@ from modelserver.localization.settings import RawSettings
 UNKNOWN_VARIANCE = (math.pi / math.sqrt(3.0)) ** 2
 """Variance of a direction of which nothing is known: uniform over the circle."""
 
+_STOOD_GATE = 4.0
+"""Sigmas that a rate at rest may be off the bias known."""
+
 
 class Course(Enum):
     """What became of a course."""
@@ -75,9 +78,12 @@ class Heading:
     def stood(self, rate: float, variance: float) -> Heading:
         """Return the heading after a yaw rate was measured at rest: what is left of it is bias.
 
-        `rate` is without the bias known so far, rad/s, and `variance` its noise.
+        `rate` is without the bias known so far, rad/s, and `variance` its noise. A rate that neither can explain
+        is a turn, and changes nothing.
         """
         s = self.bias_variance + variance
+        if rate * rate > _STOOD_GATE**2 * s:
+            return self
         k1, k2 = self.covariance / s, self.bias_variance / s
         return Heading(
             self.known,
@@ -89,6 +95,20 @@ class Heading:
             self.refused,
             self.refused_offset,
         )
+
+    def doubted(self, bias: float, bias_variance: float, seconds: float) -> Heading:
+        """Return the heading after it turned out that the vehicle moved while it was taken to stand.
+
+        `bias` and `bias_variance` are those of `seconds` ago: what the bias has changed by may be a turn.
+        """
+        turned = (self.bias - bias) * seconds
+        variance = min(self.variance + turned * turned + bias_variance * seconds * seconds, UNKNOWN_VARIANCE)
+        known = max(bias_variance, self.bias_variance)
+        return replace(self, variance=variance, bias=bias, bias_variance=known, covariance=0.0)
+
+    def widened(self, variance: float) -> Heading:
+        """Return the heading with `variance` more."""
+        return replace(self, variance=min(self.variance + variance, UNKNOWN_VARIANCE))
 
     def met(self, offset: float, variance: float, settings: RawSettings) -> tuple[Heading, Course]:
         """Return the heading after a course said `offset` with `variance`, and what became of the course.

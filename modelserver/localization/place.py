@@ -45,18 +45,23 @@ def lever_arm(motion: Motion, lever: Vector3) -> tuple[complex, float]:
 
 @dataclass(frozen=True, slots=True)
 class Jumps:
-    """A run of refused fixes that agree among themselves: `count` of them, the last at `utime` and `place`."""
+    """A run of refused fixes that agree: `count` of them, the first at `since`, the last at `utime` and `place`."""
 
     count: int = 0
     utime: int = 0
     place: complex = 0j
+    since: int = 0
 
     def refused(self, utime: int, place: complex, sigma: float, settings: RawSettings) -> Jumps:
         """Return the run with one more refused fix: longer where it agrees with the last, else begun anew."""
         dt = abs(utime - self.utime) * 1e-6
         reach = settings.maximum_speed * dt + settings.jump_sigmas * math.sqrt(2.0) * sigma
         agrees = self.count > 0 and abs(place - self.place) <= reach
-        return Jumps(self.count + 1 if agrees else 1, utime, place)
+        return Jumps(self.count + 1, utime, place, self.since) if agrees else Jumps(1, utime, place, utime)
+
+    def believed(self, settings: RawSettings) -> bool:
+        """Return whether the run is long enough, in fixes and in time, to be right against the prediction."""
+        return self.count >= settings.jump_fixes and (self.utime - self.since) * 1e-6 >= settings.jump_time
 
 
 def jump_limit(dt: float, sigma_before: float, sigma: float, speed_sigma: float | None, settings: RawSettings) -> float:

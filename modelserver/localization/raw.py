@@ -80,7 +80,7 @@ class RawLocalizer(RawState):
         utime, settings = sample.header.utime, self.settings
         stamps, verdict = self.imu_stamps.take(utime, settings)
         if verdict is Verdict.STEPPED_BACK:
-            self = self._begun_anew(utime)
+            self = self._begun_anew(utime, stamps.lost)
         elif verdict is not Verdict.GOOD:
             return replace(self, imu_stamps=stamps), _refused(sample, verdict.value)
         inertial = attitude.read(sample, self.mounts.X_base_imu)
@@ -120,6 +120,8 @@ class RawLocalizer(RawState):
             still = still.felt(utime, wz_level, short, math.sqrt(heading.bias_variance), settings)
             if still.standing(utime, settings):
                 heading = heading.stood(wz_level, max(settings.gyro_noise**2 / short, still.variance))
+                if known_fixes.rest is not None:
+                    heading = known_fixes.rest.unsure(utime, short, heading, settings)
                 gain = short / (settings.tilt_time + short)
                 bx, by = bx + gain * rate[0], by + gain * rate[1]
                 if speed:
@@ -153,7 +155,7 @@ class RawLocalizer(RawState):
         utime, settings = sample.header.utime, self.settings
         stamps, verdict = self.gps_stamps.take(utime, settings)
         if verdict is Verdict.STEPPED_BACK:
-            self = self._begun_anew(utime)
+            self = self._begun_anew(utime, stamps.lost)
         elif verdict is not Verdict.GOOD:
             return replace(self, gps_stamps=stamps), _refused(sample, verdict.value)
         fix = gate.judge(sample, settings)
@@ -165,9 +167,11 @@ class RawLocalizer(RawState):
 
         motion, heading = self.motion or Motion(utime), self.heading
         ahead = (utime - motion.utime) * 1e-6
-        if ahead > settings.rate_hold:
-            # no inertial samples: what was predicted so far is what Odom keeps
+        if ahead > settings.imu_timeout:
+            # no inertial samples: what was predicted so far is what Odom keeps. Samples that merely lag behind
+            # the fixes must still find their place, so until then the prediction is for the fix alone
             heading = heading.carried(ahead, settings)
+            ahead = 0.0
             motion = motion.advanced(utime, motion.rate, settings)
         then = self.motion_at(utime, motion)
         step = fixes.take(
@@ -178,7 +182,8 @@ class RawLocalizer(RawState):
             then,
             self.stillness.standing(utime, settings),
             self.mounts.X_base_antenna.xyz,
-            0.0 if self.origin is None else self.origin.height,
+            math.nan if self.origin is None else self.origin.height,
+            (settings.gap_rate_sigma * max(ahead - settings.rate_hold, 0.0)) ** 2,
             settings,
         )
         notes = _refused(sample, step.refused) if step.refused else ()
@@ -220,11 +225,24 @@ class RawLocalizer(RawState):
 
     # --- shared ---------------------------------------------------------------------------------------------
 
-    def _begun_anew(self, utime: int) -> RawLocalizer:
-        """Return the localizer after its clock was set back: only Odom, the origin and the biases stay."""
+    def _begun_anew(self, utime: int, lost: float) -> RawLocalizer:
+        """Return the localizer after its clock was set back: only Odom, the origin and the biases stay.
+
+        How the vehicle moved for the `lost` seconds until that was certain is not known.
+        """
         motion = self.motion
         if motion is not None:
-            motion = replace(motion, utime=utime, rate=(0.0, 0.0, 0.0), speed=0.0, speed_utime=0)
+            yaw_variance = motion.yaw_variance + (self.settings.gap_rate_sigma * lost) ** 2
+            way = max(abs(motion.speed), motion.speed_sigma) * lost
+            motion = replace(
+                motion,
+                utime=utime,
+                rate=(0.0, 0.0, 0.0),
+                speed=0.0,
+                speed_utime=0,
+                yaw_variance=min(yaw_variance, 1e3),
+                position_variance=min(motion.position_variance + way * way, 1e12),
+            )
         return replace(
             self,
             motion=motion,

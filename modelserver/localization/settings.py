@@ -40,7 +40,10 @@ class RawSettings:
     assumed_hdop: float = 1.5
     """HDOP taken where the receiver tells neither it nor a covariance: a common value under open sky."""
     assumed_height_sigma: float = 100.0
-    """Sigma of the height where no fix gave one, metres."""
+    """Sigma of the height where no fix gave one but the origin has one, or one is above mean sea level without
+    undulation, metres: undulation is -107 to 86 m (EGM2008)."""
+    unknown_height_sigma: float = 5000.0
+    """Sigma of height 0 where nothing tells a height, metres: roads reach above 5000 m."""
 
     # --- how fixes err relative to each other ---
 
@@ -64,6 +67,8 @@ class RawSettings:
     """How many sigmas a fix may be off its prediction before it is a jump."""
     jump_fixes: int = 5
     """How many refused fixes in a row, agreeing among themselves, are believed instead of the prediction."""
+    jump_time: float = 5.0
+    """How long they must have agreed, seconds: multipath on a moving vehicle changes within a few seconds."""
 
     # --- the inertial unit ---
 

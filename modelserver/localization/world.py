@@ -125,9 +125,22 @@ def _invalid(state: RawState, utime: int) -> Invalid:
         invalid |= 8  # NOT_MOVED_YET
     if state.fixes.refusals >= settings.refusals:
         invalid |= 128  # GPS_REJECTED
-    if state.stepped:
+    if state.stepped or _too_early(state, utime):
         invalid |= 512  # CLOCK_STEPPED
     return Invalid(invalid)
+
+
+def _too_early(state: RawState, utime: int) -> bool:
+    """Return whether `utime` is so far before the newest samples that its clock and theirs cannot be one.
+
+    Before the oldest motion kept there is nothing to look up either.
+    """
+    settings, anchor, imu = state.settings, state.fixes.anchor, state.imu_utime
+    if imu is not None and (imu - utime) * 1e-6 > settings.imu_timeout:
+        return True
+    if anchor is not None and (anchor.utime - utime) * 1e-6 > settings.gps_timeout:
+        return True
+    return bool(state.history) and utime < state.history[0].utime
 
 
 def _quality(state: RawState, utime: int, motion: Motion) -> Quality:

@@ -162,7 +162,10 @@ def test_sigma_is_the_receivers_or_that_of_the_kind_of_fix():
 
 def test_height_may_be_told_above_the_sea_or_not_at_all():
     assert gate.judge(fix(height_ellipsoidal=math.nan, height_msl=720.0, undulation=-18.0), S).height == 702.0
-    assert math.isnan(gate.judge(fix(height_ellipsoidal=math.nan, height_msl=720.0), S).height)
+    over_sea = gate.judge(fix(height_ellipsoidal=math.nan, height_msl=720.0), S)
+    assert over_sea.height == 720.0
+    assert over_sea.up_variance == S.assumed_height_sigma**2
+    assert math.isnan(gate.judge(fix(height_ellipsoidal=math.nan), S).height)
 
 
 # --- attitude and motion ------------------------------------------------------------------------------------
