@@ -98,7 +98,9 @@ def take(
             base, _, _ = before.base(motion, direction)
             carried, speed_sigma = base + direction * arm, motion.speed_sigma
         off = abs(place - carried)
-        limit = jump_limit(dt, before.fix.sigma, fix.sigma, speed_sigma, settings)
+        # while fixes are being refused, time alone must not let the same ones in
+        within = min(dt, settings.gps_timeout) if fixes.jumps.count else dt
+        limit = jump_limit(within, before.fix.sigma, fix.sigma, speed_sigma, settings)
         climb = settings.jump_sigmas * math.sqrt(before.fix.up_variance + fix.up_variance)
         if off > limit or abs(up - before.up) > climb + settings.maximum_speed * dt:
             jumps = fixes.jumps.refused(utime, place, fix.sigma, settings)
@@ -122,8 +124,9 @@ def take(
     stretch = track.kept(fixes.stretch, newest, settings.course_window)
     velocity = _velocity(sample, settings)
     told = None if velocity is None else (_at_base(velocity.vector, heading, motion, swing), velocity.sigma)
-    slow = track.slow(recent, settings) if told is None else abs(told[0]) <= max(settings.standing_speed, told[1])
-    rest, heading, slow = judged(fixes.rest, slow, standing, newest, told, motion.speed, heading, settings)
+    slow = track.slow(recent, settings) if told is None else abs(told[0]) <= _slow_limit(told[1], settings)
+    least = max(abs(motion.speed) - 2.0 * motion.speed_sigma, 0.0)
+    rest, heading, slow = judged(fixes.rest, slow, standing, newest, told, least, heading, settings)
     standing = standing and slow
     refused = ""
     if standing:
@@ -238,6 +241,11 @@ def _velocity(sample: GpsSample, settings: RawSettings) -> _Velocity | None:
         course_sigma = sigma / max(abs(vector), 1e-3)
     course_sigma = max(course_sigma, settings.heading_floor)
     return _Velocity(vector, sigma, course_sigma, age)
+
+
+def _slow_limit(sigma: float, settings: RawSettings) -> float:
+    """Return the speed up to which a velocity may be a standing vehicle's: its mean over time tells the rest."""
+    return max(sigma, min(settings.standing_speed + 3.0 * sigma, settings.course_speed))
 
 
 def _at_base(vector: complex, heading: Heading, motion: Motion, swing: complex) -> complex:

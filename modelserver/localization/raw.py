@@ -119,9 +119,11 @@ class RawLocalizer(RawState):
             short = min(dt, settings.rate_hold)
             still = still.felt(utime, wz_level, short, math.sqrt(heading.bias_variance), settings)
             if still.standing(utime, settings):
-                heading = heading.stood(wz_level, max(settings.gyro_noise**2 / short, still.variance))
-                if known_fixes.rest is not None:
-                    heading = known_fixes.rest.unsure(utime, short, heading, settings)
+                rest = known_fixes.rest
+                if rest is None or not heading.known or rest.kept(utime, settings):
+                    heading = heading.stood(wz_level, max(settings.gyro_noise**2 / short, still.variance))
+                if rest is not None:
+                    heading = rest.unsure(utime, short, heading, settings)
                 gain = short / (settings.tilt_time + short)
                 bx, by = bx + gain * rate[0], by + gain * rate[1]
                 if speed:

@@ -55,6 +55,11 @@ class Rest:
         """Return after how many seconds at `standing_speed` the fixes tell that the vehicle has left."""
         return _MOVED * math.sqrt(2.0) * self.sigma / settings.standing_speed
 
+    def kept(self, utime: int, settings: RawSettings) -> bool:
+        """Return whether the place was kept so long that a rate still there is the bias's, not a slow turn's."""
+        age = (utime - self.utime) * 1e-6
+        return age >= 2.0 * self.noticed(settings) or (self.count > 0 and age >= _PATIENCE * settings.standing_time)
+
     def unsure(self, utime: int, dt: float, heading: Heading, settings: RawSettings) -> Heading:
         """Return the heading of a standing vehicle: what its bias has changed by may yet turn out to be a turn."""
         age = (utime - self.utime) * 1e-6
@@ -90,16 +95,19 @@ def judged(
 ) -> tuple[Rest, Heading, bool]:
     """Return the rest and the heading after a fix, and whether the vehicle may be standing.
 
-    `slow` is what recent fixes said, `velocity` the receiver's with its sigma, `speed` that before the fix.
+    `slow` is what recent fixes said, `velocity` the receiver's with its sigma, `speed` the
+    least that the vehicle had before the fix.
     """
-    if not slow or rest is None:
-        creeping = rest is not None and rest.creeping and abs(speed) < settings.course_speed
-        return Rest.at(fix.utime, fix.place, fix.sigma, heading, creeping), heading, slow
+    if rest is None or not (slow or abs(speed) < settings.course_speed):
+        return Rest.at(fix.utime, fix.place, fix.sigma, heading), heading, slow
     velocity_sigma = 0.0
     if velocity is not None:
         rest, velocity_sigma = rest.heard(velocity[0]), velocity[1]
+    was = rest.creeping or slow or standing
     after, may = rest.next(fix.utime, fix.place, fix.sigma, velocity_sigma, heading, settings)
+    if after.creeping and not was:
+        after = replace(after, creeping=False)  # left at a run, then
     if standing and not may:
         heading = heading.doubted(rest.bias, rest.bias_variance, (fix.utime - rest.utime) * 1e-6)
         after = replace(after, bias=heading.bias, bias_variance=heading.bias_variance)
-    return after, heading, may
+    return after, heading, may and slow

@@ -84,7 +84,11 @@ def load_vehicle(config: VehicleConfig, file: str = "") -> Vehicle:
 
     `file` is the vehicle file's path, for the problems. Raises GeometryError, ConfigError, OSError.
     """
-    model = load_model(config.geometry, variables=config.variables)
+    try:
+        model = load_model(config.geometry, variables=config.variables)
+    except OSError as error:
+        why = f"the geometry file {config.geometry} cannot be read: {error.strerror}"
+        raise ConfigError([Problem(Severity.ERROR, why, Source(file, element="geometry"))]) from None
     problems = []
     gps, imu = config.sensors.gps, config.sensors.imu
     named = [("base_frame", config.base_frame)]
@@ -164,7 +168,12 @@ def run(vehicle: Vehicle, url: str = "") -> None:
     keeper = None
     if config.origin.keep and config.origin.initial_utm is None:
         directory = Path(config.state_directory) if config.state_directory else default_directory()
-        keeper = OriginKeeper(directory, config.vehicle)
+        if directory is None:
+            log.warning(
+                "there is no home directory, so the origin is not kept; set state_directory in the vehicle file"
+            )
+        else:
+            keeper = OriginKeeper(directory, config.vehicle)
     origin = keeper.load() if keeper else None
 
     def keep(note: OriginLatched) -> None:
@@ -192,8 +201,14 @@ def run(vehicle: Vehicle, url: str = "") -> None:
     )
     if vehicle.mounts is None:
         log.warning("the vehicle file does not name both a GPS and an IMU: there is no pose in the world, and no POSE")
-    if origin is not None:
-        log.info("the origin kept from an earlier run is used: %s", origin)
+    if origin is not None and keeper is not None:
+        log.info(
+            "the origin of an earlier run is used: %s (remove it to set a new one): %.3f E %.3f N %.3f m, zone %d%s",
+            keeper.path,
+            *origin.initial_utm,
+            origin.zone,
+            "N" if origin.north else "S",
+        )
     # what is loaded lives as long as the process: the collector need not look at it again
     gc.collect()
     gc.freeze()

@@ -22,12 +22,18 @@ MAX_BYTES = 4096
 """Ten times what is written; more is no kept origin."""
 
 
-def default_directory() -> Path:
-    """Return where state is kept unless the vehicle file says otherwise: systemd's choice, else the user's."""
+def default_directory() -> Path | None:
+    """Return where state is kept unless the vehicle file says otherwise: systemd's choice, else the user's.
+
+    None for a user without a home directory.
+    """
     given = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
     if given:
         return Path(given)
-    base = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    try:
+        base = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    except RuntimeError:
+        return None
     return Path(base) / "modelserver"
 
 

@@ -78,6 +78,7 @@ class Loop:
         self._budget = 0
         self._timeless = TimelessReplies()
         self._answered = 0  # from `_timeless`, since the last tick
+        self._told: set[tuple[str, str]] = set()
         self._asked = b""  # the request that the core is answering
         self._due_ns = clock.monotonic_ns()
         self._stopping = False
@@ -188,9 +189,11 @@ class Loop:
         now = self._clock.now()
         if isinstance(error, WireError):
             self._step(Rejected(channel, error.reason), now)
+            self._told.add((channel, error.reason))
             self._log.warning(f"{channel}:{error.reason}", "rejected a message on %s: %s", channel, error)
         else:
             self._step(Rejected(channel, "handler"), now)
+            self._told.add((channel, "handler"))
             self._log.exception(f"{channel}:handler", "an error of the server's own while handling %s", channel)
 
     def _step(self, event: Event, now: Instant) -> None:
@@ -219,6 +222,12 @@ class Loop:
 
     def _send_health(self, output: PublishHealth) -> None:
         self._bus.publish(self._health, encode(output.health))
+        for source, reason, count in output.health.rejected:
+            if (source, reason) not in self._told:
+                self._told.add((source, reason))
+                log.warning(
+                    "%s: %d refused so far, reason: %s; the counts go on in %s", source, count, reason, self._health
+                )
 
     def _send_origin(self, output: OriginLatched) -> None:
         origin = output.origin

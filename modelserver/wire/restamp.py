@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import struct
-from typing import Final
 
-import mslcm
-from modelserver.wire.channels import CHANNELS, Way
+from modelserver.wire.kinds import is_sample
 
-_SAMPLES: Final = frozenset(
-    getattr(mslcm, channel.type_name)._get_packed_fingerprint() for channel in CHANNELS if channel.way is Way.SENSOR
-)
 _STAMPS = struct.Struct(">qdq")
 """Behind the fingerprint every sample begins with its header: utime, utime_sigma, host_utime."""
 
 
 def restamped(data: bytes, shift: int) -> bytes:
     """Return a sample with utime and host_utime later by `shift` microseconds; other messages come back unchanged."""
-    if data[:8] not in _SAMPLES or len(data) < 8 + _STAMPS.size:
+    if not is_sample(data) or len(data) < 8 + _STAMPS.size:
         return data
     utime, sigma, host_utime = _STAMPS.unpack_from(data, 8)
     moved = _STAMPS.pack(utime + shift, sigma, host_utime + shift if host_utime else 0)

@@ -319,7 +319,7 @@ def test_given_a_restart_then_the_origin_is_kept_and_a_client_goes_on(start_daem
         after = client.get_pose("Cart:Base", "World:UTM", at=at)
         assert after.origin == before.origin
         assert after.transformation.origin_id == before.transformation.origin_id
-    assert "the origin kept from an earlier run is used" in second.log
+    assert "the origin of an earlier run is used" in second.log
 
 
 def test_given_a_damaged_kept_origin_then_the_daemon_starts_and_captures_anew(

@@ -205,7 +205,7 @@ def show(config: Path, url: str, seconds: float, children: Children) -> None:
             platform.get_transformation("Digiclop:ImagePlane", "Raptor:CG")
         except QueryError as error:
             say(f"{error}. Nearest: {', '.join(error.nearest)}")
-    say("\nDone. Next: modelserver run -c config/raptor/vehicle.yaml, then modelserver query Raptor:CG World:UTM")
+    say(f"\nDone. Next: modelserver run -c {vehicle_file()}, and in another shell: modelserver bodies")
 
 
 def first_answer(ask: Callable[[], list[str]], children: Children) -> list[str]:

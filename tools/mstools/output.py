@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
+from collections.abc import Iterator
+from typing import TextIO
 
 import typer
 
@@ -46,13 +48,25 @@ def size_of(model: Model) -> str:
 
 
 def write_file(path: str, text: str, replace: bool) -> None:
-    """Write a file so that it is there whole or not at all.
+    """Write a file so that it is there whole or not at all; as `written_whole`."""
+    with written_whole(path, replace) as stream:
+        stream.write(text)
 
-    Raises ModelServerError where it exists and `replace` is false, OSError where it cannot be written.
+
+@contextlib.contextmanager
+def written_whole(path: str, replace: bool) -> Iterator[TextIO]:
+    """Give a stream to write; the file is there, whole, when the block has ended well, and else as it was.
+
+    What is no regular file (a device, a pipe) is written to as it is. Raises ModelServerError where the file exists
+    and `replace` is false, OSError where it cannot be written.
     """
     target = os.path.realpath(path)
     if os.path.isdir(target):
         raise ModelServerError(f"{safe(path)} is a directory; name a file in it")
+    if os.path.exists(target) and not os.path.isfile(target):
+        with open(target, "w", encoding="utf-8", newline="\n") as stream:
+            yield stream
+        return
     if os.path.lexists(target):
         if not replace:
             raise _exists(path)
@@ -63,8 +77,8 @@ def write_file(path: str, text: str, replace: bool) -> None:
         mode = 0o666 & ~umask
     handle, draft = tempfile.mkstemp(prefix=".", suffix=".part", dir=os.path.dirname(target))
     try:
-        with open(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
+        with open(handle, "w", encoding="utf-8", newline="\n") as stream:
+            yield stream
             stream.flush()
             os.fchmod(stream.fileno(), mode)
             os.fsync(stream.fileno())

@@ -22,12 +22,17 @@ def command(
     model: ModelOption = None,
     settings: Variables = None,
     at: Annotated[
-        str, typer.Option("--at", metavar="TIME", help="Microseconds since 1970, or 2026-11-21T08:30:00.5Z.")
+        str,
+        typer.Option(
+            "--at", metavar="TIME", help="Microseconds since 1970, or 2026-11-21T08:30:00.5Z (without Z: local time)."
+        ),
     ] = "",
     policy: Annotated[
         str, typer.Option("--policy", help=f"What is accepted for an answer at a time: {', '.join(POLICIES)}.")
     ] = "interpolated",
-    wait_ms: Annotated[int, typer.Option("--wait-ms", min=0, help="Let the daemon wait for data that cover it.")] = 0,
+    wait_ms: Annotated[
+        int, typer.Option("--wait-ms", min=0, max=60_000, help="Let the daemon wait for data that cover it.")
+    ] = 0,
     inverse: Annotated[bool, typer.Option("--inverse", help="Print the reverse relation.")] = False,
     matrix: Annotated[bool, typer.Option("--matrix", help="Print the 4x4 transform too.")] = False,
     as_json: JsonOption = False,
@@ -98,7 +103,7 @@ def describe(answer: PoseAnswer, matrix: bool = False) -> str:
             lines.append(
                 f"  UTM             {easting:.3f} E  {northing:.3f} N  {height:.3f} up  zone {origin.zone}{half}"
             )
-        lines.append(f"  epoch           {transformation.pose_epoch}, origin {origin.origin_id:x}")
+        lines.append(f"  epoch           {transformation.pose_epoch}, origin {origin.origin_id:016x}")
     if not math.isnan(answer.horizontal_bound):
         bound = f"{answer.horizontal_bound:.2f} m, heading {math.degrees(answer.heading_bound):.2f} deg"
         lines.append(f"  bounds          {bound}")
@@ -128,7 +133,7 @@ def as_dict(answer: PoseAnswer) -> dict[str, Any]:
         "flags": [flag.name for flag in Quality if flag in answer.quality],
         "initial_utm": None if origin is None else list(origin.initial_utm),
         "utm_zone": None if origin is None else f"{origin.zone}{'N' if origin.north else 'S'}",
-        "origin_id": transformation.origin_id,
+        "origin_id": f"{transformation.origin_id:016x}" if transformation.origin_id else None,
         "pose_epoch": transformation.pose_epoch,
         "horizontal_bound": _number(answer.horizontal_bound),
         "heading_bound": _number(answer.heading_bound),

@@ -7,7 +7,7 @@ import math
 import os
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Annotated, TextIO
 
@@ -15,7 +15,9 @@ import typer
 
 from modelserver.errors import RecordingError, nearest_names, shown
 from modelserver.wire.eventlog import LogEvent, LogFile
+from modelserver.wire.kinds import is_of_service
 from mstools.asking import JsonOption, UrlOption
+from mstools.output import written_whole
 from mstools.progress import progress
 
 TIMES_LIMIT = 64 << 20
@@ -44,13 +46,17 @@ def command(
     channel: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Only this channel; may be given again.")
     ] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Onto the bus, send recorded poses, requests and replies too.")
+    ] = False,
     url: UrlOption = "",
     as_json: JsonOption = False,
 ) -> None:
     """Feed a recorded log to the bus, or straight through the localization.
 
     Onto the bus, messages go out at the pace of their arrival, unchanged; a daemon that publishes by timer takes
-    samples of another day for stale, so give it --restamp, or publish.mode: event in its vehicle file. Offline, with
+    samples of another day for stale, so give it --restamp, or publish.mode: event in its vehicle file. What a daemon
+    has said (poses, health, replies) is left out, unless --all or --channel asks for it. Offline, with
     --poses, the daemon's core takes them as fast as it can, and the pose of one frame in World:UTM is written for
     even or listed times, each from nothing but what had arrived before it; docs/recordings.md says exactly what that
     means. A log that breaks off in its last event is used up to there; for other damage the exit code is 1.
@@ -67,6 +73,8 @@ def command(
             raise typer.BadParameter("--poses needs the vehicle: -c FILE")
         if not (math.isfinite(rate) and 0.0 < rate <= 10_000.0):
             raise typer.BadParameter(f"a rate is above 0 and at most 10000 Hz, got {rate:g}")
+        if speed != "1" or restamp or url or everything:
+            raise typer.BadParameter("--speed, --restamp, --all and --url are for the bus; --poses works offline")
         offline(log, config, poses, frame, rate, at_times, channels, as_json)
     else:
         if frame or at_times is not None:
@@ -74,14 +82,14 @@ def command(
         factor = _speed(speed)
         if restamp and factor != 1.0:
             raise typer.BadParameter("--restamp goes with --speed 1: stamps must not run faster than the clock")
-        to_bus(log, config, factor, channels, url, as_json, restamp)
+        to_bus(log, config, factor, None if everything else channels, url, as_json, restamp)
 
 
 def to_bus(
     log: Path,
     config: Path | None,
     speed: float,
-    channels: frozenset[str],
+    channels: frozenset[str] | None,
     url: str,
     as_json: bool,
     restamp: bool = False,
@@ -107,7 +115,12 @@ def to_bus(
                         shown_at = now
                         show(event.end)
 
-                player.play(_only(recording, channels), seen)
+                if channels is None:
+                    player.play(recording, seen)
+                elif channels:
+                    player.play(_only(recording, channels), seen)
+                else:
+                    player.play(_inputs(recording), seen)
         finally:
             report = {"sent": player.sent, "seconds": player.span, "most_late": player.late}
             words = (
@@ -139,6 +152,8 @@ def offline(
     if vehicle.mounts is None:
         raise RecordingError(f"{config}: names no GPS and IMU under sensors, so there is no pose in the world to write")
     times = None if at_times is None else read_times(at_times)
+    geometry = Path(vehicle.config.geometry)
+    _check_output(poses, [log, config, geometry, *([] if at_times is None else [at_times])])
     with LogFile(log) as recording:
         run = Run(vehicle, _only(recording, channels), frame or vehicle.config.base_frame)
         started = time.monotonic()
@@ -222,10 +237,23 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(sorted(names))
 
 
-def _output(poses: str) -> nullcontext[TextIO] | TextIO:
+def _output(poses: str) -> AbstractContextManager[TextIO]:
     if poses == "-":
         return nullcontext(typer.get_text_stream("stdout"))
-    return Path(poses).open("w", encoding="ascii", newline="\n")
+    return written_whole(poses, replace=True)
+
+
+def _check_output(poses: str, inputs: Iterable[Path]) -> None:
+    """Raise RecordingError where the poses would go over a file that they are made from."""
+    target = Path(poses)
+    for each in inputs:
+        if poses != "-" and target.exists() and each.exists() and target.samefile(each):
+            raise RecordingError(f"{poses}: is read by this command; name another file for the poses")
+
+
+def _inputs(recording: Iterable[LogEvent]) -> Iterator[LogEvent]:
+    """Yield all but what a daemon has said and was asked: beside a running one that would be heard twice."""
+    return (event for event in recording if not is_of_service(event.data))
 
 
 def _report_damage(recording: LogFile) -> None:
@@ -238,7 +266,7 @@ def _report_damage(recording: LogFile) -> None:
 
 
 def _speed(text: str) -> float:
-    if text in ("max", "0"):
+    if text == "max":
         return math.inf
     try:
         value = float(text)

@@ -79,7 +79,12 @@ def types_jar() -> Path:
 def cache_folder() -> Path:
     """Return the folder for what can be made again, in the user's cache."""
     cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return (cache if cache.is_absolute() else Path.home() / ".cache") / "modelserver"
+    if not cache.is_absolute():
+        try:
+            cache = Path.home() / ".cache"
+        except RuntimeError:
+            raise MissingToolError("there is no home directory to keep the types in; set XDG_CACHE_HOME") from None
+    return cache / "modelserver"
 
 
 def contract_hash(files: Sequence[Path]) -> str:

@@ -81,7 +81,7 @@ def test_given_a_world_frame_for_base_then_it_is_refused(tmp_path: Path) -> None
 def test_given_a_geometry_that_is_wrong_then_its_problems_are_told(tmp_path: Path) -> None:
     with pytest.raises(GeometryError, match="Camrea"):
         vehicle(tmp_path, geometry=GEOMETRY.replace("to: Camera:Origin", "to: Camrea:Origin"))
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(ConfigError, match=r"geometry file .*geometri.yaml cannot be read: No such file"):
         vehicle(tmp_path, VEHICLE.replace("geometry.yaml", "geometri.yaml"))
 
 

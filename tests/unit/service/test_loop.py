@@ -448,3 +448,17 @@ def test_given_control_characters_then_they_never_reach_the_log_raw(
 def test_given_percent_signs_from_the_bus_then_they_are_text(caplog: pytest.LogCaptureFixture) -> None:
     RateLimited(logging.getLogger("test"), FakeClock()).warning("a", "%s", "%s %d %(x)s")
     assert caplog.records[0].getMessage() == "%s %d %(x)s"
+
+
+def test_given_a_refused_sample_then_the_log_tells_each_reason_once(caplog: pytest.LogCaptureFixture) -> None:
+    rig = Rig()
+    for n in range(3):
+        rig.send(imu(START - S + n * 10_000, "refuse:range"))
+    rig.turns(1)
+    for _ in range(5):
+        rig.clock.advance(1.0)
+        rig.turns(1)
+    (line,) = [each.getMessage() for each in caplog.records]
+    assert "sensor:refuse:range" in line
+    assert "reason: range" in line
+    assert "MODELSERVER_HEALTH" in line

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -12,9 +13,13 @@ import lcm
 import pytest
 from support_recordings import EASTING, HEIGHT, HUSKY, LATENCY, NORTHING, SPEED, START, drive, write_log
 
+from modelserver.messages import GetBodyList, PoseAnswer, RequestHeader
 from modelserver.service import playback
+from modelserver.spatial import Pose, Transformation
+from modelserver.wire.codec import encode
+from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools import cli
-from mstools.replay import read_times
+from mstools.replay import _inputs, read_times
 
 HEADER = "utime,easting,northing,up,qw,qx,qy,qz,pose_valid,invalid_reasons"
 
@@ -276,3 +281,30 @@ def test_given_an_interrupt_when_played_then_it_ends_with_the_count(
     code, words, _ = run(driven, "--url", "memq://")
     assert code == 130
     assert "3 messages sent" in words
+
+
+def test_given_an_input_as_output_when_replayed_then_it_is_refused_and_not_touched(
+    driven: Path, tmp_path: Path, run: Run
+) -> None:
+    log = tmp_path / "drive.lcm"
+    log.write_bytes(driven.read_bytes())
+    link = tmp_path / "poses.csv"
+    link.symlink_to(log)
+    for target in (log, link):
+        code, _, err = run(log, "-c", HUSKY, "--poses", target)
+        assert code == 1
+        assert "is read by this command" in err
+        assert log.read_bytes() == driven.read_bytes()
+
+
+def test_given_a_log_of_a_running_daemon_then_what_it_said_is_not_sent_again(driven: Path) -> None:
+    pose = encode(PoseAnswer(Transformation("Cart:Base", "World:UTM", Pose.identity(), None, 5)))
+    request = encode(GetBodyList(RequestHeader(1, "REPLY_X")))
+    events = [
+        LogEvent(0, 1, "POSE", pose, 0),
+        LogEvent(1, 2, "PLATFORM_GET_BODY_LIST", request, 0),
+        LogEvent(2, 3, "CAMERA", b"of another program", 0),
+    ]
+    with LogFile(driven) as recording:
+        sensors = list(itertools.islice(recording, 3))
+    assert list(_inputs([*events, *sensors])) == [events[2], *sensors]
