@@ -1,14 +1,16 @@
-"""`modelserver check`: everything that is wrong with a geometry file, at once."""
+"""`modelserver check`: everything that is wrong with a geometry file or a vehicle file, at once."""
 
 from __future__ import annotations
 
 import json
+import os
+import re
 from collections import Counter
 from typing import Annotated, Any
 
 import typer
 
-from modelserver.errors import Problem, Severity, Source
+from modelserver.errors import ConfigError, GeometryError, Problem, Severity, Source
 from modelserver.formats import check_file
 from modelserver.geometry.model import Model
 from mstools.options import Variables, parse_variables
@@ -16,14 +18,17 @@ from mstools.output import counted, print_problem, safe, size_of
 
 
 def command(
-    files: Annotated[list[str], typer.Argument(metavar="FILE", help="Geometry files: Miro XML or YAML.")],
+    files: Annotated[
+        list[str], typer.Argument(metavar="FILE", help="Geometry files (Miro XML or YAML), or vehicle files.")
+    ],
     variables: Variables = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")] = False,
     notes: Annotated[bool, typer.Option("--notes", help="Print notes as well; they change no exit code.")] = False,
 ) -> None:
     """Say everything that is wrong with a geometry file: severity, place, what, and what to do.
 
-    Exits 0 when every file has neither error nor warning, else 1.
+    A vehicle file is checked together with the geometry it names. Exits 0 when every file has neither error nor
+    warning, else 1.
 
     Example: modelserver check config/raptor/geometry.xml
     """
@@ -40,10 +45,30 @@ def command(
 
 def _checked(file: str, variables: dict[str, str]) -> tuple[Model | None, tuple[Problem, ...]]:
     try:
-        return check_file(file, variables)
+        return _checked_vehicle(file) if _is_vehicle_file(file) else check_file(file, variables)
     except OSError as error:
         message = f"the file cannot be read: {error.strerror or error}"
         return None, (Problem(Severity.ERROR, message, Source(file), "look at the path and its permissions"),)
+
+
+def _is_vehicle_file(file: str) -> bool:
+    if not os.path.isfile(file):
+        return False
+    with open(file, "rb") as stream:
+        head = stream.read(1 << 16)
+    return all(re.search(rb"^%b\s*:" % key, head, re.MULTILINE) for key in (b"vehicle", b"base_frame"))
+
+
+def _checked_vehicle(file: str) -> tuple[Model | None, tuple[Problem, ...]]:
+    # imported here: a geometry file needs neither the configuration's libraries nor geodesy
+    from modelserver.config import load_config
+    from modelserver.service.daemon import load_vehicle
+
+    try:
+        model = load_vehicle(load_config(file), file).model
+    except (ConfigError, GeometryError) as error:
+        return None, error.problems
+    return model, model.problems
 
 
 def _is_unclean(problems: tuple[Problem, ...]) -> bool:

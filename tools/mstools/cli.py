@@ -19,7 +19,7 @@ from mstools.output import print_problem, safe
 COMMANDS = {
     "demo": "Run the whole service on simulated sensors and watch it answer.",
     "run": "Run the service for a vehicle file.",
-    "check": "Say everything that is wrong with a geometry file.",
+    "check": "Say everything that is wrong with a geometry or vehicle file.",
     "convert": "Write a geometry file in another form.",
     "query": "Where is one frame in another?",
     "bodies": "List the bodies.",

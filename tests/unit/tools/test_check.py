@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from support_formats import YAML, miro, tree, tree_frame
@@ -125,3 +126,20 @@ def test_nothing_heavy_is_imported(tmp_path):
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=tmp_path)
     assert "clean" in done.stdout
     assert {"filterpy", "matplotlib", "scipy", "pyproj", "lxml", "lcm"}.isdisjoint(done.stderr.split())
+
+
+def test_a_vehicle_file_is_checked_with_its_geometry(check, tmp_path):
+    vehicle = Path(__file__).parents[3] / "config" / "husky" / "vehicle.yaml"
+    code, out = check(str(vehicle))[:2]
+    assert code == 0
+    assert "clean" in out
+    wrong = tmp_path / "vehicle.yaml"
+    text = vehicle.read_text().replace("geometry: ", f"geometry: {vehicle.parent}/").replace("rate_hz", "rate_hertz")
+    wrong.write_text(text)
+    code, out = check(str(wrong))[:2]
+    assert code == 1
+    assert "unknown key 'rate_hertz'" in out
+    wrong.write_text(text.replace("rate_hertz", "rate_hz").replace("Husky:Base  ", "Husky:Bass  "))
+    code, out = check(str(wrong))[:2]
+    assert code == 1
+    assert "Husky:Base" in out
