@@ -133,8 +133,6 @@ class RawSettings:
     """Age of the last good fix past which a pose is stale, seconds: four missed fixes of a 2 Hz receiver."""
     imu_timeout: float = 0.5
     """Age of the last inertial sample past which a pose is stale, seconds."""
-    clock_back: float = 1.0
-    """A source whose stamps step back by more than this, seconds, has a clock that was set."""
     clock_ahead: float = 10.0
     """A stamp farther ahead of its source's last one than this, seconds, must be confirmed."""
     clock_samples: int = 3
