@@ -226,7 +226,7 @@ class PlatformView:
 
 
 _ZERO = np.zeros((6, 6))
-_ODOM_INVALID = Invalid.NO_IMU | Invalid.STALE_IMU | Invalid.CLOCK_STEPPED
+_ODOM_INVALID = Invalid.NO_IMU | Invalid.STALE_IMU | Invalid.CLOCK_STEPPED | Invalid.TILTED
 """What speaks against a pose in Odom: it needs no fix and no origin."""
 
 _STALE = Invalid.STALE_GPS | Invalid.STALE_IMU

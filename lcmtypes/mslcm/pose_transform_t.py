@@ -39,6 +39,8 @@ class pose_transform_t(object):
     """ A bound passes the configured limit. """
     CLOCK_STEPPED = 512
     """ The clock stepped; time is being taken up anew. """
+    TILTED = 1024
+    """ Gravity says that the vehicle lies on its side or its back: it has fallen, or the inertial unit's mount is wrong. """
     HEADING_FROM_GYRO = 1
     """ Heading is carried by the gyro: the vehicle stands or crawls. """
     PREDICTED = 2
@@ -126,7 +128,7 @@ class pose_transform_t(object):
 
         self.invalid_reasons = 0
         """
-        Why the pose may not be used, bit by bit: NO_FIX to CLOCK_STEPPED. 0 = it may.
+        Why the pose may not be used, bit by bit: NO_FIX to TILTED. 0 = it may.
         LCM Type: int32_t
         """
 

@@ -83,6 +83,9 @@ class RawSettings:
     tilt_time: float = 5.0
     """Time constant with which specific force corrects roll and pitch, seconds: long against a corner, short
     against what gyro bias does (0.012 rad/s would tilt by 0.06 rad)."""
+    maximum_tilt: float = 1.05
+    """Tilt from which the pose is not valid, rad: 60 deg, steeper than any ground vehicle stands. A unit that is
+    mounted otherwise than the geometry says shows up here."""
     tilt_gate: float = 1.0
     """Largest | |f| - g |, m/s2, at which specific force is taken for gravity: a tenth of g."""
     rate_hold: float = 0.2
@@ -156,6 +159,8 @@ class RawSettings:
         for name in ("risk", "fix_noise_share"):
             if getattr(self, name) > 1.0:
                 raise ValueError(f"{name} is at most 1, got {getattr(self, name)}")
+        if self.maximum_tilt > math.pi / 2:
+            raise ValueError(f"maximum_tilt is at most pi/2, got {self.maximum_tilt}")
         if self.risk > 0.5:
             raise ValueError(f"risk is at most 0.5, got {self.risk}")
         if self.origin_fixes > 1000:

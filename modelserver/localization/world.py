@@ -127,6 +127,8 @@ def _invalid(state: RawState, utime: int) -> Invalid:
         invalid |= 128  # GPS_REJECTED
     if state.stepped or _too_early(state, utime):
         invalid |= 512  # CLOCK_STEPPED
+    if state.motion is not None and state.motion.up[2] < math.cos(settings.maximum_tilt):
+        invalid |= 1024  # TILTED
     return Invalid(invalid)
 
 

@@ -67,6 +67,7 @@ class Invalid(IntFlag):
     GPS_REJECTED = 128
     BOUND_EXCEEDED = 256
     CLOCK_STEPPED = 512
+    TILTED = 1024
 
     def explain(self) -> str:
         """Return the reasons in words; empty where there is none."""
@@ -84,6 +85,7 @@ _INVALID_TEXT = {
     Invalid.GPS_REJECTED: "GPS fixes arrive but are refused",
     Invalid.BOUND_EXCEEDED: "a protection bound passes the configured limit",
     Invalid.CLOCK_STEPPED: "the clock stepped, time is being taken up anew",
+    Invalid.TILTED: "gravity says that the vehicle lies on its side: check the inertial unit's mount in the geometry",
 }
 
 

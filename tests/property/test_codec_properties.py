@@ -147,7 +147,7 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
         texts,
         texts,
         st.integers(0, 2),
-        st.integers(0, 1023).map(messages.Invalid),
+        st.integers(0, 2047).map(messages.Invalid),
         int32,
         int64,
         count64,

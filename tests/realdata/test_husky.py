@@ -133,3 +133,12 @@ def test_given_the_recording_when_replayed_twice_then_the_same_bits(imported: tu
             return [each.csv() for each in Run(vehicle, first_minute, ANTENNA).rows(None, 20.0)]
 
     assert lines() == lines()
+
+
+def test_given_the_page_on_recordings_then_its_example_is_what_comes_out(imported: tuple[Path, Report]) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "recordings.md").read_text(encoding="utf-8")
+    (shown,) = [line for line in page.splitlines() if line.startswith("14322")]
+    with LogFile(imported[0]) as log:
+        run = Run(load_vehicle(load_config(HUSKY)), log, "Husky:Base")
+        (row,) = run.rows([int(shown.partition(",")[0])], 1.0)
+    assert row.csv() == shown

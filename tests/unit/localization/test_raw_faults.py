@@ -1,4 +1,4 @@
-"""Raw mode under faults that a reviewer's simulator found: while a pose is valid its bounds hold."""
+"""Raw mode under faults: while a pose is valid its bounds hold."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import pytest
 from support_localization import MOUNTS, ORIGIN, START, Drive, Sensors, angle_error, constant, final, stepwise
 
 from modelserver.localization.raw import RawLocalizer
-from modelserver.messages import GpsSample, Invalid, Rejected
+from modelserver.messages import GpsSample, ImuSample, Invalid, Rejected, SensorHeader
+from modelserver.spatial.pose import Pose
 
 
 def seconds(sample):
@@ -161,3 +162,13 @@ def test_inertial_samples_behind_the_fixes_still_turn_the_vehicle(lag):
     assert sum(row[1].invalid == 0 for row in late) > 0.95 * len(late)
     assert worst(rows, 3) < 1.1
     assert worst(rows, 2) < 1.1
+
+
+@pytest.mark.parametrize(("roll", "tilted"), [(0.0, False), (0.6, False), (1.5, True), (math.pi, True)])
+def test_a_vehicle_on_its_side_is_not_valid(roll, tilted):
+    # a level vehicle whose geometry has the inertial unit turned about the forward axis by `roll`
+    level = RawLocalizer.start(replace(MOUNTS, X_base_imu=Pose.from_rpy((0.0, 0.0, 0.0), roll)), None, ORIGIN)
+    for n in range(200):
+        header = SensorHeader(START + n * 10_000, "imu")
+        level, _ = level.take(ImuSample(header, (0.0, 0.0, 0.0), (0.0, 0.0, 9.80665)))
+    assert (Invalid.TILTED in level.estimate(level.utime).invalid) == tilted
