@@ -66,8 +66,7 @@ LATENESS_KEPT: Final = 512
 STARTING, RUNNING, DEGRADED = 0, 1, 2
 
 
-@dataclass(frozen=True, slots=True)
-class Instant:
+class Instant(NamedTuple):
     """When an event is handled: the host's monotonic clock in nanoseconds, and its time of day as utime."""
 
     monotonic_ns: int

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import select
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import Protocol, TypeAlias
 
 from modelserver.wire.channels import literal
@@ -89,9 +89,13 @@ class LcmBus:
         """Return when something has come or the time is up."""
         # poll is the cheaper call but counts in milliseconds; select keeps the deadline to the microsecond
         milliseconds = int(seconds * 1e3)
-        ready: Collection[int] = [file for file, _ in self._poll.poll(milliseconds)]
-        if not ready:
+        ready = self._poll.poll(milliseconds)
+        if len(ready) == 1:
+            file = ready[0][0]
+            self.sensors.may_have = file == self.sensors.fileno
+            self.requests.may_have = file == self.requests.fileno
+        elif not ready:
             files = (self.sensors.fileno, self.requests.fileno)
-            ready, _, _ = select.select(files, (), (), max(0.0, seconds - milliseconds * 1e-3))
-        self.sensors.may_have = self.sensors.fileno in ready
-        self.requests.may_have = self.requests.fileno in ready
+            readable, _, _ = select.select(files, (), (), max(0.0, seconds - milliseconds * 1e-3))
+            self.sensors.may_have = self.sensors.fileno in readable
+            self.requests.may_have = self.requests.fileno in readable
