@@ -39,6 +39,7 @@ from modelserver.spatial.transformation import Transformation
 from modelserver.wire.channels import REPLY_PREFIX, literal
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.provider import open_lcm, resolve_url
+from modelserver.wire.queries import known_answer, write_question
 
 R = TypeVar("R", TransformReply, NameListReply, StateVectorReply, HistoryReply)
 
@@ -135,9 +136,9 @@ class Platform:
         accepted for an answer there; `wait_ms` how long the server may wait for data that cover it.
         Raises NoServerError, or the QueryError that the server meant.
         """
-        time = TimeQuery(at, policy, wait_ms)
-        request = GetTransformation(self._header(), frame_of_interest, frame_of_reference, time)
-        return _found(self._ask(request, TransformReply, wait_ms).answer).transformation
+        return self.get_pose(
+            frame_of_interest, frame_of_reference, at=at, policy=policy, wait_ms=wait_ms
+        ).transformation
 
     def get_pose(
         self,
@@ -149,9 +150,14 @@ class Platform:
         wait_ms: int = 0,
     ) -> PoseAnswer:
         """Return what `get_transformation` does, with the origin, the bounds and the flags beside it."""
-        time = TimeQuery(at, policy, wait_ms)
-        request = GetTransformation(self._header(), frame_of_interest, frame_of_reference, time)
-        return _found(self._ask(request, TransformReply, wait_ms).answer)
+        # by hand, not through `_ask`: this is what is asked all the time, and mostly what was asked before
+        names = (self.reply_channel, frame_of_interest, frame_of_reference)
+        try:
+            request = write_question(self._ids.getrandbits(63), *names, at, policy, wait_ms)
+        except _UNWRITABLE as error:
+            raise MalformedRequestError(f"this question cannot be put into a message: {error}") from error
+        reply = self._exchange(self._channels[GetTransformation], request, self.timeout + wait_ms * 1e-3)
+        return known_answer(reply) or _found(_opened(reply, TransformReply).answer)
 
     def get_body_list(self) -> list[str]:
         """Return the names of the bodies, root first. Raises NoServerError."""
@@ -193,14 +199,10 @@ class Platform:
         """Return the reply to a request. Raises NoServerError, the QueryError that the server meant, WireError."""
         try:
             data = encode(request)
-        except (struct.error, TypeError, AttributeError, UnicodeEncodeError) as error:
+        except _UNWRITABLE as error:
             raise MalformedRequestError(f"this question cannot be put into a message: {error}") from error
         channel = self._channels[type(request)]
-        reply: R = decode(_REPLY_TYPES[reply_kind], self._exchange(channel, data, self.timeout + wait_ms * 1e-3))
-        header: ReplyHeader = reply.header
-        if header.status is not Status.OK:
-            raise error_for_status(header.status, header.message, header.nearest)
-        return reply
+        return _opened(self._exchange(channel, data, self.timeout + wait_ms * 1e-3), reply_kind)
 
     def _exchange(self, channel: str, request: bytes, patience: float) -> bytes:
         """Send a request until its reply comes. Asking twice does no harm: requests change nothing."""
@@ -230,6 +232,19 @@ class Platform:
             f"{1 + self.retries} tries of {patience:g} s. Is the daemon running (modelserver run -c vehicle.yaml), "
             "on this bus ($LCM_DEFAULT_URL) and with this channel prefix?"
         )
+
+
+_UNWRITABLE: Final = (struct.error, TypeError, AttributeError, UnicodeEncodeError)
+"""What writing a question raises for a value that no message can hold."""
+
+
+def _opened(data: bytes, kind: type[R]) -> R:
+    """Return the reply in its bytes. Raises the QueryError that the server meant, WireError."""
+    reply: R = decode(_REPLY_TYPES[kind], data)
+    header: ReplyHeader = reply.header
+    if header.status is not Status.OK:
+        raise error_for_status(header.status, header.message, header.nearest)
+    return reply
 
 
 def _found(answer: PoseAnswer | None) -> PoseAnswer:

@@ -15,6 +15,10 @@ class Clock(Protocol):
         """Return nanoseconds on a clock that never steps."""
         ...
 
+    def utime(self) -> int:
+        """Return microseconds since the Unix epoch."""
+        ...
+
     def now(self) -> Instant:
         """Return both times: monotonic, and microseconds since the Unix epoch."""
         ...
@@ -26,6 +30,10 @@ class SystemClock:
     def monotonic_ns(self) -> int:
         """Return nanoseconds on a clock that never steps."""
         return time.monotonic_ns()
+
+    def utime(self) -> int:
+        """Return microseconds since the Unix epoch."""
+        return time.time_ns() // 1000
 
     def now(self) -> Instant:
         """Return both times."""
@@ -42,6 +50,10 @@ class FakeClock:
     def monotonic_ns(self) -> int:
         """Return nanoseconds."""
         return self._monotonic_ns
+
+    def utime(self) -> int:
+        """Return microseconds since the Unix epoch."""
+        return self._utime_ns // 1000
 
     def now(self) -> Instant:
         """Return both times."""

@@ -159,24 +159,23 @@ class Loop:
 
     def _answer(self, channel: str, type_name: str, data: bytes) -> None:
         """Answer a request, also one that makes no sense or that an error keeps from being answered."""
-        now = self._clock.now()
-        remembered = None
-        if type_name == TIMELESS_TYPE:
-            remembered = self._timeless.find(data, now.utime, self.state.view.model)
-        if remembered is not None:
-            self._bus.publish(*remembered)
-            self._answered += 1
-            return
         try:
+            if type_name == TIMELESS_TYPE:
+                remembered = self._timeless.find(data, self._clock.utime(), self.state.view.model)
+                if remembered is not None:
+                    self._bus.publish(*remembered)
+                    self._answered += 1
+                    return
             request = decode(type_name, data)
         except Exception as error:
             self._failed(channel, error)
             header = request_header(data) if isinstance(error, WireError) and error.reason == "malformed" else None
             if header is not None:
                 kind = _REQUEST_KINDS[type_name]
-                self._send(core.turn_back(self.state, kind, header, str(error), now))
+                self._send(core.turn_back(self.state, kind, header, str(error), self._clock.now()))
             return
         self._asked = data
+        now = self._clock.now()
         try:
             self._step(request, now)
         except Exception as error:

@@ -48,9 +48,16 @@ _HISTORY_REPLY: Final[bytes] = get_history_reply_t._get_packed_fingerprint()
 def write_request(request: GetTransformation) -> bytes:
     """Return the bytes of a get_transformation_request_t."""
     header, interest, reference, time = request
+    return write_question(header.request_id, header.reply_channel, interest, reference, *time)
+
+
+def write_question(
+    request_id: int, channel: str, interest: str, reference: str, at: int, policy: int, wait_ms: int
+) -> bytes:
+    """Return the bytes of a get_transformation_request_t, without the values that it is made of."""
     short = len(interest) + len(reference) <= _KEPT_BYTES
-    names = (_kept_texts if short else _texts)(header.reply_channel, interest, reference)
-    return b"%b%b%b%b" % (_REQUEST, _REQUEST_ID.pack(header.request_id), names, _TIME.pack(*time))
+    names = (_kept_texts if short else _texts)(channel, interest, reference)
+    return b"%b%b%b%b" % (_REQUEST, _REQUEST_ID.pack(request_id), names, _TIME.pack(at, policy, wait_ms))
 
 
 def _texts(channel: str, interest: str, reference: str) -> bytes:
@@ -110,6 +117,12 @@ def read_transform_reply(data: bytes) -> TransformReply:
             _READ.clear()
         _READ[rest] = (header[2:], answer)
     return TransformReply(header, answer)
+
+
+def known_answer(data: bytes) -> PoseAnswer | None:
+    """Return the answer in the bytes of a get_transformation_reply_t that was read before but for id and stamp."""
+    known = _READ.get(data[_STAMPED:]) if data[:8] == _TRANSFORM_REPLY else None
+    return None if known is None else known[1]
 
 
 def write_state_vector_reply(reply: StateVectorReply) -> bytes:

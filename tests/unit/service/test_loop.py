@@ -462,3 +462,35 @@ def test_given_a_refused_sample_then_the_log_tells_each_reason_once(caplog: pyte
     assert "sensor:refuse:range" in line
     assert "reason: range" in line
     assert "MODELSERVER_HEALTH" in line
+
+
+def test_given_the_same_question_again_then_it_is_answered_from_memory_and_counted() -> None:
+    rig = Rig()
+    question = GetTransformation(ME, "Camera:Origin", "Cart:Base")
+    first = rig.ask(question)
+    rig.bus.published.clear()
+    rig.clock.advance(0.001)
+    again = rig.ask(question)
+    assert again.answer.transformation == first.answer.transformation
+    assert again.header.utime > first.header.utime
+    rig.clock.advance(1.0)
+    rig.turns(2)
+    assert rig.loop.state.requests_answered == 2
+
+
+def test_given_a_bus_that_fails_then_an_answer_from_memory_leaves_no_exception(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rig = Rig()
+    question = GetTransformation(ME, "Camera:Origin", "Cart:Base")
+    rig.ask(question)
+
+    def broken(channel: str, data: bytes) -> None:
+        raise OSError("network is down")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(rig.bus, "publish", broken)
+        rig.bus.requests.put("PLATFORM_GET_TRANSFORMATION", encode(question))
+        rig.turns(1)
+    assert rig.rejected["PLATFORM_GET_TRANSFORMATION", "handler"] == 1
+    assert rig.ask(question).header.status is Status.OK
