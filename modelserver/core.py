@@ -94,7 +94,7 @@ class CoreSettings:
 
 @dataclass(frozen=True, slots=True)
 class Parked:
-    """A request that waits for data: asked at `asked_ns`, answered as best it can at `until_ns`."""
+    """A request that waits for data, and is answered as best it can at `until_ns` (monotonic)."""
 
     request: GetTransformation | GetStateVector | GetHTransform
     until_ns: int

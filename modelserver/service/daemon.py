@@ -129,9 +129,10 @@ def _channel_problems(config: VehicleConfig, file: str) -> list[Problem]:
         if each is not None
     }
     own = {f"{prefix}{channel.name}" for channel in CHANNELS}
+    not_for_sensors = {f"{prefix}{channel.name}" for channel in CHANNELS if channel.way is not Way.SENSOR}
     problems = []
     for key, channel in heard.items():
-        if channel in {f"{prefix}{each.name}" for each in CHANNELS if each.way is not Way.SENSOR}:
+        if channel in not_for_sensors:
             problems.append(
                 Problem(
                     Severity.ERROR,

@@ -1,7 +1,7 @@
 """Packing by hand: the pieces of messages that go over the bus with every query and every tick.
 
 The generated classes read and write field by field, which costs more than the question itself. The functions of
-this module, `poses` and `replies` produce and take the very same bytes; a test compares them with the generated
+this module, `poses` and `queries` produce and take the very same bytes; a test compares them with the generated
 classes for all kinds of values.
 """
 

@@ -38,15 +38,6 @@ NO_VECTOR: Final[bytes] = pose_vector_t().encode()[8:]
 """What stands in a reply that carries no pose."""
 
 
-# Relations that do not change with time are asked for again and again: the bytes of those lately written are kept;
-# when there are too many, all go.
-_WRITTEN: Final[dict[int, tuple[Transformation, bytes]]] = {}
-_KEPT: Final = 4096
-
-_NOTHING: Final = PoseAnswer(Transformation("", "", Pose.identity()))[1:]
-"""What stands beside a relation that does not change: no origin, no flags, no bounds."""
-
-
 def write_transform(answer: PoseAnswer) -> bytes:
     """Return the bytes of a pose_transform_t."""
     return _TRANSFORM_FINGERPRINT + transform_body(answer)
@@ -73,20 +64,8 @@ def read_vector(data: bytes) -> PoseAnswer:
 
 def transform_body(answer: PoseAnswer) -> bytes:
     """Return the bytes of a pose_transform_t without its fingerprint."""
-    transformation = answer.transformation
-    # what stands beside the transformation is in the bytes too: only answers with nothing there share them
-    bare = answer[1:] == _NOTHING
-    if bare:
-        remembered = _WRITTEN.get(id(transformation))
-        if remembered is not None and remembered[0] is transformation:
-            return remembered[1]
-    a, b, c, d = transformation.pose.matrix_rows()
-    body = _body(_TRANSFORM, a + b + c + d, answer)
-    if bare and not transformation.utime and transformation.model_revision:
-        if len(_WRITTEN) >= _KEPT:
-            _WRITTEN.clear()
-        _WRITTEN[id(transformation)] = (transformation, body)
-    return body
+    a, b, c, d = answer.transformation.pose.matrix_rows()
+    return _body(_TRANSFORM, a + b + c + d, answer)
 
 
 def vector_body(answer: PoseAnswer) -> bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from functools import lru_cache
-from typing import Any, Final
+from typing import Final
 
 from modelserver.errors import Status
 from modelserver.messages import (
@@ -27,13 +27,13 @@ _REQUEST_ID = struct.Struct(">q")
 _TIME = struct.Struct(">qbi")
 _REPLY_HEAD = struct.Struct(">qqh")
 
-_STAMP = struct.Struct(">qq")
-_STAMPED: Final = 8 + _STAMP.size
+
+_STAMPED: Final = 24
 """Where a reply goes on behind fingerprint, id and stamp."""
 
-_READ: Final[dict[bytes, tuple[Any, PoseAnswer]]] = {}
+_READ: Final[dict[bytes, PoseAnswer]] = {}
 _KEPT: Final = 1024
-"""Replies that hold for good, lately read: their bytes from `_STAMPED` on, the rest of the header, the answer."""
+"""Replies that hold for good, lately read: their bytes from `_STAMPED` on, and the answer; see `known_answer`."""
 
 _PLAIN: Final = text("") + LENGTH.pack(0)
 _PLAIN_AT: Final = 8 + _REPLY_HEAD.size
@@ -101,11 +101,6 @@ def write_transform_reply(reply: TransformReply) -> bytes:
 
 def read_transform_reply(data: bytes) -> TransformReply:
     """Return the reply in the bytes of a get_transformation_reply_t. Raises WireError, struct.error."""
-    rest = data[_STAMPED:]
-    known = _READ.get(rest)
-    if known is not None:
-        request_id, utime = _STAMP.unpack_from(data, 8)
-        return TransformReply(ReplyHeader(request_id, utime, *known[0]), known[1])
     header, at = _read_header(data)
     if header.status is not Status.OK:
         poses.check_no_transform(data, at)
@@ -115,14 +110,13 @@ def read_transform_reply(data: bytes) -> TransformReply:
     if not answer.transformation.utime and answer.origin is None:
         if len(_READ) >= _KEPT:
             _READ.clear()
-        _READ[rest] = (header[2:], answer)
+        _READ[data[_STAMPED:]] = answer
     return TransformReply(header, answer)
 
 
 def known_answer(data: bytes) -> PoseAnswer | None:
     """Return the answer in the bytes of a get_transformation_reply_t that was read before but for id and stamp."""
-    known = _READ.get(data[_STAMPED:]) if data[:8] == _TRANSFORM_REPLY else None
-    return None if known is None else known[1]
+    return _READ.get(data[_STAMPED:]) if data[:8] == _TRANSFORM_REPLY else None
 
 
 def write_state_vector_reply(reply: StateVectorReply) -> bytes:
