@@ -15,7 +15,7 @@ from pydantic import ConfigDict
 
 from modelserver import config_reader
 from modelserver.errors import shown
-from modelserver.localization.settings import RawSettings
+from modelserver.localization.raw.settings import RawSettings
 
 _STRICT: ConfigDict = {"extra": "forbid", "allow_inf_nan": False}
 

@@ -34,6 +34,7 @@ from modelserver.messages import (
     ImuSample,
     Invalid,
     JointsSample,
+    OriginLatched,
     Output,
     Policy,
     PublishHealth,
@@ -188,7 +189,7 @@ def _sample(state: CoreState, sample: Sample, now: Instant) -> Step:
         if isinstance(note, Rejected):
             state = _count(state, note.channel, note.reason)
             refused = True
-        else:
+        elif isinstance(note, OriginLatched):
             outputs.append(note)
     if localizer is before:
         return state, tuple(outputs)

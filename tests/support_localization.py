@@ -14,7 +14,7 @@ import numpy as np
 
 from modelserver.geodesy import Geodesy, origin_at
 from modelserver.localization.mounts import Mounts
-from modelserver.localization.raw import RawLocalizer
+from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.messages import FixType, GpsSample, ImuSample, OrientationReference, SensorHeader
 from modelserver.spatial import Pose, so3
 

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from modelserver.geodesy import NORTHERN_LIMIT, SOUTHERN_LIMIT
-from modelserver.localization.settings import RawSettings
+from modelserver.localization.settings import FixSettings
 from modelserver.messages import FixType, GpsSample
 
 _LEAST_VARIANCE = 1e-6
@@ -40,7 +40,7 @@ class GoodFix:
         return math.sqrt(0.5 * (self.east_variance + self.north_variance))
 
 
-def judge(sample: GpsSample, settings: RawSettings) -> GoodFix | str:
+def judge(sample: GpsSample, settings: FixSettings) -> GoodFix | str:
     """Return the fix, or in one word why it is not good enough.
 
     Words: no_fix, satellites, dilution, sigma, range (no place on Earth, latitude 0 with longitude 0, beyond
@@ -75,7 +75,7 @@ def judge(sample: GpsSample, settings: RawSettings) -> GoodFix | str:
     return fix if fix.sigma <= settings.maximum_sigma else "sigma"
 
 
-def _covariance(sample: GpsSample, settings: RawSettings) -> tuple[float, float, float, float]:
+def _covariance(sample: GpsSample, settings: FixSettings) -> tuple[float, float, float, float]:
     """Return variances east, north, covariance, variance up: the receiver's, else range error times dilution."""
     stated = sample.position_covariance
     if stated is not None:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from modelserver.geodesy import GeodesyError, geodetic_from_ecef, origin_at
-from modelserver.localization.settings import RawSettings
+from modelserver.localization.settings import FixSettings
 from modelserver.messages import Origin
 from modelserver.spatial.so3 import Vector3
 
@@ -17,7 +17,7 @@ class Capture:
 
     fixes: tuple[tuple[int, Vector3, float], ...] = ()
 
-    def take(self, utime: int, ecef: Vector3, sigma: float, settings: RawSettings) -> tuple[Capture, Origin | None]:
+    def take(self, utime: int, ecef: Vector3, sigma: float, settings: FixSettings) -> tuple[Capture, Origin | None]:
         """Return the capture with one fix more, and the origin once it is found.
 
         The origin is the mean of the last `origin_fixes` fixes, once they scatter about a straight drive at

@@ -8,15 +8,19 @@ Requests and replies are NamedTuples where the rest are dataclasses: they are ma
 NamedTuple is made at a third of the cost.
 """
 
+from modelserver.messages.decisions import Decision, Verdict
 from modelserver.messages.estimates import Estimate, Origin
 from modelserver.messages.events import (
     Event,
     OriginLatched,
     Output,
+    PublishDecisions,
     PublishHealth,
+    PublishNavigation,
     PublishPose,
     Rejected,
     SendReply,
+    SwitchMode,
     Tick,
 )
 from modelserver.messages.flags import (
@@ -32,6 +36,7 @@ from modelserver.messages.flags import (
     YawSource,
 )
 from modelserver.messages.health import ChannelHealth, Health
+from modelserver.messages.navigation import Mode, NavigationState, Phase
 from modelserver.messages.replies import (
     HistoryReply,
     NameListReply,
@@ -55,11 +60,14 @@ from modelserver.messages.requests import (
     TimeQuery,
 )
 from modelserver.messages.samples import (
+    AbsolutePoseSample,
     GpsSample,
     ImuSample,
     JointSample,
     JointsSample,
     Matrix3,
+    RangeSample,
+    RelativePoseSample,
     Sample,
     SensorHeader,
     WheelSample,
@@ -72,7 +80,9 @@ __all__ = [
     "NAN",
     "NO_FLAGS",
     "VALID",
+    "AbsolutePoseSample",
     "ChannelHealth",
+    "Decision",
     "Direction",
     "Estimate",
     "Event",
@@ -91,17 +101,24 @@ __all__ = [
     "JointSample",
     "JointsSample",
     "Matrix3",
+    "Mode",
     "NameListReply",
+    "NavigationState",
     "OrientationReference",
     "Origin",
     "OriginLatched",
     "Output",
+    "Phase",
     "Policy",
     "PoseAnswer",
+    "PublishDecisions",
     "PublishHealth",
+    "PublishNavigation",
     "PublishPose",
     "Quality",
+    "RangeSample",
     "Rejected",
+    "RelativePoseSample",
     "Reply",
     "ReplyHeader",
     "Request",
@@ -110,9 +127,11 @@ __all__ = [
     "SendReply",
     "SensorHeader",
     "StateVectorReply",
+    "SwitchMode",
     "Tick",
     "TimeQuery",
     "TransformReply",
+    "Verdict",
     "WheelSample",
     "WheelsSample",
     "YawSource",

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
+from modelserver.messages.decisions import Decision
 from modelserver.messages.estimates import Origin
 from modelserver.messages.health import Health
+from modelserver.messages.navigation import Mode, NavigationState
 from modelserver.messages.replies import PoseAnswer, Reply
 from modelserver.messages.requests import Request
-from modelserver.messages.samples import Sample
+from modelserver.messages.samples import Sample, SensorHeader
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +34,15 @@ class Rejected:
     reason: str
 
 
-Event: TypeAlias = Sample | Request | Tick | Rejected
+@dataclass(frozen=True, slots=True)
+class SwitchMode:
+    """The operator's wish that localization uses other sources from `header.utime` on; see localization_mode_t."""
+
+    header: SensorHeader
+    mode: Mode
+
+
+Event: TypeAlias = Sample | SwitchMode | Request | Tick | Rejected
 
 
 class SendReply(NamedTuple):
@@ -64,4 +74,19 @@ class OriginLatched:
     origin: Origin
 
 
-Output: TypeAlias = SendReply | PublishPose | PublishHealth | OriginLatched
+@dataclass(frozen=True, slots=True)
+class PublishDecisions:
+    """Broadcast what became of measurements; each is said once, when nothing can change it any more."""
+
+    utime: int
+    decisions: tuple[Decision, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PublishNavigation:
+    """Broadcast the filter's whole state."""
+
+    state: NavigationState
+
+
+Output: TypeAlias = SendReply | PublishPose | PublishHealth | OriginLatched | PublishDecisions | PublishNavigation

@@ -108,4 +108,51 @@ class JointsSample:
     joints: tuple[JointSample, ...]
 
 
-Sample: TypeAlias = GpsSample | ImuSample | WheelsSample | JointsSample
+@dataclass(frozen=True, slots=True)
+class AbsolutePoseSample:
+    """Where a frame of the vehicle is in a world frame, by a source that is no GPS; see absolute_pose_t.
+
+    `position` or `orientation` is None where the source tells only the other. `covariance` is 36 numbers,
+    row-major, of position and orientation along the axes of the frame of reference; None = not told.
+    """
+
+    header: SensorHeader
+    frame_of_interest: str
+    frame_of_reference: str
+    position: Vector3 | None = None
+    orientation: Quaternion | None = None
+    covariance: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RelativePoseSample:
+    """Where a frame of the vehicle is in its own earlier self, as visual odometry tells; see relative_pose_t.
+
+    `since_utime` is the earlier instant, `header.utime` the later. `covariance` is 36 numbers, row-major, along the
+    axes of the frame at the earlier instant; None = not told.
+    """
+
+    header: SensorHeader
+    frame: str
+    since_utime: int
+    position: Vector3
+    orientation: Quaternion
+    covariance: tuple[float, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RangeSample:
+    """The distance from a frame of the vehicle to a beacon whose place is known; see range_t."""
+
+    header: SensorHeader
+    frame: str
+    beacon: str
+    beacon_position: Vector3
+    frame_of_reference: str
+    distance: float
+    sigma: float = NAN
+
+
+Sample: TypeAlias = (
+    GpsSample | ImuSample | WheelsSample | JointsSample | AbsolutePoseSample | RelativePoseSample | RangeSample
+)

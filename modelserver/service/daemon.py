@@ -17,7 +17,7 @@ from modelserver.formats import load_model
 from modelserver.geodesy import GeodesyError, make_origin
 from modelserver.geometry import Model
 from modelserver.localization.mounts import Mounts
-from modelserver.localization.raw import RawLocalizer
+from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.messages import Origin, OriginLatched
 from modelserver.service.bus import LcmBus
 from modelserver.service.clock import SystemClock

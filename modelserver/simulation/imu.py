@@ -10,9 +10,10 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from modelserver import earth
 from modelserver.geodesy import Geodesy, about_up
 from modelserver.messages import ImuSample, OrientationReference, YawSource
-from modelserver.simulation import earth, rigid
+from modelserver.simulation import rigid
 from modelserver.simulation.noise import Noise, diagonal, quantised
 from modelserver.simulation.stamps import Timing, headers
 from modelserver.simulation.trajectory import Trajectory

@@ -8,7 +8,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from support_localization import MOUNTS, ORIGIN, START, Drive, Sensors, constant
 
-from modelserver.localization.raw import RawLocalizer
+from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.messages import (
     FixType,
     GpsSample,

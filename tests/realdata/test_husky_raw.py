@@ -9,7 +9,7 @@ import pytest
 
 from modelserver.geodesy import Geodesy
 from modelserver.localization.mounts import Mounts
-from modelserver.localization.raw import RawLocalizer
+from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.messages import FixType, GpsSample, ImuSample, OrientationReference, Quality, SensorHeader
 from modelserver.spatial import Pose
 

@@ -15,7 +15,7 @@ from support_samples import VEHICLE, write_vehicle
 from modelserver.config import VehicleConfig, load_config, parse_config
 from modelserver.config_reader import MAX_BYTES
 from modelserver.errors import ConfigError, Problem, Severity
-from modelserver.localization.settings import RawSettings
+from modelserver.localization.raw.settings import RawSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 BASE = "vehicle: v\ngeometry: g.yaml\nbase_frame: A:B\n"

@@ -14,7 +14,7 @@ from modelserver.core import MAX_COUNTERS, CoreSettings, CoreState, Instant, ste
 from modelserver.errors import Status, UnknownBodyError, UnknownFrameError
 from modelserver.geometry import names
 from modelserver.localization.mounts import Mounts
-from modelserver.localization.raw import RawLocalizer
+from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.messages import (
     CHANNEL_OF,
     Event,

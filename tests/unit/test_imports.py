@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 VALUES = {"errors", "version", "spatial"}
 GEOMETRY = VALUES | {"geometry"}
-POSES = VALUES | {"messages", "geodesy", "history"}
+POSES = VALUES | {"messages", "geodesy", "earth", "history"}
 CORE = GEOMETRY | POSES | {"localization", "platform"}
 WIRE = VALUES | {"messages", "wire", "mslcm"}
 SERVICE = CORE | WIRE | {"core", "config", "formats"}
@@ -24,13 +24,14 @@ MAY_IMPORT: dict[str, set[str]] = {
     "geometry": VALUES,
     "messages": VALUES,
     "geodesy": VALUES | {"messages"},
+    "earth": VALUES,
     "history": VALUES | {"messages"},
     "formats": GEOMETRY,
     "localization": GEOMETRY | POSES,
     "platform": CORE,
     "answers": CORE,
     "core": CORE | {"answers"},
-    "simulation": GEOMETRY | {"messages", "geodesy"},
+    "simulation": GEOMETRY | {"messages", "geodesy", "earth"},
     "config": GEOMETRY | {"messages", "localization", "config_reader"},
     "config_reader": {"errors"},
     "wire": WIRE,
@@ -51,6 +52,7 @@ PURE = {
     "spatial",
     "geometry",
     "geodesy",
+    "earth",
     "localization",
     "messages",
     "history",

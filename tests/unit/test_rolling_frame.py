@@ -12,7 +12,7 @@ from modelserver.errors import NotConnectedError, UnknownFrameError
 from modelserver.geodesy import origin_at
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.localization.mounts import Mounts
-from modelserver.localization.raw import RawLocalizer
+from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.messages import GpsSample, ImuSample, PublishPose, Tick
 from modelserver.simulation import Simulation, Trajectory, figure_eight
 from modelserver.spatial.pose import Pose

@@ -20,8 +20,8 @@ from support_localization import (
     stepwise,
 )
 
-from modelserver.localization.raw import RawLocalizer
-from modelserver.localization.settings import RawSettings
+from modelserver.localization.raw.localizer import RawLocalizer
+from modelserver.localization.raw.settings import RawSettings
 from modelserver.messages import Invalid, OrientationReference, Quality, Rejected
 
 

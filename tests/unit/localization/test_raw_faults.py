@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from support_localization import MOUNTS, ORIGIN, START, Drive, Sensors, angle_error, constant, final, stepwise
 
-from modelserver.localization.raw import RawLocalizer
+from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.messages import GpsSample, ImuSample, Invalid, Rejected, SensorHeader
 from modelserver.spatial.pose import Pose
 

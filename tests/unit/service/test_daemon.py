@@ -10,7 +10,7 @@ from support_samples import START as START_UTIME
 
 from modelserver.config import load_config
 from modelserver.errors import ConfigError, GeometryError, Problem
-from modelserver.localization.raw import RawLocalizer
+from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.service.daemon import Vehicle, configured_origin, load_vehicle
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from modelserver.localization.heading import Heading
-from modelserver.localization.settings import RawSettings
-from modelserver.localization.track import TrackFix
+from modelserver.localization.raw.heading import Heading
+from modelserver.localization.raw.settings import RawSettings
+from modelserver.localization.raw.track import TrackFix
 
 _MOVED = 4.0
 """Sigmas of two fixes' difference (or of the mean velocity) past which the vehicle has moved."""

@@ -11,19 +11,30 @@ import math
 from dataclasses import dataclass, replace
 
 from modelserver.geodesy import Geodesy, geodetic_from_ecef
-from modelserver.localization import attitude, fixes, gate
-from modelserver.localization.fixes import Fixes
-from modelserver.localization.heading import Heading
+from modelserver.localization import gate
 from modelserver.localization.interface import Note
-from modelserver.localization.motion import Motion, yaw_rate
 from modelserver.localization.mounts import Mounts
 from modelserver.localization.projected import Projected
-from modelserver.localization.settings import RawSettings
-from modelserver.localization.stamps import Stamps, Verdict
-from modelserver.localization.state import RawState
-from modelserver.localization.still import Stillness
-from modelserver.localization.world import estimate
-from modelserver.messages import Estimate, GpsSample, ImuSample, Origin, OriginLatched, Rejected, Sample
+from modelserver.localization.raw import attitude, fixes
+from modelserver.localization.raw.fixes import Fixes
+from modelserver.localization.raw.heading import Heading
+from modelserver.localization.raw.motion import Motion, yaw_rate
+from modelserver.localization.raw.settings import RawSettings
+from modelserver.localization.raw.stamps import Stamps, Verdict
+from modelserver.localization.raw.state import RawState
+from modelserver.localization.raw.still import Stillness
+from modelserver.localization.raw.world import estimate
+from modelserver.messages import (
+    Estimate,
+    GpsSample,
+    ImuSample,
+    NavigationState,
+    Origin,
+    OriginLatched,
+    Rejected,
+    Sample,
+    SwitchMode,
+)
 from modelserver.spatial.so3 import Vector3
 
 _HISTORY_STEP = 20_000
@@ -55,7 +66,7 @@ class RawLocalizer(RawState):
         """The instant of the newest sample taken, 0 before the first."""
         return self.newest
 
-    def take(self, sample: Sample) -> tuple[RawLocalizer, tuple[Note, ...]]:
+    def take(self, sample: Sample | SwitchMode) -> tuple[RawLocalizer, tuple[Note, ...]]:
         """Return what is concluded with one sample more, and what there is to say about it.
 
         Wheels and joints are ignored. Notes are `Rejected("sensor:<source>", reason)` with one of the reasons
@@ -73,6 +84,10 @@ class RawLocalizer(RawState):
     def estimate(self, utime: int) -> Estimate:
         """Return the base frame's pose at `utime`: predicted past the newest sample, held before the oldest kept."""
         return estimate(self, utime)
+
+    def navigation(self, utime: int) -> NavigationState | None:
+        """Return None: raw mode has no filter."""
+        return None
 
     # --- inertial samples -----------------------------------------------------------------------------------
 

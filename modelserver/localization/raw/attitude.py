@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from modelserver.localization.motion import unit
-from modelserver.localization.settings import RawSettings
+from modelserver.localization.raw.motion import unit
+from modelserver.localization.raw.settings import RawSettings
 from modelserver.messages import ImuSample, OrientationReference
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose

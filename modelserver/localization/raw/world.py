@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 from modelserver.geodesy import GeodesyError, LocalFrame, about_up, geodetic_from_ecef
-from modelserver.localization import bounds
-from modelserver.localization.heading import UNKNOWN_VARIANCE
-from modelserver.localization.motion import Motion
 from modelserver.localization.projected import Projected
-from modelserver.localization.state import RawState
+from modelserver.localization.raw import bounds
+from modelserver.localization.raw.heading import UNKNOWN_VARIANCE
+from modelserver.localization.raw.motion import Motion
+from modelserver.localization.raw.state import RawState
 from modelserver.messages import NAN, Estimate, Invalid, Quality
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose

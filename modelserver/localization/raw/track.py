@@ -15,7 +15,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from modelserver.localization.settings import RawSettings
+from modelserver.localization.raw.settings import RawSettings
 
 MOST_FIXES = 32
 """Fixes kept for one stretch; beyond it every second is dropped, so a longer stretch is seen more coarsely."""

@@ -7,7 +7,7 @@ from functools import lru_cache
 from statistics import NormalDist
 
 from modelserver.localization.gate import GoodFix
-from modelserver.localization.settings import RawSettings
+from modelserver.localization.raw.settings import RawSettings
 
 
 @lru_cache(maxsize=16)

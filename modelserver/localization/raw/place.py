@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 from modelserver.localization.gate import GoodFix
-from modelserver.localization.motion import Motion, levelled
-from modelserver.localization.settings import RawSettings
+from modelserver.localization.raw.motion import Motion, levelled
+from modelserver.localization.raw.settings import RawSettings
 from modelserver.spatial.so3 import Vector3
 
 

@@ -7,15 +7,15 @@ import math
 from dataclasses import dataclass, field, replace
 
 from modelserver.geodesy import LocalFrame, ecef_from_geodetic
-from modelserver.localization import track
-from modelserver.localization.bounds import grown
 from modelserver.localization.gate import GoodFix
-from modelserver.localization.heading import Course, Heading
-from modelserver.localization.motion import Motion, cross
-from modelserver.localization.place import Anchor, Jumps, jump_limit, lever_arm
-from modelserver.localization.rest import Rest, judged
-from modelserver.localization.settings import RawSettings
-from modelserver.localization.track import TrackFix
+from modelserver.localization.raw import track
+from modelserver.localization.raw.bounds import grown
+from modelserver.localization.raw.heading import Course, Heading
+from modelserver.localization.raw.motion import Motion, cross
+from modelserver.localization.raw.place import Anchor, Jumps, jump_limit, lever_arm
+from modelserver.localization.raw.rest import Rest, judged
+from modelserver.localization.raw.settings import RawSettings
+from modelserver.localization.raw.track import TrackFix
 from modelserver.messages import GpsSample
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import Vector3

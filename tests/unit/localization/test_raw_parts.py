@@ -17,15 +17,17 @@ from support_localization import GEODESY, MOUNTS, START
 from modelserver.errors import UnknownFrameError
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Body, BodyFrame, Constraint
-from modelserver.localization import bounds, gate, track
-from modelserver.localization.attitude import read
-from modelserver.localization.heading import Course, Heading
-from modelserver.localization.motion import Motion, attitude, levelled, roll_pitch
+from modelserver.localization import gate
 from modelserver.localization.mounts import Mounts
 from modelserver.localization.origin import Capture
-from modelserver.localization.settings import RawSettings
-from modelserver.localization.stamps import Stamps, Verdict
-from modelserver.localization.track import TrackFix
+from modelserver.localization.raw import bounds, track
+from modelserver.localization.raw.attitude import read
+from modelserver.localization.raw.heading import Course, Heading
+from modelserver.localization.raw.motion import Motion, attitude, levelled, roll_pitch
+from modelserver.localization.raw.settings import RawSettings
+from modelserver.localization.raw.stamps import Stamps, Verdict
+from modelserver.localization.raw.track import TrackFix
+from modelserver.localization.settings import FixSettings
 from modelserver.messages import FixType, GpsSample, ImuSample, OrientationReference, SensorHeader
 from modelserver.spatial import Pose, so3
 
@@ -56,7 +58,7 @@ def test_a_wrong_setting_is_named(wrong):
 
 def test_every_setting_is_a_plain_number_with_its_words():
     source = dataclasses.fields(RawSettings)
-    text = inspect.getsource(RawSettings)
+    text = inspect.getsource(FixSettings) + inspect.getsource(RawSettings)
     for field in source:
         assert field.type in ("int", "float")
         after = text.split(f"    {field.name}: ", 1)[1].split("\n", 2)[1]

@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from modelserver.localization.settings import RawSettings
+from modelserver.localization.raw.settings import RawSettings
 
 UNKNOWN_VARIANCE = (math.pi / math.sqrt(3.0)) ** 2
 """Variance of a direction of which nothing is known: uniform over the circle."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from modelserver.localization.settings import RawSettings
+from modelserver.localization.raw.settings import RawSettings
 
 _QUIET_SIGMAS = 4.0
 """Sigmas of the bias and of the mean's noise that the mean rate of a standing vehicle may be off zero."""

@@ -5,15 +5,15 @@ from __future__ import annotations
 import cmath
 from dataclasses import dataclass, field
 
-from modelserver.localization.fixes import Fixes
-from modelserver.localization.heading import Heading
-from modelserver.localization.motion import Motion, between
 from modelserver.localization.mounts import Mounts
 from modelserver.localization.origin import Capture
 from modelserver.localization.projected import Projected
-from modelserver.localization.settings import RawSettings
-from modelserver.localization.stamps import Stamps
-from modelserver.localization.still import Stillness
+from modelserver.localization.raw.fixes import Fixes
+from modelserver.localization.raw.heading import Heading
+from modelserver.localization.raw.motion import Motion, between
+from modelserver.localization.raw.settings import RawSettings
+from modelserver.localization.raw.stamps import Stamps
+from modelserver.localization.raw.still import Stillness
 from modelserver.messages import Origin
 
 

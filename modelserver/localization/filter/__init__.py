@@ -1,0 +1,1 @@
+"""The error-state filter: GPS, inertial unit, wheels and any further source, fused at their instants. Pure."""

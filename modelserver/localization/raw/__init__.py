@@ -1,0 +1,1 @@
+"""Raw mode: the pose straight from GPS and IMU, ignoring odometry. Pure."""
