@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from modelserver import earth
 from modelserver.geodesy import Geodesy, LocalFrame, origin_at
 from modelserver.geometry import Model, ModelBuilder
 from modelserver.messages import Direction, FixType, GpsSample, ImuSample, OrientationReference, WheelsSample
@@ -19,7 +20,6 @@ from modelserver.simulation import (
     Simulation,
     Trajectory,
     WheelsModel,
-    earth,
     figure_eight,
     straight,
 )
