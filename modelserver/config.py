@@ -15,12 +15,20 @@ from pydantic import ConfigDict
 
 from modelserver import config_reader
 from modelserver.errors import shown
+from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.raw.settings import RawSettings
+from modelserver.messages import Matrix3, Mode
 
 _STRICT: ConfigDict = {"extra": "forbid", "allow_inf_nan": False}
 
 MAX_CHANNEL = 39
 """Characters of a sensor's channel: LCM takes 63, and a prefix has up to 24."""
+
+MAX_NAME = 64
+"""Characters of a source's name, as in the header of its messages."""
+
+MAX_LATENCY = 5.0
+"""Seconds: the localization keeps the past for no longer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,60 +59,108 @@ class PublishConfig:
 
     mode: `timer` publishes POSE at rate_hz; `event` on every sample of an IMU or GPS that was taken.
     rate_hz: poses a second in timer mode. health_hz: health reports a second.
+    state_hz: how often a second the filter's whole state goes out; 0 = never. decisions: whether it is told, with the
+        event that settles it, which measurements were used and which not.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     mode: Literal["timer", "event"] = "timer"
     rate_hz: float = 50.0
     health_hz: float = 1.0
+    state_hz: float = 5.0
+    decisions: bool = True
 
     def __post_init__(self) -> None:
         if not 0.1 <= self.rate_hz <= 1000.0:
             raise ValueError(f"rate_hz is between 0.1 and 1000, got {self.rate_hz:g}")
         if not 0.01 <= self.health_hz <= 100.0:
             raise ValueError(f"health_hz is between 0.01 and 100, got {self.health_hz:g}")
+        if not 0.0 <= self.state_hz <= 50.0:
+            raise ValueError(f"state_hz is between 0 and 50, got {self.state_hz:g}")
 
 
-def _check_channel(channel: str) -> None:
+def _check_channel(channel: str, key: str = "channel") -> None:
     if not (0 < len(channel) <= MAX_CHANNEL and channel.isascii() and channel.isprintable() and " " not in channel):
-        raise ValueError(f"channel has 1 to {MAX_CHANNEL} printable ASCII characters, no spaces, got {shown(channel)}")
+        raise ValueError(f"{key} has 1 to {MAX_CHANNEL} printable ASCII characters, no spaces, got {shown(channel)}")
+
+
+def _check_latency(latency: float) -> None:
+    if not 0.0 <= latency <= MAX_LATENCY:
+        raise ValueError(f"latency is between 0 and {MAX_LATENCY:g} seconds, got {latency:g}")
 
 
 @dataclass(frozen=True, slots=True)
 class SensorConfig:
-    """One sensor: the channel it is heard on, and the frame of the geometry it is mounted at."""
+    """One sensor: the channel it is heard on, and the frame of the geometry it is mounted at.
+
+    latency: seconds by which its stamps are later than the measurement; subtracted from each stamp.
+    """
 
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     channel: str
     frame: str
+    latency: float = 0.0
 
     def __post_init__(self) -> None:
         _check_channel(self.channel)
+        _check_latency(self.latency)
 
 
 @dataclass(frozen=True, slots=True)
 class WheelsConfig:
-    """The wheels: the channel they are heard on, and for each wheel's name the frame of its contact point."""
+    """The wheels: the channel they are heard on, and for each wheel's name the frame of its contact point.
+
+    kinematics: how the vehicle turns. skid_steer: its sides roll at different speeds and wheels are dragged sideways;
+        differential: two driven wheels and castors; ackermann: the wheels that steer roll where they point.
+    latency: seconds by which the stamps are later than the measurement; subtracted from each stamp.
+    """
 
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     channel: str = "WHEELS"
     frames: dict[str, str] = field(default_factory=dict)
+    kinematics: Literal["skid_steer", "differential", "ackermann"] = "differential"
+    latency: float = 0.0
 
     def __post_init__(self) -> None:
         _check_channel(self.channel)
+        _check_latency(self.latency)
+
+
+@dataclass(frozen=True, slots=True)
+class AidingConfig:
+    """A further source: the channel it is heard on, and what its messages are. They name their frames themselves.
+
+    latency: seconds by which its stamps are later than the measurement; subtracted from each stamp.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    channel: str
+    type: Literal["absolute_pose", "relative_pose", "range"]
+    latency: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check_channel(self.channel)
+        _check_latency(self.latency)
 
 
 @dataclass(frozen=True, slots=True)
 class SensorsConfig:
-    """Which sensors there are. Where they sit stands in the geometry file alone."""
+    """Which sensors there are. Where they sit stands in the geometry file alone.
+
+    aiding: further sources, each by the name that it gives itself in its messages (header.source).
+    """
 
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     gps: SensorConfig | None = None
     imu: SensorConfig | None = None
     wheels: WheelsConfig | None = None
+    aiding: dict[str, AidingConfig] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        channels = [each.channel for each in (self.gps, self.imu, self.wheels) if each is not None]
+        for name in self.aiding:
+            if not (0 < len(name) <= MAX_NAME and name.isprintable()):
+                raise ValueError(f"aiding names sources with 1 to {MAX_NAME} printable characters, got {shown(name)}")
+        channels = [each.channel for each in (self.gps, self.imu, self.wheels, *self.aiding.values()) if each]
         twice = {channel for channel in channels if channels.count(channel) > 1}
         if twice:
             raise ValueError(f"each sensor has a channel of its own; {shown(min(twice))} is given twice")
@@ -131,6 +187,54 @@ class OriginConfig:
             raise ValueError("initial_utm, zone and hemisphere are given together or not at all")
         if self.zone is not None and not 1 <= self.zone <= 60:
             raise ValueError(f"a UTM zone is 1 to 60, got {self.zone}")
+
+
+@dataclass(frozen=True, slots=True)
+class MagnetometerConfig:
+    """How the inertial unit's magnetic field is corrected, along the unit's own axes: soft_iron (measured - hard_iron).
+
+    hard_iron: the vehicle's own field, tesla. soft_iron: 3 by 3, row-major, no unit: how iron bends the Earth's field,
+    undone. declination_deg: true yaw of magnetic north at the place, degrees, east positive; left out, a model's.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    hard_iron: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    soft_iron: Matrix3 = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    declination_deg: float | None = None
+
+    def __post_init__(self) -> None:
+        a, b, c, d, e, f, g, h, i = self.soft_iron
+        if not a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0:
+            raise ValueError(
+                "soft_iron is a correction close to 1 0 0 0 1 0 0 0 1; this one has no positive determinant"
+            )
+        if self.declination_deg is not None and not -180.0 <= self.declination_deg <= 180.0:
+            raise ValueError(f"declination_deg is between -180 and 180, got {self.declination_deg:g}")
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizationConfig:
+    """How the pose comes about.
+
+    mode: which sources are used from the start, see `modelserver.messages.Mode`. mode_channel: where wishes for another
+    mode are heard; empty: nobody can switch from the bus. raw, filter: the settings of raw mode and of the filter.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    mode: Literal["full", "raw", "no_imu", "no_wheels", "no_gps", "dead_reckoning"] = "full"
+    mode_channel: str = ""
+    raw: RawSettings = field(default_factory=RawSettings)
+    filter: FilterSettings = field(default_factory=FilterSettings)
+    magnetometer: MagnetometerConfig = field(default_factory=MagnetometerConfig)
+
+    def __post_init__(self) -> None:
+        if self.mode_channel:
+            _check_channel(self.mode_channel, "mode_channel")
+
+    @property
+    def first_mode(self) -> Mode:
+        """The mode from the start, as the core knows it."""
+        return Mode[self.mode.upper()]
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +289,7 @@ class VehicleConfig:
     publish: PublishConfig = field(default_factory=PublishConfig)
     sensors: SensorsConfig = field(default_factory=SensorsConfig)
     origin: OriginConfig = field(default_factory=OriginConfig)
-    localization: RawSettings = field(default_factory=RawSettings)
+    localization: LocalizationConfig = field(default_factory=LocalizationConfig)
     limits: LimitsConfig = field(default_factory=LimitsConfig)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
 from pydantic import TypeAdapter, ValidationError
@@ -102,9 +102,7 @@ class _Reader:
         """Turn one of pydantic's findings into a problem with its line and the nearest key."""
         at: Path_ = tuple(detail["loc"])
         if detail["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-            known = _known_keys(self.schema, at[:-1])
-            near = nearest_names(str(at[-1]), known)
-            fix = f"write {near[0]}" if near else f"known here: {', '.join(known)}"
+            near, fix = self._instead_of(str(at[-1]), at[:-1])
             return Problem(Severity.ERROR, f"unknown key {shown(str(at[-1]))}", self.place(at), fix, near)
         if detail["type"] == "missing" and isinstance(at[-1], int):
             at = at[:-1]
@@ -125,6 +123,22 @@ class _Reader:
             message = f"{message[:240]}..."
         return Problem(Severity.ERROR, message[:1].lower() + message[1:], self.place(at), "")
 
+    def _instead_of(self, key: str, at: Path_) -> tuple[tuple[str, ...], str]:
+        """Return the known keys nearest to one that is not known at a place, and what to write."""
+        known = _known_keys(self.schema, at)
+        below: dict[str, list[str]] = {}
+        for section in known:
+            for each in _known_keys(self.schema, (*at, section)):
+                below.setdefault(each, []).append(".".join(map(str, (*at, section))))
+        near = () if key in below else nearest_names(key, known)
+        if near:
+            return near, f"write {near[0]}"
+        deeper = (key,) if key in below else nearest_names(key, below)
+        if deeper:
+            # one level up is a common slip, and what an older version's file may have
+            return deeper, f"write {deeper[0]} under {' or '.join(below[deeper[0]])}"
+        return (), f"known here: {', '.join(known)}"
+
 
 _EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+", re.ASCII)
 """Numbers such as 1e-3, which YAML 1.1 takes for text."""
@@ -144,9 +158,12 @@ def _known_keys(schema: type, at: Path_) -> list[str]:
     """Return the keys known at a place in the file."""
     kind: Any = schema
     for step in at:
-        hints = get_type_hints(kind) if dataclasses.is_dataclass(kind) else {}
-        kind = hints.get(str(step))
-        kind = next((each for each in (kind, *get_args(kind)) if dataclasses.is_dataclass(each)), None)
+        if get_origin(kind) is dict:
+            kind = get_args(kind)[1]
+        else:
+            kind = get_type_hints(kind).get(str(step)) if dataclasses.is_dataclass(kind) else None
+        section = (each for each in (kind, *get_args(kind)) if dataclasses.is_dataclass(each))
+        kind = kind if get_origin(kind) is dict else next(section, None)
     return [each.name for each in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
 
 

@@ -21,7 +21,9 @@ from modelserver.localization.interface import Localizer
 from modelserver.messages import (
     CHANNEL_OF,
     VALID,
+    AbsolutePoseSample,
     ChannelHealth,
+    Decision,
     Event,
     GetBodyFrameList,
     GetBodyList,
@@ -37,14 +39,20 @@ from modelserver.messages import (
     OriginLatched,
     Output,
     Policy,
+    PublishDecisions,
     PublishHealth,
+    PublishNavigation,
     PublishPose,
+    RangeSample,
     Rejected,
+    RelativePoseSample,
     Request,
     RequestHeader,
     Sample,
     SendReply,
+    SwitchMode,
     Tick,
+    Verdict,
     WheelsSample,
 )
 from modelserver.platform import PlatformView
@@ -79,6 +87,8 @@ class CoreSettings:
     """What does not change while the core runs; see `modelserver.config` for the meanings.
 
     ticks_per_pose: in timer mode POSE goes out at the first of each so many ticks; missed ones are counted too.
+    ticks_per_state: the same for the filter's state; 0 = it does not go out.
+    publish_decisions: whether what became of measurements goes out.
     """
 
     base_frame: str
@@ -86,6 +96,8 @@ class CoreSettings:
     vehicle: str = ""
     publish: Literal["timer", "event"] = "timer"
     ticks_per_pose: int = 1
+    ticks_per_state: int = 0
+    publish_decisions: bool = True
     health_period_ns: int = 1_000_000_000
     history_s: float = 60.0
     parked_requests: int = 64
@@ -181,9 +193,25 @@ def _sample(state: CoreState, sample: Sample, now: Instant) -> Step:
         state = state._replace(futures=0, view=replace(state.view, doubt=VALID))
     if state.localizer is None:
         return state, ()
-    before = state.localizer
+    return _localize(state, state.localizer, sample, now)
+
+
+def _switch(state: CoreState, wish: SwitchMode, now: Instant) -> Step:
+    source = f"command:{wish.header.source}"
+    state = _note_traffic(state, source, now)
+    if wish.header.utime > now.utime + FUTURE_LIMIT_S * 1e6:
+        # unlike a sensor's this says nothing of the host's clock: it may be the operator's that is wrong
+        return _count(state, source, "future"), ()
+    if state.localizer is None:
+        return state, ()
+    return _localize(state, state.localizer, wish, now)
+
+
+def _localize(state: CoreState, before: Localizer, sample: Sample | SwitchMode, now: Instant) -> Step:
+    """Return what follows from a sample, or from a wish, for the localization."""
     localizer, notes = before.take(sample)
     outputs: list[Output] = []
+    decisions: list[Decision] = []
     refused = False
     for note in notes:
         if isinstance(note, Rejected):
@@ -191,15 +219,23 @@ def _sample(state: CoreState, sample: Sample, now: Instant) -> Step:
             refused = True
         elif isinstance(note, OriginLatched):
             outputs.append(note)
+        else:
+            decisions.append(note)
+            if note.verdict is Verdict.REJECTED:
+                state = _count(state, f"sensor:{note.source}", note.reason or "rejected")
+                # what is said late is of an earlier sample
+                refused |= (note.source, note.seq) == (sample.header.source, sample.header.seq)
+    if decisions and state.settings.publish_decisions:
+        outputs.append(PublishDecisions(now.utime, tuple(decisions)))
     if localizer is before:
         return state, tuple(outputs)
     # before the first sample that can be used there is no time that an estimate could hold for
-    moved = localizer.utime and isinstance(sample, (GpsSample, ImuSample))
+    known = localizer.utime > 0
     history = state.history
-    if moved and (not len(history) or not 0 < localizer.utime - history.last < HISTORY_STEP_US):
+    if known and (not len(history) or not 0 < localizer.utime - history.last < HISTORY_STEP_US):
         history = history.extended(localizer.estimate(localizer.utime))
     state = state._replace(view=replace(state.view, localizer=localizer, history=history))
-    if moved:
+    if known:
         # a part may be refused of a sample that moves time on all the same
         taken = not refused or localizer.utime != before.utime
         if taken and state.settings.publish == "event":
@@ -228,18 +264,22 @@ def _publish(state: CoreState, utime: int) -> tuple[CoreState, PublishPose]:
 
 def _tick(state: CoreState, tick: Tick, now: Instant) -> Step:
     outputs: list[Output] = []
-    # the first tick is one at which POSE is due
-    before, every = state.ticks - 1, state.settings.ticks_per_pose
+    settings, before = state.settings, state.ticks
     state = state._replace(
         lateness=(*state.lateness[-LATENESS_KEPT + 1 :], tick.late),
         ticks=state.ticks + 1 + tick.missed,
         ticks_missed=state.ticks_missed + tick.missed,
         requests_answered=state.requests_answered + tick.answered,
     )
-    due = (before + 1 + tick.missed) // every > before // every
-    if due and state.settings.publish == "timer" and state.localizer is not None:
-        state, pose = _publish(state, now.utime)
-        outputs.append(pose)
+    localizer = state.localizer
+    if localizer is not None:
+        if settings.publish == "timer" and _is_due(settings.ticks_per_pose, before, state.ticks):
+            state, pose = _publish(state, now.utime)
+            outputs.append(pose)
+        if settings.ticks_per_state and _is_due(settings.ticks_per_state, before, state.ticks):
+            navigation = localizer.navigation(now.utime)
+            if navigation is not None:
+                outputs.append(PublishNavigation(navigation))
     if state.parked:
         state, replies = _answer_parked(state, now)
         outputs.extend(replies)
@@ -247,6 +287,12 @@ def _tick(state: CoreState, tick: Tick, now: Instant) -> Step:
         state, health = _report(state, now)
         outputs.append(health)
     return state, tuple(outputs)
+
+
+def _is_due(every: int, before: int, after: int) -> bool:
+    """Return whether, of ticks counted from 0, the next after `before` of them up to `after` hold one in `every`."""
+    # the first tick is one at which all is due
+    return (after - 1) // every > (before - 1) // every
 
 
 def _report(state: CoreState, now: Instant) -> tuple[CoreState, PublishHealth]:
@@ -403,6 +449,10 @@ _HANDLERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], Step]]] = {
     ImuSample: _sample,
     WheelsSample: _sample,
     JointsSample: _sample,
+    AbsolutePoseSample: _sample,
+    RelativePoseSample: _sample,
+    RangeSample: _sample,
+    SwitchMode: _switch,
     Tick: _tick,
     Rejected: _rejected,
     GetTransformation: _request,

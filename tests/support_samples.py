@@ -16,18 +16,24 @@ from modelserver.geometry import Model, ModelBuilder, Sigma
 from modelserver.localization.interface import Note
 from modelserver.messages import (
     VALID,
+    Decision,
     Estimate,
     FixType,
     GpsSample,
     ImuSample,
     Invalid,
+    Mode,
+    NavigationState,
     Origin,
     OriginLatched,
+    Phase,
     Quality,
     Rejected,
     RequestHeader,
     Sample,
     SensorHeader,
+    SwitchMode,
+    Verdict,
 )
 from modelserver.spatial import Pose
 
@@ -137,9 +143,10 @@ _COVARIANCE = tuple(np.diag([0.04, 0.09, 0.16, 1e-4, 4e-4, 9e-4]).ravel().tolist
 class Scripted:
     """A localizer that does what a sample's source says.
 
-    `refuse:REASON` is refused; `latch` sets the origin; `ignore` changes nothing; `break` raises; anything else is
-    taken. It moves at 1 m/s and has a pose in the world from its first sample. `stale_s` after the newest sample its
-    estimates are invalid.
+    `refuse:REASON` is refused; `reject:REASON` is rejected with a decision; `decide:N` is taken with N decisions;
+    `late` is taken and moves no time; `latch` sets the origin; `ignore` changes nothing; `break` raises; anything else
+    is taken. A wish for a mode is granted at its instant. It moves at 1 m/s and has a pose in the world from its first
+    sample. `stale_s` after the newest sample its estimates are invalid. With `filtering` it has a state.
     """
 
     newest: int = 0
@@ -149,23 +156,55 @@ class Scripted:
     stale_s: float = 1.0
     invalid: Invalid = VALID
     covariance: tuple[float, ...] = _COVARIANCE
+    mode: Mode = Mode.FULL
+    filtering: bool = False
 
     @property
     def utime(self) -> int:
         return self.newest
 
-    def take(self, sample: Sample) -> tuple[Scripted, tuple[Note, ...]]:
+    def take(self, sample: Sample | SwitchMode) -> tuple[Scripted, tuple[Note, ...]]:
         order, _, word = sample.header.source.partition(":")
+        if isinstance(sample, SwitchMode):
+            return replace(self, mode=sample.mode), ()
         if order == "break":
             raise RuntimeError("an error of the localizer's own:\nFORGED line \x1b[31m")
         if order == "ignore":
             return self, ()
         if order == "refuse":
             return replace(self, taken=self.taken), (Rejected(f"sensor:{sample.header.source}", word),)
+        if order == "reject":
+            return replace(self, taken=self.taken), (decided(sample, Verdict.REJECTED, word),)
+        if order == "late":
+            return replace(self, taken=self.taken + 1), ()
         taken = replace(self, newest=sample.header.utime, taken=self.taken + 1)
         if order == "latch":
             return replace(taken, known=ORIGIN), (OriginLatched(ORIGIN),)
+        if order == "decide":
+            return taken, tuple(decided(sample, Verdict.USED, "", n) for n in range(int(word)))
         return taken, ()
+
+    def navigation(self, utime: int) -> NavigationState | None:
+        if not self.filtering:
+            return None
+        return NavigationState(
+            utime,
+            self.mode,
+            Phase.ALIGNED,
+            False,
+            self.invalid,
+            self.epoch,
+            50.27,
+            -111.1,
+            700.0,
+            Pose((float(self.taken), 0.0, 0.0)),
+            (1.0, 0.0, 0.0),
+            (0.0, 0.0, 0.01),
+            (),
+            ("position_east",),
+            (0.5,),
+            (0.25,),
+        )
 
     def estimate(self, utime: int) -> Estimate:
         if not self.newest:
@@ -192,6 +231,12 @@ class Scripted:
             0.1,
             math.nan,
         )
+
+
+def decided(sample: Sample, verdict: Verdict, reason: str = "", number: int = 0) -> Decision:
+    """What became of a sample's one measurement."""
+    header = sample.header
+    return Decision(header.utime, header.source, header.seq, f"speed_{number}", verdict, reason, (0.5,), (1.0,), (0.5,))
 
 
 def now_at(utime: int) -> Instant:

@@ -10,7 +10,9 @@ import numpy as np
 
 from modelserver.errors import Status
 from modelserver.messages import (
+    AbsolutePoseSample,
     ChannelHealth,
+    Decision,
     Direction,
     FixType,
     GetBodyFrameList,
@@ -26,18 +28,26 @@ from modelserver.messages import (
     Invalid,
     JointSample,
     JointsSample,
+    Mode,
     NameListReply,
+    NavigationState,
     OrientationReference,
     Origin,
+    Phase,
     Policy,
     PoseAnswer,
+    PublishDecisions,
     Quality,
+    RangeSample,
+    RelativePoseSample,
     ReplyHeader,
     RequestHeader,
     SensorHeader,
     StateVectorReply,
+    SwitchMode,
     TimeQuery,
     TransformReply,
+    Verdict,
     WheelSample,
     WheelsSample,
     YawSource,
@@ -81,6 +91,32 @@ def bare_answer() -> PoseAnswer:
     return PoseAnswer(Transformation("Camera:Image", "Raptor:CG", Pose((0.299, -0.056, 0.433))))
 
 
+_TURN = (0.5, -0.5, 0.5, -0.5)
+
+
+def state(n: int = 3) -> NavigationState:
+    """Return the state of a filter with `n` error states."""
+    error = np.arange(1.0, 1.0 + n * n).reshape(n, n)
+    return NavigationState(
+        UTIME,
+        Mode.NO_WHEELS,
+        Phase.ALIGNED,
+        True,
+        Invalid.STALE_GPS,
+        4,
+        50.25,
+        -111.125,
+        700.5,
+        Pose.from_rpy((12.5, -3.25, 1.0), 0.01, -0.02, 2.5),
+        (2.0, 0.1, -0.05),
+        (0.01, -0.02, 0.3),
+        tuple(float(value) for value in range(36)),
+        tuple(f"state_{each}" for each in range(n)),
+        tuple(0.5 * each for each in range(n)),
+        tuple((error @ error.T).ravel().tolist()),
+    )
+
+
 EXAMPLES: dict[str, tuple[Any, ...]] = {
     "gps_t": (
         GpsSample(_SENSOR, FixType.NONE, math.nan, math.nan),
@@ -108,6 +144,43 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
     "joints_t": (
         JointsSample(_SENSOR, ()),
         JointsSample(_SENSOR, (JointSample("nod", -0.336, 0.001, 1.5, 0.1), JointSample("boom", 0.25))),
+    ),
+    "absolute_pose_t": (
+        AbsolutePoseSample(_SENSOR, "Raptor:CG", "World:UTM"),
+        AbsolutePoseSample(_SENSOR, "Raptor:CG", "World:ENU", orientation=_TURN),
+        AbsolutePoseSample(
+            _SENSOR, "Räptor:CG", "World:ENU", (1.5, -2.5, 0.0), _TURN, tuple(float(each) for each in range(36))
+        ),
+    ),
+    "relative_pose_t": (
+        RelativePoseSample(_SENSOR, "Digiclops:ImagePlane", UTIME - 100_000, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),
+        RelativePoseSample(
+            _SENSOR, "Digiclops:ImagePlane", 1, (0.25, 0.01, 0.0), _TURN, tuple(float(each) for each in range(36))
+        ),
+    ),
+    "range_t": (
+        RangeSample(_SENSOR, "Raptor:CG", "", (0.0, 0.0, 0.0), "World:UTM", 0.0),
+        RangeSample(_SENSOR, "Raptor:CG", "gate", (12.5, -40.0, 3.0), "World:ENU", 41.25, 0.1),
+    ),
+    "localization_mode_t": (SwitchMode(_SENSOR, Mode.FULL), SwitchMode(_SENSOR, Mode.DEAD_RECKONING)),
+    "decisions_t": (
+        PublishDecisions(UTIME, ()),
+        PublishDecisions(
+            UTIME + 1000,
+            (
+                Decision(UTIME, "gps", 6, "gps_position", Verdict.REJECTED, "no_fix"),
+                Decision(UTIME, "gps", 7, "gps_position", Verdict.REJECTED, "outlier", (1.5, -2.5),
+                         (4.0, 0.5, 0.5, 9.0), (1.0, 0.0, 0.0, 1.0), 0.75, 13.8),
+                Decision(UTIME + 5, "wheels", 70, "wheel_speed", Verdict.USED, "", (0.02,), (0.0004,)),
+            ),
+        ),
+    ),
+    "navigation_state_t": (
+        NavigationState(
+            UTIME, Mode.FULL, Phase.LEVELLING, False, Invalid.NO_FIX, 0, math.nan, math.nan, math.nan, Pose(),
+            (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (), (), (), (),
+        ),
+        state(),
     ),
     "get_transformation_request_t": (
         GetTransformation(_REQUEST, "Raptor:CG", "World:UTM"),
@@ -167,6 +240,8 @@ def same(left: Any, right: Any) -> bool:
                 )
             )
         )
+    if isinstance(left, Pose):
+        return isinstance(right, Pose) and left.is_close(right, 0.0, 1e-12)
     if type(left) is not type(right):
         return False
     if dataclasses.is_dataclass(left):

@@ -26,7 +26,7 @@ SPEAKERS = {
     Way.SENSOR: "driver",
     Way.REQUEST: "client",
     Way.BROADCAST: "service",
-    Way.COMMAND: "controller's client",
+    Way.COMMAND: "whoever commands",
 }
 
 TABLE_BEGIN = "<!-- channels: written by `make types` -->\n"

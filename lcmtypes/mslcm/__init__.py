@@ -4,7 +4,10 @@ DO NOT MODIFY BY HAND!!!!
 lcm-gen 1.5.3
 """
 
+from .absolute_pose_t import absolute_pose_t as absolute_pose_t
 from .channel_health_t import channel_health_t as channel_health_t
+from .decision_t import decision_t as decision_t
+from .decisions_t import decisions_t as decisions_t
 from .get_body_frame_list_request_t import get_body_frame_list_request_t as get_body_frame_list_request_t
 from .get_body_list_request_t import get_body_list_request_t as get_body_list_request_t
 from .get_h_transform_request_t import get_h_transform_request_t as get_h_transform_request_t
@@ -18,10 +21,14 @@ from .gps_t import gps_t as gps_t
 from .health_t import health_t as health_t
 from .imu_t import imu_t as imu_t
 from .joints_t import joints_t as joints_t
+from .localization_mode_t import localization_mode_t as localization_mode_t
 from .name_list_reply_t import name_list_reply_t as name_list_reply_t
+from .navigation_state_t import navigation_state_t as navigation_state_t
 from .pose_transform_t import pose_transform_t as pose_transform_t
 from .pose_vector_t import pose_vector_t as pose_vector_t
+from .range_t import range_t as range_t
 from .rejected_count_t import rejected_count_t as rejected_count_t
+from .relative_pose_t import relative_pose_t as relative_pose_t
 from .reply_header_t import reply_header_t as reply_header_t
 from .request_header_t import request_header_t as request_header_t
 from .sensor_header_t import sensor_header_t as sensor_header_t

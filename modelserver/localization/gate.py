@@ -75,6 +75,17 @@ def judge(sample: GpsSample, settings: FixSettings) -> GoodFix | str:
     return fix if fix.sigma <= settings.maximum_sigma else "sigma"
 
 
+def range_error(kind: FixType, settings: FixSettings) -> float:
+    """Return the range error of a kind of fix, metres."""
+    if kind == FixType.RTK_FIXED:
+        return settings.uere_rtk_fixed
+    if kind == FixType.RTK_FLOAT:
+        return settings.uere_rtk_float
+    if kind == FixType.DIFFERENTIAL:
+        return settings.uere_differential
+    return settings.uere
+
+
 def _covariance(sample: GpsSample, settings: FixSettings) -> tuple[float, float, float, float]:
     """Return variances east, north, covariance, variance up: the receiver's, else range error times dilution."""
     stated = sample.position_covariance
@@ -87,15 +98,7 @@ def _covariance(sample: GpsSample, settings: FixSettings) -> tuple[float, float,
                 up = _VERTICAL_SHARE**2 * 0.5 * (east + north)
             least = _LEAST_VARIANCE
             return max(east, least), max(north, least), cross, min(max(up, least), _MOST_VARIANCE)
-    kind = sample.fix_type
-    if kind == FixType.RTK_FIXED:
-        uere = settings.uere_rtk_fixed
-    elif kind == FixType.RTK_FLOAT:
-        uere = settings.uere_rtk_float
-    elif kind == FixType.DIFFERENTIAL:
-        uere = settings.uere_differential
-    else:
-        uere = settings.uere
+    uere = range_error(sample.fix_type, settings)
     hdop = sample.hdop if sample.hdop > 0.0 else settings.assumed_hdop
     vdop = sample.vdop if 0.0 < sample.vdop < math.inf else _VERTICAL_SHARE * hdop
     # HDOP is of both axes together: each has its part (uere hdop)^2 / 2

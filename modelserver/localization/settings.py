@@ -62,7 +62,7 @@ class FixSettings:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if not isinstance(value, (int, float)):
+            if isinstance(value, bool):
                 continue
             if not math.isfinite(value) or value <= 0:
                 raise ValueError(f"{field.name} must be finite and above 0, got {value}")

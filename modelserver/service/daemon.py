@@ -21,6 +21,7 @@ from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.messages import Origin, OriginLatched
 from modelserver.service.bus import LcmBus
 from modelserver.service.clock import SystemClock
+from modelserver.service.heard import Heard
 from modelserver.service.keep import OriginKeeper, default_directory
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.version import __version__
@@ -31,6 +32,9 @@ log = logging.getLogger(__name__)
 
 HOUSEKEEPING_HZ = 50.0
 """The least rate of ticks: for requests that wait, the health report and the order to stop."""
+
+MODE_CHANNEL = "LOCALIZATION_MODE"
+"""The customary channel for wishes about localization's mode."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +50,15 @@ class Vehicle:
         config = self.config
         localizer = None
         if self.mounts is not None:
-            localizer = RawLocalizer.start(self.mounts, config.localization, configured_origin(config) or origin)
+            localizer = RawLocalizer.start(self.mounts, config.localization.raw, configured_origin(config) or origin)
         settings = CoreSettings(
             base_frame=config.base_frame,
             rolling_frame=config.rolling_frame,
             vehicle=config.vehicle,
             publish=config.publish.mode,
             ticks_per_pose=self.ticks_per_pose(),
+            ticks_per_state=self.ticks_per_state(),
+            publish_decisions=config.publish.decisions,
             health_period_ns=round(1e9 / config.publish.health_hz),
             history_s=config.limits.history_s,
             parked_requests=config.limits.parked_requests,
@@ -71,12 +77,31 @@ class Vehicle:
         publish = self.config.publish
         return publish.rate_hz * self.ticks_per_pose() if publish.mode == "timer" else HOUSEKEEPING_HZ
 
-    def sensor_channels(self) -> dict[str, str]:
-        """Return the wire type of each channel that sensors are heard on, with the prefix."""
-        sensors = self.config.sensors
-        named = ((sensors.gps, "gps_t"), (sensors.imu, "imu_t"), (sensors.wheels, "wheels_t"))
+    def ticks_per_state(self) -> int:
+        """Return how many ticks there are to a report of the filter's state, 0 where none is wanted."""
+        state_hz = self.config.publish.state_hz
+        return max(1, round(self.tick_hz() / state_hz)) if state_hz else 0
+
+    def sensor_channels(self) -> dict[str, Heard]:
+        """Return what is heard on each channel that localization listens to, with the prefix.
+
+        Those are the sensors' channels, and the one for wishes about its mode where the vehicle file names one.
+        """
         prefix = self.config.lcm.channel_prefix
-        return {f"{prefix}{each.channel}": type_name for each, type_name in named if each is not None}
+        sensors = self.config.sensors
+        heard = {
+            f"{prefix}{each.channel}": Heard(type_name, round(each.latency * 1e6))
+            for each, type_name in (
+                (sensors.gps, "gps_t"),
+                (sensors.imu, "imu_t"),
+                (sensors.wheels, "wheels_t"),
+                *((each, f"{each.type}_t") for each in sensors.aiding.values()),
+            )
+            if each is not None
+        }
+        if self.config.localization.mode_channel:
+            heard[f"{prefix}{self.config.localization.mode_channel}"] = Heard("localization_mode_t")
+        return heard
 
 
 def load_vehicle(config: VehicleConfig, file: str = "") -> Vehicle:
@@ -125,22 +150,38 @@ def _channel_problems(config: VehicleConfig, file: str) -> list[Problem]:
     sensors = config.sensors
     heard = {
         f"sensors.{key}.channel": f"{prefix}{each.channel}"
-        for key, each in (("gps", sensors.gps), ("imu", sensors.imu), ("wheels", sensors.wheels))
+        for key, each in (
+            ("gps", sensors.gps),
+            ("imu", sensors.imu),
+            ("wheels", sensors.wheels),
+            *((f"aiding.{name}", each) for name, each in sensors.aiding.items()),
+        )
         if each is not None
     }
     own = {f"{prefix}{channel.name}" for channel in CHANNELS}
     not_for_sensors = {f"{prefix}{channel.name}" for channel in CHANNELS if channel.way is not Way.SENSOR}
-    problems = []
-    for key, channel in heard.items():
-        if channel in not_for_sensors:
+    problems = [
+        Problem(
+            Severity.ERROR,
+            f"{channel} is a channel that the service itself uses, no sensor's",
+            Source(file, element=key),
+            "give the sensor another channel",
+        )
+        for key, channel in heard.items()
+        if channel in not_for_sensors
+    ]
+    if config.localization.mode_channel:
+        channel = f"{prefix}{config.localization.mode_channel}"
+        if channel in heard.values() or (channel in own and channel != f"{prefix}{MODE_CHANNEL}"):
             problems.append(
                 Problem(
                     Severity.ERROR,
-                    f"{channel} is a channel that the service itself uses, no sensor's",
-                    Source(file, element=key),
-                    "give the sensor another channel",
+                    f"{channel} is used for something else, so no wishes about the mode can be heard on it",
+                    Source(file, element="localization.mode_channel"),
+                    f"write {MODE_CHANNEL}",
                 )
             )
+        heard["localization.mode_channel"] = channel
     spoken_on = sorted(name for name in own | set(heard.values()) if name.startswith(reply_prefix))
     if spoken_on:
         problems.append(

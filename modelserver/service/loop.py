@@ -17,7 +17,9 @@ from modelserver.messages import (
     Event,
     OriginLatched,
     Output,
+    PublishDecisions,
     PublishHealth,
+    PublishNavigation,
     PublishPose,
     Rejected,
     Request,
@@ -26,9 +28,11 @@ from modelserver.messages import (
 )
 from modelserver.service.bus import Bus
 from modelserver.service.clock import Clock
+from modelserver.service.heard import Heard
 from modelserver.service.log import RateLimited
 from modelserver.wire.channels import BY_NAME, REQUESTS
 from modelserver.wire.codec import decode, encode
+from modelserver.wire.navigation import MAX_DECISIONS
 from modelserver.wire.requests import request_header
 from modelserver.wire.timeless import TIMELESS_TYPE, TimelessReplies
 
@@ -45,12 +49,12 @@ REFUSALS_PER_PASS = 64
 class LoopSettings:
     """How the loop runs.
 
-    period_ns: between ticks. sensors: type name for each channel that is heard.
+    period_ns: between ticks. sensors: for each channel that is heard, what it carries.
     channel_prefix, queued_requests, requests_per_pass: see `modelserver.config`.
     """
 
     period_ns: int
-    sensors: Mapping[str, str] = field(default_factory=dict)
+    sensors: Mapping[str, Heard] = field(default_factory=dict)
     channel_prefix: str = ""
     queued_requests: int = 256
     requests_per_pass: int = 16
@@ -85,8 +89,9 @@ class Loop:
         prefix = settings.channel_prefix
         self._pose, self._pose_vector = f"{prefix}POSE", f"{prefix}POSE_VECTOR"
         self._odom, self._health = f"{prefix}POSE_ODOM", f"{prefix}MODELSERVER_HEALTH"
-        for channel, type_name in settings.sensors.items():
-            bus.sensors.subscribe(channel, self._sensor_handler(type_name))
+        self._decisions, self._state = f"{prefix}LOCALIZATION_DECISIONS", f"{prefix}LOCALIZATION_STATE"
+        for channel, heard in settings.sensors.items():
+            bus.sensors.subscribe(channel, self._sensor_handler(heard))
         for request in REQUESTS:
             bus.requests.subscribe(f"{prefix}{request.name}", self._request_handler(request.type_name))
 
@@ -125,10 +130,10 @@ class Loop:
         except Exception as error:
             self._failed("tick", error)
 
-    def _sensor_handler(self, type_name: str) -> Callable[[str, bytes], None]:
+    def _sensor_handler(self, heard: Heard) -> Callable[[str, bytes], None]:
         def handle(channel: str, data: bytes) -> None:
             try:
-                self._step(decode(type_name, data), self._clock.now())
+                self._step(heard.read(data), self._clock.now())
             except Exception as error:
                 self._failed(channel, error)
 
@@ -219,6 +224,14 @@ class Loop:
         self._bus.publish(self._pose_vector, encode(output.world, "pose_vector_t"))
         self._bus.publish(self._odom, encode(output.odom))
 
+    def _send_decisions(self, output: PublishDecisions) -> None:
+        for start in range(0, len(output.decisions), MAX_DECISIONS):
+            part = output.decisions[start : start + MAX_DECISIONS]
+            self._bus.publish(self._decisions, encode(PublishDecisions(output.utime, part)))
+
+    def _send_navigation(self, output: PublishNavigation) -> None:
+        self._bus.publish(self._state, encode(output.state))
+
     def _send_health(self, output: PublishHealth) -> None:
         self._bus.publish(self._health, encode(output.health))
         for source, reason, count in output.health.rejected:
@@ -247,4 +260,6 @@ _SENDERS: Mapping[type, Callable[[Loop, Any], None]] = {
     PublishPose: Loop._send_pose,
     PublishHealth: Loop._send_health,
     OriginLatched: Loop._send_origin,
+    PublishDecisions: Loop._send_decisions,
+    PublishNavigation: Loop._send_navigation,
 }

@@ -8,18 +8,18 @@ whose stamp is later than t.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from modelserver import core
 from modelserver.core import CoreState, Instant
 from modelserver.errors import NoPoseError, TooNewError, TooOldError, WireError
 from modelserver.geometry import names
-from modelserver.messages import NAN, Policy, Rejected, TimeQuery
+from modelserver.messages import NAN, Decision, Event, Policy, PublishDecisions, Rejected, TimeQuery
 from modelserver.service.daemon import Vehicle
+from modelserver.service.heard import Heard
 from modelserver.spatial.so3 import Quaternion
-from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent
 
 CSV_HEADER: Final = "utime,easting,northing,up,qw,qx,qy,qz,pose_valid,invalid_reasons"
@@ -55,12 +55,14 @@ class Run:
 
     `events` counts all events of the log, `samples` those that the core was given, `unheard` the channels that the
     vehicle file does not name, `rejected` what was not used, by channel or source and reason. `position` is where
-    the log has been read to, in bytes.
+    the log has been read to, in bytes. `on_decision` is told what became of each measurement, in the order in which it
+    was settled, whatever the vehicle file says of broadcasting it; what the log's end leaves open is not told.
     """
 
     vehicle: Vehicle
     log: Iterable[LogEvent]
     frame: str
+    on_decision: Callable[[Decision], object] | None = None
     events: int = 0
     samples: int = 0
     unheard: set[str] = field(default_factory=set)
@@ -85,7 +87,7 @@ class Run:
         for event in self.log:
             if self._state is None:
                 self.first_utime = event.utime
-                self._state = self.vehicle.core(_instant(event.utime))
+                self._state = self._started(_instant(event.utime))
                 due = event.utime if ticks is None else next(ticks, None)
             while due is not None and due <= event.utime:
                 yield self._row(due)
@@ -96,21 +98,31 @@ class Run:
             yield self._row(due)
             due = next(ticks, None)
 
-    def _take(self, event: LogEvent, type_name: str | None) -> None:
+    def _started(self, now: Instant) -> CoreState:
+        state = self.vehicle.core(now)
+        return state._replace(settings=replace(state.settings, publish_decisions=self.on_decision is not None))
+
+    def _take(self, event: LogEvent, heard: Heard | None) -> None:
         assert self._state is not None
         self.events += 1
         self.position = event.end
         self.last_utime = max(self.last_utime, event.utime)
-        if type_name is None:
+        if heard is None:
             self.unheard.add(event.channel)
             return
         self.samples += 1
         now = _instant(event.utime)
+        sample: Event
         try:
-            sample = decode(type_name, event.data)
+            sample = heard.read(event.data)
         except WireError as error:
             sample = Rejected(event.channel, error.reason)
-        self._state, _ = core.step(self._state, sample, now)
+        self._state, outputs = core.step(self._state, sample, now)
+        if self.on_decision is not None:
+            for output in outputs:
+                if isinstance(output, PublishDecisions):
+                    for decision in output.decisions:
+                        self.on_decision(decision)
         self.rejected = self._state.rejected
 
     def _row(self, utime: int) -> Row:

@@ -15,8 +15,8 @@ from modelserver.wire.restamp import restamped
 class Player:
     """Publishes events `speed` times as fast as they were recorded (infinite: at once).
 
-    Bytes go out unchanged; with `restamp` the stamps of sensor samples are moved by what the log is older than now,
-    so that to a daemon the sensors speak now.
+    Bytes go out unchanged; with `restamp` the stamps of samples, and of wishes for another mode, are moved by what the
+    log is older than now, so that to a daemon the sensors speak now.
 
     Each event has an absolute deadline on the monotonic clock, counted from the first, so delays do not add up.
     Where the log's time steps back, it goes on at once from there. The counts hold what was done so far, also

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from modelserver.simulation.noise import Noise
 from modelserver.simulation.trajectory import Phase, Trajectory
 
 _QUARTERS = 3.0 * math.pi / 2.0
@@ -76,3 +77,97 @@ def there_and_back(
 ) -> tuple[Phase, ...]:
     """Return: stand, drive `length` metres ahead, stop, stand, back up to the start, stand."""
     return straight(speed, length, stand, ramp) + straight(-speed, length, stand, ramp)[1:]
+
+
+def reverse_eight(
+    speed: float = 2.0, radius: float = 8.0, stand: float = 4.0, laps: int = 1, ramp: float = 3.0
+) -> tuple[Phase, ...]:
+    """Return `figure_eight` driven backward from the start on; `speed` is its size."""
+    return tuple(
+        Phase(phase.duration, None if phase.speed is None else -phase.speed, phase.curvature)
+        for phase in figure_eight(speed, radius, stand, laps, ramp)
+    )
+
+
+def stand(seconds: float) -> tuple[Phase, ...]:
+    """Return: stand."""
+    return (Phase(seconds),)
+
+
+def stop_and_go(
+    speed: float = 3.0,
+    go: float = 6.0,
+    stop: float = 3.0,
+    times: int = 5,
+    ramp: float = 2.0,
+    curvature: float = 0.0,
+) -> tuple[Phase, ...]:
+    """Return: stand, then `times` over set off, go on for `go` seconds, stop, stand for `stop` seconds.
+
+    `curvature` (1/m) is that of every going, to either side in turn.
+    """
+    phases = [Phase(stop)]
+    for number in range(times):
+        side = curvature if number % 2 == 0 else -curvature
+        phases += [Phase(ramp, speed, side), Phase(go), Phase(ramp, 0.0, 0.0), Phase(stop)]
+    return tuple(phases)
+
+
+_LATERAL = 2.0
+"""m/s2 across that a driver in town does not pass in a turn."""
+
+_PUSH = 1.5
+"""m/s2, on average, with which he sets off and stops at most."""
+
+
+def city(seed: int, seconds: float = 120.0, speed: float = 6.0, tightest: float = 6.0) -> tuple[Phase, ...]:
+    """Return a random drive of `seconds`: straights, turns either way, stops, backing up; at rest at both ends.
+
+    `speed` is the largest in m/s, `tightest` the smallest radius in metres. The same seed gives the same drive.
+    Raises ValueError for less than 20 seconds, or where a limit is not above 0.
+    """
+    if not (seconds >= 20.0 and speed > 0 and tightest > 0):
+        raise ValueError(f"a drive in town takes 20 s, a speed and a radius, got {seconds}, {speed}, {tightest}")
+    chance = Noise(seed, "city")
+    phases = [Phase(chance.uniform(2.0, 4.0))]
+    left = seconds - phases[0].duration
+    now = 0.0
+
+    def to(target: float) -> Phase:
+        """Reach a speed; how hard differs from time to time."""
+        return Phase(max(1.5, abs(target - now) / chance.uniform(0.5 * _PUSH, _PUSH)), target)
+
+    while True:
+        part: list[Phase] = []
+        end = now
+        kind = chance.index(6) if now else 5
+        if kind == 4:
+            part, end = [to(0.0), Phase(chance.uniform(1.0, 6.0))], 0.0
+        elif kind == 3:
+            back = -chance.uniform(0.2, 0.4) * speed
+            bend = chance.uniform(-1.0, 1.0) / tightest
+            part = [to(0.0), Phase(chance.uniform(0.5, 2.0)), Phase(2.0, back, bend)]
+            part += [Phase(chance.uniform(1.0, 5.0)), Phase(2.0, 0.0, 0.0), Phase(chance.uniform(0.5, 2.0))]
+            end = 0.0
+        elif kind in (1, 2):
+            bend = math.copysign(1.0, chance.uniform(-1.0, 1.0)) / (tightest * chance.uniform(1.0, 4.0))
+            slow = min(now, math.sqrt(_LATERAL / abs(bend)))
+            # the steering alone turns by half of what it does at full lock
+            hold = max(chance.uniform(0.3, 2.0) / (abs(bend) * slow) - 1.5, 0.2)
+            part, end = [to(slow), Phase(1.5, None, bend), Phase(hold), Phase(1.5, None, 0.0)], slow
+        elif kind == 0:
+            part = [Phase(chance.uniform(1.0, 6.0))]
+        else:
+            end = chance.uniform(0.4, 1.0) * speed
+            part = [to(end), Phase(chance.uniform(0.5, 4.0))]
+        # what is left must do to stop
+        if sum(phase.duration for phase in part) + end / (0.5 * _PUSH) + 2.0 > left:
+            break
+        phases += part
+        left -= sum(phase.duration for phase in part)
+        now = end
+    if now:
+        stopping = max(1.5, now / (0.5 * _PUSH))
+        phases.append(Phase(stopping, 0.0))
+        left -= stopping
+    return (*phases, Phase(left))

@@ -5,30 +5,58 @@ from __future__ import annotations
 import math
 
 from modelserver.simulation.trajectory import Motion
+from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
-from modelserver.spatial.so3 import Vector3
+from modelserver.spatial.so3 import Quaternion, Vector3
+
+
+def orientation(motion: Motion) -> Quaternion:
+    """Return the quaternion that turns the vehicle's axes to east, north, up."""
+    if motion.attitude is not None:
+        return motion.attitude.wxyz
+    half = motion.yaw / 2.0
+    return (math.cos(half), 0.0, 0.0, math.sin(half))
 
 
 def pose(motion: Motion, X_VP: Pose) -> Pose:
     """Return the pose, along east, north, up, of a frame that stands at `X_VP` in the vehicle's moving frame."""
-    half = motion.yaw / 2.0
-    return Pose(motion.position, (math.cos(half), 0.0, 0.0, math.sin(half))) @ X_VP
+    return Pose(motion.position, orientation(motion)) @ X_VP
+
+
+def angular_rate(motion: Motion) -> Vector3:
+    """Return the angular rate along east, north, up, rad/s."""
+    if motion.attitude is not None:
+        return so3.rotate(motion.attitude.wxyz, motion.attitude.rate)
+    return (0.0, 0.0, motion.yaw_rate)
 
 
 def velocity(motion: Motion, lever: Vector3) -> Vector3:
     """Return the velocity, east, north, up, of the point at `lever` in the vehicle's moving frame."""
-    x, y = _turned(motion.yaw, lever)
     vx, vy, vz = motion.velocity
+    if motion.attitude is not None:
+        x, y, z = so3.rotate(motion.attitude.wxyz, _cross(motion.attitude.rate, lever))
+        return (vx + x, vy + y, vz + z)
+    x, y = _turned(motion.yaw, lever)
     w = motion.yaw_rate
     return (vx - w * y, vy + w * x, vz)
 
 
 def acceleration(motion: Motion, lever: Vector3) -> Vector3:
     """Return the acceleration, east, north, up, of the point at `lever` in the vehicle's moving frame."""
-    x, y = _turned(motion.yaw, lever)
     ax, ay, az = motion.acceleration
+    if motion.attitude is not None:
+        q, rate, faster = motion.attitude
+        sx, sy, sz = _cross(faster, lever)
+        cx, cy, cz = _cross(rate, _cross(rate, lever))
+        x, y, z = so3.rotate(q, (sx + cx, sy + cy, sz + cz))
+        return (ax + x, ay + y, az + z)
+    x, y = _turned(motion.yaw, lever)
     w, wd = motion.yaw_rate, motion.yaw_acceleration
     return (ax - wd * y - w * w * x, ay + wd * x - w * w * y, az)
+
+
+def _cross(a: Vector3, b: Vector3) -> Vector3:
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def _turned(yaw: float, v: Vector3) -> tuple[float, float]:

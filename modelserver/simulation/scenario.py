@@ -8,11 +8,23 @@ from dataclasses import dataclass
 
 from modelserver.geodesy import Geodesy
 from modelserver.geometry.model import Model
-from modelserver.messages import GpsSample, ImuSample, Origin, WheelsSample
-from modelserver.simulation import gps, imu, rigid, wheels
+from modelserver.messages import (
+    AbsolutePoseSample,
+    GpsSample,
+    ImuSample,
+    Origin,
+    RangeSample,
+    RelativePoseSample,
+    WheelsSample,
+)
+from modelserver.simulation import aiding, gps, imu, rigid, wheels
+from modelserver.simulation.aiding import AbsolutePoseModel, RangeModel, RelativePoseModel
 from modelserver.simulation.gps import GpsModel
 from modelserver.simulation.imu import ImuModel
-from modelserver.simulation.trajectory import Trajectory
+from modelserver.simulation.ride import ride
+from modelserver.simulation.side_slip import SideSlip
+from modelserver.simulation.terrain import Terrain
+from modelserver.simulation.trajectory import Drive, Trajectory
 from modelserver.simulation.wheels import WheelsModel
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Vector3, conjugate, rotate
@@ -20,7 +32,7 @@ from modelserver.spatial.so3 import Vector3, conjugate, rotate
 START_UTIME = 1_750_000_000_000_000
 """When a simulation starts unless told otherwise: a whole second in June 2025."""
 
-Event = GpsSample | ImuSample | WheelsSample
+Event = GpsSample | ImuSample | WheelsSample | AbsolutePoseSample | RelativePoseSample | RangeSample
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +42,7 @@ class Truth:
     `enu` is its pose in World:ENU and `utm` in World:UTM, both relative to the origin. `latitude_deg`,
     `longitude_deg`, `height` are the same place on the ellipsoid. `velocity` and `acceleration` are along east, north,
     up of the origin; `twist` is the velocity and the angular velocity along the axes of the base frame.
-    `yaw` is the vehicle's, counter-clockwise from true east, not wrapped; `yaw_rate` is about up.
+    `yaw` is the vehicle's, counter-clockwise from true east, not wrapped, and `yaw_rate` its derivative.
     """
 
     utime: int
@@ -51,7 +63,8 @@ class Simulation:
 
     The trajectory is driven by `rolling_frame`, the frame whose x axis points along the way: that which does not
     slide sideways, on a vehicle that steers its front wheels the middle of the rear axle. Unless named it is the base
-    frame. It moves on the tangent plane of the origin, its z up. Where the sensors sit comes from the model.
+    frame. It moves on the tangent plane of the origin, its z up; with `terrain` on ground that rises above that plane,
+    and with `side_slip` it points beside its way. Where the sensors sit comes from the model.
     """
 
     def __init__(
@@ -70,8 +83,21 @@ class Simulation:
         gps_model: GpsModel | None = None,
         imu_model: ImuModel | None = None,
         wheels_model: WheelsModel | None = None,
+        terrain: Terrain | None = None,
+        side_slip: SideSlip | None = None,
+        second_gps_frame: str | None = None,
+        pose_frame: str | None = None,
+        pose_model: AbsolutePoseModel | None = None,
+        odometry_frame: str | None = None,
+        odometry_model: RelativePoseModel | None = None,
+        range_frame: str | None = None,
+        beacons: Mapping[str, Vector3] | None = None,
+        range_model: RangeModel | None = None,
     ):
         """Take the vehicle, its drive and its sensors; a sensor without frame is not there.
+
+        `second_gps_frame` is that of a second antenna. `pose_frame` is seen from outside, `odometry_frame` sees its
+        own way, `range_frame` hears the `beacons`, places in World:ENU by name.
 
         `wheel_frames` has the frame of each wheel's contact point by the wheel's name. `origin` is that of the
         world frames and of the drive's east and north. Raises UnknownBodyError, UnknownFrameError or
@@ -83,20 +109,35 @@ class Simulation:
             return model.get_transformation(frame, rolling).pose
 
         self.trajectory = trajectory
+        self.drive: Drive = ride(trajectory, terrain, side_slip, seed)
+        """The trajectory as it is driven: on its ground and with its side slip."""
         self.geodesy = Geodesy(origin)
         self.start_utime = start_utime
         self._X_VB = mounted(base_frame)
+        drive = self.drive
         sensors: list[Iterator[Event]] = []
         common = (self.geodesy, start_utime, seed)
         if imu_frame is not None:
-            sensors.append(imu.readings(imu_model or ImuModel(), trajectory, mounted(imu_frame), *common, "imu"))
+            sensors.append(imu.readings(imu_model or ImuModel(), drive, mounted(imu_frame), *common, "imu"))
         if wheel_frames:
             contacts = {name: mounted(frame).xyz for name, frame in wheel_frames.items()}
-            sensors.append(
-                wheels.turns(wheels_model or WheelsModel(), trajectory, contacts, start_utime, seed, "wheels")
-            )
+            sensors.append(wheels.turns(wheels_model or WheelsModel(), drive, contacts, start_utime, seed, "wheels"))
         if gps_frame is not None:
-            sensors.append(gps.fixes(gps_model or GpsModel(), trajectory, mounted(gps_frame), *common, "gps"))
+            second = mounted(second_gps_frame).xyz if second_gps_frame is not None else None
+            sensors.append(gps.fixes(gps_model or GpsModel(), drive, mounted(gps_frame), *common, "gps", second))
+        if pose_frame is not None:
+            poses = pose_model or AbsolutePoseModel()
+            sensors.append(
+                aiding.absolute_poses(poses, drive, pose_frame, mounted(pose_frame), *common, "absolute_pose")
+            )
+        if odometry_frame is not None:
+            X_VF, odometry = mounted(odometry_frame), odometry_model or RelativePoseModel()
+            sensors.append(
+                aiding.relative_poses(odometry, drive, odometry_frame, X_VF, start_utime, seed, "relative_pose")
+            )
+        if range_frame is not None and beacons:
+            lever, radio = mounted(range_frame).xyz, range_model or RangeModel()
+            sensors.append(aiding.ranges(radio, drive, range_frame, lever, beacons, start_utime, seed, "range"))
         self._arrivals = heapq.merge(*sensors, key=lambda sample: sample.header.host_utime)
         self._next: Event | None = next(self._arrivals, None)
         self._until = start_utime
@@ -117,7 +158,7 @@ class Simulation:
 
     def truth(self, utime: int) -> Truth:
         """Return where the base frame is at `utime`; before and after the drive it stands."""
-        motion = self.trajectory.at((utime - self.start_utime) * 1e-6)
+        motion = self.drive.at((utime - self.start_utime) * 1e-6)
         enu = rigid.pose(motion, self._X_VB)
         latitude, longitude, height = self.geodesy.geodetic_from_enu(enu.xyz)
         velocity = rigid.velocity(motion, self._X_VB.xyz)
@@ -131,7 +172,7 @@ class Simulation:
             height,
             velocity,
             rigid.acceleration(motion, self._X_VB.xyz),
-            (rotate(to_base, velocity), rotate(to_base, (0.0, 0.0, motion.yaw_rate))),
+            (rotate(to_base, velocity), rotate(to_base, rigid.angular_rate(motion))),
             motion.yaw,
             motion.yaw_rate,
         )

@@ -4,9 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TypeAlias
 
 from modelserver.messages import SensorHeader
 from modelserver.simulation.noise import Noise
+
+Intervals: TypeAlias = tuple[tuple[float, float], ...]
+"""Seconds since the start, from and to."""
+
+
+def within(intervals: Intervals, t: float) -> bool:
+    """Return whether an instant lies in one of the intervals, whose ends do not belong to them."""
+    return any(begin <= t < end for begin, end in intervals)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +42,7 @@ def headers(timing: Timing, start_utime: int, device_epoch: int, source: str, no
     """
     arrived = 0
     seq = 0
+    noise.draw_ahead()
     while True:
         utime = start_utime + round(seq * 1e6 / timing.rate_hz)
         delay = timing.latency + (abs(noise.normal(timing.jitter)) if timing.jitter else 0.0)

@@ -12,13 +12,13 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import polynomial
 
-from modelserver.spatial.so3 import Vector3
+from modelserver.spatial.so3 import Quaternion, Vector3
 
 Coefficients: TypeAlias = tuple[float, ...]
 """Of a polynomial in u, the constant first."""
@@ -45,13 +45,27 @@ class Phase:
     curvature: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Motion:
-    """The vehicle at one instant: the point that does not slide sideways, and how the vehicle turns.
+class Attitude(NamedTuple):
+    """How a vehicle on rising ground stands and turns.
+
+    `wxyz` turns the vehicle's axes to east, north, up. `rate`, rad/s, and its derivative `acceleration`, rad/s2,
+    are with respect to east, north, up and along the vehicle's axes.
+    """
+
+    wxyz: Quaternion
+    rate: Vector3
+    acceleration: Vector3
+
+
+class Motion(NamedTuple):
+    """The vehicle at one instant: the point that drives the trajectory, and how the vehicle turns.
 
     `position`, `velocity`, `acceleration` along east, north, up. `yaw` is counter-clockwise from east and not
-    wrapped. `speed` is forward, m/s, `forward_acceleration` its rate, `way` its integral since the start: what is
-    backed up counts off. Angular rates are about up.
+    wrapped; `yaw_rate` and `yaw_acceleration` are its derivatives. `speed` is forward along the vehicle, m/s, and
+    `forward_acceleration` its rate. `way` is the speed's integral on level ground without side slip, whose closed
+    form is lost on other ground: what is backed up counts off. `curvature`, 1/m, is the steering's.
+    `lateral_speed` is to the left, m/s, 0 without side slip. `attitude` is None on level ground, where the vehicle
+    turns about up alone.
     """
 
     position: Vector3
@@ -64,6 +78,15 @@ class Motion:
     forward_acceleration: float
     way: float
     curvature: float
+    lateral_speed: float = 0.0
+    attitude: Attitude | None = None
+
+
+class Drive(Protocol):
+    """Whatever tells the vehicle's motion at any time."""
+
+    def at(self, t: float) -> Motion:
+        """Return the motion `t` seconds after the start."""
 
 
 class Trajectory:
@@ -107,13 +130,25 @@ class Trajectory:
         index = max(bisect_right(self._starts, t) - 1, 0)
         return self._pieces[index].at(t - self._starts[index])
 
+    def higher_rates(self, t: float) -> Vector3:
+        """Return what `Motion` leaves out: the rate and second rate of curvature, 1/m/s and 1/m/s2, and jerk, m/s3.
+
+        Jerk is the second rate of forward speed.
+        """
+        t = min(max(t, 0.0), self.duration)
+        index = max(bisect_right(self._starts, t) - 1, 0)
+        return self._pieces[index].higher_rates(t - self._starts[index])
+
 
 class _Piece:
     """One phase with all its polynomials."""
 
     __slots__ = (
         "curvature",
+        "curvature_rate",
+        "curvature_rate_rate",
         "duration",
+        "jerk",
         "knots",
         "speed",
         "speed_rate",
@@ -137,6 +172,9 @@ class _Piece:
         self.curvature = _ramp(*curvature)
         self.yaw_rate = _trimmed(polynomial.polymul(self.speed, self.curvature))
         self.speed_rate = _trimmed(polynomial.polyder(self.speed) / duration)
+        self.jerk = _trimmed(polynomial.polyder(self.speed_rate) / duration)
+        self.curvature_rate = _trimmed(polynomial.polyder(self.curvature) / duration)
+        self.curvature_rate_rate = _trimmed(polynomial.polyder(self.curvature_rate) / duration)
         self.yaw_acceleration = _trimmed(polynomial.polyder(self.yaw_rate) / duration)
         self.yaw = _trimmed(polynomial.polyint(np.multiply(self.yaw_rate, duration), k=yaw))
         self.way = _trimmed(polynomial.polyint(np.multiply(self.speed, duration), k=way))
@@ -181,6 +219,10 @@ class _Piece:
             _value(self.way, u),
             _value(self.curvature, u),
         )
+
+    def higher_rates(self, t: float) -> Vector3:
+        u = t / self.duration
+        return (_value(self.curvature_rate, u), _value(self.curvature_rate_rate, u), _value(self.jerk, u))
 
 
 def _ramp(start: float, end: float) -> Coefficients:

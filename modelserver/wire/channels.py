@@ -37,11 +37,25 @@ CHANNELS = (
     Channel("IMU", "imu_t", Way.SENSOR, "30-200 Hz", "rates, specific force, field, own orientation"),
     Channel("WHEELS", "wheels_t", Way.SENSOR, "10-100 Hz", "travel, speed and direction of each wheel"),
     Channel("JOINTS", "joints_t", Way.SENSOR, "50 Hz and more", "positions and rates of joints"),
+    Channel(
+        "ABSOLUTE_POSE", "absolute_pose_t", Way.SENSOR, "as they come", "poses in the world by other means than GPS"
+    ),
+    Channel("RELATIVE_POSE", "relative_pose_t", Way.SENSOR, "as they come", "motion between two instants, as seen"),
+    Channel("RANGE", "range_t", Way.SENSOR, "as they come", "distances to beacons whose place is known"),
     Channel("VEHICLE_STATUS", "vehicle_status_t", Way.SENSOR, "1-20 Hz", "what the vehicle controller says"),
     Channel("VEHICLE_COMMAND", "vehicle_command_t", Way.COMMAND, "10 Hz and more", "wish to the vehicle controller"),
+    Channel("LOCALIZATION_MODE", "localization_mode_t", Way.COMMAND, "on demand", "which sources localization uses"),
     Channel("POSE", "pose_transform_t", Way.BROADCAST, "timer or event", "base frame in World:UTM"),
     Channel("POSE_VECTOR", "pose_vector_t", Way.BROADCAST, "with POSE", "the same as a 7-vector"),
     Channel("POSE_ODOM", "pose_transform_t", Way.BROADCAST, "with POSE", "base frame in Odom:Origin, never jumps"),
+    Channel(
+        "LOCALIZATION_DECISIONS",
+        "decisions_t",
+        Way.BROADCAST,
+        "on sensor events",
+        "which measurements were used, and why",
+    ),
+    Channel("LOCALIZATION_STATE", "navigation_state_t", Way.BROADCAST, "timer, 5 Hz", "the filter's whole state"),
     Channel("MODELSERVER_HEALTH", "health_t", Way.BROADCAST, "1 Hz", "state, traffic, rejected input"),
     Channel(
         "PLATFORM_GET_TRANSFORMATION",

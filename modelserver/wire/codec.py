@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 
 from modelserver import messages
 from modelserver.errors import WireError
-from modelserver.wire import health, packed, poses, queries, requests, sensors
+from modelserver.wire import aiding, health, navigation, packed, poses, queries, requests, sensors
+from mslcm.absolute_pose_t import absolute_pose_t
+from mslcm.decisions_t import decisions_t
 from mslcm.get_body_frame_list_request_t import get_body_frame_list_request_t
 from mslcm.get_body_list_request_t import get_body_list_request_t
 from mslcm.get_h_transform_request_t import get_h_transform_request_t
@@ -23,9 +25,13 @@ from mslcm.gps_t import gps_t
 from mslcm.health_t import health_t
 from mslcm.imu_t import imu_t
 from mslcm.joints_t import joints_t
+from mslcm.localization_mode_t import localization_mode_t
 from mslcm.name_list_reply_t import name_list_reply_t
+from mslcm.navigation_state_t import navigation_state_t
 from mslcm.pose_transform_t import pose_transform_t
 from mslcm.pose_vector_t import pose_vector_t
+from mslcm.range_t import range_t
+from mslcm.relative_pose_t import relative_pose_t
 from mslcm.wheels_t import wheels_t
 
 
@@ -68,6 +74,12 @@ _CODECS = (
     _generated(imu_t, messages.ImuSample, sensors.read_imu, sensors.write_imu),
     _generated(wheels_t, messages.WheelsSample, sensors.read_wheels, sensors.write_wheels),
     _generated(joints_t, messages.JointsSample, sensors.read_joints, sensors.write_joints),
+    _generated(absolute_pose_t, messages.AbsolutePoseSample, aiding.read_absolute_pose, aiding.write_absolute_pose),
+    _generated(relative_pose_t, messages.RelativePoseSample, aiding.read_relative_pose, aiding.write_relative_pose),
+    _generated(range_t, messages.RangeSample, aiding.read_range, aiding.write_range),
+    _generated(localization_mode_t, messages.SwitchMode, navigation.read_mode, navigation.write_mode),
+    _generated(decisions_t, messages.PublishDecisions, navigation.read_decisions, navigation.write_decisions),
+    _generated(navigation_state_t, messages.NavigationState, navigation.read_state, navigation.write_state),
     _packed(get_transformation_request_t, messages.GetTransformation, queries.read_request, queries.write_request),
     _generated(
         get_body_list_request_t, messages.GetBodyList, requests.read_get_body_list, requests.write_get_body_list

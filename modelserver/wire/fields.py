@@ -20,6 +20,18 @@ NAN36 = (math.nan,) * 36
 MAX_UTIME = 1 << 61
 """Times beyond are no times: sums and differences of them must not leave 64 bits."""
 
+MAX_NAME = 64
+"""Characters of the name of a source, a beacon, a state."""
+
+MAX_FRAME_NAME = 401
+"""Characters of a frame's full name: 200 on each side of the colon, as many as a geometry file may have."""
+
+FAR = 1e12
+"""Metres; nothing on a vehicle or on earth is farther."""
+
+TOLERANCE = 1e-6
+"""How far a rotation on the wire may be from one: it comes from computers, so more is damage."""
+
 E = TypeVar("E", bound=IntEnum)
 
 
@@ -40,6 +52,44 @@ def matrix3(values: Sequence[float]) -> Matrix3 | None:
     a, b, c, d, e, f, g, h, i = values
     total = a + b + c + d + e + f + g + h + i
     return None if total != total and any(value != value for value in values) else (a, b, c, d, e, f, g, h, i)
+
+
+def finite(values: Sequence[float], what: str) -> tuple[float, ...]:
+    """Return numbers. Raises WireError where one is nan or infinite."""
+    if not all(map(math.isfinite, values)):
+        raise WireError("malformed", f"{what} has a number that is not finite")
+    return tuple(values)
+
+
+def finite_vector3(values: Sequence[float], what: str) -> Vector3:
+    """Return a place, metres. Raises WireError for one that is nowhere on earth."""
+    x, y, z = values
+    if not (abs(x) < FAR and abs(y) < FAR and abs(z) < FAR):
+        raise WireError("malformed", f"{what} {(x, y, z)} is no place")
+    return (x, y, z)
+
+
+def unit_quaternion(values: Sequence[float], what: str) -> Quaternion:
+    """Return a rotation. Raises WireError where the numbers are no unit quaternion."""
+    w, x, y, z = values
+    # a nan fails the comparison
+    if not abs(w * w + x * x + y * y + z * z - 1.0) <= TOLERANCE:
+        raise WireError("malformed", f"{what} {(w, x, y, z)} is no unit quaternion")
+    return (w, x, y, z)
+
+
+def name(value: str, what: str) -> str:
+    """Return a name. Raises WireError for an endless one."""
+    if len(value) > MAX_NAME:
+        raise WireError("malformed", f"{what} {shown(value, 40)} is longer than {MAX_NAME} characters")
+    return value
+
+
+def frame_name(value: str, what: str) -> str:
+    """Return the full name of a frame. Raises WireError for an endless one."""
+    if len(value) > MAX_FRAME_NAME:
+        raise WireError("malformed", f"{what} {shown(value, 40)} is longer than {MAX_FRAME_NAME} characters")
+    return value
 
 
 def member(kind: type[E], value: int, what: str) -> E:
@@ -67,11 +117,9 @@ def sensor_header(header: sensor_header_t) -> SensorHeader:
     """Return the header of a sample. Raises WireError for a sample without time or with an endless source name."""
     if header.utime <= 0:
         raise WireError("malformed", f"a sample needs utime, got {header.utime}")
-    if len(header.source) > 64:
-        raise WireError("malformed", f"source {shown(header.source, 40)} is longer than 64 characters")
     return SensorHeader(
         checked_utime(header.utime),
-        header.source,
+        name(header.source, "source"),
         header.seq,
         checked_utime(header.host_utime, "host_utime"),
         header.device_utime,

@@ -14,15 +14,10 @@ from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array
 from modelserver.spatial.transformation import Transformation
 from modelserver.wire import fields
+from modelserver.wire.fields import FAR, TOLERANCE
 from modelserver.wire.packed import check_end, read_text, text
 from mslcm.pose_transform_t import pose_transform_t
 from mslcm.pose_vector_t import pose_vector_t
-
-TOLERANCE: Final = 1e-6
-"""How far the entries of a rotation on the wire may be from one: it comes from computers, so more is damage."""
-
-_FAR: Final = 1e12
-"""Metres; nothing on a vehicle or on earth is farther."""
 
 _UTIME = struct.Struct(">q")
 # covariance, initial_utm, zone, north, origin id, epoch, valid, reasons, flags, bounds and seconds
@@ -184,9 +179,9 @@ def _pose(p: so3.Vector3, rows: tuple[so3.Vector3, so3.Vector3, so3.Vector3]) ->
         and abs(a * g + b * h + c * i) <= TOLERANCE
         and abs(d * g + e * h + f * i) <= TOLERANCE
         and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0
-        and abs(x) < _FAR
-        and abs(y) < _FAR
-        and abs(z) < _FAR
+        and abs(x) < FAR
+        and abs(y) < FAR
+        and abs(z) < FAR
     ):
         raise WireError("malformed", f"{rows} with {p} is no rigid transform")
     return Pose._of(p, so3.from_rows(rows))

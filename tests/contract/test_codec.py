@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 import tracemalloc
 from typing import Any
 
+import numpy as np
 import pytest
-from support_wire import EXAMPLES, same
+from support_wire import EXAMPLES, same, state
 
 import mslcm
 from modelserver.errors import WireError
-from modelserver.messages import GetTransformation, PoseAnswer, Quality, RequestHeader
+from modelserver.messages import (
+    Decision,
+    GetTransformation,
+    PoseAnswer,
+    PublishDecisions,
+    Quality,
+    RequestHeader,
+    Verdict,
+)
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.transformation import Transformation
 from modelserver.wire.codec import decode, encode, type_names
@@ -131,6 +141,35 @@ def _message(type_name: str, **fields: Any) -> bytes:
         ("imu_t", {"orientation_reference": 3}),
         ("imu_t", {"yaw_source": -1}),
         ("wheels_t", {"direction": [3, 0]}),
+        ("absolute_pose_t", {"orientation": [1.0, 0.0, 0.0, 0.1]}),
+        ("absolute_pose_t", {"position": [0.0, 0.0, float("inf")]}),
+        ("absolute_pose_t", {"covariance": [1.0] * 35 + [float("nan")]}),
+        ("absolute_pose_t", {"frame_of_interest": "A:" + "b" * 400}),
+        ("relative_pose_t", {"since_utime": 0}),
+        ("relative_pose_t", {"since_utime": 1 << 61}),
+        ("relative_pose_t", {"position": [float("nan")] * 3}),
+        ("relative_pose_t", {"orientation": [float("nan")] * 4}),
+        ("relative_pose_t", {"orientation": [0.0] * 4}),
+        ("range_t", {"distance": -0.5}),
+        ("range_t", {"distance": float("nan")}),
+        ("range_t", {"distance": float("inf")}),
+        ("range_t", {"beacon_position": [0.0, float("nan"), 0.0]}),
+        ("range_t", {"beacon": "b" * 65}),
+        ("range_t", {"header__utime": 0}),
+        ("localization_mode_t", {"mode": 6}),
+        ("localization_mode_t", {"mode": -1}),
+        ("localization_mode_t", {"header__source": "s" * 65}),
+        ("decisions_t", {"utime": -1}),
+        ("decisions_t", {"count": -1, "decisions": []}),
+        ("decisions_t", {"count": 1025, "decisions": [mslcm.decision_t()] * 1025}),
+        ("navigation_state_t", {"mode": 17}),
+        ("navigation_state_t", {"phase": 3}),
+        ("navigation_state_t", {"utime": -1}),
+        ("navigation_state_t", {"orientation": [0.0] * 4}),
+        ("navigation_state_t", {"position": [float("nan")] * 3}),
+        ("navigation_state_t", {"num_covariance": 5, "covariance": [0.0] * 5}),
+        ("navigation_state_t", {"names": ["a", "b", "c" * 65]}),
+        ("navigation_state_t", {"n": 65, "names": [""] * 65, "values": [0.0] * 65}),
         ("get_transformation_request_t", {"time__policy": 4}),
         ("get_transformation_request_t", {"time__wait_ms": -1}),
         ("get_transformation_request_t", {"time__at": -1}),
@@ -197,3 +236,43 @@ def test_given_a_flood_of_long_frame_names_when_decoded_then_they_are_not_kept()
 def test_given_text_that_is_not_utf8_when_decoded_then_nothing_breaks() -> None:
     data = encode(EXAMPLES["get_body_frame_list_request_t"][0]).replace(b"Raptor", b"R\xff\xfeptor"[:6])
     assert decode("get_body_frame_list_request_t", data).body == "R��pto"
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"verdict": 4}, {"kind": "k" * 65}, {"source": "s" * 65}, {"reason": "r" * 65}, {"utime": -5},
+     {"num": 65, "residual": [0.0] * 65, "innovation_covariance": [[0.0] * 65] * 65, "noise": [[0.0] * 65] * 65}],
+)  # fmt: skip
+def test_given_one_decision_that_cannot_be_when_decoded_then_the_message_is_malformed(changed: dict[str, Any]) -> None:
+    decision = mslcm.decision_t()
+    for name, value in changed.items():
+        setattr(decision, name, value)
+    with pytest.raises(WireError) as caught:
+        decode("decisions_t", _message("decisions_t", count=1, decisions=[decision]))
+    assert caught.value.reason == "malformed"
+
+
+def test_given_as_much_as_fits_when_encoded_then_it_comes_back() -> None:
+    one = Decision(5, "gps", 1, "k" * 64, Verdict.USED, "", (0.0,) * 64, (1.0,) * 4096, (2.0,) * 4096)
+    for value in (PublishDecisions(5, (one,)), PublishDecisions(5, (Decision(5, "", 1, "", Verdict.USED),) * 1024)):
+        assert same(decode("decisions_t", encode(value)), value)
+    assert same(decode("navigation_state_t", encode(state(64))), state(64))
+
+
+def test_given_more_than_fits_when_encoded_then_it_is_refused_before_it_goes_out() -> None:
+    one = Decision(5, "gps", 1, "speed", Verdict.USED)
+    for value in (
+        PublishDecisions(5, (one,) * 1025),
+        PublishDecisions(5, (one._replace(residual=(1.0, 2.0), noise=(1.0,)),)),
+        state(65),
+        dataclasses.replace(state(), values=(1.0,)),
+        dataclasses.replace(state(), covariance=()),
+    ):
+        with pytest.raises(ValueError, match=r"no|at most"):
+            encode(value)
+
+
+def test_given_a_covariance_when_packed_then_the_lower_triangle_stands_on_the_wire_row_by_row() -> None:
+    message = mslcm.navigation_state_t.decode(encode(state()))
+    error = np.arange(1.0, 10.0).reshape(3, 3)
+    assert list(message.covariance) == (error @ error.T)[np.tril_indices(3)].tolist()

@@ -11,12 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support_wire import EXAMPLES
 
 import mslcm
 from modelserver import errors, messages
+from modelserver.geometry import names
 from modelserver.messages import Origin, PoseAnswer, Quality
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.transformation import Transformation
+from modelserver.wire import fields
 from modelserver.wire.channels import CHANNELS
 from modelserver.wire.codec import encode, type_names
 from mstools.lcm_wheel import binary, type_files
@@ -152,6 +155,9 @@ def test_given_a_field_without_comment_then_the_check_names_it(text: str, missin
         (messages.OrientationReference, mslcm.imu_t, "REFERENCE_"),
         (messages.YawSource, mslcm.imu_t, "YAW_"),
         (messages.FixType, mslcm.gps_t, "FIX_"),
+        (messages.Mode, mslcm.localization_mode_t, ""),
+        (messages.Phase, mslcm.navigation_state_t, ""),
+        (messages.Verdict, mslcm.decision_t, ""),
     ],
 )
 def test_given_an_enumeration_then_the_wire_has_the_same_numbers(kind: Any, wire: Any, prefix: str) -> None:
@@ -171,6 +177,9 @@ def test_given_all_enumerations_then_no_constant_of_a_type_is_left_out() -> None
         mslcm.wheels_t: len(messages.Direction),
         mslcm.imu_t: len(messages.OrientationReference) + len(messages.YawSource),
         mslcm.gps_t: len(messages.FixType),
+        mslcm.localization_mode_t: len(messages.Mode),
+        mslcm.navigation_state_t: len(messages.Phase),
+        mslcm.decision_t: len(messages.Verdict),
     }
     assert known == {wire: sum(name.isupper() for name in vars(wire)) for wire in known}
 
@@ -186,6 +195,20 @@ def test_given_frame_names_of_63_characters_when_a_pose_is_encoded_then_one_pack
     overhead = 8 + 63 + 1
     for type_name in ("pose_transform_t", "pose_vector_t"):
         assert len(encode(answer, type_name)) + overhead < ONE_PACKET
+
+
+def test_given_the_samples_of_further_sources_when_encoded_then_one_packet_holds_each() -> None:
+    for type_name in ("absolute_pose_t", "relative_pose_t", "range_t", "localization_mode_t"):
+        assert all(len(encode(value, type_name)) + 72 < ONE_PACKET for value in EXAMPLES[type_name])
+
+
+def test_given_names_and_frames_as_long_as_geometry_allows_then_the_wire_takes_them() -> None:
+    assert names.MAX_LENGTH * 2 + 1 == fields.MAX_FRAME_NAME
+
+
+def test_given_files_of_the_package_then_none_of_the_types_is_left_out_of_it() -> None:
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert re.findall(r'^"lcmtypes/(\w+)\.lcm" = "mslcm/lcm/\1\.lcm"$', project, re.MULTILINE) == NAMES
 
 
 def test_given_the_codec_then_every_type_of_the_core_is_known() -> None:

@@ -15,6 +15,7 @@ from support_wire import EXAMPLES, same
 import mslcm
 from modelserver import messages
 from modelserver.errors import Status, WireError
+from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.transformation import Transformation
 from modelserver.wire.codec import decode, encode, type_names
@@ -77,6 +78,74 @@ def answers(draw: st.DrawFn) -> messages.PoseAnswer:
     )
 
 
+places = st.tuples(*[st.floats(-1e9, 1e9)] * 3)
+turns = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 1e-3).map(so3.normalized)
+frames = st.text(st.characters(exclude_categories=("Cs",)), max_size=40)
+covariances = st.none() | st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=36, max_size=36).map(
+    tuple
+)
+
+
+def told(length: int) -> st.SearchStrategy[tuple[float, ...]]:
+    """Numbers of which the first is not nan, which stands for none."""
+    if not length:
+        return st.just(())
+    return st.tuples(known, *[numbers] * (length - 1))
+
+
+@st.composite
+def relative_poses(draw: st.DrawFn) -> messages.RelativePoseSample:
+    header = draw(sensor_headers.filter(lambda header: header.utime > 1))
+    since = draw(st.integers(1, header.utime - 1))
+    return messages.RelativePoseSample(header, draw(frames), since, draw(places), draw(turns), draw(covariances))
+
+
+@st.composite
+def decisions(draw: st.DrawFn) -> messages.Decision:
+    n = draw(st.integers(0, 4))
+    return messages.Decision(
+        draw(utimes),
+        draw(texts),
+        draw(int64),
+        draw(texts),
+        draw(st.sampled_from(messages.Verdict)),
+        draw(texts),
+        tuple(draw(st.lists(numbers, min_size=n, max_size=n))),
+        draw(st.just(()) | told(n * n)),
+        draw(st.just(()) | told(n * n)),
+        draw(numbers),
+        draw(numbers),
+    )
+
+
+@st.composite
+def states(draw: st.DrawFn) -> messages.NavigationState:
+    n = draw(st.integers(0, 5))
+    square = np.zeros((n, n))
+    for row in range(n):
+        for column in range(row + 1):
+            square[row, column] = square[column, row] = draw(numbers)
+    vectors3 = st.tuples(numbers, numbers, numbers)
+    return messages.NavigationState(
+        draw(utimes),
+        draw(st.sampled_from(messages.Mode)),
+        draw(st.sampled_from(messages.Phase)),
+        draw(st.booleans()),
+        messages.Invalid(draw(st.integers(0, 2047))),
+        draw(int32),
+        draw(numbers),
+        draw(numbers),
+        draw(numbers),
+        Pose(draw(places), draw(turns)),
+        draw(vectors3),
+        draw(vectors3),
+        draw(st.just(()) | told(36)),
+        tuple(draw(st.lists(texts, min_size=n, max_size=n))),
+        tuple(draw(st.lists(numbers, min_size=n, max_size=n))),
+        tuple(square.ravel().tolist()),
+    )
+
+
 failed = reply_headers(st.sampled_from([status for status in Status if status is not Status.OK]))
 fine = reply_headers(st.just(Status.OK))
 names = st.lists(st.tuples(texts, texts), max_size=4)
@@ -121,6 +190,16 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
         sensor_headers,
         st.lists(st.builds(messages.JointSample, texts, *[numbers] * 4), max_size=6).map(tuple),
     ),
+    "absolute_pose_t": st.builds(
+        messages.AbsolutePoseSample, sensor_headers, frames, frames, st.none() | places, st.none() | turns, covariances
+    ),
+    "relative_pose_t": relative_poses(),
+    "range_t": st.builds(
+        messages.RangeSample, sensor_headers, frames, texts, places, frames, st.floats(0.0, 1e9), numbers
+    ),
+    "localization_mode_t": st.builds(messages.SwitchMode, sensor_headers, st.sampled_from(messages.Mode)),
+    "decisions_t": st.builds(messages.PublishDecisions, utimes, st.lists(decisions(), max_size=4).map(tuple)),
+    "navigation_state_t": states(),
     "get_transformation_request_t": st.builds(messages.GetTransformation, request_headers, texts, texts, times),
     "get_body_list_request_t": st.builds(messages.GetBodyList, request_headers),
     "get_body_frame_list_request_t": st.builds(messages.GetBodyFrameList, request_headers, texts),

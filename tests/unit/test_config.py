@@ -12,10 +12,19 @@ from typing import get_args, get_type_hints
 import pytest
 from support_samples import VEHICLE, write_vehicle
 
-from modelserver.config import VehicleConfig, load_config, parse_config
+from modelserver.config import (
+    AidingConfig,
+    LocalizationConfig,
+    SensorConfig,
+    VehicleConfig,
+    load_config,
+    parse_config,
+)
 from modelserver.config_reader import MAX_BYTES
 from modelserver.errors import ConfigError, Problem, Severity
 from modelserver.localization.raw.settings import RawSettings
+from modelserver.localization.settings import FixSettings
+from modelserver.messages import Mode
 
 ROOT = Path(__file__).resolve().parents[2]
 BASE = "vehicle: v\ngeometry: g.yaml\nbase_frame: A:B\n"
@@ -53,6 +62,22 @@ def test_given_the_three_keys_then_the_rest_has_defaults() -> None:
     assert (config.publish.mode, config.publish.rate_hz, config.limits.queued_requests) == ("timer", 50.0, 256)
 
 
+def test_given_nothing_said_of_localization_then_all_sources_count_and_nobody_switches() -> None:
+    config = parse_config((BASE + "sensors: {wheels: {channel: W}}\n").encode())
+    assert config.localization == LocalizationConfig()
+    assert (config.localization.first_mode, config.localization.mode_channel) == (Mode.FULL, "")
+    assert config.localization.magnetometer.soft_iron == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+    assert (config.publish.state_hz, config.publish.decisions) == (5.0, True)
+    assert config.sensors.wheels is not None
+    assert (config.sensors.wheels.kinematics, config.sensors.wheels.latency) == ("differential", 0.0)
+
+
+@pytest.mark.parametrize("mode", Mode)
+def test_given_any_mode_then_the_vehicle_file_knows_it(mode: Mode) -> None:
+    text = f"{BASE}localization: {{mode: {mode.name.lower()}}}\n"
+    assert parse_config(text.encode()).localization.first_mode is mode
+
+
 def test_given_every_key_then_each_is_taken() -> None:
     config = parse_config(
         (
@@ -60,13 +85,21 @@ def test_given_every_key_then_each_is_taken() -> None:
             + """\
 variables: {MRN: K11}
 lcm: {url: "memq://", channel_prefix: V1_, reply_prefix: ANSWER_}
-publish: {mode: event, rate_hz: 10, health_hz: 2.5}
+publish: {mode: event, rate_hz: 10, health_hz: 2.5, state_hz: 0, decisions: false}
 sensors:
-  gps: {channel: gps/front, frame: A:G}
-  imu: {channel: IMU.1, frame: A:I}
-  wheels: {channel: W, frames: {left: A:L}}
+  gps: {channel: gps/front, frame: A:G, latency: 0.12}
+  imu: {channel: IMU.1, frame: A:I, latency: 5}
+  wheels: {channel: W, frames: {left: A:L}, kinematics: skid_steer, latency: 0.05}
+  aiding:
+    visual odometry: {channel: VO, type: relative_pose, latency: 0.1}
+    map: {channel: MAP, type: absolute_pose}
 origin: {initial_utm: [445000, 5030000.5, 71], zone: 18, hemisphere: south, keep: false}
-localization: {gps_timeout: 3}
+localization:
+  mode: dead_reckoning
+  mode_channel: LOCALIZATION_MODE
+  raw: {gps_timeout: 3}
+  filter: {minimum_fix_type: 3}
+  magnetometer: {hard_iron: [1e-6, -2e-6, 0], soft_iron: [1, 0, 0, 0, 2, 0, 0, 0, 1], declination_deg: -14.5}
 limits: {history_s: 10, parked_requests: 0, wait_ms: 0, queued_requests: 1, requests_per_pass: 1}
 """
         ).encode()
@@ -75,7 +108,19 @@ limits: {history_s: 10, parked_requests: 0, wait_ms: 0, queued_requests: 1, requ
     assert config.origin.initial_utm == (445000.0, 5030000.5, 71.0)
     assert config.sensors.wheels is not None
     assert config.sensors.wheels.frames == {"left": "A:L"}
-    assert config.localization.gps_timeout == 3.0
+    wheels, aiding = config.sensors.wheels, config.sensors.aiding
+    assert (wheels.kinematics, wheels.latency) == ("skid_steer", 0.05)
+    assert config.sensors.gps == SensorConfig("gps/front", "A:G", 0.12)
+    assert aiding == {
+        "visual odometry": AidingConfig("VO", "relative_pose", 0.1),
+        "map": AidingConfig("MAP", "absolute_pose"),
+    }
+    localization = config.localization
+    assert (localization.first_mode, localization.mode_channel) == (Mode.DEAD_RECKONING, "LOCALIZATION_MODE")
+    assert (localization.raw.gps_timeout, localization.filter.minimum_fix_type) == (3.0, 3)
+    assert localization.magnetometer.hard_iron == (1e-6, -2e-6, 0.0)
+    assert localization.magnetometer.declination_deg == -14.5
+    assert (config.publish.state_hz, config.publish.decisions) == (0.0, False)
     assert config.limits.parked_requests == 0
 
 
@@ -126,7 +171,15 @@ def test_given_a_missing_key_then_it_is_named(missing: str) -> None:
         ("sensors:\n  gps:\n    channel: G\n    frame: A:B\n    fram: A:B\n", "sensors.gps.fram", 8, "frame"),
         ("sensors:\n  wheels:\n    chanel: W\n", "sensors.wheels.chanel", 6, "channel"),
         ("origin:\n  kept: true\n", "origin.kept", 5, "keep"),
-        ("localization:\n  gps_timeot: 3\n", "localization.gps_timeot", 5, "gps_timeout"),
+        ("localization:\n  raw:\n    gps_timeot: 3\n", "localization.raw.gps_timeot", 6, "gps_timeout"),
+        ("localization:\n  mode_chanel: M\n", "localization.mode_chanel", 5, "mode_channel"),
+        (
+            "sensors:\n  aiding:\n    vo: {chanel: V, type: range, channel: V}\n",
+            "sensors.aiding.vo.chanel",
+            6,
+            "channel",
+        ),
+        ("sensors:\n  wheels:\n    kinematic: ackermann\n", "sensors.wheels.kinematic", 6, "kinematics"),
         ("limits:\n  wait: 3\n", "limits.wait", 5, "wait_ms"),
     ],
 )
@@ -140,8 +193,30 @@ def test_given_an_unknown_key_at_any_level_then_line_key_and_nearest_are_told(
     assert "unknown key" in found.message
 
 
+@pytest.mark.parametrize(
+    ("text", "key", "near", "fix"),
+    [
+        # how raw mode's settings stood in the files of earlier versions
+        ("minimum_fix_type: 1", "minimum_fix_type", "minimum_fix_type",
+         "write minimum_fix_type under localization.raw or localization.filter"),
+        ("jump_time: 1", "jump_time", "jump_time", "write jump_time under localization.raw"),
+        ("jump_tyme: 1", "jump_tyme", "jump_time", "write jump_time under localization.raw"),
+        ("hard_iron: [0, 0, 0]", "hard_iron", "hard_iron", "write hard_iron under localization.magnetometer"),
+    ],
+)  # fmt: skip
+def test_given_a_key_that_stands_one_level_deeper_then_where_is_told(text: str, key: str, near: str, fix: str) -> None:
+    found = problem(f"localization:\n  {text}\n")
+    assert (found.element, found.line, found.nearest[0]) == (f"localization.{key}", 5, near)
+    assert found.fix.startswith(fix)
+    assert f"unknown key '{key}'" in found.message
+
+
+def test_given_a_key_of_a_section_at_the_top_then_the_section_is_told() -> None:
+    assert problem("rate_hz: 10\n").fix == "write rate_hz under publish"
+
+
 def test_given_an_unknown_key_like_no_other_then_the_known_ones_are_told() -> None:
-    assert problem("publish: {zzzzzz: 1}\n").fix == "known here: mode, rate_hz, health_hz"
+    assert problem("publish: {zzzzzz: 1}\n").fix == "known here: mode, rate_hz, health_hz, state_hz, decisions"
 
 
 def test_given_many_problems_then_all_are_told_at_once() -> None:
@@ -206,8 +281,26 @@ def test_given_a_key_twice_then_both_lines_are_told(text: str, element: str, lin
         ("lcm:\n  channel_prefix: Ä", "lcm.channel_prefix", "letters, digits and underscores"),
         (f"lcm:\n  channel_prefix: {'A' * 25}", "lcm.channel_prefix", "at most 24"),
         ("lcm:\n  channel_prefix: 'A.*'", "lcm.channel_prefix", "letters, digits and underscores"),
-        ("localization:\n  gps_timeout: -1", "localization.gps_timeout", "above 0"),
-        ("localization:\n  risk: 0.9", "localization.risk", "at most 0.5"),
+        ("publish:\n  state_hz: -1", "publish.state_hz", "between 0 and 50, got -1"),
+        ("publish:\n  state_hz: 51", "publish.state_hz", "between 0 and 50, got 51"),
+        ("publish:\n  decisions: 1", "publish.decisions", "boolean"),
+        ("localization:\n  raw: {gps_timeout: -1}", "localization.raw.gps_timeout", "above 0"),
+        ("localization:\n  raw: {risk: 0.9}", "localization.raw.risk", "at most 0.5"),
+        ("localization:\n  filter: {uere: -1}", "localization.filter.uere", "above 0"),
+        ("localization:\n  mode: Full", "localization.mode", "'full', 'raw'.*got 'Full'"),
+        ("localization:\n  mode_channel: 'A B'", "localization.mode_channel", "mode_channel has 1 to 39"),
+        ("localization:\n  magnetometer: {hard_iron: [1, 2]}", "localization.magnetometer.hard_iron", "too few"),
+        ("localization:\n  magnetometer: {declination_deg: 181}", "localization.magnetometer.declination_deg", "-180"),
+        ("localization:\n  magnetometer: {soft_iron: [0, 0, 0, 0, 0, 0, 0, 0, 0]}",
+         "localization.magnetometer.soft_iron", "no positive determinant"),
+        ("sensors:\n  gps: {channel: G, frame: A:B, latency: -0.1}", "sensors.gps.latency", "between 0 and 5"),
+        ("sensors:\n  imu: {channel: G, frame: A:B, latency: 5.1}", "sensors.imu.latency", "between 0 and 5"),
+        ("sensors:\n  wheels: {latency: .nan}", "sensors.wheels.latency", "finite"),
+        ("sensors:\n  wheels: {kinematics: tank}", "sensors.wheels.kinematics", "'skid_steer'.*got 'tank'"),
+        ("sensors:\n  aiding: {vo: {channel: V, type: pose}}", "sensors.aiding.vo.type", "'absolute_pose'.*got 'pose'"),
+        ("sensors:\n  aiding: {vo: {channel: V, type: range, latency: 9}}", "sensors.aiding.vo.latency", "0 and 5"),
+        ("sensors:\n  aiding: {vo: {type: range}}", "sensors.aiding.vo.channel", "missing"),
+        (f"sensors:\n  aiding: {{{'v' * 65}: {{channel: V, type: range}}}}", "sensors.aiding", "1 to 64"),
     ],
 )  # fmt: skip
 def test_given_a_value_that_cannot_be_then_line_key_and_why_are_told(text: str, element: str, message: str) -> None:
@@ -232,8 +325,9 @@ def test_given_a_channel_that_lcm_cannot_carry_then_it_is_refused(sensor: str, c
     assert "printable ASCII" in found.message
 
 
-def test_given_two_sensors_on_one_channel_then_it_is_refused() -> None:
-    found = problem("sensors:\n  gps: {channel: X, frame: A:B}\n  imu: {channel: X, frame: A:C}\n")
+@pytest.mark.parametrize("other", ["imu: {channel: X, frame: A:C}", "aiding: {vo: {channel: X, type: relative_pose}}"])
+def test_given_two_sensors_on_one_channel_then_it_is_refused(other: str) -> None:
+    found = problem(f"sensors:\n  gps: {{channel: X, frame: A:B}}\n  {other}\n")
     assert "'X' is given twice" in found.message
 
 
@@ -304,14 +398,14 @@ def test_given_the_cart_of_these_tests_then_it_loads(tmp_path: Path) -> None:
 
 
 def keys_of(kind: type) -> set[str]:
-    """The keys of a section and of those in it; raw mode's settings stand on another page."""
+    """The keys of a section and of those in it; the settings of raw mode and of the filter stand on another page."""
     found = set()
     for name, hint in get_type_hints(kind).items():
         if name.startswith("__"):
             continue
         found.add(name)
         for inner in (hint, *get_args(hint)):
-            if dataclasses.is_dataclass(inner) and inner is not RawSettings:
+            if dataclasses.is_dataclass(inner) and not issubclass(inner, FixSettings):
                 found |= keys_of(inner)
     return found
 

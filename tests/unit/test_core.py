@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from support_samples import ME, ORIGIN, START, Scripted, cart, drive, gps, imu, now_at, started
+from support_samples import ME, ORIGIN, START, Scripted, cart, decided, drive, gps, imu, now_at, started
 
 from modelserver import core
 from modelserver.core import MAX_COUNTERS, CoreSettings, CoreState, Instant, step
@@ -17,6 +17,7 @@ from modelserver.localization.mounts import Mounts
 from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.messages import (
     CHANNEL_OF,
+    AbsolutePoseSample,
     Event,
     GetBodyFrameList,
     GetBodyList,
@@ -26,23 +27,31 @@ from modelserver.messages import (
     GetTransformation,
     Health,
     HistoryReply,
+    ImuSample,
     Invalid,
     JointsSample,
+    Mode,
     NameListReply,
     OriginLatched,
     Output,
     Policy,
+    PublishDecisions,
     PublishHealth,
+    PublishNavigation,
     PublishPose,
+    RangeSample,
     Rejected,
+    RelativePoseSample,
     Reply,
     RequestHeader,
     SendReply,
     SensorHeader,
     StateVectorReply,
+    SwitchMode,
     Tick,
     TimeQuery,
     TransformReply,
+    Verdict,
     WheelsSample,
 )
 from modelserver.wire.codec import encode
@@ -57,6 +66,13 @@ REQUESTS: list[Any] = [
     GetHTransform(ME),
     GetHTransform(ME, inverse=True),
     GetHistory(ME, START, START + S, 10.0),
+]
+OTHERS: list[Any] = [
+    WheelsSample(SensorHeader(START + 3, "wheels"), ()),
+    JointsSample(SensorHeader(START + 3, "joints"), ()),
+    AbsolutePoseSample(SensorHeader(START + 3, "map"), "Cart:Mast", names.WORLD_UTM, (1.0, 2.0, 3.0)),
+    RelativePoseSample(SensorHeader(START + 3, "vo"), "Cart:Mast", START, (0.1, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),
+    RangeSample(SensorHeader(START + 3, "tag"), "Cart:Mast", "gate", (1.0, 2.0, 3.0), names.WORLD_UTM, 5.0),
 ]
 KINDS = [TransformReply, TransformReply, NameListReply, NameListReply, StateVectorReply, TransformReply, TransformReply,
          HistoryReply]  # fmt: skip
@@ -356,12 +372,127 @@ def test_given_event_mode_then_a_sample_that_is_not_taken_publishes_nothing(sour
     assert run.state.history.last == START + 6
 
 
-def test_given_wheels_and_joints_then_they_count_as_traffic_and_publish_nothing() -> None:
+@pytest.mark.parametrize("sample", OTHERS, ids=lambda sample: type(sample).__name__)
+def test_given_a_sample_of_any_kind_then_it_counts_for_what_the_localizer_makes_of_it(sample: Any) -> None:
     run = Run(publish="event")
-    for kind in (WheelsSample, JointsSample):
-        assert not of_kind(run.feed(kind(SensorHeader(START, "w"), ())), PublishPose)
-    assert run.state.traffic["sensor:w"].count == 2
+    assert run.feed(replace(sample, header=SensorHeader(START, "ignore"))) == ()
+    assert run.state.traffic["sensor:ignore"].count == 1
     assert len(run.state.history) == 0
+    (pose,) = of_kind(run.feed(sample), PublishPose)
+    assert pose.world.transformation.utime == run.state.history.last == START + 3
+
+
+@pytest.mark.parametrize("sample", OTHERS, ids=lambda sample: type(sample).__name__)
+def test_given_raw_mode_then_wheels_joints_and_further_sources_publish_nothing(sample: Any) -> None:
+    localizer = RawLocalizer.start(Mounts.from_model(cart(), "Cart:Base", "Cart:Antenna", "Cart:Imu"), None, ORIGIN)
+    run = Run(localizer, publish="event")
+    run.samples(0)
+    held = len(run.state.history)
+    assert run.feed(sample) == ()
+    assert len(run.state.history) == held
+    assert run.feed(SwitchMode(SensorHeader(START + 5, "me"), Mode.NO_GPS)) == ()
+
+
+def test_given_a_sample_that_changes_what_is_known_of_the_newest_instant_then_that_is_held_and_told() -> None:
+    run = Run(publish="event")
+    run.samples(0.1)
+    before = run.state.history.newest
+    (pose,) = of_kind(run.feed(gps(START, source="late"), 0.1), PublishPose)
+    assert pose.world.transformation.utime == before.utime
+    assert len(run.state.history) == 1
+    assert run.state.history.newest is not before
+
+
+# --- decisions, modes and the filter's state ----------------------------------------------------------------
+
+
+def test_given_decisions_then_they_go_out_together_once_in_their_order() -> None:
+    run = Run()
+    (said,) = run.feed(imu(START, "decide:3"), 0.25)
+    assert isinstance(said, PublishDecisions)
+    assert said.utime == START + S // 4
+    assert [each.kind for each in said.decisions] == ["speed_0", "speed_1", "speed_2"]
+    assert run.feed(imu(START + 1)) == ()
+    assert run.rejected == {}
+    assert encode(said)
+
+
+def test_given_decisions_that_nobody_wants_then_they_are_counted_all_the_same() -> None:
+    run = Run(publish_decisions=False)
+    assert run.feed(imu(START, "decide:3")) == ()
+    assert run.feed(imu(START, "reject:outlier")) == ()
+    assert run.rejected == {("sensor:reject:outlier", "outlier"): 1}
+
+
+def test_given_a_rejecting_decision_then_it_is_counted_once_and_the_sample_publishes_no_pose() -> None:
+    run = Run(publish="event")
+    for count in (1, 2):
+        (said,) = run.feed(gps(START, source="reject:outlier"))
+        assert isinstance(said, PublishDecisions)
+        assert run.rejected == {("sensor:reject:outlier", "outlier"): count}
+    run.feed(gps(START, source="reject:"))
+    assert run.rejected["sensor:reject:", "rejected"] == 1
+
+
+class Tardy(Scripted):
+    """A localizer that settles what became of a fix with the inertial sample after it."""
+
+    def take(self, sample: Any) -> Any:
+        fix = gps(START, source="gps")
+        taken = replace(self, newest=max(self.newest, START + 1), taken=self.taken + 1)
+        return taken, (decided(fix, Verdict.REJECTED, "outlier"),) if isinstance(sample, ImuSample) else ()
+
+
+def test_given_a_decision_on_an_earlier_sample_then_the_one_that_settled_it_publishes_its_pose() -> None:
+    run = Run(Tardy(), publish="event")
+    for sample in (gps(START), imu(START), imu(START)):
+        assert len(of_kind(run.feed(sample), PublishPose)) == 1
+    assert run.rejected == {("sensor:gps", "outlier"): 2}
+
+
+def test_given_a_wish_for_a_mode_then_the_localizer_hears_it_and_it_counts_as_traffic() -> None:
+    run = Run()
+    run.feed(SwitchMode(SensorHeader(START, "console"), Mode.NO_GPS))
+    assert run.state.localizer is not None
+    assert run.state.localizer == replace(Scripted(), mode=Mode.NO_GPS)
+    assert run.state.traffic["command:console"].count == 1
+    assert [each.channel for each in run.health(1.0).channels] == ["command:console"]
+    assert len(run.state.history) == 0
+
+
+def test_given_wishes_from_the_future_then_they_are_counted_and_no_pose_is_doubted_for_them() -> None:
+    run = Run()
+    run.samples(0)
+    for _ in range(core.FUTURE_SAMPLES + 1):
+        assert run.feed(SwitchMode(SensorHeader(START + 10 * S, "console"), Mode.RAW)) == ()
+    assert run.rejected == {("command:console", "future"): core.FUTURE_SAMPLES + 1}
+    (pose,) = of_kind(run.feed(Tick(), 0.1), PublishPose)
+    assert pose.world.transformation.valid
+    assert run.state.localizer == replace(Scripted(), newest=START, taken=1)
+
+
+def test_given_no_localizer_then_a_wish_for_a_mode_is_counted() -> None:
+    run = Run(None)
+    assert run.feed(SwitchMode(SensorHeader(START, "console"), Mode.RAW)) == ()
+    assert run.state.traffic["command:console"].count == 1
+
+
+@pytest.mark.parametrize("publish", ["timer", "event"])
+def test_given_a_rate_of_states_then_ticks_publish_them(publish: str) -> None:
+    run = Run(Scripted(filtering=True), ticks_per_state=10, publish=publish)
+    said = [of_kind(run.feed(Tick(), 0.02 * n), PublishNavigation) for n in range(25)]
+    assert [n for n, each in enumerate(said) if each] == [0, 10, 20]
+    (first,) = said[10]
+    assert (first.state.utime, first.state.mode) == (START + 200_000, Mode.FULL)
+    # 6 ticks were missed on the way: tick 30 is one of them
+    assert [bool(of_kind(run.feed(Tick(0.0, n), 1.0), PublishNavigation)) for n in (3, 2, 0)] == [False, True, False]
+
+
+@pytest.mark.parametrize(("localizer", "ticks"), [(Scripted(), 1), (Scripted(filtering=True), 0), (None, 1)])
+def test_given_no_filter_or_no_rate_then_no_state_goes_out(localizer: Scripted | None, ticks: int) -> None:
+    run = Run(localizer, ticks_per_state=ticks)
+    run.feed(imu(START))
+    assert not any(of_kind(run.feed(Tick(), 0.02 * n), PublishNavigation) for n in range(10))
 
 
 def test_given_a_slow_pose_rate_then_ticks_in_between_serve_the_rest() -> None:
@@ -559,6 +690,10 @@ def bits(events: list[tuple[Event, Instant]], publish: str) -> list[bytes]:
                     said += [channel.encode(), encode(reply)]
                 case PublishHealth(health):
                     said.append(encode(health))
+                case PublishDecisions() as decisions:
+                    said.append(encode(decisions))
+                case PublishNavigation(navigation):
+                    said.append(encode(navigation))
                 case OriginLatched(origin):
                     said.append(repr(origin).encode())
     return said

@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 VALUES = {"errors", "version", "spatial"}
 GEOMETRY = VALUES | {"geometry"}
-POSES = VALUES | {"messages", "geodesy", "earth", "history"}
+POSES = VALUES | {"messages", "geodesy", "earth", "magnetism", "history"}
 CORE = GEOMETRY | POSES | {"localization", "platform"}
 WIRE = VALUES | {"messages", "wire", "mslcm"}
 SERVICE = CORE | WIRE | {"core", "config", "formats"}
@@ -25,6 +25,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "messages": VALUES,
     "geodesy": VALUES | {"messages"},
     "earth": VALUES,
+    "magnetism": VALUES,
     "history": VALUES | {"messages"},
     "formats": GEOMETRY,
     "localization": GEOMETRY | POSES,
@@ -53,6 +54,7 @@ PURE = {
     "geometry",
     "geodesy",
     "earth",
+    "magnetism",
     "localization",
     "messages",
     "history",

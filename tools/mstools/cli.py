@@ -25,10 +25,13 @@ COMMANDS = {
     "bodies": "List the bodies.",
     "frames": "List the frames of a body.",
     "replay": "Feed a recorded log to the bus, or straight through the localization.",
+    "mode": "Tell the running daemon which sources its localization is to use.",
+    "calibrate": "Find an inertial unit's noise, or the iron around its magnetometer, from a log.",
     "import-bag": "Turn a ROS bag into an LCM log of this project's types.",
     "spy": "Watch the channels with lcm-spy, decoded.",
 }
-"""Subcommands and what each is for. `import-bag` is function `command` of module `mstools.import_bag`, and so on."""
+"""Subcommands and what each is for. `import-bag` is function `command` of module `mstools.import_bag`, and so on; a
+command with subcommands of its own has a Typer application there instead."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -68,10 +71,13 @@ def build(arguments: Sequence[str]) -> typer.Typer:
     app.callback()(_options)
     wanted = next((argument for argument in arguments if not argument.startswith("-")), "")
     for name, summary in COMMANDS.items():
-        function: Callable[..., None] = _stub
+        function: Callable[..., None] | typer.Typer = _stub
         if name == wanted:
             function = importlib.import_module(f"mstools.{name.replace('-', '_')}").command
-        app.command(name, short_help=summary)(function)
+        if isinstance(function, typer.Typer):
+            app.add_typer(function, name=name, short_help=summary)
+        else:
+            app.command(name, short_help=summary)(function)
     return app
 
 

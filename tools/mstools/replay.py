@@ -8,12 +8,14 @@ import os
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Annotated, TextIO
 
 import typer
 
 from modelserver.errors import RecordingError, nearest_names, shown
+from modelserver.messages import Decision
 from modelserver.wire.eventlog import LogEvent, LogFile
 from modelserver.wire.kinds import is_of_service
 from mstools.asking import JsonOption, UrlOption
@@ -29,6 +31,10 @@ def command(
     config: Annotated[Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file.")] = None,
     poses: Annotated[
         str, typer.Option(metavar="CSV", help="Work offline, and write the poses here; - is standard output.")
+    ] = "",
+    decisions: Annotated[
+        str,
+        typer.Option(metavar="JSONL", help="With --poses: write what became of each measurement here, a JSON a line."),
     ] = "",
     frame: Annotated[
         str, typer.Option(metavar="BODY:FRAME", help="Frame whose pose is written. Default: the base frame.")
@@ -75,10 +81,12 @@ def command(
             raise typer.BadParameter(f"a rate is above 0 and at most 10000 Hz, got {rate:g}")
         if speed != "1" or restamp or url or everything:
             raise typer.BadParameter("--speed, --restamp, --all and --url are for the bus; --poses works offline")
-        offline(log, config, poses, frame, rate, at_times, channels, as_json)
+        if poses == decisions == "-":
+            raise typer.BadParameter("only one of --poses and --decisions can go to standard output")
+        offline(log, config, poses, decisions, frame, rate, at_times, channels, as_json)
     else:
-        if frame or at_times is not None:
-            raise typer.BadParameter("--frame and --at-times go with --poses CSV")
+        if frame or decisions or at_times is not None:
+            raise typer.BadParameter("--frame, --decisions and --at-times go with --poses CSV")
         factor = _speed(speed)
         if restamp and factor != 1.0:
             raise typer.BadParameter("--restamp goes with --speed 1: stamps must not run faster than the clock")
@@ -134,6 +142,7 @@ def offline(
     log: Path,
     config: Path,
     poses: str,
+    decisions: str,
     frame: str,
     rate: float,
     at_times: Path | None,
@@ -153,12 +162,23 @@ def offline(
         raise RecordingError(f"{config}: names no GPS and IMU under sensors, so there is no pose in the world to write")
     times = None if at_times is None else read_times(at_times)
     geometry = Path(vehicle.config.geometry)
-    _check_output(poses, [log, config, geometry, *([] if at_times is None else [at_times])])
+    inputs = [log, config, geometry, *([] if at_times is None else [at_times])]
+    _check_output(poses, inputs)
+    if decisions:
+        _check_output(decisions, inputs)
+        if decisions != "-" and os.path.realpath(decisions) == os.path.realpath(poses):
+            raise RecordingError(f"{decisions}: the poses go there; name another file for the decisions")
     with LogFile(log) as recording:
         run = Run(vehicle, _only(recording, channels), frame or vehicle.config.base_frame)
         started = time.monotonic()
         written = valid = 0
-        with _output(poses) as out, progress(f"replaying {log.name}", recording.size) as show:
+        with (
+            _output(poses) as out,
+            _output(decisions) if decisions else nullcontext() as ledger,
+            progress(f"replaying {log.name}", recording.size) as show,
+        ):
+            if ledger is not None:
+                run.on_decision = partial(_write_decision, ledger)
             out.write(CSV_HEADER + "\n")
             for row in run.rows(times, rate):
                 out.write(row.csv() + "\n")
@@ -183,7 +203,7 @@ def offline(
             f"{span:.1f} s in {wall:.2f} s: {report['real_time_factor']:.0f} times real time"
         ]
         lines += [f"  not used: {n} of {s}, {r}" for (s, r), n in sorted(run.rejected.items())]
-        typer.echo(json.dumps(report) if as_json else "\n".join(lines), err=poses == "-")
+        typer.echo(json.dumps(report) if as_json else "\n".join(lines), err="-" in (poses, decisions))
         if not run.samples:
             heard = _listed(vehicle.sensor_channels())
             raise RecordingError(f"{log}: nothing on the vehicle's channels ({heard}); it has: {_listed(run.unheard)}")
@@ -237,18 +257,30 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(sorted(names))
 
 
-def _output(poses: str) -> AbstractContextManager[TextIO]:
-    if poses == "-":
+def _output(path: str) -> AbstractContextManager[TextIO]:
+    if path == "-":
         return nullcontext(typer.get_text_stream("stdout"))
-    return written_whole(poses, replace=True)
+    return written_whole(path, replace=True)
 
 
-def _check_output(poses: str, inputs: Iterable[Path]) -> None:
-    """Raise RecordingError where the poses would go over a file that they are made from."""
-    target = Path(poses)
+def _check_output(path: str, inputs: Iterable[Path]) -> None:
+    """Raise RecordingError where the output would go over a file that it is made from."""
+    target = Path(path)
     for each in inputs:
-        if poses != "-" and target.exists() and each.exists() and target.samefile(each):
-            raise RecordingError(f"{poses}: is read by this command; name another file for the poses")
+        if path != "-" and target.exists() and each.exists() and target.samefile(each):
+            raise RecordingError(f"{path}: is read by this command; name another file to write")
+
+
+def _write_decision(ledger: TextIO, decision: Decision) -> None:
+    """Write a decision as a line of JSON, which has no nan: null stands for it."""
+    values = decision._asdict() | {"verdict": decision.verdict.name.lower()}
+    ledger.write(json.dumps({key: _json(value) for key, value in values.items()}, allow_nan=False) + "\n")
+
+
+def _json(value: object) -> object:
+    if isinstance(value, tuple):
+        return [_json(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _inputs(recording: Iterable[LogEvent]) -> Iterator[LogEvent]:

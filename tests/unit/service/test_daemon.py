@@ -12,6 +12,7 @@ from modelserver.config import load_config
 from modelserver.errors import ConfigError, GeometryError, Problem
 from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.service.daemon import Vehicle, configured_origin, load_vehicle
+from modelserver.service.heard import Heard
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -30,8 +31,65 @@ def problems(folder: Path, text: str, geometry: str = GEOMETRY) -> tuple[Problem
 def test_given_the_vehicles_of_this_project_then_they_load_whole(path: Path) -> None:
     loaded = load_vehicle(load_config(path))
     assert loaded.mounts is not None
-    assert loaded.sensor_channels() == {"GPS": "gps_t", "IMU": "imu_t", "WHEELS": "wheels_t"}
-    assert (loaded.tick_hz(), loaded.ticks_per_pose()) == (50.0, 1)
+    assert loaded.sensor_channels() == {"GPS": Heard("gps_t"), "IMU": Heard("imu_t"), "WHEELS": Heard("wheels_t")}
+    assert (loaded.tick_hz(), loaded.ticks_per_pose(), loaded.ticks_per_state()) == (50.0, 1, 10)
+
+
+AIDING = """\
+  aiding:
+    vo: {channel: VO, type: relative_pose, latency: 0.08}
+    mocap: {channel: ABSOLUTE_POSE, type: absolute_pose}
+    uwb: {channel: RANGE, type: range}
+"""
+
+
+@pytest.mark.parametrize("prefix", ["", "V1_"])
+def test_given_further_sources_and_a_channel_for_modes_then_they_are_heard(tmp_path: Path, prefix: str) -> None:
+    text = VEHICLE.replace("frame: Cart:Antenna", "frame: Cart:Antenna, latency: 0.12") + AIDING
+    text += f"localization: {{mode_channel: LOCALIZATION_MODE}}\nlcm: {{channel_prefix: '{prefix}'}}\n"
+    assert vehicle(tmp_path, text).sensor_channels() == {
+        f"{prefix}GPS": Heard("gps_t", 120_000),
+        f"{prefix}IMU": Heard("imu_t"),
+        f"{prefix}VO": Heard("relative_pose_t", 80_000),
+        f"{prefix}ABSOLUTE_POSE": Heard("absolute_pose_t"),
+        f"{prefix}RANGE": Heard("range_t"),
+        f"{prefix}LOCALIZATION_MODE": Heard("localization_mode_t"),
+    }
+
+
+@pytest.mark.parametrize("channel", ["GPS", "VO", "POSE", "LOCALIZATION_STATE", "POSE_GET_HISTORY", "VEHICLE_COMMAND"])
+def test_given_a_channel_for_modes_that_is_used_otherwise_then_it_is_refused(tmp_path: Path, channel: str) -> None:
+    (found,) = problems(tmp_path, f"{VEHICLE}{AIDING}localization: {{mode_channel: {channel}}}\n")
+    assert (found.element, found.fix) == ("localization.mode_channel", "write LOCALIZATION_MODE")
+    assert channel in found.message
+
+
+@pytest.mark.parametrize("channel", ["LOCALIZATION_MODE", "MODE", "console/mode"])
+def test_given_a_channel_for_modes_of_its_own_then_it_is_taken(tmp_path: Path, channel: str) -> None:
+    text = f"{VEHICLE}localization: {{mode_channel: {channel}}}\n"
+    assert vehicle(tmp_path, text).sensor_channels()[channel] == Heard("localization_mode_t")
+
+
+@pytest.mark.parametrize("channel", ["POSE", "LOCALIZATION_DECISIONS", "LOCALIZATION_MODE"])
+def test_given_a_further_source_on_a_channel_of_the_service_then_it_is_refused(tmp_path: Path, channel: str) -> None:
+    (found,) = problems(tmp_path, VEHICLE + AIDING.replace("channel: VO", f"channel: {channel}"))
+    assert found.element == "sensors.aiding.vo.channel"
+
+
+def test_given_a_channel_for_modes_that_replies_may_use_then_it_is_refused(tmp_path: Path) -> None:
+    (found,) = problems(tmp_path, VEHICLE + "localization: {mode_channel: REPLY_MODE}\n")
+    assert found.element == "lcm.reply_prefix"
+
+
+@pytest.mark.parametrize(
+    ("publish", "ticks"),
+    [("state_hz: 0", 0), ("state_hz: 50", 1), ("state_hz: 10", 5), ("state_hz: 0.5", 100),
+     ("state_hz: 50, rate_hz: 200", 4), ("mode: event, state_hz: 5", 10)],
+)  # fmt: skip
+def test_given_a_rate_of_states_then_it_is_counted_in_ticks(tmp_path: Path, publish: str, ticks: int) -> None:
+    loaded = vehicle(tmp_path, f"{VEHICLE}publish: {{{publish}, decisions: false}}\n")
+    settings = loaded.core(now_at(START_UTIME)).settings
+    assert (loaded.ticks_per_state(), settings.ticks_per_state, settings.publish_decisions) == (ticks, ticks, False)
 
 
 def test_given_a_vehicle_then_its_core_starts_with_the_settings_of_its_file(tmp_path: Path) -> None:

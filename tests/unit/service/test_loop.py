@@ -22,14 +22,20 @@ from modelserver.messages import (
     GetStateVector,
     GetTransformation,
     Health,
+    Mode,
+    NavigationState,
     Policy,
     PoseAnswer,
+    PublishDecisions,
     Reply,
     RequestHeader,
+    SensorHeader,
+    SwitchMode,
     TimeQuery,
 )
 from modelserver.service.clock import FakeClock
 from modelserver.service.fake_bus import FakeBus
+from modelserver.service.heard import Heard
 from modelserver.service.log import MAX_CAUSES, PERIOD_S, RateLimited
 from modelserver.service.loop import REFUSALS_PER_PASS, SENSORS_PER_PASS, Loop, LoopSettings
 from modelserver.wire.channels import REQUESTS
@@ -50,11 +56,19 @@ REPLY_TYPES = {
 class Rig:
     """A loop with its fakes. The clock starts at START and stands still but for what the loop waits."""
 
-    def __init__(self, localizer: Scripted | None = Scripted(), prefix: str = "", **settings: Any):  # noqa: B008
+    def __init__(
+        self,
+        localizer: Scripted | None = Scripted(),  # noqa: B008
+        prefix: str = "",
+        latency_us: int = 0,
+        **settings: Any,
+    ):
         self.clock = FakeClock(START, 10_000_000_000)
         self.bus = FakeBus(self.clock)
-        heard = {f"{prefix}GPS": "gps_t", f"{prefix}IMU": "imu_t"}
-        core_settings = {key: settings.pop(key) for key in ("publish", "parked_requests") if key in settings}
+        heard = {f"{prefix}GPS": Heard("gps_t", latency_us), f"{prefix}IMU": Heard("imu_t")}
+        heard[f"{prefix}LOCALIZATION_MODE"] = Heard("localization_mode_t")
+        names = ("publish", "parked_requests", "ticks_per_state")
+        core_settings = {key: settings.pop(key) for key in names if key in settings}
         state = started(localizer, **core_settings)
         self.origins: list[object] = []
         self.loop = Loop(
@@ -66,7 +80,7 @@ class Rig:
             self.loop.turn()
 
     def send(self, value: Any, channel: str = "") -> None:
-        kinds = {"GpsSample": "GPS", "ImuSample": "IMU"}
+        kinds = {"GpsSample": "GPS", "ImuSample": "IMU", "SwitchMode": "LOCALIZATION_MODE"}
         self.bus.publish(channel or CHANNEL_OF.get(type(value)) or kinds[type(value).__name__], encode(value))
 
     def ask(self, request: Any, turns: int = 2) -> Reply:
@@ -254,18 +268,50 @@ def test_given_each_request_channel_then_the_loop_answers_on_it() -> None:
 
 
 def test_given_a_channel_prefix_then_everything_carries_it_but_replies() -> None:
-    rig = Rig(prefix="V1_")
+    rig = Rig(Scripted(filtering=True), prefix="V1_", ticks_per_state=1)
     for channel in ("PLATFORM_GET_BODY_LIST", "V1_PLATFORM_GET_BODY_LIST", "V2_PLATFORM_GET_BODY_LIST"):
         rig.bus.publish(channel, encode(GetBodyList(ME)))
     rig.bus.publish("IMU", encode(imu(START)))
-    rig.bus.publish("V1_IMU", encode(imu(START + 1)))
+    rig.bus.publish("V1_IMU", encode(imu(START + 1, "decide:1")))
     rig.bus.published.clear()
     rig.turns(2)
     assert {channel for channel, _ in rig.bus.published} == {
-        "V1_POSE", "V1_POSE_VECTOR", "V1_POSE_ODOM", "V1_MODELSERVER_HEALTH", "REPLY_TEST",
+        "V1_POSE", "V1_POSE_VECTOR", "V1_POSE_ODOM", "V1_MODELSERVER_HEALTH", "V1_LOCALIZATION_DECISIONS",
+        "V1_LOCALIZATION_STATE", "REPLY_TEST",
     }  # fmt: skip
     assert len(rig.bus.said("REPLY_TEST")) == 1
-    assert rig.loop.state.traffic["sensor:imu"].count == 1
+    assert rig.loop.state.traffic["sensor:decide:1"].count == 1
+
+
+def test_given_decisions_then_each_goes_out_once_in_messages_that_can_be_read() -> None:
+    rig = Rig()
+    rig.send(imu(START, "decide:2500"))
+    rig.send(imu(START + 1, "decide:1"))
+    rig.turns(1)
+    said: list[PublishDecisions] = [decode("decisions_t", data) for data in rig.bus.said("LOCALIZATION_DECISIONS")]
+    assert [len(each.decisions) for each in said] == [1024, 1024, 452, 1]
+    assert [each.kind for part in said[:3] for each in part.decisions] == [f"speed_{n}" for n in range(2500)]
+    assert rig.loop.state.handler_errors == 0
+
+
+def test_given_a_filter_then_its_state_goes_out_and_tells_the_mode_that_was_wished_for() -> None:
+    rig = Rig(Scripted(filtering=True), ticks_per_state=5)
+    rig.turns(1)
+    rig.send(SwitchMode(SensorHeader(START + 5, "console"), Mode.DEAD_RECKONING))
+    rig.turns(9)
+    said: list[NavigationState] = [decode("navigation_state_t", data) for data in rig.bus.said("LOCALIZATION_STATE")]
+    assert [each.mode for each in said] == [Mode.FULL, Mode.DEAD_RECKONING]
+    assert [each.utime - START for each in said] == [0, 100_000]
+
+
+def test_given_a_latency_then_the_core_is_told_the_instant_of_measurement() -> None:
+    rig = Rig(latency_us=120_000)
+    rig.send(gps(START))
+    rig.turns(1)
+    assert rig.loop.state.localizer.utime == START - 120_000  # type: ignore[union-attr]
+    rig.send(imu(START))
+    rig.turns(1)
+    assert rig.loop.state.localizer.utime == START  # type: ignore[union-attr]
 
 
 def test_given_an_origin_that_is_latched_then_it_is_handed_on() -> None:
@@ -278,13 +324,17 @@ def test_given_an_origin_that_is_latched_then_it_is_handed_on() -> None:
 # --- bad input ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("channel", [*(each.name for each in REQUESTS), "GPS", "IMU"])
+@pytest.mark.parametrize("channel", [*(each.name for each in REQUESTS), "GPS", "IMU", "LOCALIZATION_MODE"])
 def test_given_random_bytes_on_any_channel_then_they_are_counted_and_the_next_good_request_is_answered(
     channel: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     rng = random.Random(4)
     rig = Rig()
-    good = {"GPS": encode(gps(START)), "IMU": encode(imu(START))}.get(channel) or encode(
+    good = {
+        "GPS": encode(gps(START)),
+        "IMU": encode(imu(START)),
+        "LOCALIZATION_MODE": encode(SwitchMode(SensorHeader(START, "console"), Mode.RAW)),
+    }.get(channel) or encode(
         next(
             kind(ME, *values)
             for kind, values in (

@@ -12,7 +12,23 @@ from modelserver import core
 from modelserver.core import CoreSettings, CoreState, Instant
 from modelserver.errors import UnknownFrameError
 from modelserver.geometry import ModelBuilder
-from modelserver.messages import Estimate, FixType, GpsSample, Invalid, Origin, Rejected, Sample, SensorHeader
+from modelserver.localization.interface import Note
+from modelserver.messages import (
+    AbsolutePoseSample,
+    Decision,
+    Estimate,
+    FixType,
+    GpsSample,
+    Invalid,
+    Mode,
+    Origin,
+    Rejected,
+    Sample,
+    SensorHeader,
+    SwitchMode,
+    Verdict,
+)
+from modelserver.service.heard import Heard
 from modelserver.service.offline import Row, Run
 from modelserver.spatial.pose import Pose
 from modelserver.wire.codec import encode
@@ -29,10 +45,14 @@ class Counting:
     taken: int = 0
     utime: int = 0
 
-    def take(self, sample: Sample) -> tuple[Counting, tuple[Rejected, ...]]:
+    def take(self, sample: Sample | SwitchMode) -> tuple[Counting, tuple[Note, ...]]:
         if isinstance(sample, GpsSample) and sample.fix_type is FixType.NONE:
             return self, (Rejected("sensor:gps", "fix"),)
-        return Counting(self.taken + 1, max(self.utime, sample.header.utime)), ()
+        decision = Decision(sample.header.utime, sample.header.source, self.taken, "any", Verdict.USED)
+        return Counting(self.taken + 1, max(self.utime, sample.header.utime)), (decision,)
+
+    def navigation(self, utime: int) -> None:
+        return None
 
     def estimate(self, utime: int) -> Estimate:
         if not self.taken:
@@ -49,12 +69,16 @@ def vehicle() -> Any:
     model = builder.build()
 
     def start(now: Instant) -> CoreState:
-        return core.start(CoreSettings("V:Base"), model, Counting(), now)
+        return core.start(CoreSettings("V:Base", publish_decisions=False), model, Counting(), now)
 
     return SimpleNamespace(
         model=model,
         config=SimpleNamespace(base_frame="V:Base"),
-        sensor_channels=lambda: {"GPS": "gps_t"},
+        sensor_channels=lambda: {
+            "GPS": Heard("gps_t"),
+            "MAP": Heard("absolute_pose_t", 40),
+            "MODE": Heard("localization_mode_t"),
+        },
         core=start,
     )
 
@@ -130,6 +154,25 @@ def test_given_bad_messages_when_replayed_then_they_are_counted_and_the_rest_is_
     assert run.rejected == {("GPS", "truncated"): 1, ("GPS", "fingerprint"): 1, ("sensor:gps", "fix"): 1}
     assert (run.events, run.samples) == (6, 5)
     assert (run.first_utime, run.last_utime) == (T0 + 10, T0 + 50)
+
+
+def test_given_further_sources_and_modes_when_replayed_then_they_are_heard_at_their_instants() -> None:
+    pose = AbsolutePoseSample(SensorHeader(T0 + 20, "map"), "V:Base", "World:UTM", (1.0, 2.0, 3.0))
+    wish = SwitchMode(SensorHeader(T0 + 30, "console"), Mode.NO_GPS)
+    told: list[Decision] = []
+    log = [gps(10), LogEvent(0, T0 + 20, "MAP", encode(pose), 20), LogEvent(0, T0 + 30, "MODE", encode(wish), 30)]
+    run = Run(vehicle(), log, "V:Base", told.append)
+    assert taken(run, 100) == [3]
+    assert [(each.source, each.utime - T0) for each in told] == [("gps", 10), ("map", -20), ("console", 30)]
+    assert (run.samples, run.unheard) == (3, set())
+
+
+def test_given_nobody_who_wants_decisions_when_replayed_then_the_rows_are_the_same() -> None:
+    told: list[Decision] = []
+    log = [gps(100), gps(200), gps(300)]
+    with_, without = (list(Run(vehicle(), log, "V:Base", each).rows(None)) for each in (told.append, None))
+    assert [row.csv() for row in with_] == [row.csv() for row in without]
+    assert len(told) == 3
 
 
 def test_given_a_row_when_written_then_tenths_of_a_millimetre_survive() -> None:

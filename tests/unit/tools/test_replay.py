@@ -8,13 +8,18 @@ import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import lcm
 import pytest
 from support_recordings import EASTING, HEIGHT, HUSKY, LATENCY, NORTHING, SPEED, START, drive, write_log
+from support_samples import Scripted
 
-from modelserver.messages import GetBodyList, PoseAnswer, RequestHeader
+from modelserver import core
+from modelserver.core import CoreSettings, CoreState, Instant
+from modelserver.messages import Decision, GetBodyList, GpsSample, PoseAnswer, RequestHeader, Verdict
 from modelserver.service import playback
+from modelserver.service.daemon import Vehicle
 from modelserver.spatial import Pose, Transformation
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import LogEvent, LogFile
@@ -125,6 +130,88 @@ def test_given_a_channel_when_replayed_offline_then_the_others_are_left_out(
     out = tmp_path / "p.csv"
     assert run(driven, "-c", HUSKY, "--poses", out, "--channel", "IMU", "--rate", 1)[0] == 0
     assert all(not row[8] for row in rows(out))
+
+
+# --- what became of measurements ----------------------------------------------------------------------------
+
+
+class Deciding(Scripted):
+    """A localizer that says of each fix what became of it."""
+
+    def take(self, sample: Any) -> Any:
+        taken, notes = super().take(sample)
+        if not isinstance(sample, GpsSample):
+            return taken, notes
+        utime, seq = sample.header.utime, sample.header.seq
+        if seq % 2:
+            return taken, (Decision(utime, "gps", seq, "gps_position", Verdict.REJECTED, "satellites"),)
+        matrix = (4.0, 0.5, 0.5, 4.0)
+        decision = Decision(
+            utime, "gps", seq, "gps_position", Verdict.USED, "", (1.5, -0.5), matrix, matrix, 0.75, math.inf
+        )
+        return taken, (decision,)
+
+
+@pytest.fixture
+def deciding(monkeypatch: pytest.MonkeyPatch) -> None:
+    def start(vehicle: Vehicle, now: Instant) -> CoreState:
+        settings = CoreSettings(vehicle.config.base_frame, publish_decisions=False)
+        return core.start(settings, vehicle.model, Deciding(), now)
+
+    monkeypatch.setattr(Vehicle, "core", start)
+
+
+@pytest.mark.usefixtures("deciding")
+def test_given_a_ledger_when_replayed_then_each_decision_is_a_line_of_json(
+    driven: Path, tmp_path: Path, run: Run
+) -> None:
+    ledger = tmp_path / "ledger.jsonl"
+    code, _, err = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--decisions", ledger, "--rate", 1)
+    assert (code, err) == (0, "")
+    text = ledger.read_text()
+    assert "NaN" not in text
+    assert "Infinity" not in text
+    lines = [json.loads(line) for line in text.splitlines()]
+    assert [line["seq"] for line in lines] == list(range(200))
+    assert lines[0] == {
+        "utime": START, "source": "gps", "seq": 0, "kind": "gps_position", "verdict": "used", "reason": "",
+        "residual": [1.5, -0.5], "innovation_covariance": [4.0, 0.5, 0.5, 4.0], "noise": [4.0, 0.5, 0.5, 4.0],
+        "statistic": 0.75, "limit": None,
+    }  # fmt: skip
+    assert (lines[1]["verdict"], lines[1]["reason"], lines[1]["residual"]) == ("rejected", "satellites", [])
+    assert lines[1]["statistic"] is None
+    assert len(rows(tmp_path / "p.csv")) == 40
+
+
+@pytest.mark.usefixtures("deciding")
+def test_given_a_ledger_on_standard_output_then_only_that_goes_there(driven: Path, tmp_path: Path, run: Run) -> None:
+    code, out, err = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--decisions", "-", "--rate", 1)
+    assert code == 0
+    assert len([json.loads(line) for line in out.splitlines()]) == 200
+    assert "times real time" in err
+
+
+def test_given_raw_mode_then_the_ledger_is_empty_and_the_poses_are_the_same(
+    driven: Path, tmp_path: Path, run: Run
+) -> None:
+    config = tmp_path / "vehicle.yaml"
+    geometry = f"geometry: {HUSKY.with_name('geometry.yaml')}"
+    config.write_text(HUSKY.read_text().replace("geometry: geometry.yaml", geometry) + "localization: {mode: raw}\n")
+    for name, options in (("one.csv", ("--decisions", tmp_path / "ledger.jsonl")), ("two.csv", ())):
+        assert run(driven, "-c", config, "--poses", tmp_path / name, *options)[0] == 0
+    assert (tmp_path / "ledger.jsonl").read_text() == ""
+    assert (tmp_path / "one.csv").read_bytes() == (tmp_path / "two.csv").read_bytes()
+
+
+def test_given_a_ledger_over_a_file_that_is_needed_then_it_is_refused(driven: Path, tmp_path: Path, run: Run) -> None:
+    log, poses = tmp_path / "drive.lcm", tmp_path / "p.csv"
+    log.write_bytes(driven.read_bytes())
+    for target, words in ((log, "is read by this command"), (poses, "the poses go there")):
+        code, _, err = run(log, "-c", HUSKY, "--poses", poses, "--decisions", target)
+        assert code == 1
+        assert words in err
+    assert log.read_bytes() == driven.read_bytes()
+    assert not poses.exists()
 
 
 # --- bad input ----------------------------------------------------------------------------------------------
@@ -239,6 +326,8 @@ def test_given_times_with_comments_when_read_then_they_are_numbers(tmp_path: Pat
         ["--poses", "p.csv"],
         ["--frame", "A:B"],
         ["--at-times", "t"],
+        ["--decisions", "d.jsonl"],
+        ["-c", "v.yaml", "--poses", "-", "--decisions", "-"],
         ["--speed", "fast"],
         ["--speed", "-1"],
         ["--speed", "nan"],

@@ -1,0 +1,248 @@
+"""Accuracy on the recordings against fixes that were withheld, beside required figures and other systems' figures.
+
+    python -m benchmarks accuracy                        the whole table
+    python -m benchmarks.accuracy husky half             one line of it
+    python -m benchmarks.accuracy husky p2x --verbose    with every gap
+    python -m benchmarks.accuracy kitti half --set gyro_noise=0.001 --mode filter
+
+What the lines mean stands in `benchmarks.protocols`, where the recordings come from in `benchmarks.recordings`.
+Exit code 1 where a required figure is missed or estimates diverge, 77 where no recording is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import multiprocessing
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from benchmarks import plaza_ranges, protocols
+from benchmarks.husky_rmse import common_scorer, data_directory
+from benchmarks.protocols import SHIFTS, Job, Outcome
+from benchmarks.recordings import dresden, husky, kitti, plaza
+from benchmarks.support import ROOT
+
+SKIPPED = 77
+PROTOCOLS = ("half", "outage", "p2x")
+DIVERGED_M = 100.0
+"""An error beyond, at fixes that come every second or more often, is no noise of any receiver."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What a line is held against: metres, nan = nothing is asked. `peers` in words, as they were measured."""
+
+    required: float = math.nan
+    aim: float = math.nan
+    peers: str = ""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recording that is scored by its own fixes, and what is asked of it by protocol."""
+
+    name: str
+    file: Callable[[Path], Path]
+    convert: Callable[[Path, Path], Mapping[str, int]]
+    vehicle: Path
+    figures: Mapping[str, Figures] = field(default_factory=dict)
+
+
+RECORDINGS = (
+    Recording(
+        "husky",
+        husky.file,
+        husky.convert,
+        ROOT / "config" / "husky" / "vehicle.yaml",
+        {
+            "half": Figures(0.45, 0.33, "robot_localization 0.37 (UKF 0.34), 6-state EKF 1.65, FusionCore 0.45"),
+            "p2x": Figures(3.4, 3.0, "robot_localization 3.4 (UKF 4.1), 6-state EKF 3.9, FusionCore 4.8 to 5.6"),
+        },
+    ),
+    Recording(
+        "kitti",
+        lambda data: kitti.files(data)[0],
+        kitti.convert,
+        ROOT / "benchmarks" / "vehicles" / "kitti" / "vehicle.yaml",
+        {
+            "half": Figures(0.35, 0.27, "robot_localization 0.25, 6-state EKF 0.32, KF-GINS 0.93, pyins 0.91"),
+            "p2x": Figures(25.0, 15.0, "robot_localization 25, 6-state EKF 25, KF-GINS 90, pyins 74 (4 gaps)"),
+        },
+    ),
+    Recording(
+        "dresden",
+        dresden.file,
+        dresden.convert,
+        ROOT / "benchmarks" / "vehicles" / "dresden" / "vehicle.yaml",
+        {"half": Figures()},
+    ),
+)
+PLAZA = ("plaza1", "plaza2")
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of the table."""
+
+    recording: Recording
+    protocol: str
+    outcomes: tuple[Outcome, ...]
+
+    @property
+    def ours(self) -> float:
+        """The figure: RMSE for `half`, the mean gap-end error for the others."""
+        return self.outcomes[0].rmse if self.protocol == "half" else protocols.mean_gap_end(self.outcomes)
+
+    @property
+    def figures(self) -> Figures:
+        """What is asked."""
+        return self.recording.figures.get(self.protocol, Figures())
+
+    @property
+    def holds(self) -> bool:
+        """Whether the required figure is met; in `half` also that nothing diverged, and no estimate is missing."""
+        if not math.isfinite(self.ours):
+            return False
+        if self.protocol == "half" and (self.outcomes[0].missing or not self.outcomes[0].max < DIVERGED_M):
+            return False
+        required = self.figures.required
+        return math.isnan(required) or self.ours <= required
+
+    def text(self) -> str:
+        """Return the line."""
+        n = (
+            sum(each.n for each in self.outcomes)
+            if self.protocol == "half"
+            else sum(len(o.gaps) for o in self.outcomes)
+        )
+        missing = sum(each.missing for each in self.outcomes)
+        asked = "".join(f"{'' if math.isnan(x) else f'{x:.2f}':>10}" for x in (self.figures.required, self.figures.aim))
+        bad = "" if self.holds else "  <-- OUT OF BOUNDS"
+        name = f"{self.recording.name} {self.protocol}"
+        return f"{name:16}{self.ours:9.3f}{asked}{n:7}{missing:9}   {self.figures.peers}{bad}"
+
+    def details(self) -> list[str]:
+        """Return what --verbose adds."""
+        lines = []
+        for shift, each in zip(SHIFTS, self.outcomes, strict=False):
+            if self.protocol == "half":
+                lines.append(f"    p95 {each.p95:.3f} m, max {each.max:.3f} m, {each.valid:.1%} of the poses valid")
+            else:
+                gaps = "  ".join(f"{gap.start:5.0f} s {gap.end_error:7.2f} m" for gap in each.gaps)
+                lines.append(f"    shift {shift:4.0%}: {gaps}   largest {each.max:.2f} m, valid {each.valid:.0%}")
+            lines += [f"      rejected {source} {why}: {n}" for (source, why), n in sorted(each.rejected.items())]
+        return lines
+
+
+def main(arguments: Sequence[str] = ()) -> int:
+    options = _options(arguments)
+    data = data_directory()
+    if common_scorer(data) is None:
+        print(f"skipped: no tools/score_trajectory.py beside {data}; set MODELSERVER_DATA to the folder of recordings")
+        return SKIPPED
+    present = [each for each in RECORDINGS if each.name in options.names and each.file(data).is_file()]
+    ranges = [name for name in PLAZA if name in options.names and plaza.files(data, name)[0].is_file()]
+    for name in sorted(options.names - {each.name for each in present} - set(ranges)):
+        print(f"{name}: skipped, no such files below {data}")
+    if not present and not ranges:
+        return SKIPPED
+    holds = True
+    with tempfile.TemporaryDirectory() as directory:
+        cache = Path(options.cache or directory)
+        cache.mkdir(parents=True, exist_ok=True)
+        if present:
+            print(f"{'':16}{'ours m':>9}{'required':>10}{'aim':>10}{'n':>7}{'missing':>9}   others, m")
+            for line in _lines(present, options, data, cache):
+                holds = holds and line.holds
+                print("\n".join([line.text(), *(line.details() if options.verbose else ())]), flush=True)
+        for name in ranges:
+            print(plaza_ranges.report(name, data, options.settings, options.mode), flush=True)
+    return 0 if holds else 1
+
+
+def _lines(present: Iterable[Recording], options: Options, data: Path, cache: Path) -> Iterator[Line]:
+    """Run everything that was asked for, in as many processes as there are cores, and yield the lines in order."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(options.processes, mp_context=context) as pool:
+        logs = {}
+        for each in present:
+            logs[each.name] = cache / f"{each.name}.lcm"
+            if not logs[each.name].is_file():
+                each.convert(data, logs[each.name])
+        waiting: list[tuple[Recording, str, list[Future[Outcome]]]] = []
+        for each in present:
+            for protocol in options.protocols:
+                # one recording that is named alone is run with whatever is asked, the whole table with what is held
+                if protocol not in each.figures and len(options.names) > 1:
+                    continue
+                shifts: tuple[str | float, ...] = SHIFTS if protocol == "p2x" else SHIFTS[:1]
+                shifts = ("half",) if protocol == "half" else shifts
+                futures = [
+                    pool.submit(
+                        protocols.run,
+                        Job(logs[each.name], each.vehicle, data, shift, options.settings, options.mode),
+                    )
+                    for shift in shifts
+                ]
+                waiting.append((each, protocol, futures))
+        for recording, protocol, futures in waiting:
+            yield Line(recording, protocol, tuple(future.result() for future in futures))
+
+
+@dataclass(frozen=True)
+class Options:
+    """The command line."""
+
+    names: frozenset[str]
+    protocols: tuple[str, ...]
+    settings: Mapping[str, str]
+    mode: str
+    cache: str
+    verbose: bool
+    processes: int
+
+
+def _options(arguments: Sequence[str]) -> Options:
+    known = [*(each.name for each in RECORDINGS), *PLAZA]
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.accuracy", description=(__doc__ or "").partition("\n")[0]
+    )
+    parser.add_argument("what", nargs="*", metavar="WHAT", help=f"{', '.join(known)}; {', '.join(PROTOCOLS)}")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="a setting of localization.filter, or with dots a place in the vehicle file",
+    )
+    parser.add_argument("--mode", default="", help="localization.mode")
+    parser.add_argument(
+        "--cache", default="", metavar="FOLDER", help="keep the converted logs here; empty it when a converter changed"
+    )
+    parser.add_argument("--verbose", "-v", action="store_true", help="every gap, and what was rejected")
+    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    given = parser.parse_args(list(arguments))
+    unknown = [word for word in given.what if word not in known and word not in PROTOCOLS]
+    if unknown:
+        parser.error(f"no recording or protocol {', '.join(unknown)}; there are {', '.join([*known, *PROTOCOLS])}")
+    if any("=" not in pair for pair in given.set):
+        parser.error("--set takes KEY=VALUE")
+    return Options(
+        frozenset(word for word in given.what if word in known) or frozenset(known),
+        tuple(word for word in PROTOCOLS if word in given.what) or PROTOCOLS,
+        dict(pair.split("=", 1) for pair in given.set),
+        given.mode,
+        given.cache,
+        given.verbose,
+        given.processes,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

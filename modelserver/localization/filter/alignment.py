@@ -1,0 +1,128 @@
+"""Finding heading: the way driven, drawn in Odom or by the wheels, laid over the fixes.
+
+With u_i where the way says the antenna was, and p_i where the fixes say (both horizontal, as complex numbers),
+p_i = p_0 + c u_i. The straight-line fit c = sum conj(u_i - mean u) (p_i - mean p) / sum |u_i - mean u|^2 turns the
+way by arg c; |c| should be 1. Wheels know backward from forward, so a vehicle that starts in reverse is right. Where
+nothing tells the speed, u is the way at speed 1 and |c| the speed: then the vehicle is taken to drive forward.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from typing import NamedTuple
+
+from modelserver.localization.filter.settings import FilterSettings
+from modelserver.spatial.so3 import Vector3
+
+MOST = 64
+"""Fixes kept: of a longer stretch every second one goes."""
+
+
+class Passed(NamedTuple):
+    """A fix beside what the filter thought at its instant, all horizontal and complex, metres.
+
+    `place` is the fix (east + i north of the site), `up` its height there; `way` where the state has the antenna, `arm`
+    the lever from the rolling frame's origin to it along N; `unit` the way at speed 1, seconds. `white` and `lingering`
+    are the sigmas of what is new with each fix and of the rest; `up_sigma` that of the height.
+    """
+
+    utime: int
+    place: complex
+    up: float
+    way: complex
+    arm: complex
+    unit: complex
+    white: float
+    lingering: float
+    up_sigma: float
+
+
+class Fit(NamedTuple):
+    """What a stretch of fixes tells: N must be turned by `turn` (rad), known to `sigma`; the factor |c|.
+
+    `distance` is how far the ends of the stretch are apart, metres; `scatter` the fixes' mean deviation from the way.
+    """
+
+    turn: float
+    sigma: float
+    factor: float
+    factor_sigma: float
+    distance: float
+    scatter: float
+    seconds: float
+
+
+def kept(passed: tuple[Passed, ...], newest: Passed, seconds: float) -> tuple[Passed, ...]:
+    """Return a stretch with one fix more, no longer than `seconds` and thinned where it has too many."""
+    oldest = newest.utime - seconds * 1e6
+    stretch = tuple(each for each in passed if oldest <= each.utime < newest.utime)
+    if len(stretch) >= MOST:
+        stretch = stretch[::2]
+    return (*stretch, newest)
+
+
+def fitted(stretch: tuple[Passed, ...], settings: FilterSettings, *, by_unit: bool, rate_sigma: float) -> Fit | None:
+    """Return the fit of a stretch; None where it is too short to say anything.
+
+    `by_unit` takes the way at speed 1. `rate_sigma` is what the turn rate may be off by, rad/s.
+    """
+    if len(stretch) < 3:
+        return None
+    fit = _line(stretch, [each.unit if by_unit else each.way for each in stretch], [0j] * len(stretch))
+    if fit is None:
+        return None
+    if by_unit:
+        # the arm turns with heading, and is no part of the way at speed 1: taken off with the heading found so far
+        for _ in range(2):
+            direction = fit[0] / abs(fit[0]) if abs(fit[0]) > 0.0 else 1.0
+            again = _line(stretch, [each.unit for each in stretch], [direction * each.arm for each in stretch])
+            if again is None:
+                return None
+            fit = again
+    c, spread, scatter = fit
+    factor = abs(c)
+    seconds = (stretch[-1].utime - stretch[0].utime) * 1e-6
+    size = math.sqrt(spread)
+    if factor <= 0.0 or size <= 0.0:
+        return None
+    ends = (stretch[-1].unit - stretch[0].unit) if by_unit else (stretch[-1].way - stretch[0].way)
+    distance = abs(ends) * (factor if by_unit else 1.0)
+    newest = stretch[-1]
+    # what lingers is shared by neighbours and has changed by this between the ends
+    changed = newest.lingering * math.sqrt(2.0 * (1.0 - math.exp(-seconds / settings.gps_wander_time)))
+    if distance <= 0.0:
+        return None
+    variance = (newest.white / (size * factor)) ** 2 + (changed / distance) ** 2 + (0.5 * rate_sigma * seconds) ** 2
+    return Fit(
+        cmath.phase(c),
+        math.sqrt(variance),
+        factor,
+        factor * math.sqrt((newest.white / (size * factor)) ** 2 + (changed / distance) ** 2),
+        distance,
+        scatter,
+        seconds,
+    )
+
+
+def _line(stretch: tuple[Passed, ...], ways: list[complex], arms: list[complex]) -> tuple[complex, float, float] | None:
+    n = len(stretch)
+    places = [each.place - arm for each, arm in zip(stretch, arms, strict=True)]
+    mean_way, mean_place = sum(ways) / n, sum(places) / n
+    spread = sum(abs(way - mean_way) ** 2 for way in ways)
+    if not spread > 1e-9:
+        return None
+    pairs = list(zip(ways, places, strict=True))
+    c = sum((way - mean_way).conjugate() * (place - mean_place) for way, place in pairs) / spread
+    off = sum(abs(place - mean_place - c * (way - mean_way)) ** 2 for way, place in pairs)
+    return c, spread, math.sqrt(off / n)
+
+
+def agrees(fit: Fit, newest: Passed) -> bool:
+    """Return whether the fixes of a fit lie along the way as well as their noise lets them."""
+    return fit.scatter <= 3.0 * (newest.white + 0.5 * newest.lingering) + 0.05 * fit.distance
+
+
+def horizontal(v: Vector3) -> complex:
+    """Return the horizontal part of a vector along N."""
+    return complex(v[0], v[1])

@@ -1,0 +1,85 @@
+"""Whether stamps can be believed: what comes late, what comes from the future, and when a clock was set."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import Enum
+from types import MappingProxyType
+from typing import NamedTuple
+
+from modelserver.localization.filter.settings import FilterSettings
+
+
+class Verdict(Enum):
+    """What a stamp says about its sample."""
+
+    GOOD = "good"
+    LATE = "late"
+    ORDER = "order"
+    FUTURE = "future"
+    STEPPED_BACK = "stepped_back"
+
+
+class Source(NamedTuple):
+    """The stamps of one source: the newest good one with its sequence number, and a run of odd ones."""
+
+    newest: int
+    seq: int
+    odd: int = 0
+    odd_utime: int = 0
+    odd_since: int = 0
+
+
+class Clocks(NamedTuple):
+    """The stamps of all sources. `lead` is the one that time goes by: of those heard the one with the highest rank.
+
+    A clock that was set is told from a sample that is odd by a run of `clock_samples` of one source, ascending. Only
+    the lead can set time back; another may set it forward while the lead is silent.
+    """
+
+    newest: int = 0
+    rank: int = -1
+    lead_utime: int = 0
+    sources: Mapping[str, Source] = MappingProxyType({})
+
+    def take(self, name: str, rank: int, utime: int, seq: int, settings: FilterSettings) -> tuple[Clocks, Verdict]:
+        """Return the clocks with one stamp more, and what to do with its sample."""
+        source = self.sources.get(name)
+        if source is None:
+            source = Source(0, -1)
+        horizon = round(settings.horizon * 1e6)
+        ahead = utime - self.newest
+        if self.newest and ahead > settings.clock_ahead * 1e6:
+            source = _odd(source, utime, self.lead_utime)
+            if source.odd < settings.clock_samples:
+                return self._with(name, source), Verdict.FUTURE
+        elif source.newest and utime < source.newest and (utime < self.newest - horizon or seq > source.seq > 0):
+            # its own stamps go back: those of one that merely comes late do not, or its sequence goes back too
+            source = _odd(source, utime, 0)
+            if source.odd < settings.clock_samples or rank < self.rank:
+                return self._with(name, source), Verdict.ORDER
+            return Clocks(utime, rank, utime, MappingProxyType({name: Source(utime, seq)})), Verdict.STEPPED_BACK
+        elif self.newest and ahead < -horizon:
+            return self, Verdict.LATE
+        source = Source(max(utime, source.newest), seq if utime >= source.newest else source.seq)
+        leads = rank >= self.rank
+        return (
+            Clocks(
+                max(self.newest, utime),
+                max(rank, self.rank),
+                max(utime, self.lead_utime) if leads else self.lead_utime,
+                MappingProxyType({**self.sources, name: source}) if len(self.sources) < 256 else self.sources,
+            ),
+            Verdict.GOOD,
+        )
+
+    def _with(self, name: str, source: Source) -> Clocks:
+        if name not in self.sources and len(self.sources) >= 256:
+            return self
+        return self._replace(sources=MappingProxyType({**self.sources, name: source}))
+
+
+def _odd(source: Source, utime: int, lead: int) -> Source:
+    """Return a source with an odd stamp more: those that follow each other make a run, unless the lead spoke."""
+    follows = source.odd > 0 and 0 < utime - source.odd_utime <= 10_000_000 and source.odd_since == lead
+    return source._replace(odd=source.odd + 1 if follows else 1, odd_utime=utime, odd_since=lead)

@@ -1,0 +1,326 @@
+"""The logic around fixes: finding heading, refusing jumps, standing, and taking position up anew.
+
+2005's lesson: a Kalman filter needs logic around it. It stands here, and what it remembers is part of the state, so
+that it is set back with it when a measurement comes late.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+
+import numpy as np
+
+from modelserver.geodesy import GeodesyError, LocalFrame, ecef_from_geodetic, geodetic_from_ecef
+from modelserver.localization import gate
+from modelserver.localization.filter import alignment, placing, updates
+from modelserver.localization.filter.alignment import Fit, Passed, horizontal
+from modelserver.localization.filter.measurements.aiding import AbsolutePose
+from modelserver.localization.filter.measurements.base import Compared, Scene, wrapped
+from modelserver.localization.filter.measurements.gps import place_of, shares, stated_velocity
+from modelserver.localization.filter.nav import Nav
+from modelserver.localization.filter.setup import Setup
+from modelserver.localization.filter.state import FilterState, Pending
+from modelserver.localization.filter.strapdown import Earth
+from modelserver.localization.gate import GoodFix
+from modelserver.messages import AbsolutePoseSample, Decision, FixType, GpsSample, Mode, Phase, Verdict
+from modelserver.spatial import so3
+
+FRESH = 1.5
+"""Seconds for which a fix still says where a vehicle is whose heading was just found."""
+
+SAME_PLACE = 3.0
+"""Seconds of fixes that tell whether the vehicle moves, where wheels do not."""
+
+
+def good(setup: Setup, state: FilterState, sample: GpsSample) -> GoodFix | str:
+    """Return the fix, or in one word why it is not good enough."""
+    fix = gate.judge(sample, setup.settings)
+    if isinstance(fix, str):
+        return fix
+    if state.geodesy is not None:
+        try:
+            state.geodesy.utm_from_geodetic(fix.latitude_deg, fix.longitude_deg, 0.0)
+        except GeodesyError:
+            return "range"
+    return fix
+
+
+def captured(setup: Setup, state: FilterState, fix: GoodFix, utime: int) -> FilterState:
+    """Return the state with a fix more towards the origin; it is set once nothing that comes late can change it."""
+    if state.geodesy is not None or any(each.origin is not None for each in state.pending):
+        return state
+    height = 0.0 if math.isnan(fix.height) else fix.height
+    ecef = ecef_from_geodetic(fix.latitude_deg, fix.longitude_deg, height)
+    capture, origin = state.capture.take(utime, ecef, fix.sigma, setup.settings)
+    state = state._replace(capture=capture)
+    if origin is None:
+        return state
+    due = utime + round(setup.settings.horizon * 1e6)
+    return state._replace(pending=(*state.pending, Pending(due, origin=origin)))
+
+
+def passed(setup: Setup, state: FilterState, nav: Nav, fix: GoodFix, kind: FixType) -> tuple[FilterState, Passed]:
+    """Return a fix beside what the state says at its instant; with the site, which the first fix sets."""
+    site, earth = state.site, state.earth
+    if site is None:
+        height = 0.0 if math.isnan(fix.height) else fix.height
+        site = LocalFrame.at(fix.latitude_deg, fix.longitude_deg, height)
+        found = Earth.at(fix.latitude_deg, height)
+        # before heading is known the horizontal part of the earth's rotation has no direction
+        earth = Earth(found.gravity, (0.0, 0.0, found.rotation[2]))
+    lever = setup.rig.lever(setup.rig.gps_frame)
+    x, y, z = nav.point(lever)
+    east, north, up = place_of(fix, site, z)
+    white_e, lingering_e = shares(fix.east_variance, kind, setup.settings)
+    white_n, lingering_n = shares(fix.north_variance, kind, setup.settings)
+    arm = so3.rotate(nav.attitude, setup.rig.pose(setup.rig.gps_frame).xyz)
+    newest = Passed(
+        nav.utime,
+        complex(east, north),
+        up,
+        complex(x, y),
+        horizontal(arm),
+        state.unit,
+        math.sqrt(0.5 * (white_e + white_n)),
+        math.sqrt(0.5 * (lingering_e**2 + lingering_n**2)),
+        shares(fix.up_variance, kind, setup.settings)[1],
+    )
+    return state._replace(site=site, earth=earth), newest
+
+
+# --- finding heading ----------------------------------------------------------------------------------------
+
+
+def speed_known(setup: Setup, state: FilterState, nav: Nav) -> bool:
+    """Return whether the state knows how fast, and which way along its own axis, the vehicle goes."""
+    if state.mode is not Mode.NO_WHEELS and state.wheels_utime and (nav.utime - state.wheels_utime) * 1e-6 < 1.0:
+        return True
+    P = nav.covariance
+    sigma = math.sqrt(max(P[3, 3], P[4, 4]))
+    return sigma < max(0.3 * math.hypot(nav.velocity[0], nav.velocity[1]), 0.15)
+
+
+def sought(setup: Setup, state: FilterState, newest: Passed) -> tuple[FilterState, Fit | None]:
+    """Return the state with a fix more towards heading, and how the way lies over the fixes once that is sure."""
+    settings, nav = setup.settings, state.nav
+    assert nav is not None
+    stretch = alignment.kept(state.passed, newest, settings.align_window)
+    state = state._replace(passed=stretch, fixed=newest)
+    rate_sigma = math.sqrt(nav.covariance[11, 11])
+    known = speed_known(setup, state, nav)
+    fit = alignment.fitted(stretch, settings, by_unit=not known, rate_sigma=rate_sigma)
+    if fit is None or fit.sigma > settings.align_sigma or not alignment.agrees(fit, newest):
+        return state, None
+    if known and not 0.6 < fit.factor < 1.6:
+        # not the way that was driven: fixes that wander, or wheels that spin
+        return state, None
+    if not known and fit.factor < settings.align_speed:
+        return state, None
+    return state, fit
+
+
+def aligned(setup: Setup, state: FilterState, fit: Fit, *, by_unit: bool) -> FilterState:
+    """Return the state in the world, by a fit of its way and the newest fix."""
+    nav, newest = state.nav, state.fixed
+    assert nav is not None
+    assert newest is not None
+    if by_unit:
+        nav = placing.at_speed(nav, fit.factor, fit.factor_sigma)
+    return into_world(setup, state, nav, fit.turn, fit.sigma, newest)
+
+
+def into_world(setup: Setup, state: FilterState, nav: Nav, turn: float, sigma: float, newest: Passed) -> FilterState:
+    """Return the state turned by a heading that was found, with its antenna at the newest fix."""
+    lever = setup.rig.lever(setup.rig.gps_frame)
+    x, y, _ = nav.point(lever)
+    moved = (complex(x, y) - newest.way) * cmath.rect(1.0, turn)
+    nav = placing.placed(placing.turned(nav, turn, sigma), newest, moved, lever, setup.layout)
+    site = state.site
+    assert site is not None
+    latitude, _, height = geodetic_from_ecef(site.ecef)
+    return state._replace(
+        nav=nav,
+        phase=Phase.ALIGNED,
+        earth=Earth.at(latitude, height),
+        passed=(),
+        refused=(),
+        refused_since=0,
+        refused_count=0,
+        fix_utime=nav.utime,
+        stepped=False,
+    )
+
+
+def by_velocity(setup: Setup, state: FilterState, sample: GpsSample, utime: int) -> tuple[float, float, float] | None:
+    """Return turn, sigma and speed (nan: known already) by the receiver's velocity; None where it does not tell.
+
+    Where the speed is not known the vehicle is taken to drive forward, and slower than twice `align_speed` not at all.
+    """
+    settings, nav, newest = setup.settings, state.nav, state.fixed
+    assert nav is not None
+    stated = stated_velocity(sample, settings)
+    if stated is None or newest is None or (utime - newest.utime) * 1e-6 > FRESH:
+        return None
+    velocity, R = stated
+    z = complex(velocity[0], velocity[1])
+    size = abs(z)
+    sigma_v = math.sqrt(max(R[0, 0], R[1, 1]))
+    if size < settings.align_speed or sigma_v > 0.3 * size:
+        return None
+    sigma = math.hypot(sigma_v / size, 0.03)
+    if speed_known(setup, state, nav):
+        v = horizontal(nav.point_velocity(setup.rig.lever(setup.rig.gps_frame)))
+        if not 0.6 * size < abs(v) < 1.6 * size:
+            return None
+        return wrapped(cmath.phase(z) - cmath.phase(v)), sigma, math.nan
+    if size < 2.0 * settings.align_speed:
+        return None
+    return wrapped(cmath.phase(z) - nav.yaw), sigma, size
+
+
+# --- jumps --------------------------------------------------------------------------------------------------
+
+
+def at_rest(setup: Setup, scene: Scene, fix: GoodFix) -> bool:
+    """Return whether a fix can say nothing new: the vehicle stands, and is known as well as the fix.
+
+    What lingers in fixes would else drag a standing vehicle about (report 7: erratic when stationary).
+    """
+    P = scene.nav.covariance
+    return scene.standing and max(P[0, 0], P[1, 1]) <= max(fix.sigma, scene.settings.gps_sigma_floor) ** 2 * 1.1
+
+
+def put(
+    setup: Setup, state: FilterState, compared: Compared, newest: Passed, source: str, seq: int
+) -> tuple[FilterState, tuple[Decision, ...]]:
+    """Return the state after a comparison of a fix, with the logic of jumps around it."""
+    settings, nav = setup.settings, state.nav
+    assert nav is not None
+    utime = nav.utime
+    after, decision = updates.used(nav, compared, settings, utime, source, seq, "gps_position")
+    within = decision.statistic <= decision.limit
+    if decision.verdict is Verdict.MONITORED and within:
+        return _confirmed(state, utime), (decision,)
+    if decision.verdict is Verdict.USED:
+        shift = math.hypot(after.position[0] - nav.position[0], after.position[1] - nav.position[1])
+        epoch = state.epoch + (1 if shift > settings.jump_epoch else 0)
+        state = _confirmed(state, utime)._replace(nav=after, epoch=epoch)
+        return allowed(state, nav, compared, decision), (decision,)
+    if decision.verdict is Verdict.MONITORED:
+        decision = decision._replace(verdict=Verdict.REJECTED, reason="gate")
+    refused = alignment.kept(state.refused, newest, 2.0 * settings.recovery_time)
+    state = state._replace(
+        refused=refused, refused_since=state.refused_since or utime, refused_count=state.refused_count + 1
+    )
+    if _believed(setup, state):
+        due = utime + round(settings.horizon * 1e6)
+        if not any(each.take_up for each in state.pending):
+            state = state._replace(pending=(*state.pending, Pending(due, take_up=True)))
+    return state, (decision,)
+
+
+def _confirmed(state: FilterState, utime: int) -> FilterState:
+    pending = state.pending
+    if pending:
+        pending = tuple(each for each in pending if not each.take_up)
+    return state._replace(fix_utime=utime, refused=(), refused_since=0, refused_count=0, pending=pending)
+
+
+def allowed(state: FilterState, before: Nav, compared: Compared, decision: Decision) -> FilterState:
+    """Return the state with what an outlier just within the gate would have moved the position by, metres.
+
+    The gain's horizontal rows times the gate's radius; what earlier fixes allowed fades as newer ones correct it.
+    """
+    H, m = compared.jacobian, len(compared.residual)
+    S = np.array(decision.innovation_covariance).reshape(m, m)
+    gain = before.covariance[0:2] @ H.T @ np.linalg.inv(S)
+    radius = math.sqrt(decision.limit * float(np.trace(S)) / m)
+    one = float(np.linalg.norm(gain, 2)) * radius
+    weight = 1.0 - min(float(np.linalg.norm(gain, 2)), 1.0)
+    return state._replace(allowance=max(one, weight * state.allowance), allowance_utime=before.utime)
+
+
+def _believed(setup: Setup, state: FilterState) -> bool:
+    """Return whether refused fixes have agreed with the way driven for long enough to be right, not the state."""
+    fit = _recovery(setup, state)
+    return fit is not None
+
+
+def _recovery(setup: Setup, state: FilterState) -> Fit | None:
+    settings, refused, nav = setup.settings, state.refused, state.nav
+    assert nav is not None
+    if len(refused) < settings.recovery_fixes:
+        return None
+    seconds = (refused[-1].utime - refused[0].utime) * 1e-6
+    if seconds < settings.recovery_time:
+        return None
+    fit = alignment.fitted(refused, settings, by_unit=False, rate_sigma=math.sqrt(nav.covariance[11, 11]))
+    if fit is None or fit.distance < settings.recovery_distance or not alignment.agrees(fit, refused[-1]):
+        return None
+    if not 0.7 < fit.factor < 1.4 or fit.sigma > settings.align_sigma:
+        return None
+    return fit
+
+
+def taken_up(setup: Setup, state: FilterState) -> tuple[FilterState, Decision | None]:
+    """Return the state with position, and where it was wrong heading, taken up anew from the refused fixes."""
+    fit = _recovery(setup, state)
+    nav = state.nav
+    if fit is None or nav is None:
+        return state, None
+    sigma = math.hypot(fit.sigma, math.sqrt(nav.covariance[8, 8]))
+    turn, turn_sigma = (fit.turn, fit.sigma) if abs(fit.turn) > 3.0 * sigma else (0.0, 0.0)
+    newest = state.refused[-1]
+    state = into_world(setup, state, nav, turn, turn_sigma, newest)
+    decision = Decision(
+        nav.utime, "filter", 0, "gps_position", Verdict.TOOK_UP, "fixes agree with the way driven, the state does not"
+    )
+    return state._replace(epoch=state.epoch + 1, allowance=0.0), decision
+
+
+# --- set outright -------------------------------------------------------------------------------------------
+
+
+def set_from(
+    setup: Setup,
+    state: FilterState,
+    measurement: AbsolutePose,
+    sample: AbsolutePoseSample,
+    scene: Scene,
+    source: str,
+    seq: int,
+) -> tuple[FilterState, tuple[Decision, ...]]:
+    """Return the state in the world by a position and orientation that an operator or another source tells."""
+    nav, geodesy = state.nav, state.geodesy
+    assert nav is not None
+    assert geodesy is not None
+    site = state.site or geodesy.tangent
+    scene = scene._replace(site=site)
+    compared = measurement.compare(scene, sample)
+    if isinstance(compared, str):
+        reason = compared or "empty"
+        return state, (updates.refused(nav.utime, source, seq, measurement.kind, reason),)
+    # the turn outright, for it may be of any size
+    turn = math.remainder(float(compared.residual[5]), math.tau)
+    nav = placing.turned(nav, turn, math.sqrt(float(compared.noise[5, 5])))
+    again = measurement.compare(scene._replace(nav=nav), sample)
+    assert not isinstance(again, str)
+    x, y, z = nav.position
+    a, b, c = again.residual[:3].tolist()
+    P = nav.covariance.copy()
+    P[0:3, :] = 0.0
+    P[:, 0:3] = 0.0
+    P[0:3, 0:3] = again.noise[:3, :3]
+    latitude, _, height = geodetic_from_ecef(site.ecef)
+    state = state._replace(
+        nav=nav._replace(position=(x + a, y + b, z + c), covariance=P),
+        phase=Phase.ALIGNED,
+        site=site,
+        earth=Earth.at(latitude, height),
+        passed=(),
+        fix_utime=nav.utime,
+        stepped=False,
+    )
+    word = Decision(nav.utime, source, seq, measurement.kind, Verdict.TOOK_UP, "position and heading were set")
+    return state, (word,)

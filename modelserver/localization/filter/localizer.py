@@ -1,0 +1,209 @@
+"""The filter as a localizer: takes samples in any order, and says where the vehicle is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import NamedTuple
+
+from modelserver.geodesy import Geodesy
+from modelserver.localization.filter import clocks, engine, motion, world
+from modelserver.localization.filter.clocks import Clocks
+from modelserver.localization.filter.engine import INERTIAL, Item
+from modelserver.localization.filter.odometry import Odometry
+from modelserver.localization.filter.setup import Setup
+from modelserver.localization.filter.state import FilterState
+from modelserver.localization.filter.timeline import Timeline
+from modelserver.localization.interface import Note
+from modelserver.messages import (
+    Decision,
+    Estimate,
+    ImuSample,
+    Mode,
+    NavigationState,
+    Origin,
+    OriginLatched,
+    Sample,
+    SwitchMode,
+    Verdict,
+    WheelsSample,
+)
+
+ODOM_KEPT_US = 2_000_000
+ODOM_STEP_US = 20_000
+"""How far back poses in Odom are kept, and how close together, microseconds."""
+
+
+class Deferred(NamedTuple):
+    """An estimate that is worked out when it is looked at: most of those held for questions never are."""
+
+    setup: Setup
+    state: FilterState
+    odom: Odometry
+    utime: int
+    newest: int
+
+    def resolved(self) -> Estimate:
+        """Return the estimate."""
+        return world.estimate(self.setup, self.state, self.odom, self.utime, self.newest)
+
+
+@dataclass(frozen=True, slots=True)
+class FilterLocalizer:
+    """The filter: an immutable value. Make the first with `start`.
+
+    `timeline` holds what was measured within the horizon. `head` is the state that answers come from: the newest, or
+    while one is being worked through anew for a late measurement, the one before it carried forward. `odoms` are the
+    last two seconds of Odom.
+    """
+
+    setup: Setup
+    latencies: Mapping[str, float]
+    timeline: Timeline
+    head: FilterState
+    clocks: Clocks = field(default_factory=Clocks)
+    odom: Odometry = field(default_factory=Odometry)
+    odoms: tuple[Odometry, ...] = field(default=(), repr=False)
+    latched: bool = False
+
+    @classmethod
+    def start(
+        cls,
+        setup: Setup,
+        origin: Origin | None = None,
+        mode: Mode = Mode.FULL,
+        latencies: Mapping[str, float] | None = None,
+    ) -> FilterLocalizer:
+        """Return a localizer that has seen nothing yet.
+
+        `origin` is the configured or persisted one; None captures it from the first good fixes. `latencies` has for a
+        source's name by how many seconds its samples are older than their stamps. Raises GeodesyError for an origin
+        that is no place.
+        """
+        first = engine.first(setup, mode, None if origin is None else Geodesy(origin))
+        return cls(setup, MappingProxyType(dict(latencies or {})), Timeline(first), first, latched=origin is not None)
+
+    @property
+    def utime(self) -> int:
+        """The instant of the newest sample taken, 0 before the first that the state could be carried to."""
+        return 0 if self.head.nav is None else self.head.nav.utime
+
+    @property
+    def mode(self) -> Mode:
+        """Which sources are used."""
+        return self.head.mode
+
+    def take(self, sample: Sample | SwitchMode) -> tuple[FilterLocalizer, tuple[Note, ...]]:
+        """Return what is concluded with one sample more, and what there is to say about it.
+
+        Notes are `OriginLatched` and a `Decision` for each measurement: at once where its stamp is refused (late,
+        order, future, duplicate), else when the horizon has passed and nothing can change it any more.
+        """
+        setup, header = self.setup, sample.header
+        found = engine.items(setup, sample, self.latencies.get(header.source, 0.0))
+        if not found:
+            return self, ()
+        settings = setup.settings
+        known, verdict = self.clocks.take(header.source, _rank(sample), found[0].utime, header.seq, settings)
+        if verdict is clocks.Verdict.STEPPED_BACK:
+            self = self._begun_anew()
+        elif verdict is not clocks.Verdict.GOOD:
+            return replace(self, clocks=known), (_refused(found[0], verdict.value),)
+        oldest = known.newest - round(settings.horizon * 1e6)
+        timeline = self.timeline
+        notes: list[Note] = []
+        for item in found:
+            if item.utime < oldest:
+                notes.append(_refused(item, "late"))
+                continue
+            longer = timeline.with_item(item)
+            if isinstance(longer, str):
+                notes.append(_refused(item, longer))
+            else:
+                timeline = longer
+        if timeline is self.timeline:
+            return replace(self, clocks=known), tuple(notes)
+        timeline = timeline.worked(setup, settings.replay_budget)
+        head = timeline.newest if timeline.settled else self._carried(sample, found[0])
+        timeline, decisions = timeline.settled_before(oldest)
+        notes += decisions
+        odom, odoms = self.odom, self.odoms
+        if head.nav is not None and head.nav.utime > odom.utime:
+            odom = odom.advanced(head.nav, setup.rig.base, head.standing)
+            if not odoms or odom.utime - odoms[-1].utime >= ODOM_STEP_US:
+                odoms = _kept(odoms, odom)
+        latched = self.latched
+        if not latched and head.geodesy is not None:
+            latched = True
+            notes.append(OriginLatched(head.geodesy.origin))
+        return (
+            FilterLocalizer(setup, self.latencies, timeline, head, known, odom, odoms, latched),
+            tuple(notes),
+        )
+
+    def _carried(self, sample: Sample | SwitchMode, item: Item) -> FilterState:
+        """Return the head carried on by an inertial sample alone, while the timeline is not settled."""
+        head = self.head
+        if item.kind == INERTIAL and isinstance(sample, ImuSample) and head.nav is not None:
+            read = engine.read(self.setup, sample)
+            if not isinstance(read, str) and item.utime > head.nav.utime and head.mode is not Mode.NO_IMU:
+                return motion.felt(self.setup, head, item.utime, *read)
+        return head
+
+    def _begun_anew(self) -> FilterLocalizer:
+        """Return the localizer after its clock was set back: only Odom, the origin and the biases stay."""
+        old = self.head
+        biases = old.biases
+        if old.nav is not None:
+            P = old.nav.covariance
+            biases = (old.nav.gyro_bias, float(max(P[9, 9], P[10, 10], P[11, 11])) ** 0.5)
+        fresh = FilterState(
+            mode=old.mode,
+            geodesy=old.geodesy,
+            capture=old.capture,
+            epoch=old.epoch + 1,
+            biases=biases,
+            stepped=True,
+        )
+        return replace(
+            self, timeline=Timeline(fresh), head=fresh, odom=self.odom._replace(utime=0), odoms=(), clocks=Clocks()
+        )
+
+    def estimate(self, utime: int) -> Estimate:
+        """Return the rolling frame's pose at `utime`: predicted past the newest sample, else of the state then."""
+        return self.deferred(utime).resolved()
+
+    def deferred(self, utime: int) -> Deferred:
+        """Return `estimate(utime)`, to be worked out later; it holds no more of the past than it needs."""
+        state, odom = self.head, self.odom
+        if state.nav is not None and utime < state.nav.utime:
+            state = self.timeline.state_at(utime)
+            odom = _at(self.odoms, utime, odom)
+        return Deferred(self.setup, state, odom, utime, self.utime)
+
+    def navigation(self, utime: int) -> NavigationState | None:
+        """Return the whole state as of the newest sample; None before levelling."""
+        return world.navigation(self.setup, motion.caught_up(self.setup, self.head))
+
+
+def _rank(sample: Sample | SwitchMode) -> int:
+    return 2 if isinstance(sample, ImuSample) else 1 if isinstance(sample, WheelsSample) else 0
+
+
+def _refused(item: Item, reason: str) -> Decision:
+    return Decision(item.utime, item.source, item.seq, item.kind, Verdict.REJECTED, reason)
+
+
+def _kept(odoms: tuple[Odometry, ...], newest: Odometry) -> tuple[Odometry, ...]:
+    if odoms and newest.utime - odoms[0].utime > ODOM_KEPT_US:
+        return (*odoms[1:], newest)
+    return (*odoms, newest)
+
+
+def _at(odoms: tuple[Odometry, ...], utime: int, newest: Odometry) -> Odometry:
+    """Return the pose in Odom kept nearest before an instant, else the oldest."""
+    for odom in reversed(odoms):
+        if odom.utime <= utime:
+            return odom
+    return odoms[0] if odoms else newest

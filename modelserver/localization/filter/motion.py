@@ -1,0 +1,117 @@
+"""Carrying the state on to an instant: by the inertial unit, by the wheels' turn rate, or by nothing but inertia."""
+
+from __future__ import annotations
+
+import cmath
+
+from modelserver.localization.filter import strapdown
+from modelserver.localization.filter.nav import ZERO, Nav
+from modelserver.localization.filter.setup import Setup
+from modelserver.localization.filter.state import FilterState
+from modelserver.localization.filter.strapdown import Noise
+from modelserver.messages import Mode, Phase
+from modelserver.spatial import so3
+from modelserver.spatial.so3 import Vector3
+
+
+def inertial(setup: Setup, mode: Mode) -> bool:
+    """Return whether the inertial unit carries the state."""
+    return setup.has_imu and mode is not Mode.NO_IMU
+
+
+def noise(setup: Setup, state: FilterState, nav: Nav) -> Noise:
+    """Return what drives the errors now."""
+    if not inertial(setup, state.mode):
+        fresh = state.wheels_utime and (nav.utime - state.wheels_utime) * 1e-6 < 1.0
+        return setup.standing if state.standing else setup.rolling if fresh else setup.coasting
+    if (nav.utime - state.imu_utime) * 1e-6 > setup.settings.rate_hold:
+        return setup.coasting
+    return setup.standing if state.standing else setup.driving
+
+
+def felt(setup: Setup, state: FilterState, utime: int, rate: Vector3, force: Vector3) -> FilterState:
+    """Return the state at an inertial sample, which feels `rate` and `force` along the body's axes."""
+    assert state.nav is not None
+    settings = setup.settings
+    gap = (utime - state.imu_utime) * 1e-6 > settings.rate_hold
+    if gap:
+        state = at(setup, state, utime)
+        nav = state.nav
+        assert nav is not None
+        nav = strapdown.caught_up(nav, noise(setup, state, nav), setup.layout)._replace(rate=rate, force=force)
+    else:
+        nav = state.nav
+        assert nav is not None
+        if state.standing:
+            # standing is not turning: what the gyros feel goes to their bias alone
+            turning = _at_rest(state, nav)
+            nav = strapdown.carried(nav._replace(rate=turning), utime, turning, force, state.earth, setup.rig.base)
+            nav = nav._replace(rate=rate)
+        else:
+            nav = strapdown.carried(nav, utime, rate, force, state.earth, setup.rig.base)
+        if nav.lag >= strapdown.COVARIANCE_STEP:
+            nav = strapdown.caught_up(nav, setup.standing if state.standing else setup.driving, setup.layout)
+    return _moved(state, nav)._replace(imu_utime=utime)
+
+
+def at(setup: Setup, state: FilterState, utime: int) -> FilterState:
+    """Return the state at an instant not before its own, by what is known until then."""
+    nav = state.nav
+    if nav is None or utime <= nav.utime:
+        return state
+    nav = predicted(setup, state, utime)
+    return _moved(state, nav)
+
+
+def predicted(setup: Setup, state: FilterState, utime: int) -> Nav:
+    """Return the navigation state at a later instant, its covariance caught up where what drives it changes."""
+    nav = state.nav
+    assert nav is not None
+    base = setup.rig.base
+    if inertial(setup, state.mode):
+        held = state.imu_utime + round(setup.settings.rate_hold * 1e6)
+        if nav.utime < held:
+            until = min(utime, held)
+            rate = _at_rest(state, nav) if state.standing else nav.rate
+            felt_rate = nav.rate
+            nav = strapdown.carried(nav._replace(rate=rate), until, rate, nav.force, state.earth, base)
+            nav = nav._replace(rate=felt_rate)
+            if until == utime:
+                return nav
+            nav = strapdown.caught_up(nav, setup.standing if state.standing else setup.driving, setup.layout)
+        turn = (0.0, 0.0, 0.0 if state.standing else _wheels_rate(state, nav))
+        return strapdown.coasted(nav, utime, turn, base)
+    turn = (0.0, 0.0, 0.0 if state.standing else _wheels_rate(state, nav))
+    return strapdown.coasted(nav, utime, turn, base)
+
+
+def caught_up(setup: Setup, state: FilterState) -> FilterState:
+    """Return the state with its covariance at its instant."""
+    nav = state.nav
+    if nav is None or nav.lag <= 0.0:
+        return state
+    return state._replace(nav=strapdown.caught_up(nav, noise(setup, state, nav), setup.layout))
+
+
+def _wheels_rate(state: FilterState, nav: Nav) -> float:
+    fresh = state.wheels_utime and (nav.utime - state.wheels_utime) * 1e-6 < 1.0
+    return state.wheels_rate if fresh else 0.0
+
+
+def _at_rest(state: FilterState, nav: Nav) -> Vector3:
+    """Return the rate that a standing vehicle's gyros would feel with the bias known so far."""
+    a, b, c = nav.gyro_bias
+    if state.earth.rotation == ZERO:
+        return nav.gyro_bias
+    x, y, z = so3.rotate(so3.conjugate(nav.attitude), state.earth.rotation)
+    return (a + x, b + y, c + z)
+
+
+def _moved(state: FilterState, nav: Nav) -> FilterState:
+    """Return the state at a new navigation state; before heading is known the way at speed 1 is drawn with it."""
+    before = state.nav
+    if state.phase is Phase.UNALIGNED and before is not None and nav.utime > before.utime:
+        step = (nav.utime - before.utime) * 1e-6
+        middle = 0.5 * (cmath.rect(1.0, before.yaw) + cmath.rect(1.0, nav.yaw))
+        return state._replace(nav=nav, unit=state.unit + step * middle)
+    return state._replace(nav=nav)

@@ -1,0 +1,91 @@
+"""Setting the state into the world: turned by a heading that was found, and with the antenna at a fix."""
+
+from __future__ import annotations
+
+import cmath
+
+import numpy as np
+
+from modelserver.localization.filter import kalman
+from modelserver.localization.filter.alignment import Passed
+from modelserver.localization.filter.layout import Layout
+from modelserver.localization.filter.measurements.gps import WANDER
+from modelserver.localization.filter.nav import Nav
+from modelserver.spatial import so3
+from modelserver.spatial.so3 import Vector3
+
+
+def turned(nav: Nav, turn: float, sigma: float) -> Nav:
+    """Return the state with N turned by `turn` radians about up, known to `sigma`: everything in N turns with it.
+
+    An error of the turn is one of yaw, and turns the velocity with it.
+    """
+    q = (np.cos(0.5 * turn), 0.0, 0.0, np.sin(0.5 * turn))
+    spin = (float(q[0]), 0.0, 0.0, float(q[3]))
+    velocity = so3.rotate(spin, nav.velocity)
+    n = len(nav.covariance)
+    T = np.eye(n)
+    R = np.array(so3.matrix_rows(spin))
+    for at in (0, 3, 6):
+        T[at : at + 3, at : at + 3] = R
+    P = T @ nav.covariance @ T.T
+    G = np.zeros(n)
+    G[3], G[4], G[8] = -velocity[1], velocity[0], 1.0
+    P += np.outer(G, G) * sigma * sigma
+    return nav._replace(
+        position=so3.rotate(spin, nav.position),
+        velocity=velocity,
+        attitude=so3.normalized(so3.multiply(spin, nav.attitude)),
+        impulse=so3.rotate(spin, nav.impulse),
+        covariance=0.5 * (P + P.T),
+    )
+
+
+def placed(nav: Nav, fix: Passed, moved: complex, lever: Vector3, layout: Layout) -> Nav:
+    """Return the state with the antenna at a fix, `moved` metres along N since then; `lever` leads to it.
+
+    What lingers in the fix is the position's error from now on: both are tied as p = fix - lingering - white.
+    """
+    arm = so3.rotate(nav.attitude, lever)
+    place = fix.place + moved
+    position = (place.real - arm[0], place.imag - arm[1], fix.up - arm[2])
+    P = nav.covariance.copy()
+    n = len(P)
+    P[0:3, :] = 0.0
+    P[:, 0:3] = 0.0
+    at = layout.index(WANDER[0])
+    P[at : at + 3, :] = 0.0
+    P[:, at : at + 3] = 0.0
+    # p = place - R lever: an error of attitude moves p by -theta x (R lever) = [arm]x theta
+    L = np.zeros((3, n))
+    L[:, 6:9] = so3.skew(arm)
+    P[0:3, :] += L @ P
+    P[:, 0:3] += P @ L.T
+    lingering = (fix.lingering, fix.lingering, fix.up_sigma)
+    white = (fix.white, fix.white, 0.5 * fix.up_sigma)
+    for axis in range(3):
+        P[axis, axis] += lingering[axis] ** 2 + white[axis] ** 2
+        P[axis, at + axis] = P[at + axis, axis] = -lingering[axis]
+        P[at + axis, at + axis] = 1.0
+    extras = list(nav.extras)
+    for name in WANDER:
+        extras[layout.extra(name)] = 0.0
+    return nav._replace(position=position, covariance=0.5 * (P + P.T), extras=tuple(extras))
+
+
+def at_speed(nav: Nav, speed: float, sigma: float) -> Nav:
+    """Return the state with a speed along the body's x axis that was found from fixes."""
+    n = len(nav.covariance)
+    forward = so3.rotate(nav.attitude, (1.0, 0.0, 0.0))
+    along = sum(a * b for a, b in zip(forward, nav.velocity, strict=True))
+    H = np.zeros((1, n))
+    H[0, 3:6] = forward
+    # the mean over the stretch is not the speed now: a tenth of it may have changed
+    variance = sigma * sigma + (0.1 * speed) ** 2 + 0.04
+    error, P = kalman.corrected(nav.covariance, np.array((speed - along,)), H, np.array(((variance,),)))
+    return nav.injected(error, P)
+
+
+def direction(angle: float) -> complex:
+    """Return the unit vector at an angle, as a complex number."""
+    return cmath.rect(1.0, angle)

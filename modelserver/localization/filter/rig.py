@@ -1,0 +1,68 @@
+"""Where everything sits on the vehicle, taken from the geometry model alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+from modelserver.errors import QueryError
+from modelserver.geometry.model import Model
+from modelserver.localization.magnetometer import MagnetometerCalibration
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.so3 import Vector3
+
+Kinematics: TypeAlias = Literal["skid_steer", "differential", "ackermann"]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The vehicle's frames as the filter needs them. The body's axes are those of `rolling_frame`.
+
+    `rolling_frame` moves along its own x axis; `imu_frame`, `gps_frame` and `second_antenna_frame` are full names,
+    empty where there is none; `wheel_frames` has the frame of each wheel's contact point by the wheel's name.
+    Raises QueryError for a frame that the model does not have or join to the rolling frame.
+    """
+
+    model: Model
+    rolling_frame: str
+    imu_frame: str = ""
+    gps_frame: str = ""
+    second_antenna_frame: str = ""
+    wheel_frames: Mapping[str, str] = field(default_factory=dict)
+    kinematics: Kinematics = "differential"
+    magnetometer: MagnetometerCalibration = field(default_factory=MagnetometerCalibration)
+
+    def __post_init__(self) -> None:
+        imu = self.pose(self.imu_frame).xyz if self.imu_frame else (0.0, 0.0, 0.0)
+        object.__setattr__(self, "imu", imu)
+        object.__setattr__(self, "base", self.lever_to((0.0, 0.0, 0.0)))
+        for frame in (self.gps_frame, self.second_antenna_frame, *self.wheel_frames.values()):
+            if frame:
+                self.pose(frame)
+
+    def pose(self, frame: str) -> Pose:
+        """Return the pose of a frame in the rolling frame. Raises QueryError."""
+        return self.model.get_transformation(frame, self.rolling_frame).pose
+
+    def knows(self, frame: str) -> bool:
+        """Return whether a frame is there and joined to the rolling frame."""
+        try:
+            self.pose(frame)
+        except QueryError:
+            return False
+        return True
+
+    def lever(self, frame: str) -> Vector3:
+        """Return what leads from the inertial unit's point to a frame's origin, body axes, m. Raises QueryError."""
+        return self.lever_to(self.pose(frame).xyz)
+
+    def lever_to(self, point: Vector3) -> Vector3:
+        """Return what leads from the inertial unit's point to a point of the rolling frame, body axes, metres."""
+        a, b, c = self.imu
+        return (point[0] - a, point[1] - b, point[2] - c)
+
+    imu: Vector3 = field(init=False, compare=False)
+    """Where the inertial unit is in the rolling frame; without one, the rolling frame's origin itself."""
+    base: Vector3 = field(init=False, compare=False)
+    """What leads from the inertial unit's point to the rolling frame's origin, body axes, metres."""

@@ -1,0 +1,57 @@
+"""What does not change while the filter runs: the vehicle, its settings, the measurements that it has."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from modelserver.localization.filter.layout import Layout
+from modelserver.localization.filter.measurements import REGISTRY, Measurement
+from modelserver.localization.filter.measurements.gps import wander
+from modelserver.localization.filter.measurements.wheels import WheelSpeed, wheel_states
+from modelserver.localization.filter.rig import Rig
+from modelserver.localization.filter.settings import FilterSettings
+from modelserver.localization.filter.strapdown import Noise
+from modelserver.spatial import so3
+
+ROCKING = 1e-5
+"""Angle random walk of a standing vehicle, rad/sqrt(s): its tyres give 0.02 deg in 10 minutes."""
+
+
+class Setup:
+    """A vehicle for the filter. Immutable.
+
+    `measurements` has what is made of each type of sample, in the order in which those of one sample are fused. The
+    layout holds the error states that these need.
+    """
+
+    def __init__(self, rig: Rig, settings: FilterSettings | None = None, kinds: Iterable[type[Measurement]] = ()):
+        """Take the vehicle; `kinds` are the measurements to use, by default all that are registered."""
+        self.rig = rig
+        self.settings = settings = settings or FilterSettings()
+        made = [kind.of(rig, settings) for kind in (tuple(kinds) or REGISTRY.values())]
+        present = [each for each in made if each is not None]
+        self.wheels = next((each for each in present if isinstance(each, WheelSpeed)), None)
+        extras = [wander(settings)]
+        if self.wheels is not None:
+            extras += wheel_states(settings)
+        extras += [state for each in present for state in each.states]
+        self.mount = rig.pose(rig.imu_frame).wxyz if rig.imu_frame else so3.IDENTITY
+        self.layout = Layout(extras)
+        by_sample: dict[type, list[Measurement]] = {}
+        for each in present:
+            by_sample.setdefault(each.sample, []).append(each)
+        self.measurements: Mapping[type, tuple[Measurement, ...]] = {
+            sample: tuple(found) for sample, found in by_sample.items()
+        }
+        s = settings
+        biases = (s.gyro_bias_walk**2, s.accelerometer_bias_walk**2)
+        self.driving = Noise(s.gyro_noise**2, s.accelerometer_noise**2, *biases)
+        self.standing = Noise(ROCKING**2, s.accelerometer_noise**2, *biases)
+        # what nobody measures lasts about a second each way
+        self.coasting = Noise(s.gap_rate_sigma**2, s.gap_acceleration**2, *biases)
+        self.rolling = Noise(s.wheel_rate_sigma**2 * s.slip_time, s.gap_acceleration**2, *biases)
+
+    @property
+    def has_imu(self) -> bool:
+        """Whether the vehicle has an inertial unit."""
+        return bool(self.rig.imu_frame)

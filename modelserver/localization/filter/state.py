@@ -1,0 +1,88 @@
+"""All that the filter has concluded up to an instant: what is set back when a measurement comes late."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from modelserver.geodesy import Geodesy, LocalFrame
+from modelserver.localization.filter.alignment import Passed
+from modelserver.localization.filter.nav import Nav
+from modelserver.localization.filter.stillness import Stillness
+from modelserver.localization.filter.strapdown import Earth
+from modelserver.localization.origin import Capture
+from modelserver.messages import Mode, Origin, Phase
+from modelserver.spatial.so3 import Vector3
+
+
+class Last(NamedTuple):
+    """The last measurement of a kind from a source that was compared: its instant, and its sample."""
+
+    utime: int
+    sample: Any
+
+
+class Frozen(NamedTuple):
+    """What an inertial unit said last, and since when it says nothing else."""
+
+    rate: Vector3
+    force: Vector3
+    since: int
+
+
+class Pending(NamedTuple):
+    """A decision that takes effect at `utime`, when no sample that comes late can change it any more."""
+
+    utime: int
+    origin: Origin | None = None
+    take_up: bool = False
+
+
+class FilterState(NamedTuple):
+    """Nominal state, covariance, and everything that decisions rest on. Make the first with the engine's `first`.
+
+    `nav` is None while levelling. `site` is the tangent plane that N is east, north, up of once `phase` is ALIGNED.
+    `imu_utime` is the last inertial sample used, `began` the first; `wheels_utime` the last wheels used. `passed` are
+    fixes beside the way, for heading; `unit` the way at speed 1 so far (s). `refused` are the fixes refused in a row,
+    `refused_since` the first of them; `fix_utime` the last fix that was used or confirmed. `moved` is until when fixes
+    say that the vehicle moves. `allowance` is what one outlier just within its gate may have moved the position by,
+    metres, at `allowance_utime`. `biases` are the gyros' with their sigma, kept where the rest begins anew. `tilt` is
+    how far gravity is off the geometry's up at start-up, where that is too far.
+    """
+
+    nav: Nav | None = None
+    phase: Phase = Phase.LEVELLING
+    mode: Mode = Mode.FULL
+    earth: Earth = Earth()
+    site: LocalFrame | None = None
+    geodesy: Geodesy | None = None
+    capture: Capture = Capture()
+    pending: tuple[Pending, ...] = ()
+    stillness: Stillness = Stillness()
+    standing: bool = False
+    began: int = 0
+    imu_utime: int = 0
+    frozen: Frozen | None = None
+    wheels_utime: int = 0
+    wheels_rate: float = 0.0
+    last: Mapping[tuple[str, str], Last] = MappingProxyType({})
+    rolled_utime: int = 0
+    rested_utime: int = 0
+    passed: tuple[Passed, ...] = ()
+    unit: complex = 0j
+    refused: tuple[Passed, ...] = ()
+    refused_since: int = 0
+    refused_count: int = 0
+    fix_utime: int = 0
+    moved: int = 0
+    fixed: Passed | None = None
+    allowance: float = 0.0
+    allowance_utime: int = 0
+    epoch: int = 0
+    tilt: float = 0.0
+    level_force: Vector3 = (0.0, 0.0, 0.0)
+    level_rate: Vector3 = (0.0, 0.0, 0.0)
+    level_count: int = 0
+    biases: tuple[Vector3, float] | None = None
+    stepped: bool = False

@@ -1,0 +1,111 @@
+"""The timeline: what was measured within the horizon, in the order of instants, with the state after each.
+
+A measurement that comes late is put in its place, and what follows is worked through anew, a bounded amount at a time.
+Whatever the order of arrival, the state in the end is that of the one order: instant, source, sequence.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from typing import NamedTuple, TypeAlias
+
+from modelserver.localization.filter import engine
+from modelserver.localization.filter.engine import Item
+from modelserver.localization.filter.setup import Setup
+from modelserver.localization.filter.state import FilterState
+from modelserver.messages import Decision
+
+MOST = 8192
+"""Items within a horizon: more come from a flood, and are refused."""
+
+
+class Entry(NamedTuple):
+    """An item, the state after it (None: not worked through yet), and what became of it."""
+
+    item: Item
+    state: FilterState | None
+    decisions: tuple[Decision, ...]
+
+
+Key: TypeAlias = tuple[int, str, int, int]
+
+
+def _key(entry: Entry) -> Key:
+    return entry.item.key
+
+
+class Timeline(NamedTuple):
+    """`base` is the state before all `entries`; the first `fused` of them are worked through."""
+
+    base: FilterState
+    entries: tuple[Entry, ...] = ()
+    fused: int = 0
+
+    @property
+    def newest(self) -> FilterState:
+        """The state after all that is worked through."""
+        state = self.entries[self.fused - 1].state if self.fused else self.base
+        assert state is not None
+        return state
+
+    @property
+    def settled(self) -> bool:
+        """Whether everything is worked through."""
+        return self.fused == len(self.entries)
+
+    def with_item(self, item: Item) -> Timeline | str:
+        """Return the timeline with one item more in its place, or in one word why not."""
+        entries = self.entries
+        key = item.key
+        if not entries or key > entries[-1].item.key:
+            last = entries[-1].item if entries else None
+            if last is not None and _same(last, item):
+                return "duplicate"
+            return Timeline(self.base, (*entries, Entry(item, None, ())), self.fused)
+        if len(entries) >= MOST:
+            return "load"
+        at = bisect_left(entries, key, key=_key)
+        if at < len(entries) and entries[at].item.key == key:
+            return "duplicate"
+        if any(_same(each.item, item) for each in entries[max(at - 1, 0) : at + 1]):
+            return "duplicate"
+        return Timeline(self.base, (*entries[:at], Entry(item, None, ()), *entries[at:]), min(self.fused, at))
+
+    def worked(self, setup: Setup, budget: int) -> Timeline:
+        """Return the timeline with up to `budget` items more worked through."""
+        entries, at = self.entries, self.fused
+        if at == len(entries):
+            return self
+        state = self.newest
+        until = min(at + budget, len(entries))
+        fresh = []
+        for entry in entries[at:until]:
+            state, decisions = engine.fused(setup, state, entry.item)
+            fresh.append(Entry(entry.item, state, decisions))
+        return Timeline(self.base, (*entries[:at], *fresh, *entries[until:]), until)
+
+    def settled_before(self, utime: int) -> tuple[Timeline, tuple[Decision, ...]]:
+        """Return the timeline without what is older than `utime` and worked through, and what became of that."""
+        entries = self.entries
+        if not self.fused or entries[0].item.utime >= utime:
+            return self, ()
+        cut = min(bisect_left(entries, (utime, "", -1, -1), key=_key), self.fused)
+        if not cut:
+            return self, ()
+        decisions = tuple(decision for entry in entries[:cut] for decision in entry.decisions)
+        state = entries[cut - 1].state
+        assert state is not None
+        return Timeline(state, entries[cut:], self.fused - cut), decisions
+
+    def state_at(self, utime: int) -> FilterState:
+        """Return the newest state worked through that is not newer than an instant; the base before all."""
+        for entry in reversed(self.entries[: self.fused]):
+            if entry.item.utime <= utime and entry.state is not None:
+                found: FilterState = entry.state
+                return found
+        return self.base
+
+
+def _same(a: Item, b: Item) -> bool:
+    """Return whether two items are one: a source measures a thing once at an instant, whatever its numbering."""
+    return a.utime == b.utime and a.source == b.source and a.part == b.part

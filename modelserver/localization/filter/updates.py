@@ -1,0 +1,82 @@
+"""Putting a comparison into the state: the chi-square gate, the update, and the word for the ledger."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from modelserver.localization.filter import kalman
+from modelserver.localization.filter.measurements.base import Compared
+from modelserver.localization.filter.nav import Nav
+from modelserver.localization.filter.settings import FilterSettings
+from modelserver.messages import Decision, Verdict
+
+
+def used(
+    nav: Nav, compared: Compared, settings: FilterSettings, utime: int, source: str, seq: int, kind: str
+) -> tuple[Nav, Decision]:
+    """Return the state with a comparison put into it, or as it was where the gate refuses; and what became of it."""
+    residual, H, R, monitored, separable = compared
+    if not (np.isfinite(residual).all() and np.isfinite(H).all() and np.isfinite(R).all()):
+        return nav, Decision(utime, source, seq, kind, Verdict.REJECTED, "nan")
+    S = kalman.innovation(nav.covariance, H, R)
+    statistic = kalman.statistic(residual, S)
+    limit = kalman.gate_limit(len(residual), settings.gate_risk)
+    verdict, reason = Verdict.USED, ""
+    keep = np.ones(len(residual), dtype=bool)
+    if monitored:
+        verdict, reason = Verdict.MONITORED, monitored
+    elif not statistic <= limit:
+        verdict, reason = Verdict.REJECTED, "gate"
+        if separable and len(residual) > 1:
+            single = kalman.gate_limit(1, settings.gate_risk)
+            fits = residual * residual <= single * np.diagonal(S)
+            if fits.any() and not fits.all():
+                residual_, S_ = residual[fits], S[np.ix_(fits, fits)]
+                if kalman.statistic(residual_, S_) <= kalman.gate_limit(len(residual_), settings.gate_risk):
+                    verdict, reason = Verdict.USED, "part"
+                    keep = fits
+    decision = Decision(
+        utime,
+        source,
+        seq,
+        kind,
+        verdict,
+        reason,
+        tuple(residual.tolist()),
+        tuple(S.ravel().tolist()),
+        tuple(R.ravel().tolist()),
+        statistic,
+        limit,
+    )
+    if verdict is not Verdict.USED:
+        return nav, decision
+    if reason == "part":
+        residual, H, R = residual[keep], H[keep], R[np.ix_(keep, keep)]
+    try:
+        error, P = kalman.corrected(nav.covariance, residual, H, R)
+    except np.linalg.LinAlgError:
+        return nav, decision._replace(verdict=Verdict.REJECTED, reason="singular")
+    return nav.injected(error, P), decision
+
+
+def refused(utime: int, source: str, seq: int, kind: str, reason: str) -> Decision:
+    """Return the word for a sample that was refused before it could be compared."""
+    return Decision(utime, source, seq, kind, Verdict.REJECTED, reason)
+
+
+def sound(nav: Nav, settings: FilterSettings) -> bool:
+    """Return whether a state is finite and within what a vehicle can be: else the filter has diverged."""
+    P = nav.covariance
+    diagonal = np.diagonal(P)
+    if not (np.isfinite(P).all() and (diagonal >= 0.0).all()):
+        return False
+    numbers = (*nav.position, *nav.velocity, *nav.gyro_bias, *nav.accelerometer_bias, *nav.extras)
+    if not all(map(math.isfinite, numbers)):
+        return False
+    return (
+        math.hypot(*nav.velocity) <= 2.0 * settings.maximum_speed
+        and math.hypot(*nav.gyro_bias) <= 20.0 * settings.gyro_bias_sigma
+        and math.hypot(*nav.accelerometer_bias) <= 20.0 * settings.accelerometer_bias_sigma
+    )

@@ -1,0 +1,241 @@
+"""From the filter's state to what it says: pose in Odom, ENU and UTM, validity, bounds, and the whole state."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+
+from modelserver.geodesy import Geodesy, GeodesyError, LocalFrame, about_up, geodetic_from_ecef
+from modelserver.localization.filter import bounds, motion, strapdown
+from modelserver.localization.filter.measurements.constraints import tilt_of
+from modelserver.localization.filter.nav import Nav, jacobian_of_body_velocity
+from modelserver.localization.filter.odometry import Odometry
+from modelserver.localization.filter.setup import Setup
+from modelserver.localization.filter.state import FilterState
+from modelserver.messages import NAN, Estimate, Invalid, Mode, NavigationState, Phase, Quality
+from modelserver.spatial import so3
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.so3 import Array, Quaternion
+
+FACTORS_REACH = 200.0
+"""Metres within which one convergence serves: it changes by 3e-5 rad times tan(latitude)."""
+
+SLOW = 0.3
+"""Speed, m/s, below which nothing but the gyros tells heading."""
+
+
+def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newest: int) -> Estimate:
+    """Return the rolling frame's pose at `utime` from a state not newer than it; `newest` is that of all samples."""
+    nav = state.nav
+    origin = None if state.geodesy is None else state.geodesy.origin
+    invalid = _invalid(setup, state, utime)
+    if nav is None:
+        return Estimate(utime, odom.pose(utime), invalid=invalid, pose_epoch=state.epoch, origin=origin)
+    ahead = motion.at(setup, state, utime)
+    nav = ahead.nav
+    assert nav is not None
+    quality = _quality(setup, ahead, nav, utime, newest)
+    X_odom = odom.pose(utime)
+    odom_covariance = odom.covariance()
+    if state.phase is not Phase.ALIGNED or state.site is None:
+        return Estimate(
+            utime,
+            X_odom,
+            odom_covariance=odom_covariance,
+            invalid=invalid,
+            quality=quality,
+            pose_epoch=state.epoch,
+            origin=origin,
+        )
+    nav = strapdown.caught_up(nav, motion.noise(setup, ahead, nav), setup.layout)
+    settings = setup.settings
+    P = _at_base(nav, setup)
+    horizontal = bounds.horizontal(P, state.allowance, settings)
+    heading = bounds.heading(float(P[5, 5]), settings)
+    if heading > settings.heading_limit:
+        invalid |= Invalid.STATIONARY_HEADING if state.standing else Invalid.BOUND_EXCEEDED
+    if horizontal > settings.horizontal_limit:
+        invalid |= Invalid.BOUND_EXCEEDED
+        if state.refused_count:
+            invalid |= Invalid.GPS_REJECTED
+    enu = utm = None
+    if state.geodesy is not None:
+        enu, utm = _world_poses(state.geodesy, state.site, nav.point(setup.rig.base), nav.attitude)
+    return Estimate(
+        utime,
+        X_odom,
+        enu,
+        utm,
+        tuple(P.ravel().tolist()),
+        odom_covariance,
+        invalid,
+        quality,
+        state.epoch,
+        origin,
+        horizontal,
+        heading,
+        NAN if invalid else _seconds_left(setup, state, nav, utime, horizontal),
+    )
+
+
+def _at_base(nav: Nav, setup: Setup) -> Array:
+    """Return the covariance (6, 6) of the rolling frame along N, from that of the inertial unit's point."""
+    P = np.empty((6, 6))
+    C = nav.covariance
+    P[:3, :3], P[:3, 3:], P[3:, :3], P[3:, 3:] = C[:3, :3], C[:3, 6:9], C[6:9, :3], C[6:9, 6:9]
+    x, y, z = so3.rotate(nav.attitude, setup.rig.base)
+    J = np.eye(6)
+    J[0, 4], J[0, 5] = z, -y
+    J[1, 3], J[1, 5] = -z, x
+    J[2, 3], J[2, 4] = y, -x
+    found: Array = J @ P @ J.T
+    return found
+
+
+@lru_cache(maxsize=8)
+def _axes(geodesy: Geodesy, site: LocalFrame) -> Quaternion:
+    """Return what turns the site's axes to World:ENU's."""
+    return geodesy.tangent.rotation_of(site)
+
+
+@lru_cache(maxsize=64)
+def _grid(geodesy: Geodesy, site: LocalFrame, east: int, north: int) -> Quaternion:
+    """Return what turns the site's axes to grid east, grid north and up at a cell of the site (in FACTORS_REACH)."""
+    ecef = site.to_ecef((east * FACTORS_REACH, north * FACTORS_REACH, 0.0))
+    latitude, longitude, height = geodetic_from_ecef(ecef)
+    there = LocalFrame.at(latitude, longitude, height)
+    return so3.multiply(about_up(geodesy.convergence(latitude, longitude)), there.rotation_of(site))
+
+
+def _world_poses(
+    geodesy: Geodesy, site: LocalFrame, place: tuple[float, float, float], attitude: Quaternion
+) -> tuple[Pose, Pose] | tuple[None, None]:
+    """Return the pose in World:ENU and in World:UTM, each from the earth-centred position; None out of reach."""
+    ecef = site.to_ecef(place)
+    try:
+        position = geodesy.relative(geodesy.utm_from_ecef(ecef))
+        grid = _grid(geodesy, site, round(place[0] / FACTORS_REACH), round(place[1] / FACTORS_REACH))
+    except GeodesyError:
+        return None, None
+    return (
+        Pose(geodesy.tangent.from_ecef(ecef), so3.multiply(_axes(geodesy, site), attitude)),
+        Pose(position, so3.multiply(grid, attitude)),
+    )
+
+
+def _invalid(setup: Setup, state: FilterState, utime: int) -> Invalid:
+    settings, nav = setup.settings, state.nav
+    invalid = Invalid(0)
+    aligned = state.phase is Phase.ALIGNED
+    if not aligned and state.fixed is None:
+        invalid |= Invalid.NO_FIX
+    if motion.inertial(setup, state.mode):
+        if not state.imu_utime:
+            invalid |= Invalid.NO_IMU
+        elif abs(utime - state.imu_utime) * 1e-6 > settings.imu_timeout:
+            invalid |= Invalid.STALE_IMU if utime > state.imu_utime else Invalid.CLOCK_STEPPED
+    elif nav is not None and (utime - nav.utime) * 1e-6 > settings.imu_timeout:
+        invalid |= Invalid.STALE_IMU
+    if state.geodesy is None:
+        invalid |= Invalid.NO_ORIGIN
+    if not aligned:
+        invalid |= Invalid.NOT_MOVED_YET
+    elif (
+        state.fix_utime
+        and state.mode not in (Mode.NO_GPS, Mode.DEAD_RECKONING)
+        and (utime - state.fix_utime) * 1e-6 > settings.gps_timeout
+    ):
+        invalid |= Invalid.STALE_GPS
+    if state.refused_since and (utime - state.refused_since) * 1e-6 > settings.conflict_time:
+        invalid |= Invalid.GPS_REJECTED
+    if state.stepped:
+        invalid |= Invalid.CLOCK_STEPPED
+    if state.tilt or (nav is not None and tilt_of(nav.up) > settings.maximum_tilt):
+        invalid |= Invalid.TILTED
+    return invalid
+
+
+def _quality(setup: Setup, state: FilterState, nav: Nav, utime: int, newest: int) -> Quality:
+    quality = Quality(0)
+    forward = nav.body_velocity(setup.rig.base)[0]
+    if state.standing or abs(forward) < SLOW:
+        quality |= Quality.HEADING_FROM_GYRO
+    if utime > newest:
+        quality |= Quality.PREDICTED
+    if forward < -0.1 and not state.standing:
+        quality |= Quality.REVERSING
+    return quality
+
+
+def _seconds_left(setup: Setup, state: FilterState, nav: Nav, utime: int, horizontal: float) -> float:
+    """Return the seconds until a limit is passed if nothing more comes.
+
+    Variance along each axis grows as p + 2 c t + v t^2 + q t^3 / 3 when nothing tells the motion any more.
+    """
+    settings = setup.settings
+    heard = max(state.imu_utime, nav.utime if not motion.inertial(setup, state.mode) else 0)
+    left = settings.imu_timeout - (utime - heard) * 1e-6
+    if state.fix_utime and state.mode not in (Mode.NO_GPS, Mode.DEAD_RECKONING):
+        left = min(left, settings.gps_timeout - (utime - state.fix_utime) * 1e-6)
+    left = max(left, 0.0)
+    k, _ = bounds.factors(settings.risk_per_hour, settings.gps_wander_time)
+    room = settings.horizontal_limit - state.allowance
+    C = nav.covariance
+    p, v, c = bounds.longest(C), float(max(C[3, 3], C[4, 4])), float(max(C[0, 3], C[1, 4], 0.0))
+    q = setup.coasting.accelerometer
+
+    def bound(t: float) -> float:
+        return k * math.sqrt(p + 2.0 * c * t + v * t * t + q * t**3 / 3.0)
+
+    if bound(left) <= room:
+        return left
+    low, high = 0.0, left
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if bound(middle) <= room else (low, middle)
+    return low
+
+
+def navigation(setup: Setup, state: FilterState) -> NavigationState | None:
+    """Return the whole state; None before there is one."""
+    nav = state.nav
+    if nav is None:
+        return None
+    base = setup.rig.base
+    n = setup.layout.size
+    latitude = longitude = height = NAN
+    if state.site is not None and state.phase is Phase.ALIGNED:
+        latitude, longitude, height = geodetic_from_ecef(state.site.ecef)
+    H = np.zeros((6, n))
+    H[:3] = jacobian_of_body_velocity(nav, base, n)
+    H[3:, 9:12] = -np.eye(3)
+    twist = H @ nav.covariance @ H.T
+    twist[3:, 3:] += np.eye(3) * setup.settings.gyro_noise**2 / 0.02
+    values = (
+        *nav.position,
+        *nav.velocity,
+        *so3.to_rpy(nav.attitude),
+        *nav.gyro_bias,
+        *nav.accelerometer_bias,
+        *nav.extras,
+    )
+    return NavigationState(
+        nav.utime,
+        state.mode,
+        state.phase,
+        state.standing,
+        _invalid(setup, state, nav.utime),
+        state.epoch,
+        latitude,
+        longitude,
+        height,
+        Pose(nav.point(base), nav.attitude),
+        nav.body_velocity(base),
+        nav.turn_rate,
+        tuple(twist.ravel().tolist()),
+        setup.layout.names,
+        tuple(map(float, values)),
+        tuple(nav.covariance.ravel().tolist()),
+    )
