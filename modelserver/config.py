@@ -16,8 +16,9 @@ from pydantic import ConfigDict
 from modelserver import config_reader
 from modelserver.errors import shown
 from modelserver.localization.filter.settings import FilterSettings
+from modelserver.localization.magnetometer import MagnetometerCalibration
 from modelserver.localization.raw.settings import RawSettings
-from modelserver.messages import Matrix3, Mode
+from modelserver.messages import Mode
 
 _STRICT: ConfigDict = {"extra": "forbid", "allow_inf_nan": False}
 
@@ -107,6 +108,14 @@ class SensorConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class GpsConfig(SensorConfig):
+    """The satellite receiver. second_frame: of a dual-antenna receiver, the frame of the other antenna."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    second_frame: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class WheelsConfig:
     """The wheels: the channel they are heard on, and for each wheel's name the frame of its contact point.
 
@@ -151,7 +160,7 @@ class SensorsConfig:
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
-    gps: SensorConfig | None = None
+    gps: GpsConfig | None = None
     imu: SensorConfig | None = None
     wheels: WheelsConfig | None = None
     aiding: dict[str, AidingConfig] = field(default_factory=dict)
@@ -190,29 +199,6 @@ class OriginConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class MagnetometerConfig:
-    """How the inertial unit's magnetic field is corrected, along the unit's own axes: soft_iron (measured - hard_iron).
-
-    hard_iron: the vehicle's own field, tesla. soft_iron: 3 by 3, row-major, no unit: how iron bends the Earth's field,
-    undone. declination_deg: true yaw of magnetic north at the place, degrees, east positive; left out, a model's.
-    """
-
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
-    hard_iron: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    soft_iron: Matrix3 = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-    declination_deg: float | None = None
-
-    def __post_init__(self) -> None:
-        a, b, c, d, e, f, g, h, i = self.soft_iron
-        if not a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0:
-            raise ValueError(
-                "soft_iron is a correction close to 1 0 0 0 1 0 0 0 1; this one has no positive determinant"
-            )
-        if self.declination_deg is not None and not -180.0 <= self.declination_deg <= 180.0:
-            raise ValueError(f"declination_deg is between -180 and 180, got {self.declination_deg:g}")
-
-
-@dataclass(frozen=True, slots=True)
 class LocalizationConfig:
     """How the pose comes about.
 
@@ -225,7 +211,7 @@ class LocalizationConfig:
     mode_channel: str = ""
     raw: RawSettings = field(default_factory=RawSettings)
     filter: FilterSettings = field(default_factory=FilterSettings)
-    magnetometer: MagnetometerConfig = field(default_factory=MagnetometerConfig)
+    magnetometer: MagnetometerCalibration = field(default_factory=MagnetometerCalibration)
 
     def __post_init__(self) -> None:
         if self.mode_channel:

@@ -233,7 +233,7 @@ def _localize(state: CoreState, before: Localizer, sample: Sample | SwitchMode, 
     known = localizer.utime > 0
     history = state.history
     if known and (not len(history) or not 0 < localizer.utime - history.last < HISTORY_STEP_US):
-        history = history.extended(localizer.estimate(localizer.utime))
+        history = history.extended(localizer.deferred(localizer.utime))
     state = state._replace(view=replace(state.view, localizer=localizer, history=history))
     if known:
         # a part may be refused of a sample that moves time on all the same

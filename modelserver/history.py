@@ -3,10 +3,24 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from typing import Protocol
 
 from modelserver.errors import TooNewError, TooOldError
 from modelserver.messages import VALID, Estimate, Invalid, Quality
 from modelserver.spatial.pose import Pose
+
+
+class Later(Protocol):
+    """An estimate for `utime` that is worked out when it is looked at."""
+
+    @property
+    def utime(self) -> int:
+        """The instant that it is for."""
+        ...
+
+    def resolved(self) -> Estimate:
+        """Return it: the same each time."""
+        ...
 
 
 class History:
@@ -20,7 +34,7 @@ class History:
 
     def __init__(self, seconds: float):
         self._times: list[int] = []
-        self._estimates: list[Estimate] = []
+        self._estimates: list[Estimate | Later] = []
         self._start = 0
         self._end = 0
         self._horizon = round(seconds * 1e6)
@@ -41,9 +55,16 @@ class History:
     @property
     def newest(self) -> Estimate:
         """The newest estimate. Only when not empty."""
-        return self._estimates[self._end - 1]
+        return self._at(self._end - 1)
 
-    def extended(self, estimate: Estimate) -> History:
+    def _at(self, index: int) -> Estimate:
+        found = self._estimates[index]
+        if not isinstance(found, Estimate):
+            # kept in the list that successors share: it is the same for all of them
+            found = self._estimates[index] = found.resolved()
+        return found
+
+    def extended(self, estimate: Estimate | Later) -> History:
         """Return the history with one estimate more.
 
         One that is not newer than the last takes the places of all that are not older than it: it knows more,
@@ -79,21 +100,21 @@ class History:
         """
         self.check_span(utime)
         after = bisect_right(self._times, utime, self._start, self._end)
-        before = self._estimates[after - 1]
+        before = self._at(after - 1)
         if before.utime == utime or after == self._end:
             return before
-        return interpolated(before, self._estimates[after], utime)
+        return interpolated(before, self._at(after), utime)
 
     def held(self, utime: int) -> Estimate:
         """Return the newest estimate not newer than a time. Raises TooOldError."""
         if self._times[self._start] > utime:
             raise TooOldError(self._span(utime, "before"))
-        return self._estimates[bisect_right(self._times, utime, self._start, self._end) - 1]
+        return self._at(bisect_right(self._times, utime, self._start, self._end) - 1)
 
     def following(self, utime: int) -> Estimate | None:
         """Return the oldest estimate newer than a time, None where there is none."""
         after = bisect_right(self._times, utime, self._start, self._end)
-        return None if after == self._end else self._estimates[after]
+        return None if after == self._end else self._at(after)
 
     def check_span(self, utime: int) -> None:
         """Raise TooOldError or TooNewError where a time lies outside what is held."""

@@ -206,6 +206,9 @@ class Scripted:
             (0.25,),
         )
 
+    def deferred(self, utime: int) -> Estimate:
+        return self.estimate(utime)
+
     def estimate(self, utime: int) -> Estimate:
         if not self.newest:
             return Estimate(utime, Pose.identity(), invalid=Invalid.NO_FIX | Invalid.NO_IMU)

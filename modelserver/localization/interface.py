@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol, Self, TypeAlias
 
+from modelserver.history import Later
 from modelserver.messages import Decision, Estimate, NavigationState, OriginLatched, Rejected, Sample, SwitchMode
 
 Note: TypeAlias = Rejected | OriginLatched | Decision
@@ -20,6 +21,10 @@ class Localizer(Protocol):
 
     def estimate(self, utime: int) -> Estimate:
         """Return the base frame's pose predicted to `utime`, from nothing but the samples taken."""
+        ...
+
+    def deferred(self, utime: int) -> Estimate | Later:
+        """Return `estimate(utime)`, to be worked out when it is looked at where that saves work."""
         ...
 
     def navigation(self, utime: int) -> NavigationState | None:

@@ -17,7 +17,7 @@ from modelserver.formats import load_model
 from modelserver.geodesy import GeodesyError, make_origin
 from modelserver.geometry import Model
 from modelserver.localization.mounts import Mounts
-from modelserver.localization.raw.localizer import RawLocalizer
+from modelserver.localization.rig import Rig
 from modelserver.messages import Origin, OriginLatched
 from modelserver.service.bus import LcmBus
 from modelserver.service.clock import SystemClock
@@ -39,18 +39,28 @@ MODE_CHANNEL = "LOCALIZATION_MODE"
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """A vehicle file with its geometry loaded and everything in it checked against each other."""
+    """A vehicle file with its geometry loaded and everything in it checked against each other.
+
+    `rig` is None for a vehicle without any sensor that localization could use, `mounts` for one without GPS or IMU.
+    """
 
     config: VehicleConfig
     model: Model
     mounts: Mounts | None
+    rig: Rig | None = None
 
     def core(self, now: Instant, origin: Origin | None = None) -> CoreState:
         """Return the core's first state; `origin` is one kept from an earlier run, a configured one goes first."""
         config = self.config
         localizer = None
-        if self.mounts is not None:
-            localizer = RawLocalizer.start(self.mounts, config.localization.raw, configured_origin(config) or origin)
+        if self.rig is not None:
+            from modelserver.localization.filter.setup import Setup
+            from modelserver.localization.modes import Makings, ModeLocalizer
+
+            setup = Setup(self.rig, config.localization.filter)
+            makings = Makings(setup, config.localization.raw, self.mounts)
+            origin = configured_origin(config) or origin
+            localizer = ModeLocalizer.start(makings, config.localization.first_mode, origin)
         settings = CoreSettings(
             base_frame=config.base_frame,
             rolling_frame=config.rolling_frame,
@@ -119,6 +129,7 @@ def load_vehicle(config: VehicleConfig, file: str = "") -> Vehicle:
     named = [("base_frame", config.base_frame)]
     named += [("rolling_frame", config.rolling_frame)] if config.rolling_frame else []
     named += [(f"sensors.{key}.frame", each.frame) for key, each in (("gps", gps), ("imu", imu)) if each is not None]
+    named += [("sensors.gps.second_frame", gps.second_frame)] if gps is not None and gps.second_frame else []
     if config.sensors.wheels is not None:
         named += [(f"sensors.wheels.frames.{name}", frame) for name, frame in config.sensors.wheels.frames.items()]
     base_stands = True
@@ -131,6 +142,9 @@ def load_vehicle(config: VehicleConfig, file: str = "") -> Vehicle:
             base_stands = base_stands and key != "base_frame"
             fix = f"write {error.nearest[0]}" if error.nearest else f"see: modelserver bodies --model {config.geometry}"
             problems.append(Problem(Severity.ERROR, str(error), Source(file, element=key), fix, error.nearest))
+    if config.localization.mode == "raw" and (gps is None or imu is None):
+        why = "raw mode takes a GPS and an IMU, and sensors does not name both"
+        problems.append(Problem(Severity.ERROR, why, Source(file, element="localization.mode"), "write mode: full"))
     problems += _channel_problems(config, file)
     try:
         configured_origin(config)
@@ -141,7 +155,24 @@ def load_vehicle(config: VehicleConfig, file: str = "") -> Vehicle:
     mounts = None
     if gps is not None and imu is not None:
         mounts = Mounts.from_model(model, config.rolling_frame or config.base_frame, gps.frame, imu.frame)
-    return Vehicle(config, model, mounts)
+    return Vehicle(config, model, mounts, _rig(config, model))
+
+
+def _rig(config: VehicleConfig, model: Model) -> Rig | None:
+    """Return the vehicle's frames as the filter needs them, None where it names nothing to localize by."""
+    gps, imu, wheels = config.sensors.gps, config.sensors.imu, config.sensors.wheels
+    if gps is None and imu is None and wheels is None:
+        return None
+    return Rig(
+        model,
+        config.rolling_frame or config.base_frame,
+        imu.frame if imu is not None else "",
+        gps.frame if gps is not None else "",
+        gps.second_frame if gps is not None else "",
+        wheels.frames if wheels is not None else {},
+        wheels.kinematics if wheels is not None else "differential",
+        config.localization.magnetometer,
+    )
 
 
 def _channel_problems(config: VehicleConfig, file: str) -> list[Problem]:
@@ -241,8 +272,8 @@ def run(vehicle: Vehicle, url: str = "") -> None:
         bus.url,
         f"at {config.publish.rate_hz:g} Hz" if config.publish.mode == "timer" else "on every sensor event",
     )
-    if vehicle.mounts is None:
-        log.warning("the vehicle file does not name both a GPS and an IMU: there is no pose in the world, and no POSE")
+    if vehicle.rig is None:
+        log.warning("the vehicle file names no sensor to localize by: there is no POSE")
     if origin is not None and keeper is not None:
         log.info(
             "the origin of an earlier run is used: %s (remove it to set a new one): %.3f E %.3f N %.3f m, zone %d%s",

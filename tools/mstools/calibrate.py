@@ -107,6 +107,11 @@ def imu(
             f"{safe(str(log))}: the longest standing stretch is {noise.seconds:.1f} s, {LEAST_STANDING:.0f} s are "
             "needed for a proposal, and 10 minutes for the biases' walk: record longer"
         )
+    if not calibrate_report.proposal(noise):
+        raise CalibrationError(
+            f"{safe(str(log))}: no figure can be told from {noise.seconds:.0f} s of standing: the samples are frozen, "
+            "or something other than noise covers it; --plot shows what"
+        )
     _write_proposal(output, calibrate_report.noise_yaml(str(log), noise), force)
 
 

@@ -110,6 +110,12 @@ QUANTITIES = (
     ),
 )
 
+
+def proposal(noise: Noise) -> dict[str, float]:
+    """Return the settings of the filter that can be told."""
+    return {each.setting: value for each in QUANTITIES if each.setting and math.isfinite(value := each.proposed(noise))}
+
+
 SHAKING = "of the standing unit: what the engine and the road shake comes on top"
 
 
@@ -160,9 +166,7 @@ def noise_data(noise: Noise, advice: MountAdvice | None) -> dict[str, Any]:
         "to": noise.end,
         "seconds": noise.seconds,
         "rate_hz": noise.rate_hz,
-        "proposal": {
-            each.setting: value for each in QUANTITIES if each.setting and math.isfinite(value := each.proposed(noise))
-        },
+        "proposal": proposal(noise),
         "gyro": [_axis_data(each) for each in noise.gyro],
         "accelerometer": [_axis_data(each) for each in noise.accelerometer],
         "mount": None
@@ -202,8 +206,6 @@ def noise_yaml(log: str, noise: Noise) -> str:
         "localization:",
         "  filter:",
     ]
-    if not any(each.setting and math.isfinite(each.proposed(noise)) for each in QUANTITIES):
-        lines[-1] = "  filter: {}"
     for each in QUANTITIES:
         if not each.setting:
             continue
@@ -266,9 +268,10 @@ def magnetometer_lines(log: str, found: MagnetometerFit, place: Vector3 | None, 
             f"{math.hypot(field[0], field[1]) * 1e6:.2f} uT, declination {turned:+.2f} deg (World Magnetic Model)"
         )
     else:
+        why = "place unknown" if place is None else "no model of the field for that time"
         lines.append(
-            f"place unknown: the {'horizontal ' if found.planar else ''}field is taken to be the mean felt, "
-            f"{found.strength * 1e6:.2f} uT; --place LAT,LON would tell"
+            f"{why}: the {'horizontal ' if found.planar else ''}field is taken to be the mean felt, "
+            f"{found.strength * 1e6:.2f} uT" + ("; --place LAT,LON would tell" if place is None else "")
         )
     matrix = found.soft_iron
     lines += [
@@ -278,7 +281,7 @@ def magnetometer_lines(log: str, found: MagnetometerFit, place: Vector3 | None, 
         + (f", {math.degrees(found.heading_rms):.2f} deg of heading" if math.isfinite(found.heading_rms) else ""),
     ]
     if found.planar and field is None:
-        lines.append("Hard iron along the vertical is not determined without the place: taken as 0.")
+        lines.append("Hard iron along the vertical is not determined without the field at the place: taken as 0.")
     if found.planar:
         lines.append("Found on the level: it holds there; slopes bring part of the vertical field into the horizontal.")
     return lines

@@ -158,8 +158,8 @@ def offline(
     from modelserver.service.offline import CSV_HEADER, Run
 
     vehicle = load_vehicle(load_config(config), str(config))
-    if vehicle.mounts is None:
-        raise RecordingError(f"{config}: names no GPS and IMU under sensors, so there is no pose in the world to write")
+    if vehicle.rig is None:
+        raise RecordingError(f"{config}: names nothing under sensors to localize by, so there is no pose to write")
     times = None if at_times is None else read_times(at_times)
     geometry = Path(vehicle.config.geometry)
     inputs = [log, config, geometry, *([] if at_times is None else [at_times])]

@@ -30,6 +30,9 @@ LEAST_CLUSTERS = 5
 SLOPE_TOLERANCE = 0.1
 """How far from -1/2 the slope may be for white noise: it then holds nine tenths of the variance."""
 
+SLOPE_FLAT = 0.25
+"""A floor is reached where the deviation falls less steeply than this, half of what white noise does."""
+
 WALK_SLOPES = (0.25, 0.75)
 """Slopes between which the rise counts as a random walk: flatter is instability, steeper a ramp (slope 1)."""
 
@@ -165,11 +168,14 @@ def _instability(curve: AllanCurve, deviations: Array) -> tuple[Figure | None, f
     at = int(np.argmin(deviations))
     least = float(deviations[at])
     limit = math.sqrt(float(_upper(curve, deviations**2)[at])) / FLOOR
-    # past the minimum the curve must have risen, or stayed, by more than chance: else it is still falling
-    after = range(at + 1, len(deviations))
+    # past the minimum the curve must have risen by more than chance, or stay flat over the last decade
     half_decade = curve.taus[-1] >= 3.0 * curve.taus[at]
-    risen = any(deviations[index] * (1.0 - errors[index]) > least for index in after)
-    if not (half_decade and risen):
+    risen = half_decade and any(
+        deviations[index] * (1.0 - errors[index]) > least for index in range(at + 1, len(deviations))
+    )
+    last = slice(max(len(deviations) - POINTS_PER_DECADE, 0), None)
+    slope, unsure = _slope(np.log(curve.taus[last]), np.log(deviations[last]), np.array(errors[last]))
+    if not (risen or slope - unsure > -SLOPE_FLAT):
         return None, limit
     return Figure(least / FLOOR, least / FLOOR * errors[at], curve.taus[at], curve.clusters[at]), limit
 

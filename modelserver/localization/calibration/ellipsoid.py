@@ -30,11 +30,12 @@ SECTORS = 12
 """Sectors of 30 degrees in which the directions are counted."""
 
 NEEDED_SECTORS = 10
-"""Sectors that must have been seen: with a quarter of the circle missing, noise of 1 % shifts the centre by several."""
+"""Sectors that must have been seen: over what is missing the ellipse is extrapolated, and nothing would show there that
+something else moved the field."""
 
 NEEDED_SPREAD = 0.3
 """For the mode of all axes: how much of the sphere's height the directions must reach over on its least-seen axis:
-rolling and pitching by 20 degrees."""
+17 degrees of elevation to both sides."""
 
 LARGEST_RESIDUAL = 0.1
 """Largest residual as a share of the strength: beyond, the samples lie on no ellipse (6 degrees of heading)."""

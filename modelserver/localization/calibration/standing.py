@@ -13,13 +13,17 @@ from modelserver.spatial.so3 import Array
 BLOCK = 1.0
 """Seconds over which rates and forces are averaged; who turns or sets off shows it in a second."""
 
+LEAST_SAMPLES = 10
+"""Least samples in a block: of fewer the spread tells nothing."""
+
 
 @dataclass(frozen=True, slots=True)
 class StandingLimits:
     """What a standing unit may feel. A block of a second counts as standing when every limit holds on every axis."""
 
-    spread_factor: float = 2.0
-    """Spread of a block, as a multiple of the quietest tenth's: a running engine, wind and steps nearby come and go."""
+    spread_factor: float = 3.0
+    """Spread of a block, as a multiple of the quietest tenth's: engines, wind and steps come and go. The spread of
+    ten samples is itself unsure by a quarter, so of many blocks one shows twice the least by chance."""
     rate_spread: float = 0.05
     """Largest spread of the rates in a block, rad/s: five times the noise of a 3DM-GX1 at 100 Hz (1e-3 rad/sqrt(s))."""
     force_spread: float = 0.3
@@ -49,7 +53,7 @@ def standing(
     limits = limits or StandingLimits()
     stamps = np.asarray(utimes, dtype=np.int64)
     values = np.column_stack((np.asarray(rates, dtype=float), np.asarray(forces, dtype=float)))
-    size = max(round(BLOCK / period(stamps)), 2)
+    size = max(round(BLOCK / period(stamps)), LEAST_SAMPLES)
     found: list[Stretch] = []
     blocks = [(each, *_blocks(values[each.start : each.stop], size)) for each in stretches(stamps)]
     if not any(len(means) for _, means, _ in blocks):

@@ -17,7 +17,7 @@ from modelserver.localization.filter.measurements import Compared, Measurement, 
 from modelserver.localization.filter.measurements.aiding import AbsolutePose
 from modelserver.localization.filter.measurements.base import wrapped
 from modelserver.localization.filter.measurements.gps import GpsBaseline, GpsPosition, baseline_sigma
-from modelserver.localization.filter.measurements.orientation import Yaw, yaw_seen
+from modelserver.localization.filter.measurements.orientation import Yaw, yaw_told
 from modelserver.localization.filter.measurements.wheels import WheelSpeed, standing_wheels, turn_rate
 from modelserver.localization.filter.nav import ZERO
 from modelserver.localization.filter.setup import Setup
@@ -34,6 +34,7 @@ from modelserver.messages import (
     SwitchMode,
     Verdict,
     WheelsSample,
+    YawSource,
 )
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import Vector3
@@ -78,18 +79,17 @@ Fused: TypeAlias = tuple[FilterState, tuple[Decision, ...]]
 _NOTHING: tuple[Decision, ...] = ()
 
 
-def items(setup: Setup, sample: Sample | SwitchMode, latency: float = 0.0) -> list[Item]:
-    """Return what a sample measured, each at its instant; `latency` (s) is how much older it is than its stamp."""
+def items(setup: Setup, sample: Sample | SwitchMode) -> list[Item]:
+    """Return what a sample measured, each at its instant."""
     header = sample.header
-    shift = round(latency * 1e6)
     found: list[Item] = []
     if isinstance(sample, (ImuSample, SwitchMode)):
         kind = INERTIAL if isinstance(sample, ImuSample) else "mode"
-        found.append(Item(header.utime - shift, header.source, header.seq, 0, kind, None, sample))
+        found.append(Item(header.utime, header.source, header.seq, 0, kind, None, sample))
     for part, measurement in enumerate(setup.measurements.get(type(sample), ()), start=1):
         instant = measurement.instant(sample)
         if instant is not None:
-            found.append(Item(instant - shift, header.source, header.seq, part, measurement.kind, measurement, sample))
+            found.append(Item(instant, header.source, header.seq, part, measurement.kind, measurement, sample))
     return found
 
 
@@ -189,7 +189,7 @@ def _constrained(setup: Setup, state: FilterState, utime: int) -> Fused:
         return state, decisions
     if (utime - state.rolled_utime) * 1e-6 < CONSTRAINT_PERIOD:
         return state, _NOTHING
-    if state.wheels_utime and (utime - state.wheels_utime) * 1e-6 < 2.0 * CONSTRAINT_PERIOD + 0.05:
+    if state.wheels_utime and (utime - state.wheels_utime) * 1e-6 < setup.settings.wheel_period + CONSTRAINT_PERIOD:
         return state, _NOTHING  # the next wheel sample brings it along
     return _rolled(setup, state, utime)
 
@@ -238,17 +238,21 @@ def _wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
     if state.mode is Mode.NO_WHEELS:
         return state, _NOTHING
     key = (item.source, item.kind)
-    last = state.last.get(key)
+    seen = (item.source, "seen")
+    last, newest = state.last.get(key), state.last.get(seen)
     before = None if last is None else last.sample
     settings = setup.settings
-    stands = standing_wheels(sample, before, measurement.contacts, settings)
-    state = state._replace(stillness=state.stillness.rolled(item.utime, stands))
+    stands = standing_wheels(sample, None if newest is None else newest.sample, measurement.contacts, settings)
+    state = _remembered(state._replace(stillness=state.stillness.rolled(item.utime, stands)), seen, item)
     if state.nav is None:
         if not motion.inertial(setup, state.mode):
             state = _begun_level(setup, state, item.utime)
-        return _remembered(state, key, item), _NOTHING
-    state = motion.caught_up(setup, motion.at(setup, state, item.utime))
+        return state, _NOTHING
     age = math.inf if last is None else (item.utime - last.utime) * 1e-6
+    bridged = motion.inertial(setup, state.mode) and measurement.by_travel(sample, before)
+    if bridged and age < settings.wheel_period - 0.01:
+        return state, _NOTHING
+    state = motion.caught_up(setup, motion.at(setup, state, item.utime))
     scene = _scene(setup, state, age, before)
     compared = measurement.compare(scene, sample)
     decisions = _NOTHING
@@ -260,9 +264,9 @@ def _wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
         rate = 0.0 if gyro else turn_rate(sample, before, measurement, settings)
         state = state._replace(nav=nav, wheels_utime=item.utime, wheels_rate=rate)
         decisions = (decision,)
-    nav = state.nav
-    assert nav is not None
-    state = _remembered(state._replace(nav=nav._replace(rolled=ZERO, turned=ZERO)), key, item)
+    now = state.nav
+    assert now is not None
+    state = _remembered(state._replace(nav=now._replace(rolled=ZERO, turned=ZERO)), key, item)
     if not motion.inertial(setup, state.mode):
         # without an inertial unit the wheels alone say when the vehicle stands
         state = state._replace(standing=stands is True, rested_utime=item.utime)
@@ -307,6 +311,9 @@ def _fix(setup: Setup, state: FilterState, item: Item) -> Fused:
     nav = state.nav
     assert nav is not None
     state, newest = fixes.passed(setup, state, nav, fix, sample.fix_type)
+    before = state.fixed
+    steady = fixes.follows(setup, before, newest)
+    since = 0.0 if before is None else (newest.utime - before.utime) * 1e-6
     state = _seen_moving(setup, state, newest)._replace(fixed=newest)
     if state.phase is not Phase.ALIGNED:
         if unused:
@@ -317,16 +324,37 @@ def _fix(setup: Setup, state: FilterState, item: Item) -> Fused:
             return state, _NOTHING
         state = fixes.aligned(setup, state, fit, by_unit=by_unit)
         return state, (_took_up(item, f"heading to {math.degrees(fit.sigma):.1f} deg by {fit.distance:.1f} m driven"),)
+    resting = fixes.at_rest(setup, _scene(setup, state), fix)
+    if not resting:
+        state = state._replace(nav=fixes.widened(setup, nav, state.restless, since))
     scene = _scene(setup, state)
     compared = measurement.compare(scene, sample)
     if isinstance(compared, str):
         return state, _NOTHING
-    if unused or fixes.at_rest(setup, scene, fix):
+    if unused or resting:
         compared = compared._replace(monitored=unused or "at_rest")
     if unused:
         _, decision = updates.used(nav, compared, setup.settings, item.utime, item.source, item.seq, item.kind)
         return state, (decision,)
-    return fixes.put(setup, state, compared, newest, item.source, item.seq)
+    state, decisions = fixes.put(setup, state, compared, newest, item.source, item.seq, steady=steady)
+    if not resting and decisions[0].verdict is Verdict.USED:
+        state = state._replace(restless=fixes.learnt(setup, state.restless, decisions[0], since))
+        state = fixes.shown(setup, state, (newest.lingering, newest.lingering, 0.0), since, slice(0, 2))
+    return state, decisions
+
+
+def _height(setup: Setup, state: FilterState, item: Item) -> Fused:
+    """Return the state with a height; one that drifts says that the whole fix does."""
+    if state.refused_count:
+        return state, _NOTHING  # what is said of the position is said of the fix
+    last = state.last.get((item.source, item.kind))
+    state, decisions = _measured(setup, state, item)
+    if decisions and decisions[0].residual and last is not None:
+        since = (item.utime - last.utime) * 1e-6
+        state = state._replace(restless=fixes.learnt(setup, state.restless, decisions[0], since))
+        if state.fixed is not None and not state.standing:
+            state = fixes.shown(setup, state, (0.0, 0.0, state.fixed.up_sigma), since, slice(2, 3))
+    return state, decisions
 
 
 def _seen_moving(setup: Setup, state: FilterState, newest: Passed) -> FilterState:
@@ -385,11 +413,13 @@ def _yaw(setup: Setup, state: FilterState, item: Item) -> Fused:
         return state, _NOTHING
     if state.phase is Phase.ALIGNED:
         return _measured(setup, state, item)
-    if state.site is None or not setup.settings.use_magnetometer:
+    magnetic = sample.yaw_source is YawSource.MAGNETIC
+    if state.site is None or (magnetic and not setup.settings.use_magnetometer):
         return state, _NOTHING
-    turn = yaw_seen(_scene(setup, state), sample, measurement.mount, state.nav.yaw)
-    if turn is None:
+    told = yaw_told(_scene(setup, state)._replace(site=state.site), sample, measurement.mount)
+    if isinstance(told, str):
         return state, _NOTHING
+    turn = wrapped(told - state.nav.yaw)
     return _by_azimuth(setup, state, item, turn, setup.settings.magnetic_sigma)
 
 
@@ -513,6 +543,7 @@ _HANDLERS: dict[str, Handler] = {
     "mode": _mode,
     "wheel_speed": _wheels,
     "gps_position": _fix,
+    "gps_height": _height,
     "gps_velocity": _velocity,
     "gps_baseline": _baseline,
     "imu_yaw": _yaw,

@@ -17,7 +17,7 @@ from modelserver.localization.filter import alignment, placing, updates
 from modelserver.localization.filter.alignment import Fit, Passed, horizontal
 from modelserver.localization.filter.measurements.aiding import AbsolutePose
 from modelserver.localization.filter.measurements.base import Compared, Scene, wrapped
-from modelserver.localization.filter.measurements.gps import place_of, shares, stated_velocity
+from modelserver.localization.filter.measurements.gps import WANDER, place_of, shares, stated_velocity
 from modelserver.localization.filter.nav import Nav
 from modelserver.localization.filter.setup import Setup
 from modelserver.localization.filter.state import FilterState, Pending
@@ -25,6 +25,7 @@ from modelserver.localization.filter.strapdown import Earth
 from modelserver.localization.gate import GoodFix
 from modelserver.messages import AbsolutePoseSample, Decision, FixType, GpsSample, Mode, Phase, Verdict
 from modelserver.spatial import so3
+from modelserver.spatial.so3 import Vector3
 
 FRESH = 1.5
 """Seconds for which a fix still says where a vehicle is whose heading was just found."""
@@ -191,8 +192,54 @@ def at_rest(setup: Setup, scene: Scene, fix: GoodFix) -> bool:
     return scene.standing and max(P[0, 0], P[1, 1]) <= max(fix.sigma, scene.settings.gps_sigma_floor) ** 2 * 1.1
 
 
+def widened(setup: Setup, nav: Nav, restless: float, seconds: float) -> Nav:
+    """Return the state with what lingers in fixes driven faster than the settings say, for the last `seconds`."""
+    if restless <= 1.0 or seconds <= 0.0:
+        return nav
+    at = setup.layout.index(WANDER[0])
+    P = nav.covariance.copy()
+    more = (restless - 1.0) * 2.0 * min(seconds, 2.0) / setup.settings.gps_wander_time
+    for axis in (at, at + 1, at + 2):
+        P[axis, axis] += more
+    return nav._replace(covariance=P)
+
+
+def shown(setup: Setup, state: FilterState, sigma: Vector3, seconds: float, axes: slice) -> FilterState:
+    """Return the state with the pose gone along with what lingers in fixes, no faster than it may."""
+    nav = state.nav
+    assert nav is not None
+    most = setup.settings.follow_speed * min(seconds, 2.0)
+    at = setup.layout.extra(WANDER[0])
+    new, lingering = list(state.shown), list(state.lingering)
+    for axis in range(3)[axes]:
+        off = sigma[axis] * nav.extras[at + axis] - new[axis]
+        new[axis] += max(-most, min(off, most))
+        lingering[axis] = sigma[axis]
+    return state._replace(shown=(new[0], new[1], new[2]), lingering=(lingering[0], lingering[1], lingering[2]))
+
+
+def learnt(setup: Setup, restless: float, decision: Decision, seconds: float) -> float:
+    """Return how restless fixes are after one more: its statistic should be its degrees of freedom in the mean."""
+    settings = setup.settings
+    if not decision.dof or not math.isfinite(decision.statistic):
+        return restless
+    gain = min(seconds, 2.0) / settings.restless_time
+    ratio = min(decision.statistic / decision.dof, 20.0)
+    return min(max(restless * (1.0 + gain * (ratio - 1.0)), 1.0), settings.restless_limit)
+
+
+def follows(setup: Setup, before: Passed | None, newest: Passed) -> bool:
+    """Return whether a fix lies where the one before and the way since lead to: fixes that drift do, a jump not."""
+    if before is None:
+        return True
+    seconds = (newest.utime - before.utime) * 1e-6
+    off = abs((newest.place - before.place) - (newest.way - before.way))
+    wandered = newest.lingering * math.sqrt(2.0 * seconds / setup.settings.gps_wander_time)
+    return off <= 5.0 * math.hypot(1.5 * newest.white, wandered)
+
+
 def put(
-    setup: Setup, state: FilterState, compared: Compared, newest: Passed, source: str, seq: int
+    setup: Setup, state: FilterState, compared: Compared, newest: Passed, source: str, seq: int, *, steady: bool
 ) -> tuple[FilterState, tuple[Decision, ...]]:
     """Return the state after a comparison of a fix, with the logic of jumps around it."""
     settings, nav = setup.settings, state.nav
@@ -200,6 +247,17 @@ def put(
     utime = nav.utime
     after, decision = updates.used(nav, compared, settings, utime, source, seq, "gps_position")
     within = decision.statistic <= decision.limit
+    if not within and steady and not state.refused_count:
+        # it drifted here, fix by fix, and did not jump: it is let wander as fast as it does
+        excess = decision.statistic / decision.dof
+        wide = widened(setup, nav, 1.0 + excess * settings.gps_wander_time / 2.0 * 0.01, 1.0)
+        for _ in range(12):
+            after, again = updates.used(wide, compared, settings, utime, source, seq, "gps_position")
+            if again.statistic <= 2.0 * again.dof:
+                break
+            wide = widened(setup, wide, 1.0 + settings.gps_wander_time * 0.01 * excess, 1.0)
+        if again.verdict is Verdict.USED:
+            decision, within, nav = again._replace(reason="drift"), True, wide
     if decision.verdict is Verdict.MONITORED and within:
         return _confirmed(state, utime), (decision,)
     if decision.verdict is Verdict.USED:

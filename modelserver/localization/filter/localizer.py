@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 from typing import NamedTuple
 
 from modelserver.geodesy import Geodesy
-from modelserver.localization.filter import clocks, engine, motion, world
+from modelserver.localization.filter import clocks, engine, motion, start, world
 from modelserver.localization.filter.clocks import Clocks
 from modelserver.localization.filter.engine import INERTIAL, Item
 from modelserver.localization.filter.odometry import Odometry
@@ -59,7 +57,6 @@ class FilterLocalizer:
     """
 
     setup: Setup
-    latencies: Mapping[str, float]
     timeline: Timeline
     head: FilterState
     clocks: Clocks = field(default_factory=Clocks)
@@ -73,16 +70,14 @@ class FilterLocalizer:
         setup: Setup,
         origin: Origin | None = None,
         mode: Mode = Mode.FULL,
-        latencies: Mapping[str, float] | None = None,
     ) -> FilterLocalizer:
         """Return a localizer that has seen nothing yet.
 
-        `origin` is the configured or persisted one; None captures it from the first good fixes. `latencies` has for a
-        source's name by how many seconds its samples are older than their stamps. Raises GeodesyError for an origin
-        that is no place.
+        `origin` is the configured or persisted one; None captures it from the first good fixes. Raises GeodesyError for
+        an origin that is no place.
         """
         first = engine.first(setup, mode, None if origin is None else Geodesy(origin))
-        return cls(setup, MappingProxyType(dict(latencies or {})), Timeline(first), first, latched=origin is not None)
+        return cls(setup, Timeline(first), first, latched=origin is not None)
 
     @property
     def utime(self) -> int:
@@ -101,7 +96,7 @@ class FilterLocalizer:
         order, future, duplicate), else when the horizon has passed and nothing can change it any more.
         """
         setup, header = self.setup, sample.header
-        found = engine.items(setup, sample, self.latencies.get(header.source, 0.0))
+        found = engine.items(setup, sample)
         if not found:
             return self, ()
         settings = setup.settings
@@ -138,7 +133,7 @@ class FilterLocalizer:
             latched = True
             notes.append(OriginLatched(head.geodesy.origin))
         return (
-            FilterLocalizer(setup, self.latencies, timeline, head, known, odom, odoms, latched),
+            FilterLocalizer(setup, timeline, head, known, odom, odoms, latched),
             tuple(notes),
         )
 
@@ -169,6 +164,18 @@ class FilterLocalizer:
         return replace(
             self, timeline=Timeline(fresh), head=fresh, odom=self.odom._replace(utime=0), odoms=(), clocks=Clocks()
         )
+
+    def begun_from(self, last: Estimate, before: Estimate) -> FilterLocalizer:
+        """Return the localizer knowing what another one knew at `last`, and a moment `before` for the speed.
+
+        Only of one that has seen nothing yet. Where the other had no valid pose in the world this one starts alone.
+        """
+        state = start.begun_from(self.setup, self.head, last, before)
+        if state is None:
+            return self
+        assert state.nav is not None
+        odom = self.odom.advanced(state.nav, self.setup.rig.base, standing=False)
+        return replace(self, timeline=Timeline(state), head=state, odom=odom, odoms=(odom,))
 
     def estimate(self, utime: int) -> Estimate:
         """Return the rolling frame's pose at `utime`: predicted past the newest sample, else of the state then."""

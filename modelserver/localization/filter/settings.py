@@ -61,6 +61,9 @@ class FilterSettings(FixSettings):
 
     wheel_sigma: float = 0.02
     """Sigma of a wheel's speed where the sample does not tell, m/s: a pulse of 1 cm twice in a second."""
+    wheel_period: float = 0.4
+    """Shortest time over which the wheels' way is compared, seconds: an encoder's errors of place, a pulse or an update
+    missed, fall out over a longer way, and the inertial unit bridges the time."""
     wheel_scale_sigma: float = 0.03
     """Sigma of the common error of scale of the wheels: tyre pressure and load change a rolling radius by 3 %."""
     wheel_scale_walk: float = 1e-4
@@ -113,7 +116,11 @@ class FilterSettings(FixSettings):
     """Correlation time of the rest, seconds: multipath of a slow antenna lasts minutes (Kaplan and Hegarty)."""
     gps_sigma_floor: float = 0.02
     """A fix is never taken to be surer than this, metres: RTK, 2 cm (OEM4 data sheet)."""
-    follow_speed: float = 0.5
+    restless_time: float = 5.0
+    """Time constant, seconds, with which the wandering of fixes is learnt from what they do beside odometry."""
+    restless_limit: float = 100.0
+    """By how much faster than the settings say, in variance, fixes are let wander before they are refused."""
+    follow_speed: float = 2.0
     """How fast the pose goes with what lingers in the fixes, m/s, at most: the pose in the world is where the receiver
     would see it, as way points surveyed with it are, but it does not jump there."""
     velocity_sigma: float = 0.1

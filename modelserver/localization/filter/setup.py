@@ -8,9 +8,9 @@ from modelserver.localization.filter.layout import Layout
 from modelserver.localization.filter.measurements import REGISTRY, Measurement
 from modelserver.localization.filter.measurements.gps import wander
 from modelserver.localization.filter.measurements.wheels import WheelSpeed, wheel_states
-from modelserver.localization.filter.rig import Rig
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.filter.strapdown import Noise
+from modelserver.localization.rig import Rig
 from modelserver.spatial import so3
 
 ROCKING = 1e-5

@@ -6,13 +6,14 @@ import math
 
 import numpy as np
 
+from modelserver.geodesy import geodetic_from_ecef
 from modelserver.localization.filter import strapdown
 from modelserver.localization.filter.layout import ACCELEROMETER_BIAS, GYRO_BIAS, STRAPDOWN, VELOCITY
 from modelserver.localization.filter.measurements.constraints import tilt_of
 from modelserver.localization.filter.nav import ZERO, Nav
 from modelserver.localization.filter.setup import Setup
 from modelserver.localization.filter.state import FilterState
-from modelserver.messages import Phase
+from modelserver.messages import Estimate, Phase
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import Quaternion, Vector3
 
@@ -107,6 +108,43 @@ def first_nav(
         np.diag(np.square(sigmas)),
         force=(0.0, 0.0, strapdown.STANDARD_GRAVITY),
         rate=bias,
+    )
+
+
+def begun_from(setup: Setup, first: FilterState, last: Estimate, before: Estimate) -> FilterState | None:
+    """Return a state in the world where another localizer had the rolling frame, None where it had no valid pose.
+
+    Velocity is what it moved by between the two estimates. N is World:ENU, the tangent plane at the origin.
+    """
+    geodesy, pose = first.geodesy, last.enu
+    if geodesy is None or pose is None or last.covariance is None or last.invalid:
+        return None
+    settings, rig = setup.settings, setup.rig
+    dt = (last.utime - before.utime) * 1e-6
+    moved = (before.odom.inverse() @ last.odom).xyz
+    along = moved[0] / dt if dt > 0.0 else 0.0
+    nav = first_nav(setup, last.utime, pose.wxyz, LEVEL_SIGMA, settings.course_speed, ZERO, settings.gyro_bias_sigma)
+    arm = so3.rotate(pose.wxyz, rig.imu)
+    P = nav.covariance.copy()
+    stated = np.array(last.covariance).reshape(6, 6)
+    P[0:3, 0:3] = np.diag(np.diagonal(stated)[:3])
+    P[6:9, 6:9] = np.diag(np.maximum(np.diagonal(stated)[3:], 1e-4))
+    x, y, z = pose.xyz
+    latitude, _, height = geodetic_from_ecef(geodesy.tangent.ecef)
+    return first._replace(
+        nav=nav._replace(
+            position=(x + arm[0], y + arm[1], z + arm[2]),
+            velocity=so3.rotate(pose.wxyz, (along, 0.0, 0.0)),
+            covariance=P,
+        ),
+        phase=Phase.ALIGNED,
+        site=geodesy.tangent,
+        earth=strapdown.Earth.at(latitude, height),
+        imu_utime=last.utime,
+        fix_utime=last.utime,
+        rolled_utime=last.utime,
+        rested_utime=last.utime,
+        began=last.utime,
     )
 
 

@@ -43,12 +43,14 @@ class FilterState(NamedTuple):
     """Nominal state, covariance, and everything that decisions rest on. Make the first with the engine's `first`.
 
     `nav` is None while levelling. `site` is the tangent plane that N is east, north, up of once `phase` is ALIGNED.
-    `imu_utime` is the last inertial sample used, `began` the first; `wheels_utime` the last wheels used. `passed` are
-    fixes beside the way, for heading; `unit` the way at speed 1 so far (s). `refused` are the fixes refused in a row,
-    `refused_since` the first of them; `fix_utime` the last fix that was used or confirmed. `moved` is until when fixes
-    say that the vehicle moves. `allowance` is what one outlier just within its gate may have moved the position by,
-    metres, at `allowance_utime`. `biases` are the gyros' with their sigma, kept where the rest begins anew. `tilt` is
-    how far gravity is off the geometry's up at start-up, where that is too far.
+    `imu_utime` is the last inertial sample used, `began` the first; `wheels_utime` the last wheels used. `passed`
+    are fixes beside the way, for heading; `unit` the way at speed 1 so far (s). `refused` are the fixes refused in
+    a row, `refused_since` the first of them; `fix_utime` the last fix that was used or confirmed. `moved` is until
+    when fixes say that the vehicle moves. `restless` is by how much faster than the settings say what lingers in
+    fixes wanders. `shown` is how far the pose goes with what lingers in fixes, metres along N, whose sigma is
+    `lingering`. `allowance` is what one outlier just within its gate may have moved the position by, metres, at
+    `allowance_utime`. `biases` are the gyros' with their sigma, kept where the rest begins anew. `tilt` is how far
+    gravity is off the geometry's up at start-up, where that is too far.
     """
 
     nav: Nav | None = None
@@ -77,6 +79,9 @@ class FilterState(NamedTuple):
     fix_utime: int = 0
     moved: int = 0
     fixed: Passed | None = None
+    restless: float = 1.0
+    shown: Vector3 = (0.0, 0.0, 0.0)
+    lingering: Vector3 = (0.0, 0.0, 0.0)
     allowance: float = 0.0
     allowance_utime: int = 0
     epoch: int = 0

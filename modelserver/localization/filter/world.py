@@ -10,6 +10,7 @@ import numpy as np
 from modelserver.geodesy import Geodesy, GeodesyError, LocalFrame, about_up, geodetic_from_ecef
 from modelserver.localization.filter import bounds, motion, strapdown
 from modelserver.localization.filter.measurements.constraints import tilt_of
+from modelserver.localization.filter.measurements.gps import WANDER
 from modelserver.localization.filter.nav import Nav, jacobian_of_body_velocity
 from modelserver.localization.filter.odometry import Odometry
 from modelserver.localization.filter.setup import Setup
@@ -17,10 +18,13 @@ from modelserver.localization.filter.state import FilterState
 from modelserver.messages import NAN, Estimate, Invalid, Mode, NavigationState, Phase, Quality
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
-from modelserver.spatial.so3 import Array, Quaternion
+from modelserver.spatial.so3 import Array, Quaternion, Vector3
 
 FACTORS_REACH = 200.0
 """Metres within which one convergence serves: it changes by 3e-5 rad times tan(latitude)."""
+
+FADING = 3.0
+"""Seconds without a fix after which what lingers in them fades from the pose."""
 
 SLOW = 0.3
 """Speed, m/s, below which nothing but the gyros tells heading."""
@@ -52,6 +56,8 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     nav = strapdown.caught_up(nav, motion.noise(setup, ahead, nav), setup.layout)
     settings = setup.settings
     P = _at_base(nav, setup)
+    offset, doubt = _followed(setup, state, nav, utime)
+    P[0, 0], P[1, 1], P[2, 2] = P[0, 0] + doubt[0], P[1, 1] + doubt[1], P[2, 2] + doubt[2]
     horizontal = bounds.horizontal(P, state.allowance, settings)
     heading = bounds.heading(float(P[5, 5]), settings)
     if heading > settings.heading_limit:
@@ -62,7 +68,9 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
             invalid |= Invalid.GPS_REJECTED
     enu = utm = None
     if state.geodesy is not None:
-        enu, utm = _world_poses(state.geodesy, state.site, nav.point(setup.rig.base), nav.attitude)
+        x, y, z = nav.point(setup.rig.base)
+        place = (x + offset[0], y + offset[1], z + offset[2])
+        enu, utm = _world_poses(state.geodesy, state.site, place, nav.attitude)
     return Estimate(
         utime,
         X_odom,
@@ -78,6 +86,24 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
         heading,
         NAN if invalid else _seconds_left(setup, state, nav, utime, horizontal),
     )
+
+
+def _followed(setup: Setup, state: FilterState, nav: Nav, utime: int) -> tuple[Vector3, Vector3]:
+    """Return how far the pose goes with what lingers in fixes, metres along N, and the variance that this adds, m2.
+
+    The estimate of what lingers is independent of the position's error, as an optimal estimate is of its own error; so
+    adding it adds its variance, which is what the filter has learnt: sigma^2 less what is left. Where fixes are missing
+    on the move it fades, as what lingers does.
+    """
+    at = setup.layout.index(WANDER[0])
+    fade = 1.0
+    silent = (utime - state.fix_utime) * 1e-6
+    if silent > FADING and not state.standing:
+        fade = math.exp(-(silent - FADING) / setup.settings.gps_wander_time)
+    x, y, z = state.shown
+    left = np.diagonal(nav.covariance)[at : at + 3].tolist()
+    a, b, c = (s * s * max(1.0 - p, 0.0) for s, p in zip(state.lingering, left, strict=True))
+    return (x * fade, y * fade, z * fade), (a, b, c)
 
 
 def _at_base(nav: Nav, setup: Setup) -> Array:

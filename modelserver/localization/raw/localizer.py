@@ -85,6 +85,10 @@ class RawLocalizer(RawState):
         """Return the base frame's pose at `utime`: predicted past the newest sample, held before the oldest kept."""
         return estimate(self, utime)
 
+    def deferred(self, utime: int) -> Estimate:
+        """Return `estimate(utime)`, worked out at once: it costs little."""
+        return self.estimate(utime)
+
     def navigation(self, utime: int) -> NavigationState | None:
         """Return None: raw mode has no filter."""
         return None

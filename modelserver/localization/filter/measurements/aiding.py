@@ -22,8 +22,8 @@ from modelserver.localization.filter.nav import (
     jacobian_of_body_velocity,
     jacobian_of_point,
 )
-from modelserver.localization.filter.rig import Rig
 from modelserver.localization.filter.settings import FilterSettings
+from modelserver.localization.rig import Rig
 from modelserver.messages import AbsolutePoseSample, RangeSample, RelativePoseSample
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import Array, Quaternion, Vector3

@@ -11,8 +11,8 @@ import numpy as np
 from modelserver.geodesy import Geodesy, LocalFrame
 from modelserver.localization.filter.layout import ErrorState, Layout
 from modelserver.localization.filter.nav import Nav
-from modelserver.localization.filter.rig import Rig
 from modelserver.localization.filter.settings import FilterSettings
+from modelserver.localization.rig import Rig
 from modelserver.spatial.so3 import Array, Vector3
 
 

@@ -13,9 +13,9 @@ from modelserver.localization import gate
 from modelserver.localization.filter.layout import ErrorState
 from modelserver.localization.filter.measurements.base import Compared, Scene, azimuth, register, wrapped
 from modelserver.localization.filter.nav import ZERO, jacobian_of_point, jacobian_of_point_velocity
-from modelserver.localization.filter.rig import Rig
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.gate import GoodFix
+from modelserver.localization.rig import Rig
 from modelserver.messages import FixType, GpsSample
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import Array, Vector3

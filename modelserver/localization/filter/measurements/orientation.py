@@ -11,9 +11,9 @@ import numpy as np
 from modelserver.geodesy import geodetic_from_ecef
 from modelserver.localization.filter.layout import ErrorState
 from modelserver.localization.filter.measurements.base import Compared, Scene, azimuth, register, wrapped
-from modelserver.localization.filter.rig import Rig
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.magnetometer import MagnetometerCalibration, magnetic_field
+from modelserver.localization.rig import Rig
 from modelserver.messages import ImuSample, OrientationReference, YawSource
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import Quaternion, Vector3
@@ -96,20 +96,16 @@ class Yaw(_OfUnit):
         """Compare yaw."""
         if scene.age < PERIOD or scene.site is None:
             return ""
+        told = yaw_told(scene, sample, self.mount)
+        if isinstance(told, str):
+            return told
         magnetic = sample.yaw_source is YawSource.MAGNETIC
-        told = attitude_in_enu(sample, self.mount)
-        if told is None:
-            return "orientation"
         expected, H = azimuth(so3.rotate(scene.nav.attitude, (1.0, 0.0, 0.0)), scene.layout.size)
-        x, y, _ = so3.rotate(told, (1.0, 0.0, 0.0))
-        turned = declination(scene, sample.header.utime) if magnetic else 0.0
         settings = scene.settings
         sigma = settings.magnetic_sigma if magnetic else settings.orientation_sigma
         lasting = max(settings.magnetic_time / min(scene.age, settings.magnetic_time), 1.0)
         unused = "vertical_gyro" if magnetic and not settings.use_magnetometer else ""
-        # a magnetic azimuth counts from magnetic north: seen from true north it lies to the east by the declination
-        residual = wrapped(math.atan2(y, x) - turned - expected)
-        return Compared(np.array((residual,)), H, np.array(((sigma * sigma * lasting,),)), unused)
+        return Compared(np.array((wrapped(told - expected),)), H, np.array(((sigma * sigma * lasting,),)), unused)
 
 
 @register
@@ -140,40 +136,40 @@ class Magnetometer:
             return "nan"
         felt = so3.rotate(self.mount, self.calibration.applied(sample.magnetic_field))
         model = model_field(scene, sample.header.utime)
+        if model is None:
+            return "no_model"
         strength = math.hypot(*model)
         settings = scene.settings
         if abs(math.hypot(*felt) - strength) > settings.magnetic_strength * strength:
             return "disturbed"
         expected, H = azimuth(so3.rotate(scene.nav.attitude, felt), scene.layout.size)
-        residual = wrapped(math.atan2(model[1], model[0]) - expected)
+        residual = wrapped(0.5 * math.pi - self.calibration.declination(model) - expected)
         lasting = max(settings.magnetic_time / min(scene.age, settings.magnetic_time), 1.0)
         R = np.array(((settings.magnetic_sigma**2 * lasting,),))
         return Compared(np.array((residual,)), H, R, "" if settings.use_magnetometer else "vertical_gyro")
 
 
-def model_field(scene: Scene, utime: int) -> Vector3:
+def model_field(scene: Scene, utime: int) -> Vector3 | None:
     """Return the earth's magnetic field, tesla, along N's axes at N's origin: it turns by a degree in 100 km."""
     assert scene.site is not None
     latitude, longitude, height = geodetic_from_ecef(scene.site.ecef)
     return magnetic_field(latitude, longitude, height, utime)
 
 
-def declination(scene: Scene, utime: int) -> float:
-    """Return the angle from true to magnetic north, clockwise, radians."""
-    east, north, _ = model_field(scene, utime)
-    return math.atan2(east, north)
-
-
-def yaw_seen(site_scene: Scene, sample: ImuSample, mount: Quaternion, body_yaw: float) -> float | None:
-    """Return how far N's yaw must be turned for the unit's own yaw to be right; None where it is not against north."""
-    if sample.yaw_source is YawSource.NONE:
-        return None
+def yaw_told(scene: Scene, sample: ImuSample, mount: Quaternion) -> float | str:
+    """Return the body's yaw from true east by the unit's own orientation, radians; or in one word why not."""
     told = attitude_in_enu(sample, mount)
     if told is None:
-        return None
+        return "orientation"
     x, y, _ = so3.rotate(told, (1.0, 0.0, 0.0))
-    turned = declination(site_scene, sample.header.utime) if sample.yaw_source is YawSource.MAGNETIC else 0.0
-    return wrapped(math.atan2(y, x) - turned - body_yaw)
+    if sample.yaw_source is not YawSource.MAGNETIC:
+        return math.atan2(y, x)
+    calibration = scene.rig.magnetometer
+    model = model_field(scene, sample.header.utime) if calibration.declination_deg is None else (0.0, 1.0, 0.0)
+    if model is None:
+        return "no_model"
+    # a magnetic azimuth counts from magnetic north: seen from true north it lies to the east by the declination
+    return math.atan2(y, x) - calibration.declination(model)
 
 
-__all__ = ["Magnetometer", "Tilt", "Yaw", "attitude_in_enu", "declination", "model_field", "yaw_seen"]
+__all__ = ["Magnetometer", "Tilt", "Yaw", "attitude_in_enu", "model_field", "yaw_told"]

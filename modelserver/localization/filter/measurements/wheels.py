@@ -11,8 +11,8 @@ import numpy as np
 from modelserver.localization.filter.layout import ErrorState
 from modelserver.localization.filter.measurements.base import Compared, Scene, register
 from modelserver.localization.filter.nav import cross, jacobian_of_body_velocity
-from modelserver.localization.filter.rig import Rig
 from modelserver.localization.filter.settings import FilterSettings
+from modelserver.localization.rig import Rig
 from modelserver.messages import WheelsSample
 from modelserver.spatial.so3 import Vector3
 
@@ -107,6 +107,11 @@ class WheelSpeed:
         if self.skid:
             wheels = [_mean(wheels)]
         return self._compared(scene, wheels)
+
+    def by_travel(self, sample: WheelsSample, before: WheelsSample | None) -> bool:
+        """Return whether a wheel tells the way since a sample before."""
+        earlier = {wheel.name: wheel.travel for wheel in before.wheels} if before is not None else {}
+        return any(math.isfinite(wheel.travel - earlier.get(wheel.name, math.nan)) for wheel in sample.wheels)
 
     def _compared(self, scene: Scene, wheels: list[Rolling]) -> Compared:
         nav, layout, settings = scene.nav, scene.layout, scene.settings

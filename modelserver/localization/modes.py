@@ -1,0 +1,144 @@
+"""Switching between the filter and raw mode while running: Odom goes on without a step, and the pose is handed over."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from modelserver.localization.filter.localizer import Deferred, FilterLocalizer
+from modelserver.localization.filter.setup import Setup
+from modelserver.localization.interface import Note
+from modelserver.localization.mounts import Mounts
+from modelserver.localization.raw.heading import Heading
+from modelserver.localization.raw.localizer import RawLocalizer
+from modelserver.localization.raw.settings import RawSettings
+from modelserver.messages import (
+    Decision,
+    Estimate,
+    Mode,
+    NavigationState,
+    Origin,
+    Rejected,
+    Sample,
+    SwitchMode,
+    Verdict,
+)
+from modelserver.spatial import so3
+from modelserver.spatial.pose import Pose
+
+SPEED_SPAN_US = 100_000
+"""Microseconds of Odom from which the speed is read that the filter begins with."""
+
+
+@dataclass(frozen=True, slots=True)
+class Makings:
+    """What each localizer is made of; `mounts` is None where raw mode lacks a GPS or an inertial unit."""
+
+    setup: Setup
+    raw: RawSettings
+    mounts: Mounts | None
+
+
+@dataclass(frozen=True, slots=True)
+class ModeLocalizer:
+    """One localizer for all modes: an immutable value. Make the first with `start`.
+
+    `active` is the filter or raw mode. `X_odom` leads from its Odom to the one that has been spoken of since the start,
+    and `epochs` are those counted by the localizers before it.
+    """
+
+    makings: Makings
+    active: FilterLocalizer | RawLocalizer
+    X_odom: Pose
+    epochs: int = 0
+
+    @classmethod
+    def start(cls, makings: Makings, mode: Mode, origin: Origin | None = None) -> ModeLocalizer:
+        """Return a localizer that has seen nothing yet.
+
+        Raises GeodesyError for an origin that is no place, ValueError for raw mode without GPS or inertial unit.
+        """
+        if mode is Mode.RAW:
+            if makings.mounts is None:
+                raise ValueError("raw mode takes a GPS and an inertial unit")
+            return cls(makings, RawLocalizer.start(makings.mounts, makings.raw, origin), Pose.identity())
+        return cls(makings, FilterLocalizer.start(makings.setup, origin, mode), Pose.identity())
+
+    @property
+    def utime(self) -> int:
+        """The instant of the newest sample taken, 0 before the first."""
+        return self.active.utime
+
+    def take(self, sample: Sample | SwitchMode) -> tuple[ModeLocalizer, tuple[Note, ...]]:
+        """Return what is concluded with one sample more, and what there is to say about it."""
+        raw = isinstance(self.active, RawLocalizer)
+        if isinstance(sample, SwitchMode) and (raw or sample.mode is Mode.RAW):
+            return self._switched(sample)
+        active, notes = self.active.take(sample)
+        if active is self.active:
+            return self, notes
+        return ModeLocalizer(self.makings, active, self.X_odom, self.epochs), notes
+
+    def estimate(self, utime: int) -> Estimate:
+        """Return the pose at `utime`, in the Odom that has been spoken of since the start."""
+        return self._continued(self.active.estimate(utime))
+
+    def deferred(self, utime: int) -> Estimate | Deferred:
+        """Return `estimate(utime)`, to be worked out when it is looked at where that saves work."""
+        if isinstance(self.active, FilterLocalizer) and not self.epochs:
+            return self.active.deferred(utime)
+        return self.estimate(utime)
+
+    def navigation(self, utime: int) -> NavigationState | None:
+        """Return the filter's whole state; None in raw mode."""
+        return self.active.navigation(utime)
+
+    def _continued(self, estimate: Estimate) -> Estimate:
+        if not self.epochs:
+            return estimate
+        return replace(estimate, odom=self.X_odom @ estimate.odom, pose_epoch=estimate.pose_epoch + self.epochs)
+
+    def _switched(self, wish: SwitchMode) -> tuple[ModeLocalizer, tuple[Note, ...]]:
+        """Return the localizer with the other one at work, begun from what this one knows."""
+        raw = isinstance(self.active, RawLocalizer)
+        if raw == (wish.mode is Mode.RAW):
+            return self, ()
+        makings = self.makings
+        if wish.mode is Mode.RAW and makings.mounts is None:
+            return self, (Rejected(f"command:{wish.header.source}", "no_raw_mode"),)
+        utime = self.active.utime
+        last = self.estimate(utime)
+        active: FilterLocalizer | RawLocalizer
+        if wish.mode is Mode.RAW:
+            assert makings.mounts is not None
+            active = _raw_from(RawLocalizer.start(makings.mounts, makings.raw, last.origin), last)
+            # raw mode's Odom begins level at its first sample: tilt is the unit's own
+            yaw = math.atan2(*_heading(last.odom))
+            X_odom = Pose.from_rpy(last.odom.xyz, 0.0, 0.0, yaw)
+        else:
+            before = self.estimate(utime - SPEED_SPAN_US)
+            active = FilterLocalizer.start(makings.setup, last.origin, wish.mode).begun_from(last, before)
+            X_odom = last.odom @ active.odom.pose(utime).inverse()
+        word = Decision(
+            utime, wish.header.source, wish.header.seq, "mode", Verdict.TOOK_UP, f"mode {wish.mode.name.lower()}"
+        )
+        return ModeLocalizer(makings, active, X_odom, last.pose_epoch + 1), (word,)
+
+
+def _heading(pose: Pose) -> tuple[float, float]:
+    """Return sine and cosine (times its level part) of a pose's yaw."""
+    x, y, _ = so3.rotate(pose.wxyz, (1.0, 0.0, 0.0))
+    return y, x
+
+
+def _raw_from(fresh: RawLocalizer, last: Estimate) -> RawLocalizer:
+    """Return raw mode knowing the heading that the filter knew, where that was good; its Odom's yaw begins with 0."""
+    if last.enu is None or last.covariance is None or last.invalid:
+        return fresh
+    heading = Heading(
+        known=True,
+        offset=math.atan2(*_heading(last.enu)),
+        variance=last.covariance[35],
+        bias_variance=fresh.heading.bias_variance,
+    )
+    return replace(fresh, heading=heading)
