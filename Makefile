@@ -47,6 +47,7 @@ format: $(DEV_STAMP)
 
 types: $(DEV_STAMP)
 	$(BIN)/python tools/generate_types.py
+	$(BIN)/python tools/settings_page.py
 
 bench: $(DEV_STAMP)
 	$(BIN)/python -m benchmarks

@@ -23,10 +23,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks import plaza_ranges, protocols
-from benchmarks.husky_rmse import common_scorer, data_directory
 from benchmarks.protocols import SHIFTS, Job, Outcome
 from benchmarks.recordings import dresden, husky, kitti, plaza
 from benchmarks.support import ROOT
+from benchmarks.withheld import common_scorer, data_directory
 
 SKIPPED = 77
 PROTOCOLS = ("half", "outage", "p2x")

@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.husky_rmse import Fixes, common_scorer, read_fixes
 from benchmarks.overrides import vehicle_with
+from benchmarks.withheld import Fixes, common_scorer, read_fixes
 from modelserver.service.offline import Run
 from modelserver.wire.eventlog import LogEvent, LogFile
 

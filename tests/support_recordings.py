@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -31,14 +32,20 @@ def write_log(path: Path, events: Iterable[tuple[int, str, bytes]]) -> Path:
 
 
 def drive(seconds: float, prefix: str = "") -> list[tuple[int, str, bytes]]:
-    """Return the events of a drive along grid east: IMU at 50 Hz, fixes at 5 Hz, by order of arrival."""
+    """Return the events of a drive along grid east: IMU at 50 Hz, fixes at 5 Hz, by order of arrival.
+
+    The vehicle drives from the first sample on, and shakes as vehicles do.
+    """
     to_geodetic = pyproj.Transformer.from_crs(32619, 4326, always_xy=True)
+    shaken = random.Random(20050901).gauss
     events = []
     for n in range(round(seconds * 50)):
         utime = START + n * 20_000
         header = SensorHeader(utime, "imu", n, utime + LATENCY)
         # the unit's y axis points up, see config/husky/geometry.yaml
-        imu = ImuSample(header, angular_velocity=(0.0, 0.0, 0.0), specific_force=(0.0, 9.81, 0.0))
+        rate = (shaken(0.0, 0.02), shaken(0.0, 0.02), shaken(0.0, 0.02))
+        force = (shaken(0.0, 0.3), 9.81 + shaken(0.0, 0.3), shaken(0.0, 0.3))
+        imu = ImuSample(header, angular_velocity=rate, specific_force=force)
         events.append((utime + LATENCY, f"{prefix}IMU", encode(imu)))
         if n % 10 == 0:
             longitude, latitude = to_geodetic.transform(EASTING + SPEED * n * 0.02, NORTHING)

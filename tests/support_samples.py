@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -118,8 +119,11 @@ def gps(utime: int, east: float = 0.0, speed: float = 2.0, source: str = "gps") 
 
 
 def imu(utime: int, source: str = "imu") -> ImuSample:
-    """What the inertial unit says on a level straight drive."""
-    return ImuSample(SensorHeader(utime, source), (0.0, 0.0, 0.0), (0.0, 0.0, 9.80665))
+    """What the inertial unit says on a level straight drive, shaken as on a vehicle; the same for the same instant."""
+    shaken = random.Random(utime).gauss
+    rate = (shaken(0.0, 0.02), shaken(0.0, 0.02), shaken(0.0, 0.02))
+    force = (shaken(0.0, 0.3), shaken(0.0, 0.3), 9.80665 + shaken(0.0, 0.3))
+    return ImuSample(SensorHeader(utime, source), rate, force)
 
 
 def drive(seconds: float, start_utime: int = START, imu_hz: float = 50.0, gps_hz: float = 10.0) -> Iterator[Fix]:

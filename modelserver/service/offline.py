@@ -16,6 +16,7 @@ from modelserver import core
 from modelserver.core import CoreState, Instant
 from modelserver.errors import NoPoseError, TooNewError, TooOldError, WireError
 from modelserver.geometry import names
+from modelserver.localization.interface import Localizer
 from modelserver.messages import NAN, Decision, Event, Policy, PublishDecisions, Rejected, TimeQuery
 from modelserver.service.daemon import Vehicle
 from modelserver.service.heard import Heard
@@ -57,12 +58,14 @@ class Run:
     vehicle file does not name, `rejected` what was not used, by channel or source and reason. `position` is where
     the log has been read to, in bytes. `on_decision` is told what became of each measurement, in the order in which it
     was settled, whatever the vehicle file says of broadcasting it; what the log's end leaves open is not told.
+    `on_taken` is shown each sample that could be read, and what was known right after it.
     """
 
     vehicle: Vehicle
     log: Iterable[LogEvent]
     frame: str
     on_decision: Callable[[Decision], object] | None = None
+    on_taken: Callable[[Event, Localizer], object] | None = None
     events: int = 0
     samples: int = 0
     unheard: set[str] = field(default_factory=set)
@@ -124,6 +127,13 @@ class Run:
                     for decision in output.decisions:
                         self.on_decision(decision)
         self.rejected = self._state.rejected
+        if self.on_taken is not None and self._state.localizer is not None:
+            self.on_taken(sample, self._state.localizer)
+
+    @property
+    def localizer(self) -> Localizer | None:
+        """What is known after the events read so far; None before the first."""
+        return None if self._state is None else self._state.localizer
 
     def _row(self, utime: int) -> Row:
         assert self._state is not None

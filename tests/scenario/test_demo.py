@@ -45,7 +45,7 @@ def still_running(url: str) -> list[str]:
 
 
 def test_given_nothing_else_when_the_demo_runs_then_it_shows_a_valid_pose_and_ends_by_itself():
-    process = start("--seconds", "5")
+    process = start("--seconds", "7")
     try:
         out, err = process.communicate(timeout=60)
     finally:

@@ -169,7 +169,7 @@ def test_given_a_time_to_come_and_a_wait_then_the_reply_comes_with_the_sample(st
         daemon.health(lambda health: health.requests_parked == 1)
         daemon.publish("IMU", encode(imu(at)))
         assert waiting.result(PATIENCE_S).utime == at
-    assert daemon.health().requests_parked == 0
+    assert daemon.health(lambda health: health.requests_parked == 0)
 
 
 # --- the client: no server, many clients --------------------------------------------------------------------

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
+import importlib.util
 import random
 import re
 from contextlib import suppress
 from pathlib import Path
+from types import ModuleType
 from typing import get_args, get_type_hints
 
 import pytest
@@ -14,14 +17,15 @@ from support_samples import VEHICLE, write_vehicle
 
 from modelserver.config import (
     AidingConfig,
+    GpsConfig,
     LocalizationConfig,
-    SensorConfig,
     VehicleConfig,
     load_config,
     parse_config,
 )
 from modelserver.config_reader import MAX_BYTES
 from modelserver.errors import ConfigError, Problem, Severity
+from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.raw.settings import RawSettings
 from modelserver.localization.settings import FixSettings
 from modelserver.messages import Mode
@@ -87,7 +91,7 @@ variables: {MRN: K11}
 lcm: {url: "memq://", channel_prefix: V1_, reply_prefix: ANSWER_}
 publish: {mode: event, rate_hz: 10, health_hz: 2.5, state_hz: 0, decisions: false}
 sensors:
-  gps: {channel: gps/front, frame: A:G, latency: 0.12}
+  gps: {channel: gps/front, frame: A:G, second_frame: A:H, latency: 0.12}
   imu: {channel: IMU.1, frame: A:I, latency: 5}
   wheels: {channel: W, frames: {left: A:L}, kinematics: skid_steer, latency: 0.05}
   aiding:
@@ -110,7 +114,7 @@ limits: {history_s: 10, parked_requests: 0, wait_ms: 0, queued_requests: 1, requ
     assert config.sensors.wheels.frames == {"left": "A:L"}
     wheels, aiding = config.sensors.wheels, config.sensors.aiding
     assert (wheels.kinematics, wheels.latency) == ("skid_steer", 0.05)
-    assert config.sensors.gps == SensorConfig("gps/front", "A:G", 0.12)
+    assert config.sensors.gps == GpsConfig("gps/front", "A:G", 0.12, "A:H")
     assert aiding == {
         "visual odometry": AidingConfig("VO", "relative_pose", 0.1),
         "map": AidingConfig("MAP", "absolute_pose"),
@@ -170,6 +174,12 @@ def test_given_a_missing_key_then_it_is_named(missing: str) -> None:
         ("sensors:\n  gsp: {channel: GPS, frame: A:B}\n", "sensors.gsp", 5, "gps"),
         ("sensors:\n  gps:\n    channel: G\n    frame: A:B\n    fram: A:B\n", "sensors.gps.fram", 8, "frame"),
         ("sensors:\n  wheels:\n    chanel: W\n", "sensors.wheels.chanel", 6, "channel"),
+        (
+            "sensors:\n  gps:\n    channel: G\n    frame: A:B\n    second_fram: A:C\n",
+            "sensors.gps.second_fram",
+            8,
+            "second_frame",
+        ),
         ("origin:\n  kept: true\n", "origin.kept", 5, "keep"),
         ("localization:\n  raw:\n    gps_timeot: 3\n", "localization.raw.gps_timeot", 6, "gps_timeout"),
         ("localization:\n  mode_chanel: M\n", "localization.mode_chanel", 5, "mode_channel"),
@@ -421,3 +431,23 @@ def test_given_the_page_on_localization_then_it_names_every_setting() -> None:
     page = (Path(__file__).parents[2] / "docs" / "localization.md").read_text(encoding="utf-8")
     for each in dataclasses.fields(RawSettings):
         assert f"`{each.name}`" in page
+
+
+def settings_page() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("settings_page", ROOT / "tools" / "settings_page.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_given_the_page_on_the_filters_settings_then_it_is_what_they_say_themselves() -> None:
+    assert settings_page().PAGE.read_text(encoding="utf-8") == settings_page().page(), "run tools/settings_page.py"
+
+
+def test_given_the_filters_settings_then_their_page_names_each_with_its_default() -> None:
+    rows = [line.split(" | ") for line in settings_page().page().splitlines() if line.startswith("| `")]
+    named = {row[0].strip("| `"): ast.literal_eval(row[1].capitalize()) for row in rows}
+    assert named == {each.name: each.default for each in dataclasses.fields(FilterSettings)}
+    assert all(len(row) == 3 and len(row[2]) > 20 for row in rows)

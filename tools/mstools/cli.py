@@ -26,6 +26,7 @@ COMMANDS = {
     "frames": "List the frames of a body.",
     "replay": "Feed a recorded log to the bus, or straight through the localization.",
     "mode": "Tell the running daemon which sources its localization is to use.",
+    "tune": "Propose noise settings of the filter from a log, by fixes that were withheld.",
     "calibrate": "Find an inertial unit's noise, or the iron around its magnetometer, from a log.",
     "import-bag": "Turn a ROS bag into an LCM log of this project's types.",
     "spy": "Watch the channels with lcm-spy, decoded.",

@@ -39,7 +39,7 @@ class DemoError(ModelServerError):
 
 def command(
     seconds: Annotated[
-        float, typer.Option("--seconds", metavar="S", min=5.0, max=600.0, help="How long to drive.")
+        float, typer.Option("--seconds", metavar="S", min=7.0, max=600.0, help="How long to drive.")
     ] = 10.0,
     verbose: Annotated[bool, typer.Option("--verbose", help="Show the daemon's log.")] = False,
 ) -> None:
@@ -244,7 +244,7 @@ def poses(url: str, channel: str, start_utime: int, seconds: float, children: Ch
 def row(pose: PoseAnswer, since: float, truth: Pose, truth_origin: tuple[float, float, float]) -> str:
     """Return a line of the table: a pose, how far it is off the truth, and the bound it states."""
     found = pose.transformation
-    if pose.origin is None:
+    if pose.origin is None or not math.isfinite(pose.horizontal_bound):
         return f"{since:7.2f} s  {'-':>11} {'-':>12} {'-':>8} {'-':>7}   {'':16} {'':16} {why_not(pose)}"
     place = [a + b for a, b in zip(found.pose.xyz, pose.origin.initial_utm, strict=True)]
     real = [a + b for a, b in zip(truth.xyz, truth_origin, strict=True)]

@@ -22,18 +22,21 @@ from modelserver.wire.provider import open_lcm, resolve_url
 SUFFIELD = (50.27, -111.18, 700.0)
 """Where the report's vehicle was tried, roughly: latitude and longitude in degrees, height in metres."""
 
+STAND_SECONDS = 3.0
+"""Levelling takes two seconds at rest, and a moment until rest is seen."""
+
 LAP_SECONDS = 25.0
 """An eight takes a little longer."""
 
 
 def simulation(config: VehicleConfig, start_utime: int, seconds: float, seed: int) -> Simulation:
-    """Return the drive: two seconds at rest, then round an eight for `seconds` or more."""
+    """Return the drive: at rest until the localization is level, then round an eight for `seconds` or more."""
     laps = math.ceil(seconds / LAP_SECONDS)
     sensors = config.sensors
     return Simulation(
         load_model(config.geometry, variables=config.variables),
         config.base_frame,
-        Trajectory(figure_eight(speed=3.0, radius=6.0, stand=2.0, ramp=2.0, laps=laps), yaw=0.5),
+        Trajectory(figure_eight(speed=3.0, radius=6.0, stand=STAND_SECONDS, ramp=2.0, laps=laps), yaw=0.5),
         origin_at(*SUFFIELD),
         gps_frame=sensors.gps.frame if sensors.gps else None,
         imu_frame=sensors.imu.frame if sensors.imu else None,

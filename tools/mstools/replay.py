@@ -6,11 +6,11 @@ import json
 import math
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Annotated, TextIO
+from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
@@ -21,6 +21,10 @@ from modelserver.wire.kinds import is_of_service
 from mstools.asking import JsonOption, UrlOption
 from mstools.output import written_whole
 from mstools.progress import progress
+
+if TYPE_CHECKING:
+    from modelserver.service.offline import Run
+    from mstools.report_data import Collector
 
 TIMES_LIMIT = 64 << 20
 """Largest file of times, bytes."""
@@ -34,7 +38,10 @@ def command(
     ] = "",
     decisions: Annotated[
         str,
-        typer.Option(metavar="JSONL", help="With --poses: write what became of each measurement here, a JSON a line."),
+        typer.Option(metavar="JSONL", help="Offline: write what became of each measurement here, a JSON a line."),
+    ] = "",
+    report: Annotated[
+        str, typer.Option(metavar="HTML", help="Work offline, and draw what became of everything, for a browser.")
     ] = "",
     frame: Annotated[
         str, typer.Option(metavar="BODY:FRAME", help="Frame whose pose is written. Default: the base frame.")
@@ -65,28 +72,34 @@ def command(
     has said (poses, health, replies) is left out, unless --all or --channel asks for it. Offline, with
     --poses, the daemon's core takes them as fast as it can, and the pose of one frame in World:UTM is written for
     even or listed times, each from nothing but what had arrived before it; docs/recordings.md says exactly what that
-    means. A log that breaks off in its last event is used up to there; for other damage the exit code is 1.
+    means. --report draws the same run: track, innovations, biases, gaps, validity, and what looks wrong.
+    A log that breaks off in its last event is used up to there; for other damage the exit code is 1.
 
     \b
     Examples:
       modelserver replay drive.lcm --restamp
       modelserver replay drive.lcm --speed 2
       modelserver replay drive.lcm -c config/husky/vehicle.yaml --poses poses.csv --frame Antenna:PhaseCentre --rate 10
+      modelserver replay drive.lcm -c config/husky/vehicle.yaml --report drive.html
     """
     channels = frozenset(channel or ())
-    if poses:
+    if poses or report:
         if config is None:
-            raise typer.BadParameter("--poses needs the vehicle: -c FILE")
+            raise typer.BadParameter(f"{'--poses' if poses else '--report'} needs the vehicle: -c FILE")
         if not (math.isfinite(rate) and 0.0 < rate <= 10_000.0):
             raise typer.BadParameter(f"a rate is above 0 and at most 10000 Hz, got {rate:g}")
         if speed != "1" or restamp or url or everything:
-            raise typer.BadParameter("--speed, --restamp, --all and --url are for the bus; --poses works offline")
-        if poses == decisions == "-":
-            raise typer.BadParameter("only one of --poses and --decisions can go to standard output")
-        offline(log, config, poses, decisions, frame, rate, at_times, channels, as_json)
+            raise typer.BadParameter(
+                "--speed, --restamp, --all and --url are for the bus; --poses and --report work offline"
+            )
+        if not poses and (frame or at_times is not None):
+            raise typer.BadParameter("--frame and --at-times go with --poses CSV")
+        if (poses, decisions, report).count("-") > 1:
+            raise typer.BadParameter("only one of --poses, --decisions and --report can go to standard output")
+        offline(log, config, poses, decisions, report, frame, rate, at_times, channels, as_json)
     else:
         if frame or decisions or at_times is not None:
-            raise typer.BadParameter("--frame, --decisions and --at-times go with --poses CSV")
+            raise typer.BadParameter("--frame and --at-times go with --poses CSV, --decisions with that or --report")
         factor = _speed(speed)
         if restamp and factor != 1.0:
             raise typer.BadParameter("--restamp goes with --speed 1: stamps must not run faster than the clock")
@@ -143,13 +156,14 @@ def offline(
     config: Path,
     poses: str,
     decisions: str,
+    report: str,
     frame: str,
     rate: float,
     at_times: Path | None,
     channels: frozenset[str],
     as_json: bool,
 ) -> None:
-    """Write the poses of a frame from a log."""
+    """Write the poses of a frame, the decisions and the report of a log; each where it is named."""
     # one thread works: those of the linear algebra would only cost time
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -163,51 +177,101 @@ def offline(
     times = None if at_times is None else read_times(at_times)
     geometry = Path(vehicle.config.geometry)
     inputs = [log, config, geometry, *([] if at_times is None else [at_times])]
-    _check_output(poses, inputs)
-    if decisions:
-        _check_output(decisions, inputs)
-        if decisions != "-" and os.path.realpath(decisions) == os.path.realpath(poses):
-            raise RecordingError(f"{decisions}: the poses go there; name another file for the decisions")
+    taken: dict[str, str] = {}
+    for target, what in ((poses, "poses"), (decisions, "decisions"), (report, "report")):
+        if target:
+            _check_output(target, inputs)
+            place = os.path.realpath(target)
+            if target != "-" and place in taken:
+                raise RecordingError(f"{target}: the {taken[place]} go there; name another file for the {what}")
+            taken[place] = what
+    if not poses:
+        times = []
     with LogFile(log) as recording:
         run = Run(vehicle, _only(recording, channels), frame or vehicle.config.base_frame)
+        collector = None
+        if report:
+            from mstools.report_data import Collector
+
+            collector = Collector(vehicle)
+            run.on_taken = collector.on_taken
         started = time.monotonic()
         written = valid = 0
         with (
-            _output(poses) as out,
+            _output(poses) if poses else nullcontext() as out,
             _output(decisions) if decisions else nullcontext() as ledger,
             progress(f"replaying {log.name}", recording.size) as show,
         ):
+            listeners: list[Callable[[Decision], object]] = []
             if ledger is not None:
-                run.on_decision = partial(_write_decision, ledger)
-            out.write(CSV_HEADER + "\n")
+                listeners.append(partial(_write_decision, ledger))
+            if collector is not None:
+                listeners.append(collector.on_decision)
+            run.log = _shown(run.log, show)
+            if listeners:
+                run.on_decision = partial(_tell, listeners)
+            if out is not None:
+                out.write(CSV_HEADER + "\n")
             for row in run.rows(times, rate):
-                out.write(row.csv() + "\n")
+                if out is not None:
+                    out.write(row.csv() + "\n")
                 written += 1
                 valid += row.valid
-                if written % 256 == 0:
-                    show(run.position)
         wall = time.monotonic() - started
-        span = (run.last_utime - run.first_utime) * 1e-6
-        report = {
-            "poses": written,
-            "valid": valid,
-            "events": run.events,
-            "samples": run.samples,
-            "seconds": span,
-            "wall_seconds": wall,
-            "real_time_factor": span / wall if wall > 0 else math.nan,
-            "rejected": [{"source": s, "reason": r, "count": n} for (s, r), n in sorted(run.rejected.items())],
-        }
-        lines = [
-            f"{written} poses of {run.frame}, {valid} valid, from {run.samples} of {run.events} messages; "
-            f"{span:.1f} s in {wall:.2f} s: {report['real_time_factor']:.0f} times real time"
-        ]
-        lines += [f"  not used: {n} of {s}, {r}" for (s, r), n in sorted(run.rejected.items())]
-        typer.echo(json.dumps(report) if as_json else "\n".join(lines), err="-" in (poses, decisions))
+        on_stderr = "-" in (poses, decisions, report)
+        _print_counts(run, written, valid, wall, bool(poses), as_json, on_stderr)
         if not run.samples:
             heard = _listed(vehicle.sensor_channels())
             raise RecordingError(f"{log}: nothing on the vehicle's channels ({heard}); it has: {_listed(run.unheard)}")
+        if collector is not None:
+            _write_report(collector, run, log, report, quiet=as_json)
         _report_damage(recording)
+
+
+def _shown(events: Iterable[LogEvent], show: Callable[[float], object]) -> Iterator[LogEvent]:
+    """Yield events, and show now and then how far they have come."""
+    for number, event in enumerate(events):
+        if number % 1024 == 0:
+            show(event.end)
+        yield event
+
+
+def _tell(listeners: Iterable[Callable[[Decision], object]], decision: Decision) -> None:
+    for each in listeners:
+        each(decision)
+
+
+def _print_counts(run: Run, written: int, valid: int, wall: float, poses: bool, as_json: bool, on_stderr: bool) -> None:
+    span = (run.last_utime - run.first_utime) * 1e-6
+    counts = {
+        "poses": written,
+        "valid": valid,
+        "events": run.events,
+        "samples": run.samples,
+        "seconds": span,
+        "wall_seconds": wall,
+        "real_time_factor": span / wall if wall > 0 else math.nan,
+        "rejected": [{"source": s, "reason": r, "count": n} for (s, r), n in sorted(run.rejected.items())],
+    }
+    told = f"{written} poses of {run.frame}, {valid} valid, from " if poses else ""
+    lines = [
+        f"{told}{run.samples} of {run.events} messages; "
+        f"{span:.1f} s in {wall:.2f} s: {counts['real_time_factor']:.0f} times real time"
+    ]
+    lines += [f"  not used: {n} of {s}, {r}" for (s, r), n in sorted(run.rejected.items())]
+    typer.echo(json.dumps(counts) if as_json else "\n".join(lines), err=on_stderr)
+
+
+def _write_report(collector: Collector, run: Run, log: Path, report: str, quiet: bool) -> None:
+    """Write the page, and print the headlines of what it found."""
+    from mstools import replay_report
+    from mstools.report_findings import findings
+
+    replayed = collector.replayed(log.name, run.first_utime, run.last_utime, run.rejected)
+    with _output(report) as out:
+        out.write(replay_report.page(replayed))
+    if not quiet:
+        typer.echo("\n".join(replay_report.summary(findings(replayed), report)), err=report == "-")
 
 
 def read_times(path: Path) -> list[int]:

@@ -19,9 +19,9 @@ from modelserver.localization.filter.measurements.base import wrapped
 from modelserver.localization.filter.measurements.gps import GpsBaseline, GpsPosition, baseline_sigma
 from modelserver.localization.filter.measurements.orientation import Yaw, yaw_told
 from modelserver.localization.filter.measurements.wheels import WheelSpeed, standing_wheels, turn_rate
-from modelserver.localization.filter.nav import ZERO
+from modelserver.localization.filter.nav import ZERO, Nav
 from modelserver.localization.filter.setup import Setup
-from modelserver.localization.filter.state import FilterState, Frozen, Last
+from modelserver.localization.filter.state import FilterState, Last, Said
 from modelserver.messages import (
     AbsolutePoseSample,
     Decision,
@@ -50,6 +50,9 @@ CONSTRAINT_PERIOD = 0.1
 
 REST_PERIOD = 0.2
 """Seconds between two uses of standing."""
+
+UNKNOWN_SPEED = 2.0
+"""Sigma of the horizontal speed, m/s, from which on nothing is known of it: that of a walk."""
 
 INERTIAL = "inertial"
 
@@ -123,12 +126,17 @@ def _inertial(setup: Setup, state: FilterState, item: Item) -> Fused:
     if isinstance(found, str):
         return state, (_refused(item, found),)
     rate, force = found
-    frozen = state.frozen
-    if frozen is not None and frozen.rate == rate and frozen.force == force:
-        if (item.utime - frozen.since) * 1e-6 > setup.settings.frozen_time:
-            return state, (_refused(item, "frozen"),)
-    else:
-        state = state._replace(frozen=Frozen(rate, force, item.utime))
+    said = Said(item.utime, rate, force, item.utime)
+    if state.said is not None:
+        said = state.said.followed(item.utime, rate, force)
+    state = state._replace(said=said)
+    if (item.utime - said.since) * 1e-6 > setup.settings.frozen_time:
+        return state, (_refused(item, "frozen"),)
+    decisions = _NOTHING
+    if said.made_up != state.guessed:
+        state = motion.caught_up(setup, state)._replace(guessed=said.made_up)
+        if said.made_up:
+            decisions = (_refused(item, "made_up")._replace(verdict=Verdict.MONITORED),)
     nav = state.nav
     bias = ZERO if nav is None else nav.gyro_bias
     sigma = setup.settings.gyro_bias_sigma
@@ -144,7 +152,8 @@ def _inertial(setup: Setup, state: FilterState, item: Item) -> Fused:
         return state, _NOTHING
     gap = (item.utime - state.imu_utime) * 1e-6 > setup.settings.rate_hold and state.imu_utime > 0
     state = motion.felt(setup, state, item.utime, rate, force)
-    decisions = (_refused(item, "gap")._replace(verdict=Verdict.MONITORED),) if gap else _NOTHING
+    if gap:
+        decisions += (_refused(item, "gap")._replace(verdict=Verdict.MONITORED),)
     state, more = _constrained(setup, state, item.utime)
     return state, decisions + more if more else decisions
 
@@ -259,6 +268,12 @@ def _wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
     if isinstance(compared, str):
         decisions = (_refused(item, compared),) if compared else _NOTHING
     else:
+        if _speed_unknown(scene.nav):
+            # the way wheels err is a share of speed: compared at the speed that they tell, not at 0
+            rolling = updates.moving(scene.nav, compared, setup.rig.base, min(age, settings.wheel_period))
+            again = measurement.compare(scene._replace(nav=rolling), sample)
+            if not isinstance(again, str):
+                scene, compared = scene._replace(nav=rolling), again
         nav, decision = updates.used(scene.nav, compared, settings, item.utime, item.source, item.seq, item.kind)
         gyro = motion.inertial(setup, state.mode) and (item.utime - state.imu_utime) * 1e-6 <= settings.rate_hold
         rate = 0.0 if gyro else turn_rate(sample, before, measurement, settings)
@@ -274,6 +289,11 @@ def _wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
         state, more = _rolled(setup, state, item.utime)
         decisions += more
     return state, decisions
+
+
+def _speed_unknown(nav: Nav) -> bool:
+    P = nav.covariance
+    return float(P[3, 3] + P[4, 4]) > UNKNOWN_SPEED**2
 
 
 def _begun_level(setup: Setup, state: FilterState, utime: int) -> FilterState:

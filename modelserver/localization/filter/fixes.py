@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from modelserver.geodesy import GeodesyError, LocalFrame, ecef_from_geodetic, geodetic_from_ecef
+from modelserver.geodesy import GeodesyError, LocalFrame, ecef_from_geodetic, geodetic_from_ecef, origin_at
 from modelserver.localization import gate
 from modelserver.localization.filter import alignment, placing, updates
 from modelserver.localization.filter.alignment import Fit, Passed, horizontal
@@ -55,6 +55,9 @@ def captured(setup: Setup, state: FilterState, fix: GoodFix, utime: int) -> Filt
     ecef = ecef_from_geodetic(fix.latitude_deg, fix.longitude_deg, height)
     capture, origin = state.capture.take(utime, ecef, fix.sigma, setup.settings)
     state = state._replace(capture=capture)
+    if origin is None and state.confirmed >= setup.settings.origin_fixes and state.phase is Phase.ALIGNED:
+        # fixes that agree with how the vehicle moved are as good as fixes along a straight line
+        origin = origin_at(fix.latitude_deg, fix.longitude_deg, height)
     if origin is None:
         return state
     due = utime + round(setup.settings.horizon * 1e6)
@@ -246,8 +249,8 @@ def put(
     assert nav is not None
     utime = nav.utime
     after, decision = updates.used(nav, compared, settings, utime, source, seq, "gps_position")
-    within = decision.statistic <= decision.limit
-    if not within and steady and not state.refused_count:
+    within = decision.statistic <= decision.limit or decision.verdict is Verdict.USED
+    if not decision.statistic <= decision.limit and steady and not state.refused_count:
         # it drifted here, fix by fix, and did not jump: it is let wander as fast as it does
         excess = decision.statistic / decision.dof
         wide = widened(setup, nav, 1.0 + excess * settings.gps_wander_time / 2.0 * 0.01, 1.0)
@@ -282,7 +285,14 @@ def _confirmed(state: FilterState, utime: int) -> FilterState:
     pending = state.pending
     if pending:
         pending = tuple(each for each in pending if not each.take_up)
-    return state._replace(fix_utime=utime, refused=(), refused_since=0, refused_count=0, pending=pending)
+    return state._replace(
+        fix_utime=utime,
+        confirmed=min(state.confirmed + 1, 1000),
+        refused=(),
+        refused_since=0,
+        refused_count=0,
+        pending=pending,
+    )
 
 
 def allowed(state: FilterState, before: Nav, compared: Compared, decision: Decision) -> FilterState:

@@ -26,7 +26,12 @@ def noise(setup: Setup, state: FilterState, nav: Nav) -> Noise:
         return setup.standing if state.standing else setup.rolling if fresh else setup.coasting
     if (nav.utime - state.imu_utime) * 1e-6 > setup.settings.rate_hold:
         return setup.coasting
-    return setup.standing if state.standing else setup.driving
+    return felt_noise(setup, state)
+
+
+def felt_noise(setup: Setup, state: FilterState) -> Noise:
+    """Return what drives the errors while the inertial unit tells."""
+    return setup.standing if state.standing else setup.guessing if state.guessed else setup.driving
 
 
 def felt(setup: Setup, state: FilterState, utime: int, rate: Vector3, force: Vector3) -> FilterState:
@@ -50,7 +55,7 @@ def felt(setup: Setup, state: FilterState, utime: int, rate: Vector3, force: Vec
         else:
             nav = strapdown.carried(nav, utime, rate, force, state.earth, setup.rig.base)
         if nav.lag >= strapdown.COVARIANCE_STEP:
-            nav = strapdown.caught_up(nav, setup.standing if state.standing else setup.driving, setup.layout)
+            nav = strapdown.caught_up(nav, felt_noise(setup, state), setup.layout)
     return _moved(state, nav)._replace(imu_utime=utime)
 
 
@@ -78,7 +83,7 @@ def predicted(setup: Setup, state: FilterState, utime: int) -> Nav:
             nav = nav._replace(rate=felt_rate)
             if until == utime:
                 return nav
-            nav = strapdown.caught_up(nav, setup.standing if state.standing else setup.driving, setup.layout)
+            nav = strapdown.caught_up(nav, felt_noise(setup, state), setup.layout)
         turn = (0.0, 0.0, 0.0 if state.standing else _wheels_rate(state, nav))
         return strapdown.coasted(nav, utime, turn, base)
     turn = (0.0, 0.0, 0.0 if state.standing else _wheels_rate(state, nav))

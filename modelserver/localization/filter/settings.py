@@ -114,6 +114,9 @@ class FilterSettings(FixSettings):
     noise is the smallest part of the range error budget (Kaplan and Hegarty, Understanding GPS, error budgets)."""
     gps_wander_time: float = 60.0
     """Correlation time of the rest, seconds: multipath of a slow antenna lasts minutes (Kaplan and Hegarty)."""
+    gps_latency_sigma: float = 0.05
+    """Sigma of how late a fix's place is, seconds, beyond what is configured: receivers compute for 20 to 150 ms and
+    stamp as they please (P. Groves 2013, 10.3). It is estimated: at 20 m/s 80 ms are worse than all else."""
     gps_sigma_floor: float = 0.02
     """A fix is never taken to be surer than this, metres: RTK, 2 cm (OEM4 data sheet)."""
     restless_time: float = 5.0

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 
 from modelserver.localization.filter.layout import Layout
 from modelserver.localization.filter.measurements import REGISTRY, Measurement
-from modelserver.localization.filter.measurements.gps import wander
+from modelserver.localization.filter.measurements.gps import gps_states
 from modelserver.localization.filter.measurements.wheels import WheelSpeed, wheel_states
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.filter.strapdown import Noise
@@ -31,7 +31,7 @@ class Setup:
         made = [kind.of(rig, settings) for kind in (tuple(kinds) or REGISTRY.values())]
         present = [each for each in made if each is not None]
         self.wheels = next((each for each in present if isinstance(each, WheelSpeed)), None)
-        extras = [wander(settings)]
+        extras = [*gps_states(settings)] if rig.gps_frame else [gps_states(settings)[0]]
         if self.wheels is not None:
             extras += wheel_states(settings)
         extras += [state for each in present for state in each.states]
@@ -49,6 +49,8 @@ class Setup:
         self.standing = Noise(ROCKING**2, s.accelerometer_noise**2, *biases)
         # what nobody measures lasts about a second each way
         self.coasting = Noise(s.gap_rate_sigma**2, s.gap_acceleration**2, *biases)
+        # numbers that someone filled a gap with go from the one end to the other: a third of what could be
+        self.guessing = Noise((s.gap_rate_sigma / 3.0) ** 2, s.gap_acceleration**2, *biases)
         self.rolling = Noise(s.wheel_rate_sigma**2 * s.slip_time, s.gap_acceleration**2, *biases)
 
     @property

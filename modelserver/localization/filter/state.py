@@ -15,6 +15,12 @@ from modelserver.localization.origin import Capture
 from modelserver.messages import Mode, Origin, Phase
 from modelserver.spatial.so3 import Vector3
 
+LINE = 3e-4
+"""How near, as a share, two changes must be to lie on one line: stamps of whole microseconds, 100 times a second."""
+
+MADE_UP = 3
+"""Samples in a row along one line, in all six numbers, that cannot be chance."""
+
 
 class Last(NamedTuple):
     """The last measurement of a kind from a source that was compared: its instant, and its sample."""
@@ -23,12 +29,39 @@ class Last(NamedTuple):
     sample: Any
 
 
-class Frozen(NamedTuple):
-    """What an inertial unit said last, and since when it says nothing else."""
+class Said(NamedTuple):
+    """What an inertial unit said last, at `utime`: is it alive?
 
+    `since` is from when on it says nothing else. `slope` is the change a second of its six numbers, and `even` how many
+    samples in a row have gone on along exactly that line.
+    """
+
+    utime: int
     rate: Vector3
     force: Vector3
     since: int
+    slope: tuple[float, ...] = ()
+    even: int = 0
+
+    def followed(self, utime: int, rate: Vector3, force: Vector3) -> Said:
+        """Return what it said with one sample more."""
+        dt = (utime - self.utime) * 1e-6
+        if dt <= 0.0:
+            return self
+        if rate == self.rate and force == self.force:
+            return self._replace(utime=utime, slope=(), even=0)
+        (a, b, c), (d, e, f) = self.rate, self.force
+        (g, h, i), (j, k, m) = rate, force
+        slope = ((g - a) / dt, (h - b) / dt, (i - c) / dt, (j - d) / dt, (k - e) / dt, (m - f) / dt)
+        on_line = bool(self.slope) and all(
+            abs(x - y) <= LINE * (0.3 + abs(x) + abs(y)) for x, y in zip(slope, self.slope, strict=True)
+        )
+        return Said(utime, rate, force, utime, slope, self.even + 1 if on_line else 0)
+
+    @property
+    def made_up(self) -> bool:
+        """Whether the numbers go along a line as no sensor's noise lets them: someone filled a gap with them."""
+        return self.even >= MADE_UP
 
 
 class Pending(NamedTuple):
@@ -43,14 +76,15 @@ class FilterState(NamedTuple):
     """Nominal state, covariance, and everything that decisions rest on. Make the first with the engine's `first`.
 
     `nav` is None while levelling. `site` is the tangent plane that N is east, north, up of once `phase` is ALIGNED.
-    `imu_utime` is the last inertial sample used, `began` the first; `wheels_utime` the last wheels used. `passed`
-    are fixes beside the way, for heading; `unit` the way at speed 1 so far (s). `refused` are the fixes refused in
-    a row, `refused_since` the first of them; `fix_utime` the last fix that was used or confirmed. `moved` is until
-    when fixes say that the vehicle moves. `restless` is by how much faster than the settings say what lingers in
-    fixes wanders. `shown` is how far the pose goes with what lingers in fixes, metres along N, whose sigma is
-    `lingering`. `allowance` is what one outlier just within its gate may have moved the position by, metres, at
-    `allowance_utime`. `biases` are the gyros' with their sigma, kept where the rest begins anew. `tilt` is how far
-    gravity is off the geometry's up at start-up, where that is too far.
+    `imu_utime` is the last inertial sample used, `began` the first; `said` what the unit said, and `guessed`
+    whether that was made up; `wheels_utime` the last wheels used. `passed` are fixes beside the way, for heading;
+    `unit` the way at speed 1 so far (s). `refused` are the fixes refused in a row, `refused_since` the first of
+    them; `confirmed` counts the fixes that were used, and `fix_utime` is the last that was used or confirmed.
+    `moved` is until when fixes say that the vehicle moves. `restless` is by how much faster than the settings say
+    what lingers in fixes wanders. `shown` is how far the pose goes with what lingers in fixes, metres along N,
+    whose sigma is `lingering`. `allowance` is what one outlier just within its gate may have moved the position by,
+    metres, at `allowance_utime`. `biases` are the gyros' with their sigma, kept where the rest begins anew. `tilt`
+    is how far gravity is off the geometry's up at start-up, where that is too far.
     """
 
     nav: Nav | None = None
@@ -65,7 +99,8 @@ class FilterState(NamedTuple):
     standing: bool = False
     began: int = 0
     imu_utime: int = 0
-    frozen: Frozen | None = None
+    said: Said | None = None
+    guessed: bool = False
     wheels_utime: int = 0
     wheels_rate: float = 0.0
     last: Mapping[tuple[str, str], Last] = MappingProxyType({})
@@ -77,6 +112,7 @@ class FilterState(NamedTuple):
     refused_since: int = 0
     refused_count: int = 0
     fix_utime: int = 0
+    confirmed: int = 0
     moved: int = 0
     fixed: Passed | None = None
     restless: float = 1.0

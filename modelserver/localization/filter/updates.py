@@ -11,13 +11,14 @@ from modelserver.localization.filter.measurements.base import Compared
 from modelserver.localization.filter.nav import Nav
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.messages import Decision, Verdict
+from modelserver.spatial.so3 import Vector3
 
 
 def used(
     nav: Nav, compared: Compared, settings: FilterSettings, utime: int, source: str, seq: int, kind: str
 ) -> tuple[Nav, Decision]:
     """Return the state with a comparison put into it, or as it was where the gate refuses; and what became of it."""
-    residual, H, R, monitored, separable = compared
+    residual, H, R, monitored, separable, eased = compared
     if not (np.isfinite(residual).all() and np.isfinite(H).all() and np.isfinite(R).all()):
         return nav, Decision(utime, source, seq, kind, Verdict.REJECTED, "nan")
     S = kalman.innovation(nav.covariance, H, R)
@@ -29,6 +30,11 @@ def used(
         verdict, reason = Verdict.MONITORED, monitored
     elif not statistic <= limit:
         verdict, reason = Verdict.REJECTED, "gate"
+        if statistic <= eased * limit:
+            # S' = S statistic / limit: the statistic becomes its limit
+            verdict, reason = Verdict.USED, "eased"
+            R = R + (statistic / limit - 1.0) * S
+            separable = False
         if separable and len(residual) > 1:
             single = kalman.gate_limit(1, settings.gate_risk)
             fits = residual * residual <= single * np.diagonal(S)
@@ -59,6 +65,28 @@ def used(
     except np.linalg.LinAlgError:
         return nav, decision._replace(verdict=Verdict.REJECTED, reason="singular")
     return nav.injected(error, P), decision
+
+
+def moving(nav: Nav, compared: Compared, base: Vector3, seconds: float) -> Nav:
+    """Return a state of unknown speed at the speed that a comparison tells, all else and the covariance as they were.
+
+    Jacobians that grow with speed are those of the true one then. `seconds` is how long the way since the last wheel
+    sample took: it was rolled at that speed too.
+    """
+    residual, H, R = compared.residual, compared.jacobian, compared.noise
+    try:
+        error, _ = kalman.corrected(nav.covariance, residual, H, R)
+    except np.linalg.LinAlgError:
+        return nav
+    x, y, z = error[3:6].tolist()
+    if not math.isfinite(x + y + z):
+        return nav
+    before = nav.body_velocity(base)
+    vx, vy, vz = nav.velocity
+    nav = nav._replace(velocity=(vx + x, vy + y, vz + z))
+    a, b, c = nav.rolled
+    dx, dy, dz = (seconds * (new - old) for new, old in zip(nav.body_velocity(base), before, strict=True))
+    return nav._replace(rolled=(a + dx, b + dy, c + dz))
 
 
 def refused(utime: int, source: str, seq: int, kind: str, reason: str) -> Decision:

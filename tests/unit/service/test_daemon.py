@@ -10,7 +10,10 @@ from support_samples import START as START_UTIME
 
 from modelserver.config import load_config
 from modelserver.errors import ConfigError, GeometryError, Problem
+from modelserver.localization.filter.localizer import FilterLocalizer
+from modelserver.localization.modes import ModeLocalizer
 from modelserver.localization.raw.localizer import RawLocalizer
+from modelserver.messages import Mode
 from modelserver.service.daemon import Vehicle, configured_origin, load_vehicle
 from modelserver.service.heard import Heard
 
@@ -99,7 +102,32 @@ def test_given_a_vehicle_then_its_core_starts_with_the_settings_of_its_file(tmp_
     assert (settings.base_frame, settings.vehicle, settings.publish) == ("Cart:Base", "cart", "event")
     assert (settings.health_period_ns, settings.history_s, settings.wait_ms) == (250_000_000, 7.0, 5)
     assert (settings.parked_requests, settings.reply_prefix) == (6, "ANSWER_")
-    assert isinstance(state.view.localizer, RawLocalizer)
+    assert isinstance(state.view.localizer, ModeLocalizer)
+    assert isinstance(state.view.localizer.active, FilterLocalizer)
+
+
+@pytest.mark.parametrize("mode", [mode for mode in Mode if mode is not Mode.RAW])
+def test_given_a_mode_of_the_filter_then_the_filter_starts_in_it(tmp_path: Path, mode: Mode) -> None:
+    text = f"{VEHICLE}localization: {{mode: {mode.name.lower()}}}\n"
+    localizer = vehicle(tmp_path, text).core(now_at(START_UTIME)).view.localizer
+    assert isinstance(localizer, ModeLocalizer)
+    assert isinstance(localizer.active, FilterLocalizer)
+    assert localizer.active.mode is mode
+
+
+def test_given_raw_mode_then_raw_mode_starts(tmp_path: Path) -> None:
+    localizer = vehicle(tmp_path, f"{VEHICLE}localization: {{mode: raw}}\n").core(now_at(START_UTIME)).view.localizer
+    assert isinstance(localizer, ModeLocalizer)
+    assert isinstance(localizer.active, RawLocalizer)
+
+
+def test_given_a_second_antenna_then_its_frame_is_checked_and_known(tmp_path: Path) -> None:
+    given = "frame: Cart:Antenna, second_frame: Cart:Mast"
+    rig = vehicle(tmp_path, VEHICLE.replace("frame: Cart:Antenna", given)).rig
+    assert rig is not None
+    assert rig.second_antenna_frame == "Cart:Mast"
+    (found,) = problems(tmp_path, VEHICLE.replace("frame: Cart:Antenna", given.replace("Mast", "Masd")))
+    assert (found.element, found.fix) == ("sensors.gps.second_frame", "write Cart:Mast")
 
 
 @pytest.mark.parametrize(
@@ -205,9 +233,22 @@ def test_given_event_mode_then_ticks_are_for_housekeeping_alone(tmp_path: Path) 
     assert (loaded.ticks_per_pose(), loaded.tick_hz()) == (1, 50.0)
 
 
-@pytest.mark.parametrize("left_out", ["gps", "imu"])
-def test_given_one_of_the_two_sensors_then_there_is_no_localizer(tmp_path: Path, left_out: str) -> None:
-    lines = [line for line in VEHICLE.splitlines(keepends=True) if not line.startswith(f"  {left_out}:")]
-    loaded = vehicle(tmp_path, "".join(lines))
+def without(*left_out: str) -> str:
+    return "".join(line for line in VEHICLE.splitlines(keepends=True) if not line.strip().startswith(left_out))
+
+
+@pytest.mark.parametrize("left_out", ["gps:", "imu:"])
+def test_given_one_of_the_two_sensors_then_the_filter_works_with_it_and_raw_mode_is_refused(
+    tmp_path: Path, left_out: str
+) -> None:
+    loaded = vehicle(tmp_path, without(left_out))
     assert loaded.mounts is None
+    assert isinstance(loaded.core(now_at(START_UTIME)).view.localizer, ModeLocalizer)
+    (found,) = problems(tmp_path, without(left_out) + "localization: {mode: raw}\n")
+    assert (found.element, found.fix) == ("localization.mode", "write mode: full")
+
+
+def test_given_no_sensor_then_there_is_no_localizer(tmp_path: Path) -> None:
+    loaded = vehicle(tmp_path, without("sensors:", "gps:", "imu:"))
+    assert (loaded.rig, loaded.mounts) == (None, None)
     assert loaded.core(now_at(START_UTIME)).view.localizer is None

@@ -62,6 +62,9 @@ class Counting:
             utime, pose, pose, pose, origin=ORIGIN, invalid=Invalid.NOT_MOVED_YET if self.taken < 2 else Invalid(0)
         )
 
+    def deferred(self, utime: int) -> Estimate:
+        return self.estimate(utime)
+
 
 def vehicle() -> Any:
     builder = ModelBuilder("test")

@@ -259,7 +259,7 @@ def test_given_a_vehicle_without_sensors_when_replayed_then_it_says_what_is_miss
     config.write_text(f"vehicle: V\ngeometry: {HUSKY.with_name('geometry.yaml')}\nbase_frame: Husky:Base\n")
     code, _, err = run(driven, "-c", config, "--poses", tmp_path / "p.csv")
     assert code == 1
-    assert "no GPS and IMU" in err
+    assert "names nothing under sensors to localize by" in err
 
 
 @pytest.mark.parametrize("content", [b"", os.urandom(100_000), b"<Model/>"])

@@ -19,7 +19,10 @@ from modelserver.spatial.so3 import Array, Vector3
 class Compared(NamedTuple):
     """A measurement against the state: `residual` (m) = measured - expected = `jacobian` (m, n) error + noise.
 
-    `noise` (m, m) is the noise's covariance. `monitored`: compared for the ledger only, not used on purpose, in a word.
+    `noise` (m, m) is the noise's covariance. `monitored`: compared for the ledger only, not used on purpose, in a
+    word. `separable`: where all together do not fit, those that do alone may be used. `eased`: a statistic up to so
+    many times its limit is used with its noise widened until it fits (Huber's way), instead of being refused: for
+    what errs by more than usual now and then, and must not be lost for good when the state has drifted off it.
     """
 
     residual: Array
@@ -27,6 +30,7 @@ class Compared(NamedTuple):
     noise: Array
     monitored: str = ""
     separable: bool = False
+    eased: float = 1.0
 
 
 class Scene(NamedTuple):

@@ -38,7 +38,7 @@ def non_holonomic(scene: Scene, dt: float) -> Compared:
     lasting = max(settings.slip_time / dt, 1.0)
     side = (settings.side_sigma**2 + slip * slip + wander * wander) * lasting
     up = (settings.up_sigma**2 + (settings.up_share * vx) ** 2) * lasting
-    return Compared(np.array((yaw * vx - vy, -vz)), H, np.diag((side, up)))
+    return Compared(np.array((yaw * vx - vy, -vz)), H, np.diag((side, up)), eased=math.inf)
 
 
 def zero_velocity(scene: Scene, dt: float) -> Compared:

@@ -24,9 +24,19 @@ WANDER = ("gps_wander_east", "gps_wander_north", "gps_wander_up")
 """The part of a fix's error that lingers, in units of the sigma it comes with: Gauss-Markov of sigma 1."""
 
 
-def wander(settings: FilterSettings) -> ErrorState:
-    """Return the error state of what lingers in fixes."""
-    return ErrorState(WANDER, 1.0, time_constant=settings.gps_wander_time)
+EASED = 4.0
+"""Up to so many times its limit a fix is used with wider noise: it pulls no harder than one at the limit does."""
+
+LATENCY = "gps_latency"
+"""By how many seconds the place that a fix tells is older than its stamp."""
+
+
+def gps_states(settings: FilterSettings) -> tuple[ErrorState, ...]:
+    """Return the error states of fixes: what lingers in them, and how late they are."""
+    return (
+        ErrorState(WANDER, 1.0, time_constant=settings.gps_wander_time),
+        ErrorState((LATENCY,), settings.gps_latency_sigma),
+    )
 
 
 def shares(variance: float, kind: FixType, settings: FilterSettings) -> tuple[float, float]:
@@ -62,7 +72,7 @@ class _AtAntenna:
 
 @register
 class GpsPosition(_AtAntenna):
-    """Horizontal position of the antenna: p + R l + wander."""
+    """Horizontal position of the antenna: p + R l - latency v + wander."""
 
     kind: ClassVar[str] = "gps_position"
     sample: ClassVar[type] = GpsSample
@@ -87,6 +97,12 @@ class GpsPosition(_AtAntenna):
         n_white, n_sigma = shares(fix.north_variance, sample.fix_type, scene.settings)
         at = layout.index(WANDER[0])
         H[0, at], H[1, at + 1] = e_sigma, n_sigma
+        # the fix tells where the antenna was: p(t - latency)
+        vx, vy, _ = nav.point_velocity(self.lever)
+        late = scene.extra(LATENCY)
+        late_at = layout.index(LATENCY)
+        H[0, late_at], H[1, late_at] = -vx, -vy
+        x, y = x - vx * late, y - vy * late
         residual = np.array(
             (
                 east - x - e_sigma * scene.extra(WANDER[0]),
@@ -94,7 +110,7 @@ class GpsPosition(_AtAntenna):
             )
         )
         cross = fix.cross * scene.settings.gps_white_share**2
-        return Compared(residual, H, np.array(((e_white, cross), (cross, n_white))))
+        return Compared(residual, H, np.array(((e_white, cross), (cross, n_white))), eased=EASED)
 
 
 @register
@@ -217,6 +233,7 @@ def baseline_sigma(sample: GpsSample) -> float:
 
 
 __all__ = [
+    "LATENCY",
     "WANDER",
     "ZERO",
     "GpsBaseline",
@@ -224,8 +241,8 @@ __all__ = [
     "GpsPosition",
     "GpsVelocity",
     "baseline_sigma",
+    "gps_states",
     "place_of",
     "shares",
     "stated_velocity",
-    "wander",
 ]

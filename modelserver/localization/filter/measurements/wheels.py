@@ -19,6 +19,12 @@ from modelserver.spatial.so3 import Vector3
 SCALE, YAW = "wheel_scale", "wheel_yaw"
 """How much too far all wheels tell, and by how much the way they roll is turned to the left of the geometry's x."""
 
+EASED = 4.0
+"""Up to so many times its limit a slip is used with wider noise: twice what the gate lets through."""
+
+INSTANT = 0.02
+"""Seconds over which an inertial unit's rate of an instant is a mean: its bandwidth of about 50 Hz."""
+
 LONGEST = 1.0
 """Seconds between two samples over which travel still tells a speed."""
 
@@ -144,8 +150,12 @@ class WheelSpeed:
             row[layout.index(YAW)] = scale * (c * v[1] - s * v[0])
             residuals.append(wheel.speed - scale * along)
             rows.append(row)
-            noises.append(wheel.variance + self._slip(nav.force, along, rate[2], settings) * _lasting(dt, settings))
-        return Compared(np.array(residuals), np.array(rows), np.diag(noises), separable=True)
+            variance = wheel.variance
+            if not wheel.mean:
+                # the rate of the instant has the gyro's noise, which a longer way averages
+                variance += ((c * y - s * x) * settings.gyro_noise) ** 2 / INSTANT
+            noises.append(variance + self._slip(nav.force, along, rate[2], settings) * _lasting(dt, settings))
+        return Compared(np.array(residuals), np.array(rows), np.diag(noises), separable=True, eased=EASED)
 
     def _slip(self, force: Vector3, speed: float, turn: float, settings: FilterSettings) -> float:
         """Return the variance of slip, (m/s)2: on firm ground, under acceleration, and of a skid-steered in turns."""
@@ -165,15 +175,15 @@ def _mean(wheels: list[Rolling]) -> Rolling:
     sides: dict[bool, list[Rolling]] = {}
     for wheel in wheels:
         sides.setdefault(wheel.contact[1] > 0.0, []).append(wheel)
-    speed = variance = x = y = z = 0.0
+    speed = variance = y = z = 0.0
     for side in sides.values():
         part = 1.0 / (len(side) * len(sides))
         for wheel in side:
             speed += part * wheel.speed
             variance += part * part * wheel.variance
-            x, y, z = x + part * wheel.contact[0], y + part * wheel.contact[1], z + part * wheel.contact[2]
+            y, z = y + part * wheel.contact[1], z + part * wheel.contact[2]
     # along x the mean contact point does not matter to the way it rolls, and in a skid nothing rolls about it
-    return Rolling(speed, variance, 0.0, (0.0, y, 0.0), all(wheel.mean for wheel in wheels))
+    return Rolling(speed, variance, 0.0, (0.0, y, z), all(wheel.mean for wheel in wheels))
 
 
 def standing_wheels(

@@ -1,0 +1,203 @@
+"""A vehicle, its simulator and the filter for the scenario tests: modest rates, so that each takes a second or two."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from modelserver.geodesy import origin_at
+from modelserver.geometry import ModelBuilder
+from modelserver.localization.filter.localizer import FilterLocalizer
+from modelserver.localization.filter.settings import FilterSettings
+from modelserver.localization.filter.setup import Setup
+from modelserver.localization.modes import ModeLocalizer
+from modelserver.localization.rig import Rig
+from modelserver.messages import Decision, Estimate, Mode, Sample, SwitchMode, Verdict
+from modelserver.simulation import (
+    Event,
+    GpsModel,
+    ImuModel,
+    Phase,
+    Simulation,
+    Timing,
+    Trajectory,
+    WheelsModel,
+)
+from modelserver.spatial.pose import Pose
+
+ORIGIN = origin_at(50.27, -111.18, 700.0)
+WHEELS = {"left": "Car:Left", "right": "Car:Right"}
+IMU_HZ, WHEELS_HZ, GPS_HZ = 50.0, 10.0, 4.0
+IMU_TIMING = Timing(IMU_HZ, 0.004, 0.001)
+GPS_TIMING = Timing(GPS_HZ, 0.06, 0.01)
+WHEELS_TIMING = Timing(WHEELS_HZ, 0.01, 0.002)
+
+PLAIN_GPS = GpsModel(GPS_TIMING, lingering_sigma=0.3, white_sigma=0.05)
+RTK_LIKE = GpsModel(GPS_TIMING, lingering_sigma=0.01, white_sigma=0.01)
+IMU = ImuModel(IMU_TIMING)
+WHEELS_MODEL = WheelsModel(WHEELS_TIMING)
+
+MOUNT = Pose.from_rpy((0.3, -0.3, 0.5), math.pi / 2, 0.0, -math.pi / 2)
+
+Transform = Callable[[Iterable[Event]], Iterable[Event]]
+
+
+def rig(turned: float = 0.0, imu: Pose = MOUNT, kinematics: Any = "differential", *, wheels: bool = True) -> Rig:
+    """The vehicle; `turned` is the yaw of its body on the ground: sensors stay where they are on the body."""
+    builder = ModelBuilder("car")
+    car = builder.body("Car")
+    X = Pose.from_rpy((0.0, 0.0, 0.0), 0.0, 0.0, turned)
+    car.frame("Base")
+    for name, pose in (
+        ("Imu", imu),
+        ("Antenna", Pose((0.25, 0.1, 1.0))),
+        ("Second", Pose((-0.75, 0.1, 1.0))),
+        ("Left", Pose((0.0, 0.3, -0.1))),
+        ("Right", Pose((0.0, -0.3, -0.1))),
+        ("Camera", Pose.from_rpy((0.5, 0.0, 0.8), 0.0, 0.1, 0.2)),
+    ):
+        turned_pose = X @ pose if name not in ("Left", "Right") else pose
+        car.frame(name, turned_pose)
+    return Rig(
+        builder.build(),
+        "Car:Base",
+        "Car:Imu",
+        "Car:Antenna",
+        "Car:Second",
+        WHEELS if wheels else {},
+        kinematics,
+    )
+
+
+RIG = rig()
+
+
+def simulation(phases: Sequence[Phase], on: Rig = RIG, *, yaw: float = 0.7, seed: int = 1, **more: Any) -> Simulation:
+    """A drive of the vehicle; `more` goes to the simulator, over what stands here."""
+    arguments: dict[str, Any] = {
+        "gps_frame": "Car:Antenna",
+        "imu_frame": "Car:Imu",
+        "wheel_frames": WHEELS,
+        "gps_model": PLAIN_GPS,
+        "imu_model": IMU,
+        "wheels_model": WHEELS_MODEL,
+        **more,
+    }
+    return Simulation(on.model, "Car:Base", Trajectory(phases, yaw=yaw), ORIGIN, seed=seed, **arguments)
+
+
+@dataclass
+class Row:
+    """An estimate beside the truth: seconds since the start, errors east, north (m) and of heading (rad)."""
+
+    t: float
+    estimate: Estimate
+    east: float
+    north: float
+    heading: float
+    speed: float
+
+    @property
+    def off(self) -> float:
+        return math.hypot(self.east, self.north)
+
+    @property
+    def valid(self) -> bool:
+        return self.estimate.enu is not None and not self.estimate.invalid
+
+
+@dataclass
+class Run:
+    """What a drive showed: rows, the ledger, and the localizer at the end."""
+
+    simulation: Simulation
+    localizer: Any
+    rows: list[Row] = field(default_factory=list)
+    ledger: list[Decision] = field(default_factory=list)
+
+    def between(self, begin: float, end: float = math.inf) -> list[Row]:
+        return [row for row in self.rows if begin <= row.t < end]
+
+    def at(self, t: float) -> Row:
+        return next(row for row in self.rows if row.t >= t)
+
+    @property
+    def last(self) -> Row:
+        return self.rows[-1]
+
+    def said(self, kind: str, verdict: Verdict | None = None, reason: str | None = None) -> list[Decision]:
+        return [
+            word
+            for word in self.ledger
+            if word.kind == kind
+            and (verdict is None or word.verdict is verdict)
+            and (reason is None or word.reason == reason)
+        ]
+
+    def seconds(self, word: Decision) -> float:
+        return (word.utime - self.simulation.start_utime) * 1e-6
+
+    @property
+    def odom_steps(self) -> list[float]:
+        """By how much Odom moved between neighbouring rows beyond what the true speed explains, metres."""
+        steps = []
+        for a, b in zip(self.rows, self.rows[1:], strict=False):
+            moved = math.dist(a.estimate.odom.xyz, b.estimate.odom.xyz)
+            way = max(abs(a.speed), abs(b.speed)) * (b.t - a.t)
+            steps.append(max(moved - way, 0.0))
+        return steps
+
+
+def row(run: Simulation, estimate: Estimate) -> Row:
+    true = run.truth(estimate.utime)
+    east = north = heading = math.nan
+    if estimate.enu is not None:
+        east, north, _ = np.subtract(estimate.enu.xyz, true.enu.xyz).tolist()
+        heading = math.remainder(estimate.enu.rpy[2] - true.enu.rpy[2], math.tau)
+    return Row(
+        (estimate.utime - run.start_utime) * 1e-6, estimate, east, north, heading, math.hypot(*true.velocity[:2])
+    )
+
+
+def untouched(events: Iterable[Event]) -> Iterable[Event]:
+    return events
+
+
+def drive(
+    run: Simulation,
+    seconds: float,
+    *,
+    settings: FilterSettings | None = None,
+    on: Rig = RIG,
+    every: float = 0.5,
+    transform: Transform = untouched,
+    mode: Mode = Mode.FULL,
+    localizer: FilterLocalizer | ModeLocalizer | None = None,
+    switches: Sequence[tuple[float, SwitchMode]] = (),
+) -> Run:
+    """Drive for some seconds, and take a row every so often at the newest sample's instant."""
+    found: Any = localizer or FilterLocalizer.start(Setup(on, settings), ORIGIN, mode)
+    shown = Run(run, found)
+    due = 0
+    waiting = list(switches)
+    for event in transform(run.events(seconds)):
+        sample: Sample = event
+        if waiting and sample.header.host_utime >= run.start_utime + round(waiting[0][0] * 1e6):
+            found, notes = found.take(waiting.pop(0)[1])
+            shown.ledger += [note for note in notes if isinstance(note, Decision)]
+        found, notes = found.take(sample)
+        shown.ledger += [note for note in notes if isinstance(note, Decision)]
+        utime = found.utime
+        if utime >= due and utime:
+            due = utime + round(every * 1e6)
+            shown.rows.append(row(run, found.estimate(utime)))
+    shown.localizer = found
+    return shown
+
+
+def rms(values: Iterable[float]) -> float:
+    return math.sqrt(float(np.mean(np.square(list(values)))))
