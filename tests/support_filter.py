@@ -16,7 +16,7 @@ from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.filter.setup import Setup
 from modelserver.localization.modes import ModeLocalizer
 from modelserver.localization.rig import Rig
-from modelserver.messages import Decision, Estimate, Mode, Sample, SwitchMode, Verdict
+from modelserver.messages import Decision, Estimate, FixType, Mode, Sample, SwitchMode, Verdict
 from modelserver.simulation import (
     Event,
     GpsModel,
@@ -37,7 +37,7 @@ GPS_TIMING = Timing(GPS_HZ, 0.06, 0.01)
 WHEELS_TIMING = Timing(WHEELS_HZ, 0.01, 0.002)
 
 PLAIN_GPS = GpsModel(GPS_TIMING, lingering_sigma=0.3, white_sigma=0.05)
-RTK_LIKE = GpsModel(GPS_TIMING, lingering_sigma=0.01, white_sigma=0.01)
+RTK_LIKE = GpsModel(GPS_TIMING, lingering_sigma=0.01, white_sigma=0.01, fix_type=FixType.RTK_FIXED)
 IMU = ImuModel(IMU_TIMING)
 WHEELS_MODEL = WheelsModel(WHEELS_TIMING)
 

@@ -1,28 +1,39 @@
-"""Whatever the samples say, raw mode neither raises nor says nonsense."""
+"""Whatever the samples say, neither raw mode nor the filter raises or says nonsense."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from functools import lru_cache
 
+import support_cart
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from support_localization import MOUNTS, ORIGIN, START, Drive, Sensors, constant
 
+from modelserver.localization.filter.localizer import FilterLocalizer
+from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.messages import (
+    AbsolutePoseSample,
     FixType,
     GpsSample,
     ImuSample,
     Invalid,
     JointSample,
     JointsSample,
+    Mode,
     OrientationReference,
+    RangeSample,
     Rejected,
+    RelativePoseSample,
     SensorHeader,
+    SwitchMode,
     WheelSample,
     WheelsSample,
     YawSource,
 )
+from modelserver.simulation.scenario import START_UTIME
 
 wild = st.floats(allow_nan=True, allow_infinity=True, width=64)
 number = st.one_of(wild, st.floats(-1e3, 1e3), st.sampled_from((0.0, -0.0, 1.0, math.nan, math.inf, 1e308, 5e-324)))
@@ -131,5 +142,84 @@ def test_given_any_samples_when_good_ones_follow_then_the_pose_is_valid_again(sa
     for sample in samples:
         localizer, _ = localizer.take(sample)
     for sample in Sensors().events(Drive(30.0, speed=constant(2.0), yaw_rate=constant(0.2))):
+        localizer, _ = localizer.take(sample)
+    assert localizer.estimate(localizer.utime).invalid == Invalid(0)
+
+
+# --- the filter ---------------------------------------------------------------------------------------------
+
+turned = st.none() | st.tuples(number, number, number, number) | st.just((1.0, 0.0, 0.0, 0.0))
+frames = st.sampled_from((support_cart.CAMERA, support_cart.BASE, "Cart:Nowhere", "", "World:UTM"))
+worlds = st.sampled_from(("World:ENU", "World:UTM", "Odom:Origin", ""))
+large = st.none() | st.tuples(*[number] * 36)
+place = st.tuples(number, number, number)
+any_header = st.builds(SensorHeader, utime, st.sampled_from(("gps", "imu", "wheels", "")), st.integers(0, 9))
+wheel = st.builds(
+    WheelSample,
+    st.sampled_from(("RL", "RR", "x")),
+    travel=number,
+    travel_sigma=number,
+    speed=number,
+    speed_sigma=number,
+    steering=number,
+)
+further = st.one_of(
+    st.builds(WheelsSample, any_header, st.lists(wheel, max_size=3).map(tuple)),
+    st.builds(AbsolutePoseSample, any_header, frames, worlds, st.none() | place, turned, large),
+    st.builds(
+        RelativePoseSample, any_header, frames, utime, place, turned.map(lambda q: q or (0.0, 0.0, 0.0, 0.0)), large
+    ),
+    st.builds(RangeSample, any_header, frames, st.just("b"), place, worlds, number, number),
+    st.builds(SwitchMode, any_header, st.sampled_from([mode for mode in Mode if mode is not Mode.RAW])),
+)
+
+
+@lru_cache
+def driven() -> tuple[list[object], FilterLocalizer]:
+    """Ten good seconds, and what the filter knows after them, the lead's clock as that of the wild samples."""
+    samples: list[object] = [
+        replace(each, header=replace(each.header, utime=each.header.utime - START_UTIME + START))
+        for each in support_cart.drive(10.0, imu_hz=20.0)[1]
+    ]
+    localizer = support_cart.localizer(FilterSettings(use_magnetometer=True))
+    for sample in samples:
+        localizer, _ = localizer.take(sample)
+    assert localizer.estimate(localizer.utime).invalid == Invalid(0)
+    return samples, localizer
+
+
+def check_state(localizer: FilterLocalizer) -> None:
+    state = localizer.navigation(localizer.utime)
+    if state is not None:
+        assert all(
+            map(math.isfinite, (*state.values, *state.covariance, *state.linear_velocity, *state.twist_covariance))
+        )
+
+
+@settings(max_examples=100, phases=PHASES, deadline=None)
+@given(
+    samples=st.lists(st.one_of(gps, imu, further), max_size=25),
+    asked=st.lists(utime, min_size=1, max_size=3),
+    warm=st.booleans(),
+)
+def test_given_any_samples_when_the_filter_takes_them_then_it_neither_raises_nor_says_nonsense(samples, asked, warm):
+    localizer = driven()[1] if warm else support_cart.localizer()
+    for sample in samples:
+        localizer, _ = localizer.take(sample)
+        check(localizer.estimate(sample.header.utime))
+    check_state(localizer)
+    for at in asked:
+        check(localizer.estimate(at))
+
+
+@settings(max_examples=6, phases=PHASES, deadline=None)
+@given(
+    samples=st.lists(st.one_of(gps, imu, further.filter(lambda each: not isinstance(each, SwitchMode))), max_size=20)
+)
+def test_given_any_samples_when_good_ones_follow_then_the_filters_pose_is_valid_again(samples):
+    localizer = support_cart.localizer()
+    for sample in samples:
+        localizer, _ = localizer.take(sample)
+    for sample in support_cart.drive(40.0, imu_hz=20.0)[1]:
         localizer, _ = localizer.take(sample)
     assert localizer.estimate(localizer.utime).invalid == Invalid(0)

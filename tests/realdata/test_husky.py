@@ -98,6 +98,7 @@ def test_given_the_recording_when_replayed_then_the_antenna_follows_its_fixes_wi
     assert (off < 2 * 1.27).mean() > 0.99
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # the scorer leaves a file open
 def test_given_withheld_fixes_when_replayed_then_the_way_between_fixes_is_carried_better_than_by_holding(
     imported: tuple[Path, Report], data_dir: Path
 ) -> None:

@@ -1,4 +1,4 @@
-"""Clients written from the .lcm files alone, in three languages, against the running daemon."""
+"""Clients written from the .lcm files alone, in three languages, against the running daemon; and other examples."""
 
 from __future__ import annotations
 
@@ -118,3 +118,14 @@ def test_given_a_client_then_it_is_written_without_modelserver(language: str) ->
     for path in (ROOT / "examples" / f"client_{language}").iterdir():
         if path.is_file():
             assert "modelserver" not in path.read_text(encoding="utf-8")
+
+
+def test_given_the_example_of_an_own_measurement_then_it_takes_few_lines_and_helps() -> None:
+    path = ROOT / "examples" / "python" / "own_measurement.py"
+    _, part = path.read_text(encoding="utf-8").split("# --- the measurement", 1)
+    lines = part.split("# --- a drive", 1)[0].splitlines()[1:]
+    assert sum(bool(line.strip()) for line in lines) < 40
+    done = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stderr) == (0, "")
+    without, with_it = (float(line.rsplit(" ", 2)[1]) for line in done.stdout.splitlines())
+    assert with_it < 0.5 * without

@@ -87,7 +87,7 @@ class Fix:
 
 @dataclass(frozen=True, slots=True)
 class WheelTurn:
-    """What a wheel told at `t` beside what the state expected of it, m/s along the vehicle's x axis."""
+    """What a wheel told at `t` beside what the state expected of it, m/s along the way that it rolls."""
 
     t: float
     name: str
@@ -154,7 +154,7 @@ class Collector:
         self._decisions: list[Decision] = []
         self._states: list[tuple[int, Snapshot]] = []
         self._fixes: list[GpsSample] = []
-        self._turns: list[tuple[int, str, float]] = []
+        self._turns: list[tuple[int, str, float, float]] = []
         self._before: dict[str, WheelsSample] = {}
         self._times: dict[str, list[int]] = {}
         self._forces = np.zeros(3)
@@ -253,9 +253,9 @@ class Collector:
         for wheel in sample.wheels:
             way = wheel.travel - earlier.get(wheel.name, math.nan)
             speed = way / dt if 0.0 < dt < 1.0 and math.isfinite(way) else wheel.speed
-            # steered wheels roll aslant: what they tell is not compared here
-            if math.isfinite(speed) and abs(wheel.steering) < 0.1:
-                self._turns.append((sample.header.utime - round(0.5e6 * min(dt, 1.0)), wheel.name, speed))
+            if math.isfinite(speed) and math.isfinite(wheel.steering):
+                middle = sample.header.utime - round(0.5e6 * min(dt, 1.0))
+                self._turns.append((middle, wheel.name, speed, wheel.steering))
 
     def _felt_by(self, sample: ImuSample) -> None:
         if sample.specific_force is not None and all(map(math.isfinite, sample.specific_force)):
@@ -326,15 +326,21 @@ class Collector:
             return ()
         times = [each.t for each in known]
         speeds, turns = [each.speed for each in known], [each.turn for each in known]
-        frames = self._rig.wheel_frames
-        sides = {name: self._rig.pose(frame).xyz[1] for name, frame in frames.items()}
-        at = (np.array([utime for utime, _, _ in self._turns]) - first_utime) * 1e-6
-        v, w = np.interp(at, times, speeds), np.interp(at, times, turns)
-        return tuple(
-            WheelTurn(float(t), name, measured, float(speed - turn * sides[name]))
-            for t, speed, turn, (_, name, measured) in zip(at, v, w, self._turns, strict=True)
-            if name in sides and times[0] <= t <= times[-1]
-        )
+        contacts = {name: self._rig.pose(frame).xyz for name, frame in self._rig.wheel_frames.items()}
+        at = (np.array([utime for utime, _, _, _ in self._turns]) - first_utime) * 1e-6
+        found = []
+        for t, v, w, (_, name, measured, steering) in zip(
+            at.tolist(),
+            np.interp(at, times, speeds).tolist(),
+            np.interp(at, times, turns).tolist(),
+            self._turns,
+            strict=True,
+        ):
+            if name in contacts and times[0] <= t <= times[-1]:
+                x, y, _ = contacts[name]
+                expected = math.cos(steering) * (v - w * y) + math.sin(steering) * w * x
+                found.append(WheelTurn(t, name, measured, expected))
+        return tuple(found)
 
 
 def _with_state(snapshot: Snapshot, state: NavigationState) -> Snapshot:

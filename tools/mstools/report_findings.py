@@ -205,14 +205,14 @@ def biases(replayed: Replayed) -> Iterable[Finding]:
 
 
 ADVICE = {
-    "gps_height": "The receiver's height is worse than it says, as heights are; where height matters, look for a better "
-    "source. gps_wander_time and uere say how fixes err.",
-    "gps_position": "Its stated sigma is too small, or a latency, the antenna's place or multipath: look at the track, and "
+    "gps_height": "The receiver's height is worse than it says, as heights are. Where height matters take a better "
+    "source; gps_wander_time and uere say how fixes err.",
+    "gps_position": "Its stated sigma is too small, or there is a latency, a wrong place of the antenna, or multipath: "
+    "look at the track, and try modelserver tune.",
+    "wheel_speed": "wheel_sigma and slip_share are too small for these wheels, or their stamps are late: "
     "try modelserver tune.",
-    "wheel_speed": "wheel_sigma and slip_share are too small for these wheels, or their stamps are late: try modelserver "
-    "tune.",
-    "non_holonomic": "The vehicle slides more than side_sigma, side_slip and roll_point_sigma say, or the rolling frame is "
-    "another point: try modelserver tune.",
+    "non_holonomic": "The vehicle slides more than side_sigma, side_slip and roll_point_sigma say, or the rolling "
+    "frame is another point: try modelserver tune.",
     "zero_rate": "The gyros are noisier at rest than gyro_noise says: modelserver calibrate imu measures it.",
     "zero_velocity": "It rocks more at rest than standing_sigma says, or it does not stand: look at its speed then.",
 }
@@ -229,8 +229,8 @@ def stated_sigma(replayed: Replayed) -> Iterable[Finding]:
         if each.count < 30:
             continue
         seen = (
-            f"NIS is {each.mean:.2f} in the mean of {each.count}, where 1 is expected; {each.beyond:.0%} are beyond the "
-            "95 % limit."
+            f"NIS is {each.mean:.2f} in the mean of {each.count}, where 1 is expected; {each.beyond:.0%} are beyond "
+            "the 95 % limit."
         )
         if each.mean > 2.5:
             advice = ADVICE.get(each.kind, GENERAL)

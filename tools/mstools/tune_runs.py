@@ -19,7 +19,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -162,15 +162,18 @@ def read_fixes(log: Path, config: Path) -> Fixes:
                 numbers.append(met - 1)
     if len(samples) < 20:
         raise RecordingError(
-            f"{log}: {len(samples)} of {met} messages on {channel} are good fixes, and at least 20 are needed to withhold "
-            "some of them; record a drive of a few minutes"
+            f"{log}: {len(samples)} of {met} messages on {channel} are good fixes, and at least 20 are needed to "
+            "withhold some of them; record a drive of a few minutes"
         )
     order = sorted(range(len(samples)), key=lambda n: samples[n].header.utime)
     return Fixes(tuple(samples[n] for n in order), tuple(numbers[n] for n in order))
 
 
 def run(job: Job) -> Outcome:
-    """Run the localization over a log with fixes withheld, and score it. Raises ValueError for settings out of range."""
+    """Run the localization over a log with fixes withheld, and score it.
+
+    Raises ValueError for settings out of range, RecordingError where there are too few fixes, OSError.
+    """
     vehicle = changed(load(job.config), dict(job.settings))
     known = read_fixes(job.log, job.config)
     withheld = known.withheld(job.part)
@@ -205,7 +208,7 @@ def changed(vehicle: Vehicle, settings: Mapping[str, float]) -> Vehicle:
     if not settings:
         return vehicle
     localization = vehicle.config.localization
-    settled = replace(localization.filter, **settings)
+    settled = replace(localization.filter, **dict[str, Any](settings))
     return replace(vehicle, config=replace(vehicle.config, localization=replace(localization, filter=settled)))
 
 

@@ -11,7 +11,7 @@ Settings: TypeAlias = Mapping[str, float]
 
 FACTOR = 2.0
 
-LEAST_GAIN = 0.01
+LEAST_GAIN = 0.02
 """Gain in mean log-likelihood below which a step is not taken: it would follow this recording's chance."""
 
 UNSEEN = 1e-4
@@ -19,8 +19,8 @@ UNSEEN = 1e-4
 
 RMSE_SLACK = 1.02
 GAPS_SLACK = 1.05
-"""By how much a step may worsen the error at withheld fixes, and at the ends of gaps: likelihood must not be bought with
-accuracy."""
+"""By how much a step may worsen the error at withheld fixes, and at the ends of gaps: likelihood must not be bought
+with accuracy."""
 
 FARTHEST = 8.0
 """A proposal is at most so many times the setting, or this part of it, that the search began with."""
@@ -28,7 +28,7 @@ FARTHEST = 8.0
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """How well settings do: mean log-likelihood of withheld fixes, their RMSE, and the mean error at gap ends (or nan)."""
+    """How well settings do: mean log-likelihood and RMSE at withheld fixes, mean error at gap ends (nan: no gaps)."""
 
     likelihood: float
     rmse: float

@@ -9,6 +9,9 @@ from typing import NamedTuple
 
 from modelserver.localization.filter.settings import FilterSettings
 
+MOST_SOURCES = 256
+"""Sources that are told apart: more names than that come from a flood."""
+
 
 class Verdict(Enum):
     """What a stamp says about its sample."""
@@ -68,13 +71,17 @@ class Clocks(NamedTuple):
                 max(self.newest, utime),
                 max(rank, self.rank),
                 max(utime, self.lead_utime) if leads else self.lead_utime,
-                MappingProxyType({**self.sources, name: source}) if len(self.sources) < 256 else self.sources,
+                self.sources if self._full(name) else MappingProxyType({**self.sources, name: source}),
             ),
             Verdict.GOOD,
         )
 
+    def _full(self, name: str) -> bool:
+        """Return whether there is no room for a source that is not known yet."""
+        return name not in self.sources and len(self.sources) >= MOST_SOURCES
+
     def _with(self, name: str, source: Source) -> Clocks:
-        if name not in self.sources and len(self.sources) >= 256:
+        if self._full(name):
             return self
         return self._replace(sources=MappingProxyType({**self.sources, name: source}))
 

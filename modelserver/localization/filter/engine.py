@@ -51,6 +51,9 @@ CONSTRAINT_PERIOD = 0.1
 REST_PERIOD = 0.2
 """Seconds between two uses of standing."""
 
+BIASES_AGE = 600.0
+"""Seconds that gyro biases kept aside are taken to be old: few vehicles drive for longer without a stop."""
+
 UNKNOWN_SPEED = 2.0
 """Sigma of the horizontal speed, m/s, from which on nothing is known of it: that of a walk."""
 
@@ -108,7 +111,7 @@ def fused(setup: Setup, state: FilterState, item: Item) -> Fused:
         state, decisions = _latched(setup, state, item.utime)
     state, more = _HANDLERS.get(item.kind, _measured)(setup, state, item)
     nav = state.nav
-    if more and nav is not None and not updates.sound(nav, setup.settings):
+    if nav is not None and not (updates.sound if more else updates.plausible)(nav, setup.settings):
         state, diverged = _diverged(setup, state, item)
         more = (*more, diverged)
     return state, decisions + more
@@ -194,6 +197,7 @@ def _constrained(setup: Setup, state: FilterState, utime: int) -> Fused:
                 compared = constraints.zero_rate(scene, still.mean_rate, state.earth.rotation, still.summed)
                 state, decision = _known(setup, state, constraints.ZERO_RATE, compared)
                 decisions = (*decisions, decision)
+                state = _biases_kept(setup, state, decision)
             state = state._replace(stillness=still.used())
         return state, decisions
     if (utime - state.rolled_utime) * 1e-6 < CONSTRAINT_PERIOD:
@@ -201,6 +205,19 @@ def _constrained(setup: Setup, state: FilterState, utime: int) -> Fused:
     if state.wheels_utime and (utime - state.wheels_utime) * 1e-6 < setup.settings.wheel_period + CONSTRAINT_PERIOD:
         return state, _NOTHING  # the next wheel sample brings it along
     return _rolled(setup, state, utime)
+
+
+def _biases_kept(setup: Setup, state: FilterState, decision: Decision) -> FilterState:
+    """Return the state with the gyros' biases kept aside: a filter that diverges later begins anew with them.
+
+    Only what standing told is kept, for that rests on nothing else in the state; less sure by what it may have wandered
+    when it is needed.
+    """
+    nav = state.nav
+    if decision.verdict is not Verdict.USED or nav is None:
+        return state
+    variance = max(nav.covariance[k, k] for k in (9, 10, 11)) + setup.settings.gyro_bias_walk**2 * BIASES_AGE
+    return state._replace(biases=(nav.gyro_bias, math.sqrt(variance)))
 
 
 def _rolled(setup: Setup, state: FilterState, utime: int) -> Fused:
@@ -353,6 +370,10 @@ def _fix(setup: Setup, state: FilterState, item: Item) -> Fused:
         return state, _NOTHING
     if unused or resting:
         compared = compared._replace(monitored=unused or "at_rest")
+    if not steady or state.refused_count:
+        # one that jumped does not err a little more than usual: eased, each pulls, and ten seconds of them pull the
+        # pose out of its bound
+        compared = compared._replace(eased=1.0)
     if unused:
         _, decision = updates.used(nav, compared, setup.settings, item.utime, item.source, item.seq, item.kind)
         return state, (decision,)

@@ -102,14 +102,17 @@ class FilterLocalizer:
         settings = setup.settings
         known, verdict = self.clocks.take(header.source, _rank(sample), found[0].utime, header.seq, settings)
         if verdict is clocks.Verdict.STEPPED_BACK:
-            self = self._begun_anew()
+            self = self._begun_anew(found[0].utime)
         elif verdict is not clocks.Verdict.GOOD:
             return replace(self, clocks=known), (_refused(found[0], verdict.value),)
         oldest = known.newest - round(settings.horizon * 1e6)
         timeline = self.timeline
+        begun = timeline.base.nav
+        # nor can anything be put before what another localizer handed over
+        earliest = oldest if begun is None else max(oldest, begun.utime)
         notes: list[Note] = []
         for item in found:
-            if item.utime < oldest:
+            if item.utime < earliest:
                 notes.append(_refused(item, "late"))
                 continue
             longer = timeline.with_item(item)
@@ -128,6 +131,8 @@ class FilterLocalizer:
             odom = odom.advanced(head.nav, setup.rig.base, head.standing)
             if not odoms or odom.utime - odoms[-1].utime >= ODOM_STEP_US:
                 odoms = _kept(odoms, odom)
+        elif head.nav is None:
+            odom = odom.stopped(odom.utime)
         latched = self.latched
         if not latched and head.geodesy is not None:
             latched = True
@@ -146,8 +151,8 @@ class FilterLocalizer:
                 return motion.felt(self.setup, head, item.utime, *read)
         return head
 
-    def _begun_anew(self) -> FilterLocalizer:
-        """Return the localizer after its clock was set back: only Odom, the origin and the biases stay."""
+    def _begun_anew(self, utime: int) -> FilterLocalizer:
+        """Return the localizer after its clock was set back to `utime`: only Odom, the origin and the biases stay."""
         old = self.head
         biases = old.biases
         if old.nav is not None:
@@ -162,7 +167,7 @@ class FilterLocalizer:
             stepped=True,
         )
         return replace(
-            self, timeline=Timeline(fresh), head=fresh, odom=self.odom._replace(utime=0), odoms=(), clocks=Clocks()
+            self, timeline=Timeline(fresh), head=fresh, odom=self.odom.stopped(utime), odoms=(), clocks=Clocks()
         )
 
     def begun_from(self, last: Estimate, before: Estimate) -> FilterLocalizer:

@@ -56,6 +56,10 @@ class Odometry(NamedTuple):
         drift = self.drift + (0.0 if standing else (speed_sigma + self.yaw_drift * math.hypot(*velocity)) * dt)
         return Odometry(nav.utime, position, attitude, velocity, rate, min(drift, 1e6), min(yaw_drift, 1e3), True)
 
+    def stopped(self, utime: int) -> Odometry:
+        """Return Odom where it is, from `utime` on, while nothing tells a motion."""
+        return self._replace(utime=utime, velocity=ZERO, rate=ZERO)
+
     def pose(self, utime: int) -> Pose:
         """Return the pose at an instant near, carried on by the twist, at most for half a second either way."""
         dt = max(-LONGEST, min((utime - self.utime) * 1e-6, LONGEST))

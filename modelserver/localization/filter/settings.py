@@ -119,7 +119,7 @@ class FilterSettings(FixSettings):
     stamp as they please (P. Groves 2013, 10.3). It is estimated: at 20 m/s 80 ms are worse than all else."""
     gps_sigma_floor: float = 0.02
     """A fix is never taken to be surer than this, metres: RTK, 2 cm (OEM4 data sheet)."""
-    restless_time: float = 5.0
+    restless_time: float = 2.0
     """Time constant, seconds, with which the wandering of fixes is learnt from what they do beside odometry."""
     restless_limit: float = 100.0
     """By how much faster than the settings say, in variance, fixes are let wander before they are refused."""

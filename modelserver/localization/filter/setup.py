@@ -46,12 +46,12 @@ class Setup:
         s = settings
         biases = (s.gyro_bias_walk**2, s.accelerometer_bias_walk**2)
         self.driving = Noise(s.gyro_noise**2, s.accelerometer_noise**2, *biases)
-        self.standing = Noise(ROCKING**2, s.accelerometer_noise**2, *biases)
+        self.standing = Noise(ROCKING**2, s.accelerometer_noise**2, *biases, by_gyros=False)
         # what nobody measures lasts about a second each way
-        self.coasting = Noise(s.gap_rate_sigma**2, s.gap_acceleration**2, *biases)
+        self.coasting = Noise(s.gap_rate_sigma**2, s.gap_acceleration**2, *biases, by_gyros=False)
         # numbers that someone filled a gap with go from the one end to the other: a third of what could be
         self.guessing = Noise((s.gap_rate_sigma / 3.0) ** 2, s.gap_acceleration**2, *biases)
-        self.rolling = Noise(s.wheel_rate_sigma**2 * s.slip_time, s.gap_acceleration**2, *biases)
+        self.rolling = Noise(s.wheel_rate_sigma**2 * s.slip_time, s.gap_acceleration**2, *biases, by_gyros=False)
 
     @property
     def has_imu(self) -> bool:

@@ -48,12 +48,17 @@ class Earth(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """Spectral densities of what drives the errors: (rad/s)2/Hz, (m/s2)2/Hz, and of the biases' walks."""
+    """Spectral densities of what drives the errors: (rad/s)2/Hz, (m/s2)2/Hz, and of the biases' walks.
+
+    `by_gyros` is whether the gyros carry the attitude. That of a standing vehicle stays, whatever they feel: an error
+    of their bias turns nothing then, and what is learnt of it must not turn anything either.
+    """
 
     gyro: float
     accelerometer: float
     gyro_bias: float
     accelerometer_bias: float
+    by_gyros: bool = True
 
 
 def carried(nav: Nav, utime: int, rate: Vector3, force: Vector3, earth: Earth, base: Vector3) -> Nav:
@@ -165,7 +170,9 @@ def caught_up(nav: Nav, noise: Noise, layout: Layout) -> Nav:
         return nav
     extras = nav.extras
     decays = _decay(layout, dt)
-    P = kalman.predicted(nav.covariance, _transition(nav, dt, layout, decays), _driven(noise, dt, layout, decays))
+    P = kalman.predicted(
+        nav.covariance, _transition(nav, dt, layout, decays, noise.by_gyros), _driven(noise, dt, layout, decays)
+    )
     if decays is not None:
         extras = tuple(value * keep for value, keep in zip(extras, decays.tolist(), strict=True))
     return nav._replace(covariance=P, lag=0.0, impulse=ZERO, extras=extras)
@@ -175,7 +182,7 @@ def _decay(layout: Layout, dt: float) -> Array | None:
     return np.exp(-dt * layout.decays) if len(layout.extra_names) else None
 
 
-def _transition(nav: Nav, dt: float, layout: Layout, decays: Array | None) -> Array:
+def _transition(nav: Nav, dt: float, layout: Layout, decays: Array | None, by_gyros: bool = True) -> Array:
     """Return F (n, n) over the lag: the errors' equations to second order in it."""
     n = layout.size
     F = np.zeros((n, n))
@@ -183,6 +190,7 @@ def _transition(nav: Nav, dt: float, layout: Layout, decays: Array | None) -> Ar
     (a, b, c), (d, e, f), (g, h, i) = so3.matrix_rows(nav.attitude)
     t, u = -dt, -0.5 * dt * dt
     k = 0.5 * dt
+    w = t if by_gyros else 0.0
     F.put(
         _entries(n),
         (
@@ -194,7 +202,7 @@ def _transition(nav: Nav, dt: float, layout: Layout, decays: Array | None) -> Ar
             *(iz, -iy, -iz, ix, iy, -ix),
             *(t * a, t * b, t * c, t * d, t * e, t * f, t * g, t * h, t * i),
             # attitude by gyro bias
-            *(t * a, t * b, t * c, t * d, t * e, t * f, t * g, t * h, t * i),
+            *(w * a, w * b, w * c, w * d, w * e, w * f, w * g, w * h, w * i),
         ),
     )
     diagonal = F.reshape(-1)[:: n + 1]

@@ -58,18 +58,28 @@ class Timeline(NamedTuple):
         entries = self.entries
         key = item.key
         if not entries or key > entries[-1].item.key:
-            last = entries[-1].item if entries else None
-            if last is not None and _same(last, item):
-                return "duplicate"
-            return Timeline(self.base, (*entries, Entry(item, None, ())), self.fused)
-        if len(entries) >= MOST:
+            at = len(entries)
+        elif len(entries) >= MOST:
             return "load"
-        at = bisect_left(entries, key, key=_key)
-        if at < len(entries) and entries[at].item.key == key:
-            return "duplicate"
-        if any(_same(each.item, item) for each in entries[max(at - 1, 0) : at + 1]):
+        else:
+            at = bisect_left(entries, key, key=_key)
+        if self._has(item, at):
             return "duplicate"
         return Timeline(self.base, (*entries[:at], Entry(item, None, ()), *entries[at:]), min(self.fused, at))
+
+    def _has(self, item: Item, at: int) -> bool:
+        """Return whether an item is there, whose place would be `at`.
+
+        A source measures a thing once at an instant, whatever its numbering; all of that instant stand side by side.
+        """
+        for around in (range(at - 1, -1, -1), range(at, len(self.entries))):
+            for n in around:
+                other = self.entries[n].item
+                if other.utime != item.utime or other.source != item.source:
+                    break
+                if other.part == item.part:
+                    return True
+        return False
 
     def worked(self, setup: Setup, budget: int) -> Timeline:
         """Return the timeline with up to `budget` items more worked through."""
@@ -104,8 +114,3 @@ class Timeline(NamedTuple):
                 found: FilterState = entry.state
                 return found
         return self.base
-
-
-def _same(a: Item, b: Item) -> bool:
-    """Return whether two items are one: a source measures a thing once at an instant, whatever its numbering."""
-    return a.utime == b.utime and a.source == b.source and a.part == b.part

@@ -94,6 +94,12 @@ def refused(utime: int, source: str, seq: int, kind: str, reason: str) -> Decisi
     return Decision(utime, source, seq, kind, Verdict.REJECTED, reason)
 
 
+def plausible(nav: Nav, settings: FilterSettings) -> bool:
+    """Return whether place and speed are numbers of a vehicle: the cheap part of `sound`, for every sample."""
+    # a comparison with nan is false
+    return math.isfinite(sum(nav.position)) and math.hypot(*nav.velocity) <= 2.0 * settings.maximum_speed
+
+
 def sound(nav: Nav, settings: FilterSettings) -> bool:
     """Return whether a state is finite and within what a vehicle can be: else the filter has diverged."""
     P = nav.covariance

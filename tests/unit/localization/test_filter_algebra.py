@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from scipy import stats
-from support_filter import rig, some_nav
+from support_cart import rig, some_nav
 
 from modelserver.localization.filter import bounds, kalman, updates
 from modelserver.localization.filter.layout import STRAPDOWN, ErrorState, Layout
@@ -77,7 +77,7 @@ def test_given_any_numbers_when_corrected_then_it_is_what_the_formulas_say(seed,
     assert np.linalg.inv(after) == pytest.approx(np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H, rel=1e-6, abs=1e-6)
     assert (after == after.T).all()
     assert np.linalg.eigvalsh(after)[0] > 0.0
-    assert (P == kept).all()
+    assert (kept == P).all()
     assert kalman.innovation(P, H, R) == pytest.approx(S)
     assert kalman.statistic(r, S) == pytest.approx(float(r @ np.linalg.inv(S) @ r))
 
@@ -87,7 +87,7 @@ def test_given_any_numbers_when_predicted_then_it_is_what_the_formula_says():
     P, F, Q = spread(rng, 18), rng.normal(size=(18, 18)), spread(rng, 18)
     kept = P.copy()
     assert kalman.predicted(P, F, Q) == pytest.approx(F @ P @ F.T + Q)
-    assert (P == kept).all()
+    assert (kept == P).all()
 
 
 def test_given_calls_of_one_size_between_then_nothing_is_carried_from_one_to_the_other():

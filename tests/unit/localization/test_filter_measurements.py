@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from support_filter import (
+from support_cart import (
     ANTENNA,
     CAMERA,
     GEODESY,

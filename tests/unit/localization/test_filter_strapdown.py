@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from support_filter import GEODESY, IMU, MOUNTS, ORIGIN, drive, model, rig, some_nav
+from support_cart import GEODESY, IMU, MOUNTS, ORIGIN, model, rig, some_nav
 
 from modelserver.localization.filter import motion, strapdown
 from modelserver.localization.filter.layout import STRAPDOWN
@@ -62,7 +62,6 @@ def test_given_a_drive_on_hills_when_integrated_for_a_minute_then_the_place_is_r
         rate=rate,
         force=force,
     )
-    way = np.zeros(3)
     for sample in samples[1:]:
         nav = strapdown.carried(nav, sample.header.utime, *felt(sample), earth, SETUP.rig.base)
     truth = simulation.truth(nav.utime)
@@ -71,7 +70,6 @@ def test_given_a_drive_on_hills_when_integrated_for_a_minute_then_the_place_is_r
     assert math.hypot(*so3.logarithm(so3.multiply(nav.attitude, so3.conjugate(truth.enu.wxyz)))) < 2e-5
     assert nav.body_velocity(SETUP.rig.base) == pytest.approx(truth.twist[0], abs=2e-3)
     # the rolling frame's way along the body, which the wheels are held against
-    way[0] = simulation.drive.at((nav.utime - START_UTIME) * 1e-6).way
     assert abs(nav.rolled[1]) < 0.02
     assert nav.rolled[0] > 100.0
     assert nav.turned[2] == pytest.approx(truth.yaw - 0.7, abs=0.2)
@@ -202,8 +200,3 @@ def test_given_a_gap_when_bridged_then_the_last_sample_is_held_for_a_while_and_t
     # what nobody measured for 0.8 s
     assert caught.covariance[8, 8] > nav.covariance[8, 8] + 0.5 * setup.settings.gap_rate_sigma**2
     assert motion.at(setup, state, nav.utime) is state
-
-
-def test_given_a_simulated_drive_then_samples_of_all_sensors_are_there():
-    _, events = drive(2.0)
-    assert {type(each).__name__ for each in events} == {"GpsSample", "ImuSample", "WheelsSample"}

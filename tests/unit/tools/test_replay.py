@@ -14,6 +14,7 @@ import lcm
 import pytest
 from support_recordings import EASTING, HEIGHT, HUSKY, LATENCY, NORTHING, SPEED, START, drive, write_log
 from support_samples import Scripted
+from support_tuning import in_raw_mode
 
 from modelserver import core
 from modelserver.core import CoreSettings, CoreState, Instant
@@ -194,9 +195,7 @@ def test_given_a_ledger_on_standard_output_then_only_that_goes_there(driven: Pat
 def test_given_raw_mode_then_the_ledger_is_empty_and_the_poses_are_the_same(
     driven: Path, tmp_path: Path, run: Run
 ) -> None:
-    config = tmp_path / "vehicle.yaml"
-    geometry = f"geometry: {HUSKY.with_name('geometry.yaml')}"
-    config.write_text(HUSKY.read_text().replace("geometry: geometry.yaml", geometry) + "localization: {mode: raw}\n")
+    config = in_raw_mode(HUSKY, tmp_path)
     for name, options in (("one.csv", ("--decisions", tmp_path / "ledger.jsonl")), ("two.csv", ())):
         assert run(driven, "-c", config, "--poses", tmp_path / name, *options)[0] == 0
     assert (tmp_path / "ledger.jsonl").read_text() == ""

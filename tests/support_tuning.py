@@ -1,0 +1,53 @@
+"""A simulated drive of the Raptor as a log with its vehicle file, for tests of tools that look at a whole drive."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+from support_recordings import REPOSITORY, write_log
+
+from modelserver.config import load_config
+from modelserver.geodesy import origin_at
+from modelserver.service.daemon import load_vehicle
+from modelserver.simulation import ImuModel, Simulation, Timing, Trajectory, figure_eight
+from modelserver.wire.codec import encode
+from mstools.demo_sensors import channel_of
+
+RAPTOR = REPOSITORY / "config" / "raptor" / "vehicle.yaml"
+
+
+def simulated(folder: Path, seconds: float, **models: Any) -> tuple[Path, Path]:
+    """Write the log of a drive round eights; `models` go to the `Simulation`. Return it and the vehicle file."""
+    config = load_config(RAPTOR)
+    vehicle = load_vehicle(config, str(RAPTOR))
+    sensors = config.sensors
+    models.setdefault("imu_model", ImuModel(Timing(25.0)))
+    assert sensors.gps is not None
+    assert sensors.imu is not None
+    assert sensors.wheels is not None
+    drive = Simulation(
+        vehicle.model,
+        config.base_frame,
+        Trajectory(figure_eight(speed=3.0, radius=8.0, stand=4.0, ramp=2.0, laps=8)),
+        origin_at(50.27, -111.18, 700.0),
+        gps_frame=sensors.gps.frame,
+        imu_frame=sensors.imu.frame,
+        wheel_frames=sensors.wheels.frames,
+        rolling_frame=config.rolling_frame,
+        seed=4,
+        **models,
+    )
+    events = [(each.header.host_utime, channel_of(each, config), encode(each)) for each in drive.events(seconds)]
+    return write_log(folder / "drive.lcm", events), RAPTOR
+
+
+def in_raw_mode(vehicle: Path, folder: Path) -> Path:
+    """Write a vehicle file as another one, in raw mode."""
+    content = yaml.safe_load(vehicle.read_text(encoding="utf-8"))
+    content["geometry"] = str((vehicle.parent / content["geometry"]).resolve())
+    content.setdefault("localization", {})["mode"] = "raw"
+    path = folder / "vehicle.yaml"
+    path.write_text(yaml.safe_dump(content), encoding="utf-8")
+    return path

@@ -1,0 +1,164 @@
+"""The page: whole, by itself, small, and with what a simulated drive shows."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from support_recordings import HUSKY, drive, write_log
+from support_tuning import in_raw_mode, simulated
+
+from modelserver.simulation import EncoderModel, WheelsModel
+from mstools import cli, panels
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    def replay(*arguments: object) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as end:
+            cli.main(["replay", *(str(each) for each in arguments)])
+        out, err = capsys.readouterr()
+        return int(end.value.code or 0), out, err
+
+    return replay
+
+
+class Balanced(HTMLParser):
+    """Counts what is opened and not closed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        if tag not in ("meta", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def whole(page: str) -> str:
+    """Check that a page is HTML that loads nothing, and return it."""
+    parser = Balanced()
+    parser.feed(page)
+    parser.close()
+    assert parser.open == []
+    assert not re.search(r"(src|href)=(?!\"#)|url\(|@import|<script|<link", page)
+    assert not re.search(r'[ ",](nan|inf)', page)
+    return page
+
+
+@pytest.fixture(scope="module")
+def eight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A drive round an eight with one wheel that counts backward: its log and vehicle file."""
+    folder = tmp_path_factory.mktemp("eight")
+    wheels = WheelsModel(encoder=EncoderModel(swapped=frozenset({"front_left"})))
+    return simulated(folder, seconds=25.0, wheels_model=wheels)
+
+
+def test_given_a_drive_when_reported_then_the_page_is_whole_and_the_swapped_wheel_is_named(
+    eight: tuple[Path, Path], tmp_path: Path, run: Run
+) -> None:
+    log, config = eight
+    out = tmp_path / "report.html"
+    code, words, err = run(log, "-c", config, "--report", out)
+    assert (code, err) == (0, "")
+    assert "Wheel front_left counts backward" in words
+    page = whole(out.read_text())
+    assert len(page) < 1_000_000
+    for text in ("Wheel front_left counts backward", "gps_position, east, m", "Gyro bias", "Wheel scale", "fixes used"):
+        assert text in page
+    assert "phase aligned" in page
+
+
+def test_given_a_report_beside_poses_and_decisions_then_these_are_as_without_it(
+    eight: tuple[Path, Path], tmp_path: Path, run: Run
+) -> None:
+    log, config = eight
+    one = ["--poses", tmp_path / "a.csv", "--decisions", tmp_path / "a.jsonl", "--rate", 5]
+    two = ["--poses", tmp_path / "b.csv", "--decisions", tmp_path / "b.jsonl", "--rate", 5]
+    assert run(log, "-c", config, *one)[0] == 0
+    assert run(log, "-c", config, *two, "--report", tmp_path / "r.html")[0] == 0
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+    assert (tmp_path / "a.jsonl").read_bytes() == (tmp_path / "b.jsonl").read_bytes()
+    assert (tmp_path / "r.html").stat().st_size > 10_000
+
+
+def test_given_raw_mode_then_there_is_a_page_without_innovations(tmp_path: Path, run: Run) -> None:
+    config = in_raw_mode(HUSKY, tmp_path)
+    log = write_log(tmp_path / "drive.lcm", drive(20.0))
+    assert run(log, "-c", config, "--report", tmp_path / "r.html")[0] == 0
+    assert "Nothing was compared" in whole((tmp_path / "r.html").read_text())
+
+
+def test_given_a_log_without_fixes_then_the_page_says_that_there_was_no_pose(tmp_path: Path, run: Run) -> None:
+    log = write_log(tmp_path / "drive.lcm", [each for each in drive(10.0) if each[1] == "IMU"])
+    code, words, _ = run(log, "-c", HUSKY, "--report", tmp_path / "r.html")
+    assert code == 0
+    assert "The pose was never valid" in words
+    assert "There was never a pose in the world" in whole((tmp_path / "r.html").read_text())
+
+
+def test_given_standard_output_then_only_the_page_goes_there(tmp_path: Path, run: Run) -> None:
+    log = write_log(tmp_path / "drive.lcm", drive(5.0))
+    code, out, err = run(log, "-c", HUSKY, "--report", "-")
+    assert code == 0
+    whole(out)
+    assert "report: -" in err
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--report", "r.html"], "--report needs the vehicle"),
+        (["-c", str(HUSKY), "--report", "r.html", "--at-times", "t"], "--at-times go with --poses"),
+        (["-c", str(HUSKY), "--report", "r.html", "--speed", "2"], "work offline"),
+        (["-c", str(HUSKY), "--report", "-", "--poses", "-"], "only one of"),
+    ],
+)
+def test_given_options_that_do_not_go_together_then_usage(
+    tmp_path: Path, run: Run, options: list[str], words: str
+) -> None:
+    log = write_log(tmp_path / "drive.lcm", drive(1.0))
+    code, _, err = run(log, *options)
+    assert code == 2
+    assert words in " ".join(re.sub(r"[│╭╮╰╯─]", " ", err).split())
+
+
+def test_given_a_report_over_what_is_read_or_written_then_it_is_refused(tmp_path: Path, run: Run) -> None:
+    log = write_log(tmp_path / "drive.lcm", drive(1.0))
+    before = log.read_bytes()
+    assert "is read by this command" in run(log, "-c", HUSKY, "--report", log)[2]
+    assert log.read_bytes() == before
+    one = tmp_path / "one"
+    assert "the poses go there" in run(log, "-c", HUSKY, "--poses", one, "--report", one)[2]
+    assert not one.exists()
+
+
+# --- drawing ------------------------------------------------------------------------------------------------
+
+
+def test_given_many_points_then_a_curve_keeps_its_peaks_and_little_else() -> None:
+    points = [(n / 100.0, 5.0 if n == 3333 else 0.0) for n in range(10_000)]
+    kept = panels.thinned(points)
+    assert len(kept) <= 4 * 101
+    assert (33.33, 5.0) in kept
+
+
+def test_given_many_dots_then_a_pixel_has_one() -> None:
+    axis = panels.Axis("m", -1.0, 1.0)
+    many = panels.Dots("dots", [n / 1000.0 for n in range(100_000)], [0.5] * 100_000)
+    drawn = panels.stack("a", 0.0, 100.0, [panels.Panel("p", axis, [many])])
+    assert len(drawn) < 30_000
+
+
+def test_given_a_name_with_marks_of_html_then_it_is_written_as_text() -> None:
+    drawn = panels.strip("<b>", 0.0, 1.0, [panels.Row("<i>", [(0.0, 1.0, '"&<')], panels.RED)])
+    assert "<b>" not in drawn
+    assert "<i>" not in drawn

@@ -1,0 +1,184 @@
+"""What the report on a replay finds, each from a replay that shows just that."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from modelserver.localization.filter.settings import FilterSettings
+from modelserver.messages import VALID, Decision, Invalid, Phase, Verdict
+from mstools import consistency
+from mstools.report_data import Fix, Replayed, Sensor, Snapshot, WheelTurn
+from mstools.report_findings import Grade, findings, fix_latency
+
+START = 1_700_000_000_000_000
+
+
+def snapshot(t: float, **more: object) -> Snapshot:
+    given = Snapshot(t, VALID, 0, (t, 0.0, 0.0), 0.0, 0.1, 0.01, speed=1.0, side=0.0, turn=0.0, phase=Phase.ALIGNED)
+    return replace(given, **more)  # type: ignore[arg-type]
+
+
+def replayed(**more: object) -> Replayed:
+    given = Replayed("cart", "drive.lcm", START, 100.0, FilterSettings(), tuple(map(snapshot, range(100))))
+    return replace(given, **more)  # type: ignore[arg-type]
+
+
+def titles(given: Replayed) -> list[str]:
+    return [each.title for each in findings(given)]
+
+
+def turns(name: str, factor: float, stuck_from: float = math.inf) -> list[WheelTurn]:
+    return [WheelTurn(t, name, 0.0 if t >= stuck_from else factor, 1.0) for t in np.arange(0.0, 40.0, 0.1).tolist()]
+
+
+def decisions(kind: str, nis: float, count: int = 100, source: str = "gps") -> tuple[Decision, ...]:
+    residual = math.sqrt(nis)
+    return tuple(
+        Decision(START + n * 100_000, source, n, kind, Verdict.USED, "", (residual,), (1.0,), (1.0,), nis, 15.0)
+        for n in range(count)
+    )
+
+
+def test_given_nothing_wrong_then_nothing_is_found() -> None:
+    good = replayed(
+        wheels=tuple(turns("left", 1.02)),
+        felt_up=(0.1, -0.2, 9.8),
+        decisions=decisions("gps_position", 0.9),
+        sensors=(Sensor("imu", tuple(np.arange(0.0, 100.0, 0.02).tolist())),),
+    )
+    assert findings(good) == []
+
+
+def test_given_a_wheel_that_counts_backward_then_it_is_named_and_the_other_is_not() -> None:
+    found = findings(replayed(wheels=(*turns("left", -1.01), *turns("right", 1.0))))
+    assert [each.title for each in found] == ["Wheel left counts backward"]
+    assert found[0].grade is Grade.WRONG
+    assert "sign" in found[0].advice
+
+
+def test_given_an_encoder_that_sticks_then_it_is_named_with_how_long() -> None:
+    found = findings(replayed(wheels=tuple(turns("left", 1.0, stuck_from=30.0))))
+    assert [each.title for each in found] == ["Wheel left stands while the vehicle drives"]
+    assert "up to 10 s" in found[0].seen
+
+
+def test_given_wheels_of_a_standing_vehicle_then_nothing_is_said_of_them() -> None:
+    still = tuple(replace(each, measured=0.0, expected=0.01) for each in turns("left", 1.0))
+    assert titles(replayed(wheels=still)) == []
+
+
+def test_given_a_frozen_unit_then_it_is_found() -> None:
+    assert titles(replayed(frozen=((10.0, 14.0),))) == ["The inertial unit froze"]
+
+
+def test_given_gravity_from_the_side_then_the_mount_is_doubted() -> None:
+    found = findings(replayed(felt_up=(0.0, 9.8, 0.0)))
+    assert [each.title for each in found] == ["The inertial unit is mounted otherwise than the geometry says"]
+    assert "90 degrees" in found[0].seen
+
+
+def test_given_acceleration_in_units_of_gravity_then_the_unit_is_doubted() -> None:
+    assert titles(replayed(felt_up=(0.0, 0.0, 1.0))) == ["The inertial unit feels 1.00 m/s2 in the mean"]
+
+
+@pytest.mark.parametrize("tau", [0.5, -0.4, 0.0])
+def test_given_fixes_that_lie_behind_by_a_time_then_that_is_told(tau: float) -> None:
+    noise = np.random.default_rng(1).normal(0.0, 0.3, (400, 2))
+    fixes = []
+    for n in range(400):
+        t = 0.25 * n
+        v = (2.0 * math.cos(0.3 * t), 2.0 * math.sin(0.3 * t))
+        off = (-tau * v[0] + 3.0 + noise[n, 0], -tau * v[1] + noise[n, 1])
+        fixes.append(Fix(t, (0.0, 0.0, 0.0), 0.5, "used", "", off, v))
+    given = replayed(fixes=tuple(fixes))
+    found = fix_latency(given)
+    assert found is not None
+    assert found[0] == pytest.approx(tau, abs=0.05)
+    said = [title for title in titles(given) if title.startswith("Fixes lie")]
+    assert said == (
+        [] if tau == 0.0 else [f"Fixes lie {abs(found[0]):.2f} s {'behind' if tau > 0 else 'ahead of'} the vehicle"]
+    )
+
+
+def test_given_a_straight_drive_then_no_latency_can_be_told() -> None:
+    fixes = tuple(Fix(0.25 * n, None, 0.5, "used", "", (-1.0, 0.0), (2.0, 0.0)) for n in range(400))
+    assert fix_latency(replayed(fixes=fixes)) is None
+
+
+def test_given_innovations_far_from_what_is_stated_then_the_kind_is_named() -> None:
+    assert titles(replayed(decisions=decisions("gps_position", 6.0))) == ["gps_position errs more than its sigma says"]
+    assert titles(replayed(decisions=decisions("gps_position", 0.05))) == ["gps_position errs less than its sigma says"]
+    # what is known without a sensor has its noise widened on purpose
+    assert titles(replayed(decisions=decisions("non_holonomic", 0.05, source="filter"))) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("wheel_scale", 0.09, "The wheels tell 9.0% too far"),
+        ("wheel_yaw", 0.05, "The wheels roll 2.9 degrees to the left"),
+        ("gyro_bias_z", -0.05, "Gyro bias about z is far outside its data sheet"),
+        ("accelerometer_bias_x", 0.5, "Accelerometer bias along x is far outside its data sheet"),
+    ],
+)
+def test_given_a_state_far_from_what_is_expected_then_it_is_named(name: str, value: float, words: str) -> None:
+    given = tuple(snapshot(t, values={name: value}, sigmas={name: 0.001}) for t in range(100))
+    assert titles(replayed(snapshots=given)) == [words]
+    unsure = tuple(snapshot(t, values={name: value}, sigmas={name: 1.0}) for t in range(100))
+    assert titles(replayed(snapshots=unsure)) == []
+
+
+def test_given_poses_that_are_never_valid_then_the_reason_is_told() -> None:
+    given = tuple(snapshot(t, invalid=Invalid.NOT_MOVED_YET) for t in range(100))
+    found = findings(replayed(snapshots=given))
+    assert [each.title for each in found] == ["The pose was never valid"]
+    assert "before the vehicle moves" in found[0].seen
+    assert titles(replayed(snapshots=())) == ["There was never a state"]
+
+
+def test_given_a_vehicle_that_always_backs_up_then_front_and_rear_are_doubted() -> None:
+    given = tuple(snapshot(t, speed=-1.0) for t in range(100))
+    assert titles(replayed(snapshots=given)) == ["The vehicle drives backward nearly all the time"]
+
+
+def test_given_refused_and_late_samples_and_gaps_then_all_are_found_worst_first() -> None:
+    fixes = tuple(Fix(n, None, 1.0, "rejected" if n % 2 else "used", "gate") for n in range(40))
+    found = findings(
+        replayed(
+            fixes=fixes,
+            frozen=((1.0, 3.0),),
+            rejected={("sensor:imu", "late"): 7, ("sensor:gps", "duplicate"): 1},
+            sensors=(Sensor("imu", (*np.arange(0.0, 40.0, 0.02).tolist(), *np.arange(45.0, 80.0, 0.02).tolist())),),
+        )
+    )
+    assert [each.title for each in found] == [
+        "The inertial unit froze",
+        "50% of the fixes were refused",
+        "sensor:imu: 7 samples late",
+        "imu: 1 gap, the longest 5.0 s",
+    ]
+    assert [each.grade for each in found] == sorted(each.grade for each in found)
+
+
+# --- consistency --------------------------------------------------------------------------------------------
+
+
+def test_given_normal_residuals_then_nis_is_one_and_a_twentieth_is_beyond() -> None:
+    draws = np.random.default_rng(2).normal(0.0, 1.0, 4000) ** 2
+    made = [decisions("a", float(nis), 1)[0]._replace(utime=START + n * 1000) for n, nis in enumerate(draws)]
+    (found,) = consistency.by_kind(made)
+    assert found.mean == pytest.approx(1.0, abs=0.07)
+    assert found.beyond == pytest.approx(0.05, abs=0.015)
+    utimes, means = consistency.running(made, 1.0)
+    assert len(utimes) == len(means) == 4000
+    assert means[-1] == pytest.approx(float(draws[-1001:].mean()))
+
+
+def test_given_what_was_set_aside_then_it_does_not_count() -> None:
+    aside = decisions("a", 9.0, 1)[0]._replace(verdict=Verdict.MONITORED)
+    refused = Decision(START, "gps", 0, "a", Verdict.REJECTED, "satellites")
+    assert consistency.by_kind([aside, refused]) == []

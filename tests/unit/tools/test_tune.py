@@ -1,0 +1,190 @@
+"""Tuning: the search by itself, and the command on a drive whose noise differs from the settings."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from support_recordings import HUSKY, drive, write_log
+from support_tuning import RAPTOR, simulated
+
+from modelserver.config import load_config
+from modelserver.simulation import GpsModel, Timing
+from mstools import cli
+from mstools.tune import TUNABLES
+from mstools.tune_runs import mixed
+from mstools.tune_search import Parameter, Score, search
+
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    def tune(*arguments: object) -> tuple[int, str, str]:
+        with pytest.raises(SystemExit) as end:
+            cli.main(["tune", *(str(each) for each in arguments)])
+        out, err = capsys.readouterr()
+        return int(end.value.code or 0), out, err
+
+    return tune
+
+
+# --- the search ---------------------------------------------------------------------------------------------
+
+
+class Hill:
+    """A likelihood that is highest at `top`, and is looked up as often as `asked` says."""
+
+    def __init__(self, begin: Mapping[str, float], top: Mapping[str, float], rmse: Mapping[str, float] | None = None):
+        self.begin, self.top, self.rmse = begin, top, rmse or {}
+        self.asked = 0
+
+    def __call__(self, trials: Sequence[Mapping[str, float]]) -> list[Score | None]:
+        self.asked += len(trials)
+        return [self.score({**self.begin, **each}) for each in trials]
+
+    def score(self, values: Mapping[str, float]) -> Score:
+        height = -sum(math.log2(values[name] / top) ** 2 for name, top in self.top.items())
+        return Score(height, 1.0 + sum(slope * math.log2(values[n] / self.begin[n]) for n, slope in self.rmse.items()))
+
+
+def test_given_a_hill_when_searched_then_each_setting_goes_to_its_top() -> None:
+    begin = {"a": 1.0, "b": 1.0, "c": 1.0}
+    hill = Hill(begin, {"a": 4.0, "b": 0.5})
+    found = search(begin, hill.score(begin), [Parameter(name) for name in begin], hill)
+    assert found.settings == {"a": 4.0, "b": 0.5}
+    assert found.unseen == ("c",)
+    assert found.score.likelihood == 0.0
+    assert [(each.name, each.after) for each in found.steps] == [("a", 2.0), ("a", 4.0), ("b", 0.5)]
+    assert hill.asked < 20
+
+
+def test_given_a_gain_that_costs_accuracy_then_the_step_is_not_taken() -> None:
+    begin = {"a": 1.0}
+    hill = Hill(begin, {"a": 4.0}, rmse={"a": 0.5})
+    assert search(begin, hill.score(begin), [Parameter("a")], hill).settings == {}
+
+
+def test_given_bounds_then_the_search_stays_within_and_not_far_from_where_it_began() -> None:
+    begin = {"a": 1.0, "b": 1.0}
+    hill = Hill(begin, {"a": 1000.0, "b": 1000.0})
+    found = search(begin, hill.score(begin), [Parameter("a", high=3.0), Parameter("b")], hill)
+    assert found.settings == {"a": 3.0, "b": 8.0}
+
+
+def test_given_settings_that_cannot_be_then_others_are_tried() -> None:
+    begin = {"a": 1.0}
+    hill = Hill(begin, {"a": 0.25})
+
+    def evaluate(trials: Sequence[Mapping[str, float]]) -> list[Score | None]:
+        return [None if each.get("a", 1.0) > 1.0 else hill([each])[0] for each in trials]
+
+    assert search(begin, hill.score(begin), [Parameter("a")], evaluate).settings == {"a": 0.25}
+
+
+def test_given_residuals_then_the_true_covariance_is_the_most_likely() -> None:
+    draws = np.random.default_rng(3).normal(0.0, 0.5, (2000, 2))
+    draws[::100] += 30.0
+
+    def likelihood(sigma: float) -> float:
+        return sum(mixed(each, np.eye(2) * sigma**2) for each in draws)
+
+    assert max((0.125, 0.25, 0.5, 1.0, 2.0), key=likelihood) == 0.5
+
+
+def test_given_the_settings_that_are_tuned_then_all_are_the_filters_and_within_bounds() -> None:
+    settings = load_config(RAPTOR).localization.filter
+    for each in TUNABLES:
+        assert each.parameter.low <= getattr(settings, each.parameter.name) <= each.parameter.high
+
+
+# --- the command --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def noisy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A drive whose fixes scatter by 0.6 m, as they say; but all of it is new with each fix."""
+    receiver = GpsModel(Timing(3.0), lingering_sigma=0.0, white_sigma=0.6, tells_velocity=False)
+    return simulated(tmp_path_factory.mktemp("noisy"), seconds=30.0, gps_model=receiver)
+
+
+def test_given_fixes_that_scatter_more_than_is_set_when_tuned_then_more_is_taken_for_new(
+    noisy: tuple[Path, Path], tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mstools.tune.TUNABLES", TUNABLES[:1])
+    log, config = noisy
+    out = tmp_path / "proposal.yaml"
+    before = config.read_bytes()
+    code, words, err = run(log, "-c", config, "--quick", "--processes", 1, "-o", out)
+    assert code == 0
+    assert "NIS, gps_position" in words
+    assert "gps_white_share: 0.15 -> 0.3" in err
+    proposed = yaml.safe_load(out.read_text())["localization"]["filter"]
+    assert proposed["gps_white_share"] >= 0.3
+    assert config.read_bytes() == before
+
+
+def test_given_the_same_drive_when_tuned_twice_then_the_same_is_told(
+    noisy: tuple[Path, Path], run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mstools.tune.TUNABLES", TUNABLES[:0])
+    first, second = (run(*noisy[:1], "-c", noisy[1], "--quick", "--processes", 1, "--json") for _ in range(2))
+    assert first[0] == 0
+    assert first[1] == second[1]
+    report = json.loads(first[1])
+    assert report["withheld"] > 20
+    assert report["before"] == report["after"]
+    assert report["before"]["rmse"] < 2.0
+    assert set(report) == {"runs", "withheld", "before", "after", "proposal", "unseen"}
+
+
+def test_given_no_vehicle_then_usage(tmp_path: Path, run: Run) -> None:
+    code, _, err = run(write_log(tmp_path / "drive.lcm", drive(1.0)))
+    assert code == 2
+    assert "tune needs the vehicle" in err
+
+
+def test_given_a_log_without_fixes_then_it_says_so(tmp_path: Path, run: Run) -> None:
+    log = write_log(tmp_path / "drive.lcm", [each for each in drive(5.0) if each[1] == "IMU"])
+    code, out, err = run(log, "-c", HUSKY)
+    assert (code, out) == (1, "")
+    assert "0 of 0 messages on GPS are good fixes" in err
+
+
+def test_given_a_vehicle_without_gps_then_it_says_so(tmp_path: Path, run: Run) -> None:
+    config = tmp_path / "vehicle.yaml"
+    config.write_text(f"vehicle: V\ngeometry: {HUSKY.with_name('geometry.yaml')}\nbase_frame: Husky:Base\n")
+    code, _, err = run(write_log(tmp_path / "drive.lcm", drive(1.0)), "-c", config)
+    assert code == 1
+    assert "names no GPS under sensors" in err
+
+
+def test_given_a_log_that_is_not_there_then_one_line(tmp_path: Path, run: Run) -> None:
+    code, _, err = run(tmp_path / "no.lcm", "-c", HUSKY)
+    assert (code, err.count("\n")) == (1, 1)
+    assert "no.lcm" in err
+
+
+def test_given_a_standing_vehicle_then_it_says_that_nothing_can_be_scored(tmp_path: Path, run: Run) -> None:
+    log = write_log(tmp_path / "drive.lcm", [each for each in drive(8.0) if each[1] == "GPS"])
+    code, _, err = run(log, "-c", HUSKY, "--quick", "--processes", 1)
+    assert code == 1
+    assert "there was no pose at any of the withheld fixes" in err
+    assert "--report" in err
+
+
+def test_given_a_proposal_that_exists_then_it_stays(tmp_path: Path, run: Run) -> None:
+    log = write_log(tmp_path / "drive.lcm", drive(1.0))
+    out = tmp_path / "proposal.yaml"
+    out.write_text("precious")
+    code, _, err = run(log, "-c", HUSKY, "-o", out)
+    assert code == 1
+    assert "--force" in err
+    assert out.read_text() == "precious"
+    assert run(log, "-c", HUSKY, "-o", log)[0] == 2
+    assert run(log, "-c", HUSKY, "-o", "-", "--json")[0] == 2
