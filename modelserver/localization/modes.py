@@ -118,7 +118,11 @@ class ModeLocalizer:
         else:
             before = self.estimate(utime - SPEED_SPAN_US)
             active = FilterLocalizer.start(makings.setup, last.origin, wish.mode).begun_from(last, before)
-            X_odom = last.odom @ active.odom.pose(utime).inverse()
+            if active.odom.started:
+                X_odom = last.odom @ active.odom.pose(utime).inverse()
+            else:
+                # its Odom will begin with the vehicle's tilt and yaw 0
+                X_odom = Pose.from_rpy(last.odom.xyz, 0.0, 0.0, math.atan2(*_heading(last.odom)))
         word = Decision(
             utime, wish.header.source, wish.header.seq, "mode", Verdict.TOOK_UP, f"mode {wish.mode.name.lower()}"
         )

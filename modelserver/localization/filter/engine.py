@@ -343,6 +343,8 @@ def _fix(setup: Setup, state: FilterState, item: Item) -> Fused:
     if state.nav is None:
         if not motion.inertial(setup, state.mode) and setup.wheels is None:
             state = _begun_level(setup, state, item.utime)
+        elif fixes.moving(setup, state, sample):
+            state = state._replace(moved=item.utime + round(fixes.SAME_PLACE * 1e6))
         return state, _NOTHING
     state = motion.caught_up(setup, motion.at(setup, state, item.utime))
     nav = state.nav
@@ -370,10 +372,6 @@ def _fix(setup: Setup, state: FilterState, item: Item) -> Fused:
         return state, _NOTHING
     if unused or resting:
         compared = compared._replace(monitored=unused or "at_rest")
-    if not steady or state.refused_count:
-        # one that jumped does not err a little more than usual: eased, each pulls, and ten seconds of them pull the
-        # pose out of its bound
-        compared = compared._replace(eased=1.0)
     if unused:
         _, decision = updates.used(nav, compared, setup.settings, item.utime, item.source, item.seq, item.kind)
         return state, (decision,)
@@ -493,6 +491,10 @@ def _measured(setup: Setup, state: FilterState, item: Item) -> Fused:
     if isinstance(compared, str):
         return state, ((_refused(item, compared),) if compared else _NOTHING)
     nav, decision = updates.used(scene.nav, compared, setup.settings, item.utime, item.source, item.seq, item.kind)
+    if decision.verdict is Verdict.USED and not isinstance(sample, GpsSample):
+        tells = compared.jacobian[:, :3] != 0.0
+        a, b, c = (item.utime if tells[:, axis].any() else state.anchored[axis] for axis in range(3))
+        state = state._replace(anchored=(a, b, c))
     return _remembered(state._replace(nav=nav), key, item), (decision,)
 
 

@@ -30,6 +30,12 @@ from modelserver.spatial.so3 import Vector3
 FRESH = 1.5
 """Seconds for which a fix still says where a vehicle is whose heading was just found."""
 
+ANCHORED = 10.0
+"""Seconds for which another source that tells the place keeps the pose from going with the fixes."""
+
+CONFLICT_FADES = 20.0
+"""Seconds after a fix from beyond its gate for which the bound allows for it in full."""
+
 SAME_PLACE = 3.0
 """Seconds of fixes that tell whether the vehicle moves, where wheels do not."""
 
@@ -91,6 +97,16 @@ def passed(setup: Setup, state: FilterState, nav: Nav, fix: GoodFix, kind: FixTy
         shares(fix.up_variance, kind, setup.settings)[1],
     )
     return state._replace(site=site, earth=earth), newest
+
+
+def moving(setup: Setup, state: FilterState, sample: GpsSample) -> bool:
+    """Return whether fixes say that a vehicle moves that is not levelled yet: by velocity, or by their places."""
+    stated = stated_velocity(sample, setup.settings)
+    if stated is not None:
+        velocity, R = stated
+        return math.hypot(velocity[0], velocity[1]) > 4.0 * math.sqrt(max(R[0, 0], R[1, 1])) + 0.2
+    kept = state.capture.fixes
+    return len(kept) > 1 and math.dist(kept[0][1], kept[-1][1]) > 4.0 * (kept[0][2] + kept[-1][2])
 
 
 # --- finding heading ----------------------------------------------------------------------------------------
@@ -208,17 +224,26 @@ def widened(setup: Setup, nav: Nav, restless: float, seconds: float) -> Nav:
 
 
 def shown(setup: Setup, state: FilterState, sigma: Vector3, seconds: float, axes: slice) -> FilterState:
-    """Return the state with the pose gone along with what lingers in fixes, no faster than it may."""
+    """Return the state with the pose gone along with what lingers in fixes, no faster than it may.
+
+    Where another source tells the place, the pose has no need of it. What following adds to the position's variance is
+    kept with it: sigma^2 less what is left unknown, and what it has still to go.
+    """
     nav = state.nav
     assert nav is not None
     most = setup.settings.follow_speed * min(seconds, 2.0)
     at = setup.layout.extra(WANDER[0])
-    new, lingering = list(state.shown), list(state.lingering)
+    first = setup.layout.index(WANDER[0])
+    new, doubt = list(state.shown), list(state.doubt)
     for axis in range(3)[axes]:
-        off = sigma[axis] * nav.extras[at + axis] - new[axis]
-        new[axis] += max(-most, min(off, most))
-        lingering[axis] = sigma[axis]
-    return state._replace(shown=(new[0], new[1], new[2]), lingering=(lingering[0], lingering[1], lingering[2]))
+        told = (nav.utime - state.anchored[axis]) * 1e-6 < ANCHORED
+        off = (0.0 if told else sigma[axis] * nav.extras[at + axis]) - new[axis]
+        moved = max(-most, min(off, most))
+        new[axis] += moved
+        left = float(nav.covariance[first + axis, first + axis])
+        learnt_variance = 0.0 if told else sigma[axis] ** 2 * max(1.0 - left, 0.0)
+        doubt[axis] = learnt_variance + (off - moved) ** 2
+    return state._replace(shown=(new[0], new[1], new[2]), doubt=(doubt[0], doubt[1], doubt[2]))
 
 
 def learnt(setup: Setup, restless: float, decision: Decision, seconds: float) -> float:
@@ -298,7 +323,9 @@ def _confirmed(state: FilterState, utime: int) -> FilterState:
 def allowed(state: FilterState, before: Nav, compared: Compared, decision: Decision) -> FilterState:
     """Return the state with what an outlier just within the gate would have moved the position by, metres.
 
-    The gain's horizontal rows times the gate's radius; what earlier fixes allowed fades as newer ones correct it.
+    The gain's horizontal rows times the gate's radius; of a fix beyond the gate, which was eased in or drifted there,
+    all that it is off: either it is wrong or the state was. It fades as newer fixes correct it, and of itself as slowly
+    as such conflicts are resolved.
     """
     H, m = compared.jacobian, len(compared.residual)
     S = np.array(decision.innovation_covariance).reshape(m, m)
@@ -306,7 +333,15 @@ def allowed(state: FilterState, before: Nav, compared: Compared, decision: Decis
     radius = math.sqrt(decision.limit * float(np.trace(S)) / m)
     one = float(np.linalg.norm(gain, 2)) * radius
     weight = 1.0 - min(float(np.linalg.norm(gain, 2)), 1.0)
-    return state._replace(allowance=max(one, weight * state.allowance), allowance_utime=before.utime)
+    if decision.reason:
+        one = max(one, float(np.linalg.norm(compared.residual)))
+    since = (before.utime - state.conflict_utime) * 1e-6
+    if decision.reason or since < CONFLICT_FADES:
+        weight = 1.0
+    return state._replace(
+        allowance=max(one, weight * state.allowance),
+        conflict_utime=before.utime if decision.reason else state.conflict_utime,
+    )
 
 
 def _believed(setup: Setup, state: FilterState) -> bool:

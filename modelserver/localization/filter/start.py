@@ -29,7 +29,7 @@ def levelled(setup: Setup, state: FilterState, utime: int, rate: Vector3, force:
     keeps `tilt`, and levelling goes on: the mount is wrong, or the vehicle lies on its side.
     """
     settings = setup.settings
-    still = state.stillness.seconds(utime) > 0.0
+    still = state.stillness.seconds(utime) > 0.0 and utime >= state.moved
     if still and state.level_count and state.stillness.since >= state.began and not state.standing:
         # what was felt before it stood does not count
         state = state._replace(level_force=ZERO, level_rate=ZERO, level_count=0, standing=True, began=utime)

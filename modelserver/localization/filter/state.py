@@ -82,9 +82,11 @@ class FilterState(NamedTuple):
     them; `confirmed` counts the fixes that were used, and `fix_utime` is the last that was used or confirmed.
     `moved` is until when fixes say that the vehicle moves. `restless` is by how much faster than the settings say
     what lingers in fixes wanders. `shown` is how far the pose goes with what lingers in fixes, metres along N,
-    whose sigma is `lingering`. `allowance` is what one outlier just within its gate may have moved the position by,
-    metres, at `allowance_utime`. `biases` are the gyros' with their sigma, kept where the rest begins anew. `tilt`
-    is how far gravity is off the geometry's up at start-up, where that is too far.
+    `doubt` the variance that this adds, and `anchored` when another source last told the place along each axis.
+    `allowance` is what one outlier just within its gate may have moved the position by, metres, and
+    `conflict_utime` when a fix from beyond its gate was last used. `biases` are the gyros' with their sigma, kept
+    where the rest begins anew. `tilt` is how far gravity is off the geometry's up at start-up, where that is too
+    far.
     """
 
     nav: Nav | None = None
@@ -117,9 +119,10 @@ class FilterState(NamedTuple):
     fixed: Passed | None = None
     restless: float = 1.0
     shown: Vector3 = (0.0, 0.0, 0.0)
-    lingering: Vector3 = (0.0, 0.0, 0.0)
+    doubt: Vector3 = (0.0, 0.0, 0.0)
+    anchored: tuple[int, int, int] = (0, 0, 0)
     allowance: float = 0.0
-    allowance_utime: int = 0
+    conflict_utime: int = 0
     epoch: int = 0
     tilt: float = 0.0
     level_force: Vector3 = (0.0, 0.0, 0.0)

@@ -10,7 +10,6 @@ import numpy as np
 from modelserver.geodesy import Geodesy, GeodesyError, LocalFrame, about_up, geodetic_from_ecef
 from modelserver.localization.filter import bounds, motion, strapdown
 from modelserver.localization.filter.measurements.constraints import tilt_of
-from modelserver.localization.filter.measurements.gps import WANDER
 from modelserver.localization.filter.nav import Nav, jacobian_of_body_velocity
 from modelserver.localization.filter.odometry import Odometry
 from modelserver.localization.filter.setup import Setup
@@ -56,7 +55,7 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     nav = strapdown.caught_up(nav, motion.noise(setup, ahead, nav), setup.layout)
     settings = setup.settings
     P = _at_base(nav, setup)
-    offset, doubt = _followed(setup, state, nav, utime)
+    offset, doubt = _followed(setup, state, utime)
     P[0, 0], P[1, 1], P[2, 2] = P[0, 0] + doubt[0], P[1, 1] + doubt[1], P[2, 2] + doubt[2]
     horizontal = bounds.horizontal(P, state.allowance, settings)
     heading = bounds.heading(float(P[5, 5]), settings)
@@ -88,22 +87,19 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     )
 
 
-def _followed(setup: Setup, state: FilterState, nav: Nav, utime: int) -> tuple[Vector3, Vector3]:
+def _followed(setup: Setup, state: FilterState, utime: int) -> tuple[Vector3, Vector3]:
     """Return how far the pose goes with what lingers in fixes, metres along N, and the variance that this adds, m2.
 
     The estimate of what lingers is independent of the position's error, as an optimal estimate is of its own error; so
-    adding it adds its variance, which is what the filter has learnt: sigma^2 less what is left. Where fixes are missing
-    on the move it fades, as what lingers does.
+    adding it adds its variance. Where fixes are missing on the move it fades, as what lingers does.
     """
-    at = setup.layout.index(WANDER[0])
     fade = 1.0
     silent = (utime - state.fix_utime) * 1e-6
     if silent > FADING and not state.standing:
         fade = math.exp(-(silent - FADING) / setup.settings.gps_wander_time)
     x, y, z = state.shown
-    left = np.diagonal(nav.covariance)[at : at + 3].tolist()
-    a, b, c = (s * s * max(1.0 - p, 0.0) for s, p in zip(state.lingering, left, strict=True))
-    return (x * fade, y * fade, z * fade), (a, b, c)
+    a, b, c = state.doubt
+    return (x * fade, y * fade, z * fade), (a * fade * fade, b * fade * fade, c * fade * fade)
 
 
 def _at_base(nav: Nav, setup: Setup) -> Array:
