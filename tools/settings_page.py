@@ -24,7 +24,7 @@ What can be set under `localization.filter` of the [vehicle file](vehicle-file.m
 standard deviation. Defaults are a data sheet's or physics' numbers, named at each; none is tuned to a recording.
 
 This page is written by `python tools/settings_page.py` from `FilterSettings` and the `FixSettings` that it shares with
-[raw mode](localization.md); a test fails where the two differ. Change the words there, and run it.
+[raw mode](raw-mode.md); a test fails where the two differ. Change the words there, and run it.
 """
 
 TABLE = """

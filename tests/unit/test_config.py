@@ -428,7 +428,7 @@ def test_given_the_page_on_the_vehicle_file_then_it_names_every_key_and_no_other
 
 
 def test_given_the_page_on_localization_then_it_names_every_setting() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "localization.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "raw-mode.md").read_text(encoding="utf-8")
     for each in dataclasses.fields(RawSettings):
         assert f"`{each.name}`" in page
 

@@ -2,7 +2,7 @@
 
 Position is the last good fix, brought to the base frame and carried on by speed along heading; roll and pitch
 are the inertial unit's; heading is the GPS course while moving and the gyro's in between. See
-docs/localization.md for the equations and the limits.
+docs/raw-mode.md for the equations and the limits.
 """
 
 from __future__ import annotations
