@@ -234,7 +234,9 @@ def _localize(state: CoreState, before: Localizer, sample: Sample | SwitchMode, 
     history = state.history
     if known and (not len(history) or not 0 < localizer.utime - history.last < HISTORY_STEP_US):
         history = history.extended(localizer.deferred(localizer.utime))
-    state = state._replace(view=replace(state.view, localizer=localizer, history=history))
+    view = state.view
+    view = PlatformView(view.model, view.base_frame, localizer, history, view.rolling_frame, view.doubt)
+    state = state._replace(view=view)
     if known:
         # a part may be refused of a sample that moves time on all the same
         taken = not refused or localizer.utime != before.utime

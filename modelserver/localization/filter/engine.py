@@ -132,9 +132,8 @@ def _inertial(setup: Setup, state: FilterState, item: Item) -> Fused:
     said = Said(item.utime, rate, force, item.utime)
     if state.said is not None:
         said = state.said.followed(item.utime, rate, force)
-    state = state._replace(said=said)
     if (item.utime - said.since) * 1e-6 > setup.settings.frozen_time:
-        return state, (_refused(item, "frozen"),)
+        return state._replace(said=said), (_refused(item, "frozen"),)
     decisions = _NOTHING
     if said.made_up != state.guessed:
         state = motion.caught_up(setup, state)._replace(guessed=said.made_up)
@@ -146,15 +145,16 @@ def _inertial(setup: Setup, state: FilterState, item: Item) -> Fused:
     if nav is not None:
         P = nav.covariance
         sigma = math.sqrt(max(P[9, 9], P[10, 10], P[11, 11]))
-    state = state._replace(stillness=state.stillness.felt(item.utime, rate, force, bias, sigma, setup.settings))
+    stillness = state.stillness.felt(item.utime, rate, force, bias, sigma, setup.settings)
     if nav is None:
         was = state.tilt
+        state = state._replace(stillness=stillness, said=said)
         state = start.levelled(setup, state, item.utime, rate, force)
         if state.tilt and state.tilt != was:
             return state, (_refused(item, "mount"),)
         return state, _NOTHING
     gap = (item.utime - state.imu_utime) * 1e-6 > setup.settings.rate_hold and state.imu_utime > 0
-    state = motion.felt(setup, state, item.utime, rate, force)
+    state = motion.felt(setup, state, item.utime, rate, force, stillness, said)
     if gap:
         decisions += (_refused(item, "gap")._replace(verdict=Verdict.MONITORED),)
     state, more = _constrained(setup, state, item.utime)

@@ -329,10 +329,11 @@ def allowed(state: FilterState, before: Nav, compared: Compared, decision: Decis
     """
     H, m = compared.jacobian, len(compared.residual)
     S = np.array(decision.innovation_covariance).reshape(m, m)
-    gain = before.covariance[0:2] @ H.T @ np.linalg.inv(S)
+    gain = np.linalg.solve(S, H @ before.covariance[:, 0:2]).T
     radius = math.sqrt(decision.limit * float(np.trace(S)) / m)
-    one = float(np.linalg.norm(gain, 2)) * radius
-    weight = 1.0 - min(float(np.linalg.norm(gain, 2)), 1.0)
+    size = float(np.sqrt((gain * gain).sum()))
+    one = size * radius
+    weight = 1.0 - min(size, 1.0)
     if decision.reason:
         one = max(one, float(np.linalg.norm(compared.residual)))
     since = (before.utime - state.conflict_utime) * 1e-6

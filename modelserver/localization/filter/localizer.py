@@ -11,7 +11,7 @@ from modelserver.localization.filter.clocks import Clocks
 from modelserver.localization.filter.engine import INERTIAL, Item
 from modelserver.localization.filter.odometry import Odometry
 from modelserver.localization.filter.setup import Setup
-from modelserver.localization.filter.state import FilterState
+from modelserver.localization.filter.state import FilterState, Said
 from modelserver.localization.filter.timeline import Timeline
 from modelserver.localization.interface import Note
 from modelserver.messages import (
@@ -27,6 +27,9 @@ from modelserver.messages import (
     Verdict,
     WheelsSample,
 )
+
+ODOM_LEAST_US = 15_000
+"""Microseconds between two steps of Odom, at least: between them it goes on by its twist."""
 
 ODOM_KEPT_US = 2_000_000
 ODOM_STEP_US = 20_000
@@ -127,7 +130,7 @@ class FilterLocalizer:
         timeline, decisions = timeline.settled_before(oldest)
         notes += decisions
         odom, odoms = self.odom, self.odoms
-        if head.nav is not None and head.nav.utime > odom.utime:
+        if head.nav is not None and head.nav.utime >= odom.utime + ODOM_LEAST_US:
             odom = odom.advanced(head.nav, setup.rig.base, head.standing)
             if not odoms or odom.utime - odoms[-1].utime >= ODOM_STEP_US:
                 odoms = _kept(odoms, odom)
@@ -148,7 +151,9 @@ class FilterLocalizer:
         if item.kind == INERTIAL and isinstance(sample, ImuSample) and head.nav is not None:
             read = engine.read(self.setup, sample)
             if not isinstance(read, str) and item.utime > head.nav.utime and head.mode is not Mode.NO_IMU:
-                return motion.felt(self.setup, head, item.utime, *read)
+                rate, force = read
+                said = head.said or Said(item.utime, rate, force, item.utime)
+                return motion.felt(self.setup, head, item.utime, rate, force, head.stillness, said)
         return head
 
     def _begun_anew(self, utime: int) -> FilterLocalizer:

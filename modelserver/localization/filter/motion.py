@@ -7,7 +7,8 @@ import cmath
 from modelserver.localization.filter import strapdown
 from modelserver.localization.filter.nav import ZERO, Nav
 from modelserver.localization.filter.setup import Setup
-from modelserver.localization.filter.state import FilterState
+from modelserver.localization.filter.state import FilterState, Said
+from modelserver.localization.filter.stillness import Stillness
 from modelserver.localization.filter.strapdown import Noise
 from modelserver.messages import Mode, Phase
 from modelserver.spatial import so3
@@ -34,8 +35,13 @@ def felt_noise(setup: Setup, state: FilterState) -> Noise:
     return setup.standing if state.standing else setup.guessing if state.guessed else setup.driving
 
 
-def felt(setup: Setup, state: FilterState, utime: int, rate: Vector3, force: Vector3) -> FilterState:
-    """Return the state at an inertial sample, which feels `rate` and `force` along the body's axes."""
+def felt(
+    setup: Setup, state: FilterState, utime: int, rate: Vector3, force: Vector3, stillness: Stillness, said: Said
+) -> FilterState:
+    """Return the state at an inertial sample, which feels `rate` and `force` along the body's axes.
+
+    `stillness` and `said` are those after the sample.
+    """
     assert state.nav is not None
     settings = setup.settings
     gap = (utime - state.imu_utime) * 1e-6 > settings.rate_hold
@@ -56,7 +62,9 @@ def felt(setup: Setup, state: FilterState, utime: int, rate: Vector3, force: Vec
             nav = strapdown.carried(nav, utime, rate, force, state.earth, setup.rig.base)
         if nav.lag >= strapdown.COVARIANCE_STEP:
             nav = strapdown.caught_up(nav, felt_noise(setup, state), setup.layout)
-    return _moved(state, nav)._replace(imu_utime=utime)
+    if state.phase is Phase.UNALIGNED:
+        state = _moved(state, nav)
+    return state.felt(nav, stillness, said, utime)
 
 
 def at(setup: Setup, state: FilterState, utime: int) -> FilterState:

@@ -80,11 +80,11 @@ def _integrated(odom: Odometry, velocity: Vector3, rate: Vector3, dt: float) -> 
     (ax, ay, az), (bx, by, bz) = odom.rate, rate
     h = 0.5 * dt
     turn = ((ax + bx) * h, (ay + by) * h, (az + bz) * h)
-    middle = so3.multiply(odom.attitude, so3.exponential((0.5 * turn[0], 0.5 * turn[1], 0.5 * turn[2])))
+    middle = so3.multiply(odom.attitude, so3.small_turn((0.5 * turn[0], 0.5 * turn[1], 0.5 * turn[2])))
     (ux, uy, uz), (vx, vy, vz) = odom.velocity, velocity
     x, y, z = so3.rotate(middle, ((ux + vx) * h, (uy + vy) * h, (uz + vz) * h))
     px, py, pz = odom.position
-    attitude = so3.normalized(so3.multiply(odom.attitude, so3.exponential(turn)))
+    attitude = so3.normalized(so3.multiply(odom.attitude, so3.small_turn(turn)))
     return (px + x, py + y, pz + z), attitude
 
 
@@ -92,4 +92,4 @@ def _levelled(attitude: Quaternion, up: Vector3, share: float) -> Quaternion:
     """Return an attitude turned by a share of the way to where its up along the body is `up`; yaw stays."""
     x, y, _ = so3.rotate(attitude, up)
     # the body's true up stands at (x, y) in Odom: turn it to (0, 0)
-    return so3.normalized(so3.multiply(so3.exponential((y * share, -x * share, 0.0)), attitude))
+    return so3.normalized(so3.multiply(so3.small_turn((y * share, -x * share, 0.0)), attitude))

@@ -90,6 +90,9 @@ class FilterState(NamedTuple):
     """
 
     nav: Nav | None = None
+    stillness: Stillness = Stillness()
+    said: Said | None = None
+    imu_utime: int = 0
     phase: Phase = Phase.LEVELLING
     mode: Mode = Mode.FULL
     earth: Earth = Earth()
@@ -97,11 +100,8 @@ class FilterState(NamedTuple):
     geodesy: Geodesy | None = None
     capture: Capture = Capture()
     pending: tuple[Pending, ...] = ()
-    stillness: Stillness = Stillness()
     standing: bool = False
     began: int = 0
-    imu_utime: int = 0
-    said: Said | None = None
     guessed: bool = False
     wheels_utime: int = 0
     wheels_rate: float = 0.0
@@ -130,3 +130,10 @@ class FilterState(NamedTuple):
     level_count: int = 0
     biases: tuple[Vector3, float] | None = None
     stepped: bool = False
+
+    def felt(self, nav: Nav, stillness: Stillness, said: Said, imu_utime: int) -> FilterState:
+        """Return the state after an inertial sample.
+
+        What `_replace` does, at a quarter of its cost: this is done for every one. The four stand first for it.
+        """
+        return FilterState._make((nav, stillness, said, imu_utime, *self[4:]))

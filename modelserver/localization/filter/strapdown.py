@@ -31,7 +31,7 @@ STANDARD_GRAVITY = 9.80665
 EARTH_RADIUS = 6_371_000.0
 """Metres, mean (IUGG): only the lean of the vertical away from N's origin needs it."""
 
-COVARIANCE_STEP = 0.03
+COVARIANCE_STEP = 0.05
 """Seconds between two steps of the covariance, at least: errors change slowly, and most of the work is here."""
 
 
@@ -79,19 +79,10 @@ def carried(nav: Nav, utime: int, rate: Vector3, force: Vector3, earth: Earth, b
     ax, ay, az = nav.accelerometer_bias
     felt = (0.5 * (s[0] + force[0]) - ax, 0.5 * (s[1] + force[1]) - ay, 0.5 * (s[2] + force[2]) - az)
 
-    # half the turn and the whole: sin(x)/x by its series, for a step turns by far less than a radian
     h = 0.5 * dt
     tx, ty, tz = wx * h, wy * h, wz * h
-    square = tx * tx + ty * ty + tz * tz
-    if square > 0.01:
-        whole = so3.exponential((wx * dt, wy * dt, wz * dt))
-        half = so3.exponential((tx, ty, tz))
-    else:
-        quarter = 0.25 * square
-        sinc = 0.5 * (1.0 - quarter / 6.0 + quarter * quarter / 120.0)
-        half = (1.0 - quarter / 2.0 + quarter * quarter / 24.0, tx * sinc, ty * sinc, tz * sinc)
-        sinc = 1.0 - square / 6.0 + square * square / 120.0
-        whole = (1.0 - square / 2.0 + square * square / 24.0, tx * sinc, ty * sinc, tz * sinc)
+    half = so3.small_turn((tx, ty, tz))
+    whole = so3.small_turn((wx * dt, wy * dt, wz * dt))
     middle = so3.multiply(q, half)
     fx, fy, fz = so3.rotate(middle, felt)
     px, py, pz = nav.position

@@ -63,9 +63,9 @@ class Timeline(NamedTuple):
             return "load"
         else:
             at = bisect_left(entries, key, key=_key)
-        if self._has(item, at):
+        if at and self._has(item, at):
             return "duplicate"
-        return Timeline(self.base, (*entries[:at], Entry(item, None, ()), *entries[at:]), min(self.fused, at))
+        return Timeline(self.base, entries[:at] + (Entry(item, None, ()),) + entries[at:], min(self.fused, at))  # noqa: RUF005 - a third faster here
 
     def _has(self, item: Item, at: int) -> bool:
         """Return whether an item is there, whose place would be `at`.
@@ -92,17 +92,20 @@ class Timeline(NamedTuple):
         for entry in entries[at:until]:
             state, decisions = engine.fused(setup, state, entry.item)
             fresh.append(Entry(entry.item, state, decisions))
-        return Timeline(self.base, (*entries[:at], *fresh, *entries[until:]), until)
+        return Timeline(self.base, entries[:at] + tuple(fresh) + entries[until:], until)
 
     def settled_before(self, utime: int) -> tuple[Timeline, tuple[Decision, ...]]:
         """Return the timeline without what is older than `utime` and worked through, and what became of that."""
         entries = self.entries
-        if not self.fused or entries[0].item.utime >= utime:
-            return self, ()
-        cut = min(bisect_left(entries, (utime, "", -1, -1), key=_key), self.fused)
+        cut = 0
+        # one or two are past at a time
+        while cut < self.fused and entries[cut].item.utime < utime:
+            cut += 1
         if not cut:
             return self, ()
-        decisions = tuple(decision for entry in entries[:cut] for decision in entry.decisions)
+        decisions: tuple[Decision, ...] = ()
+        for entry in entries[:cut]:
+            decisions += entry.decisions
         state = entries[cut - 1].state
         assert state is not None
         return Timeline(state, entries[cut:], self.fused - cut), decisions

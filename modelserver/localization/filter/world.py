@@ -6,6 +6,7 @@ import math
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from modelserver.geodesy import Geodesy, GeodesyError, LocalFrame, about_up, geodetic_from_ecef
 from modelserver.localization.filter import bounds, motion, strapdown
@@ -14,6 +15,7 @@ from modelserver.localization.filter.nav import Nav, jacobian_of_body_velocity
 from modelserver.localization.filter.odometry import Odometry
 from modelserver.localization.filter.setup import Setup
 from modelserver.localization.filter.state import FilterState
+from modelserver.localization.filter.strapdown import Noise
 from modelserver.messages import NAN, Estimate, Invalid, Mode, NavigationState, Phase, Quality
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
@@ -24,6 +26,9 @@ FACTORS_REACH = 200.0
 
 FADING = 3.0
 """Seconds without a fix after which what lingers in them fades from the pose."""
+
+LAG = 0.15
+"""Seconds over which a covariance is carried to first order."""
 
 SLOW = 0.3
 """Speed, m/s, below which nothing but the gyros tells heading."""
@@ -52,9 +57,10 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
             pose_epoch=state.epoch,
             origin=origin,
         )
-    nav = strapdown.caught_up(nav, motion.noise(setup, ahead, nav), setup.layout)
     settings = setup.settings
-    P = _at_base(nav, setup)
+    if nav.lag > LAG:
+        nav = strapdown.caught_up(nav, motion.noise(setup, ahead, nav), setup.layout)
+    P = _at_base(nav, setup, motion.noise(setup, ahead, nav))
     offset, doubt = _followed(setup, state, utime)
     P[0, 0], P[1, 1], P[2, 2] = P[0, 0] + doubt[0], P[1, 1] + doubt[1], P[2, 2] + doubt[2]
     horizontal = bounds.horizontal(P, state.allowance, settings)
@@ -102,18 +108,35 @@ def _followed(setup: Setup, state: FilterState, utime: int) -> tuple[Vector3, Ve
     return (x * fade, y * fade, z * fade), (a * fade * fade, b * fade * fade, c * fade * fade)
 
 
-def _at_base(nav: Nav, setup: Setup) -> Array:
-    """Return the covariance (6, 6) of the rolling frame along N, from that of the inertial unit's point."""
-    P = np.empty((6, 6))
-    C = nav.covariance
-    P[:3, :3], P[:3, 3:], P[3:, :3], P[3:, 3:] = C[:3, :3], C[:3, 6:9], C[6:9, :3], C[6:9, 6:9]
+def _at_base(nav: Nav, setup: Setup, noise: Noise) -> Array:
+    """Return the covariance (6, 6) of the rolling frame along N, from that of the inertial unit's point.
+
+    Over a short lag the errors' equations to first order lead from the covariance kept to that of the instant:
+    position by velocity, attitude by gyro bias; that is all that a pose needs, at a fifth of the whole.
+    """
+    n = setup.layout.size
+    dt = nav.lag
     x, y, z = so3.rotate(nav.attitude, setup.rig.base)
-    J = np.eye(6)
-    J[0, 4], J[0, 5] = z, -y
-    J[1, 3], J[1, 5] = -z, x
-    J[2, 3], J[2, 4] = y, -x
-    found: Array = J @ P @ J.T
-    return found
+    J = np.zeros((6, n))
+    J.put(
+        _places(n),
+        (*(1.0, 1.0, 1.0, 1.0, 1.0, 1.0), *(dt, dt, dt), *(z, -y, -z, x, y, -x)),
+    )
+    if dt > 0.0:
+        (a, b, c), (d, e, f), (g, h, i) = so3.matrix_rows(nav.attitude)
+        J[3:, 9:12] = ((-dt * a, -dt * b, -dt * c), (-dt * d, -dt * e, -dt * f), (-dt * g, -dt * h, -dt * i))
+    P: Array = J @ nav.covariance @ J.T
+    p, w = noise.accelerometer * dt**3 / 3.0, noise.gyro * dt
+    P.reshape(-1)[::7] += (p, p, p, w, w, w)
+    return P
+
+
+@lru_cache(maxsize=16)
+def _places(n: int) -> npt.NDArray[np.intp]:
+    """Return the flat places in a (6, n) matrix of what `_at_base` writes, in its order."""
+    rows = [(0, 0), (1, 1), (2, 2), (3, 6), (4, 7), (5, 8), (0, 3), (1, 4), (2, 5)]
+    rows += [(0, 7), (0, 8), (1, 6), (1, 8), (2, 6), (2, 7)]
+    return np.array([r * n + c for r, c in rows])
 
 
 @lru_cache(maxsize=8)
@@ -148,47 +171,50 @@ def _world_poses(
 
 
 def _invalid(setup: Setup, state: FilterState, utime: int) -> Invalid:
+    # numbers, not members: putting flags together costs more than all else here
     settings, nav = setup.settings, state.nav
-    invalid = Invalid(0)
+    invalid = 0
     aligned = state.phase is Phase.ALIGNED
-    if not aligned and state.fixed is None:
-        invalid |= Invalid.NO_FIX
-    if motion.inertial(setup, state.mode):
-        if not state.imu_utime:
-            invalid |= Invalid.NO_IMU
-        elif abs(utime - state.imu_utime) * 1e-6 > settings.imu_timeout:
-            invalid |= Invalid.STALE_IMU if utime > state.imu_utime else Invalid.CLOCK_STEPPED
-    elif nav is not None and (utime - nav.utime) * 1e-6 > settings.imu_timeout:
-        invalid |= Invalid.STALE_IMU
-    if state.geodesy is None:
-        invalid |= Invalid.NO_ORIGIN
     if not aligned:
-        invalid |= Invalid.NOT_MOVED_YET
+        invalid |= 8  # NOT_MOVED_YET
+        if state.fixed is None:
+            invalid |= 1  # NO_FIX
     elif (
         state.fix_utime
-        and state.mode not in (Mode.NO_GPS, Mode.DEAD_RECKONING)
         and (utime - state.fix_utime) * 1e-6 > settings.gps_timeout
+        and state.mode not in (Mode.NO_GPS, Mode.DEAD_RECKONING)
     ):
-        invalid |= Invalid.STALE_GPS
+        invalid |= 32  # STALE_GPS
+    if motion.inertial(setup, state.mode):
+        if not state.imu_utime:
+            invalid |= 2  # NO_IMU
+        elif (utime - state.imu_utime) * 1e-6 > settings.imu_timeout:
+            invalid |= 64  # STALE_IMU
+        elif (state.imu_utime - utime) * 1e-6 > settings.imu_timeout:
+            invalid |= 512  # CLOCK_STEPPED
+    elif nav is not None and (utime - nav.utime) * 1e-6 > settings.imu_timeout:
+        invalid |= 64  # STALE_IMU
+    if state.geodesy is None:
+        invalid |= 4  # NO_ORIGIN
     if state.refused_since and (utime - state.refused_since) * 1e-6 > settings.conflict_time:
-        invalid |= Invalid.GPS_REJECTED
+        invalid |= 128  # GPS_REJECTED
     if state.stepped:
-        invalid |= Invalid.CLOCK_STEPPED
+        invalid |= 512  # CLOCK_STEPPED
     if state.tilt or (nav is not None and tilt_of(nav.up) > settings.maximum_tilt):
-        invalid |= Invalid.TILTED
-    return invalid
+        invalid |= 1024  # TILTED
+    return Invalid(invalid)
 
 
 def _quality(setup: Setup, state: FilterState, nav: Nav, utime: int, newest: int) -> Quality:
-    quality = Quality(0)
     forward = nav.body_velocity(setup.rig.base)[0]
+    quality = 0
     if state.standing or abs(forward) < SLOW:
-        quality |= Quality.HEADING_FROM_GYRO
+        quality |= 1  # HEADING_FROM_GYRO
     if utime > newest:
-        quality |= Quality.PREDICTED
+        quality |= 2  # PREDICTED
     if forward < -0.1 and not state.standing:
-        quality |= Quality.REVERSING
-    return quality
+        quality |= 32  # REVERSING
+    return Quality(quality)
 
 
 def _seconds_left(setup: Setup, state: FilterState, nav: Nav, utime: int, horizontal: float) -> float:

@@ -1,0 +1,176 @@
+"""What the filter costs: an inertial sample through the core beside a bare predict, a recording's replay, a day's memory.
+
+The day is driven in circles, with rates low enough that it takes minutes: what could grow grows with samples and seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import random
+import resource
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from benchmarks.support import verdict
+from benchmarks.withheld import data_directory
+from modelserver import core
+from modelserver.config import load_config
+from modelserver.core import Instant
+from modelserver.geodesy import Geodesy, origin_at
+from modelserver.localization.modes import ModeLocalizer
+from modelserver.messages import FixType, GpsSample, ImuSample, Sample, SensorHeader, WheelSample, WheelsSample
+from modelserver.service.daemon import Vehicle, load_vehicle
+from modelserver.service.offline import Run
+from modelserver.wire.eventlog import LogFile
+from mstools.import_bag import import_bag
+
+ROOT = Path(__file__).resolve().parent.parent
+HUSKY = ROOT / "config" / "husky" / "vehicle.yaml"
+START = 1_750_000_000_000_000
+MOST_PREDICTS = 12.0
+LEAST_REAL_TIME = 100.0
+MOST_GROWTH_MB = 16.0
+
+
+def circles(seconds: float, imu_hz: float, wheels_hz: float, gps_hz: float, seed: int = 1) -> Iterator[Sample]:
+    """Yield what a Husky's sensors say on circles of 20 m at 1 m/s, after standing for 5 s, in order of time."""
+    rng = random.Random(seed)
+    geodesy = Geodesy(origin_at(42.0, -71.0, 20.0))
+    radius, stand = 20.0, 5.0
+    every_wheels, every_gps = round(imu_hz / wheels_hz), round(imu_hz / gps_hz)
+    for n in range(round(seconds * imu_hz)):
+        t = n / imu_hz
+        utime = START + round(t * 1e6)
+        way = max(t - stand, 0.0)
+        turn = 1.0 / radius if t > stand else 0.0
+        # the unit stands on the Husky with x to the right, y up, z to the rear
+        rate = (rng.gauss(0, 0.002), turn + rng.gauss(0, 0.002), rng.gauss(0, 0.002))
+        force = (-turn + rng.gauss(0, 0.02), 9.8 + rng.gauss(0, 0.02), rng.gauss(0, 0.02))
+        yield ImuSample(SensorHeader(utime, "imu", n + 1), rate, force)
+        if n % every_wheels == 0:
+            wheels = tuple(
+                WheelSample(name, way * (1.0 - side * 0.2775 / radius), 0.005)
+                for name, side in (("left", 1.0), ("right", -1.0))
+            )
+            yield WheelsSample(SensorHeader(utime, "wheels", n + 1), wheels)
+        if n % every_gps == 0:
+            angle = way / radius
+            east, north = radius * math.sin(angle), radius * (1.0 - math.cos(angle))
+            latitude, longitude, height = geodesy.geodetic_from_enu(
+                (east + rng.gauss(0, 0.1), north + rng.gauss(0, 0.1), rng.gauss(0, 0.2))
+            )
+            covariance = (0.25, 0.0, 0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0)
+            yield GpsSample(
+                SensorHeader(utime, "gps", n + 1),
+                FixType.DIFFERENTIAL,
+                latitude,
+                longitude,
+                height,
+                position_covariance=covariance,
+            )
+
+
+def instant(utime: int) -> Instant:
+    return Instant(utime * 1000, utime)
+
+
+def event_cost(vehicle: Vehicle) -> float:
+    """Return the median over rounds of an inertial event's mean cost to a bare predict's, of the same size."""
+    state = vehicle.core(instant(START))
+    samples = list(circles(90.0, 100.0, 10.0, 2.5))
+    warm = 60 * 113
+    for sample in samples[:warm]:
+        state, _ = core.step(state, sample, instant(sample.header.utime))
+    assert isinstance(state.localizer, ModeLocalizer)
+    n = state.localizer.makings.setup.layout.size
+    bare = KalmanFilter(n, 1)
+    bare.x, F, Q, P = np.zeros(n), np.eye(n), np.eye(n) * 1e-6, np.eye(n)
+    ratios, costs = [], []
+    for begin in range(warm, len(samples) - 300, 300):
+        events, spent = 0, 0.0
+        for sample in samples[begin : begin + 300]:
+            now = instant(sample.header.utime)
+            start = time.perf_counter()
+            state, _ = core.step(state, sample, now)
+            if isinstance(sample, ImuSample):
+                spent += time.perf_counter() - start
+                events += 1
+        start = time.perf_counter()
+        for _ in range(300):
+            bare.P = P
+            bare.predict(F=F, Q=Q)
+        floor = (time.perf_counter() - start) / 300
+        ratios.append(spent / events / floor)
+        costs.append(spent / events * 1e6)
+    print(f"  an inertial event {statistics.median(costs):.0f} us, {n} states")
+    return statistics.median(ratios)
+
+
+def replay_factor(vehicle: Vehicle) -> float | None:
+    """Return the seconds of the Husky recording replayed in one second, poses at 50 Hz; the best of three."""
+    bag = data_directory() / "husky" / "test1.bag"
+    if not bag.is_file():
+        return None
+    factors = []
+    with tempfile.TemporaryDirectory() as directory:
+        log = Path(directory) / "husky.lcm"
+        import_bag(bag, log)
+        for _ in range(3):
+            with LogFile(log) as recording:
+                run = Run(vehicle, recording, vehicle.config.base_frame)
+                start = time.perf_counter()
+                count = sum(1 for _ in run.rows(None, 50.0))
+                wall = time.perf_counter() - start
+            assert count > 10_000
+            factors.append((run.last_utime - run.first_utime) * 1e-6 / wall)
+    return max(factors)
+
+
+def resident_mb() -> float:
+    """Return the memory of this process that is in use now, MB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+def growth(vehicle: Vehicle, hours: float) -> float:
+    """Return by how many MB memory grows between the first hour and the last of a drive."""
+    state = vehicle.core(instant(START))
+    first = 0.0
+    for sample in circles(hours * 3600.0, 10.0, 2.0, 0.5):
+        state, _ = core.step(state, sample, instant(sample.header.utime))
+        if not first and sample.header.utime > START + 3_600_000_000:
+            first = resident_mb()
+    return resident_mb() - first
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.filter_cost", description=(__doc__ or "").split("\n")[0]
+    )
+    parser.add_argument("--hours", type=float, default=24.0, help="of the simulated drive")
+    options = parser.parse_args(arguments or [])
+    vehicle = load_vehicle(load_config(HUSKY))
+    holds = verdict(
+        "an inertial event through core.step to filterpy's predict", event_cost(vehicle), MOST_PREDICTS, "x"
+    )
+    factor = replay_factor(vehicle)
+    if factor is None:
+        print("  replay skipped: no husky/test1.bag; set MODELSERVER_DATA to the folder of recordings")
+    else:
+        print(f"  replay of the Husky recording, poses at 50 Hz: {factor:.0f} times real time")
+        holds &= verdict("seconds to replay 100 s", 100.0 / factor, 100.0 / LEAST_REAL_TIME, "s")
+    grown = growth(vehicle, options.hours)
+    holds &= verdict(f"memory grown over {options.hours:g} simulated hours", grown, MOST_GROWTH_MB, "MB")
+    return 0 if holds else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
