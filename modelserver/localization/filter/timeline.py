@@ -63,7 +63,7 @@ class Timeline(NamedTuple):
             return "load"
         else:
             at = bisect_left(entries, key, key=_key)
-        if at and self._has(item, at):
+        if self._has(item, at):
             return "duplicate"
         return Timeline(self.base, entries[:at] + (Entry(item, None, ()),) + entries[at:], min(self.fused, at))  # noqa: RUF005 - a third faster here
 
