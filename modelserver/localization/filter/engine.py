@@ -301,7 +301,14 @@ def _wheels(setup: Setup, state: FilterState, item: Item) -> Fused:
     state = _remembered(state._replace(nav=now._replace(rolled=ZERO, turned=ZERO)), key, item)
     if not motion.inertial(setup, state.mode):
         # without an inertial unit the wheels alone say when the vehicle stands
-        state = state._replace(standing=stands is True, rested_utime=item.utime)
+        state = state._replace(standing=stands is True)
+        rested = (item.utime - state.rested_utime) * 1e-6
+        if state.standing and rested >= REST_PERIOD:
+            compared = constraints.zero_velocity(_scene(setup, state), rested)
+            state, decision = _known(setup, state, constraints.ZERO_VELOCITY, compared)
+            decisions += (decision,)
+        if not state.standing or rested >= REST_PERIOD:
+            state = state._replace(rested_utime=item.utime)
     if not state.standing and (item.utime - state.rolled_utime) * 1e-6 >= 0.5 * CONSTRAINT_PERIOD:
         state, more = _rolled(setup, state, item.utime)
         decisions += more

@@ -155,13 +155,15 @@ class BeaconRange(_Anywhere):
         away = np.subtract(scene.nav.point(lever), found[0])
         expected = float(np.linalg.norm(away))
         H = jacobian_of_point(scene.nav, lever, scene.layout.size)
-        spread = math.sqrt(float(np.trace(scene.nav.covariance[:3, :3])))
-        if expected < max(1.0, 3.0 * spread):
+        if expected < 1.0:
             return "near"
         sigma = sample.sigma if 0.0 < sample.sigma < 1e3 else scene.settings.aiding_sigma
-        return Compared(
-            np.array((sample.distance - expected,)), (away / expected)[None, :] @ H, np.array(((sigma * sigma,),))
-        )
+        line = away / expected
+        P = scene.nav.covariance[:3, :3]
+        # a doubt across the line lengthens it by its square over twice the distance: what a first order leaves out
+        across = max(float(np.trace(P) - line @ P @ line), 0.0)
+        variance = sigma * sigma + (across / expected) ** 2
+        return Compared(np.array((sample.distance - expected,)), line[None, :] @ H, np.array(((variance,),)))
 
 
 @register
