@@ -31,6 +31,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: threads on
 import numpy as np
 from scipy.stats import chi2
 
+from benchmarks import husky_nis
 from modelserver.geodesy import origin_at
 from modelserver.geometry import ModelBuilder
 from modelserver.localization.filter.localizer import FilterLocalizer
@@ -399,6 +400,14 @@ def main(arguments: list[str] | None = None) -> int:
         for kind in KINDS:
             if options.only in (None, kind.name):
                 holds &= judged(kind, list(pool.map(kind.run, seeds, chunksize=2)))
+    if options.only is None:
+        nis = husky_nis.mean_statistics()
+        if nis is None:
+            print(" recording skipped: no husky/test1.bag; set MODELSERVER_DATA to the folder of recordings")
+        else:
+            print(" Husky recording")
+            for name, mean in nis.items():
+                holds &= line(f"mean NIS of {name} / its degrees of freedom", mean, 0.5, 2.0)
     return 0 if holds else 1
 
 
