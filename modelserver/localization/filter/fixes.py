@@ -299,7 +299,8 @@ def put(
     state = state._replace(
         refused=refused, refused_since=state.refused_since or utime, refused_count=state.refused_count + 1
     )
-    if _believed(setup, state):
+    # refused fixes that have agreed with the way driven for long enough are right, and the state is not
+    if _recovery(setup, state) is not None:
         due = utime + round(settings.horizon * 1e6)
         if not any(each.take_up for each in state.pending):
             state = state._replace(pending=(*state.pending, Pending(due, take_up=True)))
@@ -343,12 +344,6 @@ def allowed(state: FilterState, before: Nav, compared: Compared, decision: Decis
         allowance=max(one, weight * state.allowance),
         conflict_utime=before.utime if decision.reason else state.conflict_utime,
     )
-
-
-def _believed(setup: Setup, state: FilterState) -> bool:
-    """Return whether refused fixes have agreed with the way driven for long enough to be right, not the state."""
-    fit = _recovery(setup, state)
-    return fit is not None
 
 
 def _recovery(setup: Setup, state: FilterState) -> Fit | None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import cmath
-
 import numpy as np
 
 from modelserver.localization.filter import kalman
@@ -84,8 +82,3 @@ def at_speed(nav: Nav, speed: float, sigma: float) -> Nav:
     variance = sigma * sigma + (0.1 * speed) ** 2 + 0.04
     error, P = kalman.corrected(nav.covariance, np.array((speed - along,)), H, np.array(((variance,),)))
     return nav.injected(error, P)
-
-
-def direction(angle: float) -> complex:
-    """Return the unit vector at an angle, as a complex number."""
-    return cmath.rect(1.0, angle)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
@@ -113,6 +112,3 @@ def azimuth(u: Vector3, size: int) -> tuple[float, Array]:
 def wrapped(angle: float) -> float:
     """Return an angle within -pi to pi."""
     return math.remainder(angle, math.tau)
-
-
-Maker = Callable[[Rig, FilterSettings], Measurement | None]

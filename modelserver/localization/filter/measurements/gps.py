@@ -12,7 +12,7 @@ from modelserver.geodesy import LocalFrame, ecef_from_geodetic
 from modelserver.localization import gate
 from modelserver.localization.filter.layout import ErrorState
 from modelserver.localization.filter.measurements.base import Compared, Scene, azimuth, register, wrapped
-from modelserver.localization.filter.nav import ZERO, jacobian_of_point, jacobian_of_point_velocity
+from modelserver.localization.filter.nav import jacobian_of_point, jacobian_of_point_velocity
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.gate import GoodFix
 from modelserver.localization.rig import Rig
@@ -235,7 +235,6 @@ def baseline_sigma(sample: GpsSample) -> float:
 __all__ = [
     "LATENCY",
     "WANDER",
-    "ZERO",
     "GpsBaseline",
     "GpsHeight",
     "GpsPosition",
