@@ -84,6 +84,11 @@ def rotate(q: Quaternion, v: Vector3) -> Vector3:
     )
 
 
+def cross(a: Vector3, b: Vector3) -> Vector3:
+    """Return a x b."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
 def matrix_rows(q: Quaternion) -> tuple[Vector3, Vector3, Vector3]:
     """Return the rows of the rotation matrix R(q)."""
     w, x, y, z = q

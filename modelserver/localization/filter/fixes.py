@@ -401,7 +401,7 @@ def set_from(
         reason = compared or "empty"
         return state, (updates.refused(nav.utime, source, seq, measurement.kind, reason),)
     # the turn outright, for it may be of any size
-    turn = math.remainder(float(compared.residual[5]), math.tau)
+    turn = wrapped(float(compared.residual[5]))
     nav = placing.turned(nav, turn, math.sqrt(float(compared.noise[5, 5])))
     again = measurement.compare(scene._replace(nav=nav), sample)
     assert not isinstance(again, str)

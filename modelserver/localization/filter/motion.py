@@ -23,8 +23,9 @@ def inertial(setup: Setup, mode: Mode) -> bool:
 def noise(setup: Setup, state: FilterState, nav: Nav) -> Noise:
     """Return what drives the errors now."""
     if not inertial(setup, state.mode):
-        fresh = state.wheels_utime and (nav.utime - state.wheels_utime) * 1e-6 < 1.0
-        return setup.standing if state.standing else setup.rolling if fresh else setup.coasting
+        if state.standing:
+            return setup.standing
+        return setup.rolling if _wheels_tell(state, nav) else setup.coasting
     if (nav.utime - state.imu_utime) * 1e-6 > setup.settings.rate_hold:
         return setup.coasting
     return felt_noise(setup, state)
@@ -92,8 +93,6 @@ def predicted(setup: Setup, state: FilterState, utime: int) -> Nav:
             if until == utime:
                 return nav
             nav = strapdown.caught_up(nav, felt_noise(setup, state), setup.layout)
-        turn = (0.0, 0.0, 0.0 if state.standing else _wheels_rate(state, nav))
-        return strapdown.coasted(nav, utime, turn, base)
     turn = (0.0, 0.0, 0.0 if state.standing else _wheels_rate(state, nav))
     return strapdown.coasted(nav, utime, turn, base)
 
@@ -107,8 +106,11 @@ def caught_up(setup: Setup, state: FilterState) -> FilterState:
 
 
 def _wheels_rate(state: FilterState, nav: Nav) -> float:
-    fresh = state.wheels_utime and (nav.utime - state.wheels_utime) * 1e-6 < 1.0
-    return state.wheels_rate if fresh else 0.0
+    return state.wheels_rate if _wheels_tell(state, nav) else 0.0
+
+
+def _wheels_tell(state: FilterState, nav: Nav) -> bool:
+    return state.wheels_utime > 0 and (nav.utime - state.wheels_utime) * 1e-6 < 1.0
 
 
 def _at_rest(state: FilterState, nav: Nav) -> Vector3:

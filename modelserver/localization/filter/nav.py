@@ -9,7 +9,7 @@ import numpy as np
 
 from modelserver.localization.filter.layout import ACCELEROMETER_BIAS, ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
 from modelserver.spatial import so3
-from modelserver.spatial.so3 import Array, Quaternion, Vector3
+from modelserver.spatial.so3 import Array, Quaternion, Vector3, cross
 
 ZERO: Vector3 = (0.0, 0.0, 0.0)
 
@@ -109,11 +109,6 @@ class Nav(NamedTuple):
         )
 
 
-def cross(a: Vector3, b: Vector3) -> Vector3:
-    """Return a x b."""
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-
 def jacobian_of_point(nav: Nav, lever: Vector3, size: int) -> Array:
     """Return H (3, n) of the place of a point of the body in N: I for position, -[R lever]x for attitude."""
     H = np.zeros((3, size))
@@ -158,7 +153,6 @@ __all__ = [
     "VELOCITY",
     "ZERO",
     "Nav",
-    "cross",
     "jacobian_of_body_velocity",
     "jacobian_of_point",
     "jacobian_of_point_velocity",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from modelserver.geodesy import about_up
 from modelserver.localization.filter import kalman
 from modelserver.localization.filter.alignment import Passed
 from modelserver.localization.filter.layout import Layout
@@ -18,8 +19,7 @@ def turned(nav: Nav, turn: float, sigma: float) -> Nav:
 
     An error of the turn is one of yaw, and turns the velocity with it.
     """
-    q = (np.cos(0.5 * turn), 0.0, 0.0, np.sin(0.5 * turn))
-    spin = (float(q[0]), 0.0, 0.0, float(q[3]))
+    spin = about_up(turn)
     velocity = so3.rotate(spin, nav.velocity)
     n = len(nav.covariance)
     T = np.eye(n)

@@ -11,14 +11,14 @@ from modelserver.localization.gate import GoodFix
 from modelserver.localization.raw import track
 from modelserver.localization.raw.bounds import grown
 from modelserver.localization.raw.heading import Course, Heading
-from modelserver.localization.raw.motion import Motion, cross
+from modelserver.localization.raw.motion import Motion
 from modelserver.localization.raw.place import Anchor, Jumps, jump_limit, lever_arm
 from modelserver.localization.raw.rest import Rest, judged
 from modelserver.localization.raw.settings import RawSettings
 from modelserver.localization.raw.track import TrackFix
 from modelserver.messages import GpsSample
 from modelserver.spatial import so3
-from modelserver.spatial.so3 import Vector3
+from modelserver.spatial.so3 import Vector3, cross
 
 WORK_REACH = 200.0
 """Metres from the working frame's origin at which it is set anew: so near, its vertical and its north are the

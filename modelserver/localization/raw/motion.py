@@ -165,11 +165,6 @@ def unit(v: Vector3) -> Vector3:
     return (x / n, y / n, z / n)
 
 
-def cross(a: Vector3, b: Vector3) -> Vector3:
-    """Return a x b."""
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-
-
 def attitude(up: Vector3, yaw: float) -> so3.Quaternion:
     """Return the quaternion of the base frame that has the vertical `up` and that yaw."""
     roll, pitch = roll_pitch(up)

@@ -10,11 +10,11 @@ import numpy as np
 
 from modelserver.localization.filter.layout import ErrorState
 from modelserver.localization.filter.measurements.base import Compared, Scene, register
-from modelserver.localization.filter.nav import cross, jacobian_of_body_velocity
+from modelserver.localization.filter.nav import jacobian_of_body_velocity
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.rig import Rig
 from modelserver.messages import WheelsSample
-from modelserver.spatial.so3 import Vector3
+from modelserver.spatial.so3 import Vector3, cross
 
 SCALE, YAW = "wheel_scale", "wheel_yaw"
 """How much too far all wheels tell, and by how much the way they roll is turned to the left of the geometry's x."""
