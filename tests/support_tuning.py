@@ -10,10 +10,10 @@ from support_recordings import REPOSITORY, write_log
 
 from modelserver.config import load_config
 from modelserver.geodesy import origin_at
+from modelserver.messages import GpsSample, ImuSample, WheelsSample
 from modelserver.service.daemon import load_vehicle
 from modelserver.simulation import ImuModel, Simulation, Timing, Trajectory, figure_eight
 from modelserver.wire.codec import encode
-from mstools.demo_sensors import channel_of
 
 RAPTOR = REPOSITORY / "config" / "raptor" / "vehicle.yaml"
 
@@ -39,7 +39,8 @@ def simulated(folder: Path, seconds: float, **models: Any) -> tuple[Path, Path]:
         seed=4,
         **models,
     )
-    events = [(each.header.host_utime, channel_of(each, config), encode(each)) for each in drive.events(seconds)]
+    channels = {GpsSample: sensors.gps.channel, ImuSample: sensors.imu.channel, WheelsSample: sensors.wheels.channel}
+    events = [(each.header.host_utime, channels[type(each)], encode(each)) for each in drive.events(seconds)]
     return write_log(folder / "drive.lcm", events), RAPTOR
 
 

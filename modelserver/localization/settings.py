@@ -60,13 +60,14 @@ class FixSettings:
     """How many samples in a row confirm that a clock was set."""
 
     def __post_init__(self) -> None:
+        problems = []
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, bool):
-                continue
-            if not math.isfinite(value) or value <= 0:
-                raise ValueError(f"{field.name} must be finite and above 0, got {value}")
-        if not 1 <= self.minimum_fix_type <= 5:
-            raise ValueError(f"minimum_fix_type is 1 to 5, got {self.minimum_fix_type}")
+            if not isinstance(value, bool) and (not math.isfinite(value) or value <= 0):
+                problems.append(f"{field.name} must be finite and above 0, got {value}")
+        if self.minimum_fix_type > 5:
+            problems.append(f"minimum_fix_type is 1 to 5, got {self.minimum_fix_type}")
         if self.origin_fixes > 1000:
-            raise ValueError(f"origin_fixes is at most 1000, got {self.origin_fixes}")
+            problems.append(f"origin_fixes is at most 1000, got {self.origin_fixes}")
+        if problems:
+            raise ValueError("\n".join(problems))

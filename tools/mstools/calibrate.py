@@ -14,7 +14,7 @@ import typer
 
 from modelserver.errors import ModelServerError
 from modelserver.localization.calibration import mount
-from modelserver.localization.calibration.allan import allan_deviation, noise_figures
+from modelserver.localization.calibration.allan import NoiseFigures, allan_deviation, noise_figures
 from modelserver.localization.calibration.ellipsoid import MagnetometerFit, fit_all_axes, fit_level
 from modelserver.localization.calibration.errors import CalibrationError
 from modelserver.localization.calibration.even import Stretch
@@ -23,7 +23,7 @@ from modelserver.spatial.so3 import Vector3
 from mstools import calibrate_log, calibrate_report
 from mstools.calibrate_log import Recorded
 from mstools.calibrate_report import AxisNoise, Noise
-from mstools.output import counted, safe, write_file
+from mstools.output import check_target, counted, safe, write_file
 
 LEAST_STANDING = 60.0
 """Seconds of standing below which nothing is proposed: the noise at one second is then known to a tenth."""
@@ -69,7 +69,8 @@ def imu(
     """Find the noise of gyros and accelerometers: their Allan deviation, from the longest stretch of standing.
 
     The settings of the filter that follow are proposed, nothing is changed. Of the three axes the noisiest counts.
-    With less than a minute of standing what can be told is told, nothing is proposed, and the exit code is 1.
+    With less than a minute of standing what can be told is told, nothing is proposed, and the exit code is 1. A drive
+    without any standing still tells which axis of the unit points up, and with -c whether the mount agrees.
 
     Example: modelserver calibrate imu stood.lcm --plot allan.html -o imu.yaml
     """
@@ -88,13 +89,14 @@ def imu(
     )
     stretches = standing(kept.utimes, kept.rates, kept.forces)
     if not stretches:
+        _tell_up(config, kept, as_json, output == "-")
         raise CalibrationError(
-            f"{safe(str(log))}: the vehicle never stands still in {_span(kept)}: record it standing, engine off, for "
-            "10 minutes or more"
+            f"{safe(str(log))}: the vehicle never stands still in {_span(kept)}: for the noise, record it standing, "
+            "engine off, for 10 minutes or more"
         )
     used = max(stretches, key=lambda each: each.seconds)
     noise = _noise(kept, used, good.size)
-    advice = None if config is None else _mount_advice(config, kept, used)
+    advice = None if config is None else _mount_advice(config, kept.forces[used.start : used.stop])
     if as_json:
         typer.echo(json.dumps(calibrate_report.noise_data(noise, advice), indent=2, allow_nan=False))
     else:
@@ -174,7 +176,7 @@ def magnetometer(
 def _noise(recorded: Recorded, used: Stretch, samples: int) -> Noise:
     def axis(values: Any) -> AxisNoise:
         curve = allan_deviation(values, used.rate_hz)
-        return AxisNoise(curve, noise_figures(curve))
+        return AxisNoise(curve, _of_enough(noise_figures(curve), used.seconds))
 
     rows = slice(used.start, used.stop)
     return Noise(
@@ -189,16 +191,49 @@ def _noise(recorded: Recorded, used: Stretch, samples: int) -> Noise:
     )
 
 
-def _mount_advice(config: Path, recorded: Recorded, used: Stretch) -> mount.MountAdvice:
+def _of_enough(figures: NoiseFigures, seconds: float) -> NoiseFigures:
+    """Return the figures without those of the biases where the standing was too short: a minimum is then chance."""
+    if seconds >= LEAST_STANDING or (figures.instability is None and figures.walk is None):
+        return figures
+    told = tuple(each for each in figures.missing if not each.startswith("bias"))
+    why = f"biases: {seconds:.1f} s of standing tell nothing of them; stand for 10 minutes or more"
+    return dataclasses.replace(figures, instability=None, walk=None, missing=(*told, why))
+
+
+def _mount_advice(config: Path, forces: Any) -> mount.MountAdvice:
     # imported here: without --config neither the configuration's libraries nor geodesy are needed
     from modelserver.config import load_config
     from modelserver.service.daemon import load_vehicle
 
     vehicle = load_vehicle(load_config(config), str(config))
-    if vehicle.mounts is None:
+    if vehicle.rig is None or not vehicle.rig.imu_frame:
         raise ModelServerError(f"{safe(str(config))}: names no IMU under sensors, so there is no mount to compare")
-    x, y, z = (float(each) for each in recorded.forces[used.start : used.stop].mean(axis=0))
-    return mount.advise((x, y, z), vehicle.mounts.X_base_imu.wxyz)
+    x, y, z = (float(each) for each in forces.mean(axis=0))
+    return mount.advise((x, y, z), vehicle.rig.pose(vehicle.rig.imu_frame).wxyz)
+
+
+def _tell_up(config: Path | None, recorded: Recorded, as_json: bool, on_stderr: bool) -> None:
+    """Say which of the unit's axes points up, by the mean specific force of a drive: its accelerations cancel."""
+    x, y, z = (float(each) for each in recorded.forces.mean(axis=0))
+    up, angle = mount.axis_name((x, y, z)), math.nan
+    strength = math.hypot(x, y, z)
+    if strength > 0.0:
+        angle = math.degrees(math.acos(min(max(abs(x), abs(y), abs(z)) / strength, 1.0)))
+    words = [
+        f"mean specific force on the move: {strength:.2f} m/s2, {angle:.0f} degrees from the unit's {up} axis, which "
+        "points up"
+    ]
+    text = ""
+    if config is not None:
+        try:
+            text = _mount_advice(config, recorded.forces).text
+        except CalibrationError as error:
+            text = str(error)
+        words.append(f"mount: {text}")
+    if as_json:
+        typer.echo(json.dumps({"up": up, "mount": {"text": text} if text else None}, indent=2))
+    else:
+        typer.echo("\n".join(words), err=on_stderr)
 
 
 def _fit(log: Path, fields: Any, up: Vector3 | None, field: Vector3 | None, all_axes: bool) -> MagnetometerFit:
@@ -260,6 +295,7 @@ def _check_paths(begin: float, end: float, log: Path, targets: tuple[str, ...], 
         if not force and os.path.isfile(target):
             # said before the reading, for that may take a while; the writing looks again
             raise ModelServerError(f"{safe(target)} exists already; give --force to replace it, or another name")
+        check_target(target)
 
 
 def _write_proposal(output: str, text: str, force: bool) -> None:

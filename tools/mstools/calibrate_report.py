@@ -140,8 +140,11 @@ def noise_lines(log: str, noise: Noise, advice: MountAdvice | None) -> list[str]
             f"  {axis}: {_figure_words(quantity, each)}" for axis, each in zip("xyz", quantity.axes(noise), strict=True)
         ]
     for name, axes in (("gyro", noise.gyro), ("accelerometer", noise.accelerometer)):
-        missing = dict.fromkeys(each for axis in axes for each in axis.figures.missing)
-        lines += [f"{name}: {each}" for each in missing]
+        missing: dict[str, str] = {}
+        for axis, found in zip("xyz", axes, strict=True):
+            for each in found.figures.missing:
+                missing[each] = missing.get(each, "") + axis
+        lines += [f"{name}{'' if of == 'xyz' else f' {of}'}: {each}" for each, of in missing.items()]
     lines.append(f"The noisiest axis counts. accelerometer_noise is that {SHAKING}.")
     if advice is not None:
         lines.append(f"mount: {advice.text}")

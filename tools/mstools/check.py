@@ -6,7 +6,8 @@ import json
 import os
 import re
 from collections import Counter
-from typing import Annotated, Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,6 +16,9 @@ from modelserver.formats import check_file
 from modelserver.geometry.model import Model
 from mstools.options import Variables, parse_variables
 from mstools.output import counted, print_problem, safe, size_of
+
+if TYPE_CHECKING:
+    from modelserver.config import VehicleConfig
 
 
 def command(
@@ -45,7 +49,12 @@ def command(
 
 def _checked(file: str, variables: dict[str, str]) -> tuple[Model | None, tuple[Problem, ...]]:
     try:
-        return _checked_vehicle(file) if _is_vehicle_file(file) else check_file(file, variables)
+        if _is_vehicle_file(file):
+            return _checked_vehicle(file)
+        if os.path.isfile(file) and not os.path.getsize(file):
+            fix = "see docs/geometry-files.md, or docs/vehicle-file.md for a vehicle file, for an example to begin with"
+            return None, (Problem(Severity.ERROR, "the file is empty", Source(file), fix),)
+        return check_file(file, variables)
     except OSError as error:
         message = f"the file cannot be read: {error.strerror or error}"
         return None, (Problem(Severity.ERROR, message, Source(file), "look at the path and its permissions"),)
@@ -61,14 +70,60 @@ def _is_vehicle_file(file: str) -> bool:
 
 def _checked_vehicle(file: str) -> tuple[Model | None, tuple[Problem, ...]]:
     # imported here: a geometry file needs neither the configuration's libraries nor geodesy
-    from modelserver.config import load_config
+    from modelserver.config import load_partly, with_lines
     from modelserver.service.daemon import load_vehicle
 
     try:
-        model = load_vehicle(load_config(file), file).model
-    except (ConfigError, GeometryError) as error:
+        config, problems = load_partly(file)
+    except ConfigError as error:
         return None, error.problems
-    return model, model.problems
+    if config is None:
+        return None, problems
+    model = None
+    try:
+        model = load_vehicle(config, file).model
+        more = model.problems
+    except (ConfigError, GeometryError) as error:
+        more = error.problems
+    more += _drivers_problems(config, file)
+    if any(each.element.startswith("sensors") for each in problems):
+        # a sensor that was left out as wrong is not missing
+        more = tuple(each for each in more if each.element != "localization.mode")
+    more += tuple(with_lines(_worth_knowing(config, file), file)) if not problems else ()
+    # a model beside a wrong vehicle file would look as if all were well
+    clean = not any(each.severity is Severity.ERROR for each in (*problems, *more))
+    return model if clean else None, (*sorted((*problems, *more), key=lambda each: (each.file != file, each.line)),)
+
+
+def _drivers_problems(config: VehicleConfig, file: str) -> tuple[Problem, ...]:
+    """Return what is wrong with the drivers' settings."""
+    if not config.drivers:
+        return ()
+    from modelserver.config import config_lines
+    from msdrivers.settings import Place, read_drivers
+
+    try:
+        read_drivers(config.drivers, Place(file, config_lines(file)))
+    except ConfigError as error:
+        return error.problems
+    return ()
+
+
+def _worth_knowing(config: VehicleConfig, file: str) -> Iterator[Problem]:
+    """Yield what is allowed in a vehicle file and hardly meant."""
+    sensors = config.sensors
+    if sensors.gps is None and sensors.imu is None and sensors.wheels is None:
+        words = "no sensors: there will never be a pose"
+        yield Problem(Severity.NOTE, words, Source(file, element="sensors"), "see docs/vehicle-file.md")
+    wheels = sensors.wheels
+    if wheels is not None and not wheels.frames:
+        words = "frames names no wheels, so nothing of them is used"
+        fix = "write frames: {NAME: BODY:FRAME} with the names that the driver gives"
+        yield Problem(Severity.WARNING, words, Source(file, element="sensors.wheels.frames"), fix)
+    elif wheels is not None and wheels.kinematics == "ackermann" and len(wheels.frames) == 1:
+        words = "ackermann with a single wheel: the wheels tell no turn"
+        fix = "name the wheels of the other side and axle too"
+        yield Problem(Severity.WARNING, words, Source(file, element="sensors.wheels.frames"), fix)
 
 
 def _is_unclean(problems: tuple[Problem, ...]) -> bool:

@@ -19,6 +19,7 @@ from modelserver.messages import MAX_CHANNEL_LENGTH, SensorHeader
 from modelserver.wire import codec
 from mstools.bag_messages import DEFAULTS, ROS_TYPES, Altitude, Converter, ImuOrientation, Kind, Options, converter
 from mstools.bag_reader import Bag, Topic, open_bag
+from mstools.output import check_target
 from mstools.progress import progress
 
 
@@ -66,6 +67,7 @@ def command(
         raise typer.BadParameter("--undulation goes with --altitude msl")
     if any(not (c.isascii() and (c.isalnum() or c == "_")) for c in prefix) or len(prefix) > MAX_CHANNEL_LENGTH - 16:
         raise typer.BadParameter(f"a prefix has letters, digits and underscores, got {shown(prefix)}")
+    check_target(str(log))
     options = Options(altitude, undulation, imu_orientation, track_width)
     report = import_bag(bag, log, options, _kinds(topic or ()), prefix, force)
     typer.echo(json.dumps(dataclasses.asdict(report), indent=2) if as_json else report.text())

@@ -3,16 +3,35 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from modelserver.errors import ConfigError, Problem, Severity, Source, nearest_names, shown
-from modelserver.messages import Mode, SensorHeader, SwitchMode
+from modelserver.errors import (
+    ConfigError,
+    ModelServerError,
+    NoServerError,
+    Problem,
+    Severity,
+    Source,
+    nearest_names,
+    shown,
+)
+from modelserver.messages import Health, Mode, NavigationState, PublishDecisions, SensorHeader, SwitchMode
 from mstools.asking import UrlOption
 
+if TYPE_CHECKING:
+    import lcm
+
 MODES = tuple(mode.name.lower() for mode in Mode)
+
+PATIENCE_S = 2.0
+"""How long the daemon is waited for, seconds."""
+
+OPERATOR = "operator"
+"""The name under which wishes go out."""
 
 
 def command(
@@ -20,10 +39,11 @@ def command(
     config: Annotated[Path, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file.")],
     url: UrlOption = "",
 ) -> None:
-    """Tell the running daemon which sources its localization is to use from now on.
+    """Tell the running daemon which sources its localization is to use from now on, and say what it does.
 
     The wish goes out once, on the channel that the vehicle file names (localization.mode_channel); the daemon must
-    have been started with the same. It is not answered: LOCALIZATION_STATE says which mode is in force.
+    have been started with the same. Then LOCALIZATION_STATE and LOCALIZATION_DECISIONS are listened to for up to two
+    seconds: they tell which mode is in force. Exits 1 where nobody answers, or the mode stays another.
 
     Example: modelserver mode no_gps -c config/husky/vehicle.yaml
     """
@@ -38,11 +58,106 @@ def command(
         fix = "write mode_channel: LOCALIZATION_MODE under localization, and start the daemon anew"
         source = Source(str(config), element="localization.mode_channel")
         raise ConfigError([Problem(Severity.ERROR, why, source, fix)])
-    channel = f"{vehicle.lcm.channel_prefix}{vehicle.localization.mode_channel}"
-    bus = open_lcm(resolve_url(url or vehicle.lcm.url))
+    prefix, state_hz = vehicle.lcm.channel_prefix, vehicle.publish.state_hz
+    channel = f"{prefix}{vehicle.localization.mode_channel}"
+    provider = resolve_url(url or vehicle.lcm.url)
+    bus = open_lcm(provider)
+    ear = Ear(bus, prefix)
+    if state_hz:
+        ear.listen(min(PATIENCE_S, 2.5 / state_hz), lambda: ear.mode is not None)
+    was = ear.mode
     utime = time.time_ns() // 1000
-    bus.publish(channel, encode(SwitchMode(SensorHeader(utime, "operator", host_utime=utime), wanted)))
-    typer.echo(f"told {channel}: {wanted.name.lower()}")
+    ear.forget(utime)
+    bus.publish(channel, encode(SwitchMode(SensorHeader(utime, OPERATOR, host_utime=utime), wanted)))
+    told = f"told {channel}: {wanted.name.lower()}"
+    confirmed = ear.listen(PATIENCE_S, lambda: wanted in (ear.mode, ear.decided))
+    if not ear.heard:
+        raise NoServerError(
+            f"{told}, but nobody answers on {provider}: is the daemon running, on this bus and with this "
+            "vehicle file? (modelserver run -c FILE, --url)"
+        )
+    now = ear.mode
+    if not confirmed and now is not None and not (wanted is Mode.RAW and ear.is_silent(state_hz)):
+        why = f" ({ear.refusal})" if ear.refusal else "; was it started with this vehicle file?"
+        raise ModelServerError(f"{told}, but the daemon stays in mode {now.name.lower()}{why}")
+    if confirmed or (wanted is Mode.RAW and was is not None):
+        before = f" (was {was.name.lower()})" if was is not None else ""
+        typer.echo(f"now {wanted.name.lower()}{before}")
+    elif not state_hz:
+        typer.echo(f"{told}; it cannot be confirmed: the vehicle file has publish.state_hz: 0")
+    else:
+        typer.echo(f"{told}; not confirmed: LOCALIZATION_STATE is silent, as in raw mode and before the first samples")
+
+
+class Ear:
+    """Hears what a daemon says of its mode: `mode` by its state, `decided` by its decisions, `heard` anything at all.
+
+    `since`: wishes of before count for nothing. `refusal`: why a wish was refused, by the health report.
+    """
+
+    def __init__(self, bus: lcm.LCM, prefix: str):
+        from modelserver.wire.channels import literal
+
+        self.heard = False
+        self.mode: Mode | None = None
+        self.decided: Mode | None = None
+        self.refusal = ""
+        self.since = 0
+        self._bus = bus
+        self._state_at = 0.0
+        handlers = {
+            "LOCALIZATION_STATE": self._on_state,
+            "LOCALIZATION_DECISIONS": self._on_decisions,
+            "MODELSERVER_HEALTH": self._on_health,
+            "POSE": self._on_pose,
+        }
+        for name, handler in handlers.items():
+            bus.subscribe(literal(f"{prefix}{name}"), handler)
+
+    def forget(self, since: int) -> None:
+        """Forget what was heard of the mode; from an instant on it counts."""
+        self.mode = self.decided = None
+        self.heard, self.since = False, since
+
+    def listen(self, seconds: float, until: Callable[[], bool]) -> bool:
+        """Listen until something is so, for so long at most; return whether it is."""
+        deadline = time.monotonic() + seconds
+        while not until():
+            left = deadline - time.monotonic()
+            if left <= 0.0:
+                return False
+            self._bus.handle_timeout(int(left * 1e3) + 1)
+        return True
+
+    def is_silent(self, state_hz: float) -> bool:
+        """Return whether the last three reports of the state are missing: raw mode has none."""
+        return time.monotonic() - self._state_at > min(3.0 / state_hz, 0.5 * PATIENCE_S)
+
+    def _on_state(self, _: str, data: bytes) -> None:
+        from modelserver.wire.codec import decode
+
+        state: NavigationState = decode("navigation_state_t", data)
+        self.heard, self.mode, self._state_at = True, state.mode, time.monotonic()
+
+    def _on_decisions(self, _: str, data: bytes) -> None:
+        from modelserver.wire.codec import decode
+
+        told: PublishDecisions = decode("decisions_t", data)
+        self.heard = True
+        for each in told.decisions:
+            name = each.reason.removeprefix("mode ").upper()
+            if each.kind == "mode" and told.utime >= self.since > 0 and name in Mode.__members__:
+                self.decided = Mode[name]
+
+    def _on_health(self, _: str, data: bytes) -> None:
+        from modelserver.wire.codec import decode
+
+        health: Health = decode("health_t", data)
+        self.heard = True
+        self.refusal = next((why for source, why, _ in health.rejected if source == f"command:{OPERATOR}"), "")
+
+    def _on_pose(self, _: str, data: bytes) -> None:
+        self.heard = True
 
 
 def parse_mode(text: str) -> Mode:

@@ -47,6 +47,25 @@ def size_of(model: Model) -> str:
     )
 
 
+def check_target(path: str) -> None:
+    """Raise what `written_whole` would where a file cannot be written: to be asked before work that takes a while.
+
+    A file that exists is no objection; empty and - (standard output) name no file.
+    """
+    if path in ("", "-"):
+        return
+    target = os.path.realpath(path)
+    if os.path.isdir(target):
+        raise ModelServerError(f"{safe(path)} is a directory; name a file in it")
+    if os.path.exists(target) and not os.path.isfile(target):
+        return
+    folder = os.path.dirname(target)
+    if not os.path.isdir(folder):
+        raise ModelServerError(f"{safe(path)} cannot be written: there is no folder {safe(folder)}; make it first")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ModelServerError(f"{safe(path)} cannot be written: nothing may be written in the folder {safe(folder)}")
+
+
 def write_file(path: str, text: str, replace: bool) -> None:
     """Write a file so that it is there whole or not at all; as `written_whole`."""
     with written_whole(path, replace) as stream:
@@ -75,7 +94,11 @@ def written_whole(path: str, replace: bool) -> Iterator[TextIO]:
         umask = os.umask(0)
         os.umask(umask)
         mode = 0o666 & ~umask
-    handle, draft = tempfile.mkstemp(prefix=".", suffix=".part", dir=os.path.dirname(target))
+    try:
+        handle, draft = tempfile.mkstemp(prefix=".", suffix=".part", dir=os.path.dirname(target))
+    except OSError as error:
+        # the draft's name says nothing to who asked for the file
+        raise OSError(error.errno, error.strerror, path) from None
     try:
         with open(handle, "w", encoding="utf-8", newline="\n") as stream:
             yield stream

@@ -7,8 +7,10 @@ import json
 import math
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TextIO
@@ -16,16 +18,19 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 import typer
 
 from modelserver.errors import RecordingError, nearest_names, shown
-from modelserver.messages import Decision
+from modelserver.messages import Decision, Invalid, Verdict
 from modelserver.wire.eventlog import LogEvent, LogFile
 from modelserver.wire.kinds import is_of_service
 from mstools.asking import JsonOption, UrlOption
-from mstools.output import written_whole
+from mstools.output import check_target, counted, written_whole
 from mstools.progress import progress
 
 if TYPE_CHECKING:
-    from modelserver.service.offline import Run
+    from modelserver.service.offline import Row, Run
     from mstools.report_data import Collector
+
+RATE_HZ = 50.0
+"""Poses a second where none is asked for."""
 
 TIMES_LIMIT = 64 << 20
 """Largest file of times, bytes."""
@@ -47,7 +52,7 @@ def command(
     frame: Annotated[
         str, typer.Option(metavar="BODY:FRAME", help="Frame whose pose is written. Default: the base frame.")
     ] = "",
-    rate: Annotated[float, typer.Option(metavar="HZ", help="Poses a second.")] = 50.0,
+    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Poses a second. Default: 50.")] = None,
     at_times: Annotated[
         Path | None, typer.Option("--at-times", metavar="FILE", help="Poses at these times: a utime a line, rising.")
     ] = None,
@@ -75,6 +80,7 @@ def command(
     even or listed times, each from nothing but what had arrived before it; docs/recordings.md says exactly what that
     means. --report draws the same run: track, innovations, biases, gaps, validity, and what looks wrong.
     A log that breaks off in its last event is used up to there; for other damage the exit code is 1.
+    Files named by --poses, --decisions and --report that exist are replaced, without --force.
 
     \b
     Examples:
@@ -87,20 +93,24 @@ def command(
     if poses or report:
         if config is None:
             raise typer.BadParameter(f"{'--poses' if poses else '--report'} needs the vehicle: -c FILE")
-        if not (math.isfinite(rate) and 0.0 < rate <= 10_000.0):
+        if rate is not None and not (math.isfinite(rate) and 0.0 < rate <= 10_000.0):
             raise typer.BadParameter(f"a rate is above 0 and at most 10000 Hz, got {rate:g}")
+        if rate is not None and at_times is not None:
+            raise typer.BadParameter("--rate and --at-times are two ways to say when; give one of them")
         if speed != "1" or restamp or url or everything:
             raise typer.BadParameter(
                 "--speed, --restamp, --all and --url are for the bus; --poses and --report work offline"
             )
-        if not poses and (frame or at_times is not None):
-            raise typer.BadParameter("--frame and --at-times go with --poses CSV")
+        if not poses and (frame or at_times is not None or rate is not None):
+            raise typer.BadParameter("--frame, --rate and --at-times go with --poses CSV")
         if (poses, decisions, report).count("-") > 1:
             raise typer.BadParameter("only one of --poses, --decisions and --report can go to standard output")
-        offline(log, config, poses, decisions, report, frame, rate, at_times, channels, as_json)
+        offline(log, config, poses, decisions, report, frame, rate or RATE_HZ, at_times, channels, as_json)
     else:
-        if frame or decisions or at_times is not None:
-            raise typer.BadParameter("--frame and --at-times go with --poses CSV, --decisions with that or --report")
+        if frame or decisions or at_times is not None or rate is not None:
+            raise typer.BadParameter(
+                "--frame, --rate and --at-times go with --poses CSV, --decisions with that or --report"
+            )
         factor = _speed(speed)
         if restamp and factor != 1.0:
             raise typer.BadParameter("--restamp goes with --speed 1: stamps must not run faster than the clock")
@@ -168,6 +178,7 @@ def offline(
     # one thread works: those of the linear algebra would only cost time
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    # loaded here, with what it needs, as it is long: the speed that is told is that of the replay
     from modelserver.config import load_config
     from modelserver.service.daemon import load_vehicle
     from modelserver.service.offline import CSV_HEADER, Run
@@ -182,6 +193,7 @@ def offline(
     for target, what in ((poses, "poses"), (decisions, "decisions"), (report, "report")):
         if target:
             _check_output(target, inputs)
+            check_target(target)
             place = os.path.realpath(target)
             if target != "-" and place in taken:
                 raise RecordingError(f"{target}: the {taken[place]} go there; name another file for the {what}")
@@ -201,41 +213,46 @@ def offline(
         gc.freeze()
         gc.set_threshold(50_000, 20, 100)
         started = time.monotonic()
-        written = valid = 0
+        poses_told = Poses()
+        refused: Counter[tuple[str, str, str]] = Counter()
         with (
             _output(poses) if poses else nullcontext() as out,
             _output(decisions) if decisions else nullcontext() as ledger,
             progress(f"replaying {log.name}", recording.size) as show,
         ):
-            listeners: list[Callable[[Decision], object]] = []
+            listeners: list[Callable[[Decision], object]] = [partial(_count_refused, refused)]
             if ledger is not None:
                 listeners.append(partial(_write_decision, ledger))
             if collector is not None:
                 listeners.append(collector.on_decision)
-            run.log = _shown(run.log, show)
-            if listeners:
-                run.on_decision = partial(_tell, listeners)
+            met: set[str] = set()
+            run.log = _shown(run.log, show, met)
+            run.on_decision = partial(_tell, listeners)
             if out is not None:
                 out.write(CSV_HEADER + "\n")
             for row in run.rows(times, rate):
                 if out is not None:
                     out.write(row.csv() + "\n")
-                written += 1
-                valid += row.valid
+                poses_told.count(row)
         wall = time.monotonic() - started
         on_stderr = "-" in (poses, decisions, report)
-        _print_counts(run, written, valid, wall, bool(poses), as_json, on_stderr)
+        _print_counts(run, poses_told if poses else None, refused, wall, as_json, on_stderr)
+        if times:
+            _warn_of_times(times, run, at_times)
         if not run.samples:
-            heard = _listed(vehicle.sensor_channels())
+            heard = _listed(
+                name for name, each in vehicle.sensor_channels().items() if each.type_name != "localization_mode_t"
+            )
             raise RecordingError(f"{log}: nothing on the vehicle's channels ({heard}); it has: {_listed(run.unheard)}")
         if collector is not None:
-            _write_report(collector, run, log, report, quiet=as_json)
+            _write_report(collector, run, log, report, met, quiet=as_json)
         _report_damage(recording)
 
 
-def _shown(events: Iterable[LogEvent], show: Callable[[float], object]) -> Iterator[LogEvent]:
-    """Yield events, and show now and then how far they have come."""
+def _shown(events: Iterable[LogEvent], show: Callable[[float], object], channels: set[str]) -> Iterator[LogEvent]:
+    """Yield events, show now and then how far they have come, and note their channels."""
     for number, event in enumerate(events):
+        channels.add(event.channel)
         if number % 1024 == 0:
             show(event.end)
         yield event
@@ -246,33 +263,94 @@ def _tell(listeners: Iterable[Callable[[Decision], object]], decision: Decision)
         each(decision)
 
 
-def _print_counts(run: Run, written: int, valid: int, wall: float, poses: bool, as_json: bool, on_stderr: bool) -> None:
+@dataclass
+class Poses:
+    """How many poses were written, how many are valid, and for how many each reason holds not to be."""
+
+    written: int = 0
+    valid: int = 0
+    reasons: Counter[Invalid] = field(default_factory=Counter)
+
+    def count(self, row: Row) -> None:
+        """Count one."""
+        self.written += 1
+        self.valid += row.valid
+        if not row.valid:
+            self.reasons.update(flag for flag in Invalid if row.invalid & flag)
+
+    def words(self, frame: str) -> str:
+        """Return it in words."""
+        told = f"{counted(self.written, 'pose')} of {frame}, {self.valid} valid"
+        if self.valid == self.written:
+            return told
+        mostly = "".join(f", mostly {flag.name}" for flag, _ in self.reasons.most_common(1))
+        return f"{told} (not valid: {self.written - self.valid}{mostly})"
+
+
+def _count_refused(refused: Counter[tuple[str, str, str]], decision: Decision) -> None:
+    if decision.verdict is Verdict.REJECTED:
+        refused[f"sensor:{decision.source}", decision.reason or "rejected", decision.kind] += 1
+
+
+def _print_counts(
+    run: Run,
+    poses: Poses | None,
+    refused: Counter[tuple[str, str, str]],
+    wall: float,
+    as_json: bool,
+    on_stderr: bool,
+) -> None:
     span = (run.last_utime - run.first_utime) * 1e-6
+    kinds = {
+        (source, reason): {kind: n for (s, r, kind), n in sorted(refused.items()) if (s, r) == (source, reason)}
+        for source, reason in run.rejected
+    }
     counts = {
-        "poses": written,
-        "valid": valid,
+        "poses": poses.written if poses else 0,
+        "valid": poses.valid if poses else 0,
+        "invalid_reasons": {str(flag.name): n for flag, n in poses.reasons.most_common()} if poses else {},
         "events": run.events,
         "samples": run.samples,
         "seconds": span,
         "wall_seconds": wall,
         "real_time_factor": span / wall if wall > 0 else math.nan,
-        "rejected": [{"source": s, "reason": r, "count": n} for (s, r), n in sorted(run.rejected.items())],
+        "rejected": [
+            {"source": s, "reason": r, "count": n, "kinds": kinds[s, r]} for (s, r), n in sorted(run.rejected.items())
+        ],
     }
-    told = f"{written} poses of {run.frame}, {valid} valid, from " if poses else ""
+    told = f"{poses.words(run.frame)}, from " if poses else ""
     lines = [
         f"{told}{run.samples} of {run.events} messages; "
         f"{span:.1f} s in {wall:.2f} s: {counts['real_time_factor']:.0f} times real time"
     ]
-    lines += [f"  not used: {n} of {s}, {r}" for (s, r), n in sorted(run.rejected.items())]
+    for (source, reason), count in sorted(run.rejected.items()):
+        of = ", ".join(kind if n == count else f"{n} {kind}" for kind, n in kinds[source, reason].items())
+        lines.append(f"  not used: {count} of {source}, {reason}{f' ({of})' if of else ''}")
     typer.echo(json.dumps(counts) if as_json else "\n".join(lines), err=on_stderr)
 
 
-def _write_report(collector: Collector, run: Run, log: Path, report: str, quiet: bool) -> None:
+UNITS = (("seconds", 1_000_000.0), ("milliseconds", 1_000.0), ("nanoseconds", 0.001))
+"""What times may be in by mistake, and what makes microseconds of it."""
+
+
+def _warn_of_times(times: list[int], run: Run, path: Path | None) -> None:
+    """Say that no time lies within the log, where that is so, and what the times may be."""
+    if any(run.first_utime <= each <= run.last_utime for each in times):
+        return
+    hint = f"the log lasts from {run.first_utime} to {run.last_utime}, in microseconds since 1970"
+    for unit, factor in UNITS:
+        if any(run.first_utime <= each * factor <= run.last_utime + 1e6 for each in times):
+            hint += f"; these look like {unit}"
+            break
+    typer.echo(f"modelserver: {path}: none of {counted(len(times), 'time')} lies within the log: {hint}", err=True)
+
+
+def _write_report(collector: Collector, run: Run, log: Path, report: str, channels: set[str], quiet: bool) -> None:
     """Write the page, and print the headlines of what it found."""
     from mstools import replay_report
     from mstools.report_findings import findings
 
-    replayed = collector.replayed(log.name, run.first_utime, run.last_utime, run.rejected)
+    replayed = collector.replayed(log.name, run.first_utime, run.last_utime, run.rejected, channels)
     with _output(report) as out:
         out.write(replay_report.page(replayed))
     if not quiet:

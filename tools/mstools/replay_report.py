@@ -9,13 +9,14 @@ from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from itertools import pairwise
 
-from modelserver.messages import Decision, Invalid, Verdict
+from modelserver.messages import Decision, Invalid, Mode, Verdict
 from modelserver.version import __version__
 from mstools import consistency, panels
+from mstools.finding import Finding, Grade
 from mstools.output import counted, safe
 from mstools.panels import Band, Curve, Dots, Level, Panel, Row
 from mstools.report_data import Replayed, Snapshot
-from mstools.report_findings import Finding, Grade, findings
+from mstools.report_findings import findings
 from mstools.svg import Axis, decades
 
 HELD_S = 1.0
@@ -93,22 +94,53 @@ def page(replayed: Replayed) -> str:
 
 def _figures(replayed: Replayed) -> str:
     states = replayed.snapshots
-    placed = [each.place for each in states if each.place is not None]
     # the way over ground, without what the estimate trembles by while standing
     way = sum(abs(b.speed) * (b.t - a.t) for a, b in pairwise(states) if math.isfinite(b.speed) and b.t - a.t < HELD_S)
-    valid = sum(not each.invalid for each in states) / len(states) if states else 0.0
+    driven = (f"{way:.0f} m", "driven")
+    if not any(math.isfinite(each.speed) for each in states):
+        raw = replayed.raw.driven()
+        by = "wheels" if replayed.raw.wheels else "fixes"
+        driven = (f"{raw:.0f} m", f"driven, by the {by}") if math.isfinite(raw) else ("unknown", "driven")
     sigmas = sorted(each.sigma for each in states if math.isfinite(each.sigma))
     verdicts = Counter(each.verdict for each in replayed.fixes)
     figures = [
         (f"{replayed.seconds:.0f} s", "recorded"),
-        (f"{way:.0f} m" if placed else "none", "driven"),
-        (f"{valid:.1%}", "of states valid"),
-        (f"{verdicts['used']} of {len(replayed.fixes)}", "fixes used"),
-        (f"{verdicts['rejected']}", "fixes rejected"),
+        driven,
+        (f"{_valid_share(replayed):.1%}", "of the time valid"),
+        (f"{verdicts['used']} of {len(replayed.fixes)}", "fixes used as positions"),
+        (f"{verdicts['rejected']}", "positions rejected"),
         (f"{sigmas[len(sigmas) // 2]:.2f} m" if sigmas else "none", "middle position sigma"),
     ]
     cells = "".join(f"<div><strong>{value}</strong><span>{what}</span></div>" for value, what in figures)
-    return f'<div class="figures">{cells}</div>'
+    return f'<div class="figures">{cells}</div>\n<p>{html.escape(_figure_words(replayed))}</p>'
+
+
+def _valid_share(replayed: Replayed) -> float:
+    """Return the share of the recorded time in which the state was valid."""
+    held = [min(b.t - a.t, HELD_S) for a, b in pairwise(replayed.snapshots) if not a.invalid and b.t > a.t]
+    return min(sum(held) / replayed.seconds, 1.0) if replayed.seconds > 0.0 else 0.0
+
+
+def _figure_words(replayed: Replayed) -> str:
+    """Return what the figures count, and what became of the fixes that were not used."""
+    verdicts = Counter(each.verdict for each in replayed.fixes)
+    words = ["Valid is of the time recorded, from the log's first event on."]
+    if replayed.fixes:
+        rest = [
+            f"{counted(verdicts[verdict], 'fix', 'fixes')} {what}"
+            for verdict, what in (
+                ("monitored", "at rest or unused"),
+                ("took_up", "took the position up"),
+                ("", "came before heading was known, or were still open at the end"),
+            )
+            if verdicts[verdict]
+        ]
+        if rest:
+            words.append(f"Of the fixes not used as positions (gps_position): {', '.join(rest)}.")
+        heights = sum(each.kind == "gps_height" and each.verdict is Verdict.REJECTED for each in replayed.decisions)
+        if heights:
+            words.append(f"{counted(heights, 'height')} (gps_height) of fixes rejected.")
+    return " ".join(words)
 
 
 def _findings(found: Sequence[Finding]) -> str:
@@ -299,7 +331,7 @@ def _log_panel(title: str, unit: str, t: Sequence[float], sigma: Sequence[float]
 def _consistency(replayed: Replayed) -> str:
     found = consistency.by_kind(replayed.decisions)
     if not found:
-        return "<p>Nothing was compared: raw mode, or heading never known.</p>"
+        return f"<p>Nothing was compared: {_why_nothing(replayed)}.</p>"
     rows = [
         (
             each.kind,
@@ -407,7 +439,7 @@ KNOWN_STATES: tuple[tuple[str, tuple[str, ...], str, float], ...] = (
 def _states(replayed: Replayed) -> str:
     states = [each for each in replayed.snapshots if each.values]
     if not states:
-        return "<p>The filter had no state: raw mode, or it never came to level.</p>"
+        return f"<p>The filter had no state: {_why_nothing(replayed)}.</p>"
     names = list(dict.fromkeys(name for each in states for name in each.values))
     core = ("position_", "velocity_", "attitude_")
     listed = {name for _, group, _, _ in KNOWN_STATES for name in group}
@@ -490,7 +522,16 @@ def _verdicts(replayed: Replayed) -> str:
     first = _table(("kind", "verdict", "reason", "count"), rows, numbers=(3,)) if rows else ""
     rejected = [(source, reason, str(count)) for (source, reason), count in sorted(replayed.rejected.items())]
     second = _table(("not used, of", "reason", "count"), rejected, numbers=(2,)) if rejected else ""
-    return f"{first}\n{second}" if rows or rejected else "<p>Nothing was decided: raw mode.</p>"
+    return f"{first}\n{second}" if rows or rejected else f"<p>Nothing was decided: {_why_nothing(replayed)}.</p>"
+
+
+def _why_nothing(replayed: Replayed) -> str:
+    """Return why the filter decided nothing."""
+    if replayed.mode is Mode.RAW:
+        return "raw mode"
+    if replayed.silent:
+        return "there is nothing on channel " + ", ".join(channel for _, channel in replayed.silent)
+    return "it never came to level, or never knew heading"
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Iterable[int] = ()) -> str:

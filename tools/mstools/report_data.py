@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -31,6 +31,7 @@ from modelserver.service.daemon import Vehicle
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array, Vector3
+from mstools.report_raw import RawCollector, RawMotion
 
 STEP_US = 200_000
 """Microseconds between two states that are kept, at least."""
@@ -118,7 +119,11 @@ class Replayed:
     """All that a report is made of. Times `t` are seconds from `first_utime`, the log's first event.
 
     `felt_up` is the mean specific force along the vehicle's axes, None without inertial unit. `frozen` are stretches in
-    which the inertial unit repeated one value. `settings` are the filter's.
+    which the inertial unit repeated one value. `settings` are the filter's, `mode` the one from the start.
+
+    `silent` are the sensors of the vehicle file, by key under sensors and channel, of which the log has nothing;
+    `channels` is what it has. `keys` says of each source which sensor it is, `wheel_names` what the log calls its
+    wheels, `raw` what the sensors said by themselves.
     """
 
     vehicle: str
@@ -135,6 +140,16 @@ class Replayed:
     felt_up: Vector3 | None = None
     frozen: tuple[tuple[float, float], ...] = ()
     origin: Origin | None = None
+    mode: Mode = Mode.FULL
+    silent: tuple[tuple[str, str], ...] = ()
+    channels: tuple[str, ...] = ()
+    keys: Mapping[str, str] = field(default_factory=dict)
+    wheel_names: tuple[str, ...] = ()
+    raw: RawMotion = field(default_factory=RawMotion)
+
+    def samples_of(self, source: str) -> int:
+        """Return how many samples came from a source."""
+        return next((len(each.times) for each in self.sensors if each.name == source), 0)
 
     def t(self, utime: int) -> float:
         """Return an instant as seconds from the log's first event."""
@@ -164,6 +179,9 @@ class Collector:
         self._frozen: list[tuple[int, int]] = []
         self._origin: Origin | None = None
         self._taken = 0
+        self._keys: dict[str, str] = {}
+        self._wheel_names: dict[str, None] = {}
+        self._raw = RawCollector(self._rig.pose(self._rig.imu_frame).wxyz if self._rig.imu_frame else None)
 
     def on_decision(self, decision: Decision) -> None:
         """Note what became of a measurement."""
@@ -176,12 +194,16 @@ class Collector:
             return
         name = type(sample).__name__.removesuffix("Sample").lower()
         self._times.setdefault(header.source or name, []).append(header.utime)
+        if name in ("gps", "imu", "wheels"):
+            self._keys[header.source] = name
         if isinstance(sample, GpsSample):
             self._fixes.append(sample)
+            self._raw.on_fix(sample)
         elif isinstance(sample, WheelsSample):
             self._turned(sample)
         elif isinstance(sample, ImuSample):
             self._felt_by(sample)
+            self._raw.on_imu(sample)
         # before the first that the state could be carried to, the pose at the sample says why there is none
         utime = localizer.utime or header.utime
         if utime >= self._taken + STEP_US or 0 < utime < self._taken:
@@ -189,9 +211,14 @@ class Collector:
             self._states.append((utime, self._snapshot(utime, localizer)))
 
     def replayed(
-        self, log: str, first_utime: int, last_utime: int, rejected: Mapping[tuple[str, str], int]
+        self,
+        log: str,
+        first_utime: int,
+        last_utime: int,
+        rejected: Mapping[tuple[str, str], int],
+        channels: Collection[str] = (),
     ) -> Replayed:
-        """Return all of it."""
+        """Return all of it. `channels`: those that the log has."""
 
         def seconds(utime: int) -> float:
             return (utime - first_utime) * 1e-6
@@ -215,7 +242,26 @@ class Collector:
             felt_up=self._felt_up(),
             frozen=tuple((seconds(a), seconds(b)) for a, b in self._frozen),
             origin=self._origin,
+            mode=self._vehicle.config.localization.first_mode,
+            silent=self._silent(channels),
+            channels=tuple(sorted(channels)),
+            keys=dict(self._keys),
+            wheel_names=tuple(self._wheel_names),
+            raw=self._raw.motion(self._turns, self._sides()),
         )
+
+    def _silent(self, channels: Collection[str]) -> tuple[tuple[str, str], ...]:
+        config = self._vehicle.config
+        sensors = config.sensors
+        named = [("gps", sensors.gps), ("imu", sensors.imu), ("wheels", sensors.wheels)]
+        return tuple(
+            (key, f"{config.lcm.channel_prefix}{each.channel}")
+            for key, each in (*named, *((f"aiding.{name}", each) for name, each in sensors.aiding.items()))
+            if each is not None and f"{config.lcm.channel_prefix}{each.channel}" not in channels
+        )
+
+    def _sides(self) -> dict[str, float]:
+        return {name: self._rig.pose(frame).xyz[1] for name, frame in self._rig.wheel_frames.items()}
 
     # --- what is noted --------------------------------------------------------------------------------------
 
@@ -251,6 +297,7 @@ class Collector:
         earlier = {wheel.name: wheel.travel for wheel in before.wheels} if before is not None else {}
         dt = (sample.header.utime - before.header.utime) * 1e-6 if before is not None else 0.0
         for wheel in sample.wheels:
+            self._wheel_names[wheel.name] = None
             way = wheel.travel - earlier.get(wheel.name, math.nan)
             speed = way / dt if 0.0 < dt < 1.0 and math.isfinite(way) else wheel.speed
             if math.isfinite(speed) and math.isfinite(wheel.steering):
@@ -315,9 +362,11 @@ class Collector:
                     off = (decision.residual[0] + east * a, decision.residual[1] + north * b)
                     velocity = _velocity(before)
             sigma = math.nan if isinstance(fix, str) else fix.sigma
-            verdict = "" if decision is None else decision.verdict.name.lower()
-            reason = fix if isinstance(fix, str) else "" if decision is None else decision.reason
-            found.append(Fix(t, place, sigma, "rejected" if isinstance(fix, str) else verdict, reason, off, velocity))
+            verdict, reason = ("", "") if decision is None else (decision.verdict.name.lower(), decision.reason)
+            # where nothing is decided, as in raw mode, it is the gate that tells
+            if not decided and isinstance(fix, str):
+                verdict, reason = "rejected", fix
+            found.append(Fix(t, place, sigma, verdict, reason, off, velocity))
         return tuple(found)
 
     def _wheel_turns(self, first_utime: int, snapshots: tuple[Snapshot, ...]) -> tuple[WheelTurn, ...]:

@@ -9,15 +9,15 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from enum import IntEnum
 
 import numpy as np
 
-from modelserver.messages import Invalid, Verdict
+from modelserver.messages import Decision, Invalid, Verdict
 from modelserver.spatial.so3 import Array
 from mstools import consistency
+from mstools.finding import Finding, Grade
 from mstools.output import counted
+from mstools.report_causes import CAUSES
 from mstools.report_data import Replayed, Snapshot, WheelTurn
 
 MOVING = 0.3
@@ -27,27 +27,20 @@ LEAST_TURNS = 20
 """Fewest wheel samples on the move that a wheel is judged by."""
 
 
-class Grade(IntEnum):
-    """How much a finding matters, worst first."""
-
-    WRONG = 0
-    DOUBTFUL = 1
-    NOTE = 2
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One finding: a headline, what was seen, and what to do about it."""
-
-    grade: Grade
-    title: str
-    seen: str
-    advice: str
-
-
 def findings(replayed: Replayed) -> list[Finding]:
-    """Return all findings, worst first."""
-    found = [finding for check in CHECKS for finding in check(replayed)]
+    """Return all findings, worst first, and of equals the causes first.
+
+    What only follows from a sensor that is wrong, or from a filter that had to begin anew, is left out.
+    """
+    causes = [finding for check in CAUSES for finding in check(replayed)]
+    checks = list(CHECKS)
+    if not causes:
+        checks += LOOKING_AT_SENSORS
+        if not any(_has_diverged(each) for each in replayed.decisions):
+            checks += OF_A_SOUND_STATE
+        checks.append(refused_fixes)
+    found = causes + [finding for check in (*checks, stamps, gaps) for finding in check(replayed)]
+    found += validity(replayed, explained=bool(causes))
     return sorted(found, key=lambda each: each.grade)
 
 
@@ -151,31 +144,6 @@ def frozen_unit(replayed: Replayed) -> Iterable[Finding]:
             f"{begin:.0f} s.",
             "Its driver passes on the last value when the unit is silent: let it send nothing then, and look at the "
             "unit's cable.",
-        )
-
-
-def mount(replayed: Replayed) -> Iterable[Finding]:
-    """Look for gravity that does not come from below."""
-    if replayed.felt_up is None:
-        return
-    x, y, z = replayed.felt_up
-    angle = math.atan2(math.hypot(x, y), z)
-    tilted = any(Invalid.TILTED in each.invalid for each in replayed.snapshots)
-    if angle > 0.3 or tilted:
-        yield Finding(
-            Grade.WRONG,
-            "The inertial unit is mounted otherwise than the geometry says",
-            f"The mean specific force points {math.degrees(angle):.0f} degrees away from the vehicle's up "
-            f"({x:+.1f}, {y:+.1f}, {z:+.1f} m/s2 along x, y, z).",
-            "Run modelserver calibrate imu LOG -c VEHICLE on a standing stretch: it says which mount fits.",
-        )
-    size = math.sqrt(x * x + y * y + z * z)
-    if not 9.0 < size < 10.6:
-        yield Finding(
-            Grade.WRONG,
-            f"The inertial unit feels {size:.2f} m/s2 in the mean",
-            "Whatever the vehicle does, the mean of its specific force is near 9.8 m/s2.",
-            "Look at the unit of acceleration in the driver (g or m/s2), and whether gravity is taken off there.",
         )
 
 
@@ -301,17 +269,30 @@ def _smoothed(t: Array, series: Array) -> Array:
     return means
 
 
+WORDS = {
+    "gate": "gate: fixes and motion contradict each other, see the track",
+    "nan": "nan: the driver passed on no number",
+    "no_fix": "no_fix: the receiver says that it has none, or a lesser one than localization.filter.minimum_fix_type",
+    "satellites": "satellites: fewer than localization.filter.minimum_satellites",
+    "dilution": "dilution: hdop above localization.filter.maximum_hdop",
+    "sigma": "sigma: less sure than localization.filter.maximum_sigma",
+    "range": "range: no place on Earth, or out of reach of the origin's zone",
+}
+"""What to know of the reasons for which fixes are refused."""
+
+
 def refused_fixes(replayed: Replayed) -> Iterable[Finding]:
     """Look for a large share of fixes that were refused, and why."""
     reasons = Counter(each.reason or each.verdict for each in replayed.fixes if each.verdict == "rejected")
     refused, total = sum(reasons.values()), len(replayed.fixes)
     if total >= 20 and refused > 0.2 * total:
         words = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common(3))
+        known = [WORDS.get(reason, f"{reason}: docs/localization.md") for reason, _ in reasons.most_common(3)]
         yield Finding(
             Grade.DOUBTFUL,
             f"{refused / total:.0%} of the fixes were refused",
-            f"Of {counted(total, 'fix', 'fixes')}: {words}.",
-            "gate: fixes and motion contradict each other, see the track; other words: docs/localization.md.",
+            f"Of {counted(total, 'fix', 'fixes')} as positions: {words}.",
+            f"{'; '.join(known)}.",
         )
 
 
@@ -350,14 +331,19 @@ def gaps(replayed: Replayed) -> Iterable[Finding]:
             )
 
 
-def validity(replayed: Replayed) -> Iterable[Finding]:
-    """Look for poses that were not valid for long after the start, and for headings that were never found."""
+def validity(replayed: Replayed, explained: bool = False) -> Iterable[Finding]:
+    """Look for poses that were not valid for long after the start, and for headings that were never found.
+
+    `explained`: other findings say why; then the reasons given with poses, which only follow, are not repeated.
+    """
     if not replayed.snapshots:
         yield Finding(
             Grade.WRONG,
             "There was never a state",
-            "No sample of a sensor that the vehicle file names could be used.",
-            "Compare the channels in the log with those in the vehicle file.",
+            "It may follow from what stands above."
+            if explained
+            else "No sample of a sensor that the vehicle file names could be used.",
+            "Put that right first." if explained else "Compare the channels in the log with those in the vehicle file.",
         )
         return
     first = next((n for n, each in enumerate(replayed.snapshots) if not each.invalid), None)
@@ -366,8 +352,11 @@ def validity(replayed: Replayed) -> Iterable[Finding]:
         yield Finding(
             Grade.WRONG,
             "The pose was never valid",
-            f"At the end: {words}.",
-            "Heading takes a few metres of driving with fixes; the strip of reasons below says what was missing when.",
+            "It may follow from what stands above." if explained else f"At the end: {words}.",
+            "Put that right first."
+            if explained
+            else "Heading takes a few metres of driving with fixes; the strip of reasons below says what was missing "
+            "when.",
         )
         return
     after = replayed.snapshots[first:]
@@ -383,35 +372,35 @@ def validity(replayed: Replayed) -> Iterable[Finding]:
         )
 
 
+def _has_diverged(decision: Decision) -> bool:
+    return decision.verdict is Verdict.TOOK_UP and "diverged" in decision.reason
+
+
 def diverged(replayed: Replayed) -> Iterable[Finding]:
     """Look for a filter that had to begin anew, or that took its position up anew."""
-    for each in replayed.decisions:
-        if each.verdict is Verdict.TOOK_UP and ("diverged" in each.reason or "agree" in each.reason):
+    anew = [each for each in replayed.decisions if _has_diverged(each)]
+    taken = [each for each in replayed.decisions if each.verdict is Verdict.TOOK_UP and "agree" in each.reason]
+    for title, found in (("The state was begun anew", anew), ("Position was taken up anew", taken)):
+        if found:
+            first = found[0]
+            times = "" if len(found) == 1 else f", first of {len(found)} times"
             yield Finding(
                 Grade.DOUBTFUL,
-                "The state was begun anew" if "diverged" in each.reason else "Position was taken up anew",
-                f"At {replayed.t(each.utime):.0f} s: {each.reason}.",
+                title,
+                f"At {replayed.t(first.utime):.0f} s{times}: {first.reason}.",
                 "See the innovations before it: which kind went wrong first?",
             )
 
 
 Check = Callable[[Replayed], Iterable[Finding]]
 
-CHECKS: tuple[Check, ...] = (
-    validity,
-    diverged,
-    mount,
-    frozen_unit,
-    wheels_reversed,
-    always_backward,
-    wheel_scale,
-    biases,
-    latency,
-    stated_sigma,
-    refused_fixes,
-    stamps,
-    gaps,
-)
+CHECKS: tuple[Check, ...] = (frozen_unit, diverged)
+
+LOOKING_AT_SENSORS: tuple[Check, ...] = (wheels_reversed, always_backward)
+"""Those that look at sensors beside the filter's state: with a cause known they only repeat it."""
+
+OF_A_SOUND_STATE: tuple[Check, ...] = (wheel_scale, biases, latency, stated_sigma)
+"""Those that take the filter's state for good."""
 
 
 def _last(replayed: Replayed) -> Snapshot | None:

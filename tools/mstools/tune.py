@@ -6,6 +6,7 @@ import json
 import math
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from modelserver.errors import ModelServerError, RecordingError
-from mstools.output import counted, safe, write_file
+from mstools.output import check_target, counted, safe, write_file
 from mstools.progress import progress
 from mstools.tune_search import Found, Parameter, Score, Settings, Step, search
 
@@ -253,11 +254,24 @@ def _pool(processes: int, parts: int) -> Iterator[Callable[[Sequence[Job]], list
     if count == 1:
         yield lambda jobs: [_run(job) for job in jobs]
         return
-    pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
+    pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"), initializer=_ignore_interrupts)
     try:
         yield lambda jobs: list(pool.map(_run, jobs))
-    finally:
-        pool.shutdown(cancel_futures=True)
+    except BaseException:
+        # what runs takes seconds and is of no use any more; the pool forgets its workers when it shuts down
+        workers = list((getattr(pool, "_processes", None) or {}).values())
+        pool.shutdown(wait=False, cancel_futures=True)
+        for each in workers:
+            each.terminate()
+        for each in workers:
+            each.join()
+        raise
+    pool.shutdown()
+
+
+def _ignore_interrupts() -> None:
+    """Leave Ctrl-C, which reaches all processes of a terminal, to the one that began the others."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _run(job: Job) -> Outcome | None:
@@ -298,6 +312,7 @@ def _check_output(output: str, inputs: Sequence[Path], force: bool) -> None:
     if not force and os.path.isfile(output):
         # said before the work, for that takes a while; the writing looks again
         raise ModelServerError(f"{safe(output)} exists already; give --force to replace it, or another name")
+    check_target(output)
 
 
 def _mean(values: Sequence[float]) -> float:

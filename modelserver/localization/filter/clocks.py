@@ -12,6 +12,15 @@ from modelserver.localization.filter.settings import FilterSettings
 MOST_SOURCES = 256
 """Sources that are told apart: more names than that come from a flood."""
 
+MOST_AHEAD = 100
+"""Counts that a sequence is taken to go on by: more is one that began anew from 0."""
+
+INERTIAL_RANK = 2
+"""The rank of an inertial unit: nothing leads before it."""
+
+AHEAD_US = 60_000
+"""Microseconds that a measurement waits for inertial samples up to its instant: most units speak within 50 ms."""
+
 
 class Verdict(Enum):
     """What a stamp says about its sample."""
@@ -56,15 +65,18 @@ class Clocks(NamedTuple):
             source = _odd(source, utime, self.lead_utime)
             if source.odd < settings.clock_samples:
                 return self._with(name, source), Verdict.FUTURE
-        elif source.newest and utime < source.newest and (utime < self.newest - horizon or seq > source.seq > 0):
+        elif source.newest and utime < source.newest and (ahead < -horizon or 0 < seq - source.seq < MOST_AHEAD):
             # its own stamps go back: those of one that merely comes late do not, or its sequence goes back too
             source = _odd(source, utime, 0)
-            if source.odd < settings.clock_samples or rank < self.rank:
-                return self._with(name, source), Verdict.ORDER
-            return Clocks(utime, rank, utime, MappingProxyType({name: Source(utime, seq)})), Verdict.STEPPED_BACK
+            if source.odd >= settings.clock_samples and rank >= self.rank:
+                return Clocks(utime, rank, utime, MappingProxyType({name: Source(utime, seq)})), Verdict.STEPPED_BACK
+            # within the horizon it is used as long as it may be chance: what counts must not hang on the arrival
+            return self._with(name, source), Verdict.ORDER if ahead < -horizon else Verdict.GOOD
         elif self.newest and ahead < -horizon:
             return self, Verdict.LATE
-        source = Source(max(utime, source.newest), seq if utime >= source.newest else source.seq)
+        if utime < source.newest:
+            return self, Verdict.GOOD
+        source = Source(utime, seq)
         leads = rank >= self.rank
         return (
             Clocks(
@@ -75,6 +87,16 @@ class Clocks(NamedTuple):
             ),
             Verdict.GOOD,
         )
+
+    def complete_to(self) -> int:
+        """Return the instant up to which measurements can be fused for good, as far as the inertial unit goes.
+
+        What is measured after its newest sample waits for the next: fused before it, it would be fused again after it.
+        It does not wait longer than AHEAD_US.
+        """
+        if self.rank == INERTIAL_RANK and self.newest - self.lead_utime <= AHEAD_US:
+            return self.lead_utime
+        return self.newest
 
     def _full(self, name: str) -> bool:
         """Return whether there is no room for a source that is not known yet."""

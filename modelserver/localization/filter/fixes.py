@@ -151,10 +151,18 @@ def aligned(setup: Setup, state: FilterState, fit: Fit, *, by_unit: bool) -> Fil
 
 
 def into_world(setup: Setup, state: FilterState, nav: Nav, turn: float, sigma: float, newest: Passed) -> FilterState:
-    """Return the state turned by a heading that was found, with its antenna at the newest fix."""
+    """Return the state turned by a heading that was found, with its antenna at the newest fix.
+
+    `nav` is the state's own, or that with a speed that was just found. Finding it shifted the place by all that was
+    driven at an unknown speed: the way since the fix is at that speed then.
+    """
     lever = setup.rig.lever(setup.rig.gps_frame)
-    x, y, _ = nav.point(lever)
-    moved = (complex(x, y) - newest.way) * cmath.rect(1.0, turn)
+    if nav is state.nav:
+        x, y, _ = nav.point(lever)
+        way = complex(x, y) - newest.way
+    else:
+        way = horizontal(nav.point_velocity(lever)) * (nav.utime - newest.utime) * 1e-6
+    moved = way * cmath.rect(1.0, turn)
     nav = placing.placed(placing.turned(nav, turn, sigma), newest, moved, lever, setup.layout)
     site = state.site
     assert site is not None
@@ -275,7 +283,7 @@ def put(
     utime = nav.utime
     after, decision = updates.used(nav, compared, settings, utime, source, seq, "gps_position")
     within = decision.statistic <= decision.limit or decision.verdict is Verdict.USED
-    if not decision.statistic <= decision.limit and steady and not state.refused_count:
+    if decision.dof and not decision.statistic <= decision.limit and steady and not state.refused_count:
         # it drifted here, fix by fix, and did not jump: it is let wander as fast as it does
         excess = decision.statistic / decision.dof
         wide = widened(setup, nav, 1.0 + excess * settings.gps_wander_time / 2.0 * 0.01, 1.0)

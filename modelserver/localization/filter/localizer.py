@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from modelserver.geodesy import Geodesy
-from modelserver.localization.filter import clocks, engine, motion, start, world
+from modelserver.localization.filter import clocks, engine, inertial, motion, start, world
 from modelserver.localization.filter.clocks import Clocks
-from modelserver.localization.filter.engine import INERTIAL, Item
+from modelserver.localization.filter.items import INERTIAL, Item, items
 from modelserver.localization.filter.odometry import Odometry
 from modelserver.localization.filter.setup import Setup
 from modelserver.localization.filter.state import FilterState, Said
@@ -85,7 +85,11 @@ class FilterLocalizer:
     @property
     def utime(self) -> int:
         """The instant of the newest sample taken, 0 before the first that the state could be carried to."""
-        return 0 if self.head.nav is None else self.head.nav.utime
+        nav = self.head.nav
+        if nav is None:
+            return 0
+        # what waits for inertial samples counts as taken
+        return max(nav.utime, self.clocks.newest) if motion.inertial(self.setup, self.mode) else nav.utime
 
     @property
     def mode(self) -> Mode:
@@ -99,7 +103,7 @@ class FilterLocalizer:
         order, future, duplicate), else when the horizon has passed and nothing can change it any more.
         """
         setup, header = self.setup, sample.header
-        found = engine.items(setup, sample)
+        found = items(setup, sample)
         if not found:
             return self, ()
         settings = setup.settings
@@ -121,12 +125,17 @@ class FilterLocalizer:
             longer = timeline.with_item(item)
             if isinstance(longer, str):
                 notes.append(_refused(item, longer))
-            else:
-                timeline = longer
+                continue
+            timeline, out = longer
+            if out is not None:
+                notes.append(_refused(out, "duplicate"))
         if timeline is self.timeline:
             return replace(self, clocks=known), tuple(notes)
-        timeline = timeline.worked(setup, settings.replay_budget)
-        head = timeline.newest if timeline.settled else self._carried(sample, found[0])
+        # an order is obeyed at once, and what was measured waits only for inertial samples that will be used
+        waits = motion.inertial(setup, self.mode) and not isinstance(sample, SwitchMode)
+        limit = known.complete_to() if waits else known.newest
+        timeline = timeline.worked(setup, settings.replay_budget, limit)
+        head = timeline.newest if timeline.settled(limit) else self._carried(sample, found[0])
         timeline, decisions = timeline.settled_before(oldest)
         notes += decisions
         odom, odoms = self.odom, self.odoms
@@ -149,7 +158,7 @@ class FilterLocalizer:
         """Return the head carried on by an inertial sample alone, while the timeline is not settled."""
         head = self.head
         if item.kind == INERTIAL and isinstance(sample, ImuSample) and head.nav is not None:
-            read = engine.read(self.setup, sample)
+            read = inertial.read(self.setup, sample)
             if not isinstance(read, str) and item.utime > head.nav.utime and head.mode is not Mode.NO_IMU:
                 rate, force = read
                 said = head.said or Said(item.utime, rate, force, item.utime)
@@ -205,7 +214,7 @@ class FilterLocalizer:
 
 
 def _rank(sample: Sample | SwitchMode) -> int:
-    return 2 if isinstance(sample, ImuSample) else 1 if isinstance(sample, WheelsSample) else 0
+    return clocks.INERTIAL_RANK if isinstance(sample, ImuSample) else 1 if isinstance(sample, WheelsSample) else 0
 
 
 def _refused(item: Item, reason: str) -> Decision:

@@ -83,8 +83,8 @@ class Nav(NamedTuple):
     def injected(self, error: Array, covariance: Array) -> Nav:
         """Return the state with an error (n) put into it, and the covariance after that.
 
-        Attitude's covariance is turned by half the error (reset Jacobian I - [error/2]x; J. Sola, "Quaternion
-        kinematics for the error-state Kalman filter", 2017, 6.3).
+        Attitude's covariance is turned by half the error (reset Jacobian I + [error/2]x of an error about fixed
+        axes; J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017, 7.3).
         """
         e = error.tolist()
         angle = (e[6], e[7], e[8])
@@ -92,7 +92,7 @@ class Nav(NamedTuple):
         attitude = so3.normalized(so3.multiply(so3.exponential(angle), self.attitude)) if size else self.attitude
         if size > 1e-3:
             G = np.eye(len(covariance))
-            G[ATTITUDE, ATTITUDE] -= so3.skew((0.5 * e[6], 0.5 * e[7], 0.5 * e[8]))
+            G[ATTITUDE, ATTITUDE] += so3.skew((0.5 * e[6], 0.5 * e[7], 0.5 * e[8]))
             covariance = G @ covariance @ G.T
         px, py, pz = self.position
         vx, vy, vz = self.velocity

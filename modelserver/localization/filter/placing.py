@@ -8,7 +8,7 @@ from modelserver.geodesy import about_up
 from modelserver.localization.filter import kalman
 from modelserver.localization.filter.alignment import Passed
 from modelserver.localization.filter.layout import Layout
-from modelserver.localization.filter.measurements.gps import WANDER
+from modelserver.localization.filter.measurements.gps import LATENCY, WANDER
 from modelserver.localization.filter.nav import Nav
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import Vector3
@@ -42,21 +42,28 @@ def turned(nav: Nav, turn: float, sigma: float) -> Nav:
 def placed(nav: Nav, fix: Passed, moved: complex, lever: Vector3, layout: Layout) -> Nav:
     """Return the state with the antenna at a fix, `moved` metres along N since then; `lever` leads to it.
 
-    What lingers in the fix is the position's error from now on: both are tied as p = fix - lingering - white.
+    What lingers in the fix, and how late it is, is the position's error from now on: all are tied as
+    p = fix - lingering - white + latency v.
     """
     arm = so3.rotate(nav.attitude, lever)
-    place = fix.place + moved
+    vx, vy, _ = nav.point_velocity(lever)
+    late = nav.extras[layout.extra(LATENCY)]
+    place = fix.place + moved + late * complex(vx, vy)
     position = (place.real - arm[0], place.imag - arm[1], fix.up - arm[2])
     P = nav.covariance.copy()
     n = len(P)
+    late_at = layout.index(LATENCY)
+    # latency times speed, both unknown: what a first order leaves out
+    second = [P[late_at, late_at] * P[k, k] for k in (3, 4)]
     P[0:3, :] = 0.0
     P[:, 0:3] = 0.0
     at = layout.index(WANDER[0])
     P[at : at + 3, :] = 0.0
     P[:, at : at + 3] = 0.0
-    # p = place - R lever: an error of attitude moves p by -theta x (R lever) = [arm]x theta
+    # p = place - R lever + latency v: an error of attitude moves p by -theta x (R lever) = [arm]x theta
     L = np.zeros((3, n))
     L[:, 6:9] = so3.skew(arm)
+    L[:2, late_at] = vx, vy
     P[0:3, :] += L @ P
     P[:, 0:3] += P @ L.T
     lingering = (fix.lingering, fix.lingering, fix.up_sigma)
@@ -65,6 +72,8 @@ def placed(nav: Nav, fix: Passed, moved: complex, lever: Vector3, layout: Layout
         P[axis, axis] += lingering[axis] ** 2 + white[axis] ** 2
         P[axis, at + axis] = P[at + axis, axis] = -lingering[axis]
         P[at + axis, at + axis] = 1.0
+    P[0, 0] += second[0]
+    P[1, 1] += second[1]
     extras = list(nav.extras)
     for name in WANDER:
         extras[layout.extra(name)] = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -203,11 +204,20 @@ class FilterSettings(FixSettings):
     """Fastest the vehicle moves, m/s: a state beyond is taken for a diverged filter."""
 
     def __post_init__(self) -> None:
-        FixSettings.__post_init__(self)
+        problems = []
+        try:
+            FixSettings.__post_init__(self)
+        except ValueError as error:
+            problems += str(error).splitlines()
         for name, most in (("gps_white_share", 1.0), ("gate_risk", 0.1), ("risk_per_hour", 0.1), ("horizon", 10.0)):
-            if getattr(self, name) > most:
-                raise ValueError(f"{name} is at most {most:g}, got {getattr(self, name)}")
-        if self.maximum_tilt > 1.5708:
-            raise ValueError(f"maximum_tilt is at most pi/2, got {self.maximum_tilt}")
-        if not 8 <= self.replay_budget <= 4096:
-            raise ValueError(f"replay_budget is between 8 and 4096, got {self.replay_budget}")
+            if math.inf > getattr(self, name) > most:
+                problems.append(f"{name} is at most {most:g}, got {getattr(self, name)}")
+        for name, most, words in (("maximum_tilt", 1.5708, "pi/2"), ("heading_limit", 3.1416, "pi")):
+            value = getattr(self, name)
+            if math.inf > value > most:
+                hint = f"; {value:g} degrees are {math.radians(value):.3g}"
+                problems.append(f"{name} is at most {words} radians, got {value}{hint}")
+        if not 8 <= self.replay_budget <= 4096 and self.replay_budget > 0:
+            problems.append(f"replay_budget is between 8 and 4096, got {self.replay_budget}")
+        if problems:
+            raise ValueError("\n".join(problems))

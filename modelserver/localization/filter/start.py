@@ -20,15 +20,24 @@ from modelserver.spatial.so3 import Quaternion, Vector3
 LEVEL_SIGMA = 0.1
 """Sigma of roll and pitch, rad, where no inertial unit tells: ordinary ground slopes by up to 6 deg."""
 
+LEAST_MEAN = 0.5
+"""Seconds that the mean for levelling on the move is taken over, at least."""
+
+GRAVITY_WITHIN = 2.0
+"""m/s2 within which the mean force must be gravity: else the unit tells other units, or is out of order."""
+
 
 def levelled(setup: Setup, state: FilterState, utime: int, rate: Vector3, force: Vector3) -> FilterState:
     """Return the state with one inertial sample more towards levelling; with `nav` once it is done.
 
     A vehicle that stands is averaged for `levelling_time`; one that does not within `levelling_limit` is levelled by
     the mean of that time, on the move, and less sure for it. Where gravity is far off the geometry's up, the state
-    keeps `tilt`, and levelling goes on: the mount is wrong, or the vehicle lies on its side.
+    keeps `tilt`, and levelling goes on: the mount is wrong, or the vehicle lies on its side. Infinite: what is felt is
+    no gravity.
     """
     settings = setup.settings
+    if not state.heard:
+        state = state._replace(heard=utime)
     still = state.stillness.seconds(utime) > 0.0 and utime >= state.moved
     if still and state.level_count and state.stillness.since >= state.began and not state.standing:
         # what was felt before it stood does not count
@@ -44,17 +53,22 @@ def levelled(setup: Setup, state: FilterState, utime: int, rate: Vector3, force:
         imu_utime=utime,
     )
     waited = (utime - state.began) * 1e-6
-    if not (state.standing and waited >= settings.levelling_time) and waited < settings.levelling_limit:
+    # standing that comes and goes begins its mean anew each time, but nobody waits for it longer than the limit
+    late = (utime - state.heard) * 1e-6 >= settings.levelling_limit and waited >= min(
+        LEAST_MEAN, settings.levelling_time
+    )
+    if not (late or (state.standing and waited >= settings.levelling_time)):
         return state
     n += 1
     up = (state.level_force[0] / n, state.level_force[1] / n, state.level_force[2] / n)
     mean = (state.level_rate[0] / n, state.level_rate[1] / n, state.level_rate[2] / n)
-    tilt = tilt_of(up)
-    begun_anew = state._replace(level_force=ZERO, level_rate=ZERO, level_count=0, began=0, standing=False)
+    tilt = tilt_of(up) if abs(math.hypot(*up) - strapdown.STANDARD_GRAVITY) < GRAVITY_WITHIN else math.inf
     if tilt > settings.tilt_mount_limit:
-        return begun_anew._replace(tilt=tilt, level_force=up)
+        return state._replace(
+            level_force=ZERO, level_rate=ZERO, level_count=0, began=0, heard=0, standing=False, tilt=tilt
+        )
     kept = state.biases
-    if state.standing:
+    if state.standing and waited >= settings.levelling_time:
         bias, bias_sigma = mean, max(settings.gyro_noise / math.sqrt(waited), 1e-6)
         # half a second's bias walk is far below: what is left is how well the accelerometers know up
         tilt_sigma = settings.accelerometer_bias_sigma / strapdown.STANDARD_GRAVITY
@@ -67,7 +81,7 @@ def levelled(setup: Setup, state: FilterState, utime: int, rate: Vector3, force:
             bias, bias_sigma = kept
     nav = first_nav(setup, utime, strapdown.level_attitude(up), tilt_sigma, speed_sigma, bias, bias_sigma)
     # on a slope's own the accelerometers' bias and tilt look the same: tied so that gravity stays explained
-    nav = _tied(nav, settings.accelerometer_bias_sigma, tied=state.standing)
+    nav = _tied(nav, settings.accelerometer_bias_sigma, tied=state.standing and waited >= settings.levelling_time)
     return state._replace(
         nav=nav._replace(rate=rate, force=force),
         phase=Phase.UNALIGNED,

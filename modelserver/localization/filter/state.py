@@ -49,7 +49,7 @@ class Said(NamedTuple):
         if dt <= 0.0:
             return self
         if rate == self.rate and force == self.force:
-            return self._replace(utime=utime, slope=(), even=0)
+            return self._replace(utime=utime, slope=(), even=self.even + 1 if not self.slope else 1)
         (a, b, c), (d, e, f) = self.rate, self.force
         (g, h, i), (j, k, m) = rate, force
         slope = ((g - a) / dt, (h - b) / dt, (i - c) / dt, (j - d) / dt, (k - e) / dt, (m - f) / dt)
@@ -60,7 +60,7 @@ class Said(NamedTuple):
 
     @property
     def made_up(self) -> bool:
-        """Whether the numbers go along a line as no sensor's noise lets them: someone filled a gap with them."""
+        """Whether the numbers go along a line, or stay, as no noise lets them: someone filled a gap with them."""
         return self.even >= MADE_UP
 
 
@@ -76,8 +76,9 @@ class FilterState(NamedTuple):
     """Nominal state, covariance, and everything that decisions rest on. Make the first with the engine's `first`.
 
     `nav` is None while levelling. `site` is the tangent plane that N is east, north, up of once `phase` is ALIGNED.
-    `imu_utime` is the last inertial sample used, `began` the first; `said` what the unit said, and `guessed`
-    whether that was made up; `wheels_utime` the last wheels used. `passed` are fixes beside the way, for heading;
+    `imu_utime` is the last inertial sample used, `heard` the first of levelling, `began` the first of its mean;
+    `said` what the unit said, and `guessed` whether that was made up; `wheels_utime` the last wheels used, and
+    `wheels_source` who told them. `passed` are fixes beside the way, for heading;
     `unit` the way at speed 1 so far (s). `refused` are the fixes refused in a row, `refused_since` the first of
     them; `confirmed` counts the fixes that were used, and `fix_utime` is the last that was used or confirmed.
     `moved` is until when fixes say that the vehicle moves. `restless` is by how much faster than the settings say
@@ -86,7 +87,7 @@ class FilterState(NamedTuple):
     `allowance` is what one outlier just within its gate may have moved the position by, metres, and
     `conflict_utime` when a fix from beyond its gate was last used. `biases` are the gyros' with their sigma, kept
     where the rest begins anew. `tilt` is how far gravity is off the geometry's up at start-up, where that is too
-    far.
+    far; infinite where what is felt is no gravity.
     """
 
     nav: Nav | None = None
@@ -102,9 +103,11 @@ class FilterState(NamedTuple):
     pending: tuple[Pending, ...] = ()
     standing: bool = False
     began: int = 0
+    heard: int = 0
     guessed: bool = False
     wheels_utime: int = 0
     wheels_rate: float = 0.0
+    wheels_source: str = ""
     last: Mapping[tuple[str, str], Last] = MappingProxyType({})
     rolled_utime: int = 0
     rested_utime: int = 0

@@ -10,7 +10,7 @@ from bisect import bisect_left
 from typing import NamedTuple, TypeAlias
 
 from modelserver.localization.filter import engine
-from modelserver.localization.filter.engine import Item
+from modelserver.localization.filter.items import Item
 from modelserver.localization.filter.setup import Setup
 from modelserver.localization.filter.state import FilterState
 from modelserver.messages import Decision
@@ -34,6 +34,11 @@ def _key(entry: Entry) -> Key:
     return entry.item.key
 
 
+def _order(item: Item) -> tuple[int, str]:
+    """Return what decides between two items of one source and instant; samples are values, and say all in words."""
+    return item.seq, repr(item.sample)
+
+
 class Timeline(NamedTuple):
     """`base` is the state before all `entries`; the first `fused` of them are worked through."""
 
@@ -48,13 +53,16 @@ class Timeline(NamedTuple):
         assert state is not None
         return state
 
-    @property
-    def settled(self) -> bool:
-        """Whether everything is worked through."""
-        return self.fused == len(self.entries)
+    def settled(self, limit: int) -> bool:
+        """Return whether everything up to the instant `limit` is worked through."""
+        return self.fused == len(self.entries) or self.entries[self.fused].item.utime > limit
 
-    def with_item(self, item: Item) -> Timeline | str:
-        """Return the timeline with one item more in its place, or in one word why not."""
+    def with_item(self, item: Item) -> tuple[Timeline, Item | None] | str:
+        """Return the timeline with one item more in its place, or in one word why not.
+
+        With it comes the item that had to make room: of two that one source says of one instant the lower number
+        counts, whichever came first.
+        """
         entries = self.entries
         key = item.key
         if not entries or key > entries[-1].item.key:
@@ -63,12 +71,17 @@ class Timeline(NamedTuple):
             return "load"
         else:
             at = bisect_left(entries, key, key=_key)
-        if self._has(item, at):
-            return "duplicate"
-        return Timeline(self.base, entries[:at] + (Entry(item, None, ()),) + entries[at:], min(self.fused, at))  # noqa: RUF005 - a third faster here
+        out = None
+        twin = self._twin(item, at)
+        if twin is not None:
+            out = entries[twin].item
+            if _order(out) <= _order(item):
+                return "duplicate"
+            entries = entries[:twin] + entries[twin + 1 :]
+        return Timeline(self.base, entries[:at] + (Entry(item, None, ()),) + entries[at:], min(self.fused, at)), out  # noqa: RUF005 - a third faster here
 
-    def _has(self, item: Item, at: int) -> bool:
-        """Return whether an item is there, whose place would be `at`.
+    def _twin(self, item: Item, at: int) -> int | None:
+        """Return where the same source says the same of the same instant; `at` is where the item's place would be.
 
         A source measures a thing once at an instant, whatever its numbering; all of that instant stand side by side.
         """
@@ -78,20 +91,22 @@ class Timeline(NamedTuple):
                 if other.utime != item.utime or other.source != item.source:
                     break
                 if other.part == item.part:
-                    return True
-        return False
+                    return n
+        return None
 
-    def worked(self, setup: Setup, budget: int) -> Timeline:
-        """Return the timeline with up to `budget` items more worked through."""
+    def worked(self, setup: Setup, budget: int, limit: int) -> Timeline:
+        """Return the timeline with up to `budget` items more worked through, none later than the instant `limit`."""
         entries, at = self.entries, self.fused
-        if at == len(entries):
+        if self.settled(limit):
             return self
         state = self.newest
-        until = min(at + budget, len(entries))
         fresh = []
-        for entry in entries[at:until]:
+        for entry in entries[at : at + budget]:
+            if entry.item.utime > limit:
+                break
             state, decisions = engine.fused(setup, state, entry.item)
             fresh.append(Entry(entry.item, state, decisions))
+        until = at + len(fresh)
         return Timeline(self.base, entries[:at] + tuple(fresh) + entries[until:], until)
 
     def settled_before(self, utime: int) -> tuple[Timeline, tuple[Decision, ...]]:

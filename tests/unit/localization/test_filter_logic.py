@@ -11,10 +11,10 @@ import pytest
 from support_cart import ANTENNA, GEODESY, WHEELS, localizer, model, rig, some_nav
 from support_cart import IMU as IMU_FRAME
 
-from modelserver.localization.filter import alignment, clocks, engine, placing, start
+from modelserver.localization.filter import alignment, clocks, engine, inertial, placing, start
 from modelserver.localization.filter.alignment import Passed
 from modelserver.localization.filter.clocks import Clocks, Verdict
-from modelserver.localization.filter.measurements.gps import WANDER
+from modelserver.localization.filter.measurements.gps import LATENCY, WANDER
 from modelserver.localization.filter.measurements.wheels import WheelSpeed, _mean, rolling, standing_wheels, turn_rate
 from modelserver.localization.filter.nav import ZERO
 from modelserver.localization.filter.odometry import Odometry
@@ -70,9 +70,15 @@ def test_given_stamps_that_are_late_within_the_horizon_then_they_are_good_and_be
     assert words == ["good", "good", "late"]
 
 
-def test_given_a_source_that_goes_back_while_its_numbers_go_on_then_its_order_is_wrong():
-    _, words = judged(running(), ("gps", 0, 9.5, 3), ("gps", 0, 9.95, 4))
+def test_given_a_source_that_goes_back_while_its_numbers_go_on_then_its_order_is_wrong_beyond_the_horizon():
+    _, words = judged(running(), ("gps", 0, 8.5, 3), ("gps", 0, 9.95, 4))
     assert words == ["order", "good"]
+    # within it the stamp alone decides, so that it does not matter what arrived first
+    _, words = judged(running(), ("gps", 0, 9.5, 3), ("gps", 0, 9.95, 4))
+    assert words == ["good", "good"]
+    # numbers of few bits begin anew
+    _, words = judged(running(), ("gps", 0, 9.96, 0), ("gps", 0, 9.5, 255), ("gps", 0, 9.6, 254), ("gps", 0, 9.7, 253))
+    assert words == ["good"] * 4
     # one that merely comes late keeps its earlier number
     _, words = judged(running(), ("gps", 0, 9.5, 1))
     assert words == ["good"]
@@ -237,9 +243,9 @@ def test_given_what_is_felt_as_up_then_the_attitude_turns_it_up_and_has_no_yaw(u
 def test_given_inertial_samples_that_cannot_be_then_they_are_refused(word):
     wrong = math.nan if word == "nan" else 1e6
     for sample in (imu_at(0.0, (wrong, 0.0, 0.0), (0.0, 0.0, 9.8)), imu_at(0.0, ZERO, (0.0, 0.0, wrong))):
-        assert engine.read(SETUP, sample) == word
-    assert engine.read(SETUP, ImuSample(SensorHeader(T0), None, (0.0, 0.0, 9.8))) == "nan"
-    found = engine.read(SETUP, imu_at(0.0, (0.1, 0.2, 0.3), (0.0, 0.0, 9.8)))
+        assert inertial.read(SETUP, sample) == word
+    assert inertial.read(SETUP, ImuSample(SensorHeader(T0), None, (0.0, 0.0, 9.8))) == "nan"
+    found = inertial.read(SETUP, imu_at(0.0, (0.1, 0.2, 0.3), (0.0, 0.0, 9.8)))
     assert not isinstance(found, str)
     assert found[0] == pytest.approx((0.1, 0.2, 0.3))
 
@@ -344,12 +350,23 @@ def test_given_a_heading_that_was_found_then_all_in_n_turns_with_it_and_only_yaw
     assert np.linalg.eigvalsh(after.covariance)[0] > 0.0
 
 
-def test_given_a_fix_then_the_antenna_is_put_there_and_its_lingering_error_is_the_positions():
+def test_given_a_fix_then_the_antenna_is_put_there_and_its_lingering_error_and_lateness_are_the_positions():
     nav = some_nav(SETUP, 6)
+    late_at = SETUP.layout.index(LATENCY)
+    prior = nav.covariance.copy()
+    prior[late_at, :] = prior[:, late_at] = 0.0
+    prior[late_at, late_at] = 0.1**2
+    nav = nav._replace(
+        covariance=prior,
+        extras=tuple(0.2 if n == SETUP.layout.extra(LATENCY) else value for n, value in enumerate(nav.extras)),
+    )
     lever = SETUP.rig.lever(ANTENNA)
     fix = Passed(T0, 30.0 - 40.0j, 5.0, 0j, 0j, 0j, 0.05, 0.5, 0.8)
     after = placing.placed(nav, fix, 1.0 + 2.0j, lever, SETUP.layout)
-    assert after.point(lever) == pytest.approx((31.0, -38.0, 5.0))
+    vx, vy, _ = nav.point_velocity(lever)
+    v = np.array((vx, vy, 0.0))
+    doubt = np.array((*(0.1**2 * np.diagonal(nav.covariance)[3:5]), 0.0))
+    assert after.point(lever) == pytest.approx(np.array((31.0, -38.0, 5.0)) + 0.2 * v)
     P, at = after.covariance, SETUP.layout.index(WANDER[0])
     assert np.linalg.eigvalsh(P)[0] > -1e-9
     assert (P == P.T).all()
@@ -357,7 +374,10 @@ def test_given_a_fix_then_the_antenna_is_put_there_and_its_lingering_error_is_th
     H = np.zeros((3, SETUP.layout.size))
     H[:, :3] = np.eye(3)
     H[:, 6:9] = -so3.skew(so3.rotate(after.attitude, lever))
-    assert np.diagonal(H @ P @ H.T) == pytest.approx([0.5**2 + 0.05**2, 0.5**2 + 0.05**2, 0.8**2 + 0.4**2])
+    assert np.diagonal(H @ P @ H.T) == pytest.approx(
+        np.array((0.5**2 + 0.05**2, 0.5**2 + 0.05**2, 0.8**2 + 0.4**2)) + np.square(v * 0.1) + doubt
+    )
+    assert P[:3, late_at] == pytest.approx(v * 0.1**2)
     assert (P[0, at], P[1, at + 1], P[2, at + 2]) == pytest.approx((-0.5, -0.5, -0.8))
     assert [after.extras[SETUP.layout.extra(name)] for name in WANDER] == [0.0, 0.0, 0.0]
 

@@ -330,7 +330,7 @@ NAN3: Vector3 = (math.nan, 0.0, 0.0)
         ("gps_position", GpsSample(HEADER, FixType.NONE, 50.0, -111.0), "no_fix"),
         ("wheel_speed", WheelsSample(HEADER, ()), "empty"),
         ("wheel_speed", WheelsSample(HEADER, (WheelSample("RL", speed=math.nan),)), "nan"),
-        ("wheel_speed", WheelsSample(HEADER, (WheelSample("nobody", speed=1.0),)), "nan"),
+        ("wheel_speed", WheelsSample(HEADER, (WheelSample("nobody", speed=1.0),)), "names"),
         ("wheel_speed", WheelsSample(HEADER, (WheelSample("RL", speed=1e3),)), "range"),
         ("imu_tilt", turned((0.0, 0.0, 0.0, 0.0)), "orientation"),
         ("imu_tilt", turned((math.nan, 0.0, 0.0, 0.0)), "orientation"),

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from support_cart import MOUNTS, ORIGIN, drive, localizer, rig, same, taken
 
 from modelserver.history import History
-from modelserver.localization.filter import engine
+from modelserver.localization.filter import items
 from modelserver.localization.filter.localizer import Deferred, FilterLocalizer
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.filter.setup import Setup
@@ -76,7 +76,7 @@ def test_given_any_order_of_arrival_within_the_horizon_then_the_state_is_the_sam
     samples += rng.sample(samples, twice)
     rng.shuffle(samples)
     found = taken(warm(), samples)
-    assert found.timeline.settled
+    assert found.timeline.settled(found.clocks.complete_to())
     assert same(found.head, in_order().head)
     assert [each.item.key for each in found.timeline.entries] == [each.item.key for each in in_order().timeline.entries]
     utime = in_order().utime + 50_000
@@ -104,12 +104,12 @@ def test_given_a_small_budget_then_the_same_state_comes_in_the_end_and_answers_g
     late = next(each for each in chunk if isinstance(each, GpsSample))
     rest = [each for each in chunk if each is not late]
     found = taken(taken(small, rest), [late])
-    assert not found.timeline.settled
+    assert not found.timeline.settled(found.clocks.complete_to())
     assert found.utime == in_order().utime
     assert found.estimate(found.utime).invalid == Invalid(0)
     after = within(WARM + CHUNK, WARM + CHUNK + AFTER)
     found, other = taken(found, after), taken(in_order(), after)
-    assert found.timeline.settled
+    assert found.timeline.settled(found.clocks.complete_to())
     assert same(found.head._replace(pending=()), other.head._replace(pending=()))
 
 
@@ -154,12 +154,12 @@ def test_given_items_when_settled_then_what_became_of_each_is_told_once_in_order
     timeline = Timeline(warm().head)
     samples = within(WARM, WARM + CHUNK)
     for sample in reversed(samples):
-        for item in engine.items(setup, sample):
+        for item in items.items(setup, sample):
             longer = timeline.with_item(item)
-            assert isinstance(longer, Timeline)
-            timeline = longer
+            assert not isinstance(longer, str)
+            timeline = longer[0]
     assert timeline.newest is warm().head
-    timeline = timeline.worked(setup, 10_000)
+    timeline = timeline.worked(setup, 10_000, samples[-1].header.utime)
     middle = timeline.entries[len(timeline.entries) // 2].item.utime
     first, told = timeline.settled_before(middle)
     rest, more = first.settled_before(middle + 10**9)

@@ -143,3 +143,71 @@ def test_a_vehicle_file_is_checked_with_its_geometry(check, tmp_path):
     code, out = check(str(wrong))[:2]
     assert code == 1
     assert "Husky:Base" in out
+
+
+VEHICLE = """\
+vehicle: cart
+geometry: geometry.yaml
+base_frame: Cart:Mast
+"""
+
+
+def test_an_empty_file_leads_to_both_pages(check):
+    out = check(**{"vehicle.yaml": ""})[1]
+    assert "docs/geometry-files.md" in out
+    assert "docs/vehicle-file.md" in out
+
+
+def test_what_is_wrong_with_values_and_with_frames_is_told_at_once_with_lines(check, tmp_path):
+    (tmp_path / "geometry.yaml").write_text(YAML)
+    text = (
+        VEHICLE
+        + """\
+sensors:
+  gps: {channel: GPS, frame: Cart:Mst, latency: 80}
+  wheels: {kinematics: skidsteer}
+localization:
+  mode: no_gsp
+  filter:
+    horizon: -1
+    heading_limit: 30
+    gps_wander_time: soon
+"""
+    )
+    code, out, _ = check(**{"vehicle.yaml": text})
+    assert code == 1
+    lines = [line for line in out.splitlines() if line.startswith("vehicle.yaml:") and "error: " in line]
+    told = {int(line.split(":")[1]): line for line in lines}
+    # latency and frame are on one line, but nothing hides anything
+    assert [int(line.split(":")[1]) for line in lines] == [5, 5, 6, 8, 10, 11, 12]
+    assert "80 ms is 0.08" in out
+    assert "body Cart has no frame 'Mst'" in out
+    assert "horizon must be finite and above 0" in told[10]
+    assert "30 degrees are 0.524" in told[11]
+    assert "write skid_steer" in out
+    assert "write no_gps" in out
+
+
+def test_a_frame_that_is_not_there_is_told_with_its_line(check, tmp_path):
+    (tmp_path / "geometry.yaml").write_text(YAML)
+    out = check(**{"vehicle.yaml": VEHICLE.replace("Mast", "Mst")})[1]
+    assert out.startswith("vehicle.yaml:3: error: body Cart has no frame 'Mst'")
+
+
+def test_a_vehicle_without_sensors_is_noted(check, tmp_path):
+    (tmp_path / "geometry.yaml").write_text(YAML)
+    code, out, _ = check("--notes", **{"vehicle.yaml": VEHICLE})
+    assert code == 0
+    assert "note: no sensors: there will never be a pose" in out
+
+
+def test_one_wheel_of_a_steered_vehicle_and_wheels_without_names_are_warned_of(check, tmp_path):
+    (tmp_path / "geometry.yaml").write_text(YAML)
+    for wheels, words in (
+        ("{kinematics: ackermann, frames: {left: Cart:Mast}}", "ackermann with a single wheel"),
+        ("{kinematics: differential}", "frames names no wheels"),
+    ):
+        code, out, _ = check(**{"vehicle.yaml": f"{VEHICLE}sensors:\n  wheels: {wheels}\n"})
+        assert code == 1
+        assert "vehicle.yaml:5: warning: " in out
+        assert words in out

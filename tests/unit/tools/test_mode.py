@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+import math
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
+import lcm
 import pytest
 import typer
 from support_lcm import Listener, reserved_url
-from support_samples import VEHICLE, write_vehicle
+from support_samples import START, VEHICLE, write_vehicle
 
-from modelserver.messages import Mode, SwitchMode
-from modelserver.wire.codec import decode
+from modelserver.messages import (
+    VALID,
+    Decision,
+    Mode,
+    NavigationState,
+    Phase,
+    PublishDecisions,
+    SwitchMode,
+    Verdict,
+)
+from modelserver.spatial import Pose
+from modelserver.wire.codec import decode, encode
 from mstools.cli import main
 from mstools.mode import MODES, parse_mode
 
@@ -32,29 +45,110 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     return mode
 
 
+class Answering:
+    """A daemon that hears wishes and tells its state, as far as a test wants it to."""
+
+    def __init__(self, url: str, prefix: str = "", mode: Mode = Mode.FULL, obeys: bool = True, decides: bool = False):
+        self.mode, self.obeys, self.decides, self.prefix = mode, obeys, decides, prefix
+        self.wishes: list[SwitchMode] = []
+        self.bus = lcm.LCM(url)
+        self.bus.subscribe(f"{prefix}console/mode", self.heard)
+        self.ended = threading.Event()
+        self.thread = threading.Thread(target=self.run)
+
+    def __enter__(self) -> Answering:
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.ended.set()
+        self.thread.join()
+
+    def run(self) -> None:
+        while not self.ended.is_set():
+            self.bus.handle_timeout(20)
+            if self.mode is not Mode.RAW:
+                self.bus.publish(f"{self.prefix}LOCALIZATION_STATE", encode(state(self.mode)))
+            self.bus.publish(f"{self.prefix}POSE", b"")
+
+    def heard(self, _: str, data: bytes) -> None:
+        wish: SwitchMode = decode("localization_mode_t", data)
+        self.wishes.append(wish)
+        if self.obeys:
+            self.mode = wish.mode
+        if self.decides:
+            header = wish.header
+            word = f"mode {wish.mode.name.lower()}"
+            made = Decision(header.utime, header.source, header.seq, "mode", Verdict.TOOK_UP, word)
+            self.bus.publish(f"{self.prefix}LOCALIZATION_DECISIONS", encode(PublishDecisions(header.utime, (made,))))
+
+
+def state(mode: Mode) -> NavigationState:
+    nan = math.nan
+    nothing = (0.0, 0.0, 0.0)
+    return NavigationState(
+        START, mode, Phase.LEVELLING, False, VALID, 0, nan, nan, nan, Pose(), nothing, nothing, (0.0,) * 36, (), (), ()
+    )
+
+
 @pytest.mark.parametrize("prefix", ["", "V1_"])
-def test_given_a_mode_then_the_wish_is_heard_on_the_channel_of_the_vehicle_file(
-    tmp_path: Path, run: Run, prefix: str
-) -> None:
+def test_given_a_daemon_that_obeys_then_the_mode_before_and_now_are_told(tmp_path: Path, run: Run, prefix: str) -> None:
     config = write_vehicle(tmp_path, f"{LISTENS}lcm: {{channel_prefix: '{prefix}'}}\n")
-    with reserved_url() as url:
-        listener = Listener(url, f"{prefix}console/mode")
-        code, out, err = run("no_gps", "-c", config, "--url", url)
-        assert (code, out, err) == (0, f"told {prefix}console/mode: no_gps\n", "")
-        assert listener.wait()
-    (data,) = listener.heard
-    wish: SwitchMode = decode("localization_mode_t", data)
-    assert wish.mode is Mode.NO_GPS
+    with reserved_url() as url, Answering(url, prefix) as daemon:
+        assert run("no_wheels", "-c", config, "--url", url) == (0, "now no_wheels (was full)\n", "")
+    (wish,) = daemon.wishes
+    assert wish.mode is Mode.NO_WHEELS
     assert wish.header.source == "operator"
     assert wish.header.utime == wish.header.host_utime > 1_700_000_000_000_000
 
 
-def test_given_no_url_then_it_is_the_vehicle_files(tmp_path: Path, run: Run) -> None:
+def test_given_a_daemon_that_goes_to_raw_mode_then_its_silence_or_its_decision_tells(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = write_vehicle(tmp_path, LISTENS)
+    with reserved_url() as url:
+        with Answering(url, decides=True):
+            assert run("raw", "-c", config, "--url", url)[:2] == (0, "now raw (was full)\n")
+        monkeypatch.setattr("mstools.mode.PATIENCE_S", 1.0)
+        with Answering(url):
+            assert run("raw", "-c", config, "--url", url)[:2] == (0, "now raw (was full)\n")
+        with Answering(url, mode=Mode.RAW):
+            assert "not confirmed: LOCALIZATION_STATE is silent" in run("raw", "-c", config, "--url", url)[1]
+
+
+def test_given_a_daemon_that_stays_in_its_mode_then_that_is_told(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mstools.mode.PATIENCE_S", 0.5)
+    with reserved_url() as url, Answering(url, obeys=False):
+        code, out, err = run("no_gps", "-c", write_vehicle(tmp_path, LISTENS), "--url", url)
+    assert (code, out) == (1, "")
+    assert "but the daemon stays in mode full" in err
+
+
+def test_given_nobody_then_it_is_told_what_was_sent_and_that_nobody_answers(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mstools.mode.PATIENCE_S", 0.1)
     with reserved_url() as url:
         config = write_vehicle(tmp_path, f"{LISTENS}lcm: {{url: '{url}'}}\n")
         listener = Listener(url, "console/mode")
-        assert run("full", "--config", config)[0] == 0
+        code, out, err = run("full", "--config", config)
+        assert (code, out) == (1, "")
+        assert "told console/mode: full, but nobody answers" in err
         assert listener.wait()
+
+
+def test_given_a_state_that_is_never_published_then_it_says_that_nothing_confirms(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mstools.mode.PATIENCE_S", 0.5)
+    config = write_vehicle(tmp_path, f"{LISTENS}publish: {{state_hz: 0}}\n")
+    with reserved_url() as url, Answering(url, mode=Mode.RAW, obeys=False):
+        code, out, _ = run("no_gps", "-c", config, "--url", url)
+    assert code == 0
+    assert "cannot be confirmed" in out
+    assert "publish.state_hz: 0" in out
 
 
 def test_given_a_vehicle_file_without_a_channel_then_it_says_what_to_write(tmp_path: Path, run: Run) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from modelserver.errors import ModelServerError
-from mstools.output import write_file, written_whole
+from mstools.output import check_target, write_file, written_whole
 
 
 def test_given_an_error_half_way_then_the_file_is_as_it_was(tmp_path: Path) -> None:
@@ -48,3 +48,20 @@ def test_given_a_pipe_then_it_is_written_to_and_stays_a_pipe(tmp_path: Path) -> 
         assert stat.S_ISFIFO(pipe.stat().st_mode)
     finally:
         os.close(reader)
+
+
+def test_given_a_folder_that_is_not_there_then_the_target_is_named_and_not_a_draft(tmp_path: Path) -> None:
+    target = tmp_path / "none" / "a.txt"
+    with pytest.raises(ModelServerError, match=f"{target} cannot be written: there is no folder {target.parent}"):
+        check_target(str(target))
+    with pytest.raises(OSError, match="No such file") as caught:
+        write_file(str(target), "text", replace=True)
+    assert caught.value.filename == str(target)
+
+
+def test_given_targets_that_can_be_written_then_there_is_no_objection(tmp_path: Path) -> None:
+    (tmp_path / "there.txt").write_text("old")
+    for target in ("", "-", tmp_path / "new.txt", tmp_path / "there.txt", os.devnull):
+        check_target(str(target))
+    with pytest.raises(ModelServerError, match="is a directory"):
+        check_target(str(tmp_path))

@@ -4,9 +4,11 @@ import itertools
 import json
 import math
 import os
+import re
 import struct
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +20,11 @@ from support_tuning import in_raw_mode
 
 from modelserver import core
 from modelserver.core import CoreSettings, CoreState, Instant
-from modelserver.messages import Decision, GetBodyList, GpsSample, PoseAnswer, RequestHeader, Verdict
+from modelserver.messages import Decision, GetBodyList, GpsSample, Invalid, PoseAnswer, RequestHeader, Verdict
 from modelserver.service import playback
 from modelserver.service.daemon import Vehicle
 from modelserver.spatial import Pose, Transformation
-from modelserver.wire.codec import encode
+from modelserver.wire.codec import decode, encode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools import cli
 from mstools.replay import _inputs, read_times
@@ -106,6 +108,59 @@ def test_given_times_when_replayed_then_a_row_for_each_whatever_comes_after(
     assert (tmp_path / "whole.csv").read_bytes() == (tmp_path / "short.csv").read_bytes()
 
 
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [(1e-6, "these look like seconds"), (1e3, "these look like nanoseconds"), (2.0, "the log lasts")],
+)
+def test_given_times_that_lie_outside_the_log_then_that_is_told(
+    driven: Path, tmp_path: Path, run: Run, factor: float, words: str
+) -> None:
+    times = tmp_path / "times.txt"
+    times.write_text(f"{round((START + 30_000_000) * factor)}\n")
+    code, _, err = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--at-times", times)
+    assert code == 0
+    assert "none of 1 time lies within the log" in err
+    assert words in err
+
+
+def test_given_poses_that_are_not_valid_then_the_summary_says_how_many_and_why(
+    driven: Path, tmp_path: Path, run: Run
+) -> None:
+    code, out, _ = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--rate", 10)
+    assert code == 0
+    bad = sum(row[8] == 0 for row in rows(tmp_path / "p.csv"))
+    assert f"(not valid: {bad}, mostly NO" in out
+    code, out, _ = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--rate", 10, "--json")
+    assert json.loads(out)["invalid_reasons"]["NOT_MOVED_YET"] <= bad
+
+
+def test_given_fixes_that_are_refused_then_the_kinds_of_measurement_are_named(tmp_path: Path, run: Run) -> None:
+    def spoiled(event: tuple[int, str, bytes]) -> tuple[int, str, bytes]:
+        if event[1] != "GPS" or event[0] < START + 20_000_000:
+            return event
+        fix: GpsSample = decode("gps_t", event[2])
+        return (*event[:2], encode(replace(fix, latitude_deg=math.nan)))
+
+    log = write_log(tmp_path / "a.lcm", map(spoiled, drive(25.0)))
+    code, out, _ = run(log, "-c", HUSKY, "--poses", tmp_path / "p.csv")
+    assert code == 0
+    assert re.search(r"not used: \d+ of sensor:gps, nan \(.*gps_position.*\)", out)
+
+
+def test_given_a_folder_that_is_not_there_then_it_is_told_before_the_run(
+    driven: Path, tmp_path: Path, run: Run
+) -> None:
+    target = tmp_path / "none" / "report.html"
+    code, out, err = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--report", target)
+    assert (code, out) == (1, "")
+    assert f"{target} cannot be written: there is no folder" in err
+    assert not (tmp_path / "p.csv").exists()
+
+
+def test_given_help_then_it_says_that_files_are_replaced(run: Run) -> None:
+    assert "are replaced, without --force" in " ".join(run("--help")[1].split())
+
+
 def test_given_standard_output_when_replayed_then_only_the_poses_go_there(driven: Path, run: Run) -> None:
     code, out, err = run(driven, "-c", HUSKY, "--poses", "-", "--rate", 1)
     assert code == 0
@@ -120,7 +175,7 @@ def test_given_json_when_replayed_then_the_counts_are_for_scripts(tmp_path: Path
     code, out, _ = run(log, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--json")
     report = json.loads(out)
     assert code == 0
-    assert report["rejected"] == [{"source": "IMU", "reason": "fingerprint", "count": 1}]
+    assert report["rejected"] == [{"source": "IMU", "reason": "fingerprint", "count": 1, "kinds": {}}]
     assert (report["events"], report["samples"]) == (277, 276)
     assert report["real_time_factor"] > 0
 
@@ -331,10 +386,19 @@ def test_given_times_with_comments_when_read_then_they_are_numbers(tmp_path: Pat
         ["--speed", "-1"],
         ["--speed", "nan"],
         ["-c", "v.yaml", "--poses", "p.csv", "--rate", "0"],
+        ["-c", "v.yaml", "--rate", "10"],
+        ["-c", "v.yaml", "--report", "r.html", "--rate", "10"],
+        ["-c", "v.yaml", "--poses", "p.csv", "--rate", "10", "--at-times", "t"],
     ],
 )
 def test_given_wrong_options_when_replayed_then_usage(driven: Path, run: Run, options: list[str]) -> None:
     assert run(driven, *options)[0] == 2
+
+
+def test_given_the_page_on_recordings_then_it_gives_the_value_of_each_reason() -> None:
+    page = (HUSKY.parents[2] / "docs" / "recordings.md").read_text()
+    for flag in Invalid:
+        assert f"| {flag.value} | {flag.name} | {flag.explain().partition(':')[0]} |" in page
 
 
 # --- onto the bus -------------------------------------------------------------------------------------------

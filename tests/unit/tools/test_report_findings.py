@@ -82,7 +82,8 @@ def test_given_gravity_from_the_side_then_the_mount_is_doubted() -> None:
 
 
 def test_given_acceleration_in_units_of_gravity_then_the_unit_is_doubted() -> None:
-    assert titles(replayed(felt_up=(0.0, 0.0, 1.0))) == ["The inertial unit feels 1.00 m/s2 in the mean"]
+    assert titles(replayed(felt_up=(0.0, 0.0, 1.0))) == ["Specific force is in g, not in m/s2"]
+    assert titles(replayed(felt_up=(0.0, 0.0, 7.0))) == ["The inertial unit feels 7.00 m/s2 in the mean"]
 
 
 @pytest.mark.parametrize("tau", [0.5, -0.4, 0.0])
@@ -162,6 +163,14 @@ def test_given_refused_and_late_samples_and_gaps_then_all_are_found_worst_first(
         "imu: 1 gap, the longest 5.0 s",
     ]
     assert [each.grade for each in found] == sorted(each.grade for each in found)
+
+
+def test_given_fixes_without_numbers_then_only_that_word_is_explained() -> None:
+    fixes = tuple(Fix(n, None, math.nan, "rejected" if n % 2 else "used", "nan" if n % 2 else "") for n in range(40))
+    (found,) = findings(replayed(fixes=fixes))
+    assert found.seen == "Of 40 fixes as positions: 20 nan."
+    assert "nan: " in found.advice
+    assert "gate" not in found.advice
 
 
 # --- consistency --------------------------------------------------------------------------------------------

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import signal
+import subprocess
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from support_lcm import PATIENCE_S
 from support_recordings import HUSKY, drive, write_log
 from support_tuning import RAPTOR, simulated
 
@@ -188,3 +193,43 @@ def test_given_a_proposal_that_exists_then_it_stays(tmp_path: Path, run: Run) ->
     assert out.read_text() == "precious"
     assert run(log, "-c", HUSKY, "-o", log)[0] == 2
     assert run(log, "-c", HUSKY, "-o", "-", "--json")[0] == 2
+
+
+INTERRUPTED = """
+import sys
+from pathlib import Path
+from mstools import cli, tune
+from mstools.tune_runs import Job
+
+def command(log: Path, config: Path) -> None:
+    with tune._pool(2, 1) as runs:
+        runs([Job(log, config, "half", ())] * 2)
+
+tune.command = command
+if __name__ == "__main__":
+    cli.main(["tune", *sys.argv[1:]])
+"""
+
+
+def test_given_ctrl_c_while_workers_run_then_all_end_at_once_with_130(tmp_path: Path) -> None:
+    # a worker that reads a pipe which nobody writes never ends by itself
+    config = tmp_path / "vehicle.yaml"
+    os.mkfifo(config)
+    with (
+        subprocess.Popen(
+            [sys.executable, "-c", INTERRUPTED, tmp_path / "drive.lcm", config],
+            start_new_session=True,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as process,
+        config.open("wb", buffering=0) as pipe,
+    ):  # opens when a worker reads
+        os.killpg(process.pid, signal.SIGINT)
+        try:
+            _, err = process.communicate(timeout=PATIENCE_S)
+        finally:
+            process.kill()
+        with pytest.raises(BrokenPipeError):
+            pipe.write(b"vehicle")  # no worker is left to read it
+    assert process.returncode == 130
+    assert "Traceback" not in err

@@ -15,7 +15,7 @@ import numpy as np
 from modelserver.geodesy import GeodesyError, LocalFrame, about_up
 from modelserver.geometry import names
 from modelserver.localization.filter.layout import ErrorState
-from modelserver.localization.filter.measurements.base import Compared, Scene, register
+from modelserver.localization.filter.measurements.base import INSTANT, Compared, Scene, register
 from modelserver.localization.filter.nav import (
     ATTITUDE,
     GYRO_BIAS,
@@ -208,6 +208,6 @@ class RelativePose(_Anywhere):
         R = np.zeros((6, 6))
         R[:3, :3] = M @ _block(sample.covariance, 0, settings.aiding_sigma) @ M.T / (dt * dt)
         R[3:, 3:] = M @ _block(sample.covariance, 3, settings.aiding_rotation_sigma) @ M.T / (dt * dt)
-        # the gyros' own noise of the instant stands beside it
-        R[3:, 3:] += np.eye(3) * settings.gyro_noise**2 / dt
+        # the gyros' own noise stands beside it: of the instant, for the state keeps one sample and no mean
+        R[3:, 3:] += np.eye(3) * settings.gyro_noise**2 / INSTANT
         return Compared(np.concatenate((v, w)), H, R)

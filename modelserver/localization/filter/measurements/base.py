@@ -14,6 +14,9 @@ from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.rig import Rig
 from modelserver.spatial.so3 import Array, Vector3
 
+INSTANT = 0.02
+"""Seconds over which an inertial unit's rate of an instant is a mean: its bandwidth of about 50 Hz."""
+
 
 class Compared(NamedTuple):
     """A measurement against the state: `residual` (m) = measured - expected = `jacobian` (m, n) error + noise.

@@ -14,6 +14,7 @@ from modelserver.localization.filter.layout import ErrorState
 from modelserver.localization.filter.measurements.base import Compared, Scene, azimuth, register, wrapped
 from modelserver.localization.filter.nav import jacobian_of_point, jacobian_of_point_velocity
 from modelserver.localization.filter.settings import FilterSettings
+from modelserver.localization.filter.strapdown import STANDARD_GRAVITY
 from modelserver.localization.gate import GoodFix
 from modelserver.localization.rig import Rig
 from modelserver.messages import FixType, GpsSample
@@ -110,6 +111,10 @@ class GpsPosition(_AtAntenna):
             )
         )
         cross = fix.cross * scene.settings.gps_white_share**2
+        # latency times speed, both unknown: without what a first order leaves out, a speed that is still being found
+        # passes for one that changes, and latency for observed
+        P = nav.covariance
+        e_white, n_white = (white + P[late_at, late_at] * P[k, k] for white, k in ((e_white, 3), (n_white, 4)))
         return Compared(residual, H, np.array(((e_white, cross), (cross, n_white))), eased=EASED)
 
 
@@ -135,7 +140,9 @@ class GpsHeight(_AtAntenna):
         H = jacobian_of_point(scene.nav, self.lever, scene.layout.size)[2:]
         white, sigma = shares(fix.up_variance, sample.fix_type, scene.settings)
         H[0, scene.layout.index(WANDER[2])] = sigma
-        return Compared(np.array((up - z - sigma * scene.extra(WANDER[2]),)), H, np.array(((white,),)))
+        residual = up - z - sigma * scene.extra(WANDER[2])
+        # nothing else tells the height: one that is far off pulls as hard as one at the gate, and is never shut out
+        return Compared(np.array((residual,)), H, np.array(((white,),)), eased=math.inf)
 
 
 def _tells_height(sample: GpsSample) -> bool:
@@ -188,8 +195,15 @@ class GpsVelocity(_AtAntenna):
             return ""
         measured, R = stated
         m = len(R)
-        expected = scene.nav.point_velocity(self.lever)
-        H = jacobian_of_point_velocity(scene.nav, self.lever, scene.layout.size)[:m]
+        nav, layout = scene.nav, scene.layout
+        expected = nav.point_velocity(self.lever)
+        H = jacobian_of_point_velocity(nav, self.lever, layout.size)[:m]
+        # how late the place is says how late the velocity may be too, which counts while it changes
+        x, y, z = so3.rotate(nav.attitude, nav.force)
+        change = np.array((x, y, z - STANDARD_GRAVITY))[:m]
+        late_at = layout.index(LATENCY)
+        late = nav.covariance[late_at, late_at] + scene.extra(LATENCY) ** 2
+        R = R + late * np.outer(change, change)
         return Compared(np.subtract(measured, expected)[:m], H, R)
 
 

@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 
 from modelserver.localization.filter.layout import ErrorState
-from modelserver.localization.filter.measurements.base import Compared, Scene, register
+from modelserver.localization.filter.measurements.base import INSTANT, Compared, Scene, register
 from modelserver.localization.filter.nav import jacobian_of_body_velocity
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.rig import Rig
@@ -21,9 +21,6 @@ SCALE, YAW = "wheel_scale", "wheel_yaw"
 
 EASED = 4.0
 """Up to so many times its limit a slip is used with wider noise: twice what the gate lets through."""
-
-INSTANT = 0.02
-"""Seconds over which an inertial unit's rate of an instant is a mean: its bandwidth of about 50 Hz."""
 
 LONGEST = 1.0
 """Seconds between two samples over which travel still tells a speed."""
@@ -106,7 +103,8 @@ class WheelSpeed:
         settings = scene.settings
         wheels = rolling(sample, scene.before, self.contacts, settings)
         if not wheels:
-            return "nan" if sample.wheels else "empty"
+            known = any(wheel.name in self.contacts for wheel in sample.wheels)
+            return ("nan" if known else "names") if sample.wheels else "empty"
         top = settings.maximum_speed
         if not all(abs(wheel.speed) <= top for wheel in wheels):
             return "range"

@@ -1,0 +1,24 @@
+"""What a finding of the report on a replay is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+class Grade(IntEnum):
+    """How much a finding matters, worst first."""
+
+    WRONG = 0
+    DOUBTFUL = 1
+    NOTE = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One finding: a headline, what was seen, and what to do about it."""
+
+    grade: Grade
+    title: str
+    seen: str
+    advice: str
