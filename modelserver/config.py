@@ -7,14 +7,15 @@ once: file, line, key, what is wrong, and for a mistyped key the nearest known o
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import ConfigDict
 
 from modelserver import config_reader
-from modelserver.errors import shown
+from modelserver.errors import ConfigError, Problem, shown
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.magnetometer import MagnetometerCalibration
 from modelserver.localization.raw.settings import RawSettings
@@ -47,11 +48,14 @@ class LcmConfig:
     reply_prefix: str = "REPLY_"
 
     def __post_init__(self) -> None:
-        for key, value in (("channel_prefix", self.channel_prefix), ("reply_prefix", self.reply_prefix)):
-            if not all(c.isascii() and (c.isalnum() or c == "_") for c in value) or len(value) > 24:
-                raise ValueError(f"{key} has at most 24 letters, digits and underscores, got {shown(value)}")
+        problems = [
+            f"{key} has at most 24 letters, digits and underscores, got {shown(value)}"
+            for key, value in (("channel_prefix", self.channel_prefix), ("reply_prefix", self.reply_prefix))
+            if not all(c.isascii() and (c.isalnum() or c == "_") for c in value) or len(value) > 24
+        ]
         if not self.reply_prefix:
-            raise ValueError("reply_prefix must not be empty: it keeps requests from making the server speak on POSE")
+            problems.append("reply_prefix must not be empty: it keeps requests from making the server speak on POSE")
+        _refuse(problems)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,22 +76,31 @@ class PublishConfig:
     decisions: bool = True
 
     def __post_init__(self) -> None:
-        if not 0.1 <= self.rate_hz <= 1000.0:
-            raise ValueError(f"rate_hz is between 0.1 and 1000, got {self.rate_hz:g}")
-        if not 0.01 <= self.health_hz <= 100.0:
-            raise ValueError(f"health_hz is between 0.01 and 100, got {self.health_hz:g}")
-        if not 0.0 <= self.state_hz <= 50.0:
-            raise ValueError(f"state_hz is between 0 and 50, got {self.state_hz:g}")
+        _refuse(
+            f"{name} is between {low:g} and {high:g}, got {getattr(self, name):g}"
+            for name, low, high in (("rate_hz", 0.1, 1000.0), ("health_hz", 0.01, 100.0), ("state_hz", 0.0, 50.0))
+            if not low <= getattr(self, name) <= high
+        )
 
 
-def _check_channel(channel: str, key: str = "channel") -> None:
-    if not (0 < len(channel) <= MAX_CHANNEL and channel.isascii() and channel.isprintable() and " " not in channel):
-        raise ValueError(f"{key} has 1 to {MAX_CHANNEL} printable ASCII characters, no spaces, got {shown(channel)}")
+def _refuse(problems: Iterable[str]) -> None:
+    """Raise ValueError with all problems, one a line, where there are any."""
+    text = "\n".join(problems)
+    if text:
+        raise ValueError(text)
 
 
-def _check_latency(latency: float) -> None:
-    if not 0.0 <= latency <= MAX_LATENCY:
-        raise ValueError(f"latency is between 0 and {MAX_LATENCY:g} seconds, got {latency:g}")
+def _channel_problems(channel: str, key: str = "channel") -> list[str]:
+    if 0 < len(channel) <= MAX_CHANNEL and channel.isascii() and channel.isprintable() and " " not in channel:
+        return []
+    return [f"{key} has 1 to {MAX_CHANNEL} printable ASCII characters, no spaces, got {shown(channel)}"]
+
+
+def _latency_problems(latency: float) -> list[str]:
+    if 0.0 <= latency <= MAX_LATENCY:
+        return []
+    hint = f": {latency:g} ms is {latency * 1e-3:g}" if latency > MAX_LATENCY else ""
+    return [f"latency is between 0 and {MAX_LATENCY:g} seconds, got {latency:g}{hint}"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,8 +116,7 @@ class SensorConfig:
     latency: float = 0.0
 
     def __post_init__(self) -> None:
-        _check_channel(self.channel)
-        _check_latency(self.latency)
+        _refuse(_channel_problems(self.channel) + _latency_problems(self.latency))
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,8 +143,7 @@ class WheelsConfig:
     latency: float = 0.0
 
     def __post_init__(self) -> None:
-        _check_channel(self.channel)
-        _check_latency(self.latency)
+        _refuse(_channel_problems(self.channel) + _latency_problems(self.latency))
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,8 +159,7 @@ class AidingConfig:
     latency: float = 0.0
 
     def __post_init__(self) -> None:
-        _check_channel(self.channel)
-        _check_latency(self.latency)
+        _refuse(_channel_problems(self.channel) + _latency_problems(self.latency))
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +225,7 @@ class LocalizationConfig:
 
     def __post_init__(self) -> None:
         if self.mode_channel:
-            _check_channel(self.mode_channel, "mode_channel")
+            _refuse(_channel_problems(self.mode_channel, "mode_channel"))
 
     @property
     def first_mode(self) -> Mode:
@@ -241,8 +251,9 @@ class LimitsConfig:
     requests_per_pass: int = 16
 
     def __post_init__(self) -> None:
+        problems = []
         if not 0.0 < self.history_s <= 600.0:
-            raise ValueError(f"history_s is above 0 and at most 600, got {self.history_s:g}")
+            problems.append(f"history_s is above 0 and at most 600, got {self.history_s:g}")
         for name, low, high in (
             ("parked_requests", 0, 4096),
             ("wait_ms", 0, 60_000),
@@ -250,7 +261,8 @@ class LimitsConfig:
             ("requests_per_pass", 1, 1024),
         ):
             if not low <= getattr(self, name) <= high:
-                raise ValueError(f"{name} is between {low} and {high}, got {getattr(self, name)}")
+                problems.append(f"{name} is between {low} and {high}, got {getattr(self, name)}")
+        _refuse(problems)
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,6 +274,8 @@ class VehicleConfig:
     rolling_frame: the frame that moves along its own x axis when the vehicle turns: the middle of the rear axle of one
         with steered front wheels, the middle of a skid-steered one. Empty for base_frame.
     state_directory: where the captured origin is kept, relative to this file; empty for the user's state directory.
+    drivers: for each driver's name the kind of its device and what that kind wants to know. The service does not look
+        into them; `msdrivers.settings` does.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
@@ -277,6 +291,15 @@ class VehicleConfig:
     origin: OriginConfig = field(default_factory=OriginConfig)
     localization: LocalizationConfig = field(default_factory=LocalizationConfig)
     limits: LimitsConfig = field(default_factory=LimitsConfig)
+    drivers: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in self.drivers:
+            # it is a word of the command line, and the source in the headers of its samples
+            if not (0 < len(name) <= MAX_NAME and name.isprintable() and " " not in name):
+                raise ValueError(
+                    f"drivers have names of 1 to {MAX_NAME} printable characters without spaces, got {shown(name)}"
+                )
 
 
 def load_config(path: str | Path) -> VehicleConfig:
@@ -285,10 +308,46 @@ def load_config(path: str | Path) -> VehicleConfig:
     The paths in it come back absolute.
     """
     path = Path(path)
-    with path.open("rb") as file:
-        raw = file.read(config_reader.MAX_BYTES + 1)
-    config = parse_config(raw, str(path))
+    return _with_paths(parse_config(_bytes(path), str(path)), path)
 
+
+def load_partly(path: str | Path) -> tuple[VehicleConfig | None, tuple[Problem, ...]]:
+    """Read a vehicle file without what is wrong in it: None where too little is left; and every problem.
+
+    Raises ConfigError for what is no YAML mapping, OSError where it cannot be read.
+    """
+    path = Path(path)
+    config, problems = config_reader.read_partly(_bytes(path), str(path), VehicleConfig)
+    return None if config is None else _with_paths(config, path), problems
+
+
+def with_lines(problems: Iterable[Problem], path: str) -> list[Problem]:
+    """Return problems of a vehicle file with the line of the key that each is about, as far as it stands there."""
+    problems = list(problems)
+    try:
+        lines = {".".join(map(str, at)): line for at, line in config_lines(path).items()}
+    except (OSError, ConfigError):
+        return problems
+
+    def line(key: str) -> int:
+        while key and key not in lines:
+            key = key.rpartition(".")[0]
+        return lines.get(key, 0)
+
+    return [
+        dataclasses.replace(each, source=dataclasses.replace(each.source, line=line(each.element)))
+        if each.file == path and not each.line
+        else each
+        for each in problems
+    ]
+
+
+def _bytes(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(config_reader.MAX_BYTES + 1)
+
+
+def _with_paths(config: VehicleConfig, path: Path) -> VehicleConfig:
     def absolute(given: str) -> str:
         return str((path.parent / Path(given).expanduser()).resolve())
 
@@ -297,6 +356,11 @@ def load_config(path: str | Path) -> VehicleConfig:
         geometry=absolute(config.geometry),
         state_directory=absolute(config.state_directory) if config.state_directory else "",
     )
+
+
+def config_lines(path: str | Path) -> dict[tuple[str | int, ...], int]:
+    """Return the line of each key of a vehicle file. Raises ConfigError, OSError."""
+    return config_reader.lines(_bytes(Path(path)), str(path), VehicleConfig)
 
 
 def parse_config(raw: bytes, name: str = "") -> VehicleConfig:

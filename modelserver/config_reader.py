@@ -20,11 +20,73 @@ MAX_DEPTH = 16
 S = TypeVar("S")
 
 
+ROUNDS = 8
+"""How often what was wrong is left out and the rest looked at again, at most."""
+
+
 def read(raw: bytes, name: str, schema: type[S]) -> S:
     """Return the values that the bytes of a file called `name` hold, as an instance of a dataclass.
 
     Raises ConfigError with every problem.
     """
+    found, problems = read_partly(raw, name, schema)
+    if found is None or problems:
+        raise ConfigError(problems)
+    return found
+
+
+def read_partly(raw: bytes, name: str, schema: type[S]) -> tuple[S | None, tuple[Problem, ...]]:
+    """Return what the bytes hold without what is wrong in them, None where too little is left; and every problem.
+
+    Raises ConfigError for what is no YAML mapping at all.
+    """
+    reader, values = _composed(raw, name, schema)
+    problems = list(reader.problems)
+    if any(at[-1:] == ("?",) for at in reader.lines):
+        return None, tuple(problems)  # with such keys the rest is not what was meant
+    dropped: set[Path_] = set()
+    found: S | None = None
+    for _ in range(ROUNDS):
+        try:
+            # by way of JSON: strict there means that "4" is no number, while a mapping still makes a section
+            found = TypeAdapter(schema).validate_json(json.dumps(values, default=str), strict=True)
+            break
+        except ValidationError as error:
+            explained = [each for detail in error.errors() for each in reader.explain(detail)]
+        # a section's own rules are looked at once all in it is of the right type: so what is wrong goes, and again
+        fresh = [(at, problem) for at, problem in explained if at not in dropped]
+        problems += [problem for _, problem in fresh]
+        gone = [_drop(values, at, dropped) for at, _ in fresh]
+        if not gone or not all(gone):
+            break
+    return found, tuple(sorted(problems, key=lambda each: each.line))
+
+
+def _drop(values: Any, at: Path_, dropped: set[Path_]) -> bool:
+    """Take away what stands at a place, or the nearest above it that is there; return whether there was anything."""
+    steps = at[: next((n for n, step in enumerate(at) if isinstance(step, int)), len(at))]
+    while steps:
+        if steps in dropped:
+            return True
+        inside = values
+        for step in steps[:-1]:
+            inside = inside.get(step) if isinstance(inside, dict) else None
+        if isinstance(inside, dict) and steps[-1] in inside:
+            del inside[steps[-1]]
+            dropped.add(steps)
+            return True
+        steps = steps[:-1]
+    return False
+
+
+def lines(raw: bytes, name: str, schema: type) -> dict[Path_, int]:
+    """Return the line of each key, by its place. Raises ConfigError as `read_partly` does."""
+    reader, _ = _composed(raw, name, schema)
+    return reader.lines
+
+
+def _composed(raw: bytes, name: str, schema: type) -> tuple[_Reader, Any]:
+    """Return the values of a file, as they stand there, and the reader that knows their lines."""
     if len(raw) > MAX_BYTES:
         raise _one(name, 0, f"the file is larger than {MAX_BYTES >> 20} MiB", "is this the vehicle file?")
     try:
@@ -37,17 +99,10 @@ def read(raw: bytes, name: str, schema: type[S]) -> S:
     except UnicodeDecodeError:
         raise _one(name, 0, "not text in UTF-8", "is this the vehicle file?") from None
     if not isinstance(node, yaml.MappingNode):
-        required = [each.name for each in dataclasses.fields(schema) if _is_required(each)]  # type: ignore[arg-type]
+        required = [each.name for each in dataclasses.fields(schema) if _is_required(each)]
         raise _one(name, 1, "the file is empty or no mapping", f"start with: {', '.join(required)}")
     reader = _Reader(name, schema)
-    values = reader.value(node, ())
-    if reader.problems:
-        raise ConfigError(reader.problems)
-    try:
-        # by way of JSON: strict there means that "4" is no number, while a mapping still makes a section
-        return TypeAdapter(schema).validate_json(json.dumps(values, default=str), strict=True)
-    except ValidationError as error:
-        raise ConfigError(reader.explain(detail) for detail in error.errors()) from None
+    return reader, reader.value(node, ())
 
 
 def _is_required(each: dataclasses.Field[Any]) -> bool:
@@ -98,30 +153,44 @@ class _Reader:
         line = next((self.lines[at[:n]] for n in range(len(at), -1, -1) if at[:n] in self.lines), 0)
         return Source(self.name, line, ".".join(map(str, at)))
 
-    def explain(self, detail: Any) -> Problem:
-        """Turn one of pydantic's findings into a problem with its line and the nearest key."""
+    def explain(self, detail: Any) -> list[tuple[Path_, Problem]]:
+        """Turn one of pydantic's findings into problems, each with its place, its line and the nearest key."""
         at: Path_ = tuple(detail["loc"])
-        if detail["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+        kind = detail["type"]
+        if kind in ("unexpected_keyword_argument", "extra_forbidden"):
             near, fix = self._instead_of(str(at[-1]), at[:-1])
-            return Problem(Severity.ERROR, f"unknown key {shown(str(at[-1]))}", self.place(at), fix, near)
-        if detail["type"] == "missing" and isinstance(at[-1], int):
+            message = f"unknown key {shown(str(at[-1]))}"
+        elif kind == "missing" and isinstance(at[-1], int):
             at = at[:-1]
-            return Problem(Severity.ERROR, f"{at[-1]} has too few numbers", self.place(at))
-        if detail["type"] == "missing":
-            return Problem(Severity.ERROR, f"{at[-1]} is missing", self.place(at), f"add a line: {at[-1]}: ...")
-        message = str(detail["msg"]).removeprefix("Value error, ")
-        got = detail.get("input")
-        if detail["type"] == "value_error":
-            # found by the section as a whole; the message begins with the key that it is about
+            near, fix, message = (), "", f"{at[-1]} has too few numbers"
+        elif kind == "missing":
+            near, fix, message = (), f"add a line: {at[-1]}: ...", f"{at[-1]} is missing"
+        elif kind == "value_error":
+            return self._of_section(at, str(detail["msg"]).removeprefix("Value error, "))
+        else:
+            near, fix, message = self._of_value(detail)
+        return [(at, Problem(Severity.ERROR, message, self.place(at), fix, near))]
+
+    def _of_section(self, at: Path_, text: str) -> list[tuple[Path_, Problem]]:
+        """Return what a section's own rules found, one a line; each begins with the key that it is about."""
+        found = []
+        for message in text.splitlines():
             key = message.partition(" ")[0]
-            at = (*at, key) if (*at, key) in self.lines else at
-        elif detail["type"] in ("dataclass_type", "dict_type"):
+            there = (*at, key) if (*at, key) in self.lines else at
+            found.append((there, Problem(Severity.ERROR, _fit(message), self.place(there))))
+        return found
+
+    def _of_value(self, detail: Any) -> tuple[tuple[str, ...], str, str]:
+        """Return the nearest values, what to write, and what is wrong with a single value."""
+        near: tuple[str, ...] = ()
+        message, got = str(detail["msg"]), detail.get("input")
+        if detail["type"] in ("dataclass_type", "dict_type"):
             message = "expected a mapping (key: value, one a line)"
-        if detail["type"] != "value_error" and isinstance(got, (str, int, float, bool)):
+        if isinstance(got, (str, int, float, bool)):
             message += f", got {shown(str(got))}"
-        if len(message) > 240:
-            message = f"{message[:240]}..."
-        return Problem(Severity.ERROR, message[:1].lower() + message[1:], self.place(at), "")
+        if detail["type"] == "literal_error" and isinstance(got, str):
+            near = nearest_names(got, re.findall(r"'([^']*)'", str(detail["ctx"]["expected"])))
+        return near, f"write {near[0]}" if near else "", _fit(message)
 
     def _instead_of(self, key: str, at: Path_) -> tuple[tuple[str, ...], str]:
         """Return the known keys nearest to one that is not known at a place, and what to write."""
@@ -138,6 +207,12 @@ class _Reader:
             # one level up is a common slip, and what an older version's file may have
             return deeper, f"write {deeper[0]} under {' or '.join(below[deeper[0]])}"
         return (), f"known here: {', '.join(known)}"
+
+
+def _fit(message: str) -> str:
+    if len(message) > 240:
+        message = f"{message[:240]}..."
+    return message[:1].lower() + message[1:]
 
 
 _EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+", re.ASCII)

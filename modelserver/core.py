@@ -230,18 +230,18 @@ def _localize(state: CoreState, before: Localizer, sample: Sample | SwitchMode, 
     if localizer is before:
         return state, tuple(outputs)
     # before the first sample that can be used there is no time that an estimate could hold for
-    known = localizer.utime > 0
+    utime = localizer.utime
+    known = utime > 0
     history = state.history
-    if known and (not len(history) or not 0 < localizer.utime - history.last < HISTORY_STEP_US):
-        history = history.extended(localizer.deferred(localizer.utime))
+    if known and (not len(history) or not 0 < utime - history.last < HISTORY_STEP_US):
+        history = history.extended(localizer.deferred(utime))
     view = state.view
     view = PlatformView(view.model, view.base_frame, localizer, history, view.rolling_frame, view.doubt)
     state = state._replace(view=view)
     if known:
         # a part may be refused of a sample that moves time on all the same
-        taken = not refused or localizer.utime != before.utime
-        if taken and state.settings.publish == "event":
-            state, pose = _publish(state, localizer.utime)
+        if state.settings.publish == "event" and (not refused or utime != before.utime):
+            state, pose = _publish(state, utime)
             outputs.append(pose)
         if state.parked:
             state, replies = _answer_parked(state, now)

@@ -27,6 +27,7 @@ SPEAKERS = {
     Way.REQUEST: "client",
     Way.BROADCAST: "service",
     Way.COMMAND: "whoever commands",
+    Way.REPORT: "driver",
 }
 
 TABLE_BEGIN = "<!-- channels: written by `make types` -->\n"

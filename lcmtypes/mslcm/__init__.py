@@ -8,6 +8,7 @@ from .absolute_pose_t import absolute_pose_t as absolute_pose_t
 from .channel_health_t import channel_health_t as channel_health_t
 from .decision_t import decision_t as decision_t
 from .decisions_t import decisions_t as decisions_t
+from .driver_health_t import driver_health_t as driver_health_t
 from .get_body_frame_list_request_t import get_body_frame_list_request_t as get_body_frame_list_request_t
 from .get_body_list_request_t import get_body_list_request_t as get_body_list_request_t
 from .get_h_transform_request_t import get_h_transform_request_t as get_h_transform_request_t

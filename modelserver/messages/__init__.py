@@ -9,6 +9,7 @@ NamedTuple is made at a third of the cost.
 """
 
 from modelserver.messages.decisions import Decision, Verdict
+from modelserver.messages.driver_health import DriverHealth, DriverPhase
 from modelserver.messages.estimates import Estimate, Origin
 from modelserver.messages.events import (
     Event,
@@ -73,6 +74,7 @@ from modelserver.messages.samples import (
     WheelSample,
     WheelsSample,
 )
+from modelserver.messages.vehicle import DeviceSample, VehicleCommand, VehicleMode, VehicleStatusSample
 
 __all__ = [
     "CHANNEL_OF",
@@ -83,7 +85,10 @@ __all__ = [
     "AbsolutePoseSample",
     "ChannelHealth",
     "Decision",
+    "DeviceSample",
     "Direction",
+    "DriverHealth",
+    "DriverPhase",
     "Estimate",
     "Event",
     "FixType",
@@ -131,6 +136,9 @@ __all__ = [
     "Tick",
     "TimeQuery",
     "TransformReply",
+    "VehicleCommand",
+    "VehicleMode",
+    "VehicleStatusSample",
     "Verdict",
     "WheelSample",
     "WheelsSample",

@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from modelserver import core
-from modelserver.config import VehicleConfig
+from modelserver.config import VehicleConfig, with_lines
 from modelserver.core import CoreSettings, CoreState, Instant
-from modelserver.errors import ConfigError, Problem, QueryError, Severity, Source
+from modelserver.errors import ConfigError, Problem, QueryError, Severity, Source, shown
 from modelserver.formats import load_model
 from modelserver.geodesy import GeodesyError, make_origin
 from modelserver.geometry import Model
 from modelserver.localization.mounts import Mounts
 from modelserver.localization.rig import Rig
-from modelserver.messages import Origin, OriginLatched
+from modelserver.messages import Mode, Origin, OriginLatched, SwitchMode
 from modelserver.service.bus import LcmBus
 from modelserver.service.clock import SystemClock
 from modelserver.service.heard import Heard
@@ -123,7 +123,7 @@ def load_vehicle(config: VehicleConfig, file: str = "") -> Vehicle:
         model = load_model(config.geometry, variables=config.variables)
     except OSError as error:
         why = f"the geometry file {config.geometry} cannot be read: {error.strerror}"
-        raise ConfigError([Problem(Severity.ERROR, why, Source(file, element="geometry"))]) from None
+        raise ConfigError(with_lines([Problem(Severity.ERROR, why, Source(file, element="geometry"))], file)) from None
     problems = []
     gps, imu = config.sensors.gps, config.sensors.imu
     named = [("base_frame", config.base_frame)]
@@ -151,7 +151,7 @@ def load_vehicle(config: VehicleConfig, file: str = "") -> Vehicle:
     except GeodesyError as error:
         problems.append(Problem(Severity.ERROR, str(error), Source(file, element="origin.initial_utm")))
     if problems:
-        raise ConfigError(problems)
+        raise ConfigError(with_lines(problems, file))
     mounts = None
     if gps is not None and imu is not None:
         mounts = Mounts.from_model(model, config.rolling_frame or config.base_frame, gps.frame, imu.frame)
@@ -234,6 +234,28 @@ def configured_origin(config: VehicleConfig) -> Origin | None:
     return make_origin(*origin.initial_utm, zone=origin.zone, north=origin.hemisphere == "north")
 
 
+def log_wish(wish: SwitchMode, before: CoreState, after: CoreState) -> None:
+    """Log what became of a wish for another mode."""
+    was, now, source = _mode(before), _mode(after), shown(wish.header.source)
+    if now is not wish.mode:
+        kept = "none" if now is None else now.name.lower()
+        log.warning("%s wishes mode %s, and it stays %s", source, wish.mode.name.lower(), kept)
+    elif was is not now:
+        log.info(
+            "mode %s, as %s wishes (was %s)", now.name.lower(), source, "none" if was is None else was.name.lower()
+        )
+
+
+def _mode(state: CoreState) -> Mode | None:
+    from modelserver.localization.filter.localizer import FilterLocalizer
+    from modelserver.localization.modes import ModeLocalizer
+
+    if not isinstance(state.localizer, ModeLocalizer):
+        return None
+    active = state.localizer.active
+    return active.mode if isinstance(active, FilterLocalizer) else Mode.RAW
+
+
 def run(vehicle: Vehicle, url: str = "") -> None:
     """Serve a vehicle until SIGTERM or SIGINT. Raises BusError where the bus cannot be joined."""
     config = vehicle.config
@@ -261,7 +283,7 @@ def run(vehicle: Vehicle, url: str = "") -> None:
         queued_requests=config.limits.queued_requests,
         requests_per_pass=config.limits.requests_per_pass,
     )
-    loop = Loop(bus, clock, vehicle.core(clock.now(), origin), settings, keep)
+    loop = Loop(bus, clock, vehicle.core(clock.now(), origin), settings, keep, log_wish)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: loop.stop())
     log.info(

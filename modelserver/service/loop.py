@@ -24,6 +24,7 @@ from modelserver.messages import (
     Rejected,
     Request,
     SendReply,
+    SwitchMode,
     Tick,
 )
 from modelserver.service.bus import Bus
@@ -61,7 +62,10 @@ class LoopSettings:
 
 
 class Loop:
-    """Serves one core on one bus. `run` returns when it is told to `stop`."""
+    """Serves one core on one bus. `run` returns when it is told to `stop`.
+
+    `on_origin` is told of an origin that was captured, `on_wish` of a wish for a mode and the states around it.
+    """
 
     def __init__(
         self,
@@ -70,12 +74,14 @@ class Loop:
         state: CoreState,
         settings: LoopSettings,
         on_origin: Callable[[OriginLatched], None] = lambda note: None,
+        on_wish: Callable[[SwitchMode, CoreState, CoreState], None] = lambda wish, before, after: None,
     ):
         self.state = state
         self._bus = bus
         self._clock = clock
         self._settings = settings
         self._on_origin = on_origin
+        self._on_wish = on_wish
         self._log = RateLimited(log, clock)
         self._queue: deque[tuple[str, str, bytes]] = deque()
         self._refusals_left = REFUSALS_PER_PASS
@@ -133,7 +139,10 @@ class Loop:
     def _sensor_handler(self, heard: Heard) -> Callable[[str, bytes], None]:
         def handle(channel: str, data: bytes) -> None:
             try:
-                self._step(heard.read(data), self._clock.now())
+                event, before = heard.read(data), self.state
+                self._step(event, self._clock.now())
+                if isinstance(event, SwitchMode):
+                    self._on_wish(event, before, self.state)
             except Exception as error:
                 self._failed(channel, error)
 

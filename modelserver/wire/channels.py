@@ -19,6 +19,7 @@ class Way(StrEnum):
     REQUEST = "request"
     BROADCAST = "broadcast"
     COMMAND = "command"
+    REPORT = "report"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +58,9 @@ CHANNELS = (
     ),
     Channel("LOCALIZATION_STATE", "navigation_state_t", Way.BROADCAST, "timer, 5 Hz", "the filter's whole state"),
     Channel("MODELSERVER_HEALTH", "health_t", Way.BROADCAST, "1 Hz", "state, traffic, rejected input"),
+    Channel(
+        "DRIVER_HEALTH", "driver_health_t", Way.REPORT, "1 Hz, on change", "how each driver is: phase, rate, clock"
+    ),
     Channel(
         "PLATFORM_GET_TRANSFORMATION",
         "get_transformation_request_t",

@@ -9,9 +9,21 @@ from typing import Any, NamedTuple
 
 from modelserver import messages
 from modelserver.errors import WireError
-from modelserver.wire import aiding, health, navigation, packed, poses, queries, requests, sensors
+from modelserver.wire import (
+    aiding,
+    driver_health,
+    health,
+    navigation,
+    packed,
+    poses,
+    queries,
+    requests,
+    sensors,
+    vehicle,
+)
 from mslcm.absolute_pose_t import absolute_pose_t
 from mslcm.decisions_t import decisions_t
+from mslcm.driver_health_t import driver_health_t
 from mslcm.get_body_frame_list_request_t import get_body_frame_list_request_t
 from mslcm.get_body_list_request_t import get_body_list_request_t
 from mslcm.get_h_transform_request_t import get_h_transform_request_t
@@ -32,6 +44,8 @@ from mslcm.pose_transform_t import pose_transform_t
 from mslcm.pose_vector_t import pose_vector_t
 from mslcm.range_t import range_t
 from mslcm.relative_pose_t import relative_pose_t
+from mslcm.vehicle_command_t import vehicle_command_t
+from mslcm.vehicle_status_t import vehicle_status_t
 from mslcm.wheels_t import wheels_t
 
 
@@ -77,6 +91,10 @@ _CODECS = (
     _generated(absolute_pose_t, messages.AbsolutePoseSample, aiding.read_absolute_pose, aiding.write_absolute_pose),
     _generated(relative_pose_t, messages.RelativePoseSample, aiding.read_relative_pose, aiding.write_relative_pose),
     _generated(range_t, messages.RangeSample, aiding.read_range, aiding.write_range),
+    _generated(
+        vehicle_status_t, messages.VehicleStatusSample, vehicle.read_vehicle_status, vehicle.write_vehicle_status
+    ),
+    _generated(vehicle_command_t, messages.VehicleCommand, vehicle.read_vehicle_command, vehicle.write_vehicle_command),
     _generated(localization_mode_t, messages.SwitchMode, navigation.read_mode, navigation.write_mode),
     _generated(decisions_t, messages.PublishDecisions, navigation.read_decisions, navigation.write_decisions),
     _generated(navigation_state_t, messages.NavigationState, navigation.read_state, navigation.write_state),
@@ -117,6 +135,9 @@ _CODECS = (
         name_list_reply_t, messages.NameListReply, requests.read_name_list_reply, requests.write_name_list_reply
     ),
     _generated(health_t, messages.Health, health.read_health, health.write_health),
+    _generated(
+        driver_health_t, messages.DriverHealth, driver_health.read_driver_health, driver_health.write_driver_health
+    ),
     _packed(pose_transform_t, messages.PoseAnswer, poses.read_transform, poses.write_transform),
     _packed(pose_vector_t, messages.PoseAnswer, poses.read_vector, poses.write_vector),
 )

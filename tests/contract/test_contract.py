@@ -158,6 +158,8 @@ def test_given_a_field_without_comment_then_the_check_names_it(text: str, missin
         (messages.Mode, mslcm.localization_mode_t, ""),
         (messages.Phase, mslcm.navigation_state_t, ""),
         (messages.Verdict, mslcm.decision_t, ""),
+        (messages.DriverPhase, mslcm.driver_health_t, ""),
+        (messages.VehicleMode, mslcm.vehicle_status_t, "MODE_"),
     ],
 )
 def test_given_an_enumeration_then_the_wire_has_the_same_numbers(kind: Any, wire: Any, prefix: str) -> None:
@@ -180,6 +182,8 @@ def test_given_all_enumerations_then_no_constant_of_a_type_is_left_out() -> None
         mslcm.localization_mode_t: len(messages.Mode),
         mslcm.navigation_state_t: len(messages.Phase),
         mslcm.decision_t: len(messages.Verdict),
+        mslcm.driver_health_t: len(messages.DriverPhase),
+        mslcm.vehicle_status_t: len(messages.VehicleMode),
     }
     assert known == {wire: sum(name.isupper() for name in vars(wire)) for wire in known}
 

@@ -232,11 +232,12 @@ def test_given_an_unknown_key_like_no_other_then_the_known_ones_are_told() -> No
 def test_given_many_problems_then_all_are_told_at_once() -> None:
     found = problems("vehicl: x\npublish: {mode: often, rate_hz: 0}\nlimits: {wait_ms: x}\nsensors: {gps: {}}\n")
     assert [each.element for each in found] == [
+        "vehicl",
         "publish.mode",
+        "publish.rate_hz",  # which is looked at though the mode is none
+        "limits.wait_ms",
         "sensors.gps.channel",
         "sensors.gps.frame",
-        "limits.wait_ms",
-        "vehicl",
     ]
     assert len({each.line for each in found}) == 4
 

@@ -39,10 +39,23 @@ MAY_IMPORT: dict[str, set[str]] = {
     "service": SERVICE,
     "client": WIRE | GEOMETRY | {"formats", "history", "platform"},
     "msdrivers.protocol": VALUES | {"messages"},
-    "msdrivers.emulate": WIRE | {"geodesy", "simulation", "msdrivers.protocol"},
-    "msdrivers": WIRE | {"geodesy", "msdrivers.protocol", "msdrivers.emulate"},
+    "msdrivers.station": VALUES | {"messages"},
+    "msdrivers.devices": VALUES | {"messages", "msdrivers.protocol", "msdrivers.station"},
+    "msdrivers.emulate": VALUES | {"messages", "geodesy", "simulation", "msdrivers.protocol", "msdrivers.station"},
+    "msdrivers": WIRE
+    | {"geodesy", "msdrivers.protocol", "msdrivers.station", "msdrivers.devices", "msdrivers.emulate"},
     "mslcm": set(),
-    "mstools": SERVICE | {"service", "client", "simulation", "msdrivers", "msdrivers.protocol", "msdrivers.emulate"},
+    "mstools": SERVICE
+    | {
+        "service",
+        "client",
+        "simulation",
+        "msdrivers",
+        "msdrivers.protocol",
+        "msdrivers.station",
+        "msdrivers.devices",
+        "msdrivers.emulate",
+    },
     # the public names, loaded when they are first used
     "modelserver": VALUES | {"geometry", "messages", "formats", "client", "config"},
 }
@@ -63,6 +76,9 @@ PURE = {
     "core",
     "simulation",
     "msdrivers.protocol",
+    "msdrivers.station",
+    "msdrivers.devices",
+    "msdrivers.emulate",
 }
 
 IMPURE_MODULES = {

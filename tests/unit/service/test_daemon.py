@@ -13,9 +13,13 @@ from modelserver.errors import ConfigError, GeometryError, Problem
 from modelserver.localization.filter.localizer import FilterLocalizer
 from modelserver.localization.modes import ModeLocalizer
 from modelserver.localization.raw.localizer import RawLocalizer
-from modelserver.messages import Mode
-from modelserver.service.daemon import Vehicle, configured_origin, load_vehicle
+from modelserver.messages import Mode, SensorHeader, SwitchMode
+from modelserver.service.clock import FakeClock
+from modelserver.service.daemon import Vehicle, configured_origin, load_vehicle, log_wish
+from modelserver.service.fake_bus import FakeBus
 from modelserver.service.heard import Heard
+from modelserver.service.loop import Loop, LoopSettings
+from modelserver.wire.codec import encode
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -34,7 +38,10 @@ def problems(folder: Path, text: str, geometry: str = GEOMETRY) -> tuple[Problem
 def test_given_the_vehicles_of_this_project_then_they_load_whole(path: Path) -> None:
     loaded = load_vehicle(load_config(path))
     assert loaded.mounts is not None
-    assert loaded.sensor_channels() == {"GPS": Heard("gps_t"), "IMU": Heard("imu_t"), "WHEELS": Heard("wheels_t")}
+    heard = {"GPS": Heard("gps_t"), "IMU": Heard("imu_t"), "WHEELS": Heard("wheels_t")}
+    if loaded.config.localization.mode_channel:
+        heard["LOCALIZATION_MODE"] = Heard("localization_mode_t")
+    assert loaded.sensor_channels() == heard
     assert (loaded.tick_hz(), loaded.ticks_per_pose(), loaded.ticks_per_state()) == (50.0, 1, 10)
 
 
@@ -252,3 +259,24 @@ def test_given_no_sensor_then_there_is_no_localizer(tmp_path: Path) -> None:
     loaded = vehicle(tmp_path, without("sensors:", "gps:", "imu:"))
     assert (loaded.rig, loaded.mounts) == (None, None)
     assert loaded.core(now_at(START_UTIME)).view.localizer is None
+
+
+def test_given_a_wish_for_another_mode_then_the_switch_is_logged_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    text = VEHICLE + "localization: {mode_channel: M}\n"
+    loaded = vehicle(tmp_path, text)
+    clock = FakeClock(START_UTIME)
+    bus = FakeBus(clock)
+    loop = Loop(
+        bus, clock, loaded.core(clock.now()), LoopSettings(20_000_000, loaded.sensor_channels()), on_wish=log_wish
+    )
+    for number, wanted in enumerate((Mode.RAW, Mode.RAW, Mode.NO_GPS)):
+        header = SensorHeader(START_UTIME + number, "operator", number, START_UTIME + number)
+        bus.sensors.put("M", encode(SwitchMode(header, wanted)))
+        loop.turn()
+    assert caplog.messages == [
+        "mode raw, as 'operator' wishes (was full)",
+        "mode no_gps, as 'operator' wishes (was raw)",
+    ]

@@ -1,0 +1,72 @@
+"""How many NovAtel messages one process parses a second: BESTPOSB and BESTVELB, as a serial line brings them.
+
+python -m benchmarks gps_parse
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from modelserver.messages import FixType, GpsSample, SensorHeader
+from msdrivers.emulate import gps_logs
+from msdrivers.protocol.gps_stream import GpsStream
+from msdrivers.protocol.novatel import NovatelLog
+
+REQUIRED = 5_000
+INSTANTS = 10_000
+ROUNDS = 5
+CHUNK = 64
+"""Bytes that a read of a serial line brings at once, at most."""
+_START = 1_700_000_000_000_000
+
+
+def stream_of(names: tuple[str, ...], instants: int) -> bytes:
+    return b"".join(gps_logs.write(name, _sample(n), _START + n * 50_000) for n in range(instants) for name in names)
+
+
+def _sample(n: int) -> GpsSample:
+    return GpsSample(
+        SensorHeader(_START + n * 50_000),
+        FixType.DIFFERENTIAL,
+        50.0 + n * 1e-6,
+        -111.0,
+        height_msl=700.0,
+        undulation=-20.0,
+        satellites=9,
+        position_covariance=(0.04, 0.0, 0.0, 0.0, 0.09, 0.0, 0.0, 0.0, 0.16),
+        velocity=(1.0, 2.0, 0.1),
+        speed=2.2,
+        course=1.1,
+    )
+
+
+def rate(data: bytes, expected: int) -> float:
+    """Return messages a second, the best of some rounds; checks that each message was read."""
+    best = 0.0
+    for _ in range(ROUNDS):
+        stream = GpsStream()
+        begun = time.perf_counter()
+        read = sum(len(stream.feed(data[at : at + CHUNK])) for at in range(0, len(data), CHUNK))
+        best = max(best, expected / (time.perf_counter() - begun))
+        read += len(stream.idle())
+        if read != expected:
+            raise RuntimeError(f"{read} messages read of {expected}")
+    return best
+
+
+def main() -> int:
+    binary = stream_of(("bestposb", "bestvelb"), INSTANTS)
+    text = stream_of(("bestposa", "bestvela"), INSTANTS // 10)
+    nmea = stream_of(("gpgga", "gprmc"), INSTANTS // 10)
+    sentences = 2 * (INSTANTS // 10)
+    assert isinstance(GpsStream().feed(binary)[0], NovatelLog)
+    measured = rate(binary, 2 * INSTANTS)
+    print(f"BESTPOSB and BESTVELB  {measured:9,.0f} messages/s, required {REQUIRED:,}")
+    print(f"BESTPOSA and BESTVELA  {rate(text, sentences):9,.0f} messages/s")
+    print(f"GPGGA and GPRMC        {2 * rate(nmea, sentences // 2):9,.0f} sentences/s")
+    return 0 if measured >= REQUIRED else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Drivers of devices: each a `Station` at the host's end of a line."""

@@ -1,0 +1,6 @@
+"""Satellite receivers: NovAtel OEM4 and its heirs, and whatever speaks NMEA 0183."""
+
+from msdrivers.devices.gps.driver import GpsDriver
+from msdrivers.devices.gps.settings import GpsSettings
+
+__all__ = ["GpsDriver", "GpsSettings"]

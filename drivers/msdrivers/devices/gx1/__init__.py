@@ -1,0 +1,7 @@
+"""The MicroStrain 3DM-GX1 inertial unit: its driver, and its hard-iron procedure."""
+
+from msdrivers.devices.gx1.driver import Gx1Driver
+from msdrivers.devices.gx1.hard_iron import HardIron, HardIronResult, HardIronSettings
+from msdrivers.devices.gx1.settings import Gx1Settings, Heading
+
+__all__ = ["Gx1Driver", "Gx1Settings", "HardIron", "HardIronResult", "HardIronSettings", "Heading"]

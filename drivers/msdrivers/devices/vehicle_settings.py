@@ -1,0 +1,91 @@
+"""How the vehicle controller is to be used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from msdrivers.protocol.can.mapping import STRICT, CommandMap, StatusMap
+
+
+@dataclass(frozen=True, slots=True)
+class LimitsMap:
+    """What may be wished for. Zero forbids it."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
+
+    forward_speed: float = 2.0
+    """Highest speed forward, m/s."""
+    reverse_speed: float = 1.0
+    """Highest speed backward, m/s, as a positive number."""
+    steering_angle: float = 0.5
+    """Greatest steering angle to either side, radians."""
+    beyond: Literal["clamp", "refuse"] = "clamp"
+    """What becomes of a wish beyond: the limit is commanded in its place, or nothing is."""
+
+    def __post_init__(self) -> None:
+        for key, value, high in (
+            ("forward_speed", self.forward_speed, 100.0),
+            ("reverse_speed", self.reverse_speed, 100.0),
+            ("steering_angle", self.steering_angle, 1.6),
+        ):
+            if not 0.0 <= value <= high:
+                raise ValueError(f"{key} is between 0 and {high:g}, got {value:g}")
+        if self.beyond not in ("clamp", "refuse"):
+            raise ValueError(f"beyond is clamp or refuse, got {self.beyond!r}")
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleSettings:
+    """How to read and command the vehicle controller. Raises ValueError for what cannot be, naming the key."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
+
+    source: str
+    """Name that the samples give as theirs."""
+    dbc: str
+    """Path of the DBC file, relative to the file that holds these settings."""
+    status: StatusMap | None = None
+    """What the bus tells of the controller; None: nothing is published."""
+    command: CommandMap | None = None
+    """How commands are said; None: the vehicle is not commanded."""
+    limits: LimitsMap = LimitsMap()
+    """What may be wished for."""
+    commander: str = ""
+    """The only source whose commands are taken; empty: any, but one at a time."""
+    dead_man: float = 0.5
+    """Seconds after its arrival for which a command counts at most; then stop is commanded."""
+    command_period: float = 0.05
+    """Seconds between the frames in which a command, or the stop after it, is said again."""
+    clock_slack: float = 0.2
+    """Seconds by which the clock of whoever commands may be ahead of ours."""
+    window: float = 0.02
+    """Seconds to wait for the other frames of a status; shorter than the time between two."""
+    silence: float = 1.0
+    """Seconds without a usable frame after which the driver says so."""
+    delay: float = 0.0
+    """Seconds from the measurement to the frame's arrival, as far as known."""
+    delay_sigma: float = 0.0
+    """Standard deviation of `delay`, seconds."""
+
+    def __post_init__(self) -> None:
+        if not self.dbc:
+            raise ValueError("dbc is the path of a DBC file, got nothing")
+        if self.status is None and self.command is None:
+            raise ValueError("status or command is needed: without both there is nothing to do")
+        for key, value, low, high in (
+            ("dead_man", self.dead_man, 0.05, 5.0),
+            ("command_period", self.command_period, 0.005, 1.0),
+            ("clock_slack", self.clock_slack, 0.0, 5.0),
+            ("window", self.window, 0.0, 1.0),
+            ("silence", self.silence, 0.05, 3600.0),
+            ("delay", self.delay, 0.0, 5.0),
+            ("delay_sigma", self.delay_sigma, 0.0, 5.0),
+        ):
+            if not low <= value <= high:
+                raise ValueError(f"{key} is between {low:g} and {high:g}, got {value:g}")
+        if self.command_period > self.dead_man:
+            raise ValueError(
+                f"command_period is at most dead_man, {self.dead_man:g}, got {self.command_period:g}: the controller "
+                "would stop between two frames"
+            )

@@ -1,0 +1,90 @@
+"""GPS weeks to UTC: leap seconds, and weeks or dates that have rolled over.
+
+GPS time counts weeks from 1980-01-06 00:00 UTC and has no leap seconds. The signal carries the week modulo 1024: a
+receiver whose firmware is old reports times 1024 weeks (about 19.6 years) early.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from datetime import date
+
+SECOND = 1_000_000
+"""Microseconds."""
+DAY = 86_400 * SECOND
+WEEK = 7 * DAY
+ROLLOVER = 1024 * WEEK
+_EPOCH_DAYS = (date(1980, 1, 6) - date(1970, 1, 1)).days
+GPS_EPOCH = _EPOCH_DAYS * DAY
+"""utime of the beginning of GPS time."""
+
+_LEAP_DATES = (
+    date(1981, 7, 1),
+    date(1982, 7, 1),
+    date(1983, 7, 1),
+    date(1985, 7, 1),
+    date(1988, 1, 1),
+    date(1990, 1, 1),
+    date(1991, 1, 1),
+    date(1992, 7, 1),
+    date(1993, 7, 1),
+    date(1994, 7, 1),
+    date(1996, 1, 1),
+    date(1997, 7, 1),
+    date(1999, 1, 1),
+    date(2006, 1, 1),
+    date(2009, 1, 1),
+    date(2012, 7, 1),
+    date(2015, 7, 1),
+    date(2017, 1, 1),
+)
+"""Days before whose beginning a second was inserted, since 1980 (IERS Bulletin C; none after 2017 up to 2026)."""
+
+_LEAP_UTC = tuple((day - date(1970, 1, 1)).days * DAY for day in _LEAP_DATES)
+_LEAP_GPS = tuple(utime - GPS_EPOCH + (number + 1) * SECOND for number, utime in enumerate(_LEAP_UTC))
+"""GPS microseconds at which UTC's day begins after each inserted second."""
+
+
+def leap_seconds(utime: int) -> int:
+    """Return by how many seconds GPS time is ahead of UTC at an instant of UTC."""
+    return bisect_right(_LEAP_UTC, utime)
+
+
+def utime_of(week: int, microseconds: int, pivot: int) -> int:
+    """Return the utime of a GPS week (rolled over or not) and microseconds into it.
+
+    pivot: the host's date as utime, see `unrolled`. Inside an inserted leap second, which utime cannot tell from the
+    second after it, the result is that of the second after it; see `in_leap_second`.
+    """
+    return _utc(_gps(week, microseconds, pivot))
+
+
+def in_leap_second(week: int, microseconds: int, pivot: int) -> bool:
+    """Return whether the instant lies in an inserted second, 23:59:60, whose utime is ambiguous."""
+    gps = _gps(week, microseconds, pivot)
+    following = bisect_right(_LEAP_GPS, gps)
+    return following < len(_LEAP_GPS) and gps >= _LEAP_GPS[following] - SECOND
+
+
+def gps_of(utime: int) -> tuple[int, int]:
+    """Return the GPS week since 1980, not rolled over, and microseconds into it, of an instant of UTC."""
+    return divmod(utime - GPS_EPOCH + leap_seconds(utime) * SECOND, WEEK)
+
+
+def unrolled(utime: int, pivot: int) -> int:
+    """Return `utime` set later by as many rollovers as bring it within half a rollover of `pivot`.
+
+    Only a time that is too early is mended: a rolled-over receiver is never ahead. A host without a date (1970) hence
+    changes nothing. A recording more than 9.8 years old needs a pivot of its own days.
+    """
+    if utime >= pivot - ROLLOVER // 2:
+        return utime
+    return utime + -(-(pivot - ROLLOVER // 2 - utime) // ROLLOVER) * ROLLOVER
+
+
+def _gps(week: int, microseconds: int, pivot: int) -> int:
+    return unrolled(week * WEEK + microseconds, pivot - GPS_EPOCH)
+
+
+def _utc(gps: int) -> int:
+    return gps + GPS_EPOCH - bisect_right(_LEAP_GPS, gps) * SECOND

@@ -1,0 +1,119 @@
+"""Requests to the 3DM-GX1, from the host's side and from the device's. They carry no checksum."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from msdrivers.protocol.gx1.packets import LAYOUTS, Command
+
+STOP = bytes((Command.CONTINUOUS, 0, 0))
+"""Stop the continuous mode."""
+
+HARD_IRON_KEY = b"\x71\x3e"
+_WRITE_KEY, _WRITE_END = 0x71, 0xAA
+LAST_ADDRESS = 254
+
+
+def poll(command: int) -> bytes:
+    """Return the request for one reply of a command that takes no data."""
+    return bytes((command,))
+
+
+def stream(command: int) -> bytes:
+    """Return the request to stream a reply."""
+    return bytes((Command.CONTINUOUS, 0, command))
+
+
+def read_eeprom(address: int) -> bytes:
+    """Return the request for a word of the EEPROM, at an even address up to 254."""
+    return bytes((Command.READ_EEPROM, *_address(address)))
+
+
+def write_eeprom(address: int, value: int) -> bytes:
+    """Return the request to write a word, signed or unsigned 16 bit, to the EEPROM."""
+    word = (value & 0xFFFF).to_bytes(2, "big")
+    return bytes((Command.WRITE_EEPROM, _WRITE_KEY, *_address(address), *word, _WRITE_END))
+
+
+def hard_iron_start() -> bytes:
+    """Return the request to begin the collection of the magnetic field's extremes."""
+    return bytes((Command.HARD_IRON_START,)) + HARD_IRON_KEY
+
+
+def hard_iron_compute(two_dimensional: bool, magnitude_z: int) -> bytes:
+    """Return the request to compute and store the hard-iron offsets.
+
+    The type byte is 1 for two dimensions and 0 for three. `magnitude_z` is the device's own word for the vertical
+    field, which only the procedure in two dimensions uses.
+    """
+    kind = 1 if two_dimensional else 0
+    word = (magnitude_z & 0xFFFF).to_bytes(2, "big")
+    return bytes((Command.HARD_IRON_COMPUTE,)) + HARD_IRON_KEY + bytes((kind,)) + word
+
+
+def _address(address: int) -> bytes:
+    if not 0 <= address <= LAST_ADDRESS or address % 2:
+        raise ValueError(f"an address of the EEPROM is even and 0..{LAST_ADDRESS}, got {address}")
+    return address.to_bytes(2, "big")
+
+
+class Request(NamedTuple):
+    """What a host asks: the command, and its data bytes without keys."""
+
+    command: int
+    data: bytes = b""
+
+
+_LENGTHS = dict.fromkeys(LAYOUTS, 1) | {
+    Command.CONTINUOUS: 3,
+    Command.READ_EEPROM: 3,
+    Command.WRITE_EEPROM: 7,
+    Command.HARD_IRON_START: 3,
+    Command.HARD_IRON_COMPUTE: 6,
+}
+
+
+class RequestParser:
+    """Requests out of the bytes that come to a device. What fits no request is skipped, byte by byte."""
+
+    __slots__ = ("_buffer", "skipped")
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self.skipped = 0
+
+    def feed(self, data: bytes) -> list[Request]:
+        """Return the requests that are complete; at most 6 bytes wait for more."""
+        self._buffer += data
+        buffer, at, found = self._buffer, 0, []
+        while at < len(buffer):
+            length = _LENGTHS.get(buffer[at], 0)
+            if length > len(buffer) - at:
+                break
+            request = _request(bytes(buffer[at : at + length])) if length else None
+            if request is None:
+                at += 1
+                self.skipped += 1
+            else:
+                at += length
+                found.append(request)
+        del buffer[:at]
+        return found
+
+    def clear(self) -> None:
+        """Forget a request that has begun."""
+        self._buffer.clear()
+
+
+def _request(raw: bytes) -> Request | None:
+    """Return the request that the bytes are; None if a key or a fixed byte in it is wrong."""
+    command = raw[0]
+    if command == Command.CONTINUOUS:
+        return Request(command, raw[2:]) if raw[1] == 0 else None
+    if command == Command.READ_EEPROM:
+        return Request(command, raw[1:])
+    if command == Command.WRITE_EEPROM:
+        return Request(command, raw[2:6]) if (raw[1], raw[6]) == (_WRITE_KEY, _WRITE_END) else None
+    if command in (Command.HARD_IRON_START, Command.HARD_IRON_COMPUTE):
+        return Request(command, raw[3:]) if raw[1:3] == HARD_IRON_KEY else None
+    return Request(command)

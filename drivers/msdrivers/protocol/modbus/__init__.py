@@ -1,0 +1,1 @@
+"""Modbus: requests, replies and failures as values, and numbers in registers."""

@@ -1,0 +1,103 @@
+"""Fields of NMEA 0183 sentences to numbers. An empty field is nothing said: nan or None, never zero.
+
+Raises ValueError with the field's text for what no receiver should write. pynmea2's own conversions are not used: they
+give 0 for a missing hemisphere, cut microseconds, refuse 23:59:60 and return the text where they fail.
+"""
+
+from __future__ import annotations
+
+import re
+from datetime import date
+
+from modelserver.messages.flags import NAN
+
+KNOT = 1852.0 / 3600.0
+"""Metres per second."""
+KMH = 1.0 / 3.6
+SECOND = 1_000_000
+
+_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)")
+_CLOCK = re.compile(r"(\d\d)(\d\d)(\d\d)(?:\.(\d*))?")
+_ANGLE = re.compile(r"(\d{1,3}?)(\d\d(?:\.\d*)?)")
+_UNIX_DAY = date(1970, 1, 1).toordinal()
+
+
+def number(text: str) -> float:
+    """Return a decimal number; nan for an empty field."""
+    if not text:
+        return NAN
+    if not _NUMBER.fullmatch(text):
+        raise ValueError(f"'{text}' is no number")
+    return float(text)
+
+
+def whole(text: str, least: int = 0, most: int = 1_000_000) -> int | None:
+    """Return an integer within bounds; None for an empty field."""
+    if not text:
+        return None
+    if not text.isdecimal() or not least <= int(text) <= most:
+        raise ValueError(f"'{text}' is no integer from {least} to {most}")
+    return int(text)
+
+
+def time_of_day(text: str) -> int | None:
+    """Return microseconds since midnight of `hhmmss.ss`, up to 86401 s for 23:59:60.99; None for an empty field."""
+    if not text:
+        return None
+    parts = _CLOCK.fullmatch(text)
+    if parts is None:
+        raise ValueError(f"'{text}' is no time of day")
+    hours, minutes, seconds = int(parts[1]), int(parts[2]), int(parts[3])
+    leap = seconds == 60 and (hours, minutes) == (23, 59)
+    if hours > 23 or minutes > 59 or (seconds > 59 and not leap):
+        raise ValueError(f"'{text}' is no time of day")
+    fraction = (parts[4] or "")[:6].ljust(6, "0")
+    return (hours * 3600 + minutes * 60 + seconds) * SECOND + int(fraction)
+
+
+def days(day: int, month: int, year: int) -> int:
+    """Return days since 1970-01-01. ValueError for a day that does not exist."""
+    return date(year, month, day).toordinal() - _UNIX_DAY
+
+
+def date_of(text: str) -> int | None:
+    """Return days since 1970 of `ddmmyy`, years from 1980 on; None for an empty field."""
+    if not text:
+        return None
+    if len(text) != 6 or not text.isdecimal():
+        raise ValueError(f"'{text}' is no date")
+    year = int(text[4:])
+    return days(int(text[:2]), int(text[2:4]), year + (1900 if year >= 80 else 2000))
+
+
+def angle(text: str, side: str, sides: str, most: float) -> float:
+    """Return signed degrees of `dddmm.mmmm` and its hemisphere; nan where both are empty.
+
+    sides: the letters of the positive and the negative hemisphere. most: the largest angle, degrees.
+    """
+    if not text and not side:
+        return NAN
+    parts = _ANGLE.fullmatch(text)
+    if parts is None or len(side) != 1 or side not in sides:
+        raise ValueError(f"'{text},{side}' is no angle")
+    minutes = float(parts[2])
+    degrees = int(parts[1]) + minutes / 60.0
+    if minutes >= 60.0 or degrees > most:
+        raise ValueError(f"'{text},{side}' is no angle")
+    return degrees if side == sides[0] else -degrees
+
+
+def circle(text: str) -> float:
+    """Return a direction, degrees clockwise from north, 0 to 360; nan for an empty field."""
+    value = number(text)
+    if value < 0.0 or value > 360.0:
+        raise ValueError(f"'{text}' is no direction")
+    return value
+
+
+def amount(text: str) -> float:
+    """Return a number that cannot be negative; nan for an empty field."""
+    value = number(text)
+    if value < 0.0:
+        raise ValueError(f"'{text}' is negative")
+    return value

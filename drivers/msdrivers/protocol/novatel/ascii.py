@@ -1,0 +1,167 @@
+"""Bodies of ASCII logs: fields between commas, words for enumerations, strings in quotes."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from math import isfinite
+
+from msdrivers.protocol.novatel.logs import (
+    DATUMS,
+    Body,
+    Heading,
+    LogHeader,
+    Position,
+    PositionType,
+    SolutionStatus,
+    TimeStatus,
+    UtmPosition,
+    Velocity,
+)
+
+UNKNOWN_WORD = 255
+"""Stands for a status or type whose word is not in the tables; no receiver uses it."""
+
+
+def split(text: str) -> list[str]:
+    """Return the fields of a comma-separated part; quotes are taken off."""
+    return next(csv.reader([text])) if '"' in text else text.split(",")
+
+
+def long_header(fields: Sequence[str]) -> LogHeader:
+    """Read the ten fields of `#NAMEA,...`. ValueError where one is not as it should be."""
+    name, port, sequence, _, status, week, seconds, receiver, _, _ = fields
+    milliseconds = _milliseconds(seconds)
+    known = TimeStatus[status] if status in TimeStatus.__members__ else TimeStatus.UNKNOWN
+    return LogHeader(_name(name), int(week), milliseconds, known, port, int(sequence), int(receiver, 16), False)
+
+
+def short_header(fields: Sequence[str]) -> LogHeader:
+    """Read the three fields of `%NAMESA,...`."""
+    name, week, seconds = fields
+    return LogHeader(_name(name), int(week), _milliseconds(seconds), TimeStatus.UNKNOWN, "", 0, 0, False)
+
+
+def read(name: str, fields: Sequence[str]) -> Body | None:
+    """Return a log's body; None for a log that is not read here.
+
+    Raises:
+        ValueError: the number of fields, or what one says, is not what it should be.
+    """
+    reader = _READERS.get(name)
+    if reader is None:
+        return None
+    body = reader(fields)
+    if not all(isfinite(value) for value in body if isinstance(value, float)):
+        raise ValueError("a number is not finite")
+    return body
+
+
+def _name(name: str) -> str:
+    if not name.endswith("A"):
+        raise ValueError(f"{name} is no ASCII log")
+    return name[:-1]
+
+
+def _milliseconds(seconds: str) -> int:
+    value = round(float(seconds) * 1000.0)
+    if not 0 <= value < 604_800_000:
+        raise ValueError(f"{seconds} is not within a week")
+    return value
+
+
+def _word(kind: type[IntEnum], word: str) -> int:
+    return int(kind[word]) if word in kind.__members__ else UNKNOWN_WORD
+
+
+def _position(f: Sequence[str]) -> Position:
+    if len(f) != 21:
+        raise ValueError(f"{len(f)} fields where 21 belong")
+    latitude, longitude = float(f[2]), float(f[3])
+    if abs(latitude) > 90.0 or not -180.0 <= longitude <= 360.0:
+        raise ValueError(f"{f[2]},{f[3]} is no place")
+    north, east, up = (float(each) for each in f[7:10])
+    return Position(
+        _word(SolutionStatus, f[0]),
+        _word(PositionType, f[1]),
+        latitude,
+        longitude,
+        float(f[4]),
+        float(f[5]),
+        DATUMS.get(f[6], 0),
+        north,
+        east,
+        up,
+        f[10],
+        float(f[11]),
+        float(f[12]),
+        int(f[13]),
+        int(f[14]),
+    )
+
+
+def _velocity(f: Sequence[str]) -> Velocity:
+    if len(f) != 8:
+        raise ValueError(f"{len(f)} fields where 8 belong")
+    if float(f[4]) < 0.0:
+        raise ValueError(f"{f[4]} is no speed")
+    latency, age, horizontal, track, vertical = (float(each) for each in f[2:7])
+    return Velocity(_word(SolutionStatus, f[0]), _word(PositionType, f[1]), latency, age, horizontal, track, vertical)
+
+
+def _utm(f: Sequence[str]) -> UtmPosition:
+    if len(f) != 23:
+        raise ValueError(f"{len(f)} fields where 23 belong")
+    northing, easting, height, undulation = (float(each) for each in f[4:8])
+    north, east, up = (float(each) for each in f[9:12])
+    return UtmPosition(
+        _word(SolutionStatus, f[0]),
+        _word(PositionType, f[1]),
+        int(f[2]),
+        f[3],
+        northing,
+        easting,
+        height,
+        undulation,
+        DATUMS.get(f[8], 0),
+        north,
+        east,
+        up,
+        f[12],
+        float(f[13]),
+        float(f[14]),
+        int(f[15]),
+        int(f[16]),
+    )
+
+
+def _heading(stations: int) -> Callable[[Sequence[str]], Heading]:
+    def read_heading(f: Sequence[str]) -> Heading:
+        if len(f) != 16 + stations:
+            raise ValueError(f"{len(f)} fields where {16 + stations} belong")
+        return Heading(
+            _word(SolutionStatus, f[0]),
+            _word(PositionType, f[1]),
+            float(f[2]),
+            float(f[3]),
+            float(f[4]),
+            float(f[6]),
+            float(f[7]),
+            f[8],
+            int(f[8 + stations]),
+            int(f[9 + stations]),
+        )
+
+    return read_heading
+
+
+_READERS: dict[str, Callable[[Sequence[str]], Body]] = {
+    "BESTPOS": _position,
+    "PSRPOS": _position,
+    "RTKPOS": _position,
+    "BESTVEL": _velocity,
+    "BESTUTM": _utm,
+    "HEADING": _heading(1),
+    "HEADING2": _heading(2),
+}

@@ -1,0 +1,70 @@
+"""Bodies of binary logs; little-endian, packed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from struct import Struct
+
+from msdrivers.protocol.novatel.logs import Body, Heading, Position, UtmPosition, Velocity
+
+LONG_HEADER = Struct("<3sBHBBHHBBHIIHH")
+"""Sync, header length, id, type, port, body length, sequence, idle, time status, week, ms, receiver status, reserved,
+software build."""
+SHORT_HEADER = Struct("<3sBHHI")
+"""Sync, body length, id, week, ms."""
+POSITION = Struct("<IIdddfIfff4sffBB6x")
+VELOCITY = Struct("<IIffdddf")
+UTM = Struct("<IIIIdddfIfff4sffBB6x")
+HEADING = Struct("<IIfff4xff4sBB6x")
+HEADING2 = Struct("<IIfff4xff4s4xBB6x")
+
+
+def _station(raw: bytes) -> str:
+    return raw.partition(b"\0")[0].decode("ascii", "replace")
+
+
+def _position(body: bytes | bytearray) -> Position | None:
+    f = POSITION.unpack(body)
+    # an infinity makes the sum infinite, a nan makes it nan
+    if not math.isfinite(f[2] + f[3] + f[4] + f[5] + f[7] + f[8] + f[9] + f[11] + f[12]):
+        return None
+    if not (-90.0 <= f[2] <= 90.0 and -180.0 <= f[3] <= 360.0):
+        return None
+    return Position._make((*f[:10], _station(f[10]), *f[11:]))
+
+
+def _velocity(body: bytes | bytearray) -> Velocity | None:
+    f = VELOCITY.unpack(body)
+    if not math.isfinite(f[2] + f[3] + f[4] + f[5] + f[6]) or f[4] < 0.0:
+        return None
+    return Velocity(*f[:7])
+
+
+def _utm(body: bytes | bytearray) -> UtmPosition | None:
+    f = UTM.unpack(body)
+    if not math.isfinite(sum(f[4:8]) + sum(f[9:12]) + f[13] + f[14]) or not 65 <= f[3] <= 90:
+        return None
+    return UtmPosition._make((*f[:3], chr(f[3]), *f[4:12], _station(f[12]), *f[13:]))
+
+
+def _heading(layout: Struct) -> Callable[[bytes | bytearray], Heading | None]:
+    def read(body: bytes | bytearray) -> Heading | None:
+        f = layout.unpack(body)
+        if not math.isfinite(sum(f[2:7])):
+            return None
+        return Heading._make((*f[:7], _station(f[7]), *f[8:]))
+
+    return read
+
+
+READERS: dict[int, tuple[int, Callable[[bytes | bytearray], Body | None]]] = {
+    42: (POSITION.size, _position),
+    47: (POSITION.size, _position),
+    141: (POSITION.size, _position),
+    99: (VELOCITY.size, _velocity),
+    726: (UTM.size, _utm),
+    971: (HEADING.size, _heading(HEADING)),
+    1335: (HEADING2.size, _heading(HEADING2)),
+}
+"""Message id -> length of the body, and its reader: None for values that no receiver should give."""

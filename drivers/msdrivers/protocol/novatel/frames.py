@@ -1,0 +1,194 @@
+"""Frames of NovAtel receivers: binary and ASCII logs with CRC, answers to commands and prompts without."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from msdrivers.protocol.framing import CHANCE, Refused, Taken
+from msdrivers.protocol.novatel import ascii as text_logs
+from msdrivers.protocol.novatel.binary import LONG_HEADER, READERS, SHORT_HEADER
+from msdrivers.protocol.novatel.crc import crc32
+from msdrivers.protocol.novatel.logs import MESSAGE_IDS, Body, LogHeader, NovatelLog, TimeStatus
+
+LONGEST = 1024
+"""Bytes of a log. Longer ones (raw observations) are not read here; a broken length must not swallow good logs."""
+_LONGEST_NAME = 40
+_MILLISECONDS = 604_800_000
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What the receiver says to a command. error: its words, empty for `<OK`."""
+
+    start: int
+    error: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """Whether the command was accepted."""
+        return not self.error
+
+
+@dataclass(frozen=True, slots=True)
+class Prompt:
+    """`[COM1]`: follows every answer, and greets after the receiver has started."""
+
+    start: int
+    port: str
+
+
+class BinaryFormat:
+    """Long headers (AA 44 12) and short ones (AA 44 13)."""
+
+    leads = b"\xaa"
+
+    def scan(self, buffer: bytearray, at: int, start: int) -> Taken[NovatelLog] | Refused | None:
+        """See `framing.Format`."""
+        available = len(buffer) - at
+        if available < 4:
+            return None if b"\xaa\x44".startswith(buffer[at : at + 2]) else CHANCE
+        if buffer[at + 1] != 0x44:
+            return CHANCE
+        if buffer[at + 2] == 0x12:
+            return self._long(buffer, at, available, start)
+        if buffer[at + 2] == 0x13:
+            return self._short(buffer, at, available, start)
+        return CHANCE
+
+    def _long(self, buffer: bytearray, at: int, available: int, start: int) -> Taken[NovatelLog] | Refused | None:
+        head = buffer[at + 3]
+        if head < LONG_HEADER.size:
+            return Refused("novatel_header")
+        if available < LONG_HEADER.size:
+            return None
+        _, _, ident, kind, port, length, sequence, _, status, week, ms, receiver, _, _ = LONG_HEADER.unpack_from(
+            buffer, at
+        )
+        expected, reader = READERS.get(ident, (length, None))
+        if ms >= _MILLISECONDS or kind & 0x60 or length != expected:
+            return Refused("novatel_header")
+        end = at + head + length
+        if end + 4 - at > LONGEST:
+            return Refused("novatel_length")
+        if len(buffer) < end + 4:
+            return None
+        if not _sum_is_right(buffer, at, end):
+            return Refused("novatel_checksum")
+        name = MESSAGE_IDS.get(ident) or f"id {ident}"
+        body = None
+        # an answer to a binary command has the id of the command, and another body
+        if reader is not None and not kind & 0x80:
+            body = reader(buffer[at + head : end])
+            if body is None:
+                return Refused("novatel_value")
+        header = LogHeader(name, week, ms, status, str(port), sequence, receiver, True)
+        return Taken(end + 4, f"novatel.{name}B", NovatelLog(header, body, start))
+
+    def _short(self, buffer: bytearray, at: int, available: int, start: int) -> Taken[NovatelLog] | Refused | None:
+        end = at + SHORT_HEADER.size + buffer[at + 3]
+        if available < SHORT_HEADER.size:
+            return None
+        _, _, ident, week, ms = SHORT_HEADER.unpack_from(buffer, at)
+        if ms >= _MILLISECONDS:
+            return Refused("novatel_header")
+        if len(buffer) < end + 4:
+            return None
+        if not _sum_is_right(buffer, at, end):
+            return Refused("novatel_checksum")
+        name = MESSAGE_IDS.get(ident) or f"id {ident}"
+        header = LogHeader(name, week, ms, TimeStatus.UNKNOWN, "", 0, 0, True)
+        return Taken(end + 4, f"novatel.{name}SB", NovatelLog(header, None, start))
+
+
+def _sum_is_right(buffer: bytearray, at: int, end: int) -> bool:
+    return crc32(bytes(buffer[at:end])) == int.from_bytes(buffer[end : end + 4], "little")
+
+
+class AsciiFormat:
+    """`#NAMEA,header;body*crc32` and `%NAMESA,header;body*crc32`."""
+
+    leads = b"#%"
+    _begin = re.compile(rb"[#%][A-Z][A-Z0-9_]*(,?)")
+    _body = re.compile(rb"[ -)+-~]*")
+    _sum = re.compile(rb"[0-9A-Fa-f]{8}")
+
+    def scan(self, buffer: bytearray, at: int, start: int) -> Taken[NovatelLog] | Refused | None:
+        """See `framing.Format`."""
+        if len(buffer) == at + 1:
+            return None
+        begin = self._begin.match(buffer, at, at + _LONGEST_NAME)
+        if begin is None or not begin[1]:
+            return None if begin is not None and begin.end() == len(buffer) else CHANCE
+        body = self._body.match(buffer, begin.end(), at + LONGEST)
+        assert body is not None
+        end = body.end()
+        if end - at >= LONGEST:
+            return Refused("novatel_length")
+        if end == len(buffer):
+            return None
+        if buffer[end] != 0x2A:
+            return Refused("novatel_unfinished")
+        if len(buffer) < end + 9:
+            return None
+        stated = buffer[end + 1 : end + 9]
+        content = bytes(buffer[at + 1 : end])
+        if not self._sum.fullmatch(stated) or int(stated, 16) != crc32(content):
+            return Refused("novatel_checksum")
+        long = buffer[at] == 0x23
+        try:
+            header, said = _read_text(content.decode("ascii"), long)
+        except ValueError:
+            return Refused("novatel_value")
+        return Taken(end + 9, f"novatel.{header.name}A", NovatelLog(header, said, start))
+
+
+def _read_text(content: str, long: bool) -> tuple[LogHeader, Body | None]:
+    head, separator, body = content.partition(";")
+    if not separator:
+        raise ValueError("no end of the header")
+    fields = head.split(",")
+    header = text_logs.long_header(fields) if long else text_logs.short_header(fields)
+    return header, text_logs.read(header.name, text_logs.split(body)) if long else None
+
+
+class TextFormat:
+    """`<OK`, `<ERROR:...`, and abbreviated ASCII, whose lines begin with '<' and carry no checksum: not used."""
+
+    leads = b"<"
+    _line = re.compile(rb"<[ -~]*")
+    _longest = 256
+
+    def scan(self, buffer: bytearray, at: int, start: int) -> Taken[Answer] | Refused | None:
+        """See `framing.Format`."""
+        line = self._line.match(buffer, at, at + self._longest)
+        assert line is not None
+        end = line.end()
+        if end - at >= self._longest:
+            return CHANCE
+        if end == len(buffer):
+            return None
+        if buffer[end] not in b"\r\n":
+            return CHANCE
+        text = line[0].decode("ascii").rstrip()
+        if text == "<OK":
+            return Taken(end, "novatel.OK", Answer(start))
+        if text.startswith("<ERROR"):
+            return Taken(end, "novatel.ERROR", Answer(start, text[6:].lstrip(": ") or "no reason given"))
+        return Taken(end, "novatel.abbreviated", None) if len(text) > 8 else CHANCE
+
+
+class PromptFormat:
+    """`[COM1]` and the like."""
+
+    leads = b"["
+    _prompt = re.compile(rb"\[((?:[INX]?COM|USB|AUX|FILE|SPECIAL|THISPORT)\d{0,2})\]")
+    _part = re.compile(rb"\[[A-Z]*\d{0,2}")
+
+    def scan(self, buffer: bytearray, at: int, start: int) -> Taken[Prompt] | Refused | None:
+        """See `framing.Format`."""
+        prompt = self._prompt.match(buffer, at)
+        if prompt is not None:
+            return Taken(prompt.end(), "novatel.prompt", Prompt(start, prompt[1].decode("ascii")))
+        part = self._part.match(buffer, at, at + 12)
+        return None if part is not None and part.end() == len(buffer) and len(buffer) - at < 12 else CHANCE

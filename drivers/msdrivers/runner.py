@@ -1,0 +1,296 @@
+"""The runner: carries between a station and a line, keeps the line open, stamps what was measured, and reports."""
+
+from __future__ import annotations
+
+import logging
+import random
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar, runtime_checkable
+
+from modelserver.messages import DeviceSample, DriverHealth, DriverPhase, VehicleCommand
+from msdrivers.device_clock import DeviceClock
+from msdrivers.links import Link, LinkError, PlayedOutError
+from msdrivers.raw_log import Time
+from msdrivers.reporting import Reporter
+from msdrivers.stamping import Stamper
+from msdrivers.station import Measured, Now, Output, Reopen, Send, Station, Told
+
+log = logging.getLogger(__name__)
+
+U = TypeVar("U")
+
+MAX_COUNTERS = 200
+"""Of a station that go out in a report; a report takes a few more."""
+
+
+class SystemTime:
+    """The host's clocks."""
+
+    def now(self) -> Now:
+        """Return the instant."""
+        return Now(time.monotonic_ns(), time.time_ns() // 1000)
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+        time.sleep(seconds)
+
+
+@dataclass(frozen=True, slots=True)
+class RunnerSettings:
+    """How a driver is run. Times in seconds.
+
+    source, device: its name in the vehicle file and the kind of its device.
+    first_wait, last_wait: before the line is tried again, growing; each is varied by a fifth, so that many drivers do
+        not knock at once. silence: after so long without a unit the device is called silent, and after `reopen` the
+        line is opened anew. report: between reports. look: so often it is looked whether to
+        end, and for commands.
+    """
+
+    source: str
+    device: str
+    first_wait: float = 0.2
+    last_wait: float = 0.5
+    silence: float = 3.0
+    reopen: float = 10.0
+    report: float = 1.0
+    look: float = 0.2
+
+
+@runtime_checkable
+class Commanded(Protocol[U]):
+    """A station that takes commands from the bus too."""
+
+    def command(self, command: VehicleCommand, now: Now) -> Sequence[Output[U]]:
+        """Take a command."""
+        ...
+
+
+class Runner(Generic[U]):
+    """Runs one station on one line. `publish` takes the stamped samples, `report` how the driver is."""
+
+    def __init__(
+        self,
+        station: Station[U],
+        link: Link[U],
+        settings: RunnerSettings,
+        clock: Time,
+        publish: Callable[[DeviceSample], object] = lambda sample: None,
+        report: Callable[[DriverHealth], object] = lambda health: None,
+        rng: random.Random | None = None,
+    ):
+        self.counts: Counter[str] = Counter()
+        """Errors of the runner's own, by kind."""
+        self.reconnects = 0
+        self.played_out = False
+        self._station, self._link, self._settings, self._clock = station, link, settings, clock
+        self._publish, self._report = publish, report
+        self._rng = rng or random.Random()
+        self._stamper = Stamper(DeviceClock())
+        self._stopping = False
+        self._is_open = self._was_open = False
+        self._baud: int | None = None
+        self._wait = settings.first_wait
+        now = clock.now()
+        self._open_ns = self._heard_ns = now.monotonic_ns
+        self._reporter = Reporter(settings.source, settings.silence, settings.report, now, self._send_report)
+
+    @property
+    def samples(self) -> int:
+        """How many samples have gone out."""
+        return self._reporter.samples
+
+    def run(self, attend: Callable[[], object] = lambda: None) -> None:
+        """Run until `stop` is called or a recording has ended, then leave the device as the station will have it.
+
+        `attend` is called before each pass.
+        """
+        try:
+            while not self._stopping:
+                attend()
+                self.turn()
+        finally:
+            self._finish()
+
+    def stop(self) -> None:
+        """Make `run` return. May be called from a signal handler."""
+        self._stopping = self._reporter.is_ending = True
+
+    def command(self, command: VehicleCommand) -> None:
+        """Hand a command to a station that takes them; without an open line it goes nowhere and is counted."""
+        station = self._station
+        if not self._is_open or not isinstance(station, Commanded):
+            self.counts["commands_lost"] += 1
+            return
+        now = self._clock.now()
+        try:
+            self._do(self._asked("command", lambda: station.command(command, now)))
+        except LinkError as error:
+            self._lost(error)
+
+    def turn(self) -> None:
+        """Make one pass: open the line, or take what it brings; wake the station when it is due; report."""
+        if not self._is_open:
+            self._open_when_due()
+        else:
+            try:
+                self._carry()
+            except PlayedOutError as error:
+                self.played_out = True
+                self._lost(error)
+                self.stop()
+            except LinkError as error:
+                self._lost(error)
+        self._reporter.woken(self._clock.now())
+
+    # --- the line ---------------------------------------------------------------------------------------------
+
+    def _open_when_due(self) -> None:
+        now = self._clock.now()
+        left = (self._open_ns - now.monotonic_ns) * 1e-9
+        if left > 0:
+            self._clock.sleep(min(left, self._settings.look))
+            return
+        try:
+            self._link.open(self._baud)
+        except LinkError as error:
+            self._lost(error)
+            return
+        self.reconnects += self._was_open
+        self._is_open = self._was_open = True
+        now = self._clock.now()
+        self._heard_ns = now.monotonic_ns
+        self._tell(DriverPhase.WAITING, f"{self._link.description} is open")
+        try:
+            self._do(self._asked("opened", lambda: self._station.opened(now)))
+        except LinkError as error:
+            self._lost(error)
+
+    def _lost(self, error: LinkError) -> None:
+        self._close()
+        # also after one that was open: another who takes its place must not make a busy loop
+        self._try_again(self._wait * self._rng.uniform(0.8, 1.2))
+        self._wait = min(self._wait * 2.0, self._settings.last_wait)
+        self._tell(DriverPhase.CLOSED, str(error))
+
+    def _close(self) -> None:
+        self._link.close()
+        self._is_open = self._reporter.is_silent = False
+
+    def _try_again(self, seconds: float) -> None:
+        self._open_ns = self._clock.now().monotonic_ns + round(seconds * 1e9)
+
+    # --- the station ------------------------------------------------------------------------------------------
+
+    def _carry(self) -> None:
+        due = self._station.due()
+        now = self._clock.now()
+        next_ns = min(self._reporter.due_ns, due) if due is not None else self._reporter.due_ns
+        units = self._link.poll(min(max(0.0, (next_ns - now.monotonic_ns) * 1e-9), self._settings.look))
+        now = self._clock.now()
+        if units:
+            self._heard_ns, self._reporter.is_silent = now.monotonic_ns, False
+            self._wait = self._settings.first_wait
+        for unit in units:
+            self._do(self._asked("received", lambda unit=unit: self._station.received(unit, now)))  # type: ignore[misc]
+            if not self._is_open:
+                return
+        due = self._station.due()
+        if due is not None and now.monotonic_ns >= due:
+            self._do(self._asked("woken", lambda: self._station.woken(now)))
+        self._watch(now)
+
+    def _asked(self, what: str, ask: Callable[[], Sequence[Output[U]]]) -> Sequence[Output[U]]:
+        """Ask the station; an error of its own is counted and told, and the driver goes on."""
+        try:
+            return ask()
+        except Exception:
+            self._failed(what)
+            return ()
+
+    def _failed(self, what: str) -> None:
+        self.counts[f"errors.{what}"] += 1
+        count = self.counts[f"errors.{what}"]
+        # the first, the tenth, the hundredth: a flood must not fill the log
+        if str(count).strip("0") == "1":
+            log.exception("%s: an error of the driver's own, number %d in %s", self._settings.source, count, what)
+
+    def _do(self, outputs: Sequence[Output[U]]) -> None:
+        for output in outputs:
+            if isinstance(output, Send):
+                self._link.send(output.unit)
+            elif isinstance(output, Measured):
+                self._measured(output)
+            elif isinstance(output, Told):
+                self._tell(DriverPhase[output.phase.name], output.text)
+            else:
+                self._reopen(output)
+                return
+
+    def _measured(self, measured: Measured) -> None:
+        try:
+            self._publish(self._stamper.stamp(measured))
+        except Exception:
+            self._failed("publish")
+            return
+        self._reporter.measured(self._clock.now())
+
+    def _reopen(self, wish: Reopen) -> None:
+        self._close()
+        self._baud = wish.baud or self._baud
+        self._tell(DriverPhase.CLOSED, f"opening anew: {wish.why}")
+        self._try_again(0.0)
+
+    def _watch(self, now: Now) -> None:
+        quiet = (now.monotonic_ns - self._heard_ns) * 1e-9
+        if quiet >= self._settings.silence and not self._reporter.is_silent:
+            self._reporter.is_silent = True
+            self._reporter.announce(now)
+        if quiet >= self._settings.reopen:
+            self._reopen(Reopen(f"nothing heard for {quiet:.0f} s"))
+
+    # --- telling ----------------------------------------------------------------------------------------------
+
+    def _tell(self, phase: DriverPhase, text: str) -> None:
+        self._reporter.tell(phase, text, self._clock.now())
+
+    def _send_report(self, now: Now) -> None:
+        try:
+            self._report(self.health(now))
+        except Exception:
+            self._failed("report")
+
+    def health(self, now: Now) -> DriverHealth:
+        """Return how the driver is."""
+        phase, text = self._reporter.state
+        clock = self._stamper.clock
+        return DriverHealth(
+            utime=now.utime,
+            source=self._settings.source,
+            device=self._settings.device,
+            phase=phase,
+            text=text,
+            link=self._link.description,
+            baud=self._link.baud,
+            reconnects=self.reconnects,
+            samples=self.samples,
+            rate_hz=self._reporter.rate_hz,
+            age=self._reporter.age(now),
+            clock_offset=clock.offset,
+            clock_drift=clock.drift,
+            clock_sigma=self._stamper.sigma,
+            clock_restarts=clock.restarts,
+            counters=(*sorted(self._station.counts.items())[:MAX_COUNTERS], *sorted(self.counts.items())),
+        )
+
+    def _finish(self) -> None:
+        if self._is_open:
+            now = self._clock.now()
+            try:
+                self._do(self._asked("leaving", lambda: self._station.leaving(now)))
+            except LinkError as error:
+                log.warning("%s: the device could not be left as it was found: %s", self._settings.source, error)
+            self._close()
+        self._tell(DriverPhase.CLOSED, "the recording has ended" if self.played_out else "ended")

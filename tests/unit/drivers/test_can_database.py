@@ -1,0 +1,221 @@
+"""DBC files: signals found, frames to numbers and back, and what a person is told of a mapping that does not fit."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from support_vehicle_bus import DBC, METRES_PER_COUNT, RAPTOR_COMMAND, RAPTOR_STATUS, raptor_dbc, wheel
+
+from modelserver.errors import ConfigError
+from msdrivers.protocol.can.database import CanDatabase, FrameError, parse_dbc
+from msdrivers.protocol.can.frame import CanFrame, FrameKey, bus_off
+from msdrivers.protocol.can.mapping import (
+    CommandMap,
+    CountMap,
+    DirectionMap,
+    SignalMap,
+    SpeedMap,
+    StatusMap,
+    WheelMap,
+)
+from msdrivers.protocol.can.vehicle import bind_command, bind_status
+from msdrivers.protocol.can.wheels import bind_wheels
+
+MIXED = """VERSION ""
+NS_ :
+BS_:
+BU_: A
+BO_ 2566834688 Wide: 8 A
+ SG_ Up : 7|16@0+ (0.5,-100) [0|0] "" A
+ SG_ Real : 32|32@1- (1,0) [0|0] "" A
+BO_ 17 Many: 2 A
+ SG_ Which M : 0|8@1+ (1,0) [0|0] "" A
+ SG_ First m0 : 8|8@1+ (1,0) [0|0] "" A
+ SG_ Second m1 : 8|8@1- (1,0) [0|0] "" A
+
+SIG_VALTYPE_ 2566834688 Real : 1;
+"""
+
+
+@pytest.fixture(scope="module")
+def database() -> CanDatabase:
+    return raptor_dbc()
+
+
+@pytest.fixture(scope="module")
+def mixed() -> CanDatabase:
+    return parse_dbc(MIXED, "mixed.dbc")
+
+
+def test_given_the_raptors_file_then_every_mapped_signal_is_there(database: CanDatabase) -> None:
+    assert bind_wheels({"front_left": wheel("Left"), "front_right": wheel("Right")}, database, "wheels")
+    assert len(bind_status(RAPTOR_STATUS, database, "status").signals) == 7
+    assert bind_command(RAPTOR_COMMAND, database, "command").alive is not None
+
+
+def test_given_a_frame_written_by_hand_then_the_bits_are_read_as_the_file_says(database: CanDatabase) -> None:
+    frame = CanFrame(0x100, bytes.fromhex("3412 ffff 09 000000"))
+    assert database.decode(frame) == {
+        "FrontLeftCount": 0x1234,
+        "FrontRightCount": 0xFFFF,
+        "FrontLeftDirection": 1,
+        "FrontRightDirection": 2,
+    }
+
+
+def test_given_big_endian_extended_and_floating_point_signals_then_they_are_read(mixed: CanDatabase) -> None:
+    key = next(key for key in mixed.by_key if key.is_extended)
+    frame = CanFrame(key.arbitration_id, bytes.fromhex("01f4 0000 0000c03f"), True)
+    assert mixed.decode(frame) == {"Up": 500, "Real": 1.5}
+    assert mixed.signals("Wide")["Up"].physical(500) == 150.0
+    with pytest.raises(FrameError, match="no message"):
+        mixed.decode(CanFrame(key.arbitration_id, frame.data, False))
+
+
+def test_given_a_multiplexed_frame_then_only_what_it_holds_is_read(mixed: CanDatabase) -> None:
+    assert mixed.decode(CanFrame(17, bytes((1, 255)))) == {"Which": 1, "Second": -1}
+    with pytest.raises(FrameError) as caught:
+        mixed.decode(CanFrame(17, bytes((2, 255))))
+    assert caught.value.reason == "multiplexer"
+
+
+@pytest.mark.parametrize("length", [0, 1, 7, 9, 64])
+def test_given_a_wrong_length_then_the_frame_is_refused_with_both_lengths(database: CanDatabase, length: int) -> None:
+    with pytest.raises(FrameError, match=rf"WheelCounts\) has {length} bytes where raptor.dbc says 8") as caught:
+        database.decode(CanFrame(0x100, bytes(length)))
+    assert caught.value.reason == "length"
+
+
+@pytest.mark.parametrize(
+    ("raw", "value"), [(0, 0.0), (20_000, 20.0), (20_001, None), (65_535, None), (math.nan, None), (math.inf, None)]
+)
+def test_given_a_value_beyond_the_files_range_then_it_is_not_said(
+    database: CanDatabase, raw: float, value: float | None
+) -> None:
+    assert database.signals("WheelSpeeds")["FrontLeftSpeed"].physical(raw) == value
+
+
+@pytest.mark.parametrize("physical", [-1e9, -20.0, -0.0004, 0.0, 1.2344, 20.0, 1e9])
+def test_given_any_value_when_written_then_it_is_the_nearest_that_the_signal_holds(
+    database: CanDatabase, physical: float
+) -> None:
+    signal = database.signals("VehicleStatus")["ForwardSpeed"]
+    held = signal.physical(signal.raw(physical))
+    assert held == pytest.approx(min(max(physical, -20.0), 20.0), abs=0.0005)
+
+
+def test_given_a_command_then_the_frame_holds_it(database: CanDatabase) -> None:
+    command = bind_command(RAPTOR_COMMAND, database, "command")
+    frame = command.frame(-1.5, math.radians(10.0), 258)
+    assert frame.key == FrameKey(0x300)
+    assert database.decode(frame) == {"Enable": 1, "Alive": 2, "ForwardSpeed": -1500, "SteeringAngle": 1000}
+    assert database.decode(command.frame(0.0, 0.0, 0, is_stop=True))["Enable"] == 0
+
+
+def test_given_error_frames_then_bus_off_is_told_from_others() -> None:
+    assert bus_off().is_bus_off
+    assert not CanFrame(0x4, is_error=True).is_bus_off
+    assert not CanFrame(0x40).is_bus_off
+
+
+# --- what does not fit ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "said"),
+    [
+        ("hello", 1, "Invalid syntax"),
+        ("", 1, "Invalid syntax"),
+        ("BO_ 1 M: 8 A\n SG_ x : zz\n", 2, "Invalid syntax"),
+        ('BO_ 1 M: 1 A\n SG_ x : 0|16@1+ (1,0) [0|0] "" A\n', 0, "does not fit"),
+        (
+            'BO_ 1 M: 1 A\n SG_ x : 0|8@1+ (1,0) [0|0] "" A\nBO_ 1 N: 1 A\n SG_ y : 0|8@1+ (1,0) [0|0] "" A\n',
+            0,
+            "one id",
+        ),
+        ("\0" * 100, 1, "Invalid syntax"),
+    ],
+    ids=["words", "empty", "signal", "too_long", "twice", "zeros"],
+)
+def test_given_what_is_no_dbc_file_then_it_is_told_where_and_why(text: str, line: int, said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        parse_dbc(text, "bad.dbc")
+    (problem,) = caught.value.problems
+    assert (problem.file, problem.line) == ("bad.dbc", line)
+    assert said in problem.message
+    assert problem.fix
+    assert len(str(problem)) < 500
+
+
+def test_given_mistyped_names_then_every_one_is_told_with_the_nearest(database: CanDatabase) -> None:
+    wheels = {
+        "front_left": WheelMap(CountMap("WheelCounts.FrontLeftCuont", 0.01), SpeedMap("WheelSpeds.FrontLeftSpeed")),
+        "front_right": WheelMap(CountMap("WheelCounts.Zzzzz", 0.01)),
+    }
+    with pytest.raises(ConfigError) as caught:
+        bind_wheels(wheels, database, "drivers.wheels.wheels")
+    first, second, third = map(str, caught.value.problems)
+    assert "raptor.dbc (drivers.wheels.wheels.front_left.count)" in first
+    assert "message WheelCounts has no signal 'FrontLeftCuont'" in first
+    assert "write WheelCounts.FrontLeftCount" in first
+    assert "there is no message 'WheelSpeds'; nearest: WheelSpeeds" in second
+    assert "known there: FrontLeftCount, FrontRightCount" in third
+
+
+def test_given_signals_that_cannot_be_what_they_are_mapped_to_then_it_is_told(mixed: CanDatabase) -> None:
+    for wheel_map, said in (
+        (WheelMap(CountMap("Wide.Real", 0.01)), "floating-point"),
+        (WheelMap(CountMap("Wide.Up", 0.01, wrap=1 << 17)), "does not fit into the 16 bits"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            bind_wheels({"a": wheel_map}, mixed, "wheels")
+    with pytest.raises(ConfigError, match="floating-point"):
+        bind_status(StatusMap(fault_bits="Wide.Real"), mixed, "status")
+
+
+def test_given_a_signed_speed_mapped_as_a_magnitude_then_it_is_told(database: CanDatabase) -> None:
+    speed = SpeedMap("VehicleStatus.ForwardSpeed", is_magnitude=True)
+    with pytest.raises(ConfigError, match="goes down to -20"):
+        bind_wheels({"a": WheelMap(None, speed, DirectionMap("VehicleStatus.Mode"))}, database, "wheels")
+
+
+def test_given_a_command_that_leaves_a_signal_without_value_then_it_is_told(database: CanDatabase) -> None:
+    speed, angle = SignalMap("VehicleCommand.ForwardSpeed"), SignalMap("VehicleCommand.SteeringAngle")
+    with pytest.raises(ConfigError) as caught:
+        bind_command(CommandMap(speed, angle, driving={"Enalbe": 1}), database, "command")
+    text = str(caught.value)
+    assert "no signal 'Enalbe'; nearest: Enable" in text
+    assert "VehicleCommand.Alive is given no value" in text
+    with pytest.raises(ConfigError, match="cannot hold 2"):
+        bind_command(CommandMap(speed, angle, "VehicleCommand.Alive", {"Enable": 2}), database, "command")
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: SignalMap("NoDot"), "signal is written Message.Signal"),
+        (lambda: SignalMap("A.B.C"), "signal is written Message.Signal"),
+        (lambda: SignalMap("A.B", 0.0), "scale is a number and not 0"),
+        (lambda: SignalMap("A.B", 1.0, math.inf), "offset is a number"),
+        (lambda: CountMap("A.B", 0.0), "metres_per_count"),
+        (lambda: CountMap("A.B", math.nan), "metres_per_count"),
+        (lambda: CountMap("A.B", 0.1, wrap=2), "wrap is 0"),
+        (lambda: SpeedMap("A.B", sigma=-1.0), "sigma is not negative"),
+        (lambda: DirectionMap("A.B", 0, 1, 1), "three different"),
+        (lambda: WheelMap(), "count or speed is needed"),
+        (lambda: WheelMap(CountMap("A.B", 0.1, up_only=True)), r"direction is needed with count\.up_only"),
+        (lambda: StatusMap(mode="A.B"), "mode and modes"),
+        (lambda: StatusMap(mode="A.B", modes={"driving": 1}), "modes knows manual"),
+        (lambda: StatusMap(mode="A.B", modes={"manual": 1, "fault": 1}), "a number of its own"),
+        (lambda: CommandMap(SignalMap("A.B"), SignalMap("C.D")), "a command is one message, A; C.D"),
+    ],
+)
+def test_given_settings_that_cannot_be_then_the_key_is_named(make: object, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        make()  # type: ignore[operator]
+
+
+def test_the_raptors_file_is_told_to_be_this_projects_choice() -> None:
+    assert "this project's choice" in DBC.read_text(encoding="utf-8")
+    assert METRES_PER_COUNT > 0

@@ -1,0 +1,156 @@
+"""The emulated 3DM-GX1, asked by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from support_gx1 import START_UTIME, Line, angle_between, standing, turning
+
+from modelserver.geodesy import Geodesy, origin_at
+from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
+from modelserver.simulation import ImuModel, Phase, Trajectory
+from modelserver.simulation.imu import readings
+from modelserver.simulation.magnetometer import MagnetometerModel
+from modelserver.spatial import so3
+from modelserver.spatial.pose import Pose
+from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings, Heading
+from msdrivers.emulate.gx1 import Gx1Emulator
+from msdrivers.emulate.gx1_samples import Samples
+from msdrivers.emulate.gx1_unit import Eeprom, Fault, Gx1Unit
+from msdrivers.protocol.gx1 import LAYOUTS, Address, Command, Gx1Parser, Packet, requests
+from msdrivers.station import Now, Send
+
+S = 1_000_000_000
+
+
+class Hand:
+    """Asks a device and reads all that it answers."""
+
+    def __init__(self, device: Gx1Emulator):
+        self.device, self.ns = device, 5 * S
+        self.parser = Gx1Parser()
+        self.parser.stream(*LAYOUTS)
+        device.opened(self.now())
+
+    def now(self) -> Now:
+        return Now(self.ns, START_UTIME + (self.ns - 5 * S) // 1000)
+
+    def ask(self, request: bytes = b"", wait: float = 0.005) -> list[Packet]:
+        """Send a request; return what comes until `wait` seconds later."""
+        raw = b"".join(o.unit for o in self.device.received(request, self.now()) if isinstance(o, Send))
+        until = self.ns + round(wait * S)
+        while (due := self.device.due()) is not None and due <= until:
+            self.ns = max(due, self.ns)
+            raw += b"".join(o.unit for o in self.device.woken(self.now()) if isinstance(o, Send))
+        self.ns = until
+        return self.parser.feed(raw)
+
+
+def sample(at: float, orientation: so3.Quaternion, reference: OrientationReference) -> ImuSample:
+    return ImuSample(
+        SensorHeader(START_UTIME + round(at * 1e6)), orientation=orientation, orientation_reference=reference
+    )
+
+
+def test_given_samples_against_enu_then_the_device_gives_north_east_down():
+    # axes forward, left, up, facing north: in north, east, down half a turn about north
+    facing_north = so3.from_rpy(0.0, 0.0, math.pi / 2)
+    samples = Samples([sample(0.0, facing_north, OrientationReference.ENU)])
+    felt = samples.at(START_UTIME)
+    assert felt is not None
+    assert so3.rotate(felt.orientation, (1.0, 0.0, 0.0)) == pytest.approx((1.0, 0.0, 0.0), abs=1e-12)
+    assert so3.rotate(felt.orientation, (0.0, 0.0, 1.0)) == pytest.approx((0.0, 0.0, -1.0), abs=1e-12)
+
+
+def test_given_an_instant_between_samples_then_it_is_interpolated_before_the_first_held_and_after_the_last_none():
+    samples = Samples(turning((0.0, 0.0, 1.0), seconds=1.0, hz=10.0))
+    first = samples.at(START_UTIME - 1_000_000)
+    between = samples.at(START_UTIME + 150_000)
+    last = samples.at(START_UTIME + 1_000_000)
+    assert first is not None
+    assert between is not None
+    assert last is not None
+    assert first.orientation == so3.IDENTITY
+    assert angle_between(between.orientation, so3.from_rpy(0.0, 0.0, 0.15)) < 1e-9
+    assert angle_between(last.orientation, so3.from_rpy(0.0, 0.0, 1.0)) < 1e-9
+    assert samples.at(START_UTIME + 1_000_001) is None
+
+
+def test_given_the_end_of_the_samples_then_it_streams_no_more_and_still_tells_its_temperature():
+    hand = Hand(Gx1Emulator(standing(0.5), unit=Gx1Unit(streams=Command.EULER_VECTORS)))
+    assert len(hand.ask(wait=0.6)) == 51
+    assert hand.ask(requests.poll(Command.EULER_VECTORS), 0.1) == []
+    assert [packet.command for packet in hand.ask(requests.poll(Command.TEMPERATURE))] == [Command.TEMPERATURE]
+
+
+def test_given_a_stream_and_a_poll_then_replies_come_whole_in_order_with_ticks_that_rise():
+    hand = Hand(Gx1Emulator(standing(), unit=Gx1Unit(tick_offset=65_530)))
+    (started,) = hand.ask(requests.stream(Command.STABILISED_EULER))
+    assert started.field("streamed") == (Command.STABILISED_EULER,)
+    found = hand.ask(wait=0.1) + hand.ask(requests.poll(Command.TEMPERATURE), 0.1)
+    assert [packet.command for packet in found].count(Command.TEMPERATURE) == 1
+    ticks = [(packet.ticks + 6) % 65_536 for packet in found if packet.ticks is not None]
+    assert ticks == sorted(ticks)
+    assert ticks[-1] == 20
+    assert hand.parser.counts.total() == 0
+
+
+def test_given_a_command_that_cannot_be_streamed_then_it_is_not_answered():
+    device = Gx1Emulator(standing())
+    assert Hand(device).ask(requests.stream(Command.TEMPERATURE)) == []
+    assert device.streamed == 0
+
+
+def test_given_words_written_then_they_outlive_a_restart_and_the_timer_follows_only_then():
+    device = Gx1Emulator(standing(), Eeprom.factory(hundred_hertz=False))
+    hand = Hand(device)
+    for address, value in zip(Address.TIMER, (4, 10, 250, 10), strict=True):
+        (written,) = hand.ask(requests.write_eeprom(address, value))
+        assert written.unsigned == value
+    before = hand.ask(requests.poll(Command.TEMPERATURE), 0.65536)[0].ticks
+    assert hand.ask(requests.poll(Command.TEMPERATURE))[0].ticks == before + 100
+    device.strike(Fault(0.0, "restart"), hand.now())
+    assert hand.ask(requests.poll(Command.TEMPERATURE), 1.5) == []
+    assert hand.ask(requests.read_eeprom(Address.TIMER[0]))[0].unsigned == 4
+    before = hand.ask(requests.poll(Command.TEMPERATURE), 1.0)[0].ticks
+    assert hand.ask(requests.poll(Command.TEMPERATURE))[0].ticks == before + 100
+
+
+def test_given_an_address_without_a_word_then_it_reads_zero():
+    hand = Hand(Gx1Emulator(standing()))
+    assert hand.ask(b"\x28\x00\x83")[0].unsigned == 0
+    assert hand.ask(b"\x28\x40\x00")[0].unsigned == 0
+
+
+def test_given_a_wake_long_after_then_only_the_last_cycles_are_made_up_for():
+    device = Gx1Emulator(standing(), unit=Gx1Unit(streams=Command.STABILISED_EULER))
+    hand = Hand(device)
+    hand.ns += 20 * S
+    outputs = [output for output in device.woken(hand.now()) if isinstance(output, Send)]
+    assert 95 <= len(outputs) <= 101
+
+
+def test_given_a_simulated_drive_then_the_driver_gives_back_what_the_simulated_unit_felt():
+    mount = Pose.from_rpy((0.0, 0.0, 0.0), math.pi, 0.0, 0.0)
+    geodesy = Geodesy(origin_at(50.27, -111.18, 700.0))
+    drive = Trajectory([Phase(2.0), Phase(4.0, speed=4.0), Phase(6.0, curvature=0.1), Phase(4.0, speed=0.0)])
+    model = ImuModel(magnetometer=MagnetometerModel(), yaw_source=YawSource.MAGNETIC)
+    made = readings(model, drive, mount, geodesy, START_UTIME, 1, "imu")
+    felt = {each.header.utime: each for each, _ in zip(made, range(1500), strict=False)}
+    settings = Gx1Settings("imu", Command.QUATERNION_VECTORS, Heading.MAGNETIC)
+    line = Line(Gx1Driver(settings), Gx1Emulator(felt.values()))
+    line.run(14.0)
+    assert len(line.samples) > 1200
+    for measured in line.samples:
+        got = measured.sample
+        assert isinstance(got, ImuSample)
+        truth = felt[got.header.host_utime - 5000]
+        assert got.angular_velocity == pytest.approx(truth.angular_velocity, abs=1.4e-4)
+        assert got.specific_force == pytest.approx(truth.specific_force, abs=1.1e-3)
+        assert got.magnetic_field == pytest.approx(truth.magnetic_field, abs=4e-9)
+        assert got.orientation is not None
+        assert truth.orientation is not None
+        assert angle_between(got.orientation, truth.orientation) < 3e-4
+        assert got.yaw_source is YawSource.MAGNETIC
+    assert not any("specific_force_sign" in text for text in line.texts())

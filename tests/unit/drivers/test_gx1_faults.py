@@ -1,0 +1,271 @@
+"""What goes wrong with a 3DM-GX1 and its line, and what the driver makes of it."""
+
+from __future__ import annotations
+
+import itertools
+import random
+
+import pytest
+from support_gx1 import Line, Speaker, turning
+
+from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
+from msdrivers.emulate.gx1 import Gx1Emulator
+from msdrivers.emulate.gx1_unit import Eeprom, Fault, Gx1Unit
+from msdrivers.protocol.gx1 import Address, Command, Gains, Packet, requests
+from msdrivers.station import Now, Phase, Send
+
+
+def device_times(line: Line) -> list[int]:
+    return [measured.sample.header.device_utime for measured in line.samples]
+
+
+def line_with(*faults: Fault, settings: Gx1Settings | None = None, **more: object) -> Line:
+    device = Gx1Emulator(turning(), unit=Gx1Unit(faults=faults))
+    return Line(Gx1Driver(settings or Gx1Settings("imu")), device, **more)  # type: ignore[arg-type]
+
+
+def test_given_noise_between_replies_then_most_samples_come_and_every_one_is_true():
+    rng = random.Random(5)
+    line = line_with(pieces=rng, spoil=lambda unit: rng.randbytes(rng.randrange(8)) + unit)
+    line.run(20.0)
+    times = device_times(line)
+    steps = [b - a for a, b in itertools.pairwise(times)]
+    assert set(steps) == {10_000}
+    assert line.host.counts["skipped"] > 5000
+    assert line.host.counts.get("restarts", 0) == 0
+
+
+def test_given_a_line_that_spoils_one_byte_in_a_hundred_then_no_false_value_is_published():
+    rng = random.Random(6)
+    line = line_with(
+        spoil=lambda unit: bytes(byte ^ (1 << rng.randrange(8)) if rng.random() < 0.01 else byte for byte in unit)
+    )
+    line.run(30.0)
+    assert len(line.samples) > 1500
+    for measured in line.samples:
+        assert measured.sample.angular_velocity == pytest.approx((0.0, 0.0, 0.2), abs=2e-4)
+    times = device_times(line)
+    assert times == sorted(set(times))
+    assert line.host.counts["rejected.checksum"] > 100
+
+
+def test_given_dropped_and_corrupt_replies_then_they_are_missing_and_counted_and_nothing_is_repeated():
+    line = line_with(Fault(4.0, "drop", 3), Fault(5.0, "corrupt", 2))
+    line.run(7.0)
+    times = device_times(line)
+    steps = [b - a for a, b in itertools.pairwise(times) if b - a != 10_000]
+    assert steps == [40_000, 30_000]
+    assert line.host.counts["rejected.checksum"] == 2
+
+
+def test_given_replies_that_come_twice_then_each_is_published_once():
+    line = line_with(spoil=lambda unit: unit * 2)
+    line.run(5.0)
+    times = device_times(line)
+    assert len(times) == len(set(times)) > 300
+    assert line.host.counts["rejected.repeated"] >= len(times) - 1
+
+
+def test_given_a_restart_then_it_is_noticed_and_the_device_is_set_up_anew():
+    line = line_with(Fault(5.0, "restart"))
+    line.run(12.0)
+    (silent,) = line.texts(Phase.SILENT)
+    assert "no message 0x31 that can be used for 0.5 s" in silent
+    assert line.texts(Phase.STREAMING) == ["3DM-GX1 serial 1234, firmware 3.1.00 streams 0x31"] * 2
+    times = device_times(line)
+    assert times == sorted(times)
+    gaps = [b - a for a, b in itertools.pairwise(times) if b - a != 10_000]
+    # the device's time goes ahead by more than a turn of its counter, and so cannot pass for the one before
+    assert len(gaps) == 1
+    assert gaps[0] > 655_360_000
+    assert line.host.counts["restarts"] == 1
+
+
+def test_given_a_jump_of_the_ticks_then_it_is_noticed_and_the_device_is_set_up_anew():
+    line = line_with(Fault(5.0, "jump", 20_000))
+    line.run(9.0)
+    assert any("its ticks jumped" in text for text in line.texts(Phase.SILENT))
+    assert line.host.counts["rejected.ticks"] == 2
+    assert line.host.counts["restarts"] == 1
+    assert line.texts(Phase.STREAMING)[-1].endswith("streams 0x31")
+    assert len(line.samples) > 550
+
+
+def test_given_ticks_that_run_backwards_then_nothing_is_published_and_it_is_said():
+    line = line_with(settings=Gx1Settings("imu", tick=0.01))
+    line.run(3.0)
+    published = len(line.samples)
+    driver = line.host
+    # from now on a device that counts down
+    outputs, told = [], []
+    for k in range(200):
+        line.now_ns += 10_000_000
+        raw = reply_at((30_000 - k) % 65_536)
+        outputs += driver.received(raw, line.now())
+        due = driver.due()
+        if due is not None and due <= line.now_ns:
+            told = [output.text for output in driver.woken(line.now()) if hasattr(output, "text")]
+            if told:
+                break
+    assert published > 100
+    assert outputs == []
+    assert "rejected since the start: " in told[0]
+    assert "ticks" in told[0]
+
+
+def reply_at(ticks: int) -> bytes:
+    return Packet(Command.EULER_VECTORS, (1, 2, 3, 4, 5, 6, 7, 8, 9), ticks).to_bytes()
+
+
+def test_given_a_stall_then_it_is_silent_and_afterwards_streams_again_without_old_values():
+    line = line_with(Fault(5.0, "stall", 3.0))
+    line.run(14.0)
+    assert line.texts(Phase.SILENT)
+    hosts = [measured.sample.header.host_utime for measured in line.samples]
+    gaps = [b - a for a, b in itertools.pairwise(hosts) if b - a > 100_000]
+    assert len(gaps) == 1
+    assert 3_000_000 < gaps[0] < 7_000_000
+    times = device_times(line)
+    assert times == sorted(set(times))
+
+
+def test_given_a_host_that_was_busy_for_two_seconds_then_what_waited_is_published_with_its_own_times():
+    line = line_with(settings=Gx1Settings("imu", silence=5.0))
+    line.run(4.0)
+    device, driver = line.device, line.host
+    waiting = b""
+    for _ in range(200):
+        line.now_ns += 10_000_000
+        waiting += b"".join(o.unit for o in device.woken(line.now()) if isinstance(o, Send))
+    before = len(line.samples)
+    line.samples += driver.received(waiting, line.now())  # type: ignore[arg-type]
+    times = device_times(line)
+    assert len(times) - before >= 199
+    assert {b - a for a, b in itertools.pairwise(times)} == {10_000}
+    assert driver.counts.get("restarts", 0) == 0
+
+
+@pytest.mark.parametrize(
+    ("gains", "text"),
+    [
+        (Gains(0, 7000, 2000), "the gyro gain in its EEPROM (address 130) is 0"),
+        (Gains(8500, 0, 2000), "the accelerometer gain in its EEPROM (address 230) is 0"),
+        (Gains(8500, 7000, 0xFFFF), "the magnetometer gain in its EEPROM (address 232) is 65535"),
+        (Gains(64, 7000, 2000), "that of a 3DM-G, the model before"),
+    ],
+)
+def test_given_gains_that_scale_nothing_then_nothing_is_published_and_it_is_said_what_to_do(gains, text):
+    device = Gx1Emulator(turning(), Eeprom.factory(gains))
+    line = Line(Gx1Driver(Gx1Settings("imu")), device)
+    line.run(5.0)
+    assert line.samples == []
+    (silent,) = line.texts(Phase.SILENT)
+    assert text in silent
+    assert "nothing is published, trying again in 5 s" in silent
+    # mended meanwhile: it goes on by itself
+    device.eeprom = Eeprom.factory()
+    line.run(6.0)
+    assert line.samples
+
+
+def test_given_timer_words_of_zero_then_it_is_said_what_to_write():
+    device = Gx1Emulator(turning(), Eeprom.factory().written(dict.fromkeys(Address.TIMER, 0)))
+    line = Line(Gx1Driver(Gx1Settings("imu")), device)
+    line.run(6.0)
+    assert "write the defaults 16 16 256 1" in line.texts(Phase.SILENT)[0]
+    assert line.samples == []
+
+
+def test_given_a_gps_on_the_port_then_it_is_said_what_was_heard_at_which_baud_rates():
+    line = Line(Gx1Driver(Gx1Settings("imu")), Speaker(b"$GPGGA,123519,4807.038,N*47\r\n"), baud=115200)
+    line.run(30.0)
+    silent = line.texts(Phase.SILENT)[0]
+    assert "no 3DM-GX1 answers on this line: at 38400 baud heard " in silent
+    assert "at 115200 baud heard " in silent
+    assert "'$GPGGA,123519,4807.038,N*47" in silent
+    assert "check which port the 3DM-GX1 is on" in silent
+    assert {reopen.baud for reopen in line.reopened} == {38400, 115200}
+    assert line.samples == []
+
+
+def test_given_nobody_on_the_port_then_it_is_said_that_nothing_was_heard():
+    line = Line(Gx1Driver(Gx1Settings("imu")), Speaker(b""))
+    line.run(9.0)
+    silent = line.texts(Phase.SILENT)[0]
+    assert "at 38400 baud heard nothing; at 115200 baud heard nothing; check the device's power" in silent
+    assert line.host.leaving(line.now()) == []
+
+
+def test_given_a_device_at_the_second_baud_rate_then_it_is_found_there():
+    line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(turning()), baud=115200)
+    line.run(9.0)
+    assert [reopen.baud for reopen in line.reopened] == [115200]
+    assert any("answers at 115200 baud" in text for text in line.texts())
+    assert line.samples
+
+
+def test_given_random_bytes_for_a_device_then_nothing_is_published():
+    rng = random.Random(9)
+    speaker = Speaker(b"\0" * 100, 0.01)
+    line = Line(Gx1Driver(Gx1Settings("imu")), speaker, spoil=lambda unit: rng.randbytes(len(unit)))
+    line.run(30.0)
+    assert line.samples == []
+    assert line.texts(Phase.SILENT)
+
+
+def test_given_a_late_answer_to_a_read_that_was_asked_twice_then_it_is_not_taken_for_the_next():
+    line = line_with()
+    late: list[bytes] = []
+
+    def spoil(unit: bytes) -> bytes:
+        if unit[0] != Command.READ_EEPROM or late:
+            return unit
+        # comes just after the same was asked again, and before the reply to that
+        late.append(unit)
+        line._to_host.append((line.now_ns + 496_000_000, unit))
+        return b""
+
+    line.spoil = spoil
+    line.run(6.0)
+    assert line.sent.count(requests.read_eeprom(Address.GYRO_GAIN)) == 2
+    assert line.samples[-1].sample.specific_force == pytest.approx((0.0, 0.0, -9.80665), abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("message", "words"),
+    [
+        (Command.EULER_VECTORS, (0, 16_385, 0, 0, 0, 0, 0, 0, 0)),
+        (Command.QUATERNION_VECTORS, (0,) * 13),
+        (Command.QUATERNION_VECTORS, (8192, 8192, *(0,) * 11)),
+    ],
+)
+def test_given_an_orientation_that_cannot_be_then_the_reply_is_rejected(message, words):
+    line = line_with(settings=Gx1Settings("imu", message))
+    line.run(3.0)
+    ticks = round(line.samples[-1].sample.header.device_utime / 10_000) % 65_536 + 1
+    line.now_ns += 10_000_000
+    assert line.host.received(Packet(message, words, ticks).to_bytes(), line.now()) == []
+    assert line.host.counts["rejected.content"] == 1
+
+
+def test_given_the_line_opened_anew_after_it_was_lost_then_it_is_set_up_again():
+    line = line_with()
+    line.run(4.0)
+    before = len(line.samples)
+    line._to_host.clear()
+    line._from_host(line.host.opened(line.now()))
+    line.run(4.0)
+    assert len(line.samples) > before + 200
+    line.leave()
+    assert line.device.streamed == 0
+
+
+def test_given_a_fault_of_an_unknown_kind_then_it_is_refused():
+    with pytest.raises(ValueError, match="there are drop, corrupt, stall"):
+        Fault(1.0, "explode")
+
+
+def test_given_an_emulator_woken_before_it_is_opened_then_it_says_nothing():
+    device = Gx1Emulator(turning())
+    assert device.woken(Now(0, 0)) == []
+    assert device.due() is None

@@ -1,0 +1,386 @@
+"""Real lines between two ends in one process, and what they say when they cannot be opened."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+
+from msdrivers.links import Link, LinkError, ports
+from msdrivers.links import can_bus as can_module
+from msdrivers.links import serial_line as serial_module
+from msdrivers.links.can_bus import CanLink
+from msdrivers.links.modbus import ANSWER_S, ModbusLink, ModbusServerLink, modbus_link
+from msdrivers.links.pty import PtyLink
+from msdrivers.links.serial_line import SerialLink
+from msdrivers.links.tcp import TcpLink, TcpServerLink
+from msdrivers.protocol.can.frame import CanFrame
+from msdrivers.protocol.modbus.registers import (
+    FailureKind,
+    ModbusFailure,
+    ModbusUnit,
+    ReadRegisters,
+    Registers,
+    Table,
+    WriteRegisters,
+    Written,
+)
+
+PATIENCE_S = 10.0
+
+
+def heard(link: Link[Any], count: int, other: Link[Any] | None = None) -> list[Any]:
+    """Return what comes until there are `count` units, or bytes; `other` is polled meanwhile."""
+    found: list[Any] = []
+    end = time.monotonic() + PATIENCE_S
+    while sum(len(unit) if isinstance(unit, bytes) else 1 for unit in found) < count and time.monotonic() < end:
+        if other is not None:
+            other.poll(0.0)
+        found += link.poll(0.05)
+    return found
+
+
+def lost(link: Link[Any]) -> LinkError:
+    """Return the error with which a line says that it is lost."""
+    with pytest.raises(LinkError) as caught:
+        heard(link, 1 << 30)
+    return caught.value
+
+
+@pytest.fixture
+def pty() -> Iterator[PtyLink]:
+    link = PtyLink()
+    link.open()
+    yield link
+    link.close()
+
+
+@pytest.fixture
+def server() -> Iterator[TcpServerLink]:
+    link = TcpServerLink(0)
+    link.open()
+    yield link
+    link.close()
+
+
+def port_of(server: TcpServerLink | ModbusServerLink) -> int:
+    return int(server.description.rpartition(":")[2])
+
+
+# --- serial ports -------------------------------------------------------------------------------------------
+
+
+def test_given_a_pty_when_opened_as_a_port_then_bytes_go_both_ways_unchanged(pty: PtyLink) -> None:
+    port = SerialLink(pty.description, 38400)
+    port.open()
+    every = bytes(range(256))
+    pty.send(every)
+    assert b"".join(heard(port, 256)) == every
+    port.send(every)
+    assert b"".join(heard(pty, 256)) == every
+    port.close()
+    port.close()
+    # a driver that goes is no loss for the device
+    assert pty.poll(0.0) == ()
+
+
+def test_given_a_port_whose_device_goes_then_the_line_is_lost_and_can_be_opened_when_it_is_back(tmp_path: Path) -> None:
+    path = tmp_path / "gps"
+    pty = PtyLink(link=path)
+    pty.open()
+    assert pty.description == str(path)
+    port = SerialLink(str(path), 9600)
+    port.open()
+    pty.close()
+    assert "unplugged" in str(lost(port))
+    port.close()
+    assert not path.is_symlink()
+    with pytest.raises(LinkError, match="there is no such port"):
+        port.open()
+    pty.open()
+    port.open()
+    pty.send(b"back")
+    assert b"".join(heard(port, 4)) == b"back"
+    port.close()
+    pty.close()
+
+
+def test_given_the_wrong_rate_then_garbage_is_heard_and_at_the_right_one_the_device(tmp_path: Path) -> None:
+    pty = PtyLink(baud=38400)
+    pty.open()
+    port = SerialLink(pty.description, 9600)
+    port.open()
+    pty.send(b"hello")
+    assert b"".join(heard(port, 5)) != b"hello"
+    port.close()
+    port.open(38400)
+    assert port.baud == 38400
+    pty.send(b"hello")
+    assert b"".join(heard(port, 5)) == b"hello"
+    port.close()
+    pty.close()
+
+
+def test_given_a_port_in_use_then_it_says_by_which_process(pty: PtyLink) -> None:
+    first, second = SerialLink(pty.description, 9600), SerialLink(pty.description, 9600)
+    first.open()
+    with pytest.raises(LinkError) as caught:
+        second.open()
+    assert caught.value.what == f"{pty.description} is in use"
+    assert f"process {os.getpid()}" in caught.value.why
+    first.close()
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EPERM])
+def test_given_no_permission_then_it_says_which_group_and_the_command(
+    number: int, monkeypatch: pytest.MonkeyPatch, pty: PtyLink
+) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise serial.SerialException(number, "could not open port")
+
+    class Group:
+        gr_name = "dialout"
+
+    monkeypatch.setattr(serial_module.serial, "Serial", refused)
+    monkeypatch.setattr(ports.grp, "getgrgid", lambda _: Group)
+    monkeypatch.setattr(ports.getpass, "getuser", lambda: "operator")
+    with pytest.raises(LinkError) as caught:
+        SerialLink(pty.description, 9600).open()
+    assert caught.value.why == "permission denied"
+    assert caught.value.fix == "it belongs to group dialout: sudo usermod -aG dialout operator, then log in again"
+
+
+def test_given_a_mistyped_port_then_the_nearest_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serial_module, "found_ports", lambda: [ports.PortLine("/dev/ttyUSB9", "adapter", "")])
+    with pytest.raises(LinkError, match="nearest: /dev/ttyUSB9"):
+        SerialLink("/dev/ttyUBS9", 9600).open()
+
+
+def test_given_a_file_that_is_no_port_then_it_is_a_link_error(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_text("")
+    with pytest.raises(LinkError):
+        SerialLink(str(path), 9600).open()
+
+
+def test_given_the_ports_of_this_machine_then_each_can_be_shown() -> None:
+    assert all(port.path and port.what for port in ports.found_ports())
+
+
+# --- TCP ----------------------------------------------------------------------------------------------------
+
+
+def test_given_a_server_when_called_then_bytes_go_both_ways_and_a_later_caller_takes_over(
+    server: TcpServerLink,
+) -> None:
+    server.send(b"nobody hears this")
+    first, second = TcpLink("127.0.0.1", port_of(server)), TcpLink("127.0.0.1", port_of(server))
+    first.open()
+    first.send(b"hello")
+    assert b"".join(heard(server, 5)) == b"hello"
+    server.send(b"back")
+    assert b"".join(heard(first, 4)) == b"back"
+    second.open()
+    second.send(b"me too")
+    assert b"".join(heard(server, 6)) == b"me too"
+    assert "gone" in str(lost(first))
+    assert server.callers == 2
+    for link in (first, second):
+        link.close()
+
+
+def test_given_a_caller_who_goes_then_the_server_waits_for_another(server: TcpServerLink) -> None:
+    for word in (b"one", b"two"):
+        link = TcpLink("127.0.0.1", port_of(server))
+        link.open()
+        link.send(word)
+        assert b"".join(heard(server, 3)) == word
+        link.close()
+
+
+def test_given_a_line_that_is_open_when_opened_again_then_it_stays_as_it_is(server: TcpServerLink) -> None:
+    driver = TcpLink("127.0.0.1", port_of(server))
+    driver.open()
+    server.poll(1.0)
+    server.open()
+    server.send(b"still here")
+    assert driver.poll(1.0) == (b"still here",)
+    driver.close()
+
+
+def test_given_nobody_listens_then_it_says_so_and_a_port_in_use_is_named(server: TcpServerLink) -> None:
+    with pytest.raises(LinkError, match=f"port {port_of(server)} is in use"):
+        TcpServerLink(port_of(server)).open()
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with pytest.raises(LinkError, match="nothing listens there"):
+        TcpLink("127.0.0.1", port).open()
+
+
+def test_given_a_line_that_is_not_open_then_it_is_a_link_error() -> None:
+    links: Sequence[Link[bytes]] = (TcpLink("127.0.0.1", 1), TcpServerLink(0), PtyLink(), SerialLink("/dev/x", 9600))
+    for link in links:
+        with pytest.raises(LinkError):
+            link.poll(0.0)
+        link.close()
+
+
+# --- CAN ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def multicast() -> Iterator[str]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    return f"239.74.163.2:{port}"
+
+
+def test_given_a_bus_then_frames_and_error_frames_come_as_they_were_sent(multicast: str) -> None:
+    one, two = CanLink(multicast, "udp_multicast"), CanLink(multicast, "udp_multicast")
+    one.open()
+    two.open()
+    frames = [
+        CanFrame(0x123, b"\x01\x02"),
+        CanFrame(0x1ABCDEF0, b"12345678", is_extended=True),
+        CanFrame(0x40, b"", is_error=True),
+        CanFrame(0x7FF, bytes(64)),
+    ]
+    for frame in frames:
+        one.send(frame)
+    found = heard(two, 4)
+    assert found == frames
+    assert found[2].is_bus_off
+    one.close()
+    two.close()
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (errno.ENODEV, "there is no such network interface"),
+        (errno.ENETDOWN, "sudo ip link set can7 up"),
+        (errno.ENOBUFS, "nobody acknowledges"),
+        (errno.EPERM, "permission denied"),
+    ],
+)
+def test_given_an_interface_that_cannot_be_used_then_it_says_what_to_do(
+    number: int, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(**_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(can_module.can, "Bus", refused)
+    with pytest.raises(LinkError, match=said):
+        CanLink("can7").open()
+
+
+def test_given_a_mistyped_interface_then_the_nearest_is_told() -> None:
+    with pytest.raises(LinkError, match="write socketcan"):
+        CanLink("can0", "soketcan").open()
+
+
+# --- Modbus -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def modbus(server: TcpServerLink) -> Iterator[tuple[ModbusLink, ModbusServerLink]]:
+    device = ModbusServerLink(server)
+    driver = modbus_link("127.0.0.1", port_of(server), 7)
+    driver.open()
+    yield driver, device
+    driver.close()
+
+
+def test_given_requests_then_each_has_its_reply_in_any_order(modbus: tuple[ModbusLink, ModbusServerLink]) -> None:
+    driver, device = modbus
+    requests: list[ModbusUnit] = [
+        ReadRegisters(5, 3, Table.INPUT, 70_001),
+        ReadRegisters(6, 2, transaction=70_002),
+        WriteRegisters(9, (1, 2, 65_535), 70_003),
+    ]
+    for request in requests:
+        driver.send(request)
+    came = heard(device, 3)
+    assert came[0] == ReadRegisters(5, 3, Table.INPUT, 70_001 & 0xFFFF)
+    assert came[2] == WriteRegisters(9, (1, 2, 65_535), 70_003 & 0xFFFF)
+    numbers = [unit.transaction for unit in came]
+    device.send(Written(9, 3, numbers[2]))
+    device.send(ModbusFailure(FailureKind.EXCEPTION, code=2, transaction=numbers[1]))
+    device.send(Registers(5, (7, 8, 9), numbers[0]))
+    written, failure, registers = heard(driver, 3)
+    assert written == Written(9, 3, 70_003)
+    assert registers == Registers(5, (7, 8, 9), 70_001)
+    assert (failure.kind, failure.code, failure.transaction) == (FailureKind.EXCEPTION, 2, 70_002)
+    assert "no such register" in failure.text
+
+
+def test_given_no_reply_then_silence_is_told_once(server: TcpServerLink) -> None:
+    now = [0]
+    driver = ModbusLink(TcpLink("127.0.0.1", port_of(server)), 1, lambda: now[0])
+    driver.open()
+    driver.send(ReadRegisters(1, 1, transaction=4))
+    assert driver.poll(0.0) == []
+    now[0] = round(ANSWER_S * 1e9)
+    (failure,) = driver.poll(0.0)
+    assert (failure.kind, failure.transaction) == (FailureKind.SILENCE, 4)
+    assert driver.poll(0.0) == []
+    driver.close()
+
+
+@pytest.mark.parametrize(
+    ("request_bytes", "code"),
+    [
+        (bytes.fromhex("000100000002072b"), 1),  # a function that is not served
+        (bytes.fromhex("00010000000607030000ffff"), 1),  # more registers than a message holds
+    ],
+)
+def test_given_a_request_that_is_not_served_then_an_exception_is_the_answer(
+    request_bytes: bytes, code: int, server: TcpServerLink
+) -> None:
+    device = ModbusServerLink(server)
+    caller = TcpLink("127.0.0.1", port_of(server))
+    caller.open()
+    caller.send(request_bytes)
+    reply = b"".join(heard(caller, 9, device))
+    assert reply[:2] == b"\x00\x01"
+    assert reply[7] == request_bytes[7] | 0x80
+    assert reply[8] == code
+    caller.close()
+
+
+def test_given_bytes_that_are_no_modbus_then_the_driver_says_so_and_the_device_hangs_up(server: TcpServerLink) -> None:
+    driver = modbus_link("127.0.0.1", port_of(server), 1)
+    driver.open()
+    driver.send(ReadRegisters(1, 1, transaction=4))
+    heard(server, 12)
+    server.send(b"GET / HTTP/1.1\r\n")
+    assert "not Modbus/TCP" in str(lost(driver))
+    driver.close()
+    caller = TcpLink("127.0.0.1", port_of(server))
+    caller.open()
+    caller.send(b"GET / HTTP/1.1\r\n")
+    device = ModbusServerLink(server)
+    with pytest.raises(LinkError):
+        heard(caller, 1, device)
+    caller.close()
+
+
+def test_given_a_message_in_pieces_then_it_is_put_together(server: TcpServerLink) -> None:
+    device = ModbusServerLink(server)
+    caller = TcpLink("127.0.0.1", port_of(server))
+    caller.open()
+    message = bytes.fromhex("000900000006010300050002") * 2
+    found: list[ModbusUnit] = []
+    for n in range(len(message)):
+        caller.send(message[n : n + 1])
+        found += device.poll(0.2)
+    assert found == [ReadRegisters(5, 2, transaction=9)] * 2
+    caller.close()

@@ -1,0 +1,116 @@
+"""The example of a device of one's own: it runs, stays short, and does what docs/own-device.md says."""
+
+from __future__ import annotations
+
+import math
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from modelserver.messages import DeviceSample, DriverPhase, SensorHeader, WheelSample, WheelsSample
+from msdrivers.faults import Fault
+from msdrivers.links.fake import FakeLink, FakeTime
+from msdrivers.protocol.framing import Scanner
+from msdrivers.registry import KINDS, Emulation
+from msdrivers.runner import Runner, RunnerSettings
+from msdrivers.settings import read_driver
+from msdrivers.station import Now, Send
+
+ROOT = Path(__file__).resolve().parents[3]
+EXAMPLE = ROOT / "examples" / "python" / "own_device.py"
+OWN: dict[str, Any] = runpy.run_path(str(EXAMPLE))
+START_US = 1_700_000_000_000_000
+
+
+def _samples(*speeds: float) -> list[WheelsSample]:
+    stamps = (START_US + 100_000 * number for number in range(1, len(speeds) + 1))
+    return [
+        WheelsSample(SensorHeader(stamp, "radar", seq), (WheelSample("speed", speed=speed),))
+        for seq, (stamp, speed) in enumerate(zip(stamps, speeds, strict=True))
+    ]
+
+
+def _said(unit: Any) -> list[tuple[float, bytes]]:
+    """Return what the emulated device says, with the seconds of the monotonic clock."""
+    monotonic_ns, coming = 1_000_000_000, []
+    unit.opened(Now(monotonic_ns, START_US))
+    while (due := unit.due()) is not None:
+        now = Now(due, START_US + (due - monotonic_ns) // 1000)
+        coming += [(due * 1e-9, each.unit) for each in unit.woken(now) if isinstance(each, Send)]
+    return coming
+
+
+def _driven(coming: list[tuple[float, bytes]], seconds: float) -> tuple[Runner[bytes], list[DeviceSample], FakeTime]:
+    time, published = FakeTime(START_US), list[DeviceSample]()
+    driver = OWN["SpeedDriver"](OWN["SpeedSettings"]("radar"))
+    runner = Runner(driver, FakeLink(time, coming), RunnerSettings("radar", "speed"), time, published.append)
+    while time.monotonic_ns < round((1.0 + seconds) * 1e9):
+        runner.turn()
+    return runner, published, time
+
+
+def _speeds(samples: list[DeviceSample]) -> list[float]:
+    return [each.wheels[0].speed for each in samples if isinstance(each, WheelsSample)]
+
+
+def test_given_the_example_then_it_runs_and_is_short() -> None:
+    done = subprocess.run([sys.executable, EXAMPLE], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "speed=1.23" in done.stdout
+    assert "speed=1.25" in done.stdout
+    assert "('rejected.checksum', 1)" in done.stdout
+    assert "SILENT" in done.stdout
+    code = [line for line in EXAMPLE.read_text(encoding="utf-8").splitlines() if line.strip()]
+    assert len(code) < 120
+
+
+def test_given_driver_and_emulator_on_one_line_then_the_speeds_arrive_with_their_instants() -> None:
+    unit = OWN["KIND"].emulate(Emulation(None, ROOT, _samples(1.0, -0.5, 2.25)))
+    _, published, _ = _driven(_said(unit), 0.5)
+    assert _speeds(published) == [1.0, -0.5, 2.25]
+    # without a device's time: the reception less the delay of the settings
+    assert [each.header.utime for each in published] == [START_US + 1000 * ms for ms in (70, 170, 270)]
+    assert all(math.isclose(each.header.utime_sigma, 0.01) for each in published)
+
+
+def test_given_a_damaged_line_then_it_is_counted_and_the_next_one_taken() -> None:
+    unit = OWN["KIND"].emulate(Emulation(None, ROOT, _samples(1.0, 2.0, 3.0), (Fault(0.15, "corrupt", 1.0),)))
+    runner, published, time = _driven(_said(unit), 0.5)
+    assert _speeds(published) == [1.0, 3.0]
+    counters = dict(runner.health(time.now()).counters)
+    assert sum(count for name, count in counters.items() if name.startswith("rejected.")) == 1
+
+
+def test_given_silence_then_it_is_told_and_ends_with_the_next_speed() -> None:
+    unit = OWN["KIND"].emulate(Emulation(None, ROOT, _samples(1.0)))
+    coming = [*_said(unit), (4.0, OWN["line"](2.0))]
+    runner, _, time = _driven(coming, 2.0)
+    report = runner.health(time.now())
+    assert report.phase is DriverPhase.SILENT
+    assert "no $SPD for 1 s" in report.text
+    while time.monotonic_ns < 4_100_000_000:
+        runner.turn()
+    assert runner.health(time.now()).phase is DriverPhase.STREAMING
+
+
+def test_given_a_section_of_the_vehicle_file_then_its_settings_are_read() -> None:
+    section = {"device": "speed", "port": "/dev/ttyUSB2", "wheel": "speed", "delay": 0.02}
+    settings = read_driver("radar", section, kinds={**KINDS, "speed": OWN["KIND"]})
+    assert settings.station == OWN["SpeedSettings"]("radar", delay=0.02)
+
+
+@given(st.lists(st.one_of(st.binary(max_size=40), st.just(OWN["line"](1.5))), max_size=8), st.integers(1, 20))
+def test_given_any_bytes_then_pieces_give_the_same_as_the_whole(parts: list[bytes], size: int) -> None:
+    data = b"".join(parts)
+    whole, pieces = (Scanner[float]([OWN["SpeedFormat"]()]) for _ in range(2))
+    expected = whole.feed(data)
+    got = [speed for at in range(0, len(data), size) for speed in pieces.feed(data[at : at + size])]
+    assert got == pytest.approx(expected, nan_ok=True)
+    assert pieces.counts == whole.counts
+    assert pieces.waiting <= OWN["LONGEST"]

@@ -1,0 +1,246 @@
+"""The drivers section: every problem at once, each with its line, its nearest name and what was expected."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import pytest
+
+from modelserver.config import config_lines, load_config
+from modelserver.errors import ConfigError, Problem
+from modelserver.messages import ImuSample
+from msdrivers.faults import Fault, parse_fault
+from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings, TcpSettings
+from msdrivers.lines import first_baud
+from msdrivers.registry import CHANNELS, KINDS, Kind, Made
+from msdrivers.settings import DriverSettings, Place, read_driver, read_drivers
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid"}
+
+    scale: float
+    name: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class EchoSettings:
+    source: str
+    rate_hz: float = 10.0
+    heading: Literal["magnetic", "gyro"] = "gyro"
+    offsets: tuple[float, ...] = ()
+    bauds: tuple[int, ...] = ()
+    parts: Mapping[str, Part] | None = None
+    one: Part | None = None
+    hidden: str = "plain"
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.rate_hz <= 100.0:
+            raise ValueError(f"rate_hz: must be 1 to 100 Hz, got {self.rate_hz:g}")
+
+
+def never(*_: Any) -> Any:
+    raise AssertionError("nothing is made here")
+
+
+ECHO = Kind(
+    "echo",
+    "a device of the tests",
+    ImuSample,
+    (SerialSettings, TcpSettings),
+    lambda: Made(EchoSettings, never),
+    never,
+    9600,
+    presets={"hidden": "preset"},
+)
+CAN = Kind("canner", "another", ImuSample, (CanSettings,), lambda: Made(EchoSettings, never), never)
+MODBUS = Kind("axle", "a third", ImuSample, (ModbusSettings,), lambda: Made(EchoSettings, never), never)
+KNOWN = {kind.name: kind for kind in (ECHO, CAN, MODBUS)}
+
+
+def read(section: Mapping[str, Any]) -> DriverSettings:
+    return read_driver("imu", section, kinds=KNOWN)
+
+
+def problems(section: Mapping[str, Any]) -> tuple[Problem, ...]:
+    with pytest.raises(ConfigError) as caught:
+        read(section)
+    return caught.value.problems
+
+
+def test_given_a_section_then_line_and_settings_come_from_their_dataclasses() -> None:
+    driver = read(
+        {
+            "device": "echo",
+            "port": "/dev/ttyUSB0",
+            "baud": 38400,
+            "rate_hz": 5,
+            "offsets": [1, 2.5],
+            "heading": "magnetic",
+            "channel": "IMU2",
+            "parts": {"a": {"scale": 2.0}},
+        }
+    )
+    assert driver.line == SerialSettings("/dev/ttyUSB0", 38400)
+    assert driver.station == EchoSettings(
+        "imu", 5.0, "magnetic", (1.0, 2.5), (38400,), {"a": Part(2.0)}, hidden="preset"
+    )
+    assert (driver.name, driver.kind, driver.channel) == ("imu", ECHO, "IMU2")
+
+
+@pytest.mark.parametrize(
+    ("section", "line"),
+    [
+        ({"device": "echo", "address": "10.0.0.5:3001"}, TcpSettings("10.0.0.5:3001")),
+        ({"device": "canner", "can": "can0"}, CanSettings("can0", "socketcan", 0)),
+        ({"device": "axle", "address": "[::1]:502", "unit_id": 3}, ModbusSettings("[::1]:502", 3)),
+    ],
+)
+def test_given_a_lines_first_key_then_it_is_that_line(section: dict[str, Any], line: object) -> None:
+    assert read(section).line == line
+
+
+def test_given_rates_to_try_then_the_line_is_opened_at_the_first_else_the_ports_else_the_makers() -> None:
+    base = {"device": "echo", "port": "p"}
+    assert first_baud(read({**base, "bauds": [4800, 9600]})) == 4800
+    assert first_baud(read({**base, "baud": 19200})) == 19200
+    assert first_baud(read(base)) == 9600
+
+
+@pytest.mark.parametrize(
+    ("section", "element", "message", "fix"),
+    [
+        ({}, "drivers.imu.device", "device is missing", "add a line: device: ... (kinds: echo, canner, axle)"),
+        ({"device": "ehco"}, "drivers.imu.device", "unknown device 'ehco'", "write echo"),
+        ({"device": 5}, "drivers.imu.device", "unknown device '5'", "kinds: echo, canner, axle"),
+        ({"device": "echo"}, "drivers.imu", "no line is named: port or address is missing", "add a line: port: ..."),
+        (
+            {"device": "echo", "port": "p", "address": "a:1"},
+            "drivers.imu.address",
+            "both port and address are given",
+            "keep one of port or address",
+        ),
+        ({"device": "echo", "port": "p", "rate_h": 5}, "drivers.imu.rate_h", "unknown key 'rate_h'", "write rate_hz"),
+        ({"device": "echo", "port": "p", "hidden": "x"}, "drivers.imu.hidden", "unknown key 'hidden'", None),
+        ({"device": "echo", "port": "p", "source": "x"}, "drivers.imu.source", "unknown key 'source'", None),
+        (
+            {"device": "echo", "port": "p", "rate_hz": "5"},
+            "drivers.imu.rate_hz",
+            "input should be a valid number, got '5'",
+            "",
+        ),
+        ({"device": "echo", "port": "p", "rate_hz": 0.5}, "drivers.imu.rate_hz", "rate_hz: must be 1 to 100", ""),
+        ({"device": "echo", "port": "p", "heading": "up"}, "drivers.imu.heading", "'magnetic' or 'gyro', got 'up'", ""),
+        ({"device": "echo", "address": "host"}, "drivers.imu.address", "address is HOST:PORT", ""),
+        ({"device": "echo", "address": "host:99999"}, "drivers.imu.address", "address is HOST:PORT", ""),
+        ({"device": "echo", "port": "p", "baud": 3}, "drivers.imu.baud", "baud is between 50 and", ""),
+        ({"device": "echo", "port": ""}, "drivers.imu.port", "port is the path of a serial port", ""),
+        (
+            {"device": "echo", "port": "p", "parts": {"a": {"scael": 1.0, "scale": 1.0}}},
+            "drivers.imu.parts.a.scael",
+            "unknown key 'scael'",
+            "write scale",
+        ),
+        (
+            {"device": "echo", "port": "p", "one": {"scael": 1.0, "scale": 1.0}},
+            "drivers.imu.one.scael",
+            "unknown key 'scael'",
+            "write scale",
+        ),
+        (
+            {"device": "echo", "port": "p", "one": {}},
+            "drivers.imu.one.scale",
+            "scale is missing",
+            "add a line: scale: ...",
+        ),
+        ({"device": "axle", "address": "a:1", "unit_id": 300}, "drivers.imu.unit_id", "unit_id is between 0", ""),
+    ],
+)
+def test_given_a_slip_then_it_is_told_with_its_place_and_what_to_do(
+    section: dict[str, Any], element: str, message: str, fix: str | None
+) -> None:
+    (problem,) = problems(section)
+    assert problem.element == element
+    assert message in problem.message
+    assert fix is None or problem.fix == fix
+
+
+def test_given_several_slips_then_all_are_told_at_once() -> None:
+    found = problems({"device": "echo", "port": 3, "rate_hz": "x", "colour": "red"})
+    assert {problem.element for problem in found} == {
+        "drivers.imu.port",
+        "drivers.imu.rate_hz",
+        "drivers.imu.colour",
+    }
+
+
+VEHICLE = """\
+vehicle: cart
+geometry: geometry.yaml
+base_frame: Cart:Base
+drivers:
+  imu:
+    device: gx1
+    port: /dev/ttyUSB0
+    polld: 3
+  gps: {device: novatell, port: /dev/ttyUSB1}
+"""
+
+
+def test_given_a_vehicle_file_then_problems_of_all_drivers_have_their_lines(tmp_path: Path) -> None:
+    path = tmp_path / "vehicle.yaml"
+    path.write_text(VEHICLE)
+    config = load_config(path)
+    assert list(config.drivers) == ["imu", "gps"]
+    with pytest.raises(ConfigError) as caught:
+        read_drivers(config.drivers, Place(str(path), config_lines(path)))
+    assert [(problem.file, problem.line, problem.nearest[:1]) for problem in caught.value.problems] == [
+        (str(path), 8, ("polled",)),
+        (str(path), 9, ("novatel",)),
+    ]
+
+
+@pytest.mark.parametrize("name", sorted(KINDS))
+def test_given_a_kind_then_its_settings_take_the_drivers_name_and_its_sample_has_a_channel(name: str) -> None:
+    kind = KINDS[name]
+    settings = kind.load().settings
+    assert settings.__dataclass_params__.frozen
+    assert "source" in settings.__dataclass_fields__
+    assert set(kind.presets) <= set(settings.__dataclass_fields__)
+    assert kind.sample in CHANNELS
+    assert kind.lines
+
+
+def test_given_texts_of_faults_then_they_are_read_or_refused_with_what_is_wrong() -> None:
+    assert parse_fault("stall@10:2") == Fault(10.0, "stall", 2.0)
+    assert parse_fault("drop@0.5") == Fault(0.5, "drop", 1.0)
+    for text, said in (
+        ("stal@10", "did you mean stall"),
+        ("stall", "KIND@SECONDS"),
+        ("stall@x", "SECONDS"),
+        ("stall@-1", "0 or more"),
+        ("stall@1:0", "above 0"),
+        ("stall@nan", "0 or more"),
+        ("zzz@1", "drop: units"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            parse_fault(text)
+
+
+def test_given_a_line_when_shown_then_a_person_can_read_it():
+    lines = (
+        SerialSettings("/dev/ttyUSB0", 38400),
+        TcpSettings("10.0.0.2:4001"),
+        CanSettings("can0", bitrate=500_000),
+        ModbusSettings("10.0.0.3:502", 2),
+    )
+    assert [str(line) for line in lines] == [
+        "/dev/ttyUSB0, 38400 baud",
+        "TCP 10.0.0.2:4001",
+        "socketcan can0, 500000 bit/s",
+        "Modbus 10.0.0.3:502, unit 2",
+    ]

@@ -1,0 +1,405 @@
+"""The driver of the vehicle controller against the emulated one: status out, commands in, limits, the dead-man."""
+
+from __future__ import annotations
+
+import math
+import random
+import tracemalloc
+
+import pytest
+from support_vehicle_bus import (
+    DEG,
+    RAPTOR_COMMAND,
+    RAPTOR_STATUS,
+    START_UTIME,
+    Wire,
+    at,
+    raptor_dbc,
+    rolling,
+    vehicle_settings,
+)
+
+from modelserver.errors import ConfigError
+from modelserver.messages import VehicleCommand, VehicleMode, VehicleStatusSample
+from msdrivers.devices.vehicle import VehicleDriver
+from msdrivers.devices.vehicle_settings import LimitsMap, VehicleSettings
+from msdrivers.emulate.can_line import CanFault
+from msdrivers.emulate.vehicle import VehicleEmulator, VehicleUnit
+from msdrivers.protocol.can.frame import CanFrame
+from msdrivers.protocol.can.mapping import SignalMap, StatusMap
+from msdrivers.station import Measured, Phase, Send, Told
+
+DATABASE = raptor_dbc()
+
+
+def wired(
+    *faults: CanFault, settings: VehicleSettings | None = None, unit: VehicleUnit | None = None
+) -> tuple[Wire[CanFrame], VehicleDriver, VehicleEmulator]:
+    driver = VehicleDriver(settings or vehicle_settings(), DATABASE)
+    emulator = VehicleEmulator(DATABASE, RAPTOR_STATUS, RAPTOR_COMMAND, unit, faults=faults)
+    return Wire(driver, emulator), driver, emulator
+
+
+def wish(
+    t: float, seq: int, speed: float = 2.0, angle: float = 0.2, valid_for: float = 0.3, source: str = "arbitrator"
+) -> VehicleCommand:
+    return VehicleCommand(START_UTIME + round(t * 1e6), valid_for, seq, source, speed, angle)
+
+
+def drive(wire: Wire[CanFrame], driver: VehicleDriver, until: float, speed: float = 2.0, angle: float = 0.2) -> None:
+    """Command ten times a second."""
+    wire.run(wire.t)
+    seq = round(wire.t * 1000)
+    while wire.t < until - 1e-9:
+        command = wish(wire.t, seq, speed, angle)
+        wire.command(lambda now, command=command: driver.command(command, now))  # type: ignore[misc]
+        seq += 1
+        wire.run(min(until, wire.t + 0.1))
+
+
+def said(frame: CanFrame) -> dict[str, float]:
+    return DATABASE.decode(frame)
+
+
+def statuses(wire: Wire[CanFrame], begin: float = 0.0) -> list[VehicleStatusSample]:
+    found = wire.values(begin)
+    assert all(isinstance(each, VehicleStatusSample) for each in found)
+    return found  # type: ignore[return-value]
+
+
+# --- status ----------------------------------------------------------------------------------------------------
+
+
+def test_given_a_controller_then_its_status_is_published_as_it_says() -> None:
+    wire, driver, emulator = wired(unit=VehicleUnit(fault_bits=0x8001))
+    emulator.speed, emulator.steering = 0.0, 0.1
+    wire.run(2.0)
+    samples = statuses(wire)
+    assert len(samples) == 40
+    assert [each.header.seq for each in samples] == list(range(40))
+    last = samples[-1]
+    assert last.mode is VehicleMode.AUTONOMOUS
+    assert last.forward_speed == 0.0
+    assert last.steering_angle == pytest.approx(0.1, abs=0.006 * DEG)
+    assert last.supply_voltage == pytest.approx(13.8)
+    assert last.engine_speed == pytest.approx(150.0, abs=0.02)
+    assert (last.fault_bits, last.commands_refused) == (0x8001, 0)
+    assert last.header.source == "raptor"
+    assert driver.counts["samples"] == 40
+
+
+def test_given_the_message_of_voltages_lost_then_they_are_nan_and_the_rest_is_published() -> None:
+    wire, _, _ = wired()
+    wire.spoil = lambda frame, t: [] if frame.arbitration_id == 0x201 else [frame]
+    wire.run(1.0)
+    assert len(statuses(wire)) == 20
+    assert all(math.isnan(each.supply_voltage) and math.isnan(each.engine_speed) for each in statuses(wire))
+    assert all(each.mode is VehicleMode.AUTONOMOUS for each in statuses(wire))
+
+
+def test_given_the_message_of_faults_lost_then_nothing_is_published() -> None:
+    wire, driver, _ = wired()
+    wire.spoil = lambda frame, t: [] if frame.arbitration_id == 0x200 else [frame]
+    wire.run(1.5)
+    assert statuses(wire) == []
+    assert driver.counts["rejected.incomplete"] >= 19
+    assert "silent: no usable VehicleStatus (0x200)" in wire.texts()
+
+
+def test_given_a_fault_word_of_32_bits_then_the_highest_is_the_sign() -> None:
+    text = 'BO_ 1 S: 8 A\n SG_ F : 0|32@1+ (1,0) [0|0] "" A\n SG_ M : 32|8@1+ (1,0) [0|0] "" A\n'
+    from msdrivers.protocol.can.database import parse_dbc
+
+    settings = vehicle_settings(status=StatusMap("S.M", {"fault": 9}, fault_bits="S.F"), command=None)
+    driver = VehicleDriver(settings, parse_dbc(text, "s.dbc"))
+    driver.opened(at(0.0))
+    (_, measured) = driver.received(CanFrame(1, bytes.fromhex("01000080 09 000000")), at(0.1))
+    assert isinstance(measured, Measured)
+    assert isinstance(measured.sample, VehicleStatusSample)
+    assert measured.sample.fault_bits == 1 - (1 << 31)
+    assert measured.sample.mode is VehicleMode.FAULT
+    assert math.isnan(measured.sample.forward_speed)
+
+
+def test_given_a_mode_that_changes_then_it_is_told_with_what_it_means() -> None:
+    wire, _, emulator = wired()
+    wire.run(1.0)
+    emulator.mode = VehicleMode.EMERGENCY_STOP
+    wire.run(2.0)
+    assert statuses(wire)[-1].mode is VehicleMode.EMERGENCY_STOP
+    assert "emergency stop: commands have no effect until it is released" in wire.texts()
+
+
+def test_given_wheels_that_measure_the_vehicle_then_the_status_tells_their_speed() -> None:
+    emulator = VehicleEmulator(DATABASE, RAPTOR_STATUS, samples=rolling(10.0, lambda t: -0.1 * t))
+    wire = Wire(VehicleDriver(vehicle_settings(command=None), DATABASE), emulator).run(10.0)
+    for sample in statuses(wire):
+        t = (sample.header.utime - START_UTIME) * 1e-6
+        assert sample.forward_speed == pytest.approx(-0.1 * t, abs=0.003)
+
+
+# --- commands --------------------------------------------------------------------------------------------------
+
+
+def test_given_commands_then_the_vehicle_drives_as_it_is_told() -> None:
+    wire, driver, emulator = wired()
+    wire.run(0.5)
+    assert wire.sent == []
+    drive(wire, driver, 4.0)
+    assert emulator.speed == pytest.approx(2.0)
+    assert emulator.steering == pytest.approx(0.2, abs=0.01 * DEG)
+    assert statuses(wire)[-1].forward_speed == pytest.approx(2.0)
+    periods = [b - a for (a, _), (b, _) in zip(wire.sent, wire.sent[1:], strict=False)]
+    assert max(periods) < 0.0501
+    alive = [said(frame)["Alive"] for _, frame in wire.sent]
+    assert alive == [n % 256 for n in range(len(alive))]
+
+
+def test_given_no_more_commands_then_stop_is_said_when_the_last_ends_and_the_vehicle_stops() -> None:
+    wire, driver, emulator = wired()
+    drive(wire, driver, 3.0)
+    last = max(t for t, frame in wire.sent if said(frame)["Enable"] == 1)
+    wire.run(6.0)
+    stops = [(t, said(frame)) for t, frame in wire.sent if said(frame)["Enable"] == 0]
+    # the last command was given at 2.9 s and is valid for 0.3 s
+    assert stops[0][0] == pytest.approx(3.2, abs=1e-6)
+    assert max(t for t, frame in wire.sent if said(frame)["Enable"] == 1) <= max(last, 3.2)
+    assert all(frame["ForwardSpeed"] == 0 for _, frame in stops)
+    # the wheels stay where they were steered
+    assert {frame["SteeringAngle"] for _, frame in stops} == {round(0.2 / DEG * 100)}
+    assert emulator.speed == 0.0
+    assert driver.counts["dead_man"] == 1
+    assert "no command after number 29 of 'arbitrator': stop" in wire.texts()
+
+
+def test_given_a_command_valid_for_long_then_the_dead_man_ends_it() -> None:
+    wire, driver, _ = wired(settings=vehicle_settings(dead_man=0.5))
+    wire.run(1.0)
+    wire.command(lambda now: driver.command(wish(1.0, 1, valid_for=60.0), now))
+    wire.run(3.0)
+    first = next(t for t, frame in wire.sent if said(frame)["Enable"] == 0)
+    assert first == pytest.approx(1.5, abs=1e-6)
+
+
+def test_given_stop_frames_that_are_lost_then_the_controllers_own_dead_man_stops_it() -> None:
+    wire, driver, emulator = wired()
+    drive(wire, driver, 3.0)
+    wire.to_device.clear()
+    wire.device.received = lambda unit, now: []  # type: ignore[method-assign]
+    wire.run(6.0)
+    assert emulator.speed == 0.0
+
+
+def test_given_a_new_command_after_the_stop_then_it_drives_again() -> None:
+    wire, driver, emulator = wired()
+    drive(wire, driver, 2.0)
+    wire.run(4.0)
+    drive(wire, driver, 6.0, speed=-0.5)
+    assert emulator.speed == pytest.approx(-0.5)
+
+
+@pytest.mark.parametrize(
+    ("speed", "angle", "speed_said", "angle_said"),
+    [(9.0, 0.1, 3.0, 0.1), (-9.0, 0.1, -1.0, 0.1), (1.0, 2.0, 1.0, 0.5), (1.0, -2.0, 1.0, -0.5)],
+)
+def test_given_a_wish_beyond_the_limits_then_the_limit_is_commanded_and_told(
+    speed: float, angle: float, speed_said: float, angle_said: float
+) -> None:
+    wire, driver, _ = wired()
+    wire.run(0.5)
+    for seq in range(3):
+        wire.command(lambda now, seq=seq: driver.command(wish(wire.t, seq, speed, angle), now))  # type: ignore[misc]
+    frames = [said(frame) for _, frame in wire.sent]
+    assert {frame["ForwardSpeed"] for frame in frames} == {round(speed_said * 1000)}
+    assert {frame["SteeringAngle"] for frame in frames} == {round(angle_said / DEG * 100)}
+    assert driver.counts["clamped"] == 3
+    assert wire.texts().count("the limit is commanded") == 1
+
+
+def test_given_limits_that_refuse_then_nothing_is_commanded() -> None:
+    limits = LimitsMap(3.0, 1.0, 0.5, "refuse")
+    wire, driver, _ = wired(settings=vehicle_settings(limits=limits))
+    wire.run(0.5)
+    wire.command(lambda now: driver.command(wish(0.5, 1, speed=3.5), now))
+    assert wire.sent == []
+    assert driver.counts["rejected.limit"] == 1
+    assert "forward_speed 3.5 m/s is beyond -1 to 3 m/s" in wire.texts()
+    wire.run(1.0)
+    assert statuses(wire)[-1].commands_refused == 1
+
+
+@pytest.mark.parametrize(
+    ("command", "reason"),
+    [
+        (wish(0.0, 5), "expired"),
+        (wish(3.0, 5), "future"),
+        (wish(1.0, 5, source="someone"), "stranger"),
+        (wish(1.0, 0), "old"),
+        (wish(1.0, 5, speed=math.nan), "malformed"),
+        (wish(1.0, 5, angle=math.inf), "malformed"),
+        (wish(1.0, 5, valid_for=-1.0), "expired"),
+    ],
+)
+def test_given_a_command_that_may_not_count_then_the_one_before_goes_on(command: VehicleCommand, reason: str) -> None:
+    wire, driver, _ = wired()
+    wire.run(1.0)
+    wire.command(lambda now: driver.command(wish(1.0, 0, speed=1.0), now))
+    wire.command(lambda now: driver.command(command, now))
+    wire.run(1.2)
+    assert {said(frame)["ForwardSpeed"] for _, frame in wire.sent} == {1000}
+    assert driver.counts[f"rejected.{reason}"] == 1
+    assert "refused" in wire.texts()
+    wire.run(2.0)
+    assert driver.counts["dead_man"] == 1
+    assert statuses(wire)[-1].commands_refused == 1
+
+
+def test_given_a_commander_by_name_then_nobody_else_is_heard() -> None:
+    wire, driver, _ = wired(settings=vehicle_settings(commander="arbitrator"))
+    wire.run(1.0)
+    wire.command(lambda now: driver.command(wish(1.0, 0, source="stranger"), now))
+    assert wire.sent == []
+    assert "only 'arbitrator' commands" in wire.texts()
+
+
+def test_given_a_source_whose_commands_have_ended_then_another_may_command() -> None:
+    wire, driver, _ = wired()
+    wire.run(1.0)
+    wire.command(lambda now: driver.command(wish(1.0, 7), now))
+    wire.run(2.0)
+    wire.command(lambda now: driver.command(wish(2.0, 0, speed=1.0, source="joystick"), now))
+    assert said(wire.sent[-1][1])["ForwardSpeed"] == 1000
+
+
+def test_given_an_emergency_stop_then_the_controller_stops_and_refuses_and_that_is_told() -> None:
+    wire, driver, emulator = wired()
+    drive(wire, driver, 3.0)
+    emulator.mode = VehicleMode.EMERGENCY_STOP
+    drive(wire, driver, 6.0)
+    assert emulator.speed == 0.0
+    assert statuses(wire)[-1].commands_refused > 20
+
+
+def test_given_bus_off_while_driving_then_nothing_is_sent_and_stop_is_said_when_it_is_back() -> None:
+    wire, driver, _ = wired(CanFault(3.0, "bus_off", 1.0))
+    wire.reopen_s = 0.5
+    drive(wire, driver, 4.5)
+    off = [t for t, _ in wire.sent if 3.002 < t < 3.5]
+    assert off == []
+    assert driver.counts["rejected.line"] >= 4
+    first = next(said(frame) for t, frame in wire.sent if t > 3.4)
+    assert first["Enable"] == 0
+    assert [told.phase for _, told in wire.told if "went bus-off" in told.text] == [Phase.SILENT]
+
+
+def test_given_that_the_driver_leaves_then_it_says_stop() -> None:
+    wire, driver, _ = wired()
+    wire.run(1.0)
+    assert driver.leaving(at(1.0)) == []
+    drive(wire, driver, 2.0)
+    (stop,) = driver.leaving(at(2.0))
+    assert isinstance(stop, Send)
+    assert said(stop.unit)["Enable"] == 0
+
+
+def test_given_no_command_mapping_then_commands_go_nowhere() -> None:
+    driver = VehicleDriver(vehicle_settings(command=None), DATABASE)
+    driver.opened(at(0.0))
+    assert driver.command(wish(0.0, 0), at(0.0)) == []
+    assert driver.counts["rejected.no_command_mapping"] == 1
+
+
+def test_given_a_flood_of_refused_commands_then_little_is_told() -> None:
+    wire, driver, _ = wired()
+    wire.run(1.0)
+    for seq in range(1000):
+        wire.command(lambda now, seq=seq: driver.command(wish(0.0, seq, source=f"s{seq}"), now))  # type: ignore[misc]
+    assert len(wire.told) < 5
+    assert driver.counts["rejected.expired"] == 1000
+
+
+def test_given_random_frames_and_commands_then_nothing_is_raised_and_memory_stays_flat() -> None:
+    rng = random.Random(3)
+    driver = VehicleDriver(vehicle_settings(), DATABASE)
+    driver.opened(at(0.0))
+    wild = (math.nan, math.inf, -1e300, 0.0, 1.0, 5.0)
+
+    def flood(begin: int, count: int) -> None:
+        for n in range(begin, begin + count):
+            now = at(0.001 * n)
+            identifier = rng.choice((0x200, 0x201, 0x300, rng.randrange(2048)))
+            frame = CanFrame(identifier, rng.randbytes(rng.choice((4, 8, 8, rng.randrange(65)))), rng.random() < 0.1)
+            command = wish(
+                0.001 * n + rng.uniform(-0.5, 0.5), n, rng.choice(wild), rng.choice(wild), rng.choice(wild), "a"
+            )
+            outputs = driver.received(frame, now) + driver.woken(now) + driver.command(command, now)
+            for output in outputs:
+                if isinstance(output, Send):
+                    assert -1000 <= said(output.unit)["ForwardSpeed"] <= 3000
+                    assert abs(said(output.unit)["SteeringAngle"]) <= 2865
+                else:
+                    assert isinstance(output, Measured | Told)
+
+    flood(0, 1_000)
+    tracemalloc.start()
+    try:
+        flood(1_000, 1_000)
+        before, _ = tracemalloc.get_traced_memory()
+        flood(2_000, 4_000)
+        after, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert after - before < 20_000
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"status": None, "command": None}, "status or command is needed"),
+        ({"dbc": ""}, "dbc is the path"),
+        ({"dead_man": 0.0}, "dead_man is between"),
+        ({"command_period": 0.6}, "command_period is at most dead_man"),
+        ({"clock_slack": -1.0}, "clock_slack is between"),
+        ({"silence": math.nan}, "silence is between"),
+    ],
+)
+def test_given_settings_that_cannot_be_then_the_key_is_named(changes: dict[str, object], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        vehicle_settings(**changes)
+
+
+def test_given_limits_that_cannot_be_then_the_key_is_named() -> None:
+    with pytest.raises(ValueError, match="steering_angle is between"):
+        LimitsMap(steering_angle=2.0)
+    with pytest.raises(ValueError, match="beyond is clamp or refuse"):
+        LimitsMap(beyond="perhaps")  # type: ignore[arg-type]
+
+
+def test_given_limits_that_the_frame_cannot_say_then_it_is_told() -> None:
+    with pytest.raises(ConfigError, match=r"ForwardSpeed holds 20 m/s at most, 30 is allowed; fix: lower"):
+        VehicleDriver(vehicle_settings(limits=LimitsMap(forward_speed=30.0)), DATABASE)
+
+
+def test_given_a_mistyped_status_signal_then_the_nearest_is_told() -> None:
+    status = StatusMap(forward_speed=SignalMap("VehicleStatus.ForwardSped"))
+    with pytest.raises(ConfigError, match="nearest: ForwardSpeed"):
+        VehicleDriver(vehicle_settings(status=status), DATABASE)
+
+
+def test_given_a_line_opened_anew_while_a_command_counts_then_stop_is_said_and_it_counts_no_more() -> None:
+    driver = VehicleDriver(vehicle_settings(), DATABASE)
+    driver.opened(at(0.0))
+    driver.command(wish(0.0, 0), at(0.0))
+    later = [driver.opened(at(0.05)), driver.woken(at(0.1)), driver.woken(at(0.15))]
+    frames = [output.unit for outputs in later for output in outputs if isinstance(output, Send)]
+    assert [said(frame)["Enable"] for frame in frames] == [0, 0, 0]
+
+
+def test_given_bus_off_while_a_command_counts_then_nothing_is_sent() -> None:
+    driver = VehicleDriver(vehicle_settings(), DATABASE)
+    driver.opened(at(0.0))
+    driver.command(wish(0.0, 0), at(0.0))
+    driver.received(CanFrame(0x40, is_error=True), at(0.01))
+    for t in (0.06, 0.3, 1.0):
+        assert not [output for output in driver.woken(at(t)) if isinstance(output, Send)]
+    assert driver.leaving(at(1.1)) == []
