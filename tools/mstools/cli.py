@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from modelserver.errors import ConfigError, GeometryError, ModelServerError, QueryError
+from modelserver.errors import ConfigError, GeometryError, ModelServerError, QueryError, nearest_names, shown
 from modelserver.version import __version__
 from mstools.output import print_problem, safe
 
@@ -29,15 +29,33 @@ COMMANDS = {
     "tune": "Propose noise settings of the filter from a log, by fixes that were withheld.",
     "calibrate": "Find an inertial unit's noise, or the iron around its magnetometer, from a log.",
     "import-bag": "Turn a ROS bag into an LCM log of this project's types.",
+    "driver": "Read a device and publish what it measures.",
+    "emulate": "Be a device, for its driver to read.",
     "spy": "Watch the channels with lcm-spy, decoded.",
 }
 """Subcommands and what each is for. `import-bag` is function `command` of module `mstools.import_bag`, and so on; a
 command with subcommands of its own has a Typer application there instead."""
 
 
+OTHER_WORDS = {
+    "serve": "run",
+    "server": "run",
+    "start": "run",
+    "daemon": "run",
+    "validate": "check",
+    "lint": "check",
+    "play": "replay",
+    "import": "import-bag",
+    "switch": "mode",
+    "watch": "spy",
+}
+"""What others call our commands."""
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    _check_command(_command_of(arguments))
     try:
         build(arguments)(arguments, prog_name="modelserver")
     except (GeometryError, ConfigError) as error:
@@ -70,7 +88,7 @@ def build(arguments: Sequence[str]) -> typer.Typer:
         pretty_exceptions_enable=False,
     )
     app.callback()(_options)
-    wanted = next((argument for argument in arguments if not argument.startswith("-")), "")
+    wanted = _command_of(arguments)
     for name, summary in COMMANDS.items():
         function: Callable[..., None] | typer.Typer = _stub
         if name == wanted:
@@ -80,6 +98,20 @@ def build(arguments: Sequence[str]) -> typer.Typer:
         else:
             app.command(name, short_help=summary)(function)
     return app
+
+
+def _command_of(arguments: Sequence[str]) -> str:
+    return next((argument for argument in arguments if not argument.startswith("-")), "")
+
+
+def _check_command(wanted: str) -> None:
+    """Exit as for wrong usage, with the nearest command, where there is none of that name."""
+    if not wanted or wanted in COMMANDS:
+        return
+    near = OTHER_WORDS.get(wanted.casefold()) or next(iter(nearest_names(wanted, COMMANDS)), "")
+    offer = f"did you mean {near}? {COMMANDS[near]}" if near else f"there are: {', '.join(COMMANDS)}"
+    typer.echo(safe(f"modelserver: there is no command {shown(wanted, 40)}; {offer} (modelserver --help)"), err=True)
+    sys.exit(2)
 
 
 def _stub() -> None:

@@ -1,63 +1,57 @@
-"""`modelserver demo`: the real daemon on loopback, with the Raptor and simulated sensors; watch it answer."""
+"""`modelserver demo`: the real daemon and the real drivers on loopback, with the Raptor's devices in software."""
 
 from __future__ import annotations
 
-import contextlib
 import math
-import os
-import signal
-import socket
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from types import FrameType
-from typing import IO, Annotated
+from typing import Annotated
 
 import typer
 
-from modelserver.errors import ModelServerError, NoServerError, QueryError
-from modelserver.messages import Invalid, PoseAnswer
+from modelserver.errors import NoServerError, QueryError
+from modelserver.messages import DriverHealth, DriverPhase, Invalid, PoseAnswer
 from modelserver.spatial.pose import Pose
+from mstools.demo_children import MODELSERVER, Children, DemoError
+from mstools.demo_lines import Lines, lay_lines
 
 SEED = 20050901
 LEAD_SECONDS = 1.5
-"""From starting the sensors to their first sample: the time that process needs to load."""
-START_LIMIT = 10.0
-"""How long the daemon may take to answer, seconds."""
-STOP_LIMIT = 3.0
-"""How long a child may take to end after SIGTERM, seconds."""
-
-
-class DemoError(ModelServerError):
-    """The demo did not show what it should; the message says what was missing."""
+LEAD_SHARE = 0.5
+"""From starting the devices to the drive: so many seconds, and this share of what the processes before took to load,
+which tells how slow the machine is. The vehicle stands at first: one that is ready a little later misses nothing."""
+START_LIMIT = 20.0
+"""How long daemon and drivers may take to be heard, seconds."""
+OUTLIVE_SECONDS = 60.0
+"""By which the devices would outlive the drive, had nobody ended them."""
+SETTLED = 2.0
+"""From the start of the drive to when a driver's rate is that of a whole second."""
 
 
 def command(
     seconds: Annotated[
         float, typer.Option("--seconds", metavar="S", min=7.0, max=600.0, help="How long to drive.")
     ] = 10.0,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Show the daemon's log.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", help="Show the logs of all processes.")] = False,
 ) -> None:
-    """Run the whole service on simulated sensors and watch it answer.
+    """Run the whole service on emulated devices and watch it answer.
 
-    Starts the daemon for the report's Raptor on loopback, on a port of its own so that a running vehicle is not
-    disturbed, and a second process that publishes a simulated GPS, IMU and wheels; asks where things are, and prints
-    the pose beside the simulated truth. Ends by itself; exit code 1 where the pose never becomes valid.
+    Starts the daemon for the report's Raptor, the drivers of its vehicle file, and for each the device in software: GPS
+    and IMU on pseudo-terminals, the vehicle's controller on a CAN bus over UDP, the nodding axis on Modbus/TCP, all on
+    one simulated drive. Everything is on loopback, on ports of its own, so that a running vehicle is not disturbed.
+    Asks where things are, and prints the pose beside the simulated truth. Ends by itself, or with Ctrl-C; exit code 1
+    where the pose never becomes valid, or a device is not heard.
 
     Example: modelserver demo
     """
-    config = vehicle_file()
-    url = f"udpm://239.255.76.67:{free_port()}?ttl=0"
     with (
         tempfile.TemporaryDirectory(prefix="modelserver-demo-") as scratch,
         Children(Path(scratch), verbose) as children,
     ):
-        show(config, url, seconds, children)
+        show(lay_lines(vehicle_file(), Path(scratch)), seconds, children)
 
 
 def vehicle_file() -> Path:
@@ -73,114 +67,51 @@ def vehicle_file() -> Path:
     raise DemoError(f"config/raptor/vehicle.yaml is missing; looked in {', '.join(map(str, places))}. Install it anew.")
 
 
-def free_port() -> int:
-    """Return a UDP port that nobody uses, so that two demos, or a demo and a vehicle, do not hear each other."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-@dataclass(slots=True)
-class Child:
-    """A process that the demo started, and the file its errors go to."""
-
-    what: str
-    process: subprocess.Popen[bytes]
-    errors: Path
-
-
-class Children:
-    """The processes of the demo. Leaving the block ends them, whatever happened in it, SIGTERM included."""
-
-    def __init__(self, scratch: Path, verbose: bool):
-        self._scratch = scratch
-        self._verbose = verbose
-        self._started: list[Child] = []
-        self._before: Callable[[int, FrameType | None], object] | int | None = None
-
-    def __enter__(self) -> Children:
-        def ended(number: int, frame: FrameType | None) -> None:
-            raise SystemExit(128 + number)
-
-        self._before = signal.signal(signal.SIGTERM, ended)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        # a second Ctrl-C must not leave them behind
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        try:
-            for child in self._started:
-                child.process.terminate()
-            deadline = time.monotonic() + STOP_LIMIT
-            for child in self._started:
-                try:
-                    child.process.wait(max(0.0, deadline - time.monotonic()))
-                except subprocess.TimeoutExpired:
-                    child.process.kill()
-                    child.process.wait()
-        finally:
-            signal.signal(signal.SIGINT, before)
-            signal.signal(signal.SIGTERM, self._before)
-
-    def start(self, what: str, *arguments: str) -> None:
-        """Start a Python process with these arguments."""
-        errors = self._scratch / f"{len(self._started)}.log"
-        environment = os.environ | {"STATE_DIRECTORY": str(self._scratch)}
-        with contextlib.ExitStack() as stack:
-            stderr: IO[bytes] | None = None if self._verbose else stack.enter_context(errors.open("wb"))
-            # a session of its own: Ctrl-C comes to the demo alone, which then ends them in order
-            process = subprocess.Popen(
-                [sys.executable, *arguments],
-                stdin=subprocess.DEVNULL,
-                stderr=stderr,
-                env=environment,
-                start_new_session=True,
-            )
-        self._started.append(Child(what, process, errors))
-
-    def check(self) -> None:
-        """Raise DemoError, with what it said last, where a process has failed."""
-        for child in self._started:
-            code = child.process.poll()
-            if code:
-                said = child.errors.read_text(errors="replace").strip() if child.errors.exists() else ""
-                tail = "\n  ".join(said.splitlines()[-8:]) or "(nothing on stderr)"
-                raise DemoError(f"the {child.what} ended with exit code {code}. It said:\n  {tail}")
-
-
-def show(config: Path, url: str, seconds: float, children: Children) -> None:
+def show(lines: Lines, seconds: float, children: Children) -> None:
     """Start everything, ask, and print. Raises DemoError where something is missing."""
-    # heavy, so not before they are needed: `modelserver --help` lists this command too
+    say = typer.echo
+    config = str(lines.vehicle)
+    say(f"1. The daemon and the drivers: a process each, on {vehicle_file()} with lines to emulated devices")
+    begun = time.monotonic()
+    for name, words in (("daemon", ("run",)), *((f"driver {name}", ("driver", name)) for name in lines.devices)):
+        children.start(name, *MODELSERVER, *words, "-c", config, "--url", lines.url)
+        say(f"modelserver {' '.join(words)} -c {config} --url '{lines.url}'")
+    # heavy, so not before they are needed: `modelserver --help` lists this command too; and the others load meanwhile
     from modelserver.client.remote import Platform
     from modelserver.config import load_config
-    from mstools.demo_sensors import simulation
+    from mstools.demo_drive import simulation
     from mstools.query import describe
 
-    say = typer.echo
-    say(f"1. The daemon: modelserver run -c {config} --url '{url}'")
-    children.start("daemon", "-c", "from mstools.cli import main; main()", "run", "-c", str(config), "--url", url)
-    vehicle = load_config(config)
-    with Platform(url, channel_prefix=vehicle.lcm.channel_prefix, name="demo", timeout=0.25, retries=0) as platform:
+    vehicle = load_config(lines.vehicle)
+    prefix = vehicle.lcm.channel_prefix
+    ear = Ear(lines.url, prefix)
+    with Platform(lines.url, channel_prefix=prefix, name="demo", timeout=0.25, retries=0) as platform:
         bodies = first_answer(platform.get_body_list, children)
-        platform.retries = 3
-        start_utime = round((time.time() + LEAD_SECONDS) * 10) * 100_000
-        children.start(
-            "simulated sensors",
-            *("-m", "mstools.demo_sensors", "--config", str(config), "--url", url, "--seed", str(SEED)),
-            *("--start-utime", str(start_utime), "--seconds", repr(seconds)),
-        )
-        run = simulation(vehicle, start_utime, seconds, SEED)
-        say("\n2. What it knows from the geometry file, asked from this process")
+        wait_for_drivers(ear, lines, children)
+        # a dozen processes on a busy machine: an answer may take its time
+        platform.timeout, platform.retries = 1.0, 9
+
+        say("\n2. The devices, a process each; their drivers find them")
+        took = time.monotonic() - begun
+        start_utime = round((time.time() + LEAD_SECONDS + LEAD_SHARE * took) * 10) * 100_000
+        together = ("--start", str(start_utime), "--seconds", f"{seconds + OUTLIVE_SECONDS:g}", "--seed", str(SEED))
+        for name, line in lines.devices.items():
+            children.start(f"device {name}", *MODELSERVER, "emulate", name, "-c", config, *line, *together)
+            say(f"modelserver emulate {name} -c {config} {' '.join((*line, *together))}")
+        run = simulation(vehicle, start_utime, seconds + OUTLIVE_SECONDS)
+
+        say("\n3. What the daemon knows from the geometry file, asked from this process")
         say(f"bodies            {', '.join(bodies)}")
         say(f"Digiclops has     {', '.join(platform.get_body_frame_list('Digiclops'))}")
         say(describe(platform.get_pose("Digiclops:ImagePlane", "FrontNoddingSICK:Origin")))
 
-        say("\n3. POSE, broadcast while simulated GPS, IMU and wheels arrive from a third process; the truth beside it")
+        say("\n4. POSE, broadcast while GPS, IMU and wheels arrive from their drivers; the truth beside it")
         say("   time      easting     northing       up     yaw   off by           may be off by    state")
         valid: list[PoseAnswer] = []
         received = 0
         next_row = 0.0
-        for pose in poses(url, f"{vehicle.lcm.channel_prefix}POSE", start_utime, seconds, children):
+        alive = ""
+        for pose in poses(ear, start_utime, seconds, children):
             received += 1
             since = (pose.transformation.utime - start_utime) * 1e-6
             if pose.transformation.valid:
@@ -188,6 +119,11 @@ def show(config: Path, url: str, seconds: float, children: Children) -> None:
             if since >= next_row:
                 say(row(pose, since, run.truth(pose.transformation.utime).utm, run.geodesy.origin.initial_utm))
                 next_row = math.floor(since) + 1.0
+            if not alive and since >= SETTLED and not missing(ear.health, lines):
+                alive = ", ".join(f"{name} {ear.health[name].rate_hz:.1f} Hz" for name in lines.devices)
+                say(f"   all {len(lines.devices)} devices are alive: {alive}")
+        if not alive:
+            raise DemoError(f"not all devices are alive: {'; '.join(missing(ear.health, lines))}")
         if not valid:
             raise DemoError(
                 f"the pose never became valid in {seconds:g} s: {received} poses came on POSE. "
@@ -195,17 +131,41 @@ def show(config: Path, url: str, seconds: float, children: Children) -> None:
             )
         say(f"   {received} poses in {seconds:g} s, {len(valid)} of them valid")
 
-        say("\n4. Where was the camera in the world a second ago?")
+        say("\n5. Where was the camera in the world a second ago?")
         at = valid[-1].transformation.utime - 1_000_000
         say(describe(platform.get_pose("Digiclops:ImagePlane", "World:UTM", at=at)))
         history = platform.get_history(at - 1_000_000, at, 10.0)
         say(f"get_history gave {len(history)} poses of the second before that")
-        say("\n5. What it says to a slip")
+        say("\n6. What it says to a slip")
         try:
             platform.get_transformation("Digiclop:ImagePlane", "Raptor:CG")
         except QueryError as error:
             say(f"{error}. Nearest: {', '.join(error.nearest)}")
     say(f"\nDone. Next: modelserver run -c {vehicle_file()}, and in another shell: modelserver bodies")
+
+
+class Ear:
+    """Hears the poses, and how each driver is."""
+
+    def __init__(self, url: str, prefix: str):
+        from modelserver.wire.channels import literal
+        from modelserver.wire.codec import decode
+        from modelserver.wire.provider import open_lcm, resolve_url
+
+        self.poses: list[PoseAnswer] = []
+        self.health: dict[str, DriverHealth] = {}
+        """The last report of each driver by its name."""
+        self.bus = open_lcm(resolve_url(url))
+
+        def report(_: str, data: bytes) -> None:
+            health: DriverHealth = decode("driver_health_t", data)
+            self.health[health.source] = health
+
+        for channel, hear in (
+            ("POSE", lambda _, data: self.poses.append(decode("pose_transform_t", data))),
+            ("DRIVER_HEALTH", report),
+        ):
+            self.bus.subscribe(literal(f"{prefix}{channel}"), hear).set_queue_capacity(0)
 
 
 def first_answer(ask: Callable[[], list[str]], children: Children) -> list[str]:
@@ -218,26 +178,36 @@ def first_answer(ask: Callable[[], list[str]], children: Children) -> list[str]:
             children.check()
             if time.monotonic() > deadline:
                 raise DemoError(
-                    f"the daemon gave no answer within {START_LIMIT:g} s. Does multicast work on loopback here? "
-                    "Try: ip route add 224.0.0.0/4 dev lo, and run the demo with --verbose"
+                    f"the daemon gave no answer within {START_LIMIT:g} s; run the demo with --verbose"
                 ) from None
 
 
-def poses(url: str, channel: str, start_utime: int, seconds: float, children: Children) -> Iterator[PoseAnswer]:
-    """Yield what is broadcast from the start of the drive on, until its end."""
-    from modelserver.wire.channels import literal
-    from modelserver.wire.codec import decode
-    from modelserver.wire.provider import open_lcm, resolve_url
+def wait_for_drivers(ear: Ear, lines: Lines, children: Children) -> None:
+    """Wait until every driver has said how it is. Raises DemoError where one fails or takes too long."""
+    deadline = time.monotonic() + START_LIMIT
+    while unheard := [name for name in lines.devices if name not in ear.health]:
+        ear.bus.handle_timeout(100)
+        children.check()
+        if time.monotonic() > deadline:
+            raise DemoError(f"no word within {START_LIMIT:g} s of: driver {', '.join(unheard)}; see --verbose")
 
-    fresh: list[PoseAnswer] = []
-    bus = open_lcm(resolve_url(url))
-    subscription = bus.subscribe(literal(channel), lambda _, data: fresh.append(decode("pose_transform_t", data)))
-    subscription.set_queue_capacity(0)
+
+def missing(health: dict[str, DriverHealth], lines: Lines) -> list[str]:
+    """Return in words which devices are not heard."""
+    return [
+        f"{name} is {health[name].phase.name.lower()} ({health[name].text})"
+        for name in lines.devices
+        if health[name].phase is not DriverPhase.STREAMING or not health[name].rate_hz
+    ]
+
+
+def poses(ear: Ear, start_utime: int, seconds: float, children: Children) -> Iterator[PoseAnswer]:
+    """Yield what is broadcast from the start of the drive on, until its end."""
     end = time.monotonic() + start_utime * 1e-6 - time.time() + seconds
     while time.monotonic() < end:
-        bus.handle_timeout(100)
-        yield from (pose for pose in fresh if pose.transformation.utime >= start_utime)
-        fresh.clear()
+        ear.bus.handle_timeout(100)
+        yield from (pose for pose in ear.poses if pose.transformation.utime >= start_utime)
+        ear.poses.clear()
         children.check()
 
 

@@ -1,0 +1,425 @@
+"""Drivers and emulated devices as processes of their own, on real lines: pty, TCP, CAN over UDP, Modbus/TCP."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import lcm
+import pytest
+from support_lcm import MODELSERVER, PATIENCE_S, reserved_url, started, wait_until
+
+from modelserver.messages import DriverHealth, DriverPhase, FixType, GpsSample, SensorHeader, VehicleCommand
+from modelserver.wire.codec import decode, encode
+from msdrivers.links.can_bus import CanLink
+from msdrivers.protocol.gx1 import Address
+
+ROOT = Path(__file__).parents[2]
+
+DRIVERS = """
+drivers:
+  gps: {{device: novatel, port: {folder}/gps, bauds: [38400], rate_hz: 20}}
+  nmea: {{device: nmea, address: "127.0.0.1:{port}", rate_hz: 4}}
+  imu: {{device: gx1, port: {folder}/imu}}
+  wheels:
+    device: wheels
+    can: "239.74.163.2:{port}"
+    interface: udp_multicast
+    dbc: raptor.dbc
+    wheels:
+      front_left:
+        count: {{signal: WheelCounts.FrontLeftCount, metres_per_count: 0.0125}}
+        direction: {{signal: WheelCounts.FrontLeftDirection}}
+        steers: true
+      front_right:
+        count: {{signal: WheelCounts.FrontRightCount, metres_per_count: 0.0125}}
+        direction: {{signal: WheelCounts.FrontRightDirection}}
+        steers: true
+  axis:
+    device: axis
+    address: "127.0.0.1:{port}"
+    joint: nod
+    registers:
+      angle: {{address: 0, scale_deg: 0.01}}
+    poll_hz: 50
+  raptor:
+    device: vehicle
+    can: "239.74.163.2:{port}"
+    interface: udp_multicast
+    dbc: raptor.dbc
+    limits: {{forward_speed: 3.0}}
+    dead_man: 0.4
+    status:
+      mode: VehicleStatus.Mode
+      modes: {{manual: 1, autonomous: 2, emergency_stop: 3, fault: 4}}
+      commands_refused: VehicleStatus.CommandsRefused
+      forward_speed: {{signal: VehicleStatus.ForwardSpeed}}
+      steering_angle: {{signal: VehicleStatus.SteeringAngle, scale: 0.0174533}}
+    command:
+      forward_speed: {{signal: VehicleCommand.ForwardSpeed}}
+      steering_angle: {{signal: VehicleCommand.SteeringAngle, scale: 0.0174533}}
+      alive: VehicleCommand.Alive
+      driving: {{Enable: 1}}
+      stopping: {{Enable: 0}}
+"""
+
+CHANNELS = {
+    "gps": ("GPS", "gps_t"),
+    "nmea": ("GPS", "gps_t"),
+    "imu": ("IMU", "imu_t"),
+    "wheels": ("WHEELS", "wheels_t"),
+    "axis": ("JOINTS", "joints_t"),
+    "raptor": ("VEHICLE_STATUS", "vehicle_status_t"),
+}
+
+RATES_HZ = {"gps": 20, "nmea": 4, "imu": 100, "wheels": 100, "axis": 50}
+
+UNPLUGGED_S, BACK_S = 5.0, 2.0
+WHEEL_COUNTS = 256
+"""The identifier of the frames that the wheels say in."""
+
+
+@dataclass
+class Bench:
+    """A vehicle file, a bus, and what is heard on it."""
+
+    folder: Path
+    url: str
+    port: int
+    samples: list[Any] = field(default_factory=list)
+    heard: list[float] = field(default_factory=list)
+    """When each sample was heard, seconds of the monotonic clock."""
+    reports: list[DriverHealth] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        for name in ("vehicle.yaml", "geometry.yaml", "raptor.dbc"):
+            shutil.copy(ROOT / "config" / "raptor" / name, self.folder)
+        # the drivers of the trial in place of the vehicle's own, which come last
+        rest, _, _ = self.vehicle.read_text().partition("\ndrivers:")
+        self.vehicle.write_text(rest + DRIVERS.format(folder=self.folder, port=self.port))
+        self.bus = lcm.LCM(self.url)
+        self.bus.subscribe("DRIVER_HEALTH", lambda _, data: self.reports.append(decode("driver_health_t", data)))
+
+    @property
+    def vehicle(self) -> Path:
+        return self.folder / "vehicle.yaml"
+
+    def hear(self, name: str) -> None:
+        channel, type_name = CHANNELS[name]
+
+        def handle(_: str, data: bytes) -> None:
+            self.heard.append(time.monotonic())
+            self.samples.append(decode(type_name, data))
+
+        self.bus.subscribe(channel, handle).set_queue_capacity(0)
+
+    def wait(self, arrived: Callable[[], bool], what: str) -> None:
+        if not wait_until(self.bus, arrived, PATIENCE_S):
+            said = "".join(f"\n{log.name}:\n{log.read_text()}" for log in sorted(self.folder.glob("*.log")))
+            pytest.fail(f"{what} did not come; {self.reports[-1:]}{said}")
+
+    def elapse(self, seconds: float) -> None:
+        wait_until(self.bus, lambda: False, seconds)
+
+    def phase(self) -> DriverPhase | None:
+        return self.reports[-1].phase if self.reports else None
+
+    @contextmanager
+    def driver(self, name: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+        with (
+            (self.folder / "driver.log").open("a") as log,
+            started((*MODELSERVER, "driver", name, "-c", self.vehicle, *arguments), self.url, stderr=log) as process,
+        ):
+            yield process
+
+    @contextmanager
+    def device(self, name: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+        """Run an emulator; the block begins when its line is open."""
+        lines = {
+            "gps": ("--pty", "--link", self.folder / "gps"),
+            "imu": ("--pty", "--link", self.folder / "imu"),
+            "nmea": ("--tcp", str(self.port)),
+            "axis": ("--tcp", str(self.port)),
+            "wheels": ("--can", f"239.74.163.2:{self.port}"),
+            "raptor": ("--can", f"239.74.163.2:{self.port}"),
+        }
+        command = (*MODELSERVER, "emulate", name, "-c", self.vehicle, *lines[name], *arguments)
+        with (
+            (self.folder / "device.log").open("a") as log,
+            started(command, self.url, stderr=log, stdout=subprocess.PIPE) as process,
+        ):
+            assert process.stdout is not None
+            with process.stdout:
+                assert "speaks on" in process.stdout.readline(), (self.folder / "device.log").read_text()
+                yield process
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    with ExitStack() as stack:
+        url = stack.enter_context(reserved_url())
+        holder = stack.enter_context(socket.socket())
+        holder.bind(("127.0.0.1", 0))
+        port = holder.getsockname()[1]
+        holder.close()
+        yield Bench(tmp_path, url, port)
+
+
+@contextmanager
+def counted_frames(bench: Bench) -> Iterator[list[float]]:
+    """Count what the wheels say on the CAN bus, in the order of its coming, seconds of the monotonic clock."""
+    frames: list[float] = []
+    ending = threading.Event()
+    link = CanLink(f"239.74.163.2:{bench.port}", "udp_multicast")
+    link.open()
+
+    def count() -> None:
+        while not ending.is_set():
+            now = time.monotonic()
+            frames.extend(now for frame in link.poll(0.1) if frame.arbitration_id == WHEEL_COUNTS)
+
+    thread = threading.Thread(target=count)
+    thread.start()
+    try:
+        yield frames
+    finally:
+        ending.set()
+        thread.join()
+        link.close()
+
+
+@pytest.mark.parametrize("name", RATES_HZ)
+def test_given_a_device_unplugged_for_5_s_then_it_streams_within_2_s_of_its_return_and_nothing_is_lost(
+    bench: Bench, name: str
+) -> None:
+    bench.hear(name)
+    enough = round(2.0 * RATES_HZ[name]) + 8
+    with ExitStack() as stack:
+        frames = stack.enter_context(counted_frames(bench)) if name == "wheels" else None
+        driver = stack.enter_context(bench.driver(name))
+        bench.wait(lambda: bool(bench.reports), "a report without a device")
+        with bench.device(name) as device:
+            bench.wait(lambda: len(bench.samples) >= enough, "samples")
+            bench.wait(lambda: bench.phase() is DriverPhase.STREAMING, "streaming")
+            device.kill()
+            device.wait(PATIENCE_S)
+            # as the system does with the name of an adapter that is pulled out
+            (bench.folder / name).unlink(missing_ok=True)
+        bench.elapse(UNPLUGGED_S)
+        before = len(bench.samples)
+        assert bench.phase() in (DriverPhase.CLOSED, DriverPhase.SILENT)
+        with bench.device(name):
+            back = time.monotonic()
+            bench.wait(lambda: len(bench.samples) >= before + enough, "samples after its return")
+            bench.wait(lambda: bench.phase() is DriverPhase.STREAMING, "streaming after its return")
+        assert bench.heard[before] - back < BACK_S
+        if frames is not None:
+            bench.wait(lambda: len(bench.samples) >= len(frames), f"a sample for each of {len(frames)} frames")
+            assert len(bench.samples) == len(frames)
+        driver.send_signal(signal.SIGTERM)
+        assert driver.wait(PATIENCE_S) == 0
+    bench.wait(lambda: bench.reports[-1].text == "ended", "the last report")
+    health = bench.reports[-1]
+    assert (health.source, health.text) == (name, "ended")
+    assert health.samples == len(bench.samples)
+    sequence = [sample.header.seq for sample in bench.samples]
+    assert sequence == list(range(sequence[0], sequence[0] + len(sequence)))
+    for sample in bench.samples:
+        header = sample.header
+        assert header.source == name
+        assert 0 <= header.host_utime - header.utime < 1_000_000
+    for run in (bench.samples[8:before], bench.samples[before + 8 :]):
+        assert_rate(name, run)
+
+
+def assert_rate(name: str, samples: list[Any]) -> None:
+    """Check that samples come at the device's rate, and by its own time, where it has one, none is left out."""
+    period_us = 1_000_000 / RATES_HZ[name]
+    first, last = samples[0].header, samples[-1].header
+    spent = last.host_utime - first.host_utime
+    assert (len(samples) - 1) * period_us == pytest.approx(spent, rel=0.1)
+    if first.device_utime:
+        times = [sample.header.device_utime for sample in samples]
+        steps = [after - before for before, after in itertools.pairwise(times)]
+        assert steps == pytest.approx([period_us] * len(steps), abs=2)
+
+
+def test_given_a_stall_and_damage_then_the_driver_tells_and_recovers(bench: Bench) -> None:
+    bench.hear("imu")
+    with bench.driver("imu"), bench.device("imu", "--fault", "corrupt@3:5", "--fault", "stall@4:1.5"):
+        bench.wait(lambda: bool(bench.samples), "samples")
+        bench.wait(lambda: any(report.phase is DriverPhase.SILENT for report in bench.reports), "silence")
+        silent = len(bench.samples)
+        bench.wait(lambda: len(bench.samples) > silent + 5, "samples after the stall")
+
+
+def test_given_a_raw_recording_when_played_then_the_same_is_measured_without_the_device(bench: Bench) -> None:
+    bench.hear("gps")
+    raw = bench.folder / "gps.raw"
+    with bench.device("gps"), bench.driver("gps", "--record-raw", str(raw)) as driver:
+        bench.wait(lambda: len(bench.samples) >= 4, "samples")
+        driver.send_signal(signal.SIGTERM)
+        assert driver.wait(PATIENCE_S) == 0
+    first = list(bench.samples)
+    bench.samples.clear()
+    with bench.driver("gps", "--play-raw", str(raw)) as driver:
+        assert driver.wait(PATIENCE_S) == 0
+    bench.wait(lambda: len(bench.samples) >= 4, "samples of the recording")
+    measured = [(each.latitude_deg, each.longitude_deg, each.height_ellipsoidal) for each in first]
+    again = [(each.latitude_deg, each.longitude_deg, each.height_ellipsoidal) for each in bench.samples]
+    assert again[:4] == measured[:4]
+
+
+@pytest.mark.parametrize(
+    ("name", "fault", "text"),
+    [
+        ("wheels", "bus_off@2:1", "went bus-off"),
+        ("raptor", "stall@2:2", "no usable VehicleStatus"),
+        ("axis", "exception@2:4", "exception 4"),
+    ],
+)
+def test_given_a_fault_of_the_devices_own_kind_then_the_driver_tells_it_and_recovers(
+    bench: Bench, name: str, fault: str, text: str
+) -> None:
+    bench.hear(name)
+    with bench.driver(name):
+        bench.wait(lambda: bool(bench.reports), "a report without a device")
+        with bench.device(name, "--fault", fault):
+            bench.wait(lambda: len(bench.samples) > 5, "samples")
+            # it was silent before there was a device, too
+            bench.reports.clear()
+            bench.wait(lambda: any(text in report.text for report in bench.reports), text)
+            told = len(bench.samples)
+            bench.wait(lambda: len(bench.samples) > told + 5, "samples after the fault")
+            bench.wait(lambda: bench.phase() is DriverPhase.STREAMING, "streaming after the fault")
+
+
+def test_given_commands_then_the_vehicle_drives_and_when_they_cease_it_stops(bench: Bench) -> None:
+    bench.hear("raptor")
+    seq = itertools.count(1)
+    said = [0.0]
+
+    def command() -> None:
+        if time.monotonic() - said[0] >= 0.1:
+            said[0] = time.monotonic()
+            wish = VehicleCommand(time.time_ns() // 1000, 0.3, next(seq), "operator", 1.0, 0.1)
+            bench.bus.publish("VEHICLE_COMMAND", encode(wish))
+
+    def drives() -> bool:
+        command()
+        return bool(bench.samples) and bench.samples[-1].forward_speed > 0.95
+
+    with bench.device("raptor"), bench.driver("raptor"):
+        bench.wait(lambda: bool(bench.samples), "a status")
+        assert bench.samples[-1].forward_speed == 0.0
+        bench.wait(drives, "the speed that was commanded")
+        assert bench.samples[-1].steering_angle == pytest.approx(0.1, abs=0.01)
+        bench.wait(lambda: bench.samples[-1].forward_speed == 0.0, "a stop")
+        # 0.3 s that the command holds, 0.33 s to brake, and what a loaded machine takes
+        assert bench.heard[-1] - said[0] < 2.0
+        assert bench.samples[-1].commands_refused == 0
+        bench.wait(lambda: any("'operator': stop" in report.text for report in bench.reports), "word of the stop")
+        bench.wait(lambda: dict(bench.reports[-1].counters).get("dead_man") == 1, "its count")
+
+
+def test_given_a_log_then_the_emulated_device_measures_what_stands_in_it(bench: Bench) -> None:
+    log = bench.folder / "drive.lcm"
+    start = 1_700_000_000_000_000
+    events = lcm.EventLog(str(log), "w", overwrite=True)
+    for n in range(100):
+        utime = start + n * 50_000
+        fix = GpsSample(
+            SensorHeader(utime, "receiver", n, utime),
+            FixType.FIX_3D,
+            50.0 + n * 1e-6,
+            -111.0 - n * 2e-6,
+            height_msl=700.0 + n,
+            undulation=-20.0,
+            satellites=9,
+            position_covariance=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 4.0),
+            velocity=(1.0, 2.0, 0.0),
+        )
+        events.write_event(utime, "GPS", encode(fix))
+    events.close()
+    bench.hear("gps")
+    with bench.driver("gps"):
+        bench.wait(lambda: bool(bench.reports), "a report without a device")
+        with bench.device("gps", "--from", str(log)):
+            bench.wait(lambda: bool(bench.samples) and bench.samples[-1].height_msl > 798.5, "the last of the log")
+    numbers = [round(sample.height_msl - 700.0) for sample in bench.samples]
+    assert len(numbers) > 40
+    assert numbers == list(range(numbers[0], 100))
+    for n, sample in zip(numbers, bench.samples, strict=True):
+        assert sample.latitude_deg == pytest.approx(50.0 + n * 1e-6, abs=1e-9)
+        assert sample.longitude_deg == pytest.approx(-111.0 - n * 2e-6, abs=1e-9)
+    assert_rate("gps", bench.samples)
+
+
+def test_given_iron_when_the_vehicle_is_turned_then_its_own_field_is_found_and_the_device_keeps_it(
+    bench: Bench,
+) -> None:
+    state = bench.folder / "imu.eeprom"
+    device = ("imu", "--scenario", "circle", "--iron", "12,-7,5", "--state", str(state))
+    with bench.device(*device):
+        done = run(bench, "driver", "imu", "-c", bench.vehicle, "--hard-iron", "--seconds", "12")
+    assert done.returncode == 0, done.stderr
+    assert "turn the vehicle on level ground" in done.stderr
+    assert "5 of 12 s, field spans" in done.stderr
+    offsets = [float(word) for word in done.stdout.splitlines()[0].split()[1:3]]
+    assert offsets == pytest.approx([12.0, -7.0], abs=0.5)
+    assert "are stored and were read back" in done.stdout
+    kept = dict(tuple(map(int, line.split())) for line in state.read_text().splitlines())
+    counts = [(kept[address] + 32768) % 65536 - 32768 for address in Address.HARD_IRON]
+    assert counts[:2] == pytest.approx([axis * 1e-6 / 1e-4 * 16384 for axis in offsets], abs=1)
+    # switched off and on again it still has them; a vehicle that stands tells nothing, and leaves them
+    with bench.device("imu", "--scenario", "stand", "--state", str(state)):
+        vain = run(bench, "driver", "imu", "-c", bench.vehicle, "--hard-iron", "--seconds", "1")
+    assert vain.returncode == 1
+    assert f"offsets before {[kept[address] for address in Address.HARD_IRON]} counts" in vain.stderr
+    assert "turn the vehicle further" in vain.stderr
+    assert dict(tuple(map(int, line.split())) for line in state.read_text().splitlines()) == kept
+
+
+def run(bench: Bench, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [*MODELSERVER, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+
+
+def test_given_mistyped_names_then_the_nearest_is_told(bench: Bench) -> None:
+    wrong = run(bench, "driver", "gsp", "-c", bench.vehicle)
+    assert wrong.returncode == 2
+    assert "did you mean gps?" in wrong.stderr
+    fault = run(bench, "emulate", "gps", "-c", bench.vehicle, "--pty", "--fault", "stal@1")
+    assert fault.returncode == 2
+    assert "did you mean stall?" in fault.stderr
+    text = bench.vehicle.read_text().replace("bauds: [38400]", "buads: [38400]")
+    bench.vehicle.write_text(text)
+    for command in (("driver", "gps", "-c"), ("check",)):
+        slip = run(bench, *command, bench.vehicle)
+        assert slip.returncode == 1
+        said = slip.stderr + slip.stdout
+        assert "unknown key 'buads'" in said
+        assert "write bauds" in said
+
+
+def test_given_list_then_ports_and_drivers_are_shown(bench: Bench) -> None:
+    shown = run(bench, "driver", "--list", "-c", bench.vehicle)
+    assert shown.returncode == 0, shown.stderr
+    assert "novatel: NovAtel OEM4" in shown.stdout
+
+
+def test_given_a_port_in_use_then_the_emulator_says_so(bench: Bench) -> None:
+    with bench.device("nmea"):
+        second = run(bench, "emulate", "nmea", "-c", bench.vehicle, "--tcp", str(bench.port))
+    assert second.returncode == 1
+    assert f"port {bench.port} is in use" in second.stderr

@@ -1,0 +1,31 @@
+"""The command line itself: slips are told with what was probably meant."""
+
+from __future__ import annotations
+
+import pytest
+
+from mstools.cli import COMMANDS, OTHER_WORDS, main
+
+
+@pytest.mark.parametrize(
+    ("word", "words"),
+    [
+        ("serve", "did you mean run? Run the service"),
+        ("replya", "did you mean replay?"),
+        ("xyzzy", "there are: demo, run, check"),
+    ],
+)
+def test_given_an_unknown_command_then_the_nearest_is_offered(
+    capsys: pytest.CaptureFixture[str], word: str, words: str
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([word, "-c", "vehicle.yaml"])
+    assert ended.value.code == 2
+    err = capsys.readouterr().err
+    assert f"there is no command {word!r}" in err
+    assert words in err
+
+
+def test_given_the_words_of_others_then_they_lead_to_commands_that_there_are() -> None:
+    assert set(OTHER_WORDS.values()) <= COMMANDS.keys()
+    assert not OTHER_WORDS.keys() & COMMANDS.keys()

@@ -1,0 +1,64 @@
+"""The lines of the demo: every driver of the vehicle file is led to loopback, and nothing else is changed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from modelserver.config import load_config
+from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings
+from mstools import demo_lines
+from mstools.demo import vehicle_file
+from mstools.demo_children import DemoError
+from mstools.driver import load_drivers
+
+
+def test_given_the_vehicle_file_then_all_its_drivers_are_led_to_lines_of_this_machine(tmp_path: Path) -> None:
+    lines = demo_lines.lay_lines(vehicle_file(), tmp_path)
+    vehicle, drivers = load_drivers(lines.vehicle)
+    kept, before = load_drivers(vehicle_file())
+    for name in ("gps", "imu", "front_axis"):
+        assert drivers[name].station == before[name].station
+    assert vehicle.sensors == kept.sensors
+    assert vehicle.geometry == kept.geometry
+    assert list(lines.devices) == list(before)
+    for name, driver in drivers.items():
+        line = driver.line
+        told = lines.devices[name]
+        if isinstance(line, CanSettings):
+            assert line.interface == "udp_multicast"
+            assert told == ("--can", line.can)
+            assert Path(driver.station.dbc).is_file()
+        elif isinstance(line, SerialSettings):
+            assert told == ("--pty", "--link", line.port)
+            assert Path(line.port).parent == tmp_path
+        else:
+            assert isinstance(line, ModbusSettings)
+            assert line.address == f"127.0.0.1:{told[-1]}"
+    # the wheels and the controller are on one bus, which is not LCM's
+    buses = {driver.line.can for driver in drivers.values() if isinstance(driver.line, CanSettings)}
+    assert len(buses) == 1
+    assert lines.url.split("?")[0].rpartition(":")[2] != buses.pop().rpartition(":")[2]
+
+
+def test_given_no_multicast_then_it_is_said_and_nothing_is_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(demo_lines, "hears_itself", lambda group, port: False)
+    with pytest.raises(DemoError, match=r"multicast does not work(.|\n)*ip route add"):
+        demo_lines.lay_lines(vehicle_file(), tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_given_a_group_that_is_none_then_nothing_comes_back() -> None:
+    assert not demo_lines.hears_itself("127.0.0.1", 0)
+
+
+def test_given_the_raptor_then_its_drivers_are_as_the_vehicle_file_says() -> None:
+    _, drivers = load_drivers(vehicle_file())
+    kinds = {name: driver.kind.name for name, driver in drivers.items()}
+    assert kinds == {"gps": "novatel", "imu": "gx1", "wheels": "wheels", "raptor": "vehicle", "front_axis": "axis"}
+    sensors = load_config(vehicle_file()).sensors
+    assert sensors.wheels is not None
+    assert set(drivers["wheels"].station.wheels) == set(sensors.wheels.frames)

@@ -1,0 +1,222 @@
+"""`modelserver driver`: a device onto the bus."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from modelserver.errors import ModelServerError, RecordingError, nearest_names, shown
+from mstools.asking import UrlOption
+from mstools.output import safe
+from mstools.run import LEVELS
+
+if TYPE_CHECKING:
+    from modelserver.config import VehicleConfig
+    from msdrivers.links import Link
+    from msdrivers.settings import DriverSettings
+
+COMMANDS_LOOK_S = 0.02
+"""How often a driver that takes commands looks for them."""
+
+
+def command(
+    name: Annotated[str, typer.Argument(metavar="[NAME]", help="Name of the driver in the vehicle file.")] = "",
+    config: Annotated[Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file.")] = None,
+    list_ports: Annotated[
+        bool, typer.Option("--list", help="List the ports found, and the drivers of the vehicle file; then end.")
+    ] = False,
+    record_raw: Annotated[
+        Path | None, typer.Option("--record-raw", metavar="FILE", help="Keep what comes and goes on the line.")
+    ] = None,
+    record_limit: Annotated[
+        float, typer.Option("--record-limit", metavar="MB", min=0.001, help="Largest recording; then it ends.")
+    ] = 1000.0,
+    play_raw: Annotated[
+        Path | None, typer.Option("--play-raw", metavar="FILE", help="Take a recording in place of the device.")
+    ] = None,
+    hard_iron: Annotated[
+        bool, typer.Option("--hard-iron", help="Turn the vehicle: find its own magnetic field, store it, then end.")
+    ] = False,
+    seconds: Annotated[
+        float, typer.Option("--seconds", metavar="N", min=1.0, help="With --hard-iron: how long to turn it.")
+    ] = 60.0,
+    all_axes: Annotated[
+        bool, typer.Option("--all-axes", help="With --hard-iron: it is turned about all axes, not on level ground.")
+    ] = False,
+    url: UrlOption = "",
+    log_level: Annotated[str, typer.Option("--log-level", help=f"One of {', '.join(LEVELS)}.")] = "info",
+) -> None:
+    """Read a device and publish what it measures, until SIGTERM or Ctrl-C.
+
+    Connects, sets the device up, stamps each sample with the instant of its measurement, and connects again when the
+    device has been away. How it goes is on DRIVER_HEALTH once a second, and on stderr when it changes. What drivers
+    there are stands in the vehicle file, under `drivers`.
+
+    Examples:
+
+    modelserver driver --list
+
+    modelserver driver gps -c config/raptor/vehicle.yaml
+
+    modelserver driver imu -c vehicle.yaml --record-raw imu.raw
+
+    modelserver driver imu -c vehicle.yaml --hard-iron --seconds 90
+    """
+    if log_level not in LEVELS:
+        raise typer.BadParameter(f"{log_level!r} is not one of {', '.join(LEVELS)}", param_hint="--log-level")
+    if list_ports:
+        show_ports()
+        if config is not None:
+            show_drivers(config)
+        return
+    if config is None:
+        raise typer.BadParameter("give the vehicle file: -c vehicle.yaml", param_hint="--config")
+    if record_raw is not None and play_raw is not None:
+        raise typer.BadParameter("a recording that is played is not recorded again", param_hint="--record-raw")
+    vehicle, settings = load_driver(name, config)
+    if hard_iron and not settings.kind.hard_iron:
+        raise typer.BadParameter(f"a {settings.kind.name} has no such procedure", param_hint="--hard-iron")
+    logging.basicConfig(level=log_level.upper(), format="%(levelname)s %(name)s: %(message)s")
+    with contextlib.ExitStack() as stack:
+        link = _line(stack, settings, record_raw, round(record_limit * 1e6), play_raw)
+        if hard_iron:
+            from mstools.hard_iron import run_hard_iron
+
+            run_hard_iron(settings, link, seconds, all_axes)
+            return
+        run(vehicle, settings, link, config.parent, url)
+
+
+def show_ports() -> None:
+    """Print the ports of this machine."""
+    from msdrivers.links.can_bus import can_networks
+    from msdrivers.links.ports import found_ports
+
+    ports = found_ports()
+    for port in ports:
+        typer.echo(safe(f"{port.path:<16} {port.what}") + (f"\n    {safe(port.hint)}" if port.hint else ""))
+    for network in can_networks():
+        typer.echo(safe(f"{network:<16} CAN network interface"))
+    if not ports:
+        typer.echo("no serial port found: is the adapter plugged in? dmesg says what the kernel made of it")
+
+
+def show_drivers(config: Path) -> None:
+    """Print the drivers of a vehicle file."""
+    _, drivers = load_drivers(config)
+    for name, driver in drivers.items():
+        typer.echo(safe(f"{name:<16} {driver.kind.name}: {driver.kind.about}; {driver.line}"))
+
+
+def load_drivers(config: Path) -> tuple[VehicleConfig, dict[str, DriverSettings]]:
+    """Return a vehicle file and the settings of its drivers. Raises ConfigError, OSError."""
+    from modelserver.config import config_lines, load_config
+    from msdrivers.settings import Place, read_drivers
+
+    vehicle = load_config(config)
+    return vehicle, read_drivers(vehicle.drivers, Place(str(config), config_lines(config)))
+
+
+def load_driver(name: str, config: Path) -> tuple[VehicleConfig, DriverSettings]:
+    """Return a vehicle file and the settings of one of its drivers. Raises ConfigError, OSError, ModelServerError."""
+    from modelserver.config import config_lines, load_config
+    from msdrivers.settings import Place, read_driver
+
+    vehicle = load_config(config)
+    if name not in vehicle.drivers:
+        if not vehicle.drivers:
+            raise ModelServerError(f"{config} names no drivers; write a section drivers: see docs/vehicle-file.md")
+        known = f"{config} has: {', '.join(vehicle.drivers)}"
+        if not name:
+            raise typer.BadParameter(f"name the driver; {known}", param_hint="NAME")
+        near = nearest_names(name, vehicle.drivers)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise typer.BadParameter(f"{shown(name, 40)} is no driver; {hint}{known}", param_hint="NAME")
+    return vehicle, read_driver(name, vehicle.drivers[name], Place(str(config), config_lines(config)))
+
+
+def channels_of(vehicle: VehicleConfig, settings: DriverSettings) -> dict[type, str]:
+    """Return on which channels a driver's samples go out: the driver's own, else those that the service hears."""
+    from modelserver.messages import GpsSample, ImuSample, WheelsSample
+
+    sensors = vehicle.sensors
+    heard = ((GpsSample, sensors.gps), (ImuSample, sensors.imu), (WheelsSample, sensors.wheels))
+    channels: dict[type, str] = {kind: sensor.channel for kind, sensor in heard if sensor is not None}
+    if settings.channel:
+        channels[settings.kind.sample] = settings.channel
+    return channels
+
+
+def _line(
+    stack: contextlib.ExitStack, settings: DriverSettings, record: Path | None, limit: int, play: Path | None
+) -> Link[Any]:
+    """Return the driver's line, recorded, or a recording in its place."""
+    from msdrivers.lines import form_of, link_of
+    from msdrivers.raw_log import PlayedLink, RawWriter, RecordingLink, open_for_reading
+    from msdrivers.runner import SystemTime
+
+    form = form_of(settings)
+    if play is not None:
+        reader = open_for_reading(play)
+        stack.callback(reader.stream.close)
+        if reader.kind != form.name:
+            raise RecordingError(f"{play} holds {reader.kind} of a {reader.device}, and a {settings.kind.name} is read")
+        return PlayedLink(str(play), reader, form.unpack, SystemTime())
+    link = link_of(settings)
+    if record is None:
+        return link
+    writer = RawWriter(stack.enter_context(record.open("w", encoding="ascii", errors="replace")), limit)
+    writer.begin(form.name, settings.name, settings.kind.name)
+    return RecordingLink(link, form, writer, SystemTime())
+
+
+def run(vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], folder: Path, url: str) -> None:
+    """Run a driver on a line until it is told to end. Raises ConfigError, OSError, BusError."""
+    from modelserver.wire.provider import open_lcm, resolve_url
+    from msdrivers.publishing import Publisher
+    from msdrivers.runner import Runner, RunnerSettings, SystemTime
+
+    kind = settings.kind
+    station = kind.load().station(settings.station, folder)
+    bus = open_lcm(resolve_url(url or vehicle.lcm.url))
+    publisher = Publisher(bus.publish, channels_of(vehicle, settings), vehicle.lcm.channel_prefix)
+    how = RunnerSettings(settings.name, kind.name)
+    if kind.commands:
+        how = replace(how, look=COMMANDS_LOOK_S)
+    runner = Runner(station, link, how, SystemTime(), publisher.sample, publisher.health)
+    attend: Callable[[], object] = lambda: None  # noqa: E731
+    if kind.commands:
+        attend = _hear_commands(bus, f"{vehicle.lcm.channel_prefix}{kind.commands}", runner)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: runner.stop())
+    runner.run(attend)
+
+
+def _hear_commands(bus: Any, channel: str, runner: Any) -> Callable[[], object]:
+    """Return what takes the commands that have come on a channel."""
+    from modelserver.errors import WireError
+    from modelserver.wire.channels import literal
+    from modelserver.wire.codec import decode
+
+    def handle(_: str, data: bytes) -> None:
+        try:
+            wish = decode("vehicle_command_t", data)
+        except WireError as error:
+            runner.counts[f"rejected.command.{error.reason}"] += 1
+            return
+        runner.command(wish)
+
+    bus.subscribe(literal(channel), handle)
+
+    def attend() -> None:
+        while bus.handle_timeout(0):
+            pass
+
+    return attend
