@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
 from dataclasses import dataclass
-from typing import TypeAlias
+from ipaddress import ip_address
+from typing import ClassVar, TypeAlias
 
-from modelserver.errors import shown
+from modelserver.errors import nearest_names, shown
 
 
 @dataclass(frozen=True, slots=True)
 class SerialSettings:
     """A serial port: its path, and symbols a second; 0: what the device has from its maker."""
 
+    about: ClassVar[str] = "a serial port"
     port: str
     baud: int = 0
 
@@ -29,6 +33,7 @@ class SerialSettings:
 class TcpSettings:
     """A device server: `HOST:PORT`."""
 
+    about: ClassVar[str] = "a server"
     address: str
 
     def __post_init__(self) -> None:
@@ -45,9 +50,20 @@ class CanSettings:
     bitrate 0: the interface is set up already, as socketcan's are by `ip link`.
     """
 
+    about: ClassVar[str] = "a CAN bus"
     can: str
     interface: str = "socketcan"
     bitrate: int = 0
+
+    def __post_init__(self) -> None:
+        why = against_interface(self.interface)
+        if why:
+            raise ValueError(f"interface {why}")
+        why = against_channel(self.can, self.interface)
+        if why:
+            raise ValueError(f"can {why}")
+        if not 0 <= self.bitrate <= 10_000_000:
+            raise ValueError(f"bitrate is 0 (set up already) to 10000000 bits a second, got {self.bitrate}")
 
     def __str__(self) -> str:
         return f"{self.interface} {self.can}" + (f", {self.bitrate} bit/s" if self.bitrate else "")
@@ -57,6 +73,7 @@ class CanSettings:
 class ModbusSettings:
     """A Modbus/TCP server: `HOST:PORT`, the port customarily 502, and the number of the device behind it."""
 
+    about: ClassVar[str] = "a server"
     address: str
     unit_id: int = 1
 
@@ -72,9 +89,77 @@ class ModbusSettings:
 LineSettings: TypeAlias = SerialSettings | TcpSettings | CanSettings | ModbusSettings
 
 
+def first_key(kind: type[LineSettings]) -> str:
+    """Return the key by which a section names this kind of line."""
+    return dataclasses.fields(kind)[0].name
+
+
 def split_address(address: str) -> tuple[str, int]:
     """Return host and port of `HOST:PORT`. Raises ValueError."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise ValueError(f"address is HOST:PORT, e.g. 192.168.1.10:3001, got {shown(address)}")
     return host.strip("[]"), int(port)
+
+
+MULTICAST = "udp_multicast"
+"""The interface that carries frames over UDP, for trials without hardware: its channel is GROUP:PORT."""
+
+MULTICAST_PORT = 43113
+"""python-can's own, where a channel names none."""
+
+LONGEST_NETWORK = 15
+"""Characters in the name of a network interface, IFNAMSIZ - 1 in linux/if.h."""
+
+
+def against_interface(interface: str) -> str:
+    """Return why python-can has no interface of a name; empty where it has one."""
+    from can import VALID_INTERFACES
+
+    if interface in VALID_INTERFACES:
+        return ""
+    near = nearest_names(interface, VALID_INTERFACES)
+    fix = f"write {near[0]}" if near else f"known: {', '.join(sorted(VALID_INTERFACES))}"
+    return f"{shown(interface)} is no interface of python-can's; {fix}"
+
+
+def against_channel(channel: str, interface: str) -> str:
+    """Return why a CAN interface cannot have a channel; empty where it can, or nothing is known of its channels."""
+    if interface == MULTICAST:
+        try:
+            split_group(channel)
+        except ValueError as error:
+            return str(error)
+    elif interface != "socketcan":
+        return "" if channel else "is the channel as the interface names it, got nothing"
+    elif _is_group(channel):
+        fix = f"add interface: {MULTICAST}, or to modelserver emulate --interface {MULTICAST}"
+        return f"{shown(channel)} is a group of IP multicast; {fix}"
+    elif not 0 < len(channel) <= LONGEST_NETWORK or not channel.isprintable() or set(channel) & set("/: "):
+        return f"is the name of a network interface, e.g. can0, got {shown(channel)}"
+    return ""
+
+
+def split_group(channel: str) -> tuple[str, int]:
+    """Return group and port of `GROUP:PORT` or `GROUP`; IPv6 with a port is `[GROUP]:PORT`. Raises ValueError."""
+    found = _GROUP_PORT.fullmatch(channel)
+    group, port = (found[1] or found[2], int(found[3] or MULTICAST_PORT)) if found else (channel, MULTICAST_PORT)
+    try:
+        is_group = ip_address(group).is_multicast
+    except ValueError:
+        is_group = False
+    if not is_group or not 0 < port < 65536:
+        raise ValueError(f"is GROUP:PORT with {MULTICAST}, e.g. 239.74.163.2:{MULTICAST_PORT}, got {shown(channel)}")
+    return group, port
+
+
+_GROUP_PORT = re.compile(r"(?:\[([^\]]+)\]|([^:\[\]]+))(?::([0-9]{1,5}))?")
+"""IPv6 in brackets, or a group without a colon; an IPv6 group alone has none of either."""
+
+
+def _is_group(channel: str) -> bool:
+    try:
+        split_group(channel)
+    except ValueError:
+        return False
+    return True

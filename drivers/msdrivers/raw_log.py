@@ -12,15 +12,19 @@ clock in nanoseconds, and the unit in hexadecimal. A last line that breaks off i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import contextlib
+import itertools
+import logging
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Generic, NamedTuple, Protocol, TextIO, TypeVar
+from typing import NamedTuple, Protocol, TextIO, TypeVar
 
 from modelserver.errors import RecordingError
-from msdrivers.links import Link, PlayedOutError
 from msdrivers.station import Now
+
+log = logging.getLogger(__name__)
 
 U = TypeVar("U")
 
@@ -88,12 +92,17 @@ class Time(Protocol):
 
 @dataclass(slots=True)
 class RawWriter:
-    """Writes records up to a number of bytes; what does not fit is left out, and `full` says so."""
+    """Writes records to the file called `name`, up to a number of bytes or until the disk is full.
+
+    That the recording has ended then is told once, and `full` says so; `lost` counts the records that came after.
+    """
 
     stream: TextIO
     limit: int
+    name: str = ""
     written: int = 0
     full: bool = False
+    lost: int = 0
 
     def begin(self, kind: str, source: str, device: str) -> None:
         """Write the first line."""
@@ -104,101 +113,32 @@ class RawWriter:
         said = data.decode() if way is Way.WORD else data.hex()
         self._put(f"{way} {now.utime} {now.monotonic_ns} {said}\n")
 
+    def close(self) -> None:
+        """Close the file, and tell what is not in it."""
+        with contextlib.suppress(OSError):
+            # what the disk did not take stands in the buffer still, and is refused again
+            self.stream.close()
+        if self.lost:
+            log.warning("recording %s: %d records came after its end and are not in it", self.name, self.lost)
+
     def _put(self, line: str) -> None:
-        self.full = self.full or self.written + len(line) > self.limit
-        if not self.full:
-            self.stream.write(line)
-            # what was received is there after a crash too
-            self.stream.flush()
-            self.written += len(line)
+        if self.full:
+            self.lost += 1
+        elif self.written + len(line) > self.limit:
+            self._end(f"it has its {self.limit / 1e6:g} MB, see --record-limit")
+        else:
+            try:
+                self.stream.write(line)
+                # what was received is there after a crash too
+                self.stream.flush()
+            except OSError as error:
+                self._end(error.strerror or str(error))
+            else:
+                self.written += len(line)
 
-
-class RecordingLink(Generic[U]):
-    """A line whose traffic is recorded."""
-
-    def __init__(self, link: Link[U], form: Form[U], writer: RawWriter, time: Time):
-        self._link, self._form, self._writer, self._time = link, form, writer, time
-
-    @property
-    def description(self) -> str:
-        """The line's."""
-        return self._link.description
-
-    @property
-    def baud(self) -> int:
-        """The line's."""
-        return self._link.baud
-
-    def open(self, baud: int | None = None) -> None:
-        """Open the line. Raises LinkError."""
-        self._link.open(baud)
-        self._word(f"open {self.description} {self.baud}")
-
-    def close(self) -> None:
-        """Close the line."""
-        self._link.close()
-        self._word("close")
-
-    def poll(self, timeout: float) -> Sequence[U]:
-        """Return what came in. Raises LinkError."""
-        units = self._link.poll(timeout)
-        for unit in units:
-            self._writer.record(Way.RECEIVED, self._time.now(), self._form.pack(unit))
-        return units
-
-    def send(self, unit: U) -> None:
-        """Send a unit. Raises LinkError."""
-        self._link.send(unit)
-        self._writer.record(Way.SENT, self._time.now(), self._form.pack(unit))
-
-    def _word(self, text: str) -> None:
-        self._writer.record(Way.WORD, self._time.now(), text.encode())
-
-
-class PlayedLink(Generic[U]):
-    """A recording in place of a line: what was received comes again, as long after each other as then.
-
-    What is sent goes nowhere. The recording's end is a PlayedOutError.
-    """
-
-    baud = 0
-
-    def __init__(self, description: str, records: Iterable[Record], unpack: Callable[[bytes], U], time: Time):
-        self.description = description
-        self._records = (record for record in records if record.way is Way.RECEIVED)
-        self._unpack, self._time = unpack, time
-        self._next: Record | None = None
-        self._ahead_ns: int | None = None
-
-    def open(self, baud: int | None = None) -> None:
-        """Begin, or go on."""
-
-    def close(self) -> None:
-        """Stop."""
-
-    def poll(self, timeout: float) -> Sequence[U]:
-        """Return what is due, waiting `timeout` seconds at most. Raises PlayedOutError at the end."""
-        if self._next is None:
-            self._next = next(self._records, None)
-            if self._next is None:
-                raise PlayedOutError(self.description, "the recording has ended")
-        now_ns = self._time.now().monotonic_ns
-        if self._ahead_ns is None:
-            self._ahead_ns = now_ns - self._next.now.monotonic_ns
-        wait = (self._next.now.monotonic_ns + self._ahead_ns - now_ns) * 1e-9
-        if wait > 0:
-            self._time.sleep(min(wait, max(0.0, timeout)))
-            if wait > timeout:
-                return ()
-        record, self._next = self._next, None
-        try:
-            return (self._unpack(record.data),)
-        except ValueError:
-            # written by a form of another version, or damaged
-            return ()
-
-    def send(self, unit: U) -> None:
-        """Send nothing."""
+    def _end(self, why: str) -> None:
+        self.full, self.lost = True, 1
+        log.warning("recording %s ended: %s; the driver goes on", self.name, why)
 
 
 @dataclass(slots=True)
@@ -239,6 +179,52 @@ def _record(line: str) -> Record | None:
         return Record(direction, Now(int(parts[1]), int(parts[0])), data)
     except ValueError:
         return None
+
+
+@contextlib.contextmanager
+def recording(path: Path, limit: int) -> Iterator[RawWriter]:
+    """Make the file of a recording of at most `limit` bytes and close it again; one without records is taken away.
+
+    A recording that is there stays: beside gps.raw the next is gps.1.raw. Raises RecordingError for another file of
+    that name, which stays too, and OSError.
+    """
+    file = path
+    for number in itertools.count(1):
+        try:
+            stream = file.open("x", encoding="ascii", errors="replace")
+            break
+        except FileExistsError:
+            if not path.is_file():
+                # a device, e.g. /dev/null
+                stream = path.open("w", encoding="ascii", errors="replace")
+                break
+            if number == 1 and not _is_recording(path):
+                raise RecordingError(f"{path} is there, is no recording of a driver, and stays; name another") from None
+            file = path.with_suffix(f".{number}{path.suffix}")
+    log.info("recording to %s%s", file, f": {path} is there already" if file != path else "")
+    writer = RawWriter(stream, limit, str(file))
+    try:
+        yield writer
+    finally:
+        writer.close()
+        with contextlib.suppress(OSError):
+            if _is_blank(file):
+                file.unlink()
+
+
+def _is_recording(file: Path) -> bool:
+    """Return whether a file begins as a recording does, as far as it goes: one that a full disk cut short does too."""
+    with file.open("rb") as stream:
+        return MAGIC.encode().startswith(stream.read(len(MAGIC)))
+
+
+def _is_blank(file: Path) -> bool:
+    """Return whether a file has no more than a first line."""
+    if not file.is_file():
+        return False
+    with file.open("rb") as stream:
+        stream.readline(MAX_LINE)
+        return not stream.read(1)
 
 
 def open_for_reading(path: Path) -> RawReader:

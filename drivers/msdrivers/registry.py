@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from modelserver.errors import ConfigError, Problem, Severity, Source, nearest_names, shown
 from modelserver.messages import DeviceSample, GpsSample, ImuSample, JointsSample, VehicleStatusSample, WheelsSample
 from msdrivers.faults import FAULTS, Fault
 from msdrivers.line_settings import CanSettings, LineSettings, ModbusSettings, SerialSettings, TcpSettings
@@ -31,8 +32,9 @@ CHANNELS: Mapping[type[DeviceSample], str] = {
 class Made(NamedTuple):
     """What a kind's modules hold.
 
-    settings: the dataclass of its settings; a field `source` takes the driver's name, a field `bauds` the rates to try.
-    station: makes the driver from them and the folder that paths in them start from; raises ConfigError, OSError.
+    settings: the dataclass of its settings; a field `source` takes the driver's name, a field `bauds` the rates to try;
+        a field `joint` names a constraint of the geometry, a field `wheels` has the wheels by their names.
+    station: makes the driver from them and the folder that paths in them start from; raises ConfigError.
     """
 
     settings: type
@@ -60,8 +62,9 @@ class Kind:
     sample: what it says in the main, and what its emulator is driven by. lines: what it may hang on, the usual one
     first. load, emulate: import its modules. baud: what its maker sets. presets: settings that the kind itself gives.
     commands: the channel whose messages it takes, empty for none. faults: what can go wrong with its emulator, and what
-    the amount of each is. remembers: its emulator can keep its memory in a file. hard_iron: it has a procedure by which
-    it finds the vehicle's own magnetic field.
+    the amount of each is. follows: its emulator is where the samples say, and not where it was commanded to go.
+    remembers: its emulator can keep its memory in a file. hard_iron: it has a procedure by which it finds the vehicle's
+    own magnetic field.
     """
 
     name: str
@@ -74,6 +77,7 @@ class Kind:
     presets: Mapping[str, Any] = field(default_factory=dict)
     commands: str = ""
     faults: Mapping[str, str] = field(default_factory=lambda: FAULTS)
+    follows: bool = True
     remembers: bool = False
     hard_iron: bool = False
 
@@ -120,7 +124,7 @@ def _gx1_unit(wanted: Emulation) -> Station[Any]:
 def _wheels() -> Made:
     from msdrivers.devices.wheels import WheelsDriver, WheelsSettings
 
-    return Made(WheelsSettings, lambda settings, folder: WheelsDriver(settings, _dbc(settings.dbc, folder)))
+    return Made(WheelsSettings, lambda settings, folder: WheelsDriver(settings, _dbc(settings, folder)))
 
 
 def _wheels_unit(wanted: Emulation) -> Station[Any]:
@@ -128,7 +132,7 @@ def _wheels_unit(wanted: Emulation) -> Station[Any]:
     from msdrivers.emulate.wheels import WheelsEmulator
 
     faults = [CanFault(*each) for each in wanted.faults]  # type: ignore[arg-type]
-    database = _dbc(wanted.settings.dbc, wanted.folder)
+    database = _dbc(wanted.settings, wanted.folder)
     return WheelsEmulator(wanted.settings.wheels, database, wanted.samples, faults)
 
 
@@ -136,7 +140,7 @@ def _vehicle() -> Made:
     from msdrivers.devices.vehicle import VehicleDriver
     from msdrivers.devices.vehicle_settings import VehicleSettings
 
-    return Made(VehicleSettings, lambda settings, folder: VehicleDriver(settings, _dbc(settings.dbc, folder)))
+    return Made(VehicleSettings, lambda settings, folder: VehicleDriver(settings, _dbc(settings, folder)))
 
 
 def _vehicle_unit(wanted: Emulation) -> Station[Any]:
@@ -144,7 +148,7 @@ def _vehicle_unit(wanted: Emulation) -> Station[Any]:
     from msdrivers.emulate.vehicle import VehicleEmulator
 
     faults = [CanFault(*each) for each in wanted.faults]  # type: ignore[arg-type]
-    settings, database = wanted.settings, _dbc(wanted.settings.dbc, wanted.folder)
+    settings, database = wanted.settings, _dbc(wanted.settings, wanted.folder)
     return VehicleEmulator(database, settings.status, settings.command, samples=wanted.samples, faults=faults)
 
 
@@ -162,12 +166,23 @@ def _axis_unit(wanted: Emulation) -> Station[Any]:
     return AxisEmulator(wanted.settings.registers, faults=faults)
 
 
-def _dbc(path: str, folder: Path) -> CanDatabase:
+def _dbc(settings: Any, folder: Path) -> CanDatabase:
+    """Return what the DBC file of a driver's settings says. Raises ConfigError."""
     from msdrivers.protocol.can.database import parse_dbc
 
-    file = folder / Path(path).expanduser()
-    # some tools write the degree sign in Latin-1
-    return parse_dbc(file.read_bytes().decode("latin-1"), str(file))
+    path = Path(settings.dbc)
+    file = folder / path.expanduser()
+    try:
+        # some tools write the degree sign in Latin-1
+        text = file.read_bytes().decode("latin-1")
+    except (OSError, ValueError) as error:
+        there = [each.name for each in file.parent.glob("*")]
+        near = tuple(str(path.with_name(name)) for name in nearest_names(path.name, there))
+        fix = f"write {near[0]}" if near else "the path of a DBC file, relative to the vehicle file"
+        said = f"the DBC file {shown(str(file), 200)} cannot be read: {getattr(error, 'strerror', None) or error}"
+        place = Source(element=f"drivers.{settings.source}.dbc")
+        raise ConfigError([Problem(Severity.ERROR, said, place, fix, near)]) from None
+    return parse_dbc(text, str(file))
 
 
 _CAN_FAULTS = {**FAULTS, "jump": "counts by which counters jump", "bus_off": "seconds for which the bus is left"}
@@ -219,6 +234,7 @@ _ALL = (
         (ModbusSettings,),
         _axis,
         _axis_unit,
+        follows=False,
         faults={**FAULTS, "jump": "degrees by which its angle jumps", "exception": "the code that a request gets"},
     ),
 )

@@ -8,15 +8,17 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar, runtime_checkable
+from typing import Generic, TypeVar
 
 from modelserver.messages import DeviceSample, DriverHealth, DriverPhase, VehicleCommand
 from msdrivers.device_clock import DeviceClock
 from msdrivers.links import Link, LinkError, PlayedOutError
+from msdrivers.links.guarded import GuardedLink
 from msdrivers.raw_log import Time
 from msdrivers.reporting import Reporter
+from msdrivers.retries import Retries
 from msdrivers.stamping import Stamper
-from msdrivers.station import Measured, Now, Output, Reopen, Send, Station, Told
+from msdrivers.station import Commanded, Measured, Now, Output, Quiet, Reopen, Send, Station, Told
 
 log = logging.getLogger(__name__)
 
@@ -43,10 +45,9 @@ class RunnerSettings:
     """How a driver is run. Times in seconds.
 
     source, device: its name in the vehicle file and the kind of its device.
-    first_wait, last_wait: before the line is tried again, growing; each is varied by a fifth, so that many drivers do
-        not knock at once. silence: after so long without a unit the device is called silent, and after `reopen` the
-        line is opened anew. report: between reports. look: so often it is looked whether to
-        end, and for commands.
+    first_wait, last_wait: before the line is tried again, growing. silence: after so long without a unit the device is
+        called silent, and after `reopen` the line is opened anew; a station that is `Quiet` may be quiet for longer.
+        report: between reports. look: so often it is looked whether to end, and for commands.
     """
 
     source: str
@@ -57,15 +58,6 @@ class RunnerSettings:
     reopen: float = 10.0
     report: float = 1.0
     look: float = 0.2
-
-
-@runtime_checkable
-class Commanded(Protocol[U]):
-    """A station that takes commands from the bus too."""
-
-    def command(self, command: VehicleCommand, now: Now) -> Sequence[Output[U]]:
-        """Take a command."""
-        ...
 
 
 class Runner(Generic[U]):
@@ -84,18 +76,20 @@ class Runner(Generic[U]):
         self.counts: Counter[str] = Counter()
         """Errors of the runner's own, by kind."""
         self.reconnects = 0
-        self.played_out = False
-        self._station, self._link, self._settings, self._clock = station, link, settings, clock
+        self._station, self._settings, self._clock = station, settings, clock
+        self._link = GuardedLink(link, self._failed)
         self._publish, self._report = publish, report
-        self._rng = rng or random.Random()
+        self._retries = Retries(settings.first_wait, settings.last_wait, rng or random.Random())
+        quiet = station.quiet if isinstance(station, Quiet) else 0.0
+        # a line that is quiet twice as long as the device may be is opened anew
+        self._silence, self._patience = max(settings.silence, quiet), max(settings.reopen, 2.0 * quiet)
         self._stamper = Stamper(DeviceClock())
-        self._stopping = False
+        self._stopping, self._last_word = False, "ended"
         self._is_open = self._was_open = False
         self._baud: int | None = None
-        self._wait = settings.first_wait
         now = clock.now()
         self._open_ns = self._heard_ns = now.monotonic_ns
-        self._reporter = Reporter(settings.source, settings.silence, settings.report, now, self._send_report)
+        self._reporter = Reporter(settings.source, self._silence, settings.report, now, self._send_report)
 
     @property
     def samples(self) -> int:
@@ -120,13 +114,20 @@ class Runner(Generic[U]):
 
     def command(self, command: VehicleCommand) -> None:
         """Hand a command to a station that takes them; without an open line it goes nowhere and is counted."""
+        self._commanded(lambda station, now: station.command(command, now))
+
+    def refuse(self, reason: str, text: str) -> None:
+        """Let the station count and tell what came as a command and cannot be one."""
+        self._commanded(lambda station, now: station.refuse(reason, text, now))
+
+    def _commanded(self, ask: Callable[[Commanded[U], Now], Sequence[Output[U]]]) -> None:
         station = self._station
         if not self._is_open or not isinstance(station, Commanded):
             self.counts["commands_lost"] += 1
             return
         now = self._clock.now()
         try:
-            self._do(self._asked("command", lambda: station.command(command, now)))
+            self._do(self._asked("command", lambda: ask(station, now)))
         except LinkError as error:
             self._lost(error)
 
@@ -138,8 +139,9 @@ class Runner(Generic[U]):
             try:
                 self._carry()
             except PlayedOutError as error:
-                self.played_out = True
-                self._lost(error)
+                self._last_word = error.why
+                self._link.close()
+                self._is_open = self._reporter.is_silent = False
                 self.stop()
             except LinkError as error:
                 self._lost(error)
@@ -162,6 +164,7 @@ class Runner(Generic[U]):
         self._is_open = self._was_open = True
         now = self._clock.now()
         self._heard_ns = now.monotonic_ns
+        self._retries.opened(now.monotonic_ns)
         self._tell(DriverPhase.WAITING, f"{self._link.description} is open")
         try:
             self._do(self._asked("opened", lambda: self._station.opened(now)))
@@ -169,18 +172,28 @@ class Runner(Generic[U]):
             self._lost(error)
 
     def _lost(self, error: LinkError) -> None:
-        self._close()
-        # also after one that was open: another who takes its place must not make a busy loop
-        self._try_again(self._wait * self._rng.uniform(0.8, 1.2))
-        self._wait = min(self._wait * 2.0, self._settings.last_wait)
-        self._tell(DriverPhase.CLOSED, str(error))
+        self._close(str(error), lambda at_ns: self._retries.lost(at_ns))
 
-    def _close(self) -> None:
+    def _reopen(self, wish: Reopen) -> None:
+        changes = wish.baud is not None and wish.baud != self._link.baud
+        self._baud = wish.baud or self._baud
+
+        def wait(at_ns: int) -> float:
+            if not changes:
+                return self._retries.lost(at_ns, in_order=True)
+            self._retries.changed()
+            return 0.0
+
+        self._close(f"opening anew: {wish.why}", wait)
+
+    def _close(self, why: str, wait: Callable[[int], float]) -> None:
+        """Close the line, tell `why`, and open it again after `wait`, which takes the present instant."""
         self._link.close()
         self._is_open = self._reporter.is_silent = False
-
-    def _try_again(self, seconds: float) -> None:
-        self._open_ns = self._clock.now().monotonic_ns + round(seconds * 1e9)
+        at_ns = self._clock.now().monotonic_ns
+        self._open_ns = at_ns + round(wait(at_ns) * 1e9)
+        self._reporter.tell(DriverPhase.CLOSED, why, self._clock.now(), note=self._retries.note(at_ns))
+        self._reporter.steady(False)
 
     # --- the station ------------------------------------------------------------------------------------------
 
@@ -192,7 +205,6 @@ class Runner(Generic[U]):
         now = self._clock.now()
         if units:
             self._heard_ns, self._reporter.is_silent = now.monotonic_ns, False
-            self._wait = self._settings.first_wait
         for unit in units:
             self._do(self._asked("received", lambda unit=unit: self._station.received(unit, now)))  # type: ignore[misc]
             if not self._is_open:
@@ -224,37 +236,33 @@ class Runner(Generic[U]):
             elif isinstance(output, Measured):
                 self._measured(output)
             elif isinstance(output, Told):
-                self._tell(DriverPhase[output.phase.name], output.text)
+                self._tell(DriverPhase[output.phase.name], output.text, output.is_trouble)
             else:
                 self._reopen(output)
                 return
 
     def _measured(self, measured: Measured) -> None:
+        now = self._clock.now()
         try:
-            self._publish(self._stamper.stamp(measured))
+            self._publish(self._stamper.stamp(measured, now))
         except Exception:
             self._failed("publish")
             return
-        self._reporter.measured(self._clock.now())
-
-    def _reopen(self, wish: Reopen) -> None:
-        self._close()
-        self._baud = wish.baud or self._baud
-        self._tell(DriverPhase.CLOSED, f"opening anew: {wish.why}")
-        self._try_again(0.0)
+        self._reporter.measured(now)
 
     def _watch(self, now: Now) -> None:
+        self._reporter.steady(self._retries.is_steady(now.monotonic_ns))
         quiet = (now.monotonic_ns - self._heard_ns) * 1e-9
-        if quiet >= self._settings.silence and not self._reporter.is_silent:
+        if quiet >= self._silence and not self._reporter.is_silent:
             self._reporter.is_silent = True
             self._reporter.announce(now)
-        if quiet >= self._settings.reopen:
+        if quiet >= self._patience:
             self._reopen(Reopen(f"nothing heard for {quiet:.0f} s"))
 
     # --- telling ----------------------------------------------------------------------------------------------
 
-    def _tell(self, phase: DriverPhase, text: str) -> None:
-        self._reporter.tell(phase, text, self._clock.now())
+    def _tell(self, phase: DriverPhase, text: str, is_trouble: bool = False) -> None:
+        self._reporter.tell(phase, text, self._clock.now(), is_trouble=is_trouble)
 
     def _send_report(self, now: Now) -> None:
         try:
@@ -278,7 +286,7 @@ class Runner(Generic[U]):
             samples=self.samples,
             rate_hz=self._reporter.rate_hz,
             age=self._reporter.age(now),
-            clock_offset=clock.offset,
+            clock_offset=self._stamper.offset,
             clock_drift=clock.drift,
             clock_sigma=self._stamper.sigma,
             clock_restarts=clock.restarts,
@@ -292,5 +300,6 @@ class Runner(Generic[U]):
                 self._do(self._asked("leaving", lambda: self._station.leaving(now)))
             except LinkError as error:
                 log.warning("%s: the device could not be left as it was found: %s", self._settings.source, error)
-            self._close()
-        self._tell(DriverPhase.CLOSED, "the recording has ended" if self.played_out else "ended")
+            self._link.close()
+            self._is_open = self._reporter.is_silent = False
+        self._tell(DriverPhase.CLOSED, self._last_word)

@@ -10,36 +10,21 @@ names, types and limits are written there and nowhere else.
 from __future__ import annotations
 
 import dataclasses
-import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
-
-from modelserver.errors import ConfigError, Problem, Severity, Source, nearest_names, shown
-from msdrivers.line_settings import LineSettings
+from modelserver.errors import ConfigError, Problem, Severity, Source
+from msdrivers.line_settings import LineSettings, TcpSettings
 from msdrivers.registry import KINDS, Kind
+from msdrivers.section_reader import SectionReader, keys_of
+from msdrivers.settings_words import Words
 
 SOURCE = "source"
 """The field of a kind's settings that takes the driver's name."""
 
 BAUDS = "bauds"
 """The field of a kind's settings that has the rates to try; `baud` in the section gives it one."""
-
-COMMON = ("device", "channel")
-"""Keys that every driver has: the kind of its device, and the channel, where it is not that of the sensors section."""
-
-
-@dataclass(frozen=True, slots=True)
-class DriverSettings:
-    """A driver: its name, its kind, its line, the settings of its station; `channel` empty: that of the sensor."""
-
-    name: str
-    kind: Kind
-    line: LineSettings
-    station: Any
-    channel: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,139 +39,104 @@ class Place:
         line = next((self.lines[path[:n]] for n in range(len(path), 0, -1) if path[:n] in self.lines), 0)
         return Source(self.file, line, ".".join(map(str, path)))
 
+    def located(self, name: str, problems: Iterable[Problem]) -> tuple[Problem, ...]:
+        """Return problems of the driver `name` with the lines of the keys that they are about.
+
+        Those of another file, e.g. of the syntax of a DBC, stay as they are. Names in a path may have dots.
+        """
+        lines = {".".join(map(str, path)): line for path, line in self.lines.items()}
+
+        def there(problem: Problem) -> Problem:
+            key = problem.element
+            if not key.startswith("drivers."):
+                if problem.file:
+                    return problem
+                key = f"drivers.{name}.{key}"
+            parts = key.split(".")
+            around = (".".join(parts[:n]) for n in range(len(parts), 0, -1))
+            line = next((lines[each] for each in around if each in lines), 0)
+            return dataclasses.replace(problem, source=Source(self.file, line, key))
+
+        return tuple(map(there, problems))
+
+
+@dataclass(frozen=True, slots=True)
+class DriverSettings:
+    """A driver: its name, its kind, its line, the settings of its station; `channel` empty: that of the sensor.
+
+    `place` is where they were read from.
+    """
+
+    name: str
+    kind: Kind
+    line: LineSettings
+    station: Any
+    channel: str = ""
+    place: Place = field(default=Place(), compare=False, repr=False)
+
 
 def read_drivers(
     sections: Mapping[str, Mapping[str, Any]], place: Place | None = None, kinds: Mapping[str, Kind] = KINDS
-) -> dict[str, DriverSettings]:
-    """Return the settings of every driver by its name. Raises ConfigError with every problem."""
-    problems: list[Problem] = []
+) -> tuple[dict[str, DriverSettings], tuple[Problem, ...]]:
+    """Return the settings of every driver of which nothing is wrong, by its name; and every problem of the others."""
+    place = place or Place()
+    problems = [empty_section(name, place) for name in empty_sections(sections, place)]
     found = {}
     for name, section in sections.items():
         try:
             found[name] = read_driver(name, section, place, kinds)
         except ConfigError as error:
             problems += error.problems
-    if problems:
-        raise ConfigError(problems)
-    return found
+    return found, tuple(problems)
+
+
+def empty_sections(sections: Mapping[str, object], place: Place) -> list[str]:
+    """Return the names of drivers that stand in the file with nothing after them, which counts as left out."""
+    named = [path[1] for path in place.lines if len(path) == 2 and path[0] == "drivers"]
+    return [str(name) for name in named if name not in sections]
+
+
+def empty_section(name: str, place: Place) -> Problem:
+    """Return the problem of a driver that has a name and nothing else."""
+    message, fix = f"drivers.{name} is empty: device is missing", "add a line: device: ..., or take the name out"
+    return Problem(Severity.ERROR, message, place.source("drivers", name), fix)
 
 
 def read_driver(
     name: str, section: Mapping[str, Any], place: Place | None = None, kinds: Mapping[str, Kind] = KINDS
 ) -> DriverSettings:
     """Return the settings of one driver. Raises ConfigError with every problem of its section."""
-    reader = _Reader(name, section, place or Place())
+    place = place or Place()
+    reader = SectionReader(name, section, place.source)
     kind = reader.kind(kinds)
     settings = kind.load().settings
     line = reader.line(kind)
-    station_keys = [key for key in _keys(settings) if key != SOURCE and key not in kind.presets]
-    reader.refuse_unknown([*COMMON, *_keys(*kind.lines), *station_keys])
-    given: dict[str, Any] = {SOURCE: name, **kind.presets}
-    if "baud" in section and BAUDS in station_keys and BAUDS not in section:
-        given[BAUDS] = [section["baud"]]
-    values = reader.values(settings, given)
+    station_keys = [key for key in keys_of(settings) if key != SOURCE and key not in kind.presets]
+    reader.refuse_unknown(kind, line, [*keys_of(_Common), *station_keys])
     line_values = reader.values(line)
-    channel = reader.values(_Common).channel
+    given: dict[str, Any] = {SOURCE: name, **kind.presets}
+    baud = getattr(line_values, "baud", 0)
+    if "bauds" in section and "baud" in section:
+        reader.refuse("baud", Words("both baud and bauds are given", "keep one of baud or bauds"))
+    elif baud and BAUDS in station_keys:
+        given[BAUDS] = [baud]
+    if line is TcpSettings and BAUDS in station_keys:
+        # the device server has the rate, and cannot be told another
+        given[BAUDS] = []
+    values = reader.values(settings, given)
+    common = reader.values(_Common)
     if reader.problems:
         raise ConfigError(reader.problems)
-    return DriverSettings(name, kind, line_values, values, channel)
+    return DriverSettings(name, kind, line_values, values, common.channel, place)
 
 
 @dataclass(frozen=True, slots=True)
 class _Common:
+    """Keys that every driver has: its kind, and the channel, where it is not that of the sensors section."""
+
     device: str = ""
     channel: str = ""
 
 
-def _keys(*kinds: type) -> list[str]:
-    return list(dict.fromkeys(each.name for kind in kinds for each in dataclasses.fields(kind)))
-
-
-def _known_keys(kind: Any, path: tuple[str | int, ...]) -> list[str]:
-    """Return the keys known at a place below settings of `kind`: in a section, a mapping or a list of sections."""
-    for step in path:
-        if dataclasses.is_dataclass(kind):
-            kind = get_type_hints(kind).get(str(step))
-        else:
-            # a mapping or a list: what it holds is its last argument, or the first of tuple[X, ...]
-            kind = next((each for each in reversed(get_args(kind)) if each is not Ellipsis), None)
-        if type(None) in get_args(kind):
-            kind = next(each for each in get_args(kind) if each is not type(None))
-    return _keys(kind) if dataclasses.is_dataclass(kind) and isinstance(kind, type) else []
-
-
-class _Reader:
-    """Reads one section, and keeps what is wrong with it."""
-
-    def __init__(self, name: str, section: Mapping[str, Any], place: Place):
-        self.name, self.section, self.place = name, section, place
-        self.problems: list[Problem] = []
-
-    def kind(self, kinds: Mapping[str, Kind]) -> Kind:
-        given = self.section.get("device")
-        known = f"kinds: {', '.join(kinds)}"
-        if given is None:
-            raise ConfigError([self._problem("device is missing", ("device",), f"add a line: device: ... ({known})")])
-        if not isinstance(given, str) or given not in kinds:
-            near = nearest_names(str(given), kinds)
-            fix = f"write {near[0]}" if near else known
-            raise ConfigError([self._problem(f"unknown device {shown(str(given))}", ("device",), fix, near)])
-        return kinds[given]
-
-    def line(self, kind: Kind) -> type[LineSettings]:
-        """Return which of its lines the section names: the one whose first key stands there."""
-        firsts = {dataclasses.fields(each)[0].name: each for each in kind.lines}
-        given = [key for key in firsts if key in self.section]
-        if len(given) == 1:
-            return firsts[given[0]]
-        wanted = " or ".join(firsts)
-        what = f"both {' and '.join(given)} are given" if given else f"no line is named: {wanted} is missing"
-        fix = f"keep one of {wanted}" if given else f"add a line: {next(iter(firsts))}: ..."
-        self.problems.append(self._problem(what, (given[-1],) if given else (), fix))
-        return next(iter(firsts.values()))
-
-    def refuse_unknown(self, known: list[str]) -> None:
-        for key in self.section:
-            if key not in known:
-                near = nearest_names(key, known)
-                fix = f"write {near[0]}" if near else f"known here: {', '.join(dict.fromkeys(known))}"
-                self.problems.append(self._problem(f"unknown key {shown(key)}", (key,), fix, near))
-
-    def values(self, kind: type, given: Mapping[str, Any] | None = None) -> Any:
-        """Return the instance of `kind` that the section makes, None where something is wrong with it.
-
-        What is `given` goes before the section; what `kind` does not have is left out.
-        """
-        merged = {**self.section, **(given or {})}
-        values = {key: value for key, value in merged.items() if key in _keys(kind)}
-        try:
-            # by way of JSON: strict there means that "4" is no number, while a list still makes a tuple
-            return TypeAdapter(kind).validate_json(json.dumps(values, default=str), strict=True)
-        except ValidationError as error:
-            missing_line = any("no line is named" in problem.message for problem in self.problems)
-            for detail in error.errors():
-                if not (detail["type"] == "missing" and missing_line):
-                    self.problems.append(self._explained(kind, detail))
-            return _Common() if kind is _Common else None
-
-    def _explained(self, kind: type, detail: Any) -> Problem:
-        path = tuple(detail["loc"])
-        if detail["type"] == "missing":
-            return self._problem(f"{path[-1]} is missing", path, f"add a line: {path[-1]}: ...")
-        if detail["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-            known = _known_keys(kind, path[:-1])
-            near = nearest_names(str(path[-1]), known)
-            fix = f"write {near[0]}" if near else f"known here: {', '.join(known)}"
-            return self._problem(f"unknown key {shown(str(path[-1]))}", path, fix, near)
-        message = str(detail["msg"]).removeprefix("Value error, ")
-        given = detail.get("input")
-        if detail["type"] == "value_error":
-            # found by the section as a whole; the message begins with the key that it is about
-            key = message.partition(" ")[0].rstrip(":")
-            path = (*path, key) if not path and key in self.section else path
-        elif isinstance(given, (str, int, float, bool)):
-            message += f", got {shown(str(given))}"
-        return self._problem(message[:1].lower() + message[1:], path)
-
-    def _problem(self, message: str, path: tuple[str | int, ...], fix: str = "", near: tuple[str, ...] = ()) -> Problem:
-        return Problem(Severity.ERROR, message, self.place.source("drivers", self.name, *path), fix, near)
+COMMON = tuple(keys_of(_Common))
+"""Keys that every driver has."""

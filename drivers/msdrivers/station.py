@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
-from modelserver.messages import DeviceSample
+from modelserver.messages import DeviceSample, VehicleCommand
 
 
 class Now(NamedTuple):
@@ -62,10 +62,14 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """A word for the log and the health channel: the driver's phase, and what there is to say for a person."""
+    """A word for the log and the health channel: the driver's phase, and what there is to say for a person.
+
+    `is_trouble`: something is wrong even where the phase is not SILENT, e.g. the device has refused what it was told.
+    """
 
     phase: Phase
     text: str
+    is_trouble: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,3 +104,26 @@ class Station(Protocol[U]):
     @property
     def counts(self) -> Mapping[str, int]:
         """Counters for people: messages by kind, bytes skipped, rejected by reason (`rejected.checksum`)."""
+
+
+@runtime_checkable
+class Commanded(Protocol[U]):
+    """A station that takes commands from the bus too."""
+
+    def command(self, command: VehicleCommand, now: Now) -> Sequence[Output[U]]:
+        """Take a command."""
+        ...
+
+    def refuse(self, reason: str, text: str, now: Now) -> Sequence[Output[U]]:
+        """Take that something came as a command and cannot be one; `reason` is a word, `text` for a person."""
+        ...
+
+
+@runtime_checkable
+class Quiet(Protocol):
+    """A station that knows for how long nothing need come."""
+
+    @property
+    def quiet(self) -> float:
+        """Seconds without a unit that are normal; inf where nothing is expected to come at all."""
+        ...

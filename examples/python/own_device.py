@@ -8,6 +8,7 @@ it on a real port stands in docs/own-device.md.
 
 # ruff: noqa: D102 - what each method of a station is for stands in msdrivers.station
 
+import re
 from collections import Counter
 from dataclasses import dataclass
 from functools import reduce
@@ -23,6 +24,9 @@ from msdrivers.runner import Runner, RunnerSettings
 from msdrivers.station import Measured, Now, Output, Phase, Send, Told
 
 LONGEST = 32
+
+SAID = re.compile(rb"SPD,(-?\d{1,3}\.\d\d)")
+"""What the device says and nothing else: float() would take nan, 1e9 and 1_0 too."""
 
 
 def line(speed: float) -> bytes:
@@ -43,10 +47,8 @@ class SpeedFormat:
         body, _, given = bytes(buffer[at + 1 : end]).partition(b"*")
         if b"%02X" % reduce(xor, body, 0) != given:
             return Refused("checksum")
-        try:
-            return Taken(end + 2, "speed", float(body.removeprefix(b"SPD,")))
-        except ValueError:
-            return Refused("content")
+        said = SAID.fullmatch(body)
+        return Taken(end + 2, "speed", float(said[1])) if said else Refused("content")
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,7 @@ from msdrivers.protocol.novatel import (
     UtmPosition,
     Velocity,
 )
+from msdrivers.protocol.novatel.crc import crc32
 from msdrivers.protocol.novatel.encode import encode
 
 MOST_KEPT = 1024
@@ -180,3 +181,44 @@ def test_given_a_sample_when_said_in_nmea_and_read_then_it_is_the_same(latitude:
     assert (epoch.height_msl, epoch.fix_type) == (12.5, sample.fix_type)
     assert epoch.speed == pytest.approx(3.0, abs=1e-4)
     assert math.isnan(epoch.heading)
+
+
+numbers = st.sampled_from(["inf", "-inf", "nan", "1e999", "-1", "2147483648", "4294967296", "", "1e308", "0x1", "8.5"])
+fields = st.one_of(numbers, st.text("0123456789.eE+-naifNAIF", max_size=12), st.integers().map(str))
+
+
+@given(
+    st.sampled_from(("#BESTPOSA", "#BESTVELA", "#BESTUTMA", "#HEADINGA", "#HEADING2A", "%BESTPOSSA", "%RAWIMUSA")),
+    st.lists(st.tuples(st.integers(0, 40), fields), min_size=1, max_size=4),
+)
+def test_given_a_text_log_with_any_fields_and_a_right_checksum_then_nothing_is_raised_and_the_next_is_read(
+    name: str, changes: list[tuple[int, str]]
+):
+    kind = "SOL_COMPUTED,SINGLE"
+    bodies = {
+        "#BESTPOSA": f'{kind},50,-111,700,-20,WGS84,1,2,3,"",0,0,8,8,8,0,0,02,00,01',
+        "#BESTVELA": f"{kind},0.1,0,1.5,90,0.1,0",
+        "#BESTUTMA": f'{kind},12,N,5e6,5e5,700,-20,WGS84,1,2,3,"",0,0,8,8,8,0,0,02,00,01',
+        "#HEADINGA": f'{kind},2,90,1,0,0.1,0.2,"AA",10,9,9,9,00,00,00',
+        "#HEADING2A": f'{kind},2,90,1,0,0.1,0.2,"AA","BB",10,9,9,9,00,00,00',
+    }
+    short = name.startswith("%")
+    header = (
+        ["1957", "339804.750"]
+        if short
+        else ["COM1", "0", "80.0", "FINESTEERING", "1957", "339804.750", "800", "7145", "6938"]
+    )
+    parts = [header, bodies.get(name, "1,2,3").split(",")]
+    for at, value in changes:
+        part = parts[at % 2]
+        part[at // 2 % len(part)] = value
+    content = f"{name[1:]},{','.join(parts[0])};{','.join(parts[1])}"
+    log = f"{name[0]}{content}*{crc32(content.encode()):08x}\r\n".encode()
+    stream = GpsStream()
+    for each in stream.feed(log):
+        assert isinstance(each, NovatelLog)
+        # what is taken can be published
+        assert 0 <= each.header.week <= 0xFFFF
+    assert stream.counts.get("rejected.error", 0) == 0
+    assert len(stream.feed(GOOD)) > 0
+    assert stream.waiting <= MOST_KEPT

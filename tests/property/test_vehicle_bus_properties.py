@@ -155,6 +155,30 @@ def test_given_any_commands_then_what_is_sent_is_within_the_limits_and_ends(
 
 
 @given(
+    st.lists(
+        st.tuples(st.integers(0, 9), st.sampled_from(("one", "two")), st.floats(0.0, 0.4), st.booleans()), max_size=40
+    )
+)
+def test_given_copies_of_commands_in_any_order_then_none_counts_after_a_newer_one(
+    copies: list[tuple[int, str, float, bool]],
+) -> None:
+    driver = VehicleDriver(vehicle_settings(max_validity=60.0), DATABASE)
+    driver.opened(at(10.0))
+    t, taken = 10.0, []
+    for seq, source, wait, is_opened in copies:
+        t += wait
+        if is_opened:
+            driver.opened(at(t))
+        driver.woken(at(t))
+        command = VehicleCommand(at(float(seq)).utime, 60.0, seq, source, 1.0, 0.0)
+        before = driver.counts["commands"]
+        driver.command(command, at(t))
+        taken += [command] if driver.counts["commands"] > before else []
+    assert [each.utime for each in taken] == sorted(each.utime for each in taken)
+    assert len({(each.source, each.seq) for each in taken}) == len(taken)
+
+
+@given(
     st.floats(-80.0, 70.0),
     st.floats(0.5, 10.0),
     st.floats(2.0, 90.0),

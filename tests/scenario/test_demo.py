@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import select
+import shutil
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+from support_lcm import PATIENCE_S
 
 from modelserver.errors import NoServerError
 from mstools import demo
@@ -62,6 +67,18 @@ ALL_STARTED = "modelserver emulate front_axis"
 """What the demo prints when the last of its processes has been started."""
 
 
+def all_started(process: subprocess.Popen[str]) -> tuple[str, dict[str, int]]:
+    """Return the demo's vehicle file and its processes once they are all there: ids by names.
+
+    What a process was given can be seen a little later than that it was started.
+    """
+    vehicle = vehicle_in(text_until(process, ALL_STARTED))
+    deadline = time.monotonic() + PATIENCE_S
+    while set(running := still_running(vehicle)) != PROCESSES:
+        assert time.monotonic() < deadline, f"missing: {PROCESSES - set(running)}"
+    return vehicle, running
+
+
 def test_given_nothing_else_when_the_demo_runs_then_it_shows_a_valid_pose_and_ends_by_itself():
     process = start("--seconds", "8")
     try:
@@ -85,8 +102,7 @@ def test_given_nothing_else_when_the_demo_runs_then_it_shows_a_valid_pose_and_en
 def test_given_a_running_demo_when_it_is_told_to_end_then_its_children_end_too(number, code):
     process = start("--seconds", "60")
     try:
-        vehicle = vehicle_in(text_until(process, ALL_STARTED))
-        assert set(still_running(vehicle)) == PROCESSES
+        vehicle, _ = all_started(process)
         process.send_signal(number)
         process.communicate(timeout=20)
     finally:
@@ -98,8 +114,8 @@ def test_given_a_running_demo_when_it_is_told_to_end_then_its_children_end_too(n
 def test_given_a_running_demo_when_one_of_its_processes_dies_then_it_says_which_and_ends_the_others():
     process = start("--seconds", "60")
     try:
-        vehicle = vehicle_in(text_until(process, ALL_STARTED))
-        os.kill(still_running(vehicle)["driver imu"], signal.SIGKILL)
+        vehicle, running = all_started(process)
+        os.kill(running["driver imu"], signal.SIGKILL)
         _, err = process.communicate(timeout=20)
     finally:
         process.kill()
@@ -107,6 +123,31 @@ def test_given_a_running_demo_when_one_of_its_processes_dies_then_it_says_which_
     assert "the driver imu was ended by SIGKILL. It said:" in err
     assert "imu: closed:" in err  # from before its device was there
     assert still_running(vehicle) == {}
+
+
+def test_given_a_running_demo_when_it_is_killed_then_nothing_is_left_running():
+    process = start("--seconds", "60")
+    try:
+        vehicle, running = all_started(process)
+        with contextlib.ExitStack() as stack:
+            ends = select.poll()
+            for number in running.values():
+                end = os.pidfd_open(number)
+                stack.callback(os.close, end)
+                ends.register(end, select.POLLIN)
+            process.kill()
+            process.communicate(timeout=20)
+            deadline = time.monotonic() + PATIENCE_S
+            for _ in running:
+                ((ended, _),) = ends.poll(max(0.0, deadline - time.monotonic()) * 1e3)[:1] or pytest.fail(
+                    f"still running: {sorted(still_running(vehicle))}"
+                )
+                ends.unregister(ended)
+    finally:
+        process.kill()
+    assert still_running(vehicle) == {}
+    # a killed demo cannot take its folder away
+    shutil.rmtree(Path(vehicle).parent)
 
 
 def test_given_a_daemon_that_fails_when_its_answer_is_waited_for_then_what_it_said_is_told(tmp_path):

@@ -385,7 +385,8 @@ def test_given_iron_when_the_vehicle_is_turned_then_its_own_field_is_found_and_t
     with bench.device("imu", "--scenario", "stand", "--state", str(state)):
         vain = run(bench, "driver", "imu", "-c", bench.vehicle, "--hard-iron", "--seconds", "1")
     assert vain.returncode == 1
-    assert f"offsets before {[kept[address] for address in Address.HARD_IRON]} counts" in vain.stderr
+    before = [(kept[address] + 32768) % 65536 - 32768 for address in Address.HARD_IRON]
+    assert f"offsets before {before} counts" in vain.stderr
     assert "turn the vehicle further" in vain.stderr
     assert dict(tuple(map(int, line.split())) for line in state.read_text().splitlines()) == kept
 
@@ -402,6 +403,9 @@ def test_given_mistyped_names_then_the_nearest_is_told(bench: Bench) -> None:
     fault = run(bench, "emulate", "gps", "-c", bench.vehicle, "--pty", "--fault", "stal@1")
     assert fault.returncode == 2
     assert "did you mean stall?" in fault.stderr
+    axes = run(bench, "driver", "imu", "-c", bench.vehicle, "--all-axes")
+    assert axes.returncode == 2
+    assert "--hard-iron" in axes.stderr
     text = bench.vehicle.read_text().replace("bauds: [38400]", "buads: [38400]")
     bench.vehicle.write_text(text)
     for command in (("driver", "gps", "-c"), ("check",)):

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,8 +20,28 @@ from modelserver.errors import ModelServerError
 STOP_LIMIT = 3.0
 """How long a child may take to end after SIGTERM, seconds."""
 
-MODELSERVER = ("-c", "from mstools.cli import main; main()")
-"""What makes Python the `modelserver` command of this installation, wherever its script is."""
+MODELSERVER = (
+    "-c",
+    "from mstools.demo_children import end_with_parent; end_with_parent(); from mstools.cli import main; main()",
+)
+"""What makes Python the `modelserver` command of this installation, wherever its script is; it ends with the demo."""
+
+
+def end_with_parent() -> None:
+    """End this process, as SIGTERM does, when its standard input ends: `Children` holds the other end of it.
+
+    However the demo ends, SIGKILL included, the system closes that, and nothing is left behind.
+    """
+    main = threading.main_thread().ident
+    assert main is not None
+
+    def watch() -> None:
+        while os.read(0, 1):
+            pass
+        # to that thread: a call that waits there is interrupted only so
+        signal.pthread_kill(main, signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 class DemoError(ModelServerError):
@@ -65,6 +86,8 @@ class Children:
                 except subprocess.TimeoutExpired:
                     child.process.kill()
                     child.process.wait()
+                assert child.process.stdin is not None
+                child.process.stdin.close()
         finally:
             signal.signal(signal.SIGINT, before)
             signal.signal(signal.SIGTERM, self._before)
@@ -78,7 +101,8 @@ class Children:
             # a session of its own: Ctrl-C comes to the demo alone, which then ends them in order
             process = subprocess.Popen(
                 [sys.executable, *arguments],
-                stdin=subprocess.DEVNULL,
+                # nothing is ever said on it: its end tells that the demo has ended
+                stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=output,
                 env=environment,

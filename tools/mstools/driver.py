@@ -5,21 +5,22 @@ from __future__ import annotations
 import contextlib
 import logging
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from modelserver.errors import ModelServerError, RecordingError, nearest_names, shown
+from modelserver.errors import ConfigError, ModelServerError, RecordingError, Severity, nearest_names, shown
 from mstools.asking import UrlOption
-from mstools.output import safe
+from mstools.output import print_problem, safe
 from mstools.run import LEVELS
 
 if TYPE_CHECKING:
     from modelserver.config import VehicleConfig
     from msdrivers.links import Link
+    from msdrivers.registry import Kind
     from msdrivers.settings import DriverSettings
 
 COMMANDS_LOOK_S = 0.02
@@ -80,10 +81,13 @@ def command(
         raise typer.BadParameter("give the vehicle file: -c vehicle.yaml", param_hint="--config")
     if record_raw is not None and play_raw is not None:
         raise typer.BadParameter("a recording that is played is not recorded again", param_hint="--record-raw")
+    if all_axes and not hard_iron:
+        raise typer.BadParameter("belongs to --hard-iron, which is not given", param_hint="--all-axes")
     vehicle, settings = load_driver(name, config)
     if hard_iron and not settings.kind.hard_iron:
         raise typer.BadParameter(f"a {settings.kind.name} has no such procedure", param_hint="--hard-iron")
     logging.basicConfig(level=log_level.upper(), format="%(levelname)s %(name)s: %(message)s")
+    warn_of_names(vehicle, settings)
     with contextlib.ExitStack() as stack:
         link = _line(stack, settings, record_raw, round(record_limit * 1e6), play_raw)
         if hard_iron:
@@ -109,37 +113,63 @@ def show_ports() -> None:
 
 
 def show_drivers(config: Path) -> None:
-    """Print the drivers of a vehicle file."""
-    _, drivers = load_drivers(config)
+    """Print the drivers of a vehicle file, and what is wrong with them, as `modelserver check` does."""
+    from mstools.check_drivers import drivers_problems, model_of
+
+    vehicle, drivers = load_drivers(config)
     for name, driver in drivers.items():
         typer.echo(safe(f"{name:<16} {driver.kind.name}: {driver.kind.about}; {driver.line}"))
+    problems = drivers_problems(vehicle, str(config), model_of(vehicle))
+    for problem in problems:
+        print_problem(problem, err=True)
+    if any(problem.severity is Severity.ERROR for problem in problems):
+        raise typer.Exit(1)
 
 
 def load_drivers(config: Path) -> tuple[VehicleConfig, dict[str, DriverSettings]]:
-    """Return a vehicle file and the settings of its drivers. Raises ConfigError, OSError."""
+    """Return a vehicle file and its drivers, without those of which something is wrong. Raises ConfigError, OSError."""
     from modelserver.config import config_lines, load_config
     from msdrivers.settings import Place, read_drivers
 
     vehicle = load_config(config)
-    return vehicle, read_drivers(vehicle.drivers, Place(str(config), config_lines(config)))
+    drivers, _ = read_drivers(vehicle.drivers, Place(str(config), config_lines(config)))
+    return vehicle, drivers
 
 
-def load_driver(name: str, config: Path) -> tuple[VehicleConfig, DriverSettings]:
-    """Return a vehicle file and the settings of one of its drivers. Raises ConfigError, OSError, ModelServerError."""
+def load_driver(
+    name: str, config: Path, kinds: Mapping[str, Kind] | None = None
+) -> tuple[VehicleConfig, DriverSettings]:
+    """Return a vehicle file and the settings of one of its drivers, of these kinds, else of all that are known here.
+
+    Raises ConfigError, OSError, ModelServerError.
+    """
     from modelserver.config import config_lines, load_config
-    from msdrivers.settings import Place, read_driver
+    from msdrivers.registry import KINDS
+    from msdrivers.settings import Place, empty_section, empty_sections, read_driver
 
     vehicle = load_config(config)
-    if name not in vehicle.drivers:
-        if not vehicle.drivers:
-            raise ModelServerError(f"{config} names no drivers; write a section drivers: see docs/vehicle-file.md")
-        known = f"{config} has: {', '.join(vehicle.drivers)}"
-        if not name:
-            raise typer.BadParameter(f"name the driver; {known}", param_hint="NAME")
-        near = nearest_names(name, vehicle.drivers)
-        hint = f"did you mean {near[0]}? " if near else ""
-        raise typer.BadParameter(f"{shown(name, 40)} is no driver; {hint}{known}", param_hint="NAME")
-    return vehicle, read_driver(name, vehicle.drivers[name], Place(str(config), config_lines(config)))
+    place = Place(str(config), config_lines(config))
+    if name in vehicle.drivers:
+        return vehicle, read_driver(name, vehicle.drivers[name], place, kinds or KINDS)
+    if name in empty_sections(vehicle.drivers, place):
+        raise ConfigError([empty_section(name, place)])
+    if not vehicle.drivers:
+        raise ModelServerError(f"{config} names no drivers; write a section drivers: see docs/vehicle-file.md")
+    known = f"{config} has: {', '.join(vehicle.drivers)}"
+    if not name:
+        raise typer.BadParameter(f"name the driver; {known}", param_hint="NAME")
+    near = nearest_names(name, vehicle.drivers)
+    hint = f"did you mean {near[0]}? " if near else ""
+    raise typer.BadParameter(f"{shown(name, 40)} is no driver; {hint}{known}", param_hint="NAME")
+
+
+def warn_of_names(vehicle: VehicleConfig, settings: DriverSettings) -> None:
+    """Log the names of a driver's wheels and joints that the vehicle does not have: what has them is lost."""
+    from mstools.check_drivers import misnamed, model_of
+
+    model = model_of(vehicle) if hasattr(settings.station, "joint") else None
+    for problem in misnamed(vehicle, [settings], model):
+        logging.getLogger(__name__).warning("%s: %s; %s", problem.source, problem.message, problem.fix)
 
 
 def channels_of(vehicle: VehicleConfig, settings: DriverSettings) -> dict[type, str]:
@@ -159,20 +189,22 @@ def _line(
 ) -> Link[Any]:
     """Return the driver's line, recorded, or a recording in its place."""
     from msdrivers.lines import form_of, link_of
-    from msdrivers.raw_log import PlayedLink, RawWriter, RecordingLink, open_for_reading
+    from msdrivers.links.recorded import PlayedLink, RecordingLink
+    from msdrivers.raw_log import open_for_reading, recording
     from msdrivers.runner import SystemTime
 
     form = form_of(settings)
     if play is not None:
         reader = open_for_reading(play)
         stack.callback(reader.stream.close)
-        if reader.kind != form.name:
-            raise RecordingError(f"{play} holds {reader.kind} of a {reader.device}, and a {settings.kind.name} is read")
-        return PlayedLink(str(play), reader, form.unpack, SystemTime())
+        if (reader.kind, reader.device) != (form.name, settings.kind.name):
+            said = f"{reader.kind} of a {reader.device} (driver {reader.source})"
+            raise RecordingError(f"{play} holds {said}, and driver {settings.name} reads a {settings.kind.name}")
+        return PlayedLink(reader, form.unpack, SystemTime())
     link = link_of(settings)
     if record is None:
         return link
-    writer = RawWriter(stack.enter_context(record.open("w", encoding="ascii", errors="replace")), limit)
+    writer = stack.enter_context(recording(record, limit))
     writer.begin(form.name, settings.name, settings.kind.name)
     return RecordingLink(link, form, writer, SystemTime())
 
@@ -180,11 +212,12 @@ def _line(
 def run(vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], folder: Path, url: str) -> None:
     """Run a driver on a line until it is told to end. Raises ConfigError, OSError, BusError."""
     from modelserver.wire.provider import open_lcm, resolve_url
+    from msdrivers.making import station_of
     from msdrivers.publishing import Publisher
     from msdrivers.runner import Runner, RunnerSettings, SystemTime
 
     kind = settings.kind
-    station = kind.load().station(settings.station, folder)
+    station = station_of(settings, folder)
     bus = open_lcm(resolve_url(url or vehicle.lcm.url))
     publisher = Publisher(bus.publish, channels_of(vehicle, settings), vehicle.lcm.channel_prefix)
     how = RunnerSettings(settings.name, kind.name)
@@ -209,7 +242,7 @@ def _hear_commands(bus: Any, channel: str, runner: Any) -> Callable[[], object]:
         try:
             wish = decode("vehicle_command_t", data)
         except WireError as error:
-            runner.counts[f"rejected.command.{error.reason}"] += 1
+            runner.refuse(error.reason, f"a command on {channel} refused: {error}")
             return
         runner.command(wish)
 

@@ -6,34 +6,19 @@ import logging
 import math
 import signal
 import time
-from collections.abc import Iterator
-from dataclasses import replace
-from itertools import dropwhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from modelserver.errors import ModelServerError, nearest_names, shown
-from mstools.driver import channels_of, load_driver
+from modelserver.errors import nearest_names, shown
+from mstools.driver import load_driver
+from mstools.emulate_samples import LONGEST_S, Wanted, samples_of
 
 if TYPE_CHECKING:
-    from modelserver.config import VehicleConfig
-    from modelserver.messages import DeviceSample
     from modelserver.spatial.so3 import Vector3
     from msdrivers.links import Link
     from msdrivers.settings import DriverSettings
-
-LONGEST_S = 3600.0
-"""Of a simulated drive, where no other length is asked for."""
-
-LEAD_US = 200_000
-"""From now to the first sample: what it takes to open the line."""
-
-GPS_HZ = 4.0
-"""Where the driver's settings say nothing of a rate."""
-
-WHEELS_HZ = 100.0
 
 SCENARIOS = ("eight", "circle", "stand", "straight", "city")
 
@@ -114,27 +99,19 @@ def command(
         raise typer.BadParameter(str(error), param_hint="--fault") from None
     if state is not None and not settings.kind.remembers:
         raise typer.BadParameter(f"a {settings.kind.name} keeps nothing without power", param_hint="--state")
+    if log is not None and not settings.kind.follows:
+        raise typer.BadParameter(
+            f"device {settings.kind.name} goes where it is told to, not by a log", param_hint="--from"
+        )
     own_field = _field(iron)
     line = _line(settings, link, tcp, can, interface)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    start_utime = time.time_ns() // 1000 + LEAD_US if start is None else start
-    samples: Iterator[DeviceSample]
-    if log is not None:
-        samples = logged(log, vehicle, settings, start_utime)
-    elif start is None and settings.kind.commands:
-        # alone it does as it is commanded
-        samples = iter(())
-    else:
-        samples = simulated(vehicle, settings, start_utime, seconds or LONGEST_S, scenario, seed, own_field)
-    if start is not None or log is None:
-        # who comes late to a drive that has begun, and be it by making the drive, does not catch up
-        now = time.time_ns() // 1000
-        samples = dropwhile(lambda sample: sample.header.utime < now, samples)
+    samples = samples_of(vehicle, settings, Wanted(log, start, seconds or LONGEST_S, scenario, seed, own_field))
 
-    from msdrivers.registry import Emulation
+    from msdrivers.making import emulator_of
     from msdrivers.runner import Runner, RunnerSettings, SystemTime
 
-    station = settings.kind.emulate(Emulation(settings.station, config.parent, samples, wanted, state))
+    station = emulator_of(settings, config.parent, samples, wanted, state)
     how = RunnerSettings(name, f"emulated {settings.kind.name}", silence=math.inf, reopen=math.inf)
     line.open()
     typer.echo(f"{name} ({settings.kind.name}) speaks on {line.description}")
@@ -178,33 +155,6 @@ def _line(settings: DriverSettings, link: Path | None, tcp: int | None, can: str
     return PtyLink(link=link)
 
 
-def logged(log: Path, vehicle: VehicleConfig, settings: DriverSettings, start_utime: int) -> Iterator[DeviceSample]:
-    """Yield the samples of a driver's channel in a log, their stamps moved so that the first is at `start_utime`.
-
-    Raises ModelServerError where the log has none of that channel.
-    """
-    from modelserver.wire.channels import BY_NAME
-    from modelserver.wire.codec import decode
-    from modelserver.wire.eventlog import LogFile
-    from msdrivers.registry import CHANNELS
-
-    kind = settings.kind.sample
-    channel = f"{vehicle.lcm.channel_prefix}{channels_of(vehicle, settings).get(kind) or CHANNELS[kind]}"
-    type_name = BY_NAME[CHANNELS[kind]].type_name
-    shift = None
-    with LogFile(log) as events:
-        for event in events:
-            if event.channel != channel:
-                continue
-            sample: DeviceSample = decode(type_name, event.data)
-            header = sample.header
-            shift = start_utime - header.utime if shift is None else shift
-            host = header.host_utime + shift if header.host_utime else 0
-            yield replace(sample, header=replace(header, utime=header.utime + shift, host_utime=host))
-    if shift is None:
-        raise ModelServerError(f"{log} has nothing on {channel}; modelserver spy, or --channel of the recording")
-
-
 def _field(text: str) -> Vector3:
     """Return the tesla of `X,Y,Z` in microtesla."""
     try:
@@ -214,49 +164,3 @@ def _field(text: str) -> Vector3:
     if not math.hypot(x, y, z) < 1e-3:
         raise typer.BadParameter("no unit works in a field above 1000 microtesla", param_hint="--iron")
     return (x, y, z)
-
-
-def simulated(
-    vehicle: VehicleConfig,
-    settings: DriverSettings,
-    start_utime: int,
-    seconds: float,
-    scenario: str,
-    seed: int,
-    own_field: Vector3 = (0.0, 0.0, 0.0),
-) -> Iterator[DeviceSample]:
-    """Return what the sensor of a driver measures on a simulated drive that begins at `start_utime`.
-
-    `own_field`: what the vehicle adds to the earth's magnetic field, tesla along the sensor's axes. A receiver measures
-    at the rate of its driver's settings, wheels at 100 Hz. A vehicle controller has the speed of the wheels. Raises
-    ModelServerError for a sensor that has no place.
-    """
-    from modelserver.messages import GpsSample, ImuSample, VehicleStatusSample, WheelsSample
-    from modelserver.simulation import GpsModel, ImuModel, MagnetometerModel, Timing, WheelsModel
-    from mstools.demo_drive import simulation
-
-    sensors = vehicle.sensors
-    needed = {
-        GpsSample: (GpsSample, "gps", sensors.gps),
-        ImuSample: (ImuSample, "imu", sensors.imu),
-        WheelsSample: (WheelsSample, "wheels", sensors.wheels),
-        VehicleStatusSample: (WheelsSample, "wheels", sensors.wheels),
-    }
-    if settings.kind.sample not in needed:
-        # it does as it is commanded
-        return iter(())
-    kind, name, sensor = needed[settings.kind.sample]
-    if sensor is None:
-        raise ModelServerError(f"the vehicle file says nothing of sensors.{name}: where is the sensor?")
-    run = simulation(
-        vehicle,
-        start_utime,
-        seconds,
-        scenario,
-        seed,
-        (kind,),
-        gps_model=GpsModel(Timing(getattr(settings.station, "rate_hz", GPS_HZ))),
-        imu_model=ImuModel(magnetometer=MagnetometerModel(hard_iron=own_field)),
-        wheels_model=WheelsModel(Timing(WHEELS_HZ)),
-    )
-    return (sample for sample in run.events(seconds) if isinstance(sample, kind))

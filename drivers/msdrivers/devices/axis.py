@@ -85,7 +85,7 @@ class AxisDriver:
         why = self.settings.against(nod)
         if why:
             self._counts["rejected.nod"] += 1
-            return [Told(self._phase, f"nodding refused: {why}")]
+            return [Told(self._phase, f"nodding refused: {why}", is_trouble=True)]
         self._nod = nod
         self._told -= {"nod"}
         if not self._is_open:
@@ -123,7 +123,7 @@ class AxisDriver:
             said = self._nodding.done(unit)
             if said:
                 self._counts["readback"] += 1
-                outputs.append(Told(self._phase, said))
+                outputs.append(Told(self._phase, said, is_trouble=True))
             elif not self._nodding.step:
                 outputs.append(Told(self._phase, "the axis nods as it was told"))
         return outputs + self._ask(now)
@@ -157,6 +157,11 @@ class AxisDriver:
         """Write back what was found before this driver wrote."""
         self._is_open = False
         return [Send(replace(request, transaction=self._new_transaction())) for request in self._nodding.restored()]
+
+    @property
+    def quiet(self) -> float:
+        """Seconds for which nothing need come."""
+        return self.settings.silence
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -252,7 +257,7 @@ class AxisDriver:
         if word in self._told:
             return []
         self._told.add(word)
-        return [Told(self._phase, text)]
+        return [Told(self._phase, text, is_trouble=True)]
 
 
 _WORDS = {

@@ -13,8 +13,18 @@ SEEN = 8
 """Identifiers that are remembered to tell a person what is on the bus."""
 
 
+def arrival(frame: CanFrame, now: Now) -> Now:
+    """Return when a frame came that is read `now`: by its own stamp where it has one."""
+    if not 0 < frame.utime <= now.utime:
+        return now
+    return Now(now.monotonic_ns - (now.utime - frame.utime) * 1000, frame.utime)
+
+
 class CanWatch:
-    """Tells silence, errors and recovery, each once; what was told is told again after it has changed."""
+    """Tells silence, errors and recovery, each once; what was told is told again after it has changed.
+
+    Where no kind of frame is needed there is no silence.
+    """
 
     def __init__(self, needed: Mapping[FrameKey, str], silence_s: float, counts: Counter[str]):
         """Take the needed kinds of frame with their names, and after how many seconds without usable ones it tells."""
@@ -36,7 +46,7 @@ class CanWatch:
         self._told_wrong.clear()
         self._only_wrong = False
         self._wait(now)
-        return [Told(Phase.WAITING, f"waiting for {self._names()}")]
+        return [Told(Phase.WAITING, f"waiting for {self._names()}")] if self._needed else []
 
     def usable(self, now: Now, text: str) -> list[Output[CanFrame]]:
         """Note that something came that can be used; `text` says what, for the first time."""
@@ -61,7 +71,7 @@ class CanWatch:
         if frame.key in self._told_wrong:
             return []
         self._told_wrong.add(frame.key)
-        return [Told(self.phase, f"{error}; such frames are counted and not used")]
+        return [Told(self.phase, f"{error}; such frames are counted and not used", is_trouble=True)]
 
     def error_frame(self, frame: CanFrame) -> list[Output[CanFrame]]:
         """Note what the interface says of the bus: bus-off asks to open it anew, once."""
@@ -90,7 +100,7 @@ class CanWatch:
         return self._silent_at
 
     def _wait(self, now: Now) -> None:
-        self._silent_at = now.monotonic_ns + round(self._silence_s * 1e9)
+        self._silent_at = now.monotonic_ns + round(self._silence_s * 1e9) if self._needed else None
 
     def _why(self) -> str:
         head = f"no usable {self._names()} for {self._silence_s:g} s"

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 
 from modelserver.errors import ConfigError, Problem, Severity, Source
 from modelserver.messages import SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
-from msdrivers.devices.can_watch import CanWatch
+from msdrivers.devices.can_watch import CanWatch, arrival
 from msdrivers.devices.commanding import Commanding
 from msdrivers.devices.vehicle_settings import VehicleSettings
 from msdrivers.protocol.can.assembly import Assembler, Instant
@@ -37,6 +38,7 @@ class VehicleDriver:
         self._needed = frozenset(needed)
         self._watch = CanWatch(needed, settings.silence, self._counts)
         self._commanding = None
+        self._command_key: FrameKey | None = None
         if settings.command is not None:
             command = bind_command(settings.command, database, f"drivers.{settings.source}.command")
             limits = settings.limits
@@ -49,6 +51,7 @@ class VehicleDriver:
                     place = Source(database.name, 0, f"drivers.{settings.source}.limits")
                     raise ConfigError([Problem(Severity.ERROR, beyond, place, "lower the limit")])
             self._commanding = Commanding(settings, command, self._watch, self._counts)
+            self._command_key = command.forward_speed.key
         signals = self._status.signals if self._status is not None else {}
         self._has_words = "fault_bits" in signals or "commands_refused" in signals
         self._assembler = Assembler(self._needed, round(settings.window * 1e9))
@@ -59,13 +62,15 @@ class VehicleDriver:
         """Begin: no command outlives the line, and where there was one, stop is said."""
         self._assembler.clear()
         self._mode = None
-        outputs = self._watch.opened(now) if self._needed else []
+        outputs = self._watch.opened(now)
         return outputs + (self._commanding.opened(now) if self._commanding is not None else [])
 
     def received(self, unit: CanFrame, now: Now) -> list[Output[CanFrame]]:
         """Take a frame."""
         if unit.is_error:
             return self._watch.error_frame(unit)
+        if unit.key == self._command_key and self._commanding is not None:
+            return self._commanding.foreign(now)
         if unit.key not in self._needed:
             self._watch.other(unit)
             return []
@@ -74,7 +79,8 @@ class VehicleDriver:
         except FrameError as error:
             return self._watch.wrong(unit, error)
         self._counts["frames"] += 1
-        return self._published(self._assembler.add(unit.key, values, now.monotonic_ns, now.utime), now)
+        came = arrival(unit, now)
+        return self._published(self._assembler.add(unit.key, values, came.monotonic_ns, came.utime), now)
 
     def command(self, command: VehicleCommand, now: Now) -> list[Output[CanFrame]]:
         """Take a wish: say it to the controller from now on, or refuse it and say why."""
@@ -83,19 +89,25 @@ class VehicleDriver:
             return []
         return self._commanding.take(command, now)
 
+    def refuse(self, reason: str, text: str, now: Now) -> list[Output[CanFrame]]:
+        """Count and tell what came as a command and cannot be one; `reason` is a word."""
+        if self._commanding is None:
+            return []
+        return self._commanding.refuse(reason, text, now)
+
     def woken(self, now: Now) -> list[Output[CanFrame]]:
         """Say what is due to the controller, publish what has waited long enough, tell silence."""
         outputs = self._published(self._assembler.expired(now.monotonic_ns), now)
         if self._commanding is not None:
             outputs += self._commanding.woken(now)
-        return outputs + (self._watch.woken(now) if self._needed else [])
+        return outputs + self._watch.woken(now)
 
     def due(self) -> int | None:
         """Return when to be woken."""
         commanding = self._commanding
         dues = (
             self._assembler.due(),
-            self._watch.due() if self._needed else None,
+            self._watch.due(),
             commanding.due() if commanding is not None else None,
         )
         return min((due for due in dues if due is not None), default=None)
@@ -103,6 +115,11 @@ class VehicleDriver:
     def leaving(self, now: Now) -> list[Output[CanFrame]]:
         """Leave the vehicle standing where it was commanded from here."""
         return self._commanding.leaving(now) if self._commanding is not None else []
+
+    @property
+    def quiet(self) -> float:
+        """Seconds for which nothing need come: where no status is expected, for ever."""
+        return self.settings.silence if self._needed else math.inf
 
     @property
     def counts(self) -> Mapping[str, int]:

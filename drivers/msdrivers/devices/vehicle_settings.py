@@ -55,6 +55,8 @@ class VehicleSettings:
     """The only source whose commands are taken; empty: any, but one at a time."""
     dead_man: float = 0.5
     """Seconds after its arrival for which a command counts at most; then stop is commanded."""
+    max_validity: float = 1.0
+    """Seconds after its `utime` for which a command counts at most, whatever its `valid_for`: later it came late."""
     command_period: float = 0.05
     """Seconds between the frames in which a command, or the stop after it, is said again."""
     clock_slack: float = 0.2
@@ -75,6 +77,7 @@ class VehicleSettings:
             raise ValueError("status or command is needed: without both there is nothing to do")
         for key, value, low, high in (
             ("dead_man", self.dead_man, 0.05, 5.0),
+            ("max_validity", self.max_validity, 0.05, 60.0),
             ("command_period", self.command_period, 0.005, 1.0),
             ("clock_slack", self.clock_slack, 0.0, 5.0),
             ("window", self.window, 0.0, 1.0),
@@ -84,6 +87,11 @@ class VehicleSettings:
         ):
             if not low <= value <= high:
                 raise ValueError(f"{key} is between {low:g} and {high:g}, got {value:g}")
+        if self.max_validity < self.dead_man:
+            raise ValueError(
+                f"max_validity is at least dead_man, {self.dead_man:g}, got {self.max_validity:g}: a command would end "
+                "before it"
+            )
         if self.command_period > self.dead_man:
             raise ValueError(
                 f"command_period is at most dead_man, {self.dead_man:g}, got {self.command_period:g}: the controller "

@@ -10,9 +10,8 @@ from typing import ClassVar
 
 from modelserver.errors import shown
 from modelserver.messages import NAN, Direction, SensorHeader, WheelSample, WheelsSample
-from msdrivers.devices.can_watch import CanWatch
+from msdrivers.devices.can_watch import CanWatch, arrival
 from msdrivers.protocol.can.assembly import Assembler, Instant
-from msdrivers.protocol.can.counts import Odometer
 from msdrivers.protocol.can.database import CanDatabase, FrameError
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.can.mapping import STRICT, WheelMap
@@ -79,23 +78,15 @@ class WheelsDriver:
         """Take the settings and the DBC file's content. Raises ConfigError for signals that it does not have."""
         self.settings = settings
         self._database = database
-        self._wheels = bind_wheels(settings.wheels, database, f"drivers.{settings.source}.wheels")
+        place = f"drivers.{settings.source}.wheels"
+        self._wheels = bind_wheels(settings.wheels, database, place, settings.max_speed, settings.frame_delay)
         needed = {signal.key: signal.message for wheel in self._wheels for signal in wheel.signals}
         self._counts: Counter[str] = Counter()
         self._watch = CanWatch(needed, settings.silence, self._counts)
         self._needed = frozenset(needed)
         self._assembler = Assembler(self._needed, round(settings.window * 1e9))
-        self._odometers = {
-            wheel.name: Odometer(
-                wheel.map.count.wrap or 1 << wheel.count.length,
-                wheel.map.count.metres_per_count,
-                settings.max_speed,
-                settings.frame_delay,
-                wheel.map.count.up_only,
-            )
-            for wheel in self._wheels
-            if wheel.count is not None and wheel.map.count is not None
-        }
+        odometers = {wheel.name: wheel.odometer(settings.max_speed, settings.frame_delay) for wheel in self._wheels}
+        self._odometers = {name: odometer for name, odometer in odometers.items() if odometer is not None}
         self._told: set[str] = set()
         self._seq = 0
 
@@ -117,7 +108,8 @@ class WheelsDriver:
         except FrameError as error:
             return self._watch.wrong(unit, error)
         self._counts["frames"] += 1
-        return self._published(self._assembler.add(unit.key, values, now.monotonic_ns, now.utime), now)
+        came = arrival(unit, now)
+        return self._published(self._assembler.add(unit.key, values, came.monotonic_ns, came.utime), now)
 
     def woken(self, now: Now) -> list[Output[CanFrame]]:
         """Publish what has waited long enough, or tell silence."""
@@ -131,6 +123,11 @@ class WheelsDriver:
     def leaving(self, now: Now) -> list[Output[CanFrame]]:
         """Leave; this driver sends nothing."""
         return []
+
+    @property
+    def quiet(self) -> float:
+        """Seconds for which nothing need come."""
+        return self.settings.silence
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -183,14 +180,16 @@ class WheelsDriver:
         if f"{name} {reason}" in self._told:
             return
         self._told.add(f"{name} {reason}")
-        told.append(Told(self._watch.phase, f"wheel {name}: {_DOUBTS[reason].format(self.settings.max_speed)}"))
+        text = f"wheel {name}: {_DOUBTS[reason].format(self.settings.max_speed)}"
+        told.append(Told(self._watch.phase, text, is_trouble=reason != "resumed"))
 
 
 _DOUBTS = {
     "range": "a count beyond its wrap; is `wrap` right?",
     "jump": "a count that no wheel of at most {:g} m/s can have come to; is metres_per_count right, is the cable "
     "sound? That sample says no travel",
-    "gap": "no count for so long that the counter may have gone round; one sample says no travel",
+    "gap": "no count for so long that the counter may have gone round, at {:g} m/s and `frame_delay`; one sample says "
+    "no travel",
     "direction": "counts up only and does not say which way; that sample says no travel",
     "resumed": "its counts are believed again; travel goes on from where it was, without what was rolled unseen",
     "speed": "a speed above {:g} m/s, which this vehicle does not reach; is scale right? It is not published",

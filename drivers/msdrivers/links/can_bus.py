@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import logging
 import os
+import time
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import can
 
-from modelserver.errors import nearest_names, shown
+from msdrivers.line_settings import MULTICAST, against_channel, against_interface, split_group
 from msdrivers.links import LinkError
 from msdrivers.protocol.can.frame import CanFrame
 
@@ -20,12 +23,25 @@ BURST = 64
 
 CLASSIC_BYTES = 8
 
-MULTICAST = "udp_multicast"
-"""The interface that carries frames over UDP, for trials without hardware: its channel is GROUP:PORT."""
+STAMPED = ("socketcan", MULTICAST, "virtual")
+"""Interfaces that stamp frames by the host's clock when they come, the first two in the kernel. Others stamp by a clock
+of their own, or when a frame is read."""
+
+STAMP_SLACK_US = 1000
+"""By how much a stamp may be before the instant at which nothing was left to read."""
+
+ECHOES = 256
+"""Frames of our own that may be under way."""
+
+# what it has to say stands in our own errors, with what to do; and it would say it at each attempt
+logging.getLogger("can").setLevel(logging.CRITICAL)
 
 
 class CanLink:
-    """A bus on which every frame of others is heard, the interface's own error frames among them."""
+    """A bus on which every frame of others is heard, the interface's own error frames among them.
+
+    Frames have the instant at which they came, where the interface tells it by the host's clock.
+    """
 
     def __init__(self, channel: str, interface: str = "socketcan", bitrate: int = 0):
         """Name the bus. bitrate 0: the interface is set up already."""
@@ -33,29 +49,40 @@ class CanLink:
         self.baud = bitrate
         self._channel, self._interface = channel, interface
         self._bus: can.BusABC | None = None
+        self._emptied_us = 0
+        self._echoes: deque[CanFrame] = deque(maxlen=ECHOES)
 
     def open(self, baud: int | None = None) -> None:
         """Take part in the bus, if that is not done yet. Raises LinkError."""
         if self._bus is not None:
             return
         self.baud = baud or self.baud
+        for word, why in (
+            ("interface", against_interface(self._interface)),
+            ("channel", against_channel(self._channel, self._interface)),
+        ):
+            if why:
+                raise LinkError(self.description, f"{word} {why}")
         options: dict[str, Any] = {"channel": self._channel, "interface": self._interface}
         if self._interface == MULTICAST:
-            group, _, port = self._channel.partition(":")
+            group, port = split_group(self._channel)
             # nothing leaves the machine
-            options |= {"channel": group, "hop_limit": 0} | ({"port": int(port)} if port.isdecimal() else {})
+            options |= {"channel": group, "port": port, "hop_limit": 0}
         elif self.baud:
             options["bitrate"] = self.baud
+        self._echoes.clear()
+        self._emptied_us = _now_us()
         try:
             self._bus = can.Bus(**options)
-        except (can.CanError, OSError, ValueError, ImportError) as error:
+        # whatever the library of a maker raises: a name that is not defined without it, a missing argument
+        except Exception as error:
             raise self._explained(error) from None
 
     def close(self) -> None:
         """Take part no more."""
         bus, self._bus = self._bus, None
         if bus is not None:
-            with contextlib.suppress(can.CanError, OSError):
+            with contextlib.suppress(Exception):
                 bus.shutdown()
 
     def poll(self, timeout: float) -> Sequence[CanFrame]:
@@ -64,11 +91,18 @@ class CanLink:
         frames: list[CanFrame] = []
         wait = max(0.0, timeout)
         try:
-            while len(frames) < BURST and (message := bus.recv(wait)) is not None:
+            while len(frames) < BURST:
+                asked_us = _now_us()
+                message = bus.recv(wait)
+                if message is None:
+                    # what is read later came later than this
+                    self._emptied_us = asked_us
+                    break
                 wait = 0.0
-                if not message.is_remote_frame:
-                    frames.append(_frame(message))
-        except (can.CanError, OSError) as error:
+                frame = self._frame(message)
+                if not message.is_remote_frame and not self._is_own(message, frame):
+                    frames.append(frame)
+        except Exception as error:
             raise self._explained(error) from None
         return frames
 
@@ -81,10 +115,36 @@ class CanLink:
             is_error_frame=unit.is_error,
             is_fd=len(unit.data) > CLASSIC_BYTES,
         )
+        bus = self._opened()
         try:
-            self._opened().send(message, timeout=0.1)
-        except (can.CanError, OSError, ValueError) as error:
+            bus.send(message, timeout=0.1)
+        except Exception as error:
             raise self._explained(error) from None
+        if self._interface == MULTICAST:
+            self._echoes.append(unit)
+
+    def _frame(self, message: can.Message) -> CanFrame:
+        stamp = round(message.timestamp * 1e6) if self._interface in STAMPED else 0
+        # a clock that was set since makes a stamp of the past or of the future
+        is_sound = self._emptied_us - STAMP_SLACK_US <= stamp <= _now_us()
+        return CanFrame(
+            message.arbitration_id,
+            bytes(message.data),
+            message.is_extended_id,
+            message.is_error_frame,
+            stamp if is_sound else 0,
+        )
+
+    def _is_own(self, message: can.Message, frame: CanFrame) -> bool:
+        """Return whether a frame is our own that comes back: some adapters say so, multicast brings it in order."""
+        if not message.is_rx:
+            # Linux says the same of the frames of other programs on this machine, and does not bring back ours
+            return self._interface != "socketcan"
+        if frame not in self._echoes:
+            return False
+        while self._echoes.popleft() != frame:
+            pass
+        return True
 
     def _opened(self) -> can.BusABC:
         if self._bus is None:
@@ -92,15 +152,12 @@ class CanLink:
         return self._bus
 
     def _explained(self, error: Exception) -> LinkError:
-        number = getattr(error, "error_code", None) or getattr(error, "errno", None)
+        found = getattr(error, "error_code", None) or getattr(error, "errno", None)
+        # getaddrinfo has numbers of its own, below 0
+        number = found if isinstance(found, int) and found > 0 else 0
         channel = self._channel
-        if self._interface not in can.VALID_INTERFACES:
-            near = nearest_names(self._interface, can.VALID_INTERFACES)
-            return LinkError(
-                f"unknown CAN interface {shown(self._interface)}",
-                "python-can has none of that name",
-                f"write {near[0]}" if near else f"known: {', '.join(sorted(can.VALID_INTERFACES))}",
-            )
+        if number in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
+            return LinkError(self.description, "this kernel knows no CAN", "sudo modprobe -a can can_raw")
         if number == errno.ENODEV:
             known = ", ".join(can_networks()) or "none"
             return LinkError(self.description, "there is no such network interface", f"those of CAN here: {known}")
@@ -112,12 +169,15 @@ class CanLink:
             return LinkError(self.description, "frames are not taken: nobody acknowledges them", fix)
         if number in (errno.EACCES, errno.EPERM):
             return LinkError(self.description, "permission denied", "see who may use it")
+        if isinstance(error, NameError | ImportError):
+            fix = "install the driver and the library of the adapter's maker"
+            return LinkError(self.description, f"its library is not there ({error})", fix)
         why = os.strerror(number) if number else str(error) or type(error).__name__
         return LinkError(self.description, why, "see the interface's page in python-can's documentation")
 
 
-def _frame(message: can.Message) -> CanFrame:
-    return CanFrame(message.arbitration_id, bytes(message.data), message.is_extended_id, message.is_error_frame)
+def _now_us() -> int:
+    return time.time_ns() // 1000
 
 
 CAN_TYPE = "280"

@@ -6,6 +6,7 @@ Implementation Guide V1.0b).
 
 from __future__ import annotations
 
+import logging
 import struct
 import time
 from collections.abc import Callable, Sequence
@@ -46,6 +47,9 @@ ANSWER_S = 1.0
 """How long a device may take for a reply before that is told as its silence."""
 
 ILLEGAL_FUNCTION, ILLEGAL_VALUE = 1, 3
+
+# a message that is none is told by us, with what to do
+logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 Request: TypeAlias = ReadRegisters | WriteRegisters
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from msdrivers.links import LinkError
 from msdrivers.links.files import read_some, wait_readable
+from msdrivers.links.ports import other_ends
 
 GARBLE = bytes(byte ^ 0x5A for byte in range(256))
 """What bytes turn into when the two ends speak at different rates."""
@@ -27,6 +28,7 @@ class PtyLink:
         self.baud = baud
         self.description = str(link) if link else "pty"
         self._link = link
+        self._path = ""
         self._own = self._other = -1
 
     def open(self, baud: int | None = None) -> None:
@@ -39,24 +41,29 @@ class PtyLink:
             self._own, self._other = os.openpty()
             tty.setraw(self._other)
             os.set_blocking(self._own, False)
-            path = os.ttyname(self._other)
+            self._path = os.ttyname(self._other)
             if self._link is not None:
-                if self._link.is_symlink():
-                    self._link.unlink()
-                self._link.symlink_to(path)
+                make_way(self._link)
+                self._link.symlink_to(self._path)
         except OSError as error:
             self.close()
             raise LinkError(self.description, error.strerror or str(error), "give another path") from None
-        self.description = str(self._link) if self._link else path
+        except LinkError:
+            self.close()
+            raise
+        self.description = str(self._link) if self._link else self._path
 
     def close(self) -> None:
         """End both; a driver that has it open sees its port vanish."""
         for file in (self._own, self._other):
             if file >= 0:
                 os.close(file)
-        if self._link is not None and self._own >= 0:
+        if self._link is not None and self._path:
+            # what is not this pseudo-terminal's own link stays: a file, or the link of another emulator
             with contextlib.suppress(OSError):
-                self._link.unlink()
+                if os.readlink(self._link) == self._path:
+                    self._link.unlink()
+        self._path = ""
         self._own = self._other = -1
 
     def poll(self, timeout: float) -> Sequence[bytes]:
@@ -82,6 +89,26 @@ class PtyLink:
         speed = termios.tcgetattr(self._other)[5]
         return next((rate for rate in RATES if getattr(termios, f"B{rate}", None) == speed), 0)
 
+
+def make_way(link: Path) -> None:
+    """Take away a link that an emulator left behind. Raises LinkError for anything else, which stays; OSError."""
+    try:
+        target = os.readlink(link)
+    except FileNotFoundError:
+        return
+    except OSError:
+        raise LinkError(f"{link}", "there is a file of that name, and it stays", "give another path") from None
+    if link.exists():
+        if not target.startswith(PTS):
+            why = f"it is a link to {target} that no emulator made, and it stays"
+            raise LinkError(f"{link}", why, "give another path")
+        users = other_ends(target)
+        if users:
+            raise LinkError(f"{link} is in use", f"by the emulator {', '.join(users)}", "end it, or give another path")
+    link.unlink()
+
+
+PTS = "/dev/pts/"
 
 RATES = (1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
 """Those that a terminal has a name for."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import glob
 import os
 import termios
 import time
@@ -12,10 +11,9 @@ from collections.abc import Sequence
 
 import serial
 
-from modelserver.errors import nearest_names
 from msdrivers.links import LinkError
 from msdrivers.links.files import READ_BYTES, lost, wait_readable
-from msdrivers.links.ports import found_ports, holders, permission_fix
+from msdrivers.links.ports import holders, near_ports, permission_fix
 
 DRAIN_TRIES, DRAIN_S = 50, 0.01
 """How often, and how far apart in seconds, it is looked whether what was sent has left."""
@@ -34,7 +32,8 @@ class SerialLink:
         self.baud = baud or self.baud
         try:
             self._serial = serial.Serial(self.description, self.baud, timeout=0, write_timeout=1.0, exclusive=True)
-        except (OSError, ValueError) as error:
+        # pyserial passes on what a terminal's settings are refused with, and that is no OSError
+        except (OSError, ValueError, termios.error) as error:
             raise self._explained(error) from None
 
     def close(self) -> None:
@@ -43,7 +42,7 @@ class SerialLink:
         if port is None:
             return
         # not port.flush(): that waits for ever where the other end does not take what was sent
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, termios.error):
             for _ in range(DRAIN_TRIES):
                 if not port.out_waiting:
                     break
@@ -83,7 +82,7 @@ class SerialLink:
 
     def _explained(self, error: Exception) -> LinkError:
         path = self.description
-        number = getattr(error, "errno", None)
+        number = error.args[0] if isinstance(error, termios.error) else getattr(error, "errno", None)
         # pyserial keeps the cause of a refused lock only as text
         if number in (errno.EAGAIN, errno.EBUSY) or "exclusively lock" in str(error):
             users = holders(path)
@@ -95,10 +94,13 @@ class SerialLink:
         if number in (errno.EACCES, errno.EPERM):
             return LinkError(f"{path} may not be opened", "permission denied", permission_fix(path))
         if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
-            known = [port.path for port in found_ports()] + glob.glob("/dev/serial/by-id/*")
-            near = nearest_names(path, known)
-            fix = f"nearest: {', '.join(near)}" if near else "plug it in; modelserver driver --list shows what is there"
+            near = near_ports(path)
+            fix = "plug it in; modelserver driver --list shows what is there"
+            fix += f"; nearest: {', '.join(near)}" if near else ""
             return LinkError(path, "there is no such port", fix)
         if isinstance(error, ValueError):
             return LinkError(path, f"{self.baud} baud is not possible", "give another baud")
+        if isinstance(error, termios.error):
+            fix = f"is it a serial port, and does it know {self.baud} baud?"
+            return LinkError(path, f"its settings are refused: {os.strerror(number or 0)}", fix)
         return LinkError(path, os.strerror(number) if number else str(error), "is it a serial port?")

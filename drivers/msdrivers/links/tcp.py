@@ -31,6 +31,9 @@ class TcpLink:
             self._socket = socket.create_connection(self._address, CONNECT_S)
         except socket.gaierror as error:
             raise LinkError(self.description, f"no such host ({error.strerror})", "look at address") from None
+        except UnicodeError as error:
+            # a name with an empty part, or one that is too long
+            raise LinkError(self.description, f"no such address ({error})", "look at address") from None
         except TimeoutError:
             raise LinkError(self.description, "no answer", "is it switched on and on this network?") from None
         except OSError as error:

@@ -97,7 +97,7 @@ class Scanner(Generic[M]):
             if found.start() > at:
                 self._skip(at, found.start())
                 at = found.start()
-            verdict = self._format[buffer[at]].scan(buffer, at, self._offset + at)
+            verdict = self._judged(at)
             if verdict is None:
                 break
             if isinstance(verdict, Refused):
@@ -116,6 +116,13 @@ class Scanner(Generic[M]):
         self._offset += at
         del buffer[:at]
         return messages
+
+    def _judged(self, at: int) -> Taken[M] | Refused | None:
+        """Ask the format of the frame. An error of its own costs this frame, not all that follow it."""
+        try:
+            return self._format[self._buffer[at]].scan(self._buffer, at, self._offset + at)
+        except Exception:
+            return Refused("error")
 
     def _skip(self, begin: int, end: int) -> None:
         part = self._buffer[begin:end]

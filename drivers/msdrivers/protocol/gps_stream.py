@@ -50,8 +50,8 @@ class GpsStream:
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Frames by kind, `rejected.<reason>`, `skipped` bytes, `nmea.late` sentences."""
-        return {**self._scanner.counts, "nmea.late": self._epochs.late}
+        """Frames by kind, `rejected.<reason>`, `skipped` bytes."""
+        return {**self._scanner.counts, **({"rejected.late": self._epochs.late} if self._epochs.late else {})}
 
     def feed(self, data: bytes) -> list[GpsMessage]:
         """Return what `data` completes."""
@@ -70,4 +70,4 @@ class GpsStream:
     def clear(self) -> None:
         """Forget what is incomplete: the line was closed. Counters and offsets go on."""
         self._scanner.clear()
-        self._epochs.flush()
+        self._epochs.clear()

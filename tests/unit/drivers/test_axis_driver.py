@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import random
 import tracemalloc
@@ -9,10 +10,11 @@ import tracemalloc
 import pytest
 from support_vehicle_bus import AXIS_REGISTERS, DEG, START_UTIME, Wire, at, axis_settings
 
-from modelserver.messages import JointsSample
+from modelserver.messages import DriverHealth, DriverPhase, JointsSample
 from msdrivers.devices.axis import AxisDriver
 from msdrivers.devices.axis_settings import AxisSettings, NodMap
 from msdrivers.emulate.axis import AxisEmulator, AxisFault, AxisUnit
+from msdrivers.links.fake import FakeLink, FakeTime
 from msdrivers.protocol.modbus.axis_map import AxisRegisters
 from msdrivers.protocol.modbus.numbers import RegisterMap
 from msdrivers.protocol.modbus.registers import (
@@ -25,6 +27,7 @@ from msdrivers.protocol.modbus.registers import (
     WriteRegisters,
     Written,
 )
+from msdrivers.runner import Runner, RunnerSettings
 from msdrivers.station import Measured, Now, Phase, Reopen, Send
 
 STEP = 0.072 * DEG
@@ -252,6 +255,27 @@ def test_given_exceptions_then_they_are_told_once_in_words_and_tried_again(code:
     assert wire.samples[-1][0] > 5.98
 
 
+def test_given_an_axis_that_refuses_to_be_read_then_the_refusal_still_stands_when_nothing_usable_came() -> None:
+    driver = AxisDriver(axis_settings(nod=None))
+    time = FakeTime()
+    link: FakeLink[ModbusUnit] = FakeLink(time)
+    send = link.send
+
+    def refuses(unit: ModbusUnit) -> None:
+        send(unit)
+        at_s = time.monotonic_ns * 1e-9 + 0.001
+        link.coming.append((at_s, ModbusFailure(FailureKind.EXCEPTION, code=2, transaction=unit.transaction)))
+
+    link.send = refuses  # type: ignore[method-assign]
+    reports: list[DriverHealth] = []
+    runner = Runner(driver, link, RunnerSettings("axis", "axis"), time, report=reports.append)
+    while time.monotonic_ns < 4_000_000_000:
+        runner.turn()
+    assert reports[-1].phase is DriverPhase.SILENT
+    assert "no usable reading for 1 s although the axis answers" in reports[-1].text
+    assert "before that: the axis refuses reading 4 holding registers from 0: exception 2" in reports[-1].text
+
+
 def test_given_an_axis_that_is_busy_while_it_is_set_up_then_it_is_tried_again() -> None:
     wire, driver, emulator = wired(AxisFault(0.0, "exception", 6), AxisFault(0.0, "exception", 6))
     wire.run(3.0)
@@ -353,8 +377,10 @@ def test_given_random_replies_then_nothing_is_raised_and_memory_stays_flat() -> 
     tracemalloc.start()
     try:
         flood(2_000, 1_000)
+        gc.collect()
         before, _ = tracemalloc.get_traced_memory()
         flood(3_000, 5_000)
+        gc.collect()
         after, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

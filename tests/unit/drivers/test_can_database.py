@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import pytest
 from support_vehicle_bus import DBC, METRES_PER_COUNT, RAPTOR_COMMAND, RAPTOR_STATUS, raptor_dbc, wheel
@@ -156,8 +157,8 @@ def test_given_mistyped_names_then_every_one_is_told_with_the_nearest(database: 
     with pytest.raises(ConfigError) as caught:
         bind_wheels(wheels, database, "drivers.wheels.wheels")
     first, second, third = map(str, caught.value.problems)
-    assert "raptor.dbc (drivers.wheels.wheels.front_left.count)" in first
-    assert "message WheelCounts has no signal 'FrontLeftCuont'" in first
+    assert first.startswith("drivers.wheels.wheels.front_left.count: error: ")
+    assert "raptor.dbc: message WheelCounts has no signal 'FrontLeftCuont'" in first
     assert "write WheelCounts.FrontLeftCount" in first
     assert "there is no message 'WheelSpeds'; nearest: WheelSpeeds" in second
     assert "known there: FrontLeftCount, FrontRightCount" in third
@@ -172,6 +173,26 @@ def test_given_signals_that_cannot_be_what_they_are_mapped_to_then_it_is_told(mi
             bind_wheels({"a": wheel_map}, mixed, "wheels")
     with pytest.raises(ConfigError, match="floating-point"):
         bind_status(StatusMap(fault_bits="Wide.Real"), mixed, "status")
+
+
+SMALL = 'BO_ 1 M: 8 A\n SG_ N : 0|8@1+ (1,0) [0|0] "" A\n'
+
+
+@pytest.mark.parametrize(("max_speed", "delay"), [(15.0, 0.1), (200.0, 0.01), (1.0, 10.0)])
+def test_given_a_counter_that_turns_too_soon_then_the_largest_settings_that_do_are_told(
+    max_speed: float, delay: float
+) -> None:
+    small = parse_dbc(SMALL, "small.dbc")
+    wheels = {"left": WheelMap(CountMap("M.N", 0.01))}
+    with pytest.raises(ConfigError) as caught:
+        bind_wheels(wheels, small, "wheels", max_speed, delay)
+    (problem,) = caught.value.problems
+    assert "256 counts of 0.01 m tell ways up to 1.27 m apart" in problem.message
+    lower = re.findall(r"below ([\d.e-]+) ", problem.fix)
+    # what is told does
+    assert bind_wheels(wheels, small, "wheels", max_speed, 0.99 * float(lower[0]))
+    assert bind_wheels(wheels, small, "wheels", 0.99 * float(lower[1]), delay)
+    assert bind_wheels({"left": WheelMap(CountMap("M.N", 1.0))}, small, "wheels", 15.0, 0.1)
 
 
 def test_given_a_signed_speed_mapped_as_a_magnitude_then_it_is_told(database: CanDatabase) -> None:

@@ -8,11 +8,13 @@ from dataclasses import replace
 import pytest
 from support_gps import SECOND, START, Line, drive, halves, noisy, now_at
 
-from modelserver.messages import FixType
+from modelserver.messages import FixType, SensorHeader
 from msdrivers.devices.gps import GpsDriver, GpsSettings
+from msdrivers.devices.gps.samples import novatel_sample
+from msdrivers.devices.gps.set_up import Progress, SetUp
 from msdrivers.emulate.gps import GpsEmulator, GpsUnit
 from msdrivers.protocol.nmea.encode import encode as nmea
-from msdrivers.protocol.novatel import LogHeader, NovatelLog, Position, PositionType, TimeStatus
+from msdrivers.protocol.novatel import Answer, Heading, LogHeader, NovatelLog, Position, PositionType, TimeStatus
 from msdrivers.protocol.novatel.crc import crc32
 from msdrivers.protocol.novatel.encode import encode
 from msdrivers.station import Measured, Phase, Send, Told
@@ -356,3 +358,88 @@ def test_given_a_wrong_device_that_keeps_talking_when_minutes_pass_then_the_word
         one.run(0.1)
     assert 2 <= len([each for each in one.told if each.phase is Phase.SILENT]) <= 4, one.words
     assert len(one.reopened) > 20
+
+
+def spoken(*sentences: str) -> bytes:
+    return b"".join(nmea(each[:2], each[2:5], each.split(",")[1:]) for each in sentences)
+
+
+GSV = spoken("GPGSV,1,1,00", "GPTXT,01,01,02,hello")
+BARE = spoken("GPGGA,120000.00,5000.0,N,11100.0,W,1,08,0.9,700.0,M,-20.0,M,,").split(b"*")[0] + b"\r\n"
+WRONG = spoken("GPGGA,120000.00,5000.0,N,11100.0,W,1,eight,0.9,700.0,M,-20.0,M,,")
+STILL = spoken("GPGGA,120000.00,5000.0,N,11100.0,W,1,08,0.9,700.0,M,-20.0,M,,")
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        (GSV, ("heard GPGSV, GPTXT, which are not used since", "switch GGA or RMC on")),
+        (BARE, ("heard GPGGA without checksum since", "switch its checksums on")),
+        (WRONG, ("heard GPGGA with a right checksum and a field that cannot be", "compare its sentences")),
+        (STILL, ("GPGGA come, but their time stands still", "no new fix for 2 s")),
+    ],
+    ids=["others", "bare", "wrong", "still"],
+)
+def test_given_sentences_that_make_no_fix_when_heard_then_it_is_said_why_and_the_rate_is_kept(
+    data: bytes, says: tuple[str, ...]
+):
+    one = alone(*[data] * 20, protocol="nmea", bauds=(4800, 9600))
+    silent = [each.text for each in one.told if each.phase is Phase.SILENT]
+    assert silent, one.words
+    assert all(each in silent[0] for each in says), silent[0]
+    assert "baud" not in silent[0]
+    assert not one.reopened
+
+
+def test_given_a_heading_without_a_deviation_when_published_then_there_is_none():
+    for sigma, known in ((0.0, False), (-1.0, False), (0.2, True)):
+        heading = Heading(0, 50, 2.0, 90.0, 1.0, sigma, 0.2, "AAAA", 10, 9)
+        body = Position(0, PositionType.SINGLE, 50.0, -111.0, 700.0, -20.0, 61, 1.0, 2.0, 3.0, "", 0.0, 0.0, 9, 8)
+        sample = novatel_sample(SensorHeader(1, "gps", 0), body, None, heading)
+        assert sample.baseline_yaw == pytest.approx(0.0)
+        assert (sample.baseline_yaw_sigma == sample.baseline_yaw_sigma) is known
+
+
+def test_given_a_constant_delay_in_the_settings_when_published_then_it_goes_with_the_sample():
+    one = line(GpsSettings("gps", delay=0.03, delay_sigma=0.005)).run(3.0)
+    assert {(each.delay, each.delay_sigma) for each in one.measured} == {(0.03, 0.005)}
+
+
+S = 1_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("late_s", "first_is_lost"),
+    [(0.2, False), (1.2, False), (1.8, False), (2.4, False), (0.2, True), (1.2, True), (1.8, True)],
+)
+def test_given_answers_that_come_late_or_not_when_set_up_then_each_is_its_own_commands(
+    late_s: float, first_is_lost: bool
+):
+    commands = tuple(f"command {n}" for n in range(6))
+    dialogue = SetUp(commands, S, 3)
+    coming: list[tuple[int, str]] = []
+    answered: list[tuple[str, str]] = []
+    now, sent = 0, 0
+
+    def send(data: bytes) -> None:
+        nonlocal sent
+        for each in data.decode().split("\r\n"):
+            if each and not (first_is_lost and sent == 0):
+                coming.append((now + round(late_s * S), each))
+            sent += bool(each)
+
+    send(dialogue.begin(now))
+    while dialogue.progress is Progress.ASKING:
+        due = dialogue.due()
+        assert due is not None
+        if coming and coming[0][0] <= due:
+            now, command = coming.pop(0)
+            # every second command is refused, and says which it was
+            error = command if int(command[-1]) % 2 else ""
+            send(dialogue.answered(Answer(0, error), now))
+        else:
+            now = due
+            send(dialogue.woken(now))
+    answered = dialogue.refused
+    assert dialogue.progress is Progress.DONE
+    assert answered == [(each, each) for each in commands if int(each[-1]) % 2]

@@ -141,7 +141,7 @@ def test_given_a_clock_that_stands_still_when_the_same_instant_comes_again_then_
     assert len([*stream.feed(said(gga(), rmc())), *stream.idle()]) == 1
     stream.feed(said(gga(), rmc()))
     assert stream.idle() == []
-    assert stream.counts["nmea.late"] == 2
+    assert stream.counts["rejected.late"] == 2
 
 
 def test_given_midnight_when_only_gga_tells_then_the_day_goes_on():
@@ -214,7 +214,7 @@ def test_given_sentences_of_no_use_when_read_then_they_are_counted_and_nothing_e
     stream = GpsStream()
     data = b"$PGRME,15.0,M,22.5,M,27.0,M*1A\r\n" + said("GPGSV,1,1,00", "HEROT,0.0,A")
     assert stream.feed(data) == []
-    assert stream.counts == {"nmea.unused": 3, "skipped": 0, "nmea.late": 0}
+    assert stream.counts == {"nmea.unused": 3, "skipped": 0}
 
 
 def test_given_a_number_of_decimals_when_read_then_none_is_lost():
@@ -230,3 +230,95 @@ def test_given_values_when_written_then_they_read_as_they_should():
     assert angle(math.nan, "NS", 2) == ("", "")
     assert time_of_day(86_400_500_000) == "235960.500"
     assert (number(math.nan, 2), number(1.005, 1)) == ("", "1.0")
+
+
+@pytest.mark.parametrize(
+    ("sentence", "moves"),
+    [
+        ("GPVTG,90.0,T,,M,17.0,N,,K,A", True),
+        ("GPVTG,90.0,T,,M,17.0,N,,K,D", True),
+        ("GPVTG,90.0,T,,M,17.0,N,,K", True),
+        ("GPVTG,90.0,T,,M,17.0,N,,K,", True),
+        ("GPVTG,90.0,T,,M,17.0,N,,K,N", False),
+        ("GPVTG,90.0,T,,M,17.0,N,,K,S", False),
+        ("GPVTG,90.0,T,,M,17.0,N,,K,M", False),
+        (rmc(), True),
+        (rmc(mode=""), True),
+        (rmc(status="V"), False),
+        (rmc(mode="N"), False),
+        (rmc(mode="S"), False),
+        (rmc(status="V", mode="E"), True),
+        (rmc(status="", mode=""), False),
+    ],
+)
+def test_given_motion_that_is_flagged_invalid_when_read_then_it_is_not_said(sentence: str, moves: bool):
+    (epoch,) = epochs(gga(), sentence)
+    assert [value == value for value in (epoch.speed, epoch.track)] == [moves, moves]
+
+
+def test_given_a_gns_without_a_mode_when_read_then_it_is_no_fix_as_a_gga_without_quality():
+    (epoch,) = epochs("GNGNS,120000.00,5000.0,N,11100.0,W,,09,0.9,700.0,-20.0,,")
+    assert epoch.fix_type is FixType.NONE
+
+
+def cycles(order: Sequence[str], silent: Sequence[int], number: int = 8) -> list[tuple[int, float, float]]:
+    """Return second, speed and heading of each epoch of a receiver; both tell the second.
+
+    silent: the cycles after which the line is silent.
+    """
+    stream, found = GpsStream(), []
+    for n in range(number):
+        kinds = {
+            "GGA": gga(f"12000{n}.00"),
+            "VTG": f"GPVTG,90.0,T,,M,{n}.0,N,,K,A",
+            "HDT": f"GPHDT,{n}.0,T",
+            "GSA": "GPGSA,A,3,,,,,,,,,,,,,1.5,0.9,1.2",
+        }
+        found += stream.feed(said(*(kinds[each] for each in order)))
+        if n in silent:
+            found += stream.idle()
+    assert all(isinstance(each, NmeaEpoch) for each in found)
+    return [(each.time_of_day // 1_000_000 % 10, each.speed / KNOT, each.heading) for each in found]  # type: ignore[union-attr]
+
+
+ORDERS = [
+    ["VTG", "GGA"],
+    ["GGA", "VTG"],
+    ["HDT", "GGA", "VTG"],
+    ["GSA", "VTG", "HDT", "GGA"],
+    ["VTG", "GGA", "GSA"],
+    ["GGA", "GSA", "HDT", "VTG"],
+]
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("silent", [range(8), (0, 1), (2,), ()])
+def test_given_sentences_without_a_time_when_they_lead_or_follow_then_no_epoch_has_anothers(
+    order: list[str], silent: Sequence[int]
+):
+    found = cycles(order, silent)
+    assert len(found) >= 6
+    for second, *said_of in found:
+        assert all(value != value or value == pytest.approx(second) for value in said_of)
+    if len(silent) == 8:
+        # the first cycle may have begun before the line was opened, and two must have told the order
+        for second, speed, _ in found[3:]:
+            assert speed == pytest.approx(second)
+
+
+@pytest.mark.parametrize("order", ORDERS[:2])
+def test_given_the_order_that_silence_told_when_the_line_is_full_then_motion_is_said_still(order: list[str]):
+    for second, speed, _ in cycles(order, (0, 1))[2:-1]:
+        assert speed == pytest.approx(second)
+
+
+def test_given_a_pause_amid_a_cycle_when_it_contradicts_the_others_then_motion_is_left_out_rather_than_wrong():
+    stream, found = GpsStream(), []
+    for n in range(8):
+        found += stream.feed(said(gga(f"12000{n}.00")))
+        if n == 3:
+            found += stream.idle()
+        found += stream.feed(said(f"GPVTG,90.0,T,,M,{n}.0,N,,K,A"))
+    found += stream.idle()
+    wrong = [each for each in found if abs(each.speed / KNOT - each.time_of_day // 1_000_000 % 10) > 0.1]  # type: ignore[union-attr,operator]
+    assert len(wrong) <= 1

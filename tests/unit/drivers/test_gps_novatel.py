@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from msdrivers.protocol.gps_stream import GpsStream
@@ -198,3 +200,51 @@ def test_given_the_crc_when_compared_with_zlibs_then_it_is_another():
 def test_given_a_log_without_body_when_written_then_it_is_refused():
     with pytest.raises(ValueError, match="VERSION cannot be written"):
         encode(NovatelLog(LogHeader("VERSION", 1, 1, 180, "", 0, 0, True), None))
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "BESTPOSA,COM1,0,80.0,FINESTEERING,1957,inf,00000800,7145,6938",
+        "BESTPOSA,COM1,0,80.0,FINESTEERING,1957,1e999,00000800,7145,6938",
+        "BESTPOSA,COM1,0,80.0,FINESTEERING,1957,nan,00000800,7145,6938",
+        "BESTPOSA,COM1,0,80.0,FINESTEERING,1957,-1,00000800,7145,6938",
+        "BESTPOSA,COM1,0,80.0,FINESTEERING,1957,604799.9999,00000800,7145,6938",
+        "BESTPOSA,COM1,0,80.0,FINESTEERING,2147483648,0,00000800,7145,6938",
+        "BESTPOSA,COM1,0,80.0,FINESTEERING,-1,0,00000800,7145,6938",
+        "BESTPOSA,COM1,0,80.0,FINESTEERING,1957,0,100000000,7145,6938",
+    ],
+)
+def test_given_a_header_that_cannot_be_when_read_then_the_log_is_refused_and_the_next_is_read(header: str):
+    _, body = BESTPOSA.decode("ascii").split("*")[0].split(";")
+    stream = GpsStream()
+    assert stream.feed(text(f"{header};{body}")) == []
+    assert stream.counts["rejected.novatel_value"] == 1
+    assert len(stream.feed(BESTPOSA)) == 1
+
+
+@pytest.mark.parametrize("count", ["256", "2147483648", "-1", "8.5", ""])
+def test_given_a_number_of_satellites_that_cannot_be_when_read_then_the_log_is_refused(count: str):
+    content = BESTPOSA.decode("ascii").split("*")[0][1:].replace(",8,8,8,0,0", f",8,{count},8,0,0")
+    stream = GpsStream()
+    assert stream.feed(text(content)) == []
+    assert stream.counts["rejected.novatel_value"] == 1
+
+
+@pytest.mark.parametrize("degrees", [-0.5, 360.5, math.nan, math.inf, 1e30])
+@pytest.mark.parametrize("as_binary", [True, False])
+def test_given_a_heading_that_cannot_be_when_read_then_it_is_refused(degrees: float, as_binary: bool):
+    said = Heading(0, 50, 2.0, degrees, 1.0, 0.1, 0.2, "AAAA", 10, 9)
+    header = LogHeader("HEADING", 2288, 1000, TimeStatus.FINESTEERING, "32", 0, 0, as_binary)
+    stream = GpsStream()
+    assert stream.feed(encode(NovatelLog(header, said))) == []
+    assert stream.counts["rejected.novatel_value"] == 1
+
+
+@pytest.mark.parametrize("good", [BESTPOSA, b"$GPZDA,120000.00,21,11,2026,00,00*60\r\n", b"[COM1]", BESTPOSB])
+@pytest.mark.parametrize("noise", [b"<", b"<noise ", b"<OK", b"<ERROR:no"])
+def test_given_a_stray_beginning_of_text_when_a_good_message_follows_then_it_is_read(noise: bytes, good: bytes):
+    alone, stream = GpsStream(), GpsStream()
+    alone.feed(good)
+    stream.feed(noise + good + b"\r\n")
+    assert {**stream.counts, "skipped": 0} == {**alone.counts, "skipped": 0}

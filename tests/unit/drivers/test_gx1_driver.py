@@ -12,6 +12,7 @@ from support_gx1 import FIELD_NED, GRAVITY, START_UTIME, Line, angle_between, st
 from modelserver.messages import ImuSample, OrientationReference, YawSource
 from modelserver.spatial import so3
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings, Heading
+from msdrivers.devices.gx1.tick_rate import TickRate
 from msdrivers.emulate.gx1 import Gx1Emulator
 from msdrivers.emulate.gx1_unit import Eeprom, Fault, Gx1Unit
 from msdrivers.protocol.gx1 import Address, Command, Gains, requests
@@ -28,7 +29,7 @@ def test_given_a_device_when_opened_then_it_is_identified_set_up_and_streams_at_
     line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(turning()))
     line.run(6.0)
     assert line.texts(Phase.CONFIGURING) == ["3DM-GX1 serial 1234, firmware 3.1.00 answers at 38400 baud"]
-    assert line.texts(Phase.STREAMING) == ["3DM-GX1 serial 1234, firmware 3.1.00 streams 0x31"]
+    assert line.texts(Phase.STREAMING) == ["3DM-GX1 serial 1234, firmware 3.1.00 streams message 49"]
     headers = [sample.header for sample in imu_samples(line)]
     assert [header.seq for header in headers] == list(range(len(headers)))
     assert {b.device_utime - a.device_utime for a, b in itertools.pairwise(headers)} == {10_000}
@@ -233,11 +234,32 @@ def test_given_timer_words_that_take_effect_later_then_the_device_time_is_not_us
     line = Line(Gx1Driver(Gx1Settings("imu")), device)
     line.device.opened(line.now())
     device.eeprom = device.eeprom.written(dict(zip(Address.TIMER, (4, 10, 250, 10), strict=True)))
-    line.run(12.0)
+    line.run(20.0)
     assert any("6.554 ms by the host's clock" in text and "power off and on" in text for text in line.texts())
     last = line.samples[-1]
     assert last.sample.header.device_utime == 0
     assert last.delay == pytest.approx(230 / 38400)
+
+
+@pytest.mark.parametrize("off", [0.05, -0.05, 0.01, -0.01])
+def test_given_ticks_of_another_length_when_they_are_compared_then_they_contradict(off: float):
+    rng = random.Random(1)
+    rate = TickRate(0.01)
+    changes = [rate.take(n, round((n * (1.0 + off) + rng.uniform(0.0, 2.0)) * 1e7)) for n in range(2500)]
+    assert sum(changes) == 1
+    assert not rate.agrees
+    assert f"take {10.0 * (1.0 + off):.2g}" in rate.text()
+
+
+@pytest.mark.parametrize("stall_s", [0.0, 0.3, 4.0])
+def test_given_a_host_that_stalls_and_a_crystal_that_is_off_when_ticks_are_compared_then_they_agree(stall_s: float):
+    rng = random.Random(2)
+    rate = TickRate(0.01)
+    for n in range(6000):
+        at_s = n * 0.01 * 1.0002 + rng.uniform(0.0, 0.02)
+        at_s = max(at_s, 7.0 * (at_s // 7.0) + stall_s)
+        assert not rate.take(n, round(at_s * 1e9))
+    assert rate.agrees
 
 
 def test_given_a_unit_whose_timer_is_not_documented_then_the_tick_is_inferred_and_said():
@@ -251,11 +273,11 @@ def test_given_a_unit_whose_timer_is_not_documented_then_the_tick_is_inferred_an
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"message": 0x07}, "message: 0x07 is no measurement"),
-        ({"polled": Command.EULER_VECTORS}, "polled: 0x31 is streamed already"),
+        ({"message": 0x07}, "message: 7 is no measurement"),
+        ({"polled": Command.EULER_VECTORS}, "polled: 49 is streamed already"),
         ({"message": Command.INSTANTANEOUS_EULER}, "choose heading magnetic"),
         ({"specific_force_sign": 0}, "must be 1 or -1"),
-        ({"bauds": ()}, "at least one rate"),
+        ({"bauds": (0,)}, "bauds: must be above 0"),
         ({"silence": 0.0}, "silence: must be at least 0.05 s, got 0"),
         ({"tick": math.nan}, "tick: must be at least"),
     ],

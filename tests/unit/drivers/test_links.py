@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import socket
+import termios
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -112,6 +113,72 @@ def test_given_a_port_whose_device_goes_then_the_line_is_lost_and_can_be_opened_
     pty.close()
 
 
+def test_given_a_file_of_the_links_name_then_it_stays_and_the_line_is_not_opened(tmp_path: Path) -> None:
+    path = tmp_path / "precious.yaml"
+    path.write_text("precious")
+    pty = PtyLink(link=path)
+    with pytest.raises(LinkError, match=r"precious.yaml: there is a file of that name, and it stays; give another"):
+        pty.open()
+    pty.close()
+    assert path.read_text() == "precious"
+
+
+def test_given_a_link_that_no_emulator_made_then_it_stays(tmp_path: Path) -> None:
+    path = tmp_path / "gps"
+    path.symlink_to(tmp_path)
+    pty = PtyLink(link=path)
+    with pytest.raises(LinkError, match=f"a link to {tmp_path} that no emulator made, and it stays"):
+        pty.open()
+    pty.close()
+    assert path.readlink() == tmp_path
+
+
+@pytest.mark.parametrize("left", ["/dev/pts/999999", "/dev/nowhere"])
+def test_given_a_link_that_was_left_behind_then_it_is_taken_over(left: str, tmp_path: Path) -> None:
+    path = tmp_path / "gps"
+    path.symlink_to(left)
+    pty = PtyLink(link=path)
+    pty.open()
+    assert path.is_char_device()
+    pty.close()
+    assert not path.is_symlink()
+
+
+def test_given_a_link_to_a_terminal_then_it_is_a_number_used_again_and_taken_over(tmp_path: Path) -> None:
+    path = tmp_path / "gps"
+    ours, terminal = os.openpty()
+    path.symlink_to(os.ttyname(terminal))
+    # as of a terminal: its window has one end, the programs in it the other
+    os.close(terminal)
+    pty = PtyLink(link=path)
+    pty.open()
+    pty.close()
+    os.close(ours)
+
+
+def test_given_a_link_in_use_when_another_emulator_wants_it_then_it_is_told_by_whom_and_both_stay_as_they_are(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "gps"
+    first, second = PtyLink(link=path), PtyLink(link=path)
+    first.open()
+    with pytest.raises(LinkError, match=rf"gps is in use: by the emulator process {os.getpid()} \(.*; end it"):
+        second.open()
+    second.close()
+    assert path.is_char_device()
+    first.close()
+
+
+def test_given_a_link_that_another_has_taken_over_then_it_is_left_to_that_one(tmp_path: Path) -> None:
+    path = tmp_path / "gps"
+    pty = PtyLink(link=path)
+    pty.open()
+    path.unlink()
+    path.symlink_to("/dev/null")
+    pty.close()
+    assert str(path.readlink()) == "/dev/null"
+
+
 def test_given_the_wrong_rate_then_garbage_is_heard_and_at_the_right_one_the_device(tmp_path: Path) -> None:
     pty = PtyLink(baud=38400)
     pty.open()
@@ -139,28 +206,94 @@ def test_given_a_port_in_use_then_it_says_by_which_process(pty: PtyLink) -> None
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EPERM])
-def test_given_no_permission_then_it_says_which_group_and_the_command(
-    number: int, monkeypatch: pytest.MonkeyPatch, pty: PtyLink
+@pytest.mark.parametrize(
+    ("group", "mode", "said"),
+    [
+        (20, 0o660, "it belongs to group dialout: sudo usermod -aG dialout operator, then log in again"),
+        (0, 0o660, "no group but root's may use it: write KERNEL=="),
+        (20, 0o600, "no group but root's may use it: write KERNEL=="),
+        (20, 0o620, 'GROUP="dialout", MODE="0660" into /etc/udev/rules.d/99-serial.rules, sudo usermod -aG dialout'),
+    ],
+)
+def test_given_no_permission_then_it_says_how_to_get_it(
+    number: int, group: int, mode: int, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(*_: object, **__: object) -> None:
         raise serial.SerialException(number, "could not open port")
 
-    class Group:
-        gr_name = "dialout"
-
     monkeypatch.setattr(serial_module.serial, "Serial", refused)
-    monkeypatch.setattr(ports.grp, "getgrgid", lambda _: Group)
+    owned = os.stat_result((mode, 0, 0, 1, 0, group, 0, 0, 0, 0))
+    monkeypatch.setattr(ports, "owner_of", lambda _: (owned, "dialout"))
     monkeypatch.setattr(ports.getpass, "getuser", lambda: "operator")
     with pytest.raises(LinkError) as caught:
-        SerialLink(pty.description, 9600).open()
+        SerialLink("/dev/ttyUSB0", 9600).open()
     assert caught.value.why == "permission denied"
-    assert caught.value.fix == "it belongs to group dialout: sudo usermod -aG dialout operator, then log in again"
+    assert said in caught.value.fix
 
 
-def test_given_a_mistyped_port_then_the_nearest_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serial_module, "found_ports", lambda: [ports.PortLine("/dev/ttyUSB9", "adapter", "")])
-    with pytest.raises(LinkError, match="nearest: /dev/ttyUSB9"):
-        SerialLink("/dev/ttyUBS9", 9600).open()
+@pytest.mark.parametrize(
+    ("wanted", "near"),
+    [
+        ("/dev/ttyUBS9", "; nearest: /dev/ttyUSB8"),
+        ("/dev/ttyUSB0", "; nearest: /dev/ttyUSB8"),
+        # there is always a ttyS0: no help for who misses an adapter
+        ("/dev/ttyACM0", ""),
+    ],
+)
+def test_given_a_missing_port_then_those_of_its_name_are_told(
+    wanted: str, near: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = [ports.PortLine("/dev/ttyUSB8", "adapter", ""), ports.PortLine("/dev/ttyS0", "", "")]
+    monkeypatch.setattr(ports, "found_ports", lambda: found)
+    monkeypatch.setattr(ports.glob, "glob", lambda _: [])
+    with pytest.raises(LinkError) as caught:
+        SerialLink(wanted, 9600).open()
+    assert caught.value.fix == f"plug it in; modelserver driver --list shows what is there{near}"
+
+
+def test_given_adapters_with_an_id_then_a_missing_port_names_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ports, "found_ports", list)
+    monkeypatch.setattr(ports.glob, "glob", lambda _: ["/dev/serial/by-id/usb-FTDI"])
+    assert ports.near_ports("/dev/ttyUSB0") == ("/dev/serial/by-id/usb-FTDI",)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("/usr/bin/python3", "/usr/bin/modelserver", "driver", "gps"), "process 7 (modelserver driver gps)"),
+        (("/usr/bin/python3", "-c", "main()", "driver", "gps"), "process 7 (python driver gps)"),
+        (("/usr/sbin/gpsd", "-n", "/dev/ttyUSB0"), "process 7 (gpsd -n /dev/ttyUSB0)"),
+        (("x" * 100,), f"process 7 ({'x' * 60}...)"),
+        (("",), "process 7 (kworker)"),
+    ],
+)
+def test_given_a_process_then_it_is_told_by_what_was_typed(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
+    process = tmp_path / "7"
+    process.mkdir()
+    (process / "cmdline").write_text("\0".join(words) + "\0")
+    (process / "comm").write_text("kworker\n")
+    assert ports._shown(process) == said
+
+
+def test_given_driver_and_emulator_on_one_pty_then_the_driver_alone_holds_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    processes = [Path("/proc/7"), Path("/proc/8")]
+    monkeypatch.setattr(ports, "_holders", lambda _: processes)
+    monkeypatch.setattr(ports, "_shown", lambda process: process.name)
+    monkeypatch.setattr(ports, "_has_other_end", lambda process, _: process.name == "7")
+    assert ports.holders("/dev/pts/3") == ["8"]
+    assert ports.other_ends("/dev/pts/3") == ["7"]
+
+
+def test_given_a_port_whose_settings_are_refused_then_it_is_a_link_error(
+    monkeypatch: pytest.MonkeyPatch, pty: PtyLink
+) -> None:
+    def refused(*_: object) -> None:
+        # no OSError, and pyserial lets it through
+        raise termios.error(errno.EINVAL, "Invalid argument")
+
+    monkeypatch.setattr(termios, "tcsetattr", refused)
+    with pytest.raises(LinkError, match="its settings are refused: Invalid argument; is it a serial port"):
+        SerialLink(pty.description, 9600).open()
 
 
 def test_given_a_file_that_is_no_port_then_it_is_a_link_error(tmp_path: Path) -> None:
@@ -224,6 +357,12 @@ def test_given_nobody_listens_then_it_says_so_and_a_port_in_use_is_named(server:
         TcpLink("127.0.0.1", port).open()
 
 
+@pytest.mark.parametrize("host", ["a..b", "x" * 70 + ".lan"])
+def test_given_an_address_that_is_none_then_it_is_a_link_error(host: str) -> None:
+    with pytest.raises(LinkError, match="look at address"):
+        TcpLink(host, 3001).open()
+
+
 def test_given_a_line_that_is_not_open_then_it_is_a_link_error() -> None:
     links: Sequence[Link[bytes]] = (TcpLink("127.0.0.1", 1), TcpServerLink(0), PtyLink(), SerialLink("/dev/x", 9600))
     for link in links:
@@ -269,13 +408,15 @@ def test_given_a_bus_then_frames_and_error_frames_come_as_they_were_sent(multica
         (errno.ENETDOWN, "sudo ip link set can7 up"),
         (errno.ENOBUFS, "nobody acknowledges"),
         (errno.EPERM, "permission denied"),
+        (errno.EAFNOSUPPORT, "sudo modprobe -a can can_raw"),
+        (-2, "python-can's documentation"),
     ],
 )
 def test_given_an_interface_that_cannot_be_used_then_it_says_what_to_do(
     number: int, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(**_: object) -> None:
-        raise OSError(number, os.strerror(number))
+        raise OSError(number, "name or service not known" if number < 0 else os.strerror(number))
 
     monkeypatch.setattr(can_module.can, "Bus", refused)
     with pytest.raises(LinkError, match=said):
@@ -285,6 +426,27 @@ def test_given_an_interface_that_cannot_be_used_then_it_says_what_to_do(
 def test_given_a_mistyped_interface_then_the_nearest_is_told() -> None:
     with pytest.raises(LinkError, match="write socketcan"):
         CanLink("can0", "soketcan").open()
+
+
+@pytest.mark.parametrize(
+    ("channel", "interface", "said"),
+    [
+        ("can0", "udp_multicast", "GROUP:PORT"),
+        ("239.74.163.9", "socketcan", "modelserver emulate --interface udp_multicast"),
+    ],
+)
+def test_given_a_channel_of_another_interface_then_it_says_which(channel: str, interface: str, said: str) -> None:
+    with pytest.raises(LinkError, match=said):
+        CanLink(channel, interface).open()
+
+
+def test_given_a_bus_that_cannot_be_opened_then_python_can_says_nothing_beside(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    for _ in range(3):
+        with pytest.raises(LinkError):
+            CanLink("can9").open()
+    assert not caplog.records
 
 
 # --- Modbus -------------------------------------------------------------------------------------------------

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
+import re
 import runpy
 import subprocess
 import sys
+from functools import reduce
+from operator import xor
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +89,37 @@ def test_given_a_damaged_line_then_it_is_counted_and_the_next_one_taken() -> Non
     assert _speeds(published) == [1.0, 3.0]
     counters = dict(runner.health(time.now()).counters)
     assert sum(count for name, count in counters.items() if name.startswith("rejected.")) == 1
+
+
+@pytest.mark.parametrize("said", ["SPD,nan", "SPD,inf", "SPD,1e9", "SPD,1_0", "SPD, 1.00", "1.00", "SPD,", "XYZ,1.00"])
+def test_given_a_line_that_is_right_by_its_checksum_alone_then_it_is_refused(said: str) -> None:
+    body = said.encode()
+    scanner = Scanner[float]([OWN["SpeedFormat"]()])
+    assert scanner.feed(b"$%b*%02X\r\n" % (body, reduce(xor, body))) == []
+    assert scanner.counts["rejected.content"] == 1
+
+
+def test_given_the_program_of_the_page_and_a_mistyped_key_then_it_says_so_with_its_line(tmp_path: Path) -> None:
+    (code,) = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "own-device.md").read_text(encoding="utf-8"), re.DOTALL
+    )
+    (tmp_path / "vehicle.yaml").write_text(
+        "vehicle: cart\ngeometry: cart.yaml\nbase_frame: Cart:Base\n"
+        "drivers:\n  radar: {device: speed, port: /dev/ttyUSB2, weel: speed}\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(EXAMPLE.parent)},
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr == (
+        "vehicle.yaml:5 (drivers.radar.weel): error: unknown key 'weel'; nearest: wheel; fix: write wheel\n"
+    )
 
 
 def test_given_silence_then_it_is_told_and_ends_with_the_next_speed() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 from pathlib import Path
 
 import pytest
@@ -11,18 +12,20 @@ from hypothesis import strategies as st
 
 from modelserver.errors import RecordingError
 from msdrivers.lines import CanForm, ModbusForm
-from msdrivers.links import PlayedOutError
+from msdrivers.links import LinkError, PlayedOutError
 from msdrivers.links.fake import FakeLink, FakeTime
+from msdrivers.links.recorded import PlayedLink, RecordingLink
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.modbus.registers import FailureKind, ModbusFailure, ReadRegisters, Registers, Table
-from msdrivers.raw_log import BytesForm, PlayedLink, RawReader, RawWriter, RecordingLink, Way, open_for_reading
+from msdrivers.raw_log import BytesForm, RawReader, RawWriter, Way, open_for_reading, recording
+from msdrivers.station import Now
 
 
 def recorded(limit: int = 1 << 20) -> tuple[str, RawWriter]:
     time = FakeTime()
     start = time.monotonic_ns * 1e-9
     stream = io.StringIO()
-    writer = RawWriter(stream, limit)
+    writer = RawWriter(stream, limit, "x")
     writer.begin("bytes", "gps", "novatel")
     units = [(start + 0.5, b"one"), (start + 0.75, b"two"), (start + 3.0, b"\x00\xff")]
     link = RecordingLink(FakeLink(time, units), BytesForm(), writer, time)
@@ -55,13 +58,13 @@ def test_given_a_line_when_recorded_then_all_of_it_stands_there_with_times() -> 
 def test_given_a_recording_when_played_then_units_come_as_long_after_each_other_and_then_it_ends() -> None:
     text, _ = recorded()
     time = FakeTime(monotonic_ns=77_000_000_000)
-    link = PlayedLink("x", RawReader(io.StringIO(text), "x"), BytesForm().unpack, time)
+    link = PlayedLink(RawReader(io.StringIO(text), "x"), BytesForm().unpack, time)
     link.open()
     heard = []
     while len(heard) < 3:
         heard += [(time.monotonic_ns, unit) for unit in link.poll(0.2)]
         link.send(b"goes nowhere")
-    with pytest.raises(PlayedOutError):
+    with pytest.raises(PlayedOutError, match=r"the recording has ended$"):
         link.poll(0.2)
     assert heard == [(77_000_000_000, b"one"), (77_250_000_000, b"two"), (79_500_000_000, b"\x00\xff")]
 
@@ -93,6 +96,133 @@ def test_given_a_limit_then_the_recording_is_no_larger_and_whole() -> None:
     assert writer.full
     assert text.endswith("\n")
     assert len(list(RawReader(io.StringIO(text), "x"))) >= 1
+
+
+def played_out(lines: list[str]) -> Exception:
+    """Return how the playing of a recording with these lines ends."""
+    text = "".join(["# modelserver raw 1 can wheels wheels\n", *lines])
+    link = PlayedLink(RawReader(io.StringIO(text), "w.raw"), CanForm().unpack, FakeTime())
+    try:
+        while True:
+            link.poll(10.0)
+    except (PlayedOutError, RecordingError) as error:
+        return error
+
+
+def test_given_damage_in_a_recording_when_played_then_its_end_says_how_much() -> None:
+    ended = played_out(["< 1 2 0000010000ff\n", "< 1 3 00\n", "nonsense\n"])
+    assert isinstance(ended, PlayedOutError)
+    assert ended.why == "the recording has ended; 2 damaged lines of it were left out"
+
+
+@pytest.mark.parametrize(
+    ("lines", "why"),
+    [(["nonsense\n", "< 1 3 00\n"], "all that was received is damaged, 2 lines"), ([], "nothing was received in it")],
+)
+def test_given_a_recording_of_which_nothing_can_be_played_then_it_is_an_error(lines: list[str], why: str) -> None:
+    ended = played_out(lines)
+    assert isinstance(ended, RecordingError)
+    assert str(ended) == f"w.raw: nothing of it can be played: {why}"
+
+
+class FullDisk(io.StringIO):
+    """Takes so many writes."""
+
+    def __init__(self, writes: int):
+        super().__init__()
+        self.left = writes
+
+    def write(self, text: str) -> int:
+        self.left -= 1
+        if self.left < 0:
+            raise OSError(28, "No space left on device")
+        return super().write(text)
+
+
+def test_given_a_full_disk_then_the_recording_ends_it_is_told_once_and_the_line_goes_on(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    writer = RawWriter(FullDisk(2), 1 << 20, "gps.raw")
+    writer.begin("bytes", "gps", "novatel")
+    time = FakeTime()
+    link = RecordingLink(FakeLink(time, [(1.5, b"one"), (1.6, b"two")]), BytesForm(), writer, time)
+    link.open()
+    assert [*link.poll(1.0), *link.poll(1.0)] == [b"one", b"two"]
+    link.send(b"log")
+    writer.close()
+    assert writer.full
+    assert [(record.levelname, record.message) for record in caplog.records] == [
+        ("WARNING", "recording gps.raw ended: No space left on device; the driver goes on"),
+        ("WARNING", "recording gps.raw: 3 records came after its end and are not in it"),
+    ]
+
+
+def test_given_a_limit_that_is_reached_then_it_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    recorded(limit=150)
+    assert [record.message for record in caplog.records][:1] == [
+        "recording x ended: it has its 0.00015 MB, see --record-limit; the driver goes on"
+    ]
+
+
+def keep(path: Path, *units: bytes) -> None:
+    with recording(path, 1 << 20) as writer:
+        writer.begin("bytes", "gps", "novatel")
+        for unit in units:
+            writer.record(Way.RECEIVED, Now(1, 2), unit)
+
+
+def test_given_a_recording_of_that_name_then_it_stays_and_the_next_has_a_number(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "gps.raw"
+    with caplog.at_level(logging.INFO):
+        for unit in (b"one", b"two", b"three"):
+            keep(path, unit)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["gps.1.raw", "gps.2.raw", "gps.raw"]
+    reader = open_for_reading(tmp_path / "gps.1.raw")
+    with reader.stream:
+        assert [record.data for record in reader] == [b"two"]
+    assert f"recording to {tmp_path / 'gps.2.raw'}: {path} is there already" in caplog.text
+
+
+def test_given_another_file_of_that_name_then_it_stays_and_nothing_is_recorded(tmp_path: Path) -> None:
+    path = tmp_path / "vehicle.yaml"
+    path.write_text("vehicle: cart\n")
+    with pytest.raises(RecordingError, match=r"vehicle.yaml is there, is no recording of a driver, and stays"):
+        keep(path, b"one")
+    assert path.read_text() == "vehicle: cart\n"
+
+
+def test_given_what_a_full_disk_left_then_the_next_recording_has_a_number(tmp_path: Path) -> None:
+    for head in ("", "# modelser"):
+        path = tmp_path / f"{len(head)}.raw"
+        path.write_text(head)
+        keep(path, b"one")
+        assert path.with_suffix(".1.raw").exists()
+
+
+def test_given_nothing_to_record_then_no_file_is_left(tmp_path: Path) -> None:
+    keep(tmp_path / "gps.raw")
+    assert not list(tmp_path.iterdir())
+
+
+def test_given_a_line_that_cannot_be_opened_then_nothing_is_recorded() -> None:
+    stream, time = io.StringIO(), FakeTime()
+    link = FakeLink[bytes](time)
+    link.gone = [(0.0, 1e9)]
+    recorded_link = RecordingLink(link, BytesForm(), RawWriter(stream, 1 << 20), time)
+    for _ in range(3):
+        with pytest.raises(LinkError):
+            recorded_link.open()
+        recorded_link.close()
+    assert stream.getvalue() == ""
+
+
+def test_given_a_device_as_the_file_then_it_is_written_and_a_full_one_ends_the_recording_alone(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    keep(Path("/dev/full"), b"one")
+    assert "recording /dev/full ended: No space left on device" in caplog.text
 
 
 @pytest.mark.parametrize("text", ["", "hello\n", "# modelserver raw 2 bytes a b\n", "# modelserver raw 1 bytes\n"])

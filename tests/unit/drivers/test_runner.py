@@ -59,6 +59,9 @@ class Echo:
     def command(self, command: VehicleCommand, now: Now) -> Sequence[Output[bytes]]:
         return [Send(command.source.encode())]
 
+    def refuse(self, reason: str, text: str, now: Now) -> Sequence[Output[bytes]]:
+        return [Told(Phase.STREAMING, text, is_trouble=True)]
+
     @property
     def counts(self) -> dict[str, int]:
         return {"messages": self.seq}
@@ -255,20 +258,22 @@ def test_given_the_order_to_end_while_the_device_is_away_then_nothing_is_sent() 
     assert "leaving" not in bench.echo.calls
 
 
-def test_given_a_recording_that_ends_then_the_driver_ends() -> None:
+def test_given_a_recording_that_ends_then_the_driver_ends_and_says_so_once(caplog: pytest.LogCaptureFixture) -> None:
     bench = Bench(1.0)
     poll = bench.link.poll
 
     def played(timeout: float) -> Sequence[bytes]:
         if not bench.link.coming:
-            raise PlayedOutError("imu.raw", "the recording has ended")
+            raise PlayedOutError("imu.raw", "the recording has ended; 3 damaged lines of it were left out")
         return poll(timeout)
 
     bench.link.poll = played  # type: ignore[method-assign]
-    bench.runner.run()
-    assert bench.runner.played_out
+    with caplog.at_level(logging.INFO):
+        bench.runner.run()
     assert len(bench.samples) == 10
-    assert bench.reports[-1].text == "the recording has ended"
+    assert bench.reports[-1].text == "the recording has ended; 3 damaged lines of it were left out"
+    said = [(record.levelname, record.message) for record in caplog.records if "recording" in record.message]
+    assert said == [("INFO", "imu: closed: the recording has ended; 3 damaged lines of it were left out")]
 
 
 def test_given_a_command_then_the_station_has_it_and_without_a_line_it_is_counted() -> None:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from modelserver.config import config_lines, load_config
-from modelserver.errors import ConfigError, Problem
+from modelserver.errors import ConfigError, Problem, Severity, Source
 from modelserver.messages import ImuSample
 from msdrivers.faults import Fault, parse_fault
-from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings, TcpSettings
+from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings, TcpSettings, split_group
 from msdrivers.lines import first_baud
 from msdrivers.registry import CHANNELS, KINDS, Kind, Made
 from msdrivers.settings import DriverSettings, Place, read_driver, read_drivers
@@ -104,6 +107,46 @@ def test_given_a_lines_first_key_then_it_is_that_line(section: dict[str, Any], l
     assert read(section).line == line
 
 
+@pytest.mark.parametrize(
+    ("section", "key", "said"),
+    [
+        ({"can": "can0", "interface": "sockcan"}, "interface", "write socketcan"),
+        ({"can": "", "interface": "pcan"}, "can", "is the channel as the interface names it, got nothing"),
+        ({"can": ""}, "can", "is the name of a network interface, e.g. can0, got ''"),
+        ({"can": "a_name_of_sixteen"}, "can", "is the name of a network interface"),
+        ({"can": "/dev/ttyACM0"}, "can", "is the name of a network interface"),
+        ({"can": "239.74.163.9"}, "can", "is a group of IP multicast; add interface: udp_multicast"),
+        ({"can": "239.74.163.9:5000"}, "can", "is a group of IP multicast; add interface: udp_multicast"),
+        ({"can": "can0", "interface": "udp_multicast"}, "can", "is GROUP:PORT with udp_multicast, e.g. 239.74.163.2"),
+        ({"can": "239.74.163.9:abc", "interface": "udp_multicast"}, "can", "is GROUP:PORT"),
+        ({"can": "239.74.163.9:", "interface": "udp_multicast"}, "can", "is GROUP:PORT"),
+        ({"can": "192.168.1.1", "interface": "udp_multicast"}, "can", "is GROUP:PORT"),
+        ({"can": "can0", "bitrate": -1}, "bitrate", "bitrate is 0"),
+    ],
+)
+def test_given_a_can_line_that_cannot_be_then_the_key_is_named(section: dict[str, Any], key: str, said: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        read({"device": "canner", **section})
+    (problem,) = caught.value.problems
+    assert f"drivers.imu.{key}" in str(problem)
+    assert said in str(problem)
+
+
+@pytest.mark.parametrize(
+    ("channel", "parts"),
+    [
+        ("239.74.163.9", ("239.74.163.9", 43113)),
+        ("239.74.163.9:5000", ("239.74.163.9", 5000)),
+        ("ff15::1", ("ff15::1", 43113)),
+        ("[ff15::1]:5000", ("ff15::1", 5000)),
+        ("[ff15::1]", ("ff15::1", 43113)),
+    ],
+)
+def test_given_a_group_of_multicast_then_its_port_is_told_from_it(channel: str, parts: tuple[str, int]) -> None:
+    assert split_group(channel) == parts
+    assert CanSettings(channel, "udp_multicast").can == channel
+
+
 def test_given_rates_to_try_then_the_line_is_opened_at_the_first_else_the_ports_else_the_makers() -> None:
     base = {"device": "echo", "port": "p"}
     assert first_baud(read({**base, "bauds": [4800, 9600]})) == 4800
@@ -130,11 +173,85 @@ def test_given_rates_to_try_then_the_line_is_opened_at_the_first_else_the_ports_
         (
             {"device": "echo", "port": "p", "rate_hz": "5"},
             "drivers.imu.rate_hz",
-            "input should be a valid number, got '5'",
-            "",
+            "rate_hz is a number, got '5'",
+            "write 5 without quotes",
         ),
         ({"device": "echo", "port": "p", "rate_hz": 0.5}, "drivers.imu.rate_hz", "rate_hz: must be 1 to 100", ""),
         ({"device": "echo", "port": "p", "heading": "up"}, "drivers.imu.heading", "'magnetic' or 'gyro', got 'up'", ""),
+        (
+            {"device": "echo", "port": "p", "heading": "gyr"},
+            "drivers.imu.heading",
+            "heading is 'magnetic' or 'gyro', got 'gyr'",
+            "write gyro",
+        ),
+        (
+            {"device": "echo", "port": "p", "bauds": 9600},
+            "drivers.imu.bauds",
+            "bauds is a list, got 9600",
+            "write [9600]",
+        ),
+        (
+            {"device": "echo", "port": "p", "bauds": [4800, "9600"]},
+            "drivers.imu.bauds.1",
+            "bauds, number 2 in it, is a whole number, got '9600'",
+            "write 9600 without quotes",
+        ),
+        (
+            {"device": "echo", "port": "p", "one": "wide"},
+            "drivers.imu.one",
+            "one is a section, got 'wide'",
+            "write {scale: wide}",
+        ),
+        (
+            {"device": "echo", "port": "p", "parts": {"a": {"scale": 1.0, "name": 5}}},
+            "drivers.imu.parts.a.name",
+            "name is text, got 5",
+            'write "5"',
+        ),
+        (
+            {"device": "echo", "port": "p", "parts": {"a": {"scale": True}}},
+            "drivers.imu.parts.a.scale",
+            "scale is a number, got true",
+            "",
+        ),
+        (
+            {"device": "echo", "can": "can0"},
+            "drivers.imu.can",
+            "device echo is on port or address, not on a CAN bus",
+            "write port: ... in its place",
+        ),
+        (
+            {"device": "echo", "port": "p", "can": "can0"},
+            "drivers.imu.can",
+            "device echo is on port or address, not on a CAN bus",
+            "take it out",
+        ),
+        (
+            {"device": "canner", "can": "can0", "port": "p"},
+            "drivers.imu.port",
+            "device canner is on can, not on a serial port",
+            "take it out",
+        ),
+        (
+            {"device": "echo", "address": "a:1", "baud": 9600},
+            "drivers.imu.baud",
+            "baud goes with port, and the line here is address",
+            "take it out",
+        ),
+        (
+            {"device": "echo", "port": "p", "bitrate": 9600},
+            "drivers.imu.bitrate",
+            "bitrate goes with can, and device echo is on port or address",
+            "take it out",
+        ),
+        (
+            {"device": "echo", "port": "p", "baud": 9600, "bauds": [9600]},
+            "drivers.imu.baud",
+            "both baud and bauds are given",
+            "keep one of baud or bauds",
+        ),
+        # told of what stands in the file, and not of what is made of it
+        ({"device": "echo", "port": "p", "baud": -9600}, "drivers.imu.baud", "baud is between 50 and", ""),
         ({"device": "echo", "address": "host"}, "drivers.imu.address", "address is HOST:PORT", ""),
         ({"device": "echo", "address": "host:99999"}, "drivers.imu.address", "address is HOST:PORT", ""),
         ({"device": "echo", "port": "p", "baud": 3}, "drivers.imu.baud", "baud is between 50 and", ""),
@@ -178,6 +295,63 @@ def test_given_several_slips_then_all_are_told_at_once() -> None:
     }
 
 
+def test_given_rules_of_the_section_that_are_broken_then_they_are_told_beside_the_wrong_types() -> None:
+    section = {
+        "device": "novatel",
+        "port": "p",
+        "rate_hz": -4,
+        "silence": math.nan,
+        "attempts": "three",
+        "bauds": 9600,
+        "hold": -1,
+    }
+    with pytest.raises(ConfigError) as caught:
+        read_driver("gps", section)
+    assert {problem.element.rpartition(".")[2]: problem.message for problem in caught.value.problems} == {
+        "attempts": "attempts is a whole number, got 'three'",
+        "bauds": "bauds is a list, got 9600",
+        "rate_hz": "rate_hz: must be 0.1 to 20 Hz, got -4",
+        "silence": "silence: must be 0.1 to 3600 s, got nan",
+        "hold": "hold: must be 0 to 3600 s, got -1",
+    }
+    assert len(caught.value.problems) == 5
+
+
+def test_given_a_wrong_part_then_what_misses_it_is_not_told_too() -> None:
+    status = {"forward_speed": {"signal": 5}}
+    with pytest.raises(ConfigError) as caught:
+        read_driver("car", {"device": "vehicle", "can": "can0", "dbc": "a.dbc", "status": status, "window": -1})
+    assert [problem.message for problem in caught.value.problems] == [
+        "signal is text, got 5",
+        "window is between 0 and 1, got -1",
+    ]
+
+
+VALUES = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5)),
+    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=5), inner, max_size=3)),
+    max_leaves=8,
+)
+KEYS = sorted({field for kind in KINDS.values() for field in kind.load().settings.__dataclass_fields__})
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.sampled_from(sorted(KINDS)),
+    st.dictionaries(st.one_of(st.sampled_from([*KEYS, "port", "can", "address", "baud"]), st.text(max_size=5)), VALUES),
+)
+def test_given_any_section_then_it_is_read_or_refused_with_places(kind: str, section: dict[str, Any]) -> None:
+    try:
+        driver = read_driver("any", {**section, "device": kind})
+    except ConfigError as error:
+        told = [(problem.element, problem.message) for problem in error.problems]
+        assert told
+        assert len(set(told)) == len(told)
+        assert all(element.startswith("drivers.any") and message for element, message in told)
+    else:
+        assert driver.kind is KINDS[kind]
+
+
 VEHICLE = """\
 vehicle: cart
 geometry: geometry.yaml
@@ -196,11 +370,40 @@ def test_given_a_vehicle_file_then_problems_of_all_drivers_have_their_lines(tmp_
     path.write_text(VEHICLE)
     config = load_config(path)
     assert list(config.drivers) == ["imu", "gps"]
-    with pytest.raises(ConfigError) as caught:
-        read_drivers(config.drivers, Place(str(path), config_lines(path)))
-    assert [(problem.file, problem.line, problem.nearest[:1]) for problem in caught.value.problems] == [
+    found, wrong = read_drivers(config.drivers, Place(str(path), config_lines(path)))
+    assert not found
+    assert [(problem.file, problem.line, problem.nearest[:1]) for problem in wrong] == [
         (str(path), 8, ("polled",)),
         (str(path), 9, ("novatel",)),
+    ]
+
+
+def test_given_a_name_with_nothing_after_it_then_it_is_told_and_the_others_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "vehicle.yaml"
+    path.write_text(
+        VEHICLE.replace("polld", "polled")
+        .replace(": 3\n", ": 0x03\n")
+        .replace("{device: novatell, port: /dev/ttyUSB1}", "# later")
+    )
+    config = load_config(path)
+    found, (problem,) = read_drivers(config.drivers, Place(str(path), config_lines(path)))
+    assert list(found) == ["imu"]
+    assert (problem.line, problem.message) == (9, "drivers.gps is empty: device is missing")
+
+
+def test_given_problems_of_a_driver_then_they_get_the_lines_of_their_keys(tmp_path: Path) -> None:
+    lines = {("drivers",): 4, ("drivers", "w"): 5, ("drivers", "w", "wheels", "front.left"): 7}
+    problems = [
+        Problem(Severity.ERROR, "a", Source(element=element))
+        for element in ("drivers.w.wheels.front.left.count", "wheels.front.left", "drivers.w.dbc")
+    ]
+    of_another_file = Problem(Severity.ERROR, "b", Source("x.dbc", 3))
+    told = Place("v.yaml", lines).located("w", [*problems, of_another_file])
+    assert [str(each.source) for each in told] == [
+        "v.yaml:7 (drivers.w.wheels.front.left.count)",
+        "v.yaml:7 (drivers.w.wheels.front.left)",
+        "v.yaml:5 (drivers.w.dbc)",
+        "x.dbc:3",
     ]
 
 
@@ -244,3 +447,11 @@ def test_given_a_line_when_shown_then_a_person_can_read_it():
         "socketcan can0, 500000 bit/s",
         "Modbus 10.0.0.3:502, unit 2",
     ]
+
+
+@pytest.mark.parametrize("device", ["gx1", "novatel", "nmea"])
+def test_given_a_device_server_then_no_baud_rates_are_tried_that_nobody_could_set(device: str) -> None:
+    driver = read_driver("imu", {"device": device, "address": "10.0.0.5:3001"})
+    assert driver.station.bauds == ()
+    driver = read_driver("imu", {"device": device, "port": "/dev/ttyUSB0", "bauds": [9600, 38400]})
+    assert driver.station.bauds == (9600, 38400)

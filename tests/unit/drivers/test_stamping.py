@@ -13,7 +13,7 @@ from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
 from msdrivers.emulate.gx1 import Gx1Emulator
 from msdrivers.emulate.gx1_unit import Eeprom
 from msdrivers.stamping import Stamper
-from msdrivers.station import Measured
+from msdrivers.station import Measured, Now
 
 UTIME = 1_700_000_000_000_000
 
@@ -22,7 +22,7 @@ def stamped(tick: float) -> Stamper:
     stamper = Stamper(DeviceClock())
     for n in range(200):
         header = SensorHeader(0, "imu", n, UTIME + n * 10_000, 5_000_000 + n * 10_000)
-        stamper.stamp(Measured(ImuSample(header), tick=tick))
+        stamper.stamp(Measured(ImuSample(header), tick=tick), Now(n * 10_000_000, header.host_utime))
     return stamper
 
 
@@ -39,3 +39,23 @@ def test_given_an_inertial_unit_then_its_samples_have_the_tick_that_it_told(hund
     line.run(2.0)
     assert len(line.samples) > 100
     assert [measured.tick for measured in line.samples] == pytest.approx([tick] * len(line.samples))
+
+
+@pytest.mark.parametrize("step_us", [-3_600_000_000, -4_000, 4_000, 300_000, 3_600_000_000])
+def test_given_the_hosts_clock_is_set_then_the_stamps_go_with_it_and_the_devices_clock_is_not_suspected(
+    step_us: int,
+) -> None:
+    stamper = Stamper(DeviceClock())
+    errors = []
+    for n in range(400):
+        utime = UTIME + n * 50_000 + (step_us if n >= 200 else 0)
+        header = SensorHeader(0, "imu", n, utime + 1000 * (n % 3), 5_000_000 + n * 50_000)
+        # carried on 2 ms after it was received
+        now = Now(n * 50_000_000 + 1_000_000 * (n % 3) + 2_000_000, utime + 1000 * (n % 3) + 2000)
+        sample = stamper.stamp(Measured(ImuSample(header)), now)
+        if n >= 40:
+            errors.append(abs(sample.header.utime - utime))
+    assert max(errors) < 500
+    assert stamper.clock.restarts == 0
+    assert stamper.sigma < 1e-3
+    assert stamper.offset == pytest.approx((UTIME + step_us - 5_000_000) * 1e-6, abs=1e-3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import random
 import tracemalloc
@@ -344,8 +345,10 @@ def test_given_random_frames_and_commands_then_nothing_is_raised_and_memory_stay
     tracemalloc.start()
     try:
         flood(1_000, 1_000)
+        gc.collect()
         before, _ = tracemalloc.get_traced_memory()
         flood(2_000, 4_000)
+        gc.collect()
         after, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

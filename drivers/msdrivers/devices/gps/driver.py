@@ -104,6 +104,11 @@ class GpsDriver:
         return [Send(command.encode("ascii") + b"\r\n") for command in self._settings.undo()]
 
     @property
+    def quiet(self) -> float:
+        """Seconds for which nothing need come."""
+        return self._settings.silence
+
+    @property
     def _baud(self) -> int | None:
         return self._settings.bauds[self._baud_index] if self._settings.bauds else None
 
@@ -115,12 +120,12 @@ class GpsDriver:
     def _gap_ns(self) -> int | None:
         return None if self._last_byte_ns is None else self._last_byte_ns + round(self._settings.gap * _SECOND_NS)
 
-    def _tell(self, phase: Phase, text: str) -> list[Output[bytes]]:
+    def _tell(self, phase: Phase, text: str, *, is_trouble: bool = False) -> list[Output[bytes]]:
         """Say a word, once: not again as long as nothing else is to be said."""
         if (phase, text) == (self._phase, self._told):
             return []
         self._phase, self._told = phase, text
-        return [Told(phase, text)]
+        return [Told(phase, text, is_trouble)]
 
     def _begin(self, now: Now) -> list[Output[bytes]]:
         """Set the receiver up from the first command; a plain NMEA receiver is only told what the settings say."""
@@ -152,7 +157,8 @@ class GpsDriver:
             self._patient_until_ns = now.monotonic_ns + self._silence_ns
             self._heard.forget(self._stream.counts)
             self._attempts = []
-            out.append(Measured(fix.sample(header), fix.delay))
+            delay = self._settings.delay + fix.delay
+            out.append(Measured(fix.sample(header), delay, self._settings.delay_sigma))
             if self._set_up.progress is not Progress.ASKING and (self._phase, self._origin) != (
                 Phase.STREAMING,
                 fix.origin,
@@ -165,20 +171,23 @@ class GpsDriver:
 
     def _answered(self, answer: Answer, now: Now) -> list[Output[bytes]]:
         asked = self._set_up.progress is Progress.ASKING
+        refused = len(self._set_up.refused)
         following = self._set_up.answered(answer, now.monotonic_ns)
         if not asked:
             return []
         out: list[Output[bytes]] = []
         if self._phase is not Phase.CONFIGURING:
             out += self._tell(Phase.CONFIGURING, "a NovAtel receiver answers, setting it up")
-        if not answer.ok:
+        if len(self._set_up.refused) > refused:
             command, words = self._set_up.refused[-1]
             text = (
                 f"the receiver refused '{command}': {words}; check the settings `commands`, `device_port` and the logs"
             )
-            out += self._tell(Phase.CONFIGURING, text)
+            out += self._tell(Phase.CONFIGURING, text, is_trouble=True)
         if following:
             return [*out, Send(following)]
+        if self._set_up.progress is Progress.ASKING:
+            return out
         # set up: from now on its logs must come
         self._patient_until_ns = now.monotonic_ns + self._silence_ns
         if not self._set_up.refused:
@@ -206,11 +215,15 @@ class GpsDriver:
 
     def _silent(self, now: Now) -> list[Output[bytes]]:
         """No fix for too long: it has stopped, or its logs were lost with a restart, or it is no receiver at all."""
-        heard = self._heard.words(self._stream.counts)
-        if self._phase is Phase.STREAMING or self._heard.good(self._stream.counts):
-            wanted = self._settings.position_log if self._novatel else "GGA or RMC"
-            action = ", setting the receiver up again" if self._novatel else ""
-            text = f"no {wanted} for {self._settings.silence:g} s, heard {heard} since{action}"
+        heard, counts = self._heard.words(self._stream.counts), self._stream.counts
+        if self._phase is Phase.STREAMING or self._heard.good(counts) or self._heard.flaw(counts):
+            if self._novatel:
+                text = (
+                    f"no {self._settings.position_log} for {self._settings.silence:g} s, heard {heard} since, setting "
+                    "the receiver up again"
+                )
+            else:
+                text = self._heard.no_epoch(counts, self._settings.silence)
             out = self._tell(Phase.SILENT, text)
             self._heard.forget(self._stream.counts)
             return [*out, *self._begin(now)]

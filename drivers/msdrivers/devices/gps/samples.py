@@ -112,7 +112,10 @@ def novatel_sample(
         speed=velocity.horizontal if moving and velocity else NAN,
         course=course(velocity.track) if moving and velocity else NAN,
         baseline_yaw=course(heading.heading) if turned and heading else NAN,
-        baseline_yaw_sigma=math.radians(heading.sigma_heading) if turned and heading else NAN,
+        # nobody is so sure as 0
+        baseline_yaw_sigma=math.radians(heading.sigma_heading)
+        if turned and heading and heading.sigma_heading > 0.0
+        else NAN,
     )
 
 

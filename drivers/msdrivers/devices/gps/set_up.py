@@ -26,6 +26,8 @@ class SetUp:
         self._attempts = attempts
         self._index = 0
         self._tries = 0
+        self._settling = False
+        """A command was sent more than once, and the other answers may come yet."""
         self._due: int | None = None
         self._last_answer_ns: int | None = None
         self.progress = Progress.IDLE
@@ -35,6 +37,7 @@ class SetUp:
     def begin(self, now_ns: int) -> bytes:
         """Start from the first command. Return what to send: an end of line first, for what the port may hold."""
         self._index = self._tries = 0
+        self._settling = False
         self.refused = []
         self._last_answer_ns = None
         return b"\r\n" + self._ask(now_ns)
@@ -51,15 +54,20 @@ class SetUp:
     def answered(self, answer: Answer, now_ns: int) -> bytes:
         """Take an answer; return what to send next, empty where nothing is."""
         self._last_answer_ns = now_ns
-        if self.progress is not Progress.ASKING:
+        if self.progress is not Progress.ASKING or self._settling:
             return b""
         if not answer.ok:
             self.refused.append((self._commands[self._index], answer.error))
         self._index += 1
-        self._tries = 0
+        tries, self._tries = self._tries, 0
         if self._index == len(self._commands):
             self.progress = Progress.DONE
             self._due = None
+            return b""
+        if tries > 1:
+            # each as late as this one; they would pass for answers to the next command
+            self._settling = True
+            self._due = now_ns + tries * self._answer_ns
             return b""
         return self._ask(now_ns)
 
@@ -67,6 +75,7 @@ class SetUp:
         """Send the command again if its answer is overdue; after the last attempt give up."""
         if self._due is None or now_ns < self._due:
             return b""
+        self._settling = False
         if self._tries >= self._attempts:
             self.progress = Progress.UNANSWERED
             self._due = None

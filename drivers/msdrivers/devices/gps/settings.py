@@ -24,6 +24,8 @@ class GpsSettings:
     answer: how long to wait for the answer to a command; it is sent `attempts` times.
     hold: how long a position waits for the velocity of its instant. gap: how long the line must be still for the
     sentences of an instant to be complete.
+    delay: by how much the shortest way from a fix to the first byte of its log is long, mostly the receiver's
+    computing; it cannot be told from the offset of the clocks. delay_sigma: standard deviation of that.
     restore_on_leaving: stop the logs that were asked for when the driver leaves.
     """
 
@@ -42,6 +44,8 @@ class GpsSettings:
     hold: float = 0.1
     gap: float = 0.04
     restore_on_leaving: bool = True
+    delay: float = 0.0
+    delay_sigma: float = 0.02
 
     def __post_init__(self) -> None:
         for name, value, known in (
@@ -66,6 +70,8 @@ class GpsSettings:
             ("answer", self.answer, 0.05),
             ("hold", self.hold, 0.0),
             ("gap", self.gap, 0.001),
+            ("delay", self.delay, 0.0),
+            ("delay_sigma", self.delay_sigma, 0.0),
         ):
             if not least <= seconds <= 3600.0:
                 raise ValueError(f"{name}: must be {least:g} to 3600 s, got {seconds:g}")

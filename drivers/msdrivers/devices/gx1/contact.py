@@ -29,6 +29,10 @@ PATIENCE = 3
 RETRY_S = 5.0
 """From one vain attempt to the next."""
 
+GAINS = (1000, 30_000)
+"""The least and the greatest gain that is believed: a vector's full scale is a thousandth of it in gauss, g or rad/s.
+Those that are known of are 2000 to 10000."""
+
 OLD_GYRO_GAIN = 64
 """Of the 3DM-G, the model before: it speaks the same protocol with other scales."""
 
@@ -46,8 +50,14 @@ class Found:
     """
 
     bauds: list[int]
+    """Empty for a line that has none."""
     streamed: int | None = None
     known: bool = False
+
+    @property
+    def at(self) -> str:
+        """At which rate the line is open, for a person; empty where it has none."""
+        return f" at {self.bauds[0]} baud" if self.bauds else ""
 
     def restored(self) -> bytes:
         """Return the request that leaves the continuous mode as it was found."""
@@ -61,7 +71,7 @@ def contact(link: Link, found: Found) -> Part[str]:
     """
     while True:
         heard: list[str] = []
-        for number in range(len(found.bauds)):
+        for number in range(max(1, len(found.bauds))):
             if number:
                 found.bauds.append(found.bauds.pop(0))
                 yield Reopen(f"no 3DM-GX1 at {found.bauds[-1]} baud, heard {heard[-1]}", found.bauds[0])
@@ -109,14 +119,16 @@ def _identity() -> Part[str]:
 
 def _nobody(bauds: Sequence[int], heard: Sequence[str]) -> str:
     # the attempts are over: the list of rates stands one turn before its beginning
-    order = [*bauds[1:], bauds[0]] if len(bauds) > 1 else list(bauds)
-    attempts = "; ".join(f"at {baud} baud heard {what}" for baud, what in zip(order, heard, strict=True))
+    order = [f"at {baud} baud " for baud in (*bauds[1:], *bauds[:1])] or [""]
+    attempts = "; ".join(f"{at}heard {what}" for at, what in zip(order, heard, strict=True))
     if all(what == "nothing" for what in heard):
         why = "check the device's power, the cable, and that the port is the right one"
     elif any("text" in what for what in heard):
         why = "what speaks in text is another device: check which port the 3DM-GX1 is on"
-    else:
+    elif bauds:
         why = "another device, or a baud rate that was not tried: check the port, and the list of baud rates"
+    else:
+        why = "another device, or the baud rate of the device server is not the 3DM-GX1's: check both"
     return f"no 3DM-GX1 answers on this line: {attempts}; {why}; trying again in {RETRY_S:g} s"
 
 
@@ -141,10 +153,19 @@ def write_word(address: int, value: int) -> Part[None]:
 
 
 def read_gains() -> Part[Gains]:
-    """Read the gains. Raises UnusableError for those that no 3DM-GX1 can have."""
-    gyro = yield from read_word(Address.GYRO_GAIN)
-    accelerometer = yield from read_word(Address.ACCELEROMETER_GAIN)
-    magnetometer = yield from read_word(Address.MAGNETOMETER_GAIN)
+    """Read the gains. Raises UnusableError for those that no 3DM-GX1 can have.
+
+    They are read twice: a reply does not say of which address it is, and one that comes late would pass for the next.
+    """
+    addresses = (Address.GYRO_GAIN, Address.ACCELEROMETER_GAIN, Address.MAGNETOMETER_GAIN)
+    words = yield from read_words(addresses)
+    again = yield from read_words(addresses)
+    if words != again:
+        raise UnusableError(
+            f"the gains in its EEPROM were read twice, as {list(words)} and as {list(again)}: its replies come late or "
+            "are damaged; check the cable, and the device server if there is one"
+        )
+    gyro, accelerometer, magnetometer = words
     if gyro == OLD_GYRO_GAIN:
         raise UnusableError(
             f"the gyro gain in its EEPROM (address {Address.GYRO_GAIN}) is {gyro}, that of a 3DM-G, the model before, "
@@ -155,9 +176,10 @@ def read_gains() -> Part[Gains]:
         ("accelerometer", Address.ACCELEROMETER_GAIN, accelerometer),
         ("magnetometer", Address.MAGNETOMETER_GAIN, magnetometer),
     ):
-        if not 0 < gain < 32768:
+        if not GAINS[0] <= gain <= GAINS[1]:
             raise UnusableError(
-                f"the {name} gain in its EEPROM (address {address}) is {gain}, by which nothing can be scaled: "
-                "the EEPROM is erased or damaged; write the gain from the device's calibration sheet to it"
+                f"the {name} gain in its EEPROM (address {address}) is {gain}, and no 3DM-GX1 has one outside "
+                f"{GAINS[0]} to {GAINS[1]}: the EEPROM is erased or damaged; write the gain "
+                "from the device's calibration sheet to it"
             )
     return Gains(gyro, accelerometer, magnetometer)

@@ -11,7 +11,7 @@ from functools import partial
 from typing import TypeAlias
 
 from msdrivers.devices.gx1.link import Link, Reply
-from msdrivers.protocol.gx1 import Packet
+from msdrivers.protocol.gx1 import Command, Packet
 from msdrivers.station import Now, Output, Reopen, Send, Told
 
 
@@ -61,7 +61,8 @@ class NoReplyError(Exception):
 
     def __init__(self, command: int, tries: int):
         self.command = command
-        super().__init__(f"request 0x{command:02x} was sent {tries} times and not answered")
+        name = Command(command).name.lower().replace("_", " ")
+        super().__init__(f"the request '{name}' was sent {tries} times and not answered")
 
 
 class Dialogue:
@@ -113,8 +114,9 @@ class Dialogue:
         elif isinstance(step, Ask) and step.met_by(packet):
             if self._tries == 1:
                 return self._resume((packet,), now)
-            # the other tries may be answered yet, and would pass for replies to what is asked next
-            self._wait(Pause(step.timeout), now)
+            # the other tries may be answered yet, each as late as this one, and would pass for replies to what is
+            # asked next
+            self._wait(Pause(self._tries * step.timeout), now)
             self._gathered.append(packet)
         elif isinstance(step, Ask) and packet.command == step.command:
             self._link.parser.expect(packet.command)

@@ -103,7 +103,7 @@ class Gx1Driver:
         while True:
             try:
                 self._device = yield from contact(self._link, self._found)
-                yield Told(Phase.CONFIGURING, f"{self._device} answers at {self._found.bauds[0]} baud")
+                yield Told(Phase.CONFIGURING, f"{self._device} answers{self._found.at}")
                 self._gains = yield from read_gains()
                 yield from self._read_timer()
                 if self.settings.capture_bias_at_start:
@@ -190,7 +190,7 @@ class Gx1Driver:
             self._link.mark()
             if not self._streams:
                 self._streams = True
-                outputs.append(Told(Phase.STREAMING, f"{self._device} streams 0x{command:02X}"))
+                outputs.append(Told(Phase.STREAMING, f"{self._device} streams message {int(command)}"))
             if self._rate.take(count, now.monotonic_ns):
                 outputs.append(Told(Phase.STREAMING, self._rate.text()))
         device_utime = round(count * self.tick_s * 1e6) if self._rate.agrees else 0
@@ -207,7 +207,7 @@ class Gx1Driver:
         self._seq += 1
         self._celsius = NAN
         # without the device's time the way over the line is part of the delay
-        line = 0.0 if device_utime else LENGTHS[command] * 10.0 / self._found.bauds[0]
+        line = LENGTHS[command] * 10.0 / self._found.bauds[0] if self._found.bauds and not device_utime else 0.0
         return [*outputs, Measured(sample, self.settings.delay + line, self.settings.delay_sigma, self.tick_s)]
 
     def _gravity_found(self) -> list[Output[bytes]]:
@@ -231,7 +231,7 @@ class Gx1Driver:
 
     def _why_silent(self) -> str:
         message = self.settings.message
-        why = f"no message 0x{message:02X} that can be used for {self.settings.silence:g} s, heard {self._link.heard()}"
+        why = f"no message {int(message)} that can be used for {self.settings.silence:g} s, heard {self._link.heard()}"
         rejected = ", ".join(f"{reason} {count}" for reason, count in sorted(self._link.rejected.items()))
         return f"{why}" + (f", rejected since the start: {rejected}" if rejected else "")
 

@@ -7,7 +7,7 @@ against the extremes, and by reading them back. What fails leaves the offsets as
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from modelserver.spatial.so3 import Vector3
@@ -44,7 +44,7 @@ class HardIronSettings:
     duration: seconds of turning. period: from one collection to the next. two_dimensional: the vehicle turns on level
     ground only; then x and y are found and `magnitude_z` is the device's own word for the vertical field there.
     least_span: tesla that the greatest and least field of an axis must lie apart. bauds: the rates to try; the line is
-    opened at the first.
+    opened at the first. Empty: the line has none.
     """
 
     duration: float = 60.0
@@ -57,8 +57,8 @@ class HardIronSettings:
     def __post_init__(self) -> None:
         if not 0.0 < self.period < self.duration:
             raise ValueError(f"period: must be above 0 and below the duration, got {self.period:g} s")
-        if not self.bauds or min(self.bauds) <= 0:
-            raise ValueError(f"bauds: needs at least one rate above 0, got {self.bauds}")
+        if any(baud <= 0 for baud in self.bauds):
+            raise ValueError(f"bauds: must be above 0, got {self.bauds}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +160,7 @@ class HardIron:
         # begun before and the line lost: the device has no offsets now
         if not self._begun:
             self._before = yield from read_words(Address.HARD_IRON)
-        yield Told(Phase.CONFIGURING, f"hard iron: {device}, offsets before {list(self._before)} counts")
+        yield Told(Phase.CONFIGURING, f"hard iron: {device}, offsets before {_signed(self._before)} counts")
 
     def _find(self) -> Part[Vector3]:
         self._begun = True
@@ -223,7 +223,7 @@ class HardIron:
             if stored != offsets[axis] & 0xFFFF:
                 raise _FailedError(
                     f"the device gave an offset of {offsets[axis]} counts along {_AXES[axis]}, but its EEPROM (address "
-                    f"{address}) holds {stored}: it was not stored; do the procedure again"
+                    f"{address}) holds {_signed((stored,))[0]}: it was not stored; do the procedure again"
                 )
 
     def _undo(self, why: str) -> Part[str]:
@@ -231,13 +231,17 @@ class HardIron:
             for address, value in zip(Address.HARD_IRON, self._before, strict=True):
                 yield from write_word(address, value)
                 if (yield from read_word(address)) != value:
-                    raise _FailedError(f"address {address} did not take {value}")
+                    raise _FailedError(f"address {address} did not take {_signed((value,))[0]}")
         except (NoReplyError, _FailedError) as failure:
             return (
-                f"hard iron: failed: {why}; and the offsets from before, {list(self._before)} counts, could not be "
+                f"hard iron: failed: {why}; and the offsets from before, {_signed(self._before)} counts, could not be "
                 f"written back: {failure}; do the procedure again before the magnetometer is used"
             )
         return f"hard iron: failed: {why}; the offsets are as they were before"
+
+
+def _signed(words: Iterable[int]) -> list[int]:
+    return [word - 65536 if word > 32767 else word for word in words]
 
 
 def _microtesla(value: Vector3) -> str:

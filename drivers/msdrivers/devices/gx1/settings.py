@@ -25,7 +25,7 @@ class Gx1Settings:
     heading: what the yaw of a stabilised orientation is; an instantaneous one is always magnetic.
     temperature_period: between polls of the temperature, 0 for never.
     capture_bias_at_start: let the device find its gyros' biases once, at the first set-up; the vehicle must stand.
-    bauds: the rates to try; the line is opened at the first.
+    bauds: the rates to try; the line is opened at the first. Empty: the line has none.
     silence: without a streamed message for so long the device is set up anew.
     tick: of the device's timer; None to take it from the EEPROM.
     specific_force_sign: 1 where the device's acceleration is specific force, against gravity at rest, -1 where it is
@@ -48,21 +48,21 @@ class Gx1Settings:
     delay_sigma: float = 0.0
 
     def __post_init__(self) -> None:
-        known = ", ".join(f"0x{command:02X}" for command in sorted(DATA))
+        known = ", ".join(str(int(command)) for command in sorted(DATA))
         for name, command in (("message", self.message), ("polled", self.polled)):
             if command is not None and command not in DATA:
-                raise ValueError(f"{name}: 0x{command:02X} is no measurement of a 3DM-GX1; there are {known}")
+                raise ValueError(f"{name}: {command} is no measurement of a 3DM-GX1; there are {known}")
         if self.polled == self.message:
-            raise ValueError(f"polled: 0x{self.message:02X} is streamed already; leave it out or choose another")
+            raise ValueError(f"polled: {int(self.message)} is streamed already; leave it out or choose another")
         if Command.INSTANTANEOUS_EULER in (self.message, self.polled) and self.heading is Heading.VERTICAL_GYRO:
             raise ValueError(
-                "heading: the instantaneous orientation (0x0D) has its yaw from the magnetometers, which a vertical "
-                "gyro does not use; choose heading magnetic, or the stabilised orientation (0x0E)"
+                "heading: the instantaneous orientation (13) has its yaw from the magnetometers, which a vertical "
+                "gyro does not use; choose heading magnetic, or the stabilised orientation (14)"
             )
         if self.specific_force_sign not in (1, -1):
             raise ValueError(f"specific_force_sign: must be 1 or -1, got {self.specific_force_sign}")
-        if not self.bauds or min(self.bauds) <= 0:
-            raise ValueError(f"bauds: needs at least one rate above 0, got {self.bauds}")
+        if any(baud <= 0 for baud in self.bauds):
+            raise ValueError(f"bauds: must be above 0, got {self.bauds}")
         for name, value, least in (
             ("poll_period", self.poll_period, 0.01),
             ("silence", self.silence, 0.05),

@@ -2,40 +2,53 @@
 
 from __future__ import annotations
 
-WINDOW_NS = 3_000_000_000
-OFF = 0.25
-"""By how much a tick may differ from the host's clock over a window: replies come early and late."""
+WINDOW_NS = 5_000_000_000
+OFF = 0.005
+"""By how much a tick may differ from the host's clock from one window to the next: 25 ms, which are a tick or two and
+what the least delay of a window varies by. What is less `device_clock` finds, as drift."""
 
 
 class TickRate:
-    """Compares ticks with the host's clock. `agrees` changes after two windows in a row that say the same."""
+    """Compares ticks with the host's clock. `agrees` changes after two windows in a row that say the same.
 
-    __slots__ = ("_begin", "_doubts", "_measured", "_tick_s", "agrees")
+    Replies come early and late: what is compared is the earliest reply of each window.
+    """
+
+    __slots__ = ("_before", "_begin_ns", "_doubts", "_earliest", "_measured", "_tick_s", "agrees")
 
     def __init__(self, tick_s: float):
         """Take what a tick is said to be, seconds."""
         self._tick_s = tick_s
-        self._begin: tuple[int, int] | None = None
+        self._begin_ns: int | None = None
+        self._before: tuple[int, int] | None = None
+        self._earliest = (0, 0)
         self._doubts = 0
         self._measured = tick_s
         self.agrees = True
 
     def take(self, count: int, at_ns: int) -> bool:
         """Take unwrapped ticks and when they were received, monotonic nanoseconds; return whether `agrees` changed."""
-        if self._begin is None:
-            self._begin = (count, at_ns)
+        if self._begin_ns is None or at_ns - self._begin_ns < WINDOW_NS:
+            if self._begin_ns is None or self._lateness(count, at_ns) < self._lateness(*self._earliest):
+                self._earliest = (count, at_ns)
+            self._begin_ns = self._begin_ns or at_ns
             return False
-        ticks, elapsed = count - self._begin[0], at_ns - self._begin[1]
-        if elapsed < WINDOW_NS:
-            return False
-        self._begin = (count, at_ns)
-        before, self._measured = self._measured, elapsed * 1e-9 / max(ticks, 1)
+        before, self._before = self._before, self._earliest
+        self._begin_ns, self._earliest = at_ns, (count, at_ns)
+        return before is not None and self._compared(before, self._before)
+
+    def _lateness(self, count: int, at_ns: int) -> float:
+        return at_ns - count * self._tick_s * 1e9
+
+    def _compared(self, before: tuple[int, int], earliest: tuple[int, int]) -> bool:
+        ticks, elapsed_ns = earliest[0] - before[0], earliest[1] - before[1]
+        last, self._measured = self._measured, elapsed_ns * 1e-9 / max(ticks, 1)
         contradicts = _differ(self._measured, self._tick_s)
         if contradicts != self.agrees:
             self._doubts = 0
             return False
         # a host that was late makes one window too long and the next too short
-        self._doubts = 1 if _differ(self._measured, before) else self._doubts + 1
+        self._doubts = 1 if _differ(self._measured, last) else self._doubts + 1
         if self._doubts < 2:
             return False
         self._doubts = 0

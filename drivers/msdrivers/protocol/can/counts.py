@@ -58,6 +58,15 @@ class Odometer:
                 return after._moved(step, count, at_ns, sign, "resumed")
         return replace(after, doubt=count, doubt_ns=at_ns), math.nan, "jump" if sure else "gap"
 
+    def reach(self, seconds: float) -> float:
+        """Return how many counts a wheel may come in a time, frames held up and rounding included."""
+        return self.max_speed * (max(0.0, seconds) + self.delay) / abs(self.metres_per_count) + 1.0
+
+    @property
+    def turn(self) -> float:
+        """Counts after which two ways to the same number cannot be told apart."""
+        return self.wrap if self.up_only else self.wrap / 2
+
     def _moved(self, step: int, count: int, at_ns: int, sign: int, reason: str) -> tuple[Odometer, float, str]:
         known = replace(self, count=count, at_ns=at_ns, doubt=None)
         if self.up_only and step:
@@ -72,8 +81,8 @@ class Odometer:
 
         After so long a time that the counter may have gone round it is not.
         """
-        reach = self.max_speed * (max(0, at_ns - before_ns) * 1e-9 + self.delay) / abs(self.metres_per_count) + 1.0
-        if reach >= (self.wrap if self.up_only else self.wrap / 2):
+        reach = self.reach((at_ns - before_ns) * 1e-9)
+        if reach >= self.turn:
             return None, False
         step = (count - before) % self.wrap
         if not self.up_only and step >= self.wrap / 2:

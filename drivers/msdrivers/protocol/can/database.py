@@ -190,9 +190,10 @@ class Binder:
         return message
 
     def problem(self, key: str, message: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
-        """Note something wrong with the setting at `key`."""
-        source = Source(self._database.name, 0, f"{self._place}.{key}")
-        self.problems.append(Problem(Severity.ERROR, message, source, fix, nearest))
+        """Note something wrong with the setting at `key`: there it is mended, not in the DBC file."""
+        source = Source(element=f"{self._place}.{key}")
+        said = f"{self._database.name}: {message}"
+        self.problems.append(Problem(Severity.ERROR, said, source, fix, nearest))
 
     def finish(self) -> None:
         """Raise ConfigError where there were problems."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 MAX_BASE_ID = 0x7FF
@@ -31,13 +31,15 @@ class FrameKey(NamedTuple):
 class CanFrame:
     """A frame of data, or with `is_error` a word of the interface about the bus.
 
-    In an error frame `arbitration_id` holds the classes of error.
+    In an error frame `arbitration_id` holds the classes of error. `utime`: when it came, microseconds of the host's
+    clock; 0: no more is known than when it was read. Frames of one content are equal whenever they came.
     """
 
     arbitration_id: int
     data: bytes = b""
     is_extended: bool = False
     is_error: bool = False
+    utime: int = field(default=0, compare=False)
 
     @property
     def key(self) -> FrameKey:

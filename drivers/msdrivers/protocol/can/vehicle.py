@@ -104,6 +104,8 @@ def bind_command(command: CommandMap, database: CanDatabase, place: str) -> Boun
     alive = binder.signal(command.alive, "alive", whole=True) if command.alive else None
     driving = _beside(binder, command, "driving")
     stopping = driving | _beside(binder, command, "stopping")
+    if speed is not None:
+        _check_stop(binder, command, speed, driving != stopping)
     if alive is not None and alive.is_signed:
         binder.problem("alive", f"{command.alive} is signed; a counter of frames is not", "map the counter")
     if command.message in database.messages:
@@ -115,6 +117,16 @@ def bind_command(command: CommandMap, database: CanDatabase, place: str) -> Boun
     assert speed is not None
     assert steering is not None
     return BoundCommand(command, database, speed, steering, alive, driving, stopping)
+
+
+def _check_stop(binder: Binder, command: CommandMap, speed: BoundSignal, has_stop: bool) -> None:
+    """Note a stop that would be a motion: its speed of 0 rounds to another, and nothing beside it says stop."""
+    mapped = command.forward_speed
+    held = _held(speed, -mapped.offset / mapped.scale) * mapped.scale + mapped.offset
+    if abs(held) > 1e-9 and not has_stop:
+        path = f"{speed.message}.{speed.name}"
+        fix = "give a signal that stops it another value in `stopping` than in `driving`, or correct scale and offset"
+        binder.problem("forward_speed", f"{path} cannot say 0: stop would be said as {held:g} m/s", fix)
 
 
 def _beside(binder: Binder, command: CommandMap, key: str) -> dict[str, float]:

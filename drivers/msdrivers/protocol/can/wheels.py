@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from modelserver.messages import NAN, Direction
 from msdrivers.protocol.can.assembly import Instant
+from msdrivers.protocol.can.counts import Odometer
 from msdrivers.protocol.can.database import Binder, BoundSignal, CanDatabase
 from msdrivers.protocol.can.mapping import SpeedMap, WheelMap
 
@@ -26,6 +27,13 @@ class BoundWheel:
     def signals(self) -> list[BoundSignal]:
         """The signals that there are."""
         return [each for each in (self.count, self.speed, self.direction, self.steering) if each is not None]
+
+    def odometer(self, max_speed: float, delay: float) -> Odometer | None:
+        """Return the counter's odometer at its beginning, m/s and seconds; None for a wheel without a counter."""
+        if self.count is None or self.map.count is None:
+            return None
+        wrap = self.map.count.wrap or 1 << self.count.length
+        return Odometer(wrap, self.map.count.metres_per_count, max_speed, delay, self.map.count.up_only)
 
     def turning(self, instant: Instant) -> Direction:
         """Return which way the wheel turns, as the encoder tells."""
@@ -57,10 +65,13 @@ class BoundWheel:
         return NAN if physical is None else physical * self.map.steering.scale + self.map.steering.offset
 
 
-def bind_wheels(wheels: Mapping[str, WheelMap], database: CanDatabase, place: str) -> tuple[BoundWheel, ...]:
+def bind_wheels(
+    wheels: Mapping[str, WheelMap], database: CanDatabase, place: str, max_speed: float = 0.0, delay: float = 0.0
+) -> tuple[BoundWheel, ...]:
     """Return the wheels with their signals. Raises ConfigError with every signal that is not in the DBC or unfit.
 
-    `place` is where the mapping stands in the settings.
+    `place` is where the mapping stands in the settings. Counters that are too small to be followed at `max_speed`, m/s,
+    with frames held up by `delay`, seconds, are unfit.
     """
     binder = Binder(database, place)
     bound = []
@@ -74,6 +85,9 @@ def bind_wheels(wheels: Mapping[str, WheelMap], database: CanDatabase, place: st
         if speed is not None and wheel.speed is not None:
             _check_speed(binder, name, wheel.speed, speed)
         bound.append(BoundWheel(name, wheel, count, speed, direction, steering))
+        odometer = bound[-1].odometer(max_speed, delay)
+        if odometer is not None:
+            _check_reach(binder, name, odometer)
     binder.finish()
     return tuple(bound)
 
@@ -92,3 +106,18 @@ def _check_speed(binder: Binder, name: str, speed: SpeedMap, signal: BoundSignal
     if speed.is_magnitude and signal.minimum is not None and signal.minimum < 0.0:
         fix = "leave is_magnitude out: the signal has a sign of its own"
         binder.problem(f"{name}.speed.is_magnitude", f"{path} goes down to {signal.minimum:g}", fix)
+
+
+def _check_reach(binder: Binder, name: str, odometer: Odometer) -> None:
+    if odometer.reach(0.0) < odometer.turn:
+        return
+    way = max(0.0, odometer.turn - 1.0) * abs(odometer.metres_per_count)
+    fix = f"frame_delay below {way / odometer.max_speed:.3g} s"
+    if odometer.delay:
+        fix += f", or max_speed below {way / odometer.delay:.3g} m/s"
+    said = (
+        f"{odometer.wrap} counts of {abs(odometer.metres_per_count):g} m tell ways up to {way:g} m apart, "
+        f"and frames held up by frame_delay {odometer.delay:g} s at max_speed {odometer.max_speed:g} m/s are "
+        f"{odometer.max_speed * odometer.delay:g} m: no travel would be believed"
+    )
+    binder.problem(f"{name}.count", said, f"{fix}; the time between two frames comes on top")

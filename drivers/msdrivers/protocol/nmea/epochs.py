@@ -2,8 +2,8 @@
 
 An epoch is complete when a sentence of another instant comes, when the caller says that the line has fallen silent,
 or, once cycles have been alike for a second, when the sentence that ended the last one comes again (so that nobody
-waits for the next instant). Sentences without a time (VTG, GSA, HDT) belong to the epoch they follow; only after
-silence may they lead one.
+waits for the next instant). Sentences without a time (VTG, GSA, HDT) belong to the epoch they follow, or to the one
+they lead: which, silence tells. Motion whose place is not known is left out, lest it be that of the next instant.
 """
 
 from __future__ import annotations
@@ -18,6 +18,10 @@ from msdrivers.protocol.nmea.fix import fix_type
 from msdrivers.protocol.nmea.sentences import NmeaSentence
 
 POSITION_KINDS = frozenset({"GGA", "GNS", "RMC", "GLL"})
+_MOTION = frozenset({"VTG", "HDT"})
+"""Sentences without a time that say how the receiver moves: what they say of another instant is wrong."""
+_SURE = 2
+"""Cycles that must have told the order of sentences."""
 _TIMED = POSITION_KINDS | {"GST"}
 """Sentences whose time is that of the fix. ZDA's is the clock's, which in some receivers is seconds ahead."""
 _MOST = 64
@@ -74,6 +78,9 @@ class EpochAssembler:
         self._first = self._last = ""
         self._by_end = False
         self._regular = True
+        self._still = self._begun_after_silence = False
+        self._lessons: Counter[tuple[str, bool]] = Counter()
+        """How often silence told that a sentence of motion leads, or that it does not."""
         self.late = 0
         """Sentences that came after their epoch was complete, or too many for it; they were not used."""
 
@@ -81,20 +88,53 @@ class EpochAssembler:
         """Return the epochs that the sentence completes: at most the one before it, and its own."""
         closed = []
         timed = sentence.kind in _TIMED
-        if timed and self._starts_new(sentence):
+        if self._starts_new(sentence) if timed else self._leads(sentence.kind) and self._instant()[0]:
             closed += self._close(by_end=False)
         if self._is_late(sentence, timed) or len(self._open) >= _MOST:
             self.late += 1
             return closed
         self._note_date(sentence)
+        if not self._open:
+            self._begun_after_silence, self._still = self._still, False
+        elif timed and self._begun_after_silence and not self._instant()[0]:
+            self._learn(self._open, leads=True)
         self._open.append(sentence)
         if self._is_end(sentence):
             closed += self._close(by_end=True)
         return closed
 
     def flush(self) -> list[NmeaEpoch]:
-        """Return the epoch under way, if any: no more of it will come."""
-        return self._close(by_end=False)
+        """Return the epoch under way, if any: the line has been silent, so no more of it will come."""
+        self._still = True
+        begun = next((n for n, each in enumerate(self._open) if each.kind in _TIMED), len(self._open))
+        self._learn(self._open[begun:], leads=False)
+        return self._close(by_end=False, is_silent=True)
+
+    def clear(self) -> None:
+        """Forget the epoch under way, and the order of sentences: another receiver may speak."""
+        self._open, self._still = [], False
+        self._lessons.clear()
+
+    def _learn(self, sentences: list[NmeaSentence], leads: bool) -> None:
+        self._lessons.update((each.kind, leads) for each in sentences if each.kind in _MOTION)
+
+    def _leads(self, kind: str) -> bool | None:
+        """Whether a sentence of motion comes before those with the time; None where that is not known."""
+        for leads in (True, False):
+            # a pause amid a cycle tells the wrong thing
+            if self._lessons[kind, leads] >= max(_SURE, 4 * self._lessons[kind, not leads]):
+                return leads
+        return None
+
+    def _belonging(self, sentences: list[NmeaSentence], is_silent: bool) -> list[NmeaSentence]:
+        """Leave out sentences of motion that are, or may be, another instant's."""
+        begun = next(n for n, each in enumerate(sentences) if each.kind in _TIMED)
+
+        def belongs(n: int, kind: str) -> bool:
+            leads = self._leads(kind)
+            return n > begun and is_silent if leads is None else (n < begun) is leads
+
+        return [each for n, each in enumerate(sentences) if each.kind not in _MOTION or belongs(n, each.kind)]
 
     def _instant(self) -> tuple[bool, int | None]:
         """Whether the epoch under way has a sentence that has a time by its kind, and that time."""
@@ -135,7 +175,7 @@ class EpochAssembler:
         if sentence.day is not None and sentence.time_of_day is not None:
             self._reference = sentence.day * DAY + sentence.time_of_day
 
-    def _close(self, by_end: bool) -> list[NmeaEpoch]:
+    def _close(self, by_end: bool, is_silent: bool = False) -> list[NmeaEpoch]:
         sentences, self._open = self._open, []
         if not any(each.kind in _TIMED for each in sentences):
             return []
@@ -147,7 +187,7 @@ class EpochAssembler:
         self._first, self._last = sentences[0].kind, sentences[-1].kind
         if not any(each.kind in POSITION_KINDS for each in sentences):
             return []
-        return [merged(sentences, instant, self._utime(instant))]
+        return [merged(self._belonging(sentences, is_silent), instant, self._utime(instant))]
 
     def _utime(self, instant: int | None) -> int:
         """Put a time of day on the day that brings it nearest to the last date heard."""

@@ -48,7 +48,7 @@ def _denies(sentence: NmeaSentence) -> bool:
     if sentence.kind == "GGA":
         return sentence.quality not in _QUALITY
     if sentence.kind == "GNS":
-        return bool(sentence.mode) and _best(sentence.mode) is None
+        return _best(sentence.mode) is None
     if sentence.kind in ("RMC", "GLL"):
         # status V with mode E is dead reckoning, a fix of its kind
         if sentence.mode and sentence.mode not in _MODE:

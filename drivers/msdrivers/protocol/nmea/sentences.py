@@ -28,7 +28,8 @@ class NmeaSentence:
     latitude, longitude: degrees on WGS 84, or the receiver's own datum. height_msl, undulation: metres.
     quality: GGA's indicator, 0 = no fix. status: "A" or "V" of RMC and GLL. mode: letters of the mode indicator, one
     per satellite system for GNS. dimension: 1 none, 2, 3, of GSA.
-    speed: m/s. track, heading: degrees clockwise from true north, of the motion and of the antenna baseline.
+    speed: m/s. track, heading: degrees clockwise from true north, of the motion and of the antenna baseline. Speed and
+    track are nan where the sentence says that they are not valid.
     sigma_*: standard deviations along latitude, longitude and height, metres.
     """
 
@@ -104,6 +105,15 @@ def read(text: str, start: int = 0) -> NmeaSentence | None:
     return reader(_Fields(pynmea2.NMEASentence.parse(text, check=True)), start)
 
 
+VALID_MODES = frozenset("APDRFE")
+"""Letters of the mode indicator that say measured: M is typed in, S simulated, N not valid."""
+
+
+def _is_valid(mode: str) -> bool:
+    """Whether a mode indicator says that speed and course are measured; before NMEA 2.3 there was none."""
+    return not mode or mode in VALID_MODES
+
+
 class _Fields:
     """A sentence's fields by pynmea2's names, as they were written; an absent field is empty."""
 
@@ -165,6 +175,8 @@ def _gns(said: _Fields, start: int) -> NmeaSentence:
 
 def _rmc(said: _Fields, start: int) -> NmeaSentence:
     latitude, longitude = said.place(valid=said["status"] != "V")
+    speed, track = fields.amount(said["spd_over_grnd"]) * fields.KNOT, fields.circle(said["true_course"])
+    moves = (said["status"] == "A" and _is_valid(said["mode_indicator"])) or said["mode_indicator"] == "E"
     return NmeaSentence(
         said.talker,
         "RMC",
@@ -175,8 +187,8 @@ def _rmc(said: _Fields, start: int) -> NmeaSentence:
         mode=said["mode_indicator"],
         latitude=latitude,
         longitude=longitude,
-        speed=fields.amount(said["spd_over_grnd"]) * fields.KNOT,
-        track=fields.circle(said["true_course"]),
+        speed=speed if moves else NAN,
+        track=track if moves else NAN,
     )
 
 
@@ -197,12 +209,14 @@ def _gll(said: _Fields, start: int) -> NmeaSentence:
 def _vtg(said: _Fields, start: int) -> NmeaSentence:
     knots = fields.amount(said["spd_over_grnd_kts"]) * fields.KNOT
     kmh = fields.amount(said["spd_over_grnd_kmph"]) * fields.KMH
+    speed, track = knots if knots == knots else kmh, fields.circle(said["true_track"])
+    moves = _is_valid(said["faa_mode"])
     return NmeaSentence(
         said.talker,
         "VTG",
         start,
-        track=fields.circle(said["true_track"]),
-        speed=knots if knots == knots else kmh,
+        track=track if moves else NAN,
+        speed=speed if moves else NAN,
         mode=said["faa_mode"],
     )
 

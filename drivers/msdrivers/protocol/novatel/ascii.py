@@ -34,13 +34,22 @@ def long_header(fields: Sequence[str]) -> LogHeader:
     name, port, sequence, _, status, week, seconds, receiver, _, _ = fields
     milliseconds = _milliseconds(seconds)
     known = TimeStatus[status] if status in TimeStatus.__members__ else TimeStatus.UNKNOWN
-    return LogHeader(_name(name), int(week), milliseconds, known, port, int(sequence), int(receiver, 16), False)
+    return LogHeader(
+        _name(name),
+        _whole(week, 0xFFFF),
+        milliseconds,
+        known,
+        port,
+        _whole(sequence, 0xFFFF),
+        _bounded(int(receiver, 16), 0xFFFF_FFFF),
+        False,
+    )
 
 
 def short_header(fields: Sequence[str]) -> LogHeader:
     """Read the three fields of `%NAMESA,...`."""
     name, week, seconds = fields
-    return LogHeader(_name(name), int(week), _milliseconds(seconds), TimeStatus.UNKNOWN, "", 0, 0, False)
+    return LogHeader(_name(name), _whole(week, 0xFFFF), _milliseconds(seconds), TimeStatus.UNKNOWN, "", 0, 0, False)
 
 
 def read(name: str, fields: Sequence[str]) -> Body | None:
@@ -65,9 +74,21 @@ def _name(name: str) -> str:
 
 
 def _milliseconds(seconds: str) -> int:
-    value = round(float(seconds) * 1000.0)
-    if not 0 <= value < 604_800_000:
+    value = float(seconds) * 1000.0
+    # not a number and infinities are not within it either
+    if not 0.0 <= value < 604_799_999.5:
         raise ValueError(f"{seconds} is not within a week")
+    return round(value)
+
+
+def _whole(text: str, most: int) -> int:
+    """Read a number that the binary log has without a sign, `most` being the largest."""
+    return _bounded(int(text), most)
+
+
+def _bounded(value: int, most: int) -> int:
+    if not 0 <= value <= most:
+        raise ValueError(f"{value} is not within 0 to {most}")
     return value
 
 
@@ -96,17 +117,17 @@ def _position(f: Sequence[str]) -> Position:
         f[10],
         float(f[11]),
         float(f[12]),
-        int(f[13]),
-        int(f[14]),
+        _whole(f[13], 0xFF),
+        _whole(f[14], 0xFF),
     )
 
 
 def _velocity(f: Sequence[str]) -> Velocity:
     if len(f) != 8:
         raise ValueError(f"{len(f)} fields where 8 belong")
-    if float(f[4]) < 0.0:
-        raise ValueError(f"{f[4]} is no speed")
     latency, age, horizontal, track, vertical = (float(each) for each in f[2:7])
+    if horizontal < 0.0:
+        raise ValueError(f"{f[4]} is no speed")
     return Velocity(_word(SolutionStatus, f[0]), _word(PositionType, f[1]), latency, age, horizontal, track, vertical)
 
 
@@ -118,7 +139,7 @@ def _utm(f: Sequence[str]) -> UtmPosition:
     return UtmPosition(
         _word(SolutionStatus, f[0]),
         _word(PositionType, f[1]),
-        int(f[2]),
+        _whole(f[2], 0xFFFF_FFFF),
         f[3],
         northing,
         easting,
@@ -131,8 +152,8 @@ def _utm(f: Sequence[str]) -> UtmPosition:
         f[12],
         float(f[13]),
         float(f[14]),
-        int(f[15]),
-        int(f[16]),
+        _whole(f[15], 0xFF),
+        _whole(f[16], 0xFF),
     )
 
 
@@ -140,6 +161,8 @@ def _heading(stations: int) -> Callable[[Sequence[str]], Heading]:
     def read_heading(f: Sequence[str]) -> Heading:
         if len(f) != 16 + stations:
             raise ValueError(f"{len(f)} fields where {16 + stations} belong")
+        if not 0.0 <= float(f[3]) <= 360.0:
+            raise ValueError(f"{f[3]} is no heading")
         return Heading(
             _word(SolutionStatus, f[0]),
             _word(PositionType, f[1]),
@@ -149,8 +172,8 @@ def _heading(stations: int) -> Callable[[Sequence[str]], Heading]:
             float(f[6]),
             float(f[7]),
             f[8],
-            int(f[8 + stations]),
-            int(f[9 + stations]),
+            _whole(f[8 + stations], 0xFF),
+            _whole(f[9 + stations], 0xFF),
         )
 
     return read_heading

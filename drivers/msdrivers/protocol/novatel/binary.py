@@ -51,7 +51,7 @@ def _utm(body: bytes | bytearray) -> UtmPosition | None:
 def _heading(layout: Struct) -> Callable[[bytes | bytearray], Heading | None]:
     def read(body: bytes | bytearray) -> Heading | None:
         f = layout.unpack(body)
-        if not math.isfinite(sum(f[2:7])):
+        if not math.isfinite(sum(f[2:7])) or not 0.0 <= f[3] <= 360.0:
             return None
         return Heading._make((*f[:7], _station(f[7]), *f[8:]))
 

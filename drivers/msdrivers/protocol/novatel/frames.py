@@ -156,7 +156,8 @@ class TextFormat:
     """`<OK`, `<ERROR:...`, and abbreviated ASCII, whose lines begin with '<' and carry no checksum: not used."""
 
     leads = b"<"
-    _line = re.compile(rb"<[ -~]*")
+    # not over the beginning of a log or a sentence: then the '<' was noise
+    _line = re.compile(rb"<[ -\"&-Z\\-~]*")
     _longest = 256
 
     def scan(self, buffer: bytearray, at: int, start: int) -> Taken[Answer] | Refused | None:
