@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import product
 
 from hypothesis import strategies as st
+from support_joints import joints
 from support_spatial import poses
 
 from modelserver.errors import GeometryError, Severity
@@ -133,9 +134,10 @@ sigmas = st.one_of(st.none(), st.builds(Sigma, st.tuples(*[deviations] * 3), st.
 
 @st.composite
 def models(draw):
-    """Return a model whose bodies all hang on the first, so that every pair of frames has an answer."""
+    """Return a model whose bodies all hang on the first, so that every pair of frames has an answer; some by joints."""
     builder = ModelBuilder(draw(descriptions), draw(descriptions))
     bodies = draw(st.lists(names, min_size=1, max_size=4, unique=True))
+    leaders: list[str] = []
     inertia = st.none() | st.just(tuple(tuple(float(6 * i + j) / 3 for j in range(6)) for i in range(6)))
     for number, name in enumerate(bodies):
         body = builder.body(name, draw(descriptions), draw(st.none() | poses), draw(inertia))
@@ -144,7 +146,9 @@ def models(draw):
             body.frame(frame, draw(poses), draw(descriptions), draw(sigmas))
         if number:
             parent = draw(st.sampled_from(bodies[:number]))
-            builder.constraint(
-                f"c{number}", f"{parent}:on{number}", f"{name}:base", draw(poses), draw(descriptions), draw(sigmas)
-            )
+            joint = draw(joints(leaders))
+            if joint.count == 1:
+                leaders.append(f"c{number}")
+            ends = (f"{parent}:on{number}", f"{name}:base")
+            builder.constraint(f"c{number}", *ends, draw(poses), draw(descriptions), draw(sigmas), joint)
     return builder.build()

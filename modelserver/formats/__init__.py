@@ -21,28 +21,43 @@ __all__ = ["FORMS", "Saved", "check_file", "form_of_path", "load_model", "parse_
 
 
 def load_model(
-    path: str | os.PathLike[str], *, repair: bool = False, variables: Mapping[str, str] | None = None
+    path: str | os.PathLike[str],
+    *,
+    repair: bool = False,
+    variables: Mapping[str, str] | None = None,
+    strict: bool = False,
 ) -> Model:
     """Return the model in a geometry file; its `problems` hold the warnings and notes.
 
-    The form is told by the content: Miro XML, with bodies and constraints or with a tree of frames, or YAML.
+    The form is told by the content: YAML; Miro XML, with bodies and constraints or with a tree of frames; URDF; or
+    libbot2's coordinate frames.
     `variables` fill `$NAME` in a frame tree, before the environment does. With `repair`, what is badly formed
-    and what is not traceable to the first body is dropped and reported instead of refused.
+    and what is not traceable to the first body is dropped and reported instead of refused. With `strict`, a frame has
+    one constraint at most, as in 2005.
 
     Raises GeometryError, with every problem, where the file is wrong; OSError where it cannot be opened.
     """
-    return parse_model(content.read(path), os.fspath(path), repair=repair, variables=variables)
+    return parse_model(content.read(path), os.fspath(path), repair=repair, variables=variables, strict=strict)
 
 
 def parse_model(
-    text: bytes, file: str = "", *, repair: bool = False, variables: Mapping[str, str] | None = None
+    text: bytes,
+    file: str = "",
+    *,
+    repair: bool = False,
+    variables: Mapping[str, str] | None = None,
+    strict: bool = False,
 ) -> Model:
     """Return the model that the bytes of a geometry file hold; as `load_model`, with `file` named in problems."""
-    return registry.read(text, file, variables).build(repair)
+    return registry.read(text, file, variables, strict).build(repair)
 
 
 def check_file(
-    path: str | os.PathLike[str], variables: Mapping[str, str] | None = None, *, repair: bool = False
+    path: str | os.PathLike[str],
+    variables: Mapping[str, str] | None = None,
+    *,
+    repair: bool = False,
+    strict: bool = False,
 ) -> tuple[Model | None, tuple[Problem, ...]]:
     """Return the model in a file, None where there is an error, and every problem in the order of the file.
 
@@ -52,7 +67,7 @@ def check_file(
         text = content.read(path)
     except GeometryError as error:
         return None, error.problems
-    return registry.read(text, os.fspath(path), variables).check(repair)
+    return registry.read(text, os.fspath(path), variables, strict).check(repair)
 
 
 def save_model(model: Model, form: str) -> Saved:

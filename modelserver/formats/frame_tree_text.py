@@ -12,6 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 
+from modelserver.formats import losses
 from modelserver.formats.frame_tree_xml import ORIGIN
 from modelserver.formats.miro_text import escaped
 from modelserver.formats.saved import Saved, plain, some
@@ -127,6 +128,8 @@ def _losses(model: Model, used: set[str]) -> Iterator[str]:
         yield f"{sigmas} sigmas"
     if heavy := [body.name for body in model.bodies if body.inertia is not None]:
         yield f"the inertia of {len(heavy)} bodies: {some(heavy)}"
+    yield from losses.of_joints(model)
+    yield from losses.of_shapes(model)
     if model.constraints:
         yield "the names of constraints, and on which of their frames bodies meet"
     if loops := [each.name for each in model.constraints if each.name not in used]:

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING
 
 from modelserver.errors import Severity, Source, nearest_names, shown
 from modelserver.formats import numbers
+from modelserver.formats.circles import circles
 from modelserver.formats.spelling import label
 from modelserver.formats.xml_document import Named, line
 from modelserver.geometry.builder import BodyBuilder, ModelBuilder
@@ -206,23 +207,13 @@ class _Reader:
                     f"write {names[0]}" if names else "name a frame of this file, or leave it empty for a root",
                     names,
                 )
-        settled: set[str] = set()
-        for start in self.frames:
-            line_up: dict[str, None] = {}
-            here = start
-            while here and here in self.frames and here not in settled and here not in line_up:
-                line_up[here] = None
-                here = self.frames[here].parent
-            if here in line_up:
-                well = False
-                circle = list(line_up)[list(line_up).index(here) :]
-                shortened = circle if len(circle) <= 8 else [*circle[:7], "..."]
-                self.builder.error(
-                    f"parents go round in a circle: {' in '.join(label(name) for name in [*shortened, here])}",
-                    self.frames[here].parent_source,
-                    "one of them must stand in a frame outside the circle, or have an empty Parent",
-                )
-            settled.update(line_up)
+        for circle in circles(self.frames, lambda name: self.frames[name].parent if name in self.frames else None):
+            well = False
+            self.builder.error(
+                f"parents go round in a circle: {' in '.join(map(label, circle))}",
+                self.frames[circle[-1]].parent_source,
+                "one of them must stand in a frame outside the circle, or have an empty Parent",
+            )
         return well
 
     def group(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from modelserver.formats import losses
 from modelserver.formats.saved import Saved, plain, some
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Body, BodyFrame, Constraint
@@ -34,6 +35,8 @@ def _losses(model: Model) -> Iterator[str]:
         yield f"the sigmas of {len(constraints)} constraints: {some(constraints)}"
     if heavy := [body.name for body in model.bodies if body.inertia is not None]:
         yield f"the inertia of {len(heavy)} bodies: {some(heavy)}"
+    yield from losses.of_joints(model)
+    yield from losses.of_shapes(model)
     if changed := [name for name, text in _descriptions(model) if _description(text) != text]:
         yield f"line breaks and control characters in {len(changed)} descriptions: {some(changed)}"
 
@@ -84,7 +87,7 @@ def _constraints(constraints: tuple[Constraint, ...]) -> Iterator[str]:
             yield _parameter("Description", _description(each.description), 2)
         yield _parameter("From", each.from_, 2)
         yield _parameter("To", each.to, 2)
-        yield from _indented(_transform(each.pose), 2)
+        yield from _indented(_transform(each.at_rest), 2)
         yield "</parameter>"
 
 

@@ -103,3 +103,23 @@ def rotation(rows: Sequence[Sequence[float]], builder: ModelBuilder, source: Sou
             f"write {where} with more digits, or look for a slip in one of them",
         )
     return so3.from_matrix(matrix)
+
+
+def quaternion(wxyz: Sequence[float], builder: ModelBuilder, source: Source) -> Quaternion | None:
+    """Return the unit quaternion nearest to four numbers, w first; judged as `rotation`, by its squared length."""
+    w, x, y, z = wxyz
+    deviation = abs(w * w + x * x + y * y + z * z - 1.0)
+    if not deviation <= GREATEST_DEVIATION:
+        builder.error(
+            f"the quaternion has length {math.hypot(w, x, y, z):.4g}, not 1",
+            source,
+            "write w, x, y, z of a unit quaternion, w first",
+        )
+        return None
+    if deviation > SILENT_DEVIATION:
+        builder.warning(
+            f"the quaternion has length {math.hypot(w, x, y, z):.6g}, not 1; mended",
+            source,
+            "write it with more digits, or look for a slip in one of them",
+        )
+    return so3.normalized((w, x, y, z))

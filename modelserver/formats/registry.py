@@ -9,18 +9,20 @@ from contextlib import contextmanager
 from pathlib import PurePath
 
 from modelserver.errors import Source, shown
+from modelserver.formats import bot_param
 from modelserver.formats.saved import Saved
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
 
-FORMS = ("yaml", "miro", "miro-frames")
-"""Forms that `save` writes: YAML, Miro body and constraint XML, Miro frame-tree XML."""
+FORMS = ("yaml", "miro", "miro-frames", "urdf")
+"""Forms that `save` writes: YAML, Miro body and constraint XML, Miro frame-tree XML, URDF."""
 
-_ENDINGS = {".yaml": "yaml", ".yml": "yaml", ".xml": "miro"}
+_ENDINGS = {".yaml": "yaml", ".yml": "yaml", ".xml": "miro", ".urdf": "urdf"}
+
+_XML_ENDINGS = (".xml", ".urdf")
 
 _ELSEWHERE = {
-    "robot": "this looks like URDF, which is not read yet",
-    "sdf": "this looks like SDF, which is not read yet",
+    "sdf": "this looks like SDF, which is not read",
     "config_group": "this is Miro's compile-time parameter file; the run-time file holds the geometry",
 }
 
@@ -37,19 +39,23 @@ def form_of_path(path: str | os.PathLike[str]) -> str:
     return _ENDINGS[ending]
 
 
-def read(content: bytes, file: str = "", variables: Mapping[str, str] | None = None) -> ModelBuilder:
+def read(
+    content: bytes, file: str = "", variables: Mapping[str, str] | None = None, strict: bool = False
+) -> ModelBuilder:
     """Return a builder with what `content` holds and every problem met; never raises for what is in it.
 
-    `file` is named in problems.
+    `file` is named in problems; the builder is `strict`, or not.
     """
-    builder = ModelBuilder()
+    builder = ModelBuilder(strict=strict)
     text = content.removeprefix(b"\xef\xbb\xbf").lstrip()
     if not text:
         builder.error("the file is empty", Source(file), "see docs/geometry-files.md for an example to begin with")
     else:
         with _collector_paused():
-            if text.startswith(b"<") or PurePath(file).suffix.lower() == ".xml":
+            if text.startswith(b"<") or PurePath(file).suffix.lower() in _XML_ENDINGS:
                 _read_xml(content, builder, file, variables or {})
+            elif bot_param.is_likely(text):
+                _read_bot_frames(content, builder, file)
             else:
                 _read_yaml(content, builder, file)
     return builder
@@ -77,8 +83,14 @@ def _read_yaml(content: bytes, builder: ModelBuilder, file: str) -> None:
     yaml_form.load(content, builder, file)
 
 
+def _read_bot_frames(content: bytes, builder: ModelBuilder, file: str) -> None:
+    from modelserver.formats import bot_frames_text
+
+    bot_frames_text.load(content, builder, file)
+
+
 def _read_xml(content: bytes, builder: ModelBuilder, file: str, variables: Mapping[str, str]) -> None:
-    from modelserver.formats import frame_tree_xml, miro_xml, xml_document
+    from modelserver.formats import frame_tree_xml, miro_xml, urdf_xml, xml_document
     from modelserver.formats.spelling import label
 
     root = xml_document.parse(content, builder, file)
@@ -86,8 +98,11 @@ def _read_xml(content: bytes, builder: ModelBuilder, file: str, variables: Mappi
         return
     name = xml_document.tag(root)
     first = Source(file, xml_document.line(root), f"<{label(name)}>")
+    if name == "robot":
+        urdf_xml.load(root, builder, file)
+        return
     if name in _ELSEWHERE:
-        builder.error(_ELSEWHERE[name], first, "give a file in one of Miro's forms, or YAML")
+        builder.error(_ELSEWHERE[name], first, "give a file in one of Miro's forms, URDF or YAML")
         return
     if next(root.iter("{*}config_group"), None) is not None:
         builder.error(_ELSEWHERE["config_group"], first, "give the file with BodyName and ConstraintName in it")
@@ -122,4 +137,8 @@ def save(model: Model, form: str) -> Saved:
         from modelserver.formats import frame_tree_text
 
         return frame_tree_text.save(model)
+    if form == "urdf":
+        from modelserver.formats import urdf_text
+
+        return urdf_text.save(model)
     raise ValueError(f"{shown(form)} is no form; forms are {', '.join(FORMS)}")

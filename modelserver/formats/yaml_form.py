@@ -7,11 +7,15 @@ from dataclasses import dataclass, field
 from modelserver.errors import Severity, nearest_names, shown
 from modelserver.formats import yaml_nodes
 from modelserver.formats.spelling import label
+from modelserver.formats.yaml_joint import read_joint
 from modelserver.formats.yaml_nodes import Kind, Node
 from modelserver.formats.yaml_pose import POSE_KEYS, Defaults, read_pose, read_sigma, read_sigma_parts
 from modelserver.formats.yaml_reader import NodeReader
+from modelserver.formats.yaml_shapes import read_shapes
 from modelserver.geometry.builder import ModelBuilder
-from modelserver.geometry.parts import BodyFrame, JointType, Sigma
+from modelserver.geometry.joint import FIXED
+from modelserver.geometry.parts import BodyFrame, Sigma
+from modelserver.geometry.shape import Shape
 from modelserver.spatial.pose import Pose
 
 FORM_KEY = "modelserver"
@@ -22,8 +26,8 @@ GREATEST_FRAMES = 100_000
 """Frames with templates written out."""
 
 _TOP = (FORM_KEY, "name", "description", "defaults", "templates", "bodies", "constraints")
-_TEMPLATE = ("description", "inertia", "frames")
-_BODY = ("template", "description", "transform", "inertia", "frames")
+_TEMPLATE = ("description", "inertia", "visuals", "collisions", "frames")
+_BODY = ("template", "description", "transform", "inertia", "visuals", "collisions", "frames")
 _FRAME = (*POSE_KEYS, "description", "sigma")
 _CONSTRAINT = ("from", "to", *POSE_KEYS, "description", "sigma", "joint")
 
@@ -45,6 +49,8 @@ class _Template:
     inertia: _Inertia | None
     frames: list[_PlacedFrame]
     node: Node
+    visuals: tuple[Shape, ...]
+    collisions: tuple[Shape, ...]
     used: bool = field(default=False)
 
 
@@ -115,6 +121,8 @@ class _Form:
                 self.read_inertia(fields.get("inertia"), place),
                 self.read_frames(fields.get("frames"), place),
                 key,
+                read_shapes(self.reader, fields.get("visuals"), f"{place}, visuals"),
+                read_shapes(self.reader, fields.get("collisions"), f"{place}, collisions"),
             )
 
     def read_body(self, name: str, key: Node, value: Node) -> None:
@@ -124,6 +132,8 @@ class _Form:
         description = self.reader.text(fields.get("description"), place, "description")
         inertia = self.read_inertia(fields.get("inertia"), place)
         frames = self.read_frames(fields.get("frames"), place)
+        visuals = read_shapes(self.reader, fields.get("visuals"), f"{place}, visuals")
+        collisions = read_shapes(self.reader, fields.get("collisions"), f"{place}, collisions")
         pose = None
         if "transform" in fields:
             inside = f"{place}, transform"
@@ -131,6 +141,7 @@ class _Form:
         if template is not None:
             description = description or template.description
             inertia = inertia or template.inertia
+            visuals, collisions = visuals or template.visuals, collisions or template.collisions
             frames = _overridden(template.frames, frames)
         self.frames += len(frames)
         if self.frames > GREATEST_FRAMES >= self.frames - len(frames):
@@ -143,6 +154,7 @@ class _Form:
         if self.frames > GREATEST_FRAMES:
             return
         body = self.builder.body(name, description, pose, inertia, self.reader.at(key, place))
+        body.visuals, body.collisions = visuals, collisions
         for frame, node in frames:
             body.frames.append((frame, self.reader.at(node, f"{place}, frame {label(frame.name)}")))
 
@@ -208,17 +220,13 @@ class _Form:
         pose = read_pose(self.reader, fields, place)
         sigma = self.sigma_of(fields, place)
         description = self.reader.text(fields.get("description"), place, "description")
-        joint = self.reader.text(fields.get("joint"), place, "joint") or JointType.FIXED
-        if joint not in list(JointType):
-            self.reader.error(
-                f"joint {shown(joint)} is not served yet; only fixed is",
-                fields["joint"],
-                place,
-                "write joint: fixed, or leave it out",
-            )
+        joint = read_joint(self.reader, fields["joint"], place) if "joint" in fields else FIXED
+        if joint is None:
+            self.builder.unclear_joints.add(name)
+            joint = FIXED
         from_, to = (self.read_end(end, fields, key, place) for end in ("from", "to"))
         if from_ and to:
-            self.builder.constraint(name, from_, to, pose, description, sigma, source=self.reader.at(key, place))
+            self.builder.constraint(name, from_, to, pose, description, sigma, joint, self.reader.at(key, place))
 
     def read_end(self, end: str, fields: dict[str, Node], key: Node, place: str) -> str:
         """Return the frame that a constraint names, empty with an error where it names none."""

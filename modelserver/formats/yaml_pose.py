@@ -69,33 +69,13 @@ def _rotation(reader: NodeReader, key: str, node: Node, place: str) -> Quaternio
         return None if rows is None else numbers.rotation(rows, reader.builder, reader.at(node, place), "rotation")
     if key == "quaternion":
         values = reader.numbers(node, 4, place, "quaternion", "order w, x, y, z")
-        return None if values is None else _quaternion(reader, values, node, place)
+        return None if values is None else numbers.quaternion(values, reader.builder, reader.at(node, place))
     degrees = key == "rpy_deg"
     angles = reader.numbers(node, 3, place, key, "degrees" if degrees else "radians")
     if angles is None:
         return None
     roll, pitch, yaw = (math.radians(angle) for angle in angles) if degrees else angles
     return so3.from_rpy(roll, pitch, yaw)
-
-
-def _quaternion(reader: NodeReader, values: list[float], node: Node, place: str) -> Quaternion | None:
-    w, x, y, z = values
-    deviation = abs(w * w + x * x + y * y + z * z - 1.0)
-    if not deviation <= numbers.GREATEST_DEVIATION:
-        reader.error(
-            f"the quaternion has length {math.hypot(w, x, y, z):.4g}, not 1",
-            node,
-            place,
-            "write w, x, y, z of a unit quaternion, w first",
-        )
-        return None
-    if deviation > numbers.SILENT_DEVIATION:
-        reader.builder.warning(
-            f"the quaternion has length {math.hypot(w, x, y, z):.6g}, not 1; mended",
-            reader.at(node, place),
-            "write it with more digits, or look for a slip in one of them",
-        )
-    return so3.normalized((w, x, y, z))
 
 
 def _matrix(reader: NodeReader, node: Node, place: str) -> Pose | None:

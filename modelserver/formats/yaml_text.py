@@ -8,6 +8,8 @@ import re
 import yaml
 
 from modelserver.formats.saved import Saved, plain
+from modelserver.formats.yaml_joint_text import in_degrees, joint_lines
+from modelserver.formats.yaml_shapes_text import shape_lines
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
 from modelserver.spatial import so3
@@ -27,8 +29,11 @@ _PLAIN = re.compile(r"[A-Za-z$](?:[^:#]*[^:# ])?")
 _RESOLVER = yaml.resolver.Resolver()
 
 
-def save(model: Model) -> Saved:
-    """Return the text of `model`. This form holds everything a model has."""
+def save(model: Model, exact: bool = False) -> Saved:
+    """Return the text of `model`. This form holds everything a model has.
+
+    With `exact` rotations are written to the last bit, for a program to read back: the revision is the same then.
+    """
     lines = ["modelserver: geometry/1"]
     if model.name:
         lines.append(f"name: {text(model.name)}")
@@ -36,31 +41,37 @@ def save(model: Model) -> Saved:
         lines.append(f"description: {text(model.description)}")
     lines += ["", "bodies:"]
     for number, body in enumerate(model.bodies):
-        lines += ([""] if number else []) + _body(body)
+        lines += ([""] if number else []) + _body(body, exact)
     if model.constraints:
         lines += ["", "constraints:"]
         for constraint in model.constraints:
-            lines += _constraint(constraint)
+            lines += _constraint(constraint, exact)
     return Saved("\n".join(lines) + "\n")
 
 
-def _body(body: Body) -> list[str]:
+def _body(body: Body, exact: bool) -> list[str]:
     lines = [f"  {text(body.name)}:"]
     if body.description:
         lines.append(f"    description: {text(body.description)}")
     if body.pose is not None:
-        lines.append(f"    transform: {{{', '.join(_pose(body.pose) or ['xyz: [0, 0, 0]'])}}}")
+        lines.append(f"    transform: {{{', '.join(_pose(body.pose, exact) or ['xyz: [0, 0, 0]'])}}}")
     if body.inertia is not None:
         lines.append("    inertia:")
         lines += [f"      - {_list(row)}" for row in body.inertia]
+    for key, shapes in (("visuals", body.visuals), ("collisions", body.collisions)):
+        if shapes:
+            lines.append(f"    {key}:")
+            lines += [
+                f"      {line}" for shape in shapes for line in shape_lines(shape, _pose(shape.pose, exact), text)
+            ]
     lines.append("    frames:")
     for frame in body.frames:
-        lines += _frame(frame)
+        lines += _frame(frame, exact)
     return lines
 
 
-def _frame(frame: BodyFrame) -> list[str]:
-    fields = _pose(frame.pose) + _sigma(frame.sigma)
+def _frame(frame: BodyFrame, exact: bool) -> list[str]:
+    fields = _pose(frame.pose, exact) + _sigma(frame.sigma)
     head = f"      {text(frame.name)}:"
     short = f"{head} {{{', '.join(fields)}}}"
     if not frame.description and len(short) <= WIDTH:
@@ -69,18 +80,18 @@ def _frame(frame: BodyFrame) -> list[str]:
     return [head, *(f"        {each}" for each in described + fields)]
 
 
-def _constraint(constraint: Constraint) -> list[str]:
+def _constraint(constraint: Constraint, exact: bool) -> list[str]:
     fields = [f"from: {_full(constraint.from_)}", f"to: {_full(constraint.to)}"]
     if constraint.description:
         fields.append(f"description: {text(constraint.description)}")
-    fields += _pose(constraint.pose) + _sigma(constraint.sigma)
+    fields += _pose(constraint.pose, exact) + _sigma(constraint.sigma) + joint_lines(constraint.joint, text, WIDTH - 4)
     return [f"  {text(constraint.name)}:", *(f"    {each}" for each in fields)]
 
 
-def _pose(pose: Pose) -> list[str]:
+def _pose(pose: Pose, exact: bool) -> list[str]:
     fields = [] if pose.xyz == (0.0, 0.0, 0.0) else [f"xyz: {_list(pose.xyz)}"]
     if pose.wxyz != so3.IDENTITY:
-        degrees = degrees_of(pose.wxyz)
+        degrees = None if exact else degrees_of(pose.wxyz)
         fields.append(f"quaternion: {_list(pose.wxyz)}" if degrees is None else f"rpy_deg: {_list(degrees)}")
     return fields
 
@@ -115,15 +126,12 @@ def _misses(degrees: Vector3, wxyz: Quaternion) -> float:
 def _sigma(sigma: Sigma | None) -> list[str]:
     if sigma is None:
         return []
-    degrees = (math.degrees(sigma.rotation[0]), math.degrees(sigma.rotation[1]), math.degrees(sigma.rotation[2]))
-    for decimals in (6, 12, 17):
-        short = (round(degrees[0], decimals), round(degrees[1], decimals), round(degrees[2], decimals))
-        if tuple(math.radians(value) for value in short) == sigma.rotation:
-            return [f"sigma: {{xyz: {_one_or_list(sigma.position)}, rpy_deg: {_one_or_list(short)}}}"]
-    return [f"sigma: {{xyz: {_one_or_list(sigma.position)}, rpy: {_one_or_list(sigma.rotation)}}}"]
+    degrees = in_degrees(sigma.rotation)
+    rotation = f"rpy: {_one_or_list(sigma.rotation)}" if degrees is None else f"rpy_deg: {_one_or_list(degrees)}"
+    return [f"sigma: {{xyz: {_one_or_list(sigma.position)}, {rotation}}}"]
 
 
-def _one_or_list(values: Vector3) -> str:
+def _one_or_list(values: tuple[float, ...]) -> str:
     return plain(values[0]) if values[0] == values[1] == values[2] else _list(values)
 
 

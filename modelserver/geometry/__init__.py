@@ -1,17 +1,24 @@
 """The vehicle's geometry: bodies, frames, constraints, and the graph they make. Pure."""
 
 from modelserver.geometry.builder import BodyBuilder, ModelBuilder
+from modelserver.geometry.joint import Joint, JointType, Mimic
 from modelserver.geometry.model import Model, Search
-from modelserver.geometry.parts import Body, BodyFrame, Constraint, JointType, Sigma
+from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
+from modelserver.geometry.shape import Material, Shape, ShapeKind
 
 __all__ = [
     "Body",
     "BodyBuilder",
     "BodyFrame",
     "Constraint",
+    "Joint",
     "JointType",
+    "Material",
+    "Mimic",
     "Model",
     "ModelBuilder",
     "Search",
+    "Shape",
+    "ShapeKind",
     "Sigma",
 ]

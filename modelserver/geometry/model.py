@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections import OrderedDict
 from collections.abc import Iterable
+from dataclasses import astuple
 from enum import StrEnum
 from functools import partial
 from typing import NamedTuple
-
-import numpy as np
 
 from modelserver.errors import (
     NotConnectedError,
@@ -21,15 +21,22 @@ from modelserver.errors import (
     shown,
 )
 from modelserver.geometry import names
+from modelserver.geometry.drives import drives
+from modelserver.geometry.joint import Coordinates, Joint
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
+from modelserver.geometry.route import Edge, Route, edges_along
 from modelserver.geometry.topology import Crossing, Topology
-from modelserver.spatial import covariance
+from modelserver.spatial import chain
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array
 from modelserver.spatial.transformation import Transformation
 
 CACHE_SIZE = 16384
 """Static answers kept, about 1 kB each. When full the oldest goes: a vehicle asks for few pairs, again and again."""
+
+
+ROUTES_KEPT = 1024
+"""Ways kept: with all that is folded for its covariance a long one takes 40 kB."""
 
 
 class Search(StrEnum):
@@ -52,6 +59,7 @@ class Model:
     """The geometry of a vehicle. Build one with `ModelBuilder` or `modelserver.load_model`.
 
     `bodies`, `constraints`, `problems` are tuples in the order of the file; the first body is the root.
+    `joints` are the constraints that move, by name; `drives` says for each of them which coordinates place it.
     `revision` is a hash of everything in the model that can change an answer or a list. Immutable.
     """
 
@@ -59,12 +67,16 @@ class Model:
         "_answers",
         "_bodies",
         "_from_root",
+        "_in_loops",
         "_looped",
         "_places",
+        "_routes",
         "_topology",
         "bodies",
         "constraints",
         "description",
+        "drives",
+        "joints",
         "name",
         "problems",
         "revision",
@@ -88,9 +100,15 @@ class Model:
         self._topology = Topology(bodies, constraints)
         # An OrderedDict drops its oldest in constant time; a dict walks over all that was dropped before.
         self._answers: OrderedDict[tuple[str, str], Transformation] = OrderedDict()
+        self._routes: OrderedDict[tuple[str, str], Route] = OrderedDict()
+        self.joints = {each.name: each for each in constraints if each.joint.moves}
+        self.drives = drives(self.joints.values())
         self._places: dict[str, _Place] = {}
         self._from_root = self._place_bodies()
-        self._looped = frozenset(self._from_root[closing.bodies[0]][0] for closing in self._topology.loop_closures())
+        closures = self._topology.loop_closures()
+        self._looped = frozenset(self._from_root[closing.bodies[0]][0] for closing in closures)
+        # going round by each closing constraint passes every constraint that there is another way around
+        self._in_loops = frozenset(each.constraint.name for closing in closures for each in closing.path)
 
     def _place_bodies(self) -> dict[str, tuple[int, Pose]]:
         """Return for each body its assembly's number and the pose of its origin in that assembly's first body."""
@@ -108,6 +126,11 @@ class Model:
     def root(self) -> Body:
         """The first body in the file."""
         return self.bodies[0]
+
+    @property
+    def has_loops(self) -> bool:
+        """Whether somewhere two ways lead from one body to another."""
+        return bool(self._in_loops)
 
     @property
     def assemblies(self) -> tuple[tuple[str, ...], ...]:
@@ -137,12 +160,41 @@ class Model:
     def get_transformation(self, frame_of_interest: str, frame_of_reference: str) -> Transformation:
         """Return the pose of `frame_of_interest` in `frame_of_reference` by the shortest path (eq. 11-13).
 
-        Both are full names, `Body:Frame`. Raises UnknownBodyError, UnknownFrameError or NotConnectedError.
+        Joints that move stand where they rest; `modelserver.platform` knows where they are. Both are full names,
+        `Body:Frame`. Raises UnknownBodyError, UnknownFrameError or NotConnectedError.
         """
         try:
             return self._answers[frame_of_interest, frame_of_reference]
         except KeyError:
             return self._answer(frame_of_interest, frame_of_reference)
+
+    def route(self, frame_of_interest: str, frame_of_reference: str) -> Route:
+        """Return the shortest way from the frame of reference to the frame of interest, kept for the next time.
+
+        Raises UnknownBodyError, UnknownFrameError or NotConnectedError.
+        """
+        found = self._routes.get((frame_of_interest, frame_of_reference))
+        if found is None:
+            path = self.find_path(frame_of_interest, frame_of_reference)
+            in_loop = any(crossing.constraint.name in self._in_loops for crossing in path)
+            found = Route(self.edges(path, frame_of_interest, frame_of_reference), in_loop)
+            if len(self._routes) >= ROUTES_KEPT:
+                self._routes.popitem(last=False)
+            self._routes[frame_of_interest, frame_of_reference] = found
+        return found
+
+    def edges(self, path: Iterable[Crossing], frame_of_interest: str, frame_of_reference: str) -> list[Edge]:
+        """Return the edges of a path of `find_path`: frames of bodies, constraints, and joints that move.
+
+        A frame that stands at its body's origin by definition is no edge.
+        """
+        edges = edges_along(path, self.frame, frame_of_interest, frame_of_reference)
+        return [
+            each._replace(leader=self.drives[each.name].leader)
+            if each.joint is not None and each.joint.mimic is not None
+            else each
+            for each in edges
+        ]
 
     def find_path(
         self, frame_of_interest: str, frame_of_reference: str, search: Search = Search.BREADTH_FIRST
@@ -164,44 +216,24 @@ class Model:
     def along(self, path: Iterable[Crossing], frame_of_interest: str, frame_of_reference: str) -> Transformation:
         """Return the transformation that a path of `find_path` builds, edge by edge (eq. 12 and 13).
 
-        Its covariance is that of the edges' sigmas, None where an edge states none.
+        Joints stand where they rest. Its covariance is that of the edges' sigmas, None where an edge states none.
         """
-        _, start = self._split(frame_of_reference)
-        pose = Pose.identity()
-        cov: Array = np.zeros((6, 6))
-        known = True
-
-        def go(edge: Pose, sigma: Sigma | None, inverted: bool) -> None:
-            nonlocal pose, cov, known
-            step = edge.inverse() if inverted else edge
-            if edge == _IDENTITY and sigma is None:
-                return
-            if sigma is None:
-                known = False
-            elif known:
-                edge_cov = covariance.invert(edge, sigma.covariance) if inverted else sigma.covariance
-                cov = covariance.compose(pose, cov, step, edge_cov)
-            pose = pose @ step
-
-        inside = start
-        for crossing in path:
-            leaving = self.frame(crossing.enters)
-            if leaving is not inside:
-                go(inside.pose, inside.sigma, inverted=True)
-                go(leaving.pose, leaving.sigma, inverted=False)
-            go(crossing.constraint.pose, crossing.constraint.sigma, inverted=not crossing.forward)
-            inside = self.frame(crossing.leaves)
-        target = self.frame(frame_of_interest)
-        if target is not inside:
-            go(inside.pose, inside.sigma, inverted=True)
-            go(target.pose, target.sigma, inverted=False)
+        route = Route(self.edges(path, frame_of_interest, frame_of_reference))
+        rest = route.rest
+        links = route.links(rest, [self._stated_sigma(leg.name) for leg in route.legs])
         return Transformation(
             frame_of_interest,
             frame_of_reference,
-            pose,
-            cov if known else None,
+            route.pose(rest),
+            chain.covariance(links),
             model_revision=self.revision,
         )
+
+    def _stated_sigma(self, name: str) -> Coordinates:
+        """Return what the file states of how sure a joint's position is, nan where it does not; see `Route.links`."""
+        drive = self.drives[name]
+        leader = self.joints[drive.leader].joint
+        return tuple([drive.multiplier * value for value in leader.sigma or (math.nan,) * leader.count])
 
     def _split(self, name: str) -> tuple[Body, BodyFrame]:
         try:
@@ -288,9 +320,6 @@ class Model:
         )
 
 
-_IDENTITY = Pose.identity()
-
-
 def _revision(bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> str:
     """Return 16 hex digits of a SHA-256 over what answers and lists hold; floats enter exactly (repr round-trips)."""
 
@@ -299,6 +328,12 @@ def _revision(bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> 
 
     def pose(value: Pose | None) -> object:
         return None if value is None else (value.xyz, value.wxyz)
+
+    def joint(value: Joint) -> object:
+        if not value.moves:
+            return value.type
+        numbers = (value.axis, value.lower, value.upper, value.rate_limit, value.default, value.sigma)
+        return (value.type, numbers, None if value.mimic is None else astuple(value.mimic))
 
     content = (
         [
@@ -311,6 +346,9 @@ def _revision(bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> 
             )
             for body in bodies
         ],
-        [(each.name, each.from_, each.to, pose(each.pose), each.joint, sigma(each.sigma)) for each in constraints],
+        [
+            (each.name, each.from_, each.to, pose(each.pose), joint(each.joint), sigma(each.sigma))
+            for each in constraints
+        ],
     )
     return hashlib.sha256(json.dumps(content, separators=(",", ":")).encode()).hexdigest()[:16]

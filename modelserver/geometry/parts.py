@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 
 from modelserver.errors import UnknownFrameError, nearest_names, shown
+from modelserver.geometry import inertia as spatial_inertia
 from modelserver.geometry import names
+from modelserver.geometry.joint import FIXED, Joint
+from modelserver.geometry.shape import Shape
 from modelserver.spatial import covariance
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array, Vector3
@@ -40,12 +42,6 @@ class Sigma:
         return covariance.from_sigmas(self.position, self.rotation)
 
 
-class JointType(StrEnum):
-    """How a constraint lets its two frames move. Only fixed ones are served so far."""
-
-    FIXED = "fixed"
-
-
 @dataclass(frozen=True, slots=True)
 class BodyFrame:
     """A frame of interest on a body: `pose` is its place in body coordinates (the report's A_ij).
@@ -65,8 +61,10 @@ class Body:
 
     `pose` is the optional transform of the whole body that a 2005 file may carry; it is kept and written
     back, and takes no part in relations between frames. `inertia` is the 6x6 spatial inertia in body
-    coordinates, rows of 6 (the report's InertiaMatrix), or None. Copying a body is `renamed`: values are shared.
-    Raises ValueError for two frames of one name, or an inertia that is not 6x6 and finite.
+    coordinates, rows of 6 (the report's InertiaMatrix), or None; `modelserver.geometry.inertia` says how it is made.
+    `visuals` and `collisions` are what it looks like and what it occupies, kept for others. Copying a body is
+    `renamed`: values are shared. Raises ValueError for two frames of one name, or an inertia that is not 6x6 and
+    finite.
     """
 
     name: str
@@ -74,6 +72,8 @@ class Body:
     description: str = ""
     pose: Pose | None = None
     inertia: tuple[tuple[float, ...], ...] | None = None
+    visuals: tuple[Shape, ...] = ()
+    collisions: tuple[Shape, ...] = ()
     _by_name: dict[str, BodyFrame] = field(init=False, repr=False, compare=False, hash=False)
 
     def __post_init__(self) -> None:
@@ -88,6 +88,18 @@ class Body:
             if [len(row) for row in rows] != [6] * 6 or not all(map(math.isfinite, sum(rows, ()))):
                 raise ValueError(f"the inertia of body {self.name} is not 6 rows of 6 finite numbers")
             object.__setattr__(self, "inertia", rows)
+
+    @property
+    def mass(self) -> float | None:
+        """The mass in kilograms; None where no inertia is stated, or one that is not a rigid body's."""
+        found = None if self.inertia is None else spatial_inertia.rigid(self.inertia)
+        return None if found is None else found.mass
+
+    @property
+    def centre_of_mass(self) -> Vector3 | None:
+        """The centre of mass in body coordinates, metres; None as for `mass`."""
+        found = None if self.inertia is None else spatial_inertia.rigid(self.inertia)
+        return None if found is None else found.centre
 
     def frame(self, name: str) -> BodyFrame:
         """Return the frame of that name. Raises UnknownFrameError with the nearest names."""
@@ -124,7 +136,8 @@ class Body:
 class Constraint:
     """A joint between two frames: `pose` is the place of frame `to` in frame `from_` (the report's T_k).
 
-    `from_` and `to` are full names, `Body:Frame`. Crossing it from `to` to `from_` takes the inverse.
+    `from_` and `to` are full names, `Body:Frame`. Crossing it from `to` to `from_` takes the inverse. Where the joint
+    moves, `pose` is the place of `to` with all its coordinates 0, and `sigma` says how sure that is.
     """
 
     name: str
@@ -133,7 +146,12 @@ class Constraint:
     pose: Pose = field(default_factory=Pose.identity)
     description: str = ""
     sigma: Sigma | None = None
-    joint: JointType = JointType.FIXED
+    joint: Joint = FIXED
+
+    @property
+    def at_rest(self) -> Pose:
+        """The place of `to` in `from_` while nobody tells where a joint that moves stands; else `pose`."""
+        return self.pose @ self.joint.motion(self.joint.rest) if self.joint.moves else self.pose
 
     def other_end(self, frame: str) -> str:
         """Return the full name of the frame at the other end. Raises ValueError for a frame not in it."""

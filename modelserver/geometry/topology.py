@@ -34,19 +34,22 @@ class Crossing:
 
     @property
     def pose(self) -> Pose:
-        """The pose of the far frame in the near one."""
-        return self.constraint.pose if self.forward else self.constraint.pose.inverse()
+        """The pose of the far frame in the near one, with a joint that moves where it rests."""
+        X_FT = self.constraint.at_rest
+        return X_FT if self.forward else X_FT.inverse()
 
 
 @dataclass(frozen=True, slots=True)
 class LoopClosure:
     """A constraint that joins two bodies which are joined already: going round comes back with `error`.
 
-    `bodies` are those of the loop; `error` is metres and radians.
+    `bodies` are those of the loop, `path` the constraints crossed going round; `error` is metres and radians, with
+    joints that move where they rest.
     """
 
     constraint: str
     bodies: tuple[str, ...]
+    path: tuple[Crossing, ...]
     error: tuple[float, float]
 
 
@@ -57,15 +60,14 @@ class Topology:
 
     def __init__(self, bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]):
         self._bodies = {body.name: body for body in bodies}
-        self._at: dict[str, Crossing] = {}
+        self._at: dict[str, list[Crossing]] = {}
         for constraint in constraints:
-            self._at[constraint.from_] = Crossing(constraint, forward=True)
-            self._at[constraint.to] = Crossing(constraint, forward=False)
+            self._at.setdefault(constraint.from_, []).append(Crossing(constraint, forward=True))
+            self._at.setdefault(constraint.to, []).append(Crossing(constraint, forward=False))
         self._exits: dict[str, list[Crossing]] = {body.name: [] for body in bodies}
         for body in bodies:
             for frame in body:
-                if (crossing := self._at.get(names.joined(body.name, frame.name))) is not None:
-                    self._exits[body.name].append(crossing)
+                self._exits[body.name] += self._at.get(names.joined(body.name, frame.name), ())
         self.assemblies = self._find_assemblies()
         """Groups of bodies that constraints join, each in breadth-first order; the root's comes first."""
 
@@ -113,8 +115,26 @@ class Topology:
                     used.add(name)
                     entered = names.split(crossing.leaves)[0]
                     error = (place[body] @ self.step(crossing)).distance(place[entered])
-                    closures.append(LoopClosure(name, _loop(reached, body, entered), error))
+                    back = self._way_back(reached, entered, body)
+                    closures.append(LoopClosure(name, _loop(reached, body, entered), (crossing, *back), error))
         return tuple(closures)
+
+    @staticmethod
+    def _way_back(reached: dict[str, tuple[str, Crossing]], start: str, target: str) -> tuple[Crossing, ...]:
+        """Return the crossings from one body to another along the tree that says how each was reached."""
+
+        def up(body: str) -> list[Crossing]:
+            line = []
+            while body in reached:
+                body, crossing = reached[body]
+                line.append(crossing)
+            return line
+
+        rising, falling = up(start), up(target)
+        while rising and falling and rising[-1] is falling[-1]:
+            rising.pop()
+            falling.pop()
+        return (*[Crossing(each.constraint, not each.forward) for each in rising], *reversed(falling))
 
     def step(self, crossing: Crossing) -> Pose:
         """Return the pose of the entered body's origin in the left body's origin."""
@@ -149,8 +169,7 @@ class Topology:
             return ()
         path: list[Crossing] = []
         on_path: set[str] = set()
-        stack = [iter(self._bodies[body].frames)]
-        here = [body]
+        stack = [self._ways_on(body)]
         visits = 0
         while stack:
             visits += 1
@@ -159,27 +178,31 @@ class Topology:
                     f"the depth-first search gave up after {DEPTH_FIRST_VISITS} frames: the model has too many "
                     "loops for it; use the breadth-first search"
                 )
-            each = next(stack[-1], None)
-            if each is None:
+            way = next(stack[-1], None)
+            if way is None:
                 stack.pop()
-                here.pop()
                 if path:
                     on_path.discard(path.pop().enters)
                 continue
-            name = names.joined(here[-1], each.name)
+            name, crossing = way
             if name == target:
                 return tuple(path)
-            crossing = self._at.get(name)
             if crossing is None or name in on_path or crossing.leaves in on_path:
                 continue
             path.append(crossing)
             if crossing.leaves == target:
                 return tuple(path)
             on_path.add(name)
-            entered = names.split(crossing.leaves)[0]
-            here.append(entered)
-            stack.append(iter(self._bodies[entered].frames))
+            stack.append(self._ways_on(names.split(crossing.leaves)[0]))
         return None
+
+    def _ways_on(self, body: str) -> Iterator[tuple[str, Crossing | None]]:
+        """Yield a body's frames in order, by their full names, each with None first and then with its constraints."""
+        for frame in self._bodies[body].frames:
+            name = names.joined(body, frame.name)
+            yield name, None
+            for crossing in self._at.get(name, ()):
+                yield name, crossing
 
 
 def _unwind(came_by: dict[str, tuple[str, Crossing]], start: str, target: str) -> tuple[Crossing, ...]:

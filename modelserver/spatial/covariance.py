@@ -53,5 +53,25 @@ def from_sigmas(position: tuple[float, float, float], rotation: tuple[float, flo
     return np.diag(np.square(np.array(position + rotation, dtype=float)))
 
 
+def fault(cov: Array) -> str:
+    """Return what keeps a matrix (6, 6) from being a covariance; empty where nothing does.
+
+    Numbers that went over a wire are symmetric and have no negative variance but for rounding.
+    """
+    if not np.isfinite(cov).all():
+        return "it has numbers that are not finite"
+    variances = np.diag(cov)
+    if float(variances.min()) < 0.0:
+        return "a variance in it is negative"
+    # metres and radians are not of one size: each is weighed by its own
+    scale = np.sqrt(variances) + 1e-150
+    weighed = cov / np.outer(scale, scale)
+    if float(np.abs(weighed - weighed.T).max()) > 1e-9:
+        return "it is not symmetric"
+    if float(np.linalg.eigvalsh(weighed).min()) < -1e-9:
+        return "a variance in it is negative along some direction"
+    return ""
+
+
 def _symmetric(cov: Array) -> Array:
     return np.asarray((cov + cov.T) / 2)

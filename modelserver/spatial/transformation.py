@@ -125,6 +125,22 @@ class Transformation:
         """The 7-vector `px py pz qs qx qy qz`."""
         return self.pose.state_vector
 
+    def doubted(self, reasons: int) -> Transformation:
+        """Return the same with more reasons against it."""
+        if not reasons & ~self.invalid_reasons:
+            return self
+        return Transformation(
+            self.frame_of_interest,
+            self.frame_of_reference,
+            self.pose,
+            self._covariance,
+            self.utime,
+            self.invalid_reasons | reasons,
+            self.pose_epoch,
+            self.origin_id,
+            self.model_revision,
+        )
+
     def inverse(self) -> Transformation:
         """Return the pose of the frame of reference in the frame of interest."""
 

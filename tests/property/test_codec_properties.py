@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support_wire import EXAMPLES, same
+from support_wire import EXAMPLES, many_poses, same
 
 import mslcm
 from modelserver import messages
@@ -20,6 +20,7 @@ from modelserver.spatial.pose import Pose
 from modelserver.spatial.transformation import Transformation
 from modelserver.wire.codec import decode, encode, type_names
 from modelserver.wire.fields import MAX_UTIME
+from modelserver.wire.moving import HOWS, KINDS
 
 int32 = st.integers(-(1 << 31), (1 << 31) - 1)
 int64 = st.integers(-(1 << 63), (1 << 63) - 1)
@@ -146,6 +147,21 @@ def states(draw: st.DrawFn) -> messages.NavigationState:
     )
 
 
+edges = st.builds(
+    messages.EdgeReport,
+    st.sampled_from(KINDS),
+    texts,
+    st.booleans(),
+    st.tuples(texts, texts),
+    st.builds(Pose, places, turns),
+    st.sampled_from(HOWS),
+    int64,
+    numbers,
+    texts,
+    st.lists(numbers, max_size=6).map(tuple),
+    numbers,
+    numbers,
+)
 failed = reply_headers(st.sampled_from([status for status in Status if status is not Status.OK]))
 fine = reply_headers(st.just(Status.OK))
 names = st.lists(st.tuples(texts, texts), max_size=4)
@@ -218,6 +234,52 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
         names,
     ),
     "get_history_reply_t": st.builds(messages.HistoryReply, fine | failed, st.lists(answers(), max_size=3).map(tuple)),
+    "get_transformations_request_t": st.builds(
+        messages.GetTransformations,
+        request_headers,
+        st.lists(st.tuples(frames, frames), min_size=1, max_size=4).map(tuple),
+        st.lists(utimes, max_size=5).map(tuple),
+        frames,
+        utimes,
+        st.booleans(),
+    ),
+    "get_transformations_reply_t": failed.map(messages.ManyReply)
+    | st.builds(
+        messages.ManyReply,
+        fine,
+        st.just(1),
+        st.just(3),
+        st.integers(0, 63),
+        st.integers(0, 1 << 30),
+        st.booleans().map(many_poses),
+    ).map(lambda reply: reply._replace(poses=reply.poses._replace(model_revision=reply.header.model_revision))),
+    "get_motion_request_t": st.builds(messages.GetMotion, request_headers, frames, frames, frames, times),
+    "get_motion_reply_t": failed.map(messages.MotionReply)
+    | st.builds(
+        messages.MotionReply, fine, st.builds(messages.MotionAnswer, answers(), texts, *[places] * 4, covariances)
+    ),
+    "get_explanation_request_t": st.builds(messages.GetExplanation, request_headers, frames, frames, times),
+    "get_explanation_reply_t": failed.map(messages.ExplanationReply)
+    | st.builds(
+        messages.ExplanationReply,
+        fine,
+        st.builds(messages.Explanation, answers(), st.lists(edges, max_size=3).map(tuple)),
+    ),
+    "reload_model_request_t": st.builds(messages.ReloadModel, request_headers, st.booleans()),
+    "reload_model_reply_t": st.builds(
+        messages.ReloadReply, fine | failed, texts, st.lists(texts, max_size=3).map(tuple)
+    ),
+    "set_state_vector_request_t": st.builds(messages.SetStateVector, request_headers, answers()),
+    "set_h_transform_request_t": st.builds(messages.SetHTransform, request_headers, answers()),
+    "acknowledgement_t": st.builds(messages.Acknowledgement, fine | failed),
+    "model_snapshot_t": st.builds(
+        messages.SnapshotPart,
+        utimes,
+        st.text(st.characters(exclude_categories=("Cs",)), max_size=64),
+        st.integers(0, 6),
+        st.integers(7, 100_000),
+        st.binary(max_size=100),
+    ),
     "health_t": st.builds(
         messages.Health,
         int64,

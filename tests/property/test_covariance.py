@@ -109,3 +109,17 @@ def test_transformations_carry_it_along():
     np.testing.assert_allclose(ab.inverse().covariance, covariance.invert(X_AB, cov_AB))
     assert (ab @ Transformation("c:c", "b:b", X_BC)).covariance is None
     assert Transformation("c:c", "b:b", X_BC).inverse().covariance is None
+
+
+def test_given_matrices_that_are_no_covariance_then_it_is_said_why():
+    good = np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.0])
+    assert covariance.fault(good) == ""
+    for row, column, value, said in (
+        (0, 0, np.nan, "not finite"),
+        (1, 2, np.inf, "not finite"),
+        (0, 1, 0.5, "not symmetric"),
+        (5, 5, -0.1, "negative"),
+    ):
+        bad = good.copy()
+        bad[row, column] = value
+        assert said in covariance.fault(bad)

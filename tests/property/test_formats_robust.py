@@ -4,12 +4,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support_formats import YAML, miro, models, tree, tree_frame
+from support_urdf import BOT_FRAMES, URDF
 
 from modelserver.errors import GeometryError, Severity
 from modelserver.formats import parse_model, save_model
 
 TREE = tree(tree_frame("$MRN"), tree_frame("Mast", "$MRN", X="1.5", Yaw="90"), tree_frame("Camera", "Mast", Roll="-3"))
-FILES = [YAML.encode(), miro().encode(), TREE.encode()]
+JOINTS = YAML.replace(
+    "xyz: [0, 0, 0.1]", "joint: {type: revolute, axis: [0, 1, 0], limits_deg: [-9, 9], mimic: Lift}"
+) + ("  Lift: {from: Cart:Mast, to: Camera:Origin, joint: {type: planar, limits: {x: [-1, .inf]}, sigma: {x: 1}}}\n")
+FILES = [YAML.encode(), miro().encode(), TREE.encode(), JOINTS.encode(), URDF.encode(), BOT_FRAMES.encode()]
 
 PIECES = [
     *(b"<", b">", b'"', b"/>", b"<!--", b"-->", b"<!DOCTYPE x [", b"&amp;", b"&x;", b"<parameter>", b"]]>", b"<?x?>"),
@@ -42,7 +46,31 @@ PIECES = [
         b"\xef\xbb\xbf",
         b"\xed\xa0\x80",
     ),
-    *(b"$MRN", b"${X}", b"World", b"Origin", b"Cart:Mast", b"name=", b"value=", b"Row1", b"xyz", b"quaternion"),
+    *(
+        b"$MRN",
+        b"${X}",
+        b"World",
+        b"Origin",
+        b"Cart:Mast",
+        b"name=",
+        b"value=",
+        b"Row1",
+        b"xyz",
+        b"quaternion",
+        b"mimic: ",
+        b"<link",
+        b"<joint",
+        b"<mimic",
+        b"lower=",
+        b"joint=",
+        b"fixed",
+        b"mast",
+        b"cart",
+        b"${x}",
+        b"<mesh/>",
+    ),
+    *(b"=", b";", b"coordinate_frames {", b"relative_to", b"rpy", b"body", b"local", b'"', b"(cast)"),
+    *(b"revolute", b"prismatic", b"planar", b"_deg", b"axis: ", b"sigma: ", b".inf", b"CameraFixed"),
 ]
 
 
@@ -74,22 +102,22 @@ def assert_loads_or_says_why(content, file=""):
 
 
 @given(mutated())
-@settings(max_examples=250)
+@settings(max_examples=400)
 def test_a_damaged_file_is_a_model_or_says_why_not(content):
     assert_loads_or_says_why(content)
 
 
-@given(st.binary(max_size=200), st.sampled_from(["", "a.xml", "a.yaml"]))
+@given(st.binary(max_size=200), st.sampled_from(["", "a.xml", "a.yaml", "a.urdf"]))
 def test_any_bytes_are_a_model_or_say_why_not(content, file):
     assert_loads_or_says_why(content, file)
 
 
-@given(st.text(max_size=200), st.sampled_from(["", "bodies: ", "<config>"]))
+@given(st.text(max_size=200), st.sampled_from(["", "bodies: ", "<config>", "<robot>", "coordinate_frames {"]))
 def test_any_text_is_a_model_or_says_why_not(text, before):
     assert_loads_or_says_why((before + text).encode())
 
 
-@pytest.mark.parametrize("form", ["yaml", "miro", "miro-frames"])
+@pytest.mark.parametrize("form", ["yaml", "miro", "miro-frames", "urdf"])
 @given(model=models(), part=st.floats(0, 1))
 @settings(max_examples=10)
 def test_a_file_cut_short_is_a_model_or_says_why_not(form, model, part):

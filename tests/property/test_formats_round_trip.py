@@ -18,10 +18,14 @@ def folded(text):
     return " ".join("".join(each if each.isprintable() else " " for each in text).split())
 
 
-def assert_same_poses(one, other):
-    """The poses as stored, to 1e-12: what the file holds, not only what follows from it."""
+def assert_same_poses(one, other, at_rest=False):
+    """The poses as stored, to 1e-12: what the file holds, not only what follows from it.
+
+    With `at_rest` the first one's joints stand where they rest, for the other has none.
+    """
     pairs = [(a.pose, b.pose) for x, y in zip(one.bodies, other.bodies, strict=True) for a, b in zip(x, y, strict=True)]
-    pairs += [(a.pose, b.pose) for a, b in zip(one.constraints, other.constraints, strict=True)]
+    joined = zip(one.constraints, other.constraints, strict=True)
+    pairs += [(a.at_rest if at_rest else a.pose, b.pose) for a, b in joined]
     pairs += [(a.pose or Pose(), b.pose or Pose()) for a, b in zip(one.bodies, other.bodies, strict=True)]
     for a, b in pairs:
         np.testing.assert_allclose(a.matrix, b.matrix, rtol=0, atol=1e-12)
@@ -57,11 +61,13 @@ def test_yaml_gives_back_everything(model):
 def test_miro_xml_gives_back_all_transforms_and_says_what_it_lost(model):
     saved = save_model(model, "miro")
     again = read(saved.text)
-    assert_same_poses(model, again)
+    assert_same_poses(model, again, at_rest=True)
     assert_same_transforms(model, again)
+    assert not again.joints
     frames = [frame for body in model.bodies for frame in body]
     lost = " ".join(saved.losses)
     assert ("sigmas of" in lost) == any(each.sigma for each in (*frames, *model.constraints))
+    assert ("joints of" in lost) == bool(model.joints)
     assert ("inertia" in lost) == any(body.inertia is not None for body in model.bodies)
     assert [folded(body.description) for body in model.bodies] == [body.description for body in again.bodies]
     assert [frame.name for frame in frames] == [frame.name for body in again.bodies for frame in body]
@@ -70,7 +76,9 @@ def test_miro_xml_gives_back_all_transforms_and_says_what_it_lost(model):
 @given(models())
 @settings(max_examples=25)
 def test_a_frame_tree_has_every_frame_at_its_place(model):
-    again = read(save_model(model, "miro-frames").text)
+    saved = save_model(model, "miro-frames")
+    assert any("joints of" in loss for loss in saved.losses) == bool(model.joints)
+    again = read(saved.text)
     frames = {f"{body.name}:{frame.name}": frame.name for body in again.bodies for frame in body}
     by_instance = {frame: full for full, frame in frames.items() if frame != "Origin"}
     by_instance |= {body.name: f"{body.name}:Origin" for body in again.bodies}

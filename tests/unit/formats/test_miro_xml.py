@@ -249,9 +249,11 @@ def test_from_equals_to_is_refused():
     assert "two different frames" in problem.fix
 
 
-def test_a_frame_with_two_constraints_is_refused_and_both_are_named():
+def test_given_strict_then_a_frame_with_two_constraints_is_refused_and_both_are_named():
     both = [miro_constraint("A", "Cart:Mast", "Camera:Origin"), miro_constraint("B", "Cart:Mast", "Laser:Origin")]
-    problem = only_problem(miro([*CART_AND, miro_body("Laser")], both))
+    text = miro([*CART_AND, miro_body("Laser")], both)
+    assert read(text).problems == ()
+    problem = only_problem(text, strict=True)
     assert "already has constraint A" in problem.message
     assert problem.element == "constraint B"
     assert "add a frame of its own" in problem.fix
@@ -265,13 +267,14 @@ def test_orphans_load_with_a_warning_and_repair_drops_them():
     assert read(text, repair=True).get_body_list() == ["Cart", "Camera"]
 
 
-def test_cyclic_constraints_load_with_a_warning_and_every_search_ends():
+def test_cyclic_constraints_that_close_load_with_a_note_and_every_search_ends():
     bodies = [miro_body(name, miro_frame("a"), miro_frame("b")) for name in "XYZ"]
     joints = [miro_constraint(f"C{n}", f"{a}:b", f"{b}:a") for n, (a, b) in enumerate(("XY", "YZ", "ZX"))]
     text = miro(bodies, joints)
-    problem = only_problem(text, Severity.WARNING)
-    assert "closes a loop through" in problem.message
     model = read(text)
+    (problem,) = model.problems
+    assert problem.severity is Severity.NOTE
+    assert "closes a loop through" in problem.message
     for search in Search:
         assert model.find_path("Z:a", "X:a", search)
 

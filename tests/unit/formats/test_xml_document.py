@@ -76,7 +76,7 @@ def test_a_file_named_xml_is_read_as_xml_whatever_it_begins_with():
     ("root", "said"),
     [
         ("<html><body/></html>", "the outermost element is html, not config"),
-        ('<robot name="x"><link name="y"/></robot>', "URDF"),
+        ('<robot name="x"/>', "there is no link"),
         ("<sdf/>", "SDF"),
         ("<config/>", "there is no geometry in this file"),
         ("<config><config_group name='test'/></config>", "compile-time"),

@@ -249,7 +249,6 @@ def test_a_bad_frame_is_named_with_its_line_place_and_remedy(text, said, fix):
         ("from: Cart:Mast", "from: [Cart, Mast]", "from is a text, got a list", "from:"),
         ("from: Cart:Mast", "from: Cart:Mats", "From names frame 'Mats'", "write Cart:Mast"),
         ("from: Cart:Mast", "from: Camera:Origin", "From equals To", "two different frames"),
-        ("    xyz: [0, 0, 0.1]", "    joint: revolute", "joint 'revolute' is not served yet; only fixed is", "fixed"),
         ("bodies:", "boddies:", "unknown key 'boddies'", "write bodies"),
         ("geometry/1", "geometry/2", "'geometry/2' is not read here", "write modelserver: geometry/1"),
         (

@@ -1,0 +1,240 @@
+"""Routes: the way from one frame to another, ready to be walked again and again as the joints on it move.
+
+What is bolted together is folded into one pose before each joint, so that a lookup costs what moves and no more. The
+edges are kept beside, for those who ask how sure an answer is, or what it rests on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from modelserver.geometry.joint import ROUNDING, Coordinates, Joint, JointType
+from modelserver.geometry.parts import BodyFrame, Sigma
+from modelserver.geometry.sureness import Place, Sureness
+from modelserver.geometry.topology import Crossing
+from modelserver.spatial import so3
+from modelserver.spatial.chain import Link
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.so3 import Array, Quaternion
+
+
+class EdgeKind(StrEnum):
+    """What an edge of a path is."""
+
+    FRAME = "frame"
+    """From a body's origin to one of its frames."""
+    CONSTRAINT = "constraint"
+    """From the `from` frame of a constraint to its `to` frame; of a joint that moves, the place where it is mounted."""
+    JOINT = "joint"
+    """How far a joint has moved."""
+    VEHICLE = "vehicle"
+    """From a world frame to the vehicle."""
+
+
+class Edge(NamedTuple):
+    """One edge of a path: passed from its near to its far end where `forward`.
+
+    `pose` is that of the far in the near end; for a joint that moves it is the identity, and `joint` says how. `sigma`
+    is that of a survey, None where none is stated. `leader` is the joint whose coordinates place one that follows,
+    empty for one that does not.
+    """
+
+    kind: EdgeKind
+    name: str
+    forward: bool
+    pose: Pose
+    sigma: Sigma | None = None
+    joint: Joint | None = None
+    leader: str = ""
+
+    @property
+    def survey_factor(self) -> Array | None:
+        """The factor (6, n) of a fixed edge's covariance; None where a pose that is none states no sigma."""
+        if self.sigma is not None:
+            return np.diag((*self.sigma.position, *self.sigma.rotation))
+        # two frames that are one by definition are so exactly
+        return _EXACT if self.pose == _IDENTITY else None
+
+
+class Leg(NamedTuple):
+    """A joint on a route: `before` leads to it from the joint before, or from the frame of reference."""
+
+    before: Pose
+    name: str
+    joint: Joint
+    forward: bool
+    span: tuple[float, float] | None = None
+    """Of a joint with one coordinate its limits, widened by rounding."""
+    turning: tuple[Quaternion, Quaternion] | None = None
+    """Of a revolute joint the products of `before` with 1 and with its axis; cos and sin of half its angle mix them."""
+
+
+class Route:
+    """The way from `frame_of_reference` to `frame_of_interest`; see the module. Immutable by habit: nothing here sets.
+
+    `legs` are the joints on it that move, `last` leads from the last of them to the frame of interest. `closes_loop`:
+    there is another way, and this is the shortest.
+    """
+
+    __slots__ = ("_sureness", "closes_loop", "edges", "last", "legs")
+
+    def __init__(self, edges: Sequence[Edge], closes_loop: bool = False):
+        self.edges = tuple(edges)
+        self.closes_loop = closes_loop
+        self._sureness: Sureness | None = None
+        legs: list[Leg] = []
+        pose = Pose.identity()
+        for edge in self.edges:
+            if edge.joint is not None:
+                legs.append(Leg(pose, edge.name, edge.joint, edge.forward, _span(edge.joint), _turning(pose, edge)))
+                pose = Pose.identity()
+            else:
+                pose = pose @ (edge.pose if edge.forward else edge.pose.inverse())
+        self.legs = tuple(legs)
+        self.last = pose
+
+    @property
+    def rest(self) -> tuple[Coordinates, ...]:
+        """Where the joints stand while nobody tells."""
+        return tuple([leg.joint.rest for leg in self.legs])
+
+    def places(self, positions: Sequence[Coordinates]) -> list[Place]:
+        """Return where, in the frame of reference, the frame behind each leg's joint stands, itself first, and the end.
+
+        Quaternions are of unit length up to rounding.
+        """
+        px, py, pz = 0.0, 0.0, 0.0
+        q = so3.IDENTITY
+        places: list[Place] = [((px, py, pz), q)]
+        for leg, position in zip(self.legs, positions, strict=True):
+            x, y, z = so3.rotate(q, leg.before._p)
+            px, py, pz = px + x, py + y, pz + z
+            turning = leg.turning
+            if turning is not None:
+                # most joints there are: before and turn are one product, a (cos) + b (sin)
+                half = 0.5 * position[0]
+                c, s = math.cos(half), math.sin(half)
+                (aw, ax, ay, az), (bw, bx, by, bz) = turning
+                q = so3.multiply(q, (aw * c + bw * s, ax * c + bx * s, ay * c + by * s, az * c + bz * s))
+            else:
+                q = so3.multiply(q, leg.before._q)
+                moved = leg.joint.motion(position)
+                if not leg.forward:
+                    moved = moved.inverse()
+                x, y, z = so3.rotate(q, moved._p)
+                px, py, pz = px + x, py + y, pz + z
+                q = so3.multiply(q, moved._q)
+            places.append(((px, py, pz), q))
+        x, y, z = so3.rotate(q, self.last._p)
+        places.append(((px + x, py + y, pz + z), so3.multiply(q, self.last._q)))
+        return places
+
+    def pose(self, positions: Sequence[Coordinates]) -> Pose:
+        """Return the pose of the frame of interest in that of reference, with each leg's joint at its position."""
+        if not self.legs:
+            return self.last
+        return self.end(self.places(positions))
+
+    @staticmethod
+    def end(places: Sequence[Place]) -> Pose:
+        """Return the pose of the last of `places`."""
+        (x, y, z), q = places[-1]
+        return Pose._of((x + 0.0, y + 0.0, z + 0.0), so3.normalized(q))
+
+    def covariance(
+        self,
+        positions: Sequence[Coordinates],
+        sigmas: Sequence[Coordinates],
+        unstated_is_exact: bool = False,
+        places: Sequence[Place] | None = None,
+    ) -> Array | None:
+        """Return the covariance (6, 6) of `pose`, that of `links`; None where a part states none.
+
+        With `unstated_is_exact` a survey that states none counts as exact; a joint never does.
+
+        `sigmas` as in `links`; `places` spares working them out again.
+        """
+        sureness = self._sureness
+        if sureness is None:
+            sureness = self._sureness = Sureness(self.edges)
+        if any(math.isnan(each) for leg in sigmas for each in leg) or not (unstated_is_exact or sureness.stated):
+            return None
+        return sureness.covariance(self.places(positions) if places is None else places, positions, sigmas)
+
+    def links(self, positions: Sequence[Coordinates], sigmas: Sequence[Coordinates], stamp: int = 0) -> list[Link]:
+        """Return the chain of the route, link by link, with what each is unsure of.
+
+        `sigmas` are those of the legs' coordinates, nan where nobody told; of a joint that follows, its multiplier
+        times its leader's, sign and all: the two err as one. `stamp` is told apart in the sources of joints: what a
+        joint measured at two instants are two errors, what was surveyed is one.
+        """
+        links = []
+        number = 0
+        for edge in self.edges:
+            if edge.joint is None:
+                links.append(Link(edge.pose, edge.forward, edge.survey_factor, (edge.kind, edge.name)))
+                continue
+            position, sigma = positions[number], sigmas[number]
+            number += 1
+            factor = None
+            if not any(map(np.isnan, sigma)):
+                factor = edge.joint.jacobian(position) * np.array(sigma)
+            source = (edge.kind, edge.leader or edge.name, stamp)
+            links.append(Link(edge.joint.motion(position), edge.forward, factor, source))
+        return links
+
+
+def edges_along(
+    path: Iterable[Crossing],
+    frame: Callable[[str], BodyFrame],
+    frame_of_interest: str,
+    frame_of_reference: str,
+) -> list[Edge]:
+    """Return the edges of a path from one frame to another: frames of bodies, constraints, and joints that move.
+
+    `frame` gives a frame by its full name. A frame that stands at its body's origin by definition is no edge.
+    """
+    edges: list[Edge] = []
+    inside, name = frame(frame_of_reference), frame_of_reference
+
+    def within(leaving: BodyFrame, leaving_name: str) -> None:
+        if leaving is not inside:
+            for each, full, forward in ((inside, name, False), (leaving, leaving_name, True)):
+                if each.pose != _IDENTITY or each.sigma is not None:
+                    edges.append(Edge(EdgeKind.FRAME, full, forward, each.pose, each.sigma))
+
+    for crossing in path:
+        within(frame(crossing.enters), crossing.enters)
+        each = crossing.constraint
+        crossed = [Edge(EdgeKind.CONSTRAINT, each.name, crossing.forward, each.pose, each.sigma)]
+        if each.joint.moves:
+            moved = Edge(EdgeKind.JOINT, each.name, crossing.forward, _IDENTITY, joint=each.joint)
+            crossed.insert(1 if crossing.forward else 0, moved)
+        edges += crossed
+        inside, name = frame(crossing.leaves), crossing.leaves
+    within(frame(frame_of_interest), frame_of_interest)
+    return edges
+
+
+def _span(joint: Joint) -> tuple[float, float] | None:
+    if joint.count != 1:
+        return None
+    low = joint.lower[0] - ROUNDING if joint.lower else -math.inf
+    return low, joint.upper[0] + ROUNDING if joint.upper else math.inf
+
+
+def _turning(before: Pose, edge: Edge) -> tuple[Quaternion, Quaternion] | None:
+    if edge.joint is None or edge.joint.type is not JointType.REVOLUTE:
+        return None
+    x, y, z = edge.joint.axis
+    axis = (0.0, x, y, z) if edge.forward else (0.0, -x, -y, -z)
+    return before._q, so3.multiply(before._q, axis)
+
+
+_IDENTITY = Pose.identity()
+_EXACT = np.zeros((6, 1))

@@ -1,0 +1,97 @@
+"""What changes from one model to another, told line by line."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from modelserver.geometry import Joint, JointType, ModelBuilder, Sigma
+from modelserver.geometry.difference import changes
+from modelserver.geometry.model import Model
+from modelserver.spatial import Pose
+
+NOD = Joint(JointType.REVOLUTE, (0.0, 1.0, 0.0))
+
+
+def cart(
+    mast: Pose = Pose((0.5, 0.0, 1.0)),  # noqa: B008
+    mounted: Pose = Pose((0.0, 0.0, 0.1)),  # noqa: B008
+    sigma: Sigma | None = None,
+    joint: Joint | None = None,
+    lens: str = "Lens",
+    camera: str = "Camera",
+    more: str = "",
+    description: str = "",
+) -> Model:
+    builder = ModelBuilder("cart")
+    body = builder.body("Cart", description=description)
+    body.frame("Base").frame("Mast", mast, sigma=sigma)
+    builder.body(camera).frame("Origin").frame(lens)
+    if more:
+        builder.body(more).frame("Origin")
+    extra = {} if joint is None else {"joint": joint}
+    builder.constraint("Mounted", "Cart:Mast", f"{camera}:Origin", mounted, sigma=sigma, **extra)
+    return builder.build()
+
+
+@pytest.mark.parametrize(
+    ("new", "told"),
+    [
+        (cart(), ()),
+        (cart(mast=Pose((0.5 + 1e-13, 0.0, 1.0))), ("descriptions or the order of what is listed",)),
+        (cart(description="as it stands"), ("descriptions or the order of what is listed",)),
+        (cart(mast=Pose((0.5, 0.0, 1.002))), ("frame Cart:Mast moves by 2 mm and 0 deg",)),
+        (cart(mast=Pose.from_rpy((0.5, 0, 1), yaw=math.radians(3))), ("frame Cart:Mast moves by 0 mm and 3 deg",)),
+        (cart(mounted=Pose((0.0, 0.3, 0.5))), ("constraint Mounted moves by 500 mm and 0 deg",)),
+        (
+            cart(sigma=Sigma((0.1,) * 3, (0.1,) * 3)),
+            ("frame Cart:Mast states another sigma", "constraint Mounted states another sigma"),
+        ),
+        (cart(joint=NOD), ("the joint of constraint Mounted is revolute, it was fixed",)),
+        (cart(lens="Glass"), ("frame Camera:Lens is gone", "frame Camera:Glass is new")),
+        (
+            cart(camera="Eye"),
+            (
+                "body Camera is gone",
+                "body Eye is new",
+                "constraint Mounted joins Cart:Mast and Eye:Origin, it joined Cart:Mast and Camera:Origin",
+            ),
+        ),
+        (cart(more="Lamp"), ("body Lamp is new",)),
+    ],
+)
+def test_given_another_model_then_each_change_is_told_in_its_line(new: Model, told: tuple[str, ...]) -> None:
+    assert changes(cart(), new) == told
+
+
+def test_given_a_joint_with_other_limits_then_its_joint_changes() -> None:
+    limited = Joint(JointType.REVOLUTE, (0.0, 1.0, 0.0), (-1.0,), (1.0,))
+    assert changes(cart(joint=NOD), cart(joint=limited)) == ("the joint of constraint Mounted changes",)
+
+
+def test_given_constraints_that_come_and_go_and_another_root_then_it_is_told() -> None:
+    def pair(first: str, second: str, constraint: str) -> Model:
+        builder = ModelBuilder("pair")
+        builder.body(first).frame("Origin")
+        builder.body(second).frame("Origin")
+        builder.constraint(constraint, "A:Origin", "B:Origin")
+        return builder.build()
+
+    assert changes(pair("A", "B", "Weld"), pair("B", "A", "Bolt")) == (
+        "constraint Weld is gone",
+        "constraint Bolt is new",
+        "the root body is B, it was A",
+    )
+
+
+def test_given_mass_that_changes_then_it_is_told() -> None:
+    def weighed(mass: float) -> Model:
+        builder = ModelBuilder("weight")
+        inertia = [[0.0] * 6 for _ in range(6)]
+        for n in range(3):
+            inertia[n][n], inertia[n + 3][n + 3] = mass, 1.0
+        builder.body("Cart", inertia=inertia).frame("Base")
+        return builder.build()
+
+    assert changes(weighed(1.0), weighed(2.0)) == ("body Cart has another inertia",)
