@@ -50,6 +50,7 @@ types: $(DEV_STAMP)
 	$(BIN)/python tools/settings_page.py
 
 bench: $(DEV_STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,bench]'
 	$(BIN)/python -m benchmarks
 
 clean:

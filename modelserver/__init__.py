@@ -35,9 +35,11 @@ from typing import TYPE_CHECKING
 from modelserver.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from modelserver.client.mirror import PlatformMirror as PlatformMirror
     from modelserver.client.remote import Platform as Platform
     from modelserver.errors import BusError as BusError
     from modelserver.errors import ConfigError as ConfigError
+    from modelserver.errors import ForbiddenError as ForbiddenError
     from modelserver.errors import FrameMismatchError as FrameMismatchError
     from modelserver.errors import GeometryError as GeometryError
     from modelserver.errors import LimitError as LimitError
@@ -46,9 +48,11 @@ if TYPE_CHECKING:
     from modelserver.errors import NoPoseError as NoPoseError
     from modelserver.errors import NoServerError as NoServerError
     from modelserver.errors import NotConnectedError as NotConnectedError
+    from modelserver.errors import OutOfDateError as OutOfDateError
     from modelserver.errors import Problem as Problem
     from modelserver.errors import QueryError as QueryError
     from modelserver.errors import RefusedError as RefusedError
+    from modelserver.errors import RejectedError as RejectedError
     from modelserver.errors import Severity as Severity
     from modelserver.errors import Status as Status
     from modelserver.errors import TooNewError as TooNewError
@@ -57,12 +61,14 @@ if TYPE_CHECKING:
     from modelserver.errors import UnknownFrameError as UnknownFrameError
     from modelserver.formats import load_model as load_model
     from modelserver.geometry.builder import ModelBuilder as ModelBuilder
+    from modelserver.geometry.joint import Joint as Joint
+    from modelserver.geometry.joint import JointType as JointType
+    from modelserver.geometry.joint import Mimic as Mimic
     from modelserver.geometry.model import Model as Model
     from modelserver.geometry.model import Search as Search
     from modelserver.geometry.parts import Body as Body
     from modelserver.geometry.parts import BodyFrame as BodyFrame
     from modelserver.geometry.parts import Constraint as Constraint
-    from modelserver.geometry.parts import JointType as JointType
     from modelserver.geometry.parts import Sigma as Sigma
     from modelserver.messages import Invalid as Invalid
     from modelserver.messages import Policy as Policy
@@ -71,10 +77,12 @@ if TYPE_CHECKING:
     from modelserver.spatial.transformation import Transformation as Transformation
 
 _HOMES = {
+    "modelserver.client.mirror": ("PlatformMirror",),
     "modelserver.client.remote": ("Platform",),
     "modelserver.errors": (
         "BusError",
         "ConfigError",
+        "ForbiddenError",
         "FrameMismatchError",
         "GeometryError",
         "LimitError",
@@ -83,9 +91,11 @@ _HOMES = {
         "NoPoseError",
         "NoServerError",
         "NotConnectedError",
+        "OutOfDateError",
         "Problem",
         "QueryError",
         "RefusedError",
+        "RejectedError",
         "Severity",
         "Status",
         "TooNewError",
@@ -96,7 +106,8 @@ _HOMES = {
     "modelserver.formats": ("load_model",),
     "modelserver.geometry.builder": ("ModelBuilder",),
     "modelserver.geometry.model": ("Model", "Search"),
-    "modelserver.geometry.parts": ("Body", "BodyFrame", "Constraint", "JointType", "Sigma"),
+    "modelserver.geometry.joint": ("Joint", "JointType", "Mimic"),
+    "modelserver.geometry.parts": ("Body", "BodyFrame", "Constraint", "Sigma"),
     "modelserver.messages": ("Invalid", "Policy", "Quality"),
     "modelserver.spatial.pose": ("Pose",),
     "modelserver.spatial.transformation": ("Transformation",),

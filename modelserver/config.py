@@ -66,6 +66,7 @@ class PublishConfig:
     rate_hz: poses a second in timer mode. health_hz: health reports a second.
     state_hz: how often a second the filter's whole state goes out; 0 = never. decisions: whether it is told, with the
         event that settles it, which measurements were used and which not.
+    snapshot_s: seconds between broadcasts of the whole geometry, for mirrors and logs that come late.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
@@ -74,11 +75,17 @@ class PublishConfig:
     health_hz: float = 1.0
     state_hz: float = 5.0
     decisions: bool = True
+    snapshot_s: float = 5.0
 
     def __post_init__(self) -> None:
         _refuse(
             f"{name} is between {low:g} and {high:g}, got {getattr(self, name):g}"
-            for name, low, high in (("rate_hz", 0.1, 1000.0), ("health_hz", 0.01, 100.0), ("state_hz", 0.0, 50.0))
+            for name, low, high in (
+                ("rate_hz", 0.1, 1000.0),
+                ("health_hz", 0.01, 100.0),
+                ("state_hz", 0.0, 50.0),
+                ("snapshot_s", 0.5, 3600.0),
+            )
             if not low <= getattr(self, name) <= high
         )
 
@@ -163,9 +170,25 @@ class AidingConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class JointsConfig:
+    """The joints of the geometry that move: the channel that their drivers tell of them on.
+
+    latency: seconds by which the stamps are later than the measurement; subtracted from each stamp.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    channel: str = "JOINTS"
+    latency: float = 0.0
+
+    def __post_init__(self) -> None:
+        _refuse(_channel_problems(self.channel) + _latency_problems(self.latency))
+
+
+@dataclass(frozen=True, slots=True)
 class SensorsConfig:
     """Which sensors there are. Where they sit stands in the geometry file alone.
 
+    joints: where the joints are told of; heard wherever the geometry has any that move.
     aiding: further sources, each by the name that it gives itself in its messages (header.source).
     """
 
@@ -173,13 +196,16 @@ class SensorsConfig:
     gps: GpsConfig | None = None
     imu: SensorConfig | None = None
     wheels: WheelsConfig | None = None
+    joints: JointsConfig = field(default_factory=JointsConfig)
     aiding: dict[str, AidingConfig] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in self.aiding:
             if not (0 < len(name) <= MAX_NAME and name.isprintable()):
                 raise ValueError(f"aiding names sources with 1 to {MAX_NAME} printable characters, got {shown(name)}")
-        channels = [each.channel for each in (self.gps, self.imu, self.wheels, *self.aiding.values()) if each]
+        channels = [
+            each.channel for each in (self.gps, self.imu, self.wheels, self.joints, *self.aiding.values()) if each
+        ]
         twice = {channel for channel in channels if channels.count(channel) > 1}
         if twice:
             raise ValueError(f"each sensor has a channel of its own; {shown(min(twice))} is given twice")
@@ -266,6 +292,19 @@ class LimitsConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class CommandsConfig:
+    """What may be asked of the service from the bus that changes what it knows. Nothing by default.
+
+    reload: reading the geometry file anew. set_pose: telling localization where the vehicle is.
+    Whoever can speak on the bus can then do it.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    reload: bool = False
+    set_pose: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class VehicleConfig:
     """A vehicle: its geometry, its sensors, and how the service runs for it.
 
@@ -291,6 +330,7 @@ class VehicleConfig:
     origin: OriginConfig = field(default_factory=OriginConfig)
     localization: LocalizationConfig = field(default_factory=LocalizationConfig)
     limits: LimitsConfig = field(default_factory=LimitsConfig)
+    commands: CommandsConfig = field(default_factory=CommandsConfig)
     drivers: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -30,6 +30,8 @@ class Status(IntEnum):
     REFUSED_LOAD = 8
     LIMIT = 9
     INTERNAL = 10
+    FORBIDDEN = 11
+    REJECTED = 12
 
 
 class Severity(StrEnum):
@@ -253,6 +255,18 @@ class LimitError(QueryError):
     status = Status.LIMIT
 
 
+class ForbiddenError(QueryError):
+    """The vehicle file does not allow it; the message names the setting."""
+
+    status = Status.FORBIDDEN
+
+
+class RejectedError(QueryError):
+    """What was given was looked at and not taken: a geometry that does not suit, a pose that cannot be; all stays."""
+
+    status = Status.REJECTED
+
+
 class ServerError(QueryError):
     """The server failed on its side; its log holds the cause."""
 
@@ -271,6 +285,10 @@ class NoServerError(ModelServerError, TimeoutError):
     """No reply came in time: no server on this bus, or a bus that drops everything."""
 
 
+class OutOfDateError(NoServerError):
+    """A mirror has not heard enough of the service, or not for longer than its limit: it knows no more than then."""
+
+
 _BY_STATUS: dict[int, type[QueryError]] = {
     cls.status: cls
     for cls in (
@@ -283,6 +301,8 @@ _BY_STATUS: dict[int, type[QueryError]] = {
         MalformedRequestError,
         RefusedError,
         LimitError,
+        ForbiddenError,
+        RejectedError,
         ServerError,
     )
 }

@@ -246,6 +246,18 @@ class Geodesy:
             so3.multiply(about_up(self.convergence(latitude, longitude)), q_local),
         )
 
+    def pose_in_enu(self, X_utm: Pose) -> Pose:
+        """Return the pose in World:ENU of a pose in World:UTM: what `pose_in_utm` does, backwards.
+
+        Raises GeodesyError for one out of reach of the zone.
+        """
+        east, north, height = self.origin.initial_utm
+        x, y, z = X_utm.xyz
+        place = self.geodetic_from_utm(east + x, north + y, height + z)
+        local = LocalFrame.at(*place)
+        q_local = so3.multiply(about_up(-self.convergence(*place[:2])), X_utm.wxyz)
+        return Pose(self.tangent.from_ecef(local.ecef), so3.multiply(self.tangent.rotation_of(local), q_local))
+
     def relative(self, utm: Vector3) -> Vector3:
         """Return absolute grid coordinates as metres from the origin: a position in World:UTM."""
         east, north, height = self.origin.initial_utm

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from typing import Protocol
+from array import array
+from bisect import bisect_left, bisect_right
+from typing import Final, Protocol
+
+import numpy as np
+import numpy.typing as npt
 
 from modelserver.errors import TooNewError, TooOldError
-from modelserver.messages import VALID, Estimate, Invalid, Quality
+from modelserver.messages import VALID, Estimate, Invalid, Quality, VehicleMotion
 from modelserver.spatial.pose import Pose
+from modelserver.spatial.so3 import Vector3
+
+LONGEST_STEP_S: Final = 0.5
+"""Between estimates farther apart nothing is told of how the turn rate changed."""
+
+
+STEP_US: Final = 4000
+"""Microseconds between the estimates that are worth holding, at least: a flood must not fill the memory."""
 
 
 class Later(Protocol):
@@ -33,7 +45,7 @@ class History:
     __slots__ = ("_end", "_estimates", "_horizon", "_start", "_times")
 
     def __init__(self, seconds: float):
-        self._times: list[int] = []
+        self._times: array[int] = array("q")
         self._estimates: list[Estimate | Later] = []
         self._start = 0
         self._end = 0
@@ -92,6 +104,17 @@ class History:
         longer._start, longer._end = start, end + 1
         return longer
 
+    def holds_enough(self, utime: int) -> bool:
+        """Return whether an estimate for a time would come too soon after the newest to be worth holding."""
+        return len(self) > 0 and 0 < utime - self.last < STEP_US
+
+    def lasting(self, seconds: float) -> History:
+        """Return what is held now, to be held for another time from the next estimate on."""
+        other = History.__new__(History)
+        other._times, other._estimates = self._times, self._estimates
+        other._start, other._end, other._horizon = self._start, self._end, round(seconds * 1e6)
+        return other
+
     def at(self, utime: int) -> Estimate:
         """Return the estimate at a time, interpolated between the two around it.
 
@@ -105,11 +128,35 @@ class History:
             return before
         return interpolated(before, self._at(after), utime)
 
+    def turn_acceleration(self, utime: int) -> Vector3 | None:
+        """Return how the turn rate of the vehicle changes around a time, rad/s2 along its own axes; None: not known."""
+        after = min(max(bisect_left(self._times, utime, self._start, self._end), self._start + 1), self._end - 1)
+        if after <= self._start:
+            return None
+        a, b = self._at(after - 1), self._at(after)
+        span = (b.utime - a.utime) * 1e-6
+        if a.motion is None or b.motion is None or a.pose_epoch != b.pose_epoch or not span <= LONGEST_STEP_S:
+            return None
+        (x, y, z), (u, v, w) = a.motion.rate, b.motion.rate
+        return ((u - x) / span, (v - y) / span, (w - z) / span)
+
     def held(self, utime: int) -> Estimate:
         """Return the newest estimate not newer than a time. Raises TooOldError."""
         if self._times[self._start] > utime:
             raise TooOldError(self._span(utime, "before"))
         return self._at(bisect_right(self._times, utime, self._start, self._end) - 1)
+
+    def around(self, utimes: npt.NDArray[np.int64]) -> tuple[list[Estimate], npt.NDArray[np.intp]]:
+        """Return the estimates around many times within what is held, and for each time which of them is before it.
+
+        The one behind that is the next of them, where there is one; others than these are not worked out.
+        """
+        if not len(utimes):
+            return [self.newest], np.zeros(0, dtype=np.intp)
+        times = np.frombuffer(self._times[self._start : self._end], dtype=np.int64)
+        before = np.maximum(np.searchsorted(times, utimes, side="right") - 1, 0)
+        needed = np.unique(np.concatenate((before, np.minimum(before + 1, len(times) - 1))))
+        return [self._at(self._start + index) for index in needed.tolist()], np.searchsorted(needed, before)
 
     def following(self, utime: int) -> Estimate | None:
         """Return the oldest estimate newer than a time, None where there is none."""
@@ -156,6 +203,26 @@ def interpolated(a: Estimate, b: Estimate, utime: int) -> Estimate:
         max(a.horizontal_bound, b.horizontal_bound),
         max(a.heading_bound, b.heading_bound),
         b.seconds_to_limit,
+        _between(a.motion, b.motion, fraction),
+        b.odom_walks,
+    )
+
+
+def _between(a: VehicleMotion | None, b: VehicleMotion | None, fraction: float) -> VehicleMotion | None:
+    """Return the motion between two instants: each number linear in time."""
+    if a is None or b is None:
+        return None
+
+    def mixed(first: Vector3, second: Vector3) -> Vector3:
+        (x, y, z), (u, v, w) = first, second
+        return (x + (u - x) * fraction, y + (v - y) * fraction, z + (w - z) * fraction)
+
+    return VehicleMotion(
+        mixed(a.velocity, b.velocity),
+        mixed(a.rate, b.rate),
+        mixed(a.acceleration, b.acceleration),
+        b.felt_at,
+        b.covariance,
     )
 
 
@@ -175,4 +242,6 @@ def at_time(estimate: Estimate, utime: int, flag: Quality, invalid: Invalid = VA
         estimate.horizontal_bound,
         estimate.heading_bound,
         estimate.seconds_to_limit,
+        estimate.motion,
+        estimate.odom_walks,
     )

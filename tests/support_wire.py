@@ -11,18 +11,25 @@ import numpy as np
 from modelserver.errors import Status
 from modelserver.messages import (
     AbsolutePoseSample,
+    Acknowledgement,
     ChannelHealth,
     Decision,
     Direction,
     DriverHealth,
     DriverPhase,
+    EdgeReport,
+    Explanation,
+    ExplanationReply,
     FixType,
     GetBodyFrameList,
     GetBodyList,
+    GetExplanation,
     GetHistory,
     GetHTransform,
+    GetMotion,
     GetStateVector,
     GetTransformation,
+    GetTransformations,
     GpsSample,
     Health,
     HistoryReply,
@@ -30,7 +37,11 @@ from modelserver.messages import (
     Invalid,
     JointSample,
     JointsSample,
+    ManyPoses,
+    ManyReply,
     Mode,
+    MotionAnswer,
+    MotionReply,
     NameListReply,
     NavigationState,
     OrientationReference,
@@ -42,9 +53,14 @@ from modelserver.messages import (
     Quality,
     RangeSample,
     RelativePoseSample,
+    ReloadModel,
+    ReloadReply,
     ReplyHeader,
     RequestHeader,
     SensorHeader,
+    SetHTransform,
+    SetStateVector,
+    SnapshotPart,
     StateVectorReply,
     SwitchMode,
     TimeQuery,
@@ -67,6 +83,19 @@ _OK = ReplyHeader((1 << 63) - 1, UTIME, model_revision="ab12")
 _UNKNOWN = ReplyHeader(1, UTIME, Status.UNKNOWN_FRAME, "no frame 'Raptor:GC'", ("Raptor:CG", "Räptor:CG"), "ab12")
 _TIME = TimeQuery(UTIME, Policy.PREDICTED, 250)
 _NINE = (1.0, 0.1, 0.2, 0.1, 2.0, 0.3, 0.2, 0.3, 3.0)
+
+
+def many_poses(covariances: bool) -> ManyPoses:
+    """Return some poses at three instants, the last without an answer; names and instants are left to the question."""
+    vectors = np.arange(21.0).reshape(3, 7)
+    vectors[2] = math.nan
+    number = np.array([0, 0, 5], dtype=np.int32)
+    return ManyPoses(
+        "", "", np.zeros(3, dtype=np.int64), vectors, number, number + 1, number + 2, number - 7,
+        np.arange(108.0).reshape(3, 36) if covariances else None,
+        answer().origin if covariances else None,
+        "ab12",
+    )  # fmt: skip
 
 
 def answer(epoch: int = 3) -> PoseAnswer:
@@ -207,6 +236,56 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
         HistoryReply(_UNKNOWN),
         HistoryReply(_OK, (answer(1), answer(2), bare_answer())),
     ),
+    "get_transformations_request_t": (
+        GetTransformations(_REQUEST, (("Raptor:CG", "World:UTM"),), (UTIME,)),
+        GetTransformations(_REQUEST, (("a:b", "c:d"), ("Räptor:CG", "")), (UTIME, 0, 5), "Odom:Origin", 7, False),
+    ),
+    "get_transformations_reply_t": (
+        ManyReply(_UNKNOWN),
+        ManyReply(_OK, 2, 3, 1, 600, many_poses(True)),
+        ManyReply(_OK, 0, 1, 0, 0, many_poses(False)),
+    ),
+    "get_motion_request_t": (
+        GetMotion(_REQUEST, "Raptor:CG", "World:UTM"),
+        GetMotion(_REQUEST, "", "Räptor:CG", "Raptor:CG", _TIME),
+    ),
+    "get_motion_reply_t": (
+        MotionReply(_UNKNOWN),
+        MotionReply(
+            _OK,
+            MotionAnswer(
+                answer(), "Raptor:CG", (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), (4.0, 5.0, 6.0), (0.4, 0.5, 0.6),
+                tuple(float(each) for each in range(36)),
+            ),
+        ),
+        MotionReply(_OK, MotionAnswer(bare_answer(), "", (1.0, 2.0, 3.0), *(((math.nan,) * 3,) * 3))),
+    ),
+    "get_explanation_request_t": (
+        GetExplanation(_REQUEST, "Raptor:CG", "World:UTM"),
+        GetExplanation(_REQUEST, "", "Räptor:CG", _TIME),
+    ),
+    "get_explanation_reply_t": (
+        ExplanationReply(_UNKNOWN),
+        ExplanationReply(_OK, Explanation(bare_answer(), ())),
+        ExplanationReply(
+            _OK,
+            Explanation(
+                answer(),
+                (
+                    EdgeReport("vehicle", "World:UTM", False, ("World:UTM", "Raptor:CG"), Pose((1.0, 2.0, 3.0)),
+                               "predicted", UTIME, -0.25, "localization", (), 0.75, 1.0),
+                    EdgeReport("joint", "Nod", True, ("a:b", "c:d"), Pose.from_rpy((0, 0, 0), 0.1, 0.2, 0.3), "at_rest",
+                               coordinates=(0.1, 0.2, 0.3)),
+                ),
+            ),
+        ),
+    ),
+    "reload_model_request_t": (ReloadModel(_REQUEST), ReloadModel(_REQUEST, True)),
+    "reload_model_reply_t": (ReloadReply(_UNKNOWN), ReloadReply(_OK, "cd34", ("frame a:b moves by 2 mm", ""))),
+    "set_state_vector_request_t": (SetStateVector(_REQUEST, answer()), SetStateVector(_REQUEST, bare_answer())),
+    "set_h_transform_request_t": (SetHTransform(_REQUEST, answer()), SetHTransform(_REQUEST, bare_answer())),
+    "acknowledgement_t": (Acknowledgement(_UNKNOWN), Acknowledgement(_OK)),
+    "model_snapshot_t": (SnapshotPart(UTIME, "ab12", 0, 1, b""), SnapshotPart(UTIME, "ab12", 2, 5, bytes(range(256)))),
     "health_t": (
         Health(
             UTIME, 0.5, "0.1.0", "raptor", "ab12", 0, Invalid.NO_FIX | Invalid.NO_IMU, 0, 0, 0, 0, 0, 0, 0,
@@ -256,6 +335,10 @@ def same(left: Any, right: Any) -> bool:
                     "model_revision",
                 )
             )
+        )
+    if isinstance(left, np.ndarray):
+        return (
+            isinstance(right, np.ndarray) and left.dtype == right.dtype and np.array_equal(left, right, equal_nan=True)
         )
     if isinstance(left, Pose):
         return isinstance(right, Pose) and left.is_close(right, 0.0, 1e-12)

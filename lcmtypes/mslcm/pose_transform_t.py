@@ -41,6 +41,10 @@ class pose_transform_t(object):
     """ The clock stepped; time is being taken up anew. """
     TILTED = 1024
     """ Gravity says that the vehicle lies on its side or its back: it has fallen, or the inertial unit's mount is wrong. """
+    STALE_JOINT = 2048
+    """ A joint on the way was silent for more than a second around that time. """
+    JOINT_UNKNOWN = 4096
+    """ A joint on the way was never heard, and the geometry states no default for it. """
     HEADING_FROM_GYRO = 1
     """ Heading is carried by the gyro: the vehicle stands or crawls. """
     PREDICTED = 2
@@ -53,6 +57,12 @@ class pose_transform_t(object):
     """ The covariance is an upper bound. """
     REVERSING = 32
     """ The vehicle is taken to drive backwards. """
+    OUT_OF_LIMITS = 64
+    """ A joint on the way stands beyond its limits. """
+    AT_REST = 128
+    """ A joint on the way was never heard; it is taken to stand at its default. """
+    LOOP = 256
+    """ There is another way round through a loop of constraints; this is the shortest. """
 
     def __init__(self):
         self.utime = 0
@@ -128,13 +138,13 @@ class pose_transform_t(object):
 
         self.invalid_reasons = 0
         """
-        Why the pose may not be used, bit by bit: NO_FIX to TILTED. 0 = it may.
+        Why the pose may not be used, bit by bit: NO_FIX to JOINT_UNKNOWN. 0 = it may.
         LCM Type: int32_t
         """
 
         self.quality_flags = 0
         """
-        What a user should know although the pose may be used, bit by bit: HEADING_FROM_GYRO to REVERSING.
+        What a user should know although the pose may be used, bit by bit: HEADING_FROM_GYRO to LOOP.
         LCM Type: int32_t
         """
 

@@ -38,6 +38,10 @@ class reply_header_t(object):
     """ The request asks for more than the server gives at once. """
     INTERNAL = 10
     """ The server failed on its side; its log holds the cause. """
+    FORBIDDEN = 11
+    """ The vehicle file does not allow it. """
+    REJECTED = 12
+    """ What was given was looked at and not taken; nothing has changed. """
 
     def __init__(self):
         self.request_id = 0
@@ -54,7 +58,7 @@ class reply_header_t(object):
 
         self.status = 0
         """
-        How the request ended: OK to INTERNAL. Take a number you do not know for INTERNAL.
+        How the request ended: OK to REJECTED. Take a number you do not know for INTERNAL.
         LCM Type: int16_t
         """
 

@@ -5,30 +5,49 @@ from __future__ import annotations
 import os
 import random
 import re
+import reprlib
 import secrets
 import struct
 import sys
 import threading
 import time
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
 import lcm
+import numpy as np
+import numpy.typing as npt
 
+from modelserver.client import commands
+from modelserver.client.parts import Parts, stacked
 from modelserver.errors import MalformedRequestError, NoServerError, Status, WireError, error_for_status
 from modelserver.messages import (
     CHANNEL_OF,
     MAX_CHANNEL_LENGTH,
+    MOST_INSTANTS,
+    Acknowledgement,
+    Explanation,
+    ExplanationReply,
     GetBodyFrameList,
     GetBodyList,
+    GetExplanation,
     GetHistory,
     GetHTransform,
+    GetMotion,
     GetStateVector,
     GetTransformation,
+    GetTransformations,
     HistoryReply,
+    ManyPoses,
+    ManyReply,
+    MotionAnswer,
+    MotionReply,
     NameListReply,
     Policy,
     PoseAnswer,
+    ReloadModel,
+    ReloadReply,
     ReplyHeader,
     RequestHeader,
     StateVectorReply,
@@ -38,16 +57,32 @@ from modelserver.messages import (
 from modelserver.spatial.transformation import Transformation
 from modelserver.wire.channels import REPLY_PREFIX, literal
 from modelserver.wire.codec import decode, encode
+from modelserver.wire.many import MAX_PAIRS
 from modelserver.wire.provider import open_lcm, resolve_url
 from modelserver.wire.queries import known_answer, write_question
 
-R = TypeVar("R", TransformReply, NameListReply, StateVectorReply, HistoryReply)
+R = TypeVar(
+    "R",
+    TransformReply,
+    NameListReply,
+    StateVectorReply,
+    HistoryReply,
+    ManyReply,
+    MotionReply,
+    ExplanationReply,
+    ReloadReply,
+    Acknowledgement,
+)
 
 _REPLY_TYPES = {
     TransformReply: "get_transformation_reply_t",
     NameListReply: "name_list_reply_t",
     StateVectorReply: "get_state_vector_reply_t",
     HistoryReply: "get_history_reply_t",
+    ManyReply: "get_transformations_reply_t",
+    MotionReply: "get_motion_reply_t",
+    ExplanationReply: "get_explanation_reply_t",
+    **commands.REPLY_TYPES,
 }
 
 UNREAD_REPLIES: Final = 64
@@ -155,7 +190,7 @@ class Platform:
         try:
             request = write_question(self._ids.getrandbits(63), *names, at, policy, wait_ms)
         except _UNWRITABLE as error:
-            raise MalformedRequestError(f"this question cannot be put into a message: {error}") from error
+            raise _unwritable(error, at) from error
         reply = self._exchange(self._channels[GetTransformation], request, self.timeout + wait_ms * 1e-3)
         return known_answer(reply) or _found(_opened(reply, TransformReply).answer)
 
@@ -192,27 +227,150 @@ class Platform:
         request = GetHistory(self._header(), start_utime, end_utime, rate_hz)
         return [answer.transformation for answer in self._ask(request, HistoryReply).answers]
 
+    def get_transformations(
+        self,
+        pairs: Sequence[tuple[str, str]],
+        at: Sequence[int] | npt.NDArray[np.int64],
+        *,
+        fixed_frame: str = "",
+        reference_at: int = 0,
+        covariance: bool = True,
+    ) -> list[ManyPoses]:
+        """Return for each pair, of frame of interest and frame of reference, its poses at all the instants `at`.
+
+        With `fixed_frame` they are those at the instants in the frame of reference at `reference_at` (0: the latest),
+        through a frame that is taken to stand still: Odom:Origin for short times. `at` are times in microseconds since
+        the Unix epoch. What is not held at an instant has a status there that says so, and nan for a pose.
+        Raises NoServerError, or the QueryError that the server meant; MalformedRequestError for too many pairs, for
+        instants that are none, and for so many through a fixed frame that one question does not hold them, at a
+        reference time of 0: it would be another one in each.
+        """
+        utimes = _instants(at)
+        wanted = tuple((interest, reference) for interest, reference in pairs)
+        if not 1 <= len(wanted) <= MAX_PAIRS:
+            raise MalformedRequestError(f"1 to {MAX_PAIRS} pairs go in one question, got {len(wanted)}")
+        # the server takes so many at once; a longer question is asked in several
+        most = MOST_INSTANTS // len(wanted)
+        if fixed_frame and not reference_at and len(utimes) > most:
+            raise MalformedRequestError(
+                f"{len(utimes)} instants of {len(wanted)} pairs take several questions of {most}, and the latest time "
+                "is another one in each: give reference_at, or ask for fewer"
+            )
+        chunks = []
+        for start in range(0, max(len(utimes), 1), most):
+            some = tuple(utimes[start : start + most].tolist())
+            parts = Parts(lambda data: _opened(data, ManyReply))
+            self._ask(
+                GetTransformations(self._header(), wanted, some, fixed_frame, reference_at, covariance),
+                ManyReply,
+                whole=parts.add,
+            )
+            chunks.append(parts.joined(wanted, utimes[start : start + most]))
+        return [stacked([chunk[number] for chunk in chunks]) for number in range(len(wanted))]
+
+    def get_motion(
+        self,
+        frame_of_interest: str,
+        frame_of_reference: str,
+        *,
+        expressed_in: str = "",
+        at: int = 0,
+        policy: Policy = Policy.INTERPOLATED,
+        wait_ms: int = 0,
+    ) -> MotionAnswer:
+        """Return how `frame_of_interest` moves in `frame_of_reference`: velocity, turn rate, and how they change.
+
+        Vectors are along the axes of `expressed_in`, by default the frame of reference. Raises as `get_transformation`.
+        """
+        time = TimeQuery(at, policy, wait_ms)
+        request = GetMotion(self._header(), frame_of_interest, frame_of_reference, expressed_in, time)
+        answer = self._ask(request, MotionReply, wait_ms).answer
+        if answer is None:
+            raise WireError("malformed", "the server said OK but sent no motion")
+        return answer
+
+    def explain(
+        self,
+        frame_of_interest: str,
+        frame_of_reference: str,
+        *,
+        at: int = 0,
+        policy: Policy = Policy.INTERPOLATED,
+        wait_ms: int = 0,
+    ) -> Explanation:
+        """Return what `get_pose` does, and each edge it rests on: how it was come by, its share of the variance.
+
+        Raises as `get_transformation`.
+        """
+        time = TimeQuery(at, policy, wait_ms)
+        request = GetExplanation(self._header(), frame_of_interest, frame_of_reference, time)
+        answer = self._ask(request, ExplanationReply, wait_ms).answer
+        if answer is None:
+            raise WireError("malformed", "the server said OK but sent no explanation")
+        return answer
+
+    def reload_model(self, *, dry_run: bool = False) -> ReloadReply:
+        """Have the service read its geometry file anew; return the file's revision and what changes, a line each.
+
+        With `dry_run` nothing is changed. Raises NoServerError, ForbiddenError where the vehicle file does not allow
+        it, RejectedError where the file is wrong or does not suit the vehicle: the geometry in force stays.
+        """
+        return self._ask(ReloadModel(self._header(), dry_run), ReloadReply)
+
+    def set_state_vector(self, pose: Transformation) -> None:
+        """Tell localization where the vehicle is, through a 7-vector: the base frame in World:UTM.
+
+        `pose` is as `get_state_vector` returns it: of the base frame, at its `utime` (0: now), from the origin that its
+        `origin_id` names (0: the service's own), as sure as its covariance says (None: 1 m and 5 degrees). It is
+        weighed like a measurement of source "operator"; LOCALIZATION_DECISIONS tells what became of it. Sent once:
+        where NoServerError is raised it may have been taken all the same. Raises ForbiddenError, RejectedError.
+        """
+        self._ask(commands.pose_to_set(self._header(), pose, as_vector=True), Acknowledgement)
+
+    def set_h_transform(self, pose: Transformation) -> None:
+        """Do what `set_state_vector` does, through a homogeneous transform."""
+        self._ask(commands.pose_to_set(self._header(), pose, as_vector=False), Acknowledgement)
+
     def _header(self) -> RequestHeader:
         return RequestHeader(self._ids.getrandbits(63), self.reply_channel)
 
-    def _ask(self, request: Any, reply_kind: type[R], wait_ms: int = 0) -> R:
-        """Return the reply to a request. Raises NoServerError, the QueryError that the server meant, WireError."""
+    def _ask(
+        self, request: Any, reply_kind: type[R], wait_ms: int = 0, whole: Callable[[bytes], bool] | None = None
+    ) -> R:
+        """Return the reply to a request; of one in parts, the last that came: `whole` is shown each.
+
+        Raises NoServerError, the QueryError that the server meant, WireError.
+        """
         try:
             data = encode(request)
         except _UNWRITABLE as error:
-            raise MalformedRequestError(f"this question cannot be put into a message: {error}") from error
+            raise _unwritable(error, getattr(getattr(request, "time", None), "at", 0)) from error
         channel = self._channels[type(request)]
-        return _opened(self._exchange(channel, data, self.timeout + wait_ms * 1e-3), reply_kind)
+        patience, tries = self.timeout + wait_ms * 1e-3, 1 + self.retries
+        if isinstance(request, commands.COMMANDS):
+            patience, tries = patience * tries, 1
+        return _opened(self._exchange(channel, data, patience, whole, tries), reply_kind)
 
-    def _exchange(self, channel: str, request: bytes, patience: float) -> bytes:
-        """Send a request until its reply comes. Asking twice does no harm: requests change nothing."""
+    def _exchange(
+        self,
+        channel: str,
+        request: bytes,
+        patience: float,
+        whole: Callable[[bytes], bool] | None = None,
+        tries: int = 0,
+    ) -> bytes:
+        """Send a request until its reply comes, or `whole` says so of its parts; `tries` times, 0: as `retries` says.
+
+        Asking twice does no harm: questions change nothing.
+        """
+        tries = tries or 1 + self.retries
         wanted = request[_ID]
         fresh = self._fresh
         with self._lock:
             bus = self._lcm
             if bus is None:
                 raise ValueError("this Platform is closed")
-            for tried in range(1 + self.retries):
+            for tried in range(tries):
                 begin = time.monotonic()
                 if tried or begin > self._last_asked + IDLE_S:
                     _discard_unread(bus)
@@ -223,19 +381,25 @@ class Platform:
                 while left > 0:
                     bus.handle_timeout(int(left * 1000) + 1 if left < LONGEST_WAIT_S else _LONGEST_WAIT_MS)
                     for reply in fresh:
-                        if reply[_ID] == wanted:
+                        if reply[_ID] == wanted and (whole is None or whole(reply)):
                             return reply
                     fresh.clear()
                     left = begin + patience - time.monotonic()
         raise NoServerError(
             f"no reply on {self.reply_channel} to a request on {channel} at {self.url} after "
-            f"{1 + self.retries} tries of {patience:g} s. Is the daemon running (modelserver run -c vehicle.yaml), "
-            "on this bus ($LCM_DEFAULT_URL) and with this channel prefix?"
+            f"{tries} {'try' if tries == 1 else 'tries'} of {patience:g} s. Is the daemon running "
+            "(modelserver run -c vehicle.yaml), on this bus ($LCM_DEFAULT_URL) and with this channel prefix?"
         )
 
 
 _UNWRITABLE: Final = (struct.error, TypeError, AttributeError, UnicodeEncodeError)
 """What writing a question raises for a value that no message can hold."""
+
+
+def _unwritable(error: Exception, at: object) -> MalformedRequestError:
+    if isinstance(at, float):
+        return MalformedRequestError(f"at is whole microseconds since 1970, got {at!r}: write int(...) around it")
+    return MalformedRequestError(f"this question cannot be put into a message: {error}")
 
 
 def _opened(data: bytes, kind: type[R]) -> R:
@@ -245,6 +409,17 @@ def _opened(data: bytes, kind: type[R]) -> R:
     if header.status is not Status.OK:
         raise error_for_status(header.status, header.message, header.nearest)
     return reply
+
+
+def _instants(at: Sequence[int] | npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    try:
+        given = np.asarray(at)
+        utimes = given.astype(np.int64)
+        if given.ndim == 1 and (utimes == given).all():
+            return utimes
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise MalformedRequestError(f"instants are a row of whole microseconds since 1970, got {reprlib.repr(at)}")
 
 
 def _found(answer: PoseAnswer | None) -> PoseAnswer:

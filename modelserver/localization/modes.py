@@ -44,13 +44,15 @@ class ModeLocalizer:
     """One localizer for all modes: an immutable value. Make the first with `start`.
 
     `active` is the filter or raw mode. `X_odom` leads from its Odom to the one that has been spoken of since the start,
-    and `epochs` are those counted by the localizers before it.
+    `epochs` are those counted by the localizers before it, and `drift` the 36 numbers that Odom's covariance had
+    reached with them.
     """
 
     makings: Makings
     active: FilterLocalizer | RawLocalizer
     X_odom: Pose
     epochs: int = 0
+    drift: tuple[float, ...] = ()
 
     @classmethod
     def start(cls, makings: Makings, mode: Mode, origin: Origin | None = None) -> ModeLocalizer:
@@ -77,7 +79,7 @@ class ModeLocalizer:
         active, notes = self.active.take(sample)
         if active is self.active:
             return self, notes
-        return ModeLocalizer(self.makings, active, self.X_odom, self.epochs), notes
+        return ModeLocalizer(self.makings, active, self.X_odom, self.epochs, self.drift), notes
 
     def estimate(self, utime: int) -> Estimate:
         """Return the pose at `utime`, in the Odom that has been spoken of since the start."""
@@ -96,20 +98,53 @@ class ModeLocalizer:
     def _continued(self, estimate: Estimate) -> Estimate:
         if not self.epochs:
             return estimate
-        return replace(estimate, odom=self.X_odom @ estimate.odom, pose_epoch=estimate.pose_epoch + self.epochs)
+        return replace(
+            estimate,
+            odom=self.X_odom @ estimate.odom,
+            odom_covariance=_grown(self.drift, estimate),
+            pose_epoch=estimate.pose_epoch + self.epochs,
+        )
 
     def _switched(self, wish: SwitchMode) -> tuple[ModeLocalizer, tuple[Note, ...]]:
         """Return the localizer with the other one at work, begun from what this one knows."""
         raw = isinstance(self.active, RawLocalizer)
         if raw == (wish.mode is Mode.RAW):
             return self, ()
-        makings = self.makings
-        if wish.mode is Mode.RAW and makings.mounts is None:
+        if wish.mode is Mode.RAW and self.makings.mounts is None:
             return self, (Rejected(f"command:{wish.header.source}", "no_raw_mode"),)
+        word = Decision(
+            self.active.utime,
+            wish.header.source,
+            wish.header.seq,
+            "mode",
+            Verdict.TOOK_UP,
+            f"mode {wish.mode.name.lower()}",
+        )
+        return self._begun(self.makings, wish.mode), (word,)
+
+    def remade(self, makings: Makings) -> ModeLocalizer:
+        """Return the localizer of a vehicle whose geometry has changed.
+
+        Where nothing that localization rests on has moved it goes on; else it begins anew from what is known, in a new
+        pose epoch: Odom goes on without a step.
+        """
+        old, active = self.makings, self.active
+        if old.mounts == makings.mounts and old.setup.rig.places() == makings.setup.rig.places():
+            if isinstance(active, FilterLocalizer):
+                active = replace(active, setup=makings.setup)
+            return replace(self, makings=makings, active=active)
+        if not active.utime:
+            mode = active.mode if isinstance(active, FilterLocalizer) else Mode.RAW
+            fresh = ModeLocalizer.start(makings, mode, self.estimate(0).origin)
+            return replace(fresh, X_odom=self.X_odom, epochs=self.epochs, drift=self.drift)
+        return self._begun(makings, active.mode if isinstance(active, FilterLocalizer) else Mode.RAW)
+
+    def _begun(self, makings: Makings, mode: Mode) -> ModeLocalizer:
+        """Return the localizer of a mode, begun from what is known."""
         utime = self.active.utime
         last = self.estimate(utime)
         active: FilterLocalizer | RawLocalizer
-        if wish.mode is Mode.RAW:
+        if mode is Mode.RAW:
             assert makings.mounts is not None
             active = _raw_from(RawLocalizer.start(makings.mounts, makings.raw, last.origin), last)
             # raw mode's Odom begins level at its first sample: tilt is the unit's own
@@ -117,16 +152,30 @@ class ModeLocalizer:
             X_odom = Pose.from_rpy(last.odom.xyz, 0.0, 0.0, yaw)
         else:
             before = self.estimate(utime - SPEED_SPAN_US)
-            active = FilterLocalizer.start(makings.setup, last.origin, wish.mode).begun_from(last, before)
+            active = FilterLocalizer.start(makings.setup, last.origin, mode).begun_from(last, before)
             if active.odom.started:
                 X_odom = last.odom @ active.odom.pose(utime).inverse()
             else:
                 # its Odom will begin with the vehicle's tilt and yaw 0
                 X_odom = Pose.from_rpy(last.odom.xyz, 0.0, 0.0, math.atan2(*_heading(last.odom)))
-        word = Decision(
-            utime, wish.header.source, wish.header.seq, "mode", Verdict.TOOK_UP, f"mode {wish.mode.name.lower()}"
-        )
-        return ModeLocalizer(makings, active, X_odom, last.pose_epoch + 1), (word,)
+        return ModeLocalizer(makings, active, X_odom, last.pose_epoch + 1, last.odom_covariance or self.drift)
+
+
+def _grown(drift: tuple[float, ...], estimate: Estimate) -> tuple[float, ...] | None:
+    """Return Odom's covariance with what it had drifted before: sigmas add up, or variances where it walks.
+
+    Tilt does not drift: it is that of the localizer at work.
+    """
+    own = estimate.odom_covariance
+    if own is None or not drift:
+        return own
+    numbers = list(own)
+    for place in (0, 7, 14, 35):
+        if estimate.odom_walks:
+            numbers[place] = drift[place] + own[place]
+        else:
+            numbers[place] = (math.sqrt(drift[place]) + math.sqrt(own[place])) ** 2
+    return tuple(numbers)
 
 
 def _heading(pose: Pose) -> tuple[float, float]:

@@ -45,13 +45,22 @@ class Rig:
         """Return the pose of a frame in the rolling frame. Raises QueryError."""
         return self.model.get_transformation(frame, self.rolling_frame).pose
 
-    def knows(self, frame: str) -> bool:
-        """Return whether a frame is there and joined to the rolling frame."""
+    def places(self) -> tuple[object, ...]:
+        """Return all that localization takes from the geometry beforehand: equal where nothing of it has moved."""
+        frames = (self.imu_frame, self.gps_frame, self.second_antenna_frame, *sorted(self.wheel_frames.values()))
+        return (self.rolling_frame, *((frame, self.pose(frame)) for frame in frames if frame))
+
+    def fault(self, frame: str) -> str:
+        """Return in a word why what is told of a frame cannot be used; empty where it can.
+
+        `frame`: it is not there, or nothing joins it to the rolling frame. `on_joint`: a joint moves it against the
+        vehicle, and where the joint stood is not known here.
+        """
         try:
-            self.pose(frame)
+            route = self.model.route(frame, self.rolling_frame)
         except QueryError:
-            return False
-        return True
+            return "frame"
+        return "on_joint" if route.legs else ""
 
     def lever(self, frame: str) -> Vector3:
         """Return what leads from the inertial unit's point to a frame's origin, body axes, m. Raises QueryError."""

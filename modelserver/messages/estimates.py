@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from modelserver.messages.flags import NAN, NO_FLAGS, VALID, Invalid, Quality
 from modelserver.spatial.pose import Pose
@@ -29,6 +31,21 @@ class Origin:
         return (self.easting, self.northing, self.height)
 
 
+class VehicleMotion(NamedTuple):
+    """How the vehicle moves relative to the ground, along the axes of the frame that an estimate is of.
+
+    `velocity` (m/s) is that of its origin, `rate` (rad/s) its angular velocity. `acceleration` (m/s2) is that of the
+    point `felt_at` (m, from the frame's origin), where the inertial unit is; nan where nobody felt any. `covariance`
+    works out the 36 numbers of velocity and rate when it is called; None: not known.
+    """
+
+    velocity: Vector3
+    rate: Vector3
+    acceleration: Vector3 = (NAN, NAN, NAN)
+    felt_at: Vector3 = (0.0, 0.0, 0.0)
+    covariance: Callable[[], tuple[float, ...]] | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
     """The base frame at one instant.
@@ -36,7 +53,8 @@ class Estimate:
     `odom` is its pose in Odom:Origin, `enu` in the tangent plane at the origin, `utm` in World:UTM; the last
     two are None before the origin is known. `covariance` is 36 numbers, row-major, of the world pose along
     east, north, up (of `utm` and `enu` alike: the convergence between their axes is below the noise that a
-    covariance states).
+    covariance states). `odom_covariance` has grown since Odom began: as a random walk does where `odom_walks`, so that
+    variances add up; else in proportion to time, so that sigmas do. `motion` is None where it is not known.
     """
 
     utime: int
@@ -52,3 +70,5 @@ class Estimate:
     horizontal_bound: float = NAN
     heading_bound: float = NAN
     seconds_to_limit: float = NAN
+    motion: VehicleMotion | None = field(default=None, repr=False)
+    odom_walks: bool = False

@@ -10,7 +10,7 @@ from modelserver.messages.estimates import Origin
 from modelserver.messages.health import Health
 from modelserver.messages.navigation import Mode, NavigationState
 from modelserver.messages.replies import PoseAnswer, Reply
-from modelserver.messages.requests import Request
+from modelserver.messages.requests import ReloadModel, Request
 from modelserver.messages.samples import Sample, SensorHeader
 
 
@@ -89,4 +89,38 @@ class PublishNavigation:
     state: NavigationState
 
 
-Output: TypeAlias = SendReply | PublishPose | PublishHealth | OriginLatched | PublishDecisions | PublishNavigation
+@dataclass(frozen=True, slots=True)
+class LoadModel:
+    """Read the geometry anew and tell the core what came of it; `request` is None where the machine's owner asks."""
+
+    request: ReloadModel | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PublishSnapshot:
+    """Broadcast the geometry that is in force."""
+
+    utime: int
+
+
+@dataclass(frozen=True, slots=True)
+class SnapshotPart:
+    """A part of the geometry on the bus; see model_snapshot_t."""
+
+    utime: int
+    model_revision: str
+    part: int
+    parts: int
+    data: bytes
+
+
+Output: TypeAlias = (
+    SendReply
+    | PublishPose
+    | PublishHealth
+    | OriginLatched
+    | PublishDecisions
+    | PublishNavigation
+    | LoadModel
+    | PublishSnapshot
+)

@@ -68,6 +68,8 @@ class Invalid(IntFlag):
     BOUND_EXCEEDED = 256
     CLOCK_STEPPED = 512
     TILTED = 1024
+    STALE_JOINT = 2048
+    JOINT_UNKNOWN = 4096
 
     def explain(self) -> str:
         """Return the reasons in words; empty where there is none."""
@@ -86,6 +88,8 @@ _INVALID_TEXT = {
     Invalid.BOUND_EXCEEDED: "a protection bound passes the configured limit",
     Invalid.CLOCK_STEPPED: "the clock stepped, time is being taken up anew",
     Invalid.TILTED: "gravity says that the vehicle lies on its side: check the inertial unit's mount in the geometry",
+    Invalid.STALE_JOINT: "a joint on the way was silent around that time",
+    Invalid.JOINT_UNKNOWN: "a joint on the way was never heard, and the geometry states no default for it",
 }
 
 
@@ -98,6 +102,26 @@ class Quality(IntFlag):
     HELD = 8
     CORRELATION_UNKNOWN = 16
     REVERSING = 32
+    OUT_OF_LIMITS = 64
+    AT_REST = 128
+    LOOP = 256
+
+    def explain(self) -> str:
+        """Return the flags in words; empty where there is none."""
+        return "; ".join(_QUALITY_TEXT[flag] for flag in Quality if flag in self)
+
+
+_QUALITY_TEXT = {
+    Quality.HEADING_FROM_GYRO: "heading is carried by the gyro",
+    Quality.PREDICTED: "predicted past the last sample",
+    Quality.INTERPOLATED: "between two samples",
+    Quality.HELD: "the last value known before",
+    Quality.CORRELATION_UNKNOWN: "the covariance is an upper bound",
+    Quality.REVERSING: "the vehicle is taken to drive backwards",
+    Quality.OUT_OF_LIMITS: "a joint on the way stands beyond its limits",
+    Quality.AT_REST: "a joint on the way was never heard; it is taken to stand at its default",
+    Quality.LOOP: "there is another way round; this is the shortest",
+}
 
 
 VALID = Invalid(0)

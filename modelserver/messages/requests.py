@@ -8,6 +8,7 @@ from functools import lru_cache
 from typing import Final, NamedTuple, TypeAlias
 
 from modelserver.messages.flags import Policy
+from modelserver.messages.replies import PoseAnswer
 
 
 class RequestHeader(NamedTuple):
@@ -87,7 +88,79 @@ class GetHistory(NamedTuple):
     rate_hz: float
 
 
-Request: TypeAlias = GetTransformation | GetBodyList | GetBodyFrameList | GetStateVector | GetHTransform | GetHistory
+MOST_INSTANTS: Final = 2_000
+"""In one GetTransformations, all pairs together: they take the server about a hundredth of a second."""
+
+
+class GetTransformations(NamedTuple):
+    """Where are frames in others at many instants? `pairs` are of frame of interest and frame of reference.
+
+    With `fixed_frame`, at the instants in the frames of reference at `reference_at`; see get_transformations_request_t.
+    """
+
+    header: RequestHeader
+    pairs: tuple[tuple[str, str], ...]
+    at: tuple[int, ...]
+    fixed_frame: str = ""
+    reference_at: int = 0
+    with_covariance: bool = True
+
+
+class GetMotion(NamedTuple):
+    """How does `frame_of_interest` move in `frame_of_reference`, along the axes of `expressed_in`?"""
+
+    header: RequestHeader
+    frame_of_interest: str
+    frame_of_reference: str
+    expressed_in: str = ""
+    time: TimeQuery = TimeQuery()
+
+
+class GetExplanation(NamedTuple):
+    """Where is `frame_of_interest` in `frame_of_reference`, and what does that rest on?"""
+
+    header: RequestHeader
+    frame_of_interest: str
+    frame_of_reference: str
+    time: TimeQuery = TimeQuery()
+
+
+class ReloadModel(NamedTuple):
+    """Read the geometry anew; with `dry_run` only say what would change."""
+
+    header: RequestHeader
+    dry_run: bool = False
+
+
+class SetStateVector(NamedTuple):
+    """The vehicle is there: its base frame's pose in World:UTM; see set_state_vector_request_t."""
+
+    header: RequestHeader
+    pose: PoseAnswer
+
+
+class SetHTransform(NamedTuple):
+    """As SetStateVector; see set_h_transform_request_t."""
+
+    header: RequestHeader
+    pose: PoseAnswer
+
+
+Request: TypeAlias = (
+    GetTransformation
+    | GetBodyList
+    | GetBodyFrameList
+    | GetStateVector
+    | GetHTransform
+    | GetHistory
+    | GetTransformations
+    | GetMotion
+    | GetExplanation
+    | ReloadModel
+    | SetStateVector
+    | SetHTransform
+)
+
 CHANNEL_OF: Final[Mapping[type, str]] = {
     GetTransformation: "PLATFORM_GET_TRANSFORMATION",
     GetBodyList: "PLATFORM_GET_BODY_LIST",
@@ -95,5 +168,11 @@ CHANNEL_OF: Final[Mapping[type, str]] = {
     GetStateVector: "POSE_GET_STATE_VECTOR",
     GetHTransform: "POSE_GET_H_TRANSFORM",
     GetHistory: "POSE_GET_HISTORY",
+    GetTransformations: "PLATFORM_GET_TRANSFORMATIONS",
+    GetMotion: "PLATFORM_GET_MOTION",
+    GetExplanation: "PLATFORM_GET_EXPLANATION",
+    ReloadModel: "PLATFORM_RELOAD_MODEL",
+    SetStateVector: "POSE_SET_STATE_VECTOR",
+    SetHTransform: "POSE_SET_H_TRANSFORM",
 }
 """The channel that each kind of request comes in on, without the vehicle's prefix."""

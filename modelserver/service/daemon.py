@@ -8,25 +8,31 @@ import math
 import signal
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from modelserver import core
 from modelserver.config import VehicleConfig, with_lines
 from modelserver.core import CoreSettings, CoreState, Instant
-from modelserver.errors import ConfigError, Problem, QueryError, Severity, Source, shown
+from modelserver.errors import ConfigError, GeometryError, Problem, QueryError, Severity, Source, shown
 from modelserver.formats import load_model
 from modelserver.geodesy import GeodesyError, make_origin
 from modelserver.geometry import Model
 from modelserver.localization.mounts import Mounts
 from modelserver.localization.rig import Rig
-from modelserver.messages import Mode, Origin, OriginLatched, SwitchMode
+from modelserver.messages import LoadModel, Mode, Origin, OriginLatched, SwitchMode
+from modelserver.reload import ModelLoaded
 from modelserver.service.bus import LcmBus
 from modelserver.service.clock import SystemClock
 from modelserver.service.heard import Heard
 from modelserver.service.keep import OriginKeeper, default_directory
 from modelserver.service.loop import Loop, LoopSettings
+from modelserver.snapshot import Snapshot, written
 from modelserver.version import __version__
 from modelserver.wire.channels import CHANNELS, Way
 from modelserver.wire.provider import resolve_url
+
+if TYPE_CHECKING:
+    from modelserver.localization.modes import Makings
 
 log = logging.getLogger(__name__)
 
@@ -53,12 +59,10 @@ class Vehicle:
         """Return the core's first state; `origin` is one kept from an earlier run, a configured one goes first."""
         config = self.config
         localizer = None
-        if self.rig is not None:
-            from modelserver.localization.filter.setup import Setup
-            from modelserver.localization.modes import Makings, ModeLocalizer
+        makings = self.makings()
+        if makings is not None:
+            from modelserver.localization.modes import ModeLocalizer
 
-            setup = Setup(self.rig, config.localization.filter)
-            makings = Makings(setup, config.localization.raw, self.mounts)
             origin = configured_origin(config) or origin
             localizer = ModeLocalizer.start(makings, config.localization.first_mode, origin)
         settings = CoreSettings(
@@ -74,8 +78,59 @@ class Vehicle:
             parked_requests=config.limits.parked_requests,
             wait_ms=config.limits.wait_ms,
             reply_prefix=config.lcm.reply_prefix,
+            snapshot_period_ns=round(config.publish.snapshot_s * 1e9),
+            may_reload=config.commands.reload,
+            may_set_pose=config.commands.set_pose,
         )
         return core.start(settings, self.model, localizer, now)
+
+    def makings(self) -> Makings | None:
+        """Return what the localizers are made of, None for a vehicle without a sensor to localize by."""
+        if self.rig is None:
+            return None
+        from modelserver.localization.filter.setup import Setup
+        from modelserver.localization.modes import Makings
+
+        return Makings(Setup(self.rig, self.config.localization.filter), self.config.localization.raw, self.mounts)
+
+    def snapshot(self, state: CoreState) -> bytes:
+        """Return the bytes of the snapshot of the model in force."""
+        view = state.view
+        return written(
+            Snapshot(
+                self.config.vehicle,
+                view.model,
+                view.base_frame,
+                view.rolling_frame,
+                self.config.limits.history_s,
+                f"{self.config.lcm.channel_prefix}{self.config.sensors.joints.channel}",
+                round(self.config.sensors.joints.latency * 1e6),
+            )
+        )
+
+    def reloaded(self, wish: LoadModel, state: CoreState, file: str = "") -> ModelLoaded:
+        """Return what comes of reading the geometry file anew: all of it suits this vehicle, or nothing changes."""
+        try:
+            vehicle = load_vehicle(self.config, file)
+        except (GeometryError, ConfigError) as error:
+            return ModelLoaded(wish.request, why=str(error))
+        except Exception as error:
+            log.exception("reading the geometry anew failed")
+            return ModelLoaded(wish.request, why=f"an error of the server's own while reading it: {error}")
+        lost = orphaned(vehicle.model) - orphaned(state.model)
+        if lost:
+            why = (
+                f"nothing joins {', '.join(sorted(lost))} to the root any more: is the file still being written? Write "
+                "it aside and rename it. To use it all the same start the service anew"
+            )
+            return ModelLoaded(wish.request, why=why)
+        localizer, makings = state.localizer, vehicle.makings()
+        if makings is not None:
+            from modelserver.localization.modes import ModeLocalizer
+
+            if isinstance(localizer, ModeLocalizer):
+                localizer = localizer.remade(makings)
+        return ModelLoaded(wish.request, vehicle.model, localizer)
 
     def ticks_per_pose(self) -> int:
         """Return how many ticks there are to a POSE in timer mode: more than one where POSE comes seldom."""
@@ -92,11 +147,13 @@ class Vehicle:
         state_hz = self.config.publish.state_hz
         return max(1, round(self.tick_hz() / state_hz)) if state_hz else 0
 
-    def sensor_channels(self) -> dict[str, Heard]:
+    def sensor_channels(self, model: Model | None = None) -> dict[str, Heard]:
         """Return what is heard on each channel that localization listens to, with the prefix.
 
-        Those are the sensors' channels, and the one for wishes about its mode where the vehicle file names one.
+        Those are the sensors' channels, that of joints where the geometry has any (`model`, by default the one that was
+        loaded), and the one for wishes about its mode where the vehicle file names one.
         """
+        model = model or self.model
         prefix = self.config.lcm.channel_prefix
         sensors = self.config.sensors
         heard = {
@@ -105,6 +162,7 @@ class Vehicle:
                 (sensors.gps, "gps_t"),
                 (sensors.imu, "imu_t"),
                 (sensors.wheels, "wheels_t"),
+                (sensors.joints if model.joints else None, "joints_t"),
                 *((each, f"{each.type}_t") for each in sensors.aiding.values()),
             )
             if each is not None
@@ -114,17 +172,23 @@ class Vehicle:
         return heard
 
 
-def load_vehicle(config: VehicleConfig, file: str = "") -> Vehicle:
+def orphaned(model: Model) -> frozenset[str]:
+    """Return the bodies that no constraints join to the root."""
+    return frozenset(name for assembly in model.assemblies[1:] for name in assembly)
+
+
+def load_vehicle(config: VehicleConfig, file: str = "", strict: bool = False) -> Vehicle:
     """Load the geometry and check that it has every frame the vehicle file names.
 
-    `file` is the vehicle file's path, for the problems. Raises GeometryError, ConfigError, OSError.
+    `file` is the vehicle file's path, for the problems; with `strict` a frame has one constraint at most. Raises
+    GeometryError, ConfigError, OSError.
     """
     try:
-        model = load_model(config.geometry, variables=config.variables)
+        model = load_model(config.geometry, variables=config.variables, strict=strict)
     except OSError as error:
         why = f"the geometry file {config.geometry} cannot be read: {error.strerror}"
         raise ConfigError(with_lines([Problem(Severity.ERROR, why, Source(file, element="geometry"))], file)) from None
-    problems = []
+    problems: list[Problem] = []
     gps, imu = config.sensors.gps, config.sensors.imu
     named = [("base_frame", config.base_frame)]
     named += [("rolling_frame", config.rolling_frame)] if config.rolling_frame else []
@@ -138,6 +202,11 @@ def load_vehicle(config: VehicleConfig, file: str = "") -> Vehicle:
             model.frame(frame)
             if base_stands:
                 model.get_transformation(frame, config.base_frame)
+                legs = () if problems else model.route(frame, config.rolling_frame or config.base_frame).legs
+                if legs:
+                    why = f"joint {legs[0].name} moves {frame} against the vehicle; localization needs it bolted on"
+                    fix = "name a frame of the vehicle's own body, or make the constraint fixed"
+                    problems.append(Problem(Severity.ERROR, why, Source(file, element=key), fix))
         except QueryError as error:
             base_stands = base_stands and key != "base_frame"
             fix = f"write {error.nearest[0]}" if error.nearest else f"see: modelserver bodies --model {config.geometry}"
@@ -185,6 +254,7 @@ def _channel_problems(config: VehicleConfig, file: str) -> list[Problem]:
             ("gps", sensors.gps),
             ("imu", sensors.imu),
             ("wheels", sensors.wheels),
+            ("joints", sensors.joints),
             *((f"aiding.{name}", each) for name, each in sensors.aiding.items()),
         )
         if each is not None
@@ -256,8 +326,11 @@ def _mode(state: CoreState) -> Mode | None:
     return active.mode if isinstance(active, FilterLocalizer) else Mode.RAW
 
 
-def run(vehicle: Vehicle, url: str = "") -> None:
-    """Serve a vehicle until SIGTERM or SIGINT. Raises BusError where the bus cannot be joined."""
+def run(vehicle: Vehicle, url: str = "", file: str = "") -> None:
+    """Serve a vehicle until SIGTERM or SIGINT; SIGHUP has its geometry read anew. `file` is the vehicle file.
+
+    Raises BusError where the bus cannot be joined.
+    """
     config = vehicle.config
     clock = SystemClock()
     keeper = None
@@ -283,7 +356,18 @@ def run(vehicle: Vehicle, url: str = "") -> None:
         queued_requests=config.limits.queued_requests,
         requests_per_pass=config.limits.requests_per_pass,
     )
-    loop = Loop(bus, clock, vehicle.core(clock.now(), origin), settings, keep, log_wish)
+    loop = Loop(
+        bus,
+        clock,
+        vehicle.core(clock.now(), origin),
+        settings,
+        keep,
+        log_wish,
+        lambda wish, state: vehicle.reloaded(wish, state, file),
+        vehicle.snapshot,
+        lambda state: vehicle.sensor_channels(state.model),
+    )
+    signal.signal(signal.SIGHUP, lambda *_: loop.reload())
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: loop.stop())
     log.info(

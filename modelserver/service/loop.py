@@ -15,22 +15,28 @@ from modelserver.geometry import names
 from modelserver.messages import (
     CHANNEL_OF,
     Event,
+    GetHistory,
+    GetTransformations,
+    LoadModel,
     OriginLatched,
     Output,
     PublishDecisions,
     PublishHealth,
     PublishNavigation,
     PublishPose,
+    PublishSnapshot,
     Rejected,
     Request,
     SendReply,
     SwitchMode,
     Tick,
 )
+from modelserver.reload import ModelLoaded
 from modelserver.service.bus import Bus
 from modelserver.service.clock import Clock
 from modelserver.service.heard import Heard
 from modelserver.service.log import RateLimited
+from modelserver.service.snapshots import SnapshotWriter
 from modelserver.wire.channels import BY_NAME, REQUESTS
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.navigation import MAX_DECISIONS
@@ -41,6 +47,12 @@ log = logging.getLogger(__name__)
 
 SENSORS_PER_PASS = 100
 """Samples taken before the clock is looked at again: a flood of samples must not stop the ticks."""
+
+PAIR = 4
+INSTANTS_FOR_ONE = 25
+POSES_OF_HISTORY = 8
+"""What a question for many instants takes of a pass's budget of requests: so many for each pair, and one for each so
+many instants of it; and what one for a stretch of history takes."""
 
 REFUSALS_PER_PASS = 64
 """Refusals that are answered in one pass; further ones are only counted."""
@@ -65,6 +77,8 @@ class Loop:
     """Serves one core on one bus. `run` returns when it is told to `stop`.
 
     `on_origin` is told of an origin that was captured, `on_wish` of a wish for a mode and the states around it.
+    `on_load` reads the geometry anew, `snapshot` gives its bytes for the bus, and `channels` which sensors are heard
+    once another is in force: joints, where it has any.
     """
 
     def __init__(
@@ -75,6 +89,11 @@ class Loop:
         settings: LoopSettings,
         on_origin: Callable[[OriginLatched], None] = lambda note: None,
         on_wish: Callable[[SwitchMode, CoreState, CoreState], None] = lambda wish, before, after: None,
+        on_load: Callable[[LoadModel, CoreState], ModelLoaded] = lambda wish, state: ModelLoaded(
+            wish.request, why="this service has no file to read its geometry from"
+        ),
+        snapshot: Callable[[CoreState], bytes] = lambda state: b"",
+        channels: Callable[[CoreState], Mapping[str, Heard]] = lambda state: {},
     ):
         self.state = state
         self._bus = bus
@@ -82,6 +101,11 @@ class Loop:
         self._settings = settings
         self._on_origin = on_origin
         self._on_wish = on_wish
+        self._on_load = on_load
+        self._snapshot = SnapshotWriter(snapshot)
+        self._channels = channels
+        self._hearing: set[str] = set()
+        self._reloading = False
         self._log = RateLimited(log, clock)
         self._queue: deque[tuple[str, str, bytes]] = deque()
         self._refusals_left = REFUSALS_PER_PASS
@@ -95,9 +119,9 @@ class Loop:
         prefix = settings.channel_prefix
         self._pose, self._pose_vector = f"{prefix}POSE", f"{prefix}POSE_VECTOR"
         self._odom, self._health = f"{prefix}POSE_ODOM", f"{prefix}MODELSERVER_HEALTH"
+        self._model = f"{prefix}MODEL_SNAPSHOT"
         self._decisions, self._state = f"{prefix}LOCALIZATION_DECISIONS", f"{prefix}LOCALIZATION_STATE"
-        for channel, heard in settings.sensors.items():
-            bus.sensors.subscribe(channel, self._sensor_handler(heard))
+        self._hear(settings.sensors)
         for request in REQUESTS:
             bus.requests.subscribe(f"{prefix}{request.name}", self._request_handler(request.type_name))
 
@@ -110,8 +134,15 @@ class Loop:
         """Make `run` return after the pass that is under way. May be called from a signal handler."""
         self._stopping = True
 
+    def reload(self) -> None:
+        """Have the geometry read anew in the next pass. May be called from a signal handler."""
+        self._reloading = True
+
     def turn(self) -> None:
         """Make one pass: sensors, the tick when it is due, requests within their budget, then wait."""
+        if self._reloading:
+            self._reloading = False
+            self._send((LoadModel(),))
         busy = self._bus.sensors.drain(SENSORS_PER_PASS) == SENSORS_PER_PASS
         self._tick_if_due()
         self._refusals_left = REFUSALS_PER_PASS
@@ -135,6 +166,12 @@ class Loop:
             self._step(Tick(late_ns * 1e-9, missed, answered), self._clock.now())
         except Exception as error:
             self._failed("tick", error)
+
+    def _hear(self, channels: Mapping[str, Heard]) -> None:
+        for channel, heard in channels.items():
+            if channel not in self._hearing:
+                self._hearing.add(channel)
+                self._bus.sensors.subscribe(channel, self._sensor_handler(heard))
 
     def _sensor_handler(self, heard: Heard) -> Callable[[str, bytes], None]:
         def handle(channel: str, data: bytes) -> None:
@@ -189,6 +226,8 @@ class Loop:
                 self._send(core.turn_back(self.state, kind, header, str(error), self._clock.now()))
             return
         self._asked = data
+        # one that asks for much leaves less of the pass for others: the next tick must not wait for them all
+        self._budget = max(0, self._budget - effort(request))
         now = self._clock.now()
         try:
             self._step(request, now)
@@ -209,7 +248,7 @@ class Loop:
             self._told.add((channel, "handler"))
             self._log.exception(f"{channel}:handler", "an error of the server's own while handling %s", channel)
 
-    def _step(self, event: Event, now: Instant) -> None:
+    def _step(self, event: Event | ModelLoaded, now: Instant) -> None:
         self.state, outputs = core.step(self.state, event, now)
         if outputs:
             self._send(outputs)
@@ -250,6 +289,21 @@ class Loop:
                     "%s: %d refused so far, reason: %s; the counts go on in %s", source, count, reason, self._health
                 )
 
+    def _load(self, output: LoadModel) -> None:
+        before = self.state.model.revision
+        loaded = self._on_load(output, self.state)
+        self._step(loaded, self._clock.now())
+        dry = output.request is not None and output.request.dry_run
+        if loaded.model is None:
+            log.error("the geometry was read anew and is not used; that of revision %s stays: %s", before, loaded.why)
+        elif not dry:
+            self._hear(self._channels(self.state))
+            log.info("the geometry was read anew: revision %s, it was %s", loaded.model.revision, before)
+
+    def _send_snapshot(self, output: PublishSnapshot) -> None:
+        for part in self._snapshot.parts(self.state, output.utime):
+            self._bus.publish(self._model, encode(part))
+
     def _send_origin(self, output: OriginLatched) -> None:
         origin = output.origin
         log.info(
@@ -262,6 +316,15 @@ class Loop:
         self._on_origin(output)
 
 
+def effort(request: Request) -> int:
+    """Return how many usual requests' time one takes beyond its own."""
+    if isinstance(request, GetTransformations):
+        return len(request.pairs) * (PAIR + len(request.at) // INSTANTS_FOR_ONE)
+    if isinstance(request, GetHistory):
+        return POSES_OF_HISTORY
+    return 0
+
+
 _REQUEST_KINDS: Mapping[str, type[Request]] = {BY_NAME[channel].type_name: kind for kind, channel in CHANNEL_OF.items()}
 
 _SENDERS: Mapping[type, Callable[[Loop, Any], None]] = {
@@ -271,4 +334,6 @@ _SENDERS: Mapping[type, Callable[[Loop, Any], None]] = {
     OriginLatched: Loop._send_origin,
     PublishDecisions: Loop._send_decisions,
     PublishNavigation: Loop._send_navigation,
+    LoadModel: Loop._load,
+    PublishSnapshot: Loop._send_snapshot,
 }

@@ -57,6 +57,7 @@ CHANNELS = (
         "which measurements were used, and why",
     ),
     Channel("LOCALIZATION_STATE", "navigation_state_t", Way.BROADCAST, "timer, 5 Hz", "the filter's whole state"),
+    Channel("MODEL_SNAPSHOT", "model_snapshot_t", Way.BROADCAST, "at start, on change, every 5 s", "the geometry"),
     Channel("MODELSERVER_HEALTH", "health_t", Way.BROADCAST, "1 Hz", "state, traffic, rejected input"),
     Channel(
         "DRIVER_HEALTH", "driver_health_t", Way.REPORT, "1 Hz, on change", "how each driver is: phase, rate, clock"
@@ -93,6 +94,42 @@ CHANNELS = (
         "answered by get_transformation_reply_t",
     ),
     Channel("POSE_GET_HISTORY", "get_history_request_t", Way.REQUEST, "on demand", "answered by get_history_reply_t"),
+    Channel(
+        "PLATFORM_GET_TRANSFORMATIONS",
+        "get_transformations_request_t",
+        Way.REQUEST,
+        "on demand",
+        "answered by get_transformations_reply_t, in parts",
+    ),
+    Channel("PLATFORM_GET_MOTION", "get_motion_request_t", Way.REQUEST, "on demand", "answered by get_motion_reply_t"),
+    Channel(
+        "PLATFORM_GET_EXPLANATION",
+        "get_explanation_request_t",
+        Way.REQUEST,
+        "on demand",
+        "answered by get_explanation_reply_t",
+    ),
+    Channel(
+        "PLATFORM_RELOAD_MODEL",
+        "reload_model_request_t",
+        Way.REQUEST,
+        "on demand",
+        "answered by reload_model_reply_t; where allowed",
+    ),
+    Channel(
+        "POSE_SET_STATE_VECTOR",
+        "set_state_vector_request_t",
+        Way.REQUEST,
+        "on demand",
+        "answered by acknowledgement_t; where allowed",
+    ),
+    Channel(
+        "POSE_SET_H_TRANSFORM",
+        "set_h_transform_request_t",
+        Way.REQUEST,
+        "on demand",
+        "answered by acknowledgement_t; where allowed",
+    ),
 )
 
 BY_NAME = {channel.name: channel for channel in CHANNELS}

@@ -11,39 +11,55 @@ from modelserver import messages
 from modelserver.errors import WireError
 from modelserver.wire import (
     aiding,
+    commands,
     driver_health,
     health,
+    many,
+    moving,
     navigation,
     packed,
     poses,
     queries,
     requests,
     sensors,
+    snapshot,
     vehicle,
 )
 from mslcm.absolute_pose_t import absolute_pose_t
+from mslcm.acknowledgement_t import acknowledgement_t
 from mslcm.decisions_t import decisions_t
 from mslcm.driver_health_t import driver_health_t
 from mslcm.get_body_frame_list_request_t import get_body_frame_list_request_t
 from mslcm.get_body_list_request_t import get_body_list_request_t
+from mslcm.get_explanation_reply_t import get_explanation_reply_t
+from mslcm.get_explanation_request_t import get_explanation_request_t
 from mslcm.get_h_transform_request_t import get_h_transform_request_t
 from mslcm.get_history_reply_t import get_history_reply_t
 from mslcm.get_history_request_t import get_history_request_t
+from mslcm.get_motion_reply_t import get_motion_reply_t
+from mslcm.get_motion_request_t import get_motion_request_t
 from mslcm.get_state_vector_reply_t import get_state_vector_reply_t
 from mslcm.get_state_vector_request_t import get_state_vector_request_t
 from mslcm.get_transformation_reply_t import get_transformation_reply_t
 from mslcm.get_transformation_request_t import get_transformation_request_t
+from mslcm.get_transformations_reply_t import get_transformations_reply_t
+from mslcm.get_transformations_request_t import get_transformations_request_t
 from mslcm.gps_t import gps_t
 from mslcm.health_t import health_t
 from mslcm.imu_t import imu_t
 from mslcm.joints_t import joints_t
 from mslcm.localization_mode_t import localization_mode_t
+from mslcm.model_snapshot_t import model_snapshot_t
 from mslcm.name_list_reply_t import name_list_reply_t
 from mslcm.navigation_state_t import navigation_state_t
 from mslcm.pose_transform_t import pose_transform_t
 from mslcm.pose_vector_t import pose_vector_t
 from mslcm.range_t import range_t
 from mslcm.relative_pose_t import relative_pose_t
+from mslcm.reload_model_reply_t import reload_model_reply_t
+from mslcm.reload_model_request_t import reload_model_request_t
+from mslcm.set_h_transform_request_t import set_h_transform_request_t
+from mslcm.set_state_vector_request_t import set_state_vector_request_t
 from mslcm.vehicle_command_t import vehicle_command_t
 from mslcm.vehicle_status_t import vehicle_status_t
 from mslcm.wheels_t import wheels_t
@@ -134,6 +150,27 @@ _CODECS = (
     _generated(
         name_list_reply_t, messages.NameListReply, requests.read_name_list_reply, requests.write_name_list_reply
     ),
+    _packed(get_transformations_request_t, messages.GetTransformations, many.read_request, many.write_request),
+    _packed(get_transformations_reply_t, messages.ManyReply, many.read_reply, many.write_reply),
+    _packed(get_motion_request_t, messages.GetMotion, moving.read_get_motion, moving.write_get_motion),
+    _packed(get_motion_reply_t, messages.MotionReply, moving.read_motion_reply, moving.write_motion_reply),
+    _packed(
+        get_explanation_request_t, messages.GetExplanation, moving.read_get_explanation, moving.write_get_explanation
+    ),
+    _packed(
+        get_explanation_reply_t,
+        messages.ExplanationReply,
+        moving.read_explanation_reply,
+        moving.write_explanation_reply,
+    ),
+    _packed(reload_model_request_t, messages.ReloadModel, commands.read_reload, commands.write_reload),
+    _packed(reload_model_reply_t, messages.ReloadReply, commands.read_reload_reply, commands.write_reload_reply),
+    _packed(set_state_vector_request_t, messages.SetStateVector, commands.read_set_vector, commands.write_set_vector),
+    _packed(
+        set_h_transform_request_t, messages.SetHTransform, commands.read_set_transform, commands.write_set_transform
+    ),
+    _packed(acknowledgement_t, messages.Acknowledgement, commands.read_acknowledgement, commands.write_acknowledgement),
+    _generated(model_snapshot_t, messages.SnapshotPart, snapshot.read_snapshot, snapshot.write_snapshot),
     _generated(health_t, messages.Health, health.read_health, health.write_health),
     _generated(
         driver_health_t, messages.DriverHealth, driver_health.read_driver_health, driver_health.write_driver_health

@@ -96,12 +96,12 @@ _KEPT_BYTES: Final = 512
 def write_transform_reply(reply: TransformReply) -> bytes:
     """Return the bytes of a get_transformation_reply_t."""
     body = poses.NO_TRANSFORM if reply.answer is None else poses.transform_body(reply.answer)
-    return _TRANSFORM_REPLY + _header(reply.header) + body
+    return _TRANSFORM_REPLY + header_body(reply.header) + body
 
 
 def read_transform_reply(data: bytes) -> TransformReply:
     """Return the reply in the bytes of a get_transformation_reply_t. Raises WireError, struct.error."""
-    header, at = _read_header(data)
+    header, at = read_header(data)
     if header.status is not Status.OK:
         poses.check_no_transform(data, at)
         return TransformReply(header)
@@ -122,12 +122,12 @@ def known_answer(data: bytes) -> PoseAnswer | None:
 def write_state_vector_reply(reply: StateVectorReply) -> bytes:
     """Return the bytes of a get_state_vector_reply_t."""
     body = poses.NO_VECTOR if reply.answer is None else poses.vector_body(reply.answer)
-    return _VECTOR_REPLY + _header(reply.header) + body
+    return _VECTOR_REPLY + header_body(reply.header) + body
 
 
 def read_state_vector_reply(data: bytes) -> StateVectorReply:
     """Return the reply in the bytes of a get_state_vector_reply_t. Raises WireError, struct.error."""
-    header, at = _read_header(data)
+    header, at = read_header(data)
     if header.status is not Status.OK:
         poses.check_no_vector(data, at)
         return StateVectorReply(header)
@@ -139,12 +139,12 @@ def read_state_vector_reply(data: bytes) -> StateVectorReply:
 def write_history_reply(reply: HistoryReply) -> bytes:
     """Return the bytes of a get_history_reply_t."""
     bodies = b"".join(map(poses.vector_body, reply.answers))
-    return b"%b%b%b%b" % (_HISTORY_REPLY, _header(reply.header), LENGTH.pack(len(reply.answers)), bodies)
+    return b"%b%b%b%b" % (_HISTORY_REPLY, header_body(reply.header), LENGTH.pack(len(reply.answers)), bodies)
 
 
 def read_history_reply(data: bytes) -> HistoryReply:
     """Return the reply in the bytes of a get_history_reply_t. Raises WireError, struct.error."""
-    header, at = _read_header(data)
+    header, at = read_header(data)
     (count,) = LENGTH.unpack_from(data, at)
     at += LENGTH.size
     answers = []
@@ -155,7 +155,8 @@ def read_history_reply(data: bytes) -> HistoryReply:
     return HistoryReply(header, tuple(answers))
 
 
-def _header(header: ReplyHeader) -> bytes:
+def header_body(header: ReplyHeader) -> bytes:
+    """Return the bytes of a reply_header_t without its fingerprint."""
     if not header.message and not header.nearest:
         head = _REPLY_HEAD.pack(header.request_id, header.utime, header.status)
         return b"%b%b%b" % (head, _PLAIN, text(header.model_revision))
@@ -168,7 +169,8 @@ def _header(header: ReplyHeader) -> bytes:
     )
 
 
-def _read_header(data: bytes) -> tuple[ReplyHeader, int]:
+def read_header(data: bytes) -> tuple[ReplyHeader, int]:
+    """Return the header that a reply begins with, and where it ends. Raises WireError, struct.error."""
     request_id, utime, status = _REPLY_HEAD.unpack_from(data, 8)
     if status == 0 and data[_PLAIN_AT : _PLAIN_AT + len(_PLAIN)] == _PLAIN:
         revision, at = read_text(data, _PLAIN_AT + len(_PLAIN))

@@ -113,6 +113,36 @@ def test_given_one_argument_when_run_then_usage_is_said(query: Path, lcm_url: st
     assert "usage: query FRAME_OF_INTEREST FRAME_OF_REFERENCE" in done.stderr
 
 
+def test_given_the_example_for_asyncio_then_platform_and_mirror_say_the_same(daemon_url: str) -> None:
+    path = ROOT / "examples" / "python" / "asyncio_client.py"
+    pair = ("Digiclops:ImagePlane", "GPSAntenna:PhaseCentre")
+    done = subprocess.run(
+        [sys.executable, path, *pair],
+        env=os.environ | {"LCM_DEFAULT_URL": daemon_url},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    first, second = (line.rsplit(" ", 3)[1:] for line in done.stdout.splitlines() if "in Odom:" not in line)
+    expected = ms.load_model(RAPTOR / "geometry.yaml").get_transformation(*pair).position
+    np.testing.assert_allclose([list(map(float, each)) for each in (first, second)], [expected] * 2, atol=2e-6)
+
+
+def test_given_the_example_for_asyncio_and_a_mistyped_frame_then_the_nearest_is_said(daemon_url: str) -> None:
+    path = ROOT / "examples" / "python" / "asyncio_client.py"
+    done = subprocess.run(
+        [sys.executable, path, "Digiclops:ImagePlan", "Raptor:CG"],
+        env=os.environ | {"LCM_DEFAULT_URL": daemon_url},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 1
+    assert "ImagePlan" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 @pytest.mark.parametrize("language", LANGUAGES)
 def test_given_a_client_then_it_is_written_without_modelserver(language: str) -> None:
     for path in (ROOT / "examples" / f"client_{language}").iterdir():

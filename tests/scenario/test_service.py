@@ -30,20 +30,28 @@ from modelserver.messages import (
     CHANNEL_OF,
     GetBodyFrameList,
     GetBodyList,
+    GetExplanation,
     GetHistory,
     GetHTransform,
+    GetMotion,
     GetStateVector,
     GetTransformation,
+    GetTransformations,
     Invalid,
     PoseAnswer,
+    ReloadModel,
     RequestHeader,
+    SetHTransform,
+    SetStateVector,
     TimeQuery,
 )
+from modelserver.spatial import Pose, Transformation
 from modelserver.wire.channels import REQUESTS
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.provider import resolve_url
 
 ME = RequestHeader(5, "REPLY_RAW")
+THERE = PoseAnswer(Transformation("Cart:Base", "World:UTM", Pose()))
 REQUEST_OF: dict[str, Any] = {
     CHANNEL_OF[type(each)]: each
     for each in (
@@ -53,6 +61,12 @@ REQUEST_OF: dict[str, Any] = {
         GetStateVector(ME),
         GetHTransform(ME),
         GetHistory(ME, 1, 2, 1.0),
+        GetTransformations(ME, (("Camera:Origin", "Cart:Base"),), (1, 2)),
+        GetMotion(ME, "Camera:Origin", "Cart:Base"),
+        GetExplanation(ME, "Camera:Origin", "Cart:Base"),
+        ReloadModel(ME),
+        SetStateVector(ME, THERE),
+        SetHTransform(ME, THERE),
     )
 }
 StartDaemon = Callable[..., Daemon]

@@ -226,7 +226,9 @@ def test_given_a_key_of_a_section_at_the_top_then_the_section_is_told() -> None:
 
 
 def test_given_an_unknown_key_like_no_other_then_the_known_ones_are_told() -> None:
-    assert problem("publish: {zzzzzz: 1}\n").fix == "known here: mode, rate_hz, health_hz, state_hz, decisions"
+    assert (
+        problem("publish: {zzzzzz: 1}\n").fix == "known here: mode, rate_hz, health_hz, state_hz, decisions, snapshot_s"
+    )
 
 
 def test_given_many_problems_then_all_are_told_at_once() -> None:

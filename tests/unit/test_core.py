@@ -13,6 +13,7 @@ from modelserver import core
 from modelserver.core import MAX_COUNTERS, CoreSettings, CoreState, Instant, step
 from modelserver.errors import Status, UnknownBodyError, UnknownFrameError
 from modelserver.geometry import names
+from modelserver.history import STEP_US
 from modelserver.localization.mounts import Mounts
 from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.messages import (
@@ -29,6 +30,7 @@ from modelserver.messages import (
     HistoryReply,
     ImuSample,
     Invalid,
+    JointSample,
     JointsSample,
     Mode,
     NameListReply,
@@ -69,7 +71,6 @@ REQUESTS: list[Any] = [
 ]
 OTHERS: list[Any] = [
     WheelsSample(SensorHeader(START + 3, "wheels"), ()),
-    JointsSample(SensorHeader(START + 3, "joints"), ()),
     AbsolutePoseSample(SensorHeader(START + 3, "map"), "Cart:Mast", names.WORLD_UTM, (1.0, 2.0, 3.0)),
     RelativePoseSample(SensorHeader(START + 3, "vo"), "Cart:Mast", START, (0.1, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),
     RangeSample(SensorHeader(START + 3, "tag"), "Cart:Mast", "gate", (1.0, 2.0, 3.0), names.WORLD_UTM, 5.0),
@@ -380,6 +381,15 @@ def test_given_a_sample_of_any_kind_then_it_counts_for_what_the_localizer_makes_
     assert len(run.state.history) == 0
     (pose,) = of_kind(run.feed(sample), PublishPose)
     assert pose.world.transformation.utime == run.state.history.last == START + 3
+
+
+def test_given_positions_of_joints_then_they_are_no_localizers_and_unknown_names_are_counted_with_the_nearest() -> None:
+    run = Run(publish="event")
+    told = (JointSample("Mast", 0.5), JointSample("Pan", math.nan), JointSample("Tilt", math.inf))
+    assert run.feed(JointsSample(SensorHeader(START, "arm"), told)) == ()
+    assert run.state.traffic["sensor:arm"].count == 1
+    assert {reason for _, reason in run.state.rejected} == {"unknown joint 'Mast'", "unknown joint 'Tilt'"}
+    assert len(run.state.history) == 0
 
 
 @pytest.mark.parametrize("sample", OTHERS, ids=lambda sample: type(sample).__name__)
@@ -728,9 +738,9 @@ def test_given_a_flood_of_samples_then_estimates_are_held_at_intervals() -> None
     for n in range(1000):
         run.samples(n * 0.0005)
     held = len(run.state.history)
-    assert held == pytest.approx(500_000 / core.HISTORY_STEP_US, abs=1)
+    assert held == pytest.approx(500_000 / STEP_US, abs=1)
     assert run.state.localizer is not None
-    assert run.state.localizer.utime - run.state.history.last < core.HISTORY_STEP_US
+    assert run.state.localizer.utime - run.state.history.last < STEP_US
 
 
 def test_given_a_host_clock_that_was_set_back_then_no_pose_is_valid_until_a_sample_fits() -> None:

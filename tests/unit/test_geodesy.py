@@ -276,3 +276,11 @@ def test_only_localization_and_simulation_pay_for_pyproj():
         "sys.exit('pyproj' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (1200.0, -800.0, 15.0), (-40_000.0, 60_000.0, 300.0)])
+def test_given_a_pose_in_enu_then_it_comes_back_from_utm(place: tuple[float, float, float]) -> None:
+    for latitude, longitude in ((50.27, -111.1), (-33.9, 151.2), (78.2, 15.6), (0.0, 9.0)):
+        geodesy = Geodesy(origin_at(latitude, longitude, 700.0))
+        pose = Pose.from_rpy(place, 0.1, -0.2, 2.5)
+        assert geodesy.pose_in_enu(geodesy.pose_in_utm(pose)).is_close(pose, 1e-7, 1e-11)

@@ -13,9 +13,9 @@ ROOT = Path(__file__).resolve().parents[2]
 VALUES = {"errors", "version", "spatial"}
 GEOMETRY = VALUES | {"geometry"}
 POSES = VALUES | {"messages", "geodesy", "earth", "magnetism", "history"}
-CORE = GEOMETRY | POSES | {"localization", "platform"}
+CORE = GEOMETRY | POSES | {"joints", "joint_reading", "joint_track", "joint_vector", "localization", "platform"}
 WIRE = VALUES | {"messages", "wire", "mslcm"}
-SERVICE = CORE | WIRE | {"core", "config", "formats"}
+SERVICE = CORE | WIRE | {"core", "config", "formats", "reload", "snapshot"}
 
 MAY_IMPORT: dict[str, set[str]] = {
     "version": set(),
@@ -27,17 +27,23 @@ MAY_IMPORT: dict[str, set[str]] = {
     "earth": VALUES,
     "magnetism": VALUES,
     "history": VALUES | {"messages"},
+    "joint_reading": {"messages"},
+    "joint_track": VALUES | {"messages", "joint_reading"},
+    "joint_vector": GEOMETRY | {"joint_reading", "joint_track"},
+    "joints": GEOMETRY | {"messages", "joint_reading", "joint_track"},
     "formats": GEOMETRY,
     "localization": GEOMETRY | POSES,
     "platform": CORE,
     "answers": CORE,
-    "core": CORE | {"answers"},
+    "reload": CORE,
+    "snapshot": GEOMETRY | {"formats"},
+    "core": CORE | {"answers", "reload"},
     "simulation": GEOMETRY | {"messages", "geodesy", "earth"},
     "config": GEOMETRY | {"messages", "localization", "config_reader"},
     "config_reader": {"errors"},
     "wire": WIRE,
     "service": SERVICE,
-    "client": WIRE | GEOMETRY | {"formats", "history", "platform"},
+    "client": WIRE | GEOMETRY | POSES | {"formats", "joints", "platform", "snapshot"},
     "msdrivers.protocol": VALUES | {"messages"},
     "msdrivers.station": VALUES | {"messages"},
     "msdrivers.devices": VALUES | {"messages", "msdrivers.protocol", "msdrivers.station"},
@@ -71,8 +77,13 @@ PURE = {
     "localization",
     "messages",
     "history",
+    "joint_reading",
+    "joint_track",
+    "joint_vector",
+    "joints",
     "platform",
     "answers",
+    "reload",
     "core",
     "simulation",
     "msdrivers.protocol",

@@ -1,17 +1,20 @@
-"""What `query`, `bodies` and `frames` share: they ask the running daemon, or with --model a file."""
+"""What `query`, `bodies` and `frames` share: they ask the running daemon, a geometry file, or `query` a log."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Protocol
+from typing import TYPE_CHECKING, Annotated, Protocol
 
 import typer
 
 from modelserver.errors import ModelServerError
 from modelserver.geometry import names
-from modelserver.messages import Policy, PoseAnswer
+from modelserver.messages import NO_FLAGS, Explanation, MotionAnswer, Policy, PoseAnswer, Quality
 from mstools.options import parse_variables
 from mstools.output import print_problem
+
+if TYPE_CHECKING:
+    from mstools.log_answers import LogAnswers
 
 ModelOption = Annotated[
     Path | None, typer.Option("--model", metavar="FILE", help="Ask this geometry file instead of the daemon.")
@@ -72,11 +75,72 @@ class FileAnswers:
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> PoseAnswer:
-        """Return where one frame is in another; time plays no part."""
+        """Return where one frame is in another; time plays no part, and joints stand where they rest."""
         asked = {frame.partition(":")[0] for frame in (frame_of_interest, frame_of_reference)}
         if not asked.isdisjoint(names.RESERVED_BODIES):
             raise ModelServerError("a geometry file does not know where the vehicle is in the world; ask the daemon")
-        return PoseAnswer(self._model.get_transformation(frame_of_interest, frame_of_reference))
+        rests = bool(self._model.route(frame_of_interest, frame_of_reference).legs)
+        return PoseAnswer(
+            self._model.get_transformation(frame_of_interest, frame_of_reference),
+            quality=Quality.AT_REST if rests else NO_FLAGS,
+        )
+
+    def explain(
+        self,
+        frame_of_interest: str,
+        frame_of_reference: str,
+        *,
+        at: int = 0,
+        policy: Policy = Policy.INTERPOLATED,
+        wait_ms: int = 0,
+    ) -> Explanation:
+        """Return what `get_pose` does, and the edges it rests on."""
+        from modelserver.history import History
+        from modelserver.messages import TimeQuery
+        from modelserver.platform import PlatformView
+        from modelserver.platform.explained import explained
+
+        answer = self.get_pose(frame_of_interest, frame_of_reference)
+        view = PlatformView(self._model, frame_of_reference, None, History(0.0))
+        found = explained(view, frame_of_interest, frame_of_reference, TimeQuery(), 0)
+        # that nobody was heard is no reason against an answer that is of the file alone
+        return found._replace(answer=answer._replace(quality=found.answer.quality))
+
+    def get_motion(
+        self,
+        frame_of_interest: str,
+        frame_of_reference: str,
+        *,
+        expressed_in: str = "",
+        at: int = 0,
+        policy: Policy = Policy.INTERPOLATED,
+        wait_ms: int = 0,
+    ) -> MotionAnswer:
+        """Raise: a file stands still."""
+        raise ModelServerError("a geometry file does not know how anything moves; ask the daemon")
+
+
+def log_answers(log: Path, model: Path | None, settings: list[str] | None, prefix: str) -> LogAnswers:
+    """Return what answers from a log, with `model` for its geometry. Raises RecordingError, GeometryError, OSError."""
+    from modelserver.client.knowledge import HISTORY_S
+    from modelserver.formats import load_model
+    from modelserver.snapshot import Snapshot
+    from mstools.log_answers import LogAnswers
+
+    if model is None:
+        return LogAnswers(log, prefix)
+    given = load_model(model, variables=parse_variables(settings))
+    for problem in given.problems:
+        print_problem(problem, err=True)
+    root = f"{given.root.name}:{given.root.frames[0].name}"
+    source = LogAnswers(log, prefix, Snapshot("", given, root, root, HISTORY_S, f"{prefix}JOINTS"))
+    if source.revision not in ("", given.revision):
+        typer.echo(
+            f"modelserver: note: {model} is of revision {given.revision}, and the poses in {log} "
+            f"rest on {source.revision}",
+            err=True,
+        )
+    return source
 
 
 def answers(model: Path | None, settings: list[str] | None, url: str, prefix: str, timeout: float) -> Answers:

@@ -14,6 +14,7 @@ import typer
 from modelserver.errors import ConfigError, GeometryError, Problem, Severity, Source
 from modelserver.formats import check_file
 from modelserver.geometry.model import Model
+from mstools.check_drivers import drivers_problems
 from mstools.options import Variables, parse_variables
 from mstools.output import counted, print_problem, safe, size_of
 
@@ -23,11 +24,15 @@ if TYPE_CHECKING:
 
 def command(
     files: Annotated[
-        list[str], typer.Argument(metavar="FILE", help="Geometry files (Miro XML or YAML), or vehicle files.")
+        list[str],
+        typer.Argument(metavar="FILE", help="Geometry files (YAML, Miro XML, URDF, libbot2 frames), or vehicle files."),
     ],
     variables: Variables = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")] = False,
     notes: Annotated[bool, typer.Option("--notes", help="Print notes as well; they change no exit code.")] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Refuse a second constraint at a frame, as the server of 2005 did.")
+    ] = False,
 ) -> None:
     """Say everything that is wrong with a geometry file: severity, place, what, and what to do.
 
@@ -37,7 +42,7 @@ def command(
     Example: modelserver check config/raptor/geometry.xml
     """
     values = parse_variables(variables)
-    results = [(file, *_checked(file, values)) for file in files]
+    results = [(file, *_checked(file, values, strict)) for file in files]
     if as_json:
         typer.echo(json.dumps({"files": [_as_data(*result) for result in results]}, indent=2))
     else:
@@ -47,20 +52,21 @@ def command(
         raise typer.Exit(1)
 
 
-def _checked(file: str, variables: dict[str, str]) -> tuple[Model | None, tuple[Problem, ...]]:
+def _checked(file: str, variables: dict[str, str], strict: bool) -> tuple[Model | None, tuple[Problem, ...]]:
     try:
-        if _is_vehicle_file(file):
-            return _checked_vehicle(file)
+        if is_vehicle_file(file):
+            return _checked_vehicle(file, strict)
         if os.path.isfile(file) and not os.path.getsize(file):
             fix = "see docs/geometry-files.md, or docs/vehicle-file.md for a vehicle file, for an example to begin with"
             return None, (Problem(Severity.ERROR, "the file is empty", Source(file), fix),)
-        return check_file(file, variables)
+        return check_file(file, variables, strict=strict)
     except OSError as error:
         message = f"the file cannot be read: {error.strerror or error}"
         return None, (Problem(Severity.ERROR, message, Source(file), "look at the path and its permissions"),)
 
 
-def _is_vehicle_file(file: str) -> bool:
+def is_vehicle_file(file: str) -> bool:
+    """Return whether a file is a vehicle file, by what stands in it."""
     if not os.path.isfile(file):
         return False
     with open(file, "rb") as stream:
@@ -68,7 +74,7 @@ def _is_vehicle_file(file: str) -> bool:
     return all(re.search(rb"^%b\s*:" % key, head, re.MULTILINE) for key in (b"vehicle", b"base_frame"))
 
 
-def _checked_vehicle(file: str) -> tuple[Model | None, tuple[Problem, ...]]:
+def _checked_vehicle(file: str, strict: bool) -> tuple[Model | None, tuple[Problem, ...]]:
     # imported here: a geometry file needs neither the configuration's libraries nor geodesy
     from modelserver.config import load_partly, with_lines
     from modelserver.service.daemon import load_vehicle
@@ -81,11 +87,11 @@ def _checked_vehicle(file: str) -> tuple[Model | None, tuple[Problem, ...]]:
         return None, problems
     model = None
     try:
-        model = load_vehicle(config, file).model
+        model = load_vehicle(config, file, strict).model
         more = model.problems
     except (ConfigError, GeometryError) as error:
         more = error.problems
-    more += _drivers_problems(config, file)
+    more += drivers_problems(config, file, model)
     if any(each.element.startswith("sensors") for each in problems):
         # a sensor that was left out as wrong is not missing
         more = tuple(each for each in more if each.element != "localization.mode")
@@ -93,20 +99,6 @@ def _checked_vehicle(file: str) -> tuple[Model | None, tuple[Problem, ...]]:
     # a model beside a wrong vehicle file would look as if all were well
     clean = not any(each.severity is Severity.ERROR for each in (*problems, *more))
     return model if clean else None, (*sorted((*problems, *more), key=lambda each: (each.file != file, each.line)),)
-
-
-def _drivers_problems(config: VehicleConfig, file: str) -> tuple[Problem, ...]:
-    """Return what is wrong with the drivers' settings."""
-    if not config.drivers:
-        return ()
-    from modelserver.config import config_lines
-    from msdrivers.settings import Place, read_drivers
-
-    try:
-        read_drivers(config.drivers, Place(file, config_lines(file)))
-    except ConfigError as error:
-        return error.problems
-    return ()
 
 
 def _worth_knowing(config: VehicleConfig, file: str) -> Iterator[Problem]:

@@ -24,6 +24,8 @@ COMMANDS = {
     "query": "Where is one frame in another?",
     "bodies": "List the bodies.",
     "frames": "List the frames of a body.",
+    "tree": "Draw how bodies hang together: constraints, joints, loops, orphans.",
+    "reload": "Have the running daemon read its geometry file anew.",
     "replay": "Feed a recorded log to the bus, or straight through the localization.",
     "mode": "Tell the running daemon which sources its localization is to use.",
     "tune": "Propose noise settings of the filter from a log, by fixes that were withheld.",
@@ -48,6 +50,11 @@ OTHER_WORDS = {
     "import": "import-bag",
     "switch": "mode",
     "watch": "spy",
+    "graph": "tree",
+    "draw": "tree",
+    "hup": "reload",
+    "explain": "query",
+    "motion": "query",
 }
 """What others call our commands."""
 

@@ -14,14 +14,15 @@ from mstools.output import counted, print_problem, safe, size_of, write_file
 
 
 def command(
-    source: Annotated[str, typer.Argument(metavar="IN", help="Geometry file: Miro XML or YAML.")],
+    source: Annotated[str, typer.Argument(metavar="IN", help="Geometry file: YAML, Miro XML, URDF or libbot2 frames.")],
     target: Annotated[str, typer.Argument(metavar="OUT", help="File to write, or - for standard output.")],
     form: Annotated[
         str,
         typer.Option(
             "--to",
             metavar="FORM",
-            help=f"Form to write: {', '.join(FORMS)}. Without it the ending of OUT decides: .yaml, .yml; .xml is miro.",
+            help=f"Form to write: {', '.join(FORMS)}. Without it the ending of OUT decides: "
+            ".yaml, .yml, .urdf; .xml is miro.",
         ),
     ] = "",
     variables: Variables = None,
@@ -34,6 +35,8 @@ def command(
     """Write a geometry file in another form; what that form cannot hold is said on standard error.
 
     Example: modelserver convert K11Frames.xml k11.yaml --set MRN=K11
+
+    Example: modelserver convert husky.urdf husky.yaml
     """
     form = _form(form, target)
     values = parse_variables(variables)

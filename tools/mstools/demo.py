@@ -136,7 +136,13 @@ def show(lines: Lines, seconds: float, children: Children) -> None:
         say(describe(platform.get_pose("Digiclops:ImagePlane", "World:UTM", at=at)))
         history = platform.get_history(at - 1_000_000, at, 10.0)
         say(f"get_history gave {len(history)} poses of the second before that")
-        say("\n6. What it says to a slip")
+        say("\n6. The nodding laser a moment ago: where it was, and how it moved")
+        at = valid[-1].transformation.utime - 200_000
+        moving = platform.get_motion("FrontSICKLaser:Scan", "Raptor:CG", at=at)
+        say(describe(moving.pose))
+        say(f"  turns at        {math.degrees(-moving.rate[1]):.1f} deg/s, upwards positive")
+
+        say("\n7. What it says to a slip")
         try:
             platform.get_transformation("Digiclop:ImagePlane", "Raptor:CG")
         except QueryError as error:

@@ -5,12 +5,23 @@ from __future__ import annotations
 import json
 import math
 from datetime import UTC, datetime
-from typing import Annotated, Any
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from modelserver.messages import Invalid, Policy, PoseAnswer, Quality
-from mstools.asking import JsonOption, ModelOption, PrefixOption, TimeoutOption, UrlOption, answers
+from modelserver.messages import Invalid, Policy, PoseAnswer, Quality, TimeQuery
+from mstools.asking import (
+    Answers,
+    JsonOption,
+    ModelOption,
+    PrefixOption,
+    TimeoutOption,
+    UrlOption,
+    answers,
+    log_answers,
+)
+from mstools.explain import describe_edges, describe_motion, edges_as_data, explaining, motion_as_data
 from mstools.options import Variables
 
 POLICIES = {policy.name.lower(): policy for policy in Policy}
@@ -21,10 +32,17 @@ def command(
     frame_of_reference: Annotated[str, typer.Argument(metavar="REFERENCE", help="The frame that it is told in.")],
     model: ModelOption = None,
     settings: Variables = None,
+    log: Annotated[
+        Path | None,
+        typer.Option("--log", metavar="FILE", help="Ask this LCM log of the service instead of the daemon."),
+    ] = None,
     at: Annotated[
         str,
         typer.Option(
-            "--at", metavar="TIME", help="Microseconds since 1970, or 2026-11-21T08:30:00.5Z (without Z: local time)."
+            "--at",
+            metavar="TIME",
+            help="Microseconds since 1970, or 2026-11-21T08:30:00.5Z (without Z: local time); with --log also +12.5, "
+            "seconds from its start. Default: the latest.",
         ),
     ] = "",
     policy: Annotated[
@@ -35,6 +53,15 @@ def command(
     ] = 0,
     inverse: Annotated[bool, typer.Option("--inverse", help="Print the reverse relation.")] = False,
     matrix: Annotated[bool, typer.Option("--matrix", help="Print the 4x4 transform too.")] = False,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Print each edge that the answer rests on, then the answer.")
+    ] = False,
+    motion: Annotated[
+        bool, typer.Option("--motion", help="Print velocity, turn rate and how they change, then the pose.")
+    ] = False,
+    expressed_in: Annotated[
+        str, typer.Option("--expressed-in", metavar="FRAME", help="Along whose axes --motion is told.")
+    ] = "",
     as_json: JsonOption = False,
     url: UrlOption = "",
     prefix: PrefixOption = "",
@@ -42,21 +69,69 @@ def command(
 ) -> None:
     """Where is one frame in another? Frames are named Body:Frame.
 
-    Asks the running daemon, or with --model a geometry file. World:UTM, World:ENU and Odom:Origin are known beside
+    Asks the running daemon, with --model a geometry file, or with --log what a log tells: the geometry that the service
+    broadcast, its poses and the joints. World:UTM, World:ENU and Odom:Origin are known beside
     the file's frames. Exit code 1 where there is no answer; a pose that is not valid is printed, says why, and
     exits 0.
 
+    --explain tells what the answer rests on: each frame, constraint and joint on the way, how it was come by, how old
+    it is, who told it, and its share of what is unsure. --motion tells how the one frame moves in the other.
+
     Example: modelserver query Digiclops:ImagePlane FrontNoddingSICK:Origin --model config/raptor/geometry.xml
     """
+    if expressed_in and not motion:
+        raise typer.BadParameter(
+            "it says along whose axes --motion is told; give that too", param_hint="--expressed-in"
+        )
+    if explain and motion:
+        raise typer.BadParameter("--explain and --motion are two questions; ask one after the other")
     if policy not in POLICIES:
         raise typer.BadParameter(f"{policy!r} is not one of {', '.join(POLICIES)}", param_hint="--policy")
     if inverse:
         frame_of_interest, frame_of_reference = frame_of_reference, frame_of_interest
-    source = answers(model, settings, url, prefix, timeout)
+    source: Answers
+    utime = None
+    if log is not None:
+        recorded = source = log_answers(log, model, settings, prefix)
+        utime = recorded.time(at)
+    else:
+        source = answers(model, settings, url, prefix, timeout)
+    utime = _utime(at) if utime is None else utime
+    if explain or motion:
+        when = TimeQuery(utime, POLICIES[policy], wait_ms)
+        ends = (frame_of_interest, frame_of_reference)
+        told = _explained(source, *ends, when) if explain else _moved(source, *ends, expressed_in, when)
+        typer.echo(json.dumps(told.data, indent=2) if as_json else f"{told.words}\n\n{describe(told.answer, matrix)}")
+        return
     answer = source.get_pose(
-        frame_of_interest, frame_of_reference, at=_utime(at), policy=POLICIES[policy], wait_ms=wait_ms
+        frame_of_interest,
+        frame_of_reference,
+        at=utime,
+        policy=POLICIES[policy],
+        wait_ms=wait_ms,
     )
     typer.echo(json.dumps(as_dict(answer), indent=2) if as_json else describe(answer, matrix))
+
+
+class _Told(NamedTuple):
+    """An answer with what was asked beyond it, in words and for scripts."""
+
+    answer: PoseAnswer
+    words: str
+    data: dict[str, Any]
+
+
+def _explained(source: object, interest: str, reference: str, time: TimeQuery) -> _Told:
+    found = explaining(source).explain(interest, reference, at=time.at, policy=time.policy, wait_ms=time.wait_ms)
+    data = as_dict(found.answer) | {"edges": edges_as_data(found)}
+    return _Told(found.answer, describe_edges(found), data)
+
+
+def _moved(source: object, interest: str, reference: str, axes: str, time: TimeQuery) -> _Told:
+    found = explaining(source).get_motion(
+        interest, reference, expressed_in=axes, at=time.at, policy=time.policy, wait_ms=time.wait_ms
+    )
+    return _Told(found.pose, describe_motion(found), as_dict(found.pose) | motion_as_data(found))
 
 
 def _utime(text: str) -> int:
@@ -69,7 +144,9 @@ def _utime(text: str) -> int:
         return round((when if when.tzinfo else when.astimezone()).timestamp() * 1e6)
     except (ValueError, OverflowError, OSError):
         raise typer.BadParameter(
-            f"{text!r} is neither microseconds since 1970 nor a time like 2026-11-21T08:30:00.5Z", param_hint="--at"
+            f"{text!r} is neither microseconds since 1970 nor a time like 2026-11-21T08:30:00.5Z, nor with --log "
+            "seconds from its start like +12.5",
+            param_hint="--at",
         ) from None
 
 
@@ -108,7 +185,8 @@ def describe(answer: PoseAnswer, matrix: bool = False) -> str:
         bound = f"{answer.horizontal_bound:.2f} m, heading {math.degrees(answer.heading_bound):.2f} deg"
         lines.append(f"  bounds          {bound}")
     if answer.quality:
-        lines.append(f"  flags           {', '.join(flag.name or '' for flag in Quality if flag in answer.quality)}")
+        flags = ", ".join(flag.name or "" for flag in Quality if flag in answer.quality)
+        lines.append(f"  flags           {flags}: {answer.quality.explain()}")
     if not transformation.valid:
         lines.append(f"  NOT VALID       {Invalid(transformation.invalid_reasons).explain()}")
     return "\n".join(lines)

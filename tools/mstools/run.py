@@ -22,7 +22,8 @@ def command(
     """Run the service for a vehicle file, until SIGTERM or Ctrl-C.
 
     Loads the geometry, listens to the sensors, broadcasts POSE and answers requests. Refuses to start where the
-    vehicle file or the geometry is wrong, and says everything that is. Logs go to stderr.
+    vehicle file or the geometry is wrong, and says everything that is. Logs go to stderr. SIGHUP has it read the
+    geometry file anew: all of it is used, or, where it is wrong, nothing changes and the log says why.
 
     Example: modelserver run -c config/raptor/vehicle.yaml
     """
@@ -38,4 +39,4 @@ def command(
     vehicle = daemon.load_vehicle(load_config(config), str(config))
     for problem in vehicle.model.problems:
         logging.getLogger("modelserver").warning("%s", problem)
-    daemon.run(vehicle, url)
+    daemon.run(vehicle, url, str(config))

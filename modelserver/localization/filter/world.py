@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import numpy.typing as npt
@@ -11,12 +11,12 @@ import numpy.typing as npt
 from modelserver.geodesy import Geodesy, GeodesyError, LocalFrame, about_up, geodetic_from_ecef
 from modelserver.localization.filter import bounds, motion, strapdown
 from modelserver.localization.filter.measurements.constraints import tilt_of
-from modelserver.localization.filter.nav import Nav, jacobian_of_body_velocity
+from modelserver.localization.filter.nav import ZERO, Nav, jacobian_of_body_velocity
 from modelserver.localization.filter.odometry import Odometry
 from modelserver.localization.filter.setup import Setup
 from modelserver.localization.filter.state import FilterState
 from modelserver.localization.filter.strapdown import Noise
-from modelserver.messages import NAN, Estimate, Invalid, Mode, NavigationState, Phase, Quality
+from modelserver.messages import NAN, Estimate, Invalid, Mode, NavigationState, Phase, Quality, VehicleMotion
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array, Quaternion, Vector3
@@ -56,6 +56,7 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
             quality=quality,
             pose_epoch=state.epoch,
             origin=origin,
+            motion=vehicle_motion(setup, ahead, nav),
         )
     settings = setup.settings
     if nav.lag > LAG:
@@ -90,7 +91,34 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
         horizontal,
         heading,
         NAN if invalid else _seconds_left(setup, state, nav, utime, horizontal),
+        vehicle_motion(setup, ahead, nav),
     )
+
+
+def vehicle_motion(setup: Setup, state: FilterState, nav: Nav) -> VehicleMotion:
+    """Return how the vehicle moves: the filter's velocity and turn rate, and the force felt with gravity taken off."""
+    base = setup.rig.base
+    lever = (-base[0], -base[1], -base[2])
+    covariance = partial(_twist_covariance, setup, nav)
+    if state.standing:
+        return VehicleMotion(ZERO, ZERO, ZERO, lever, covariance)
+    acceleration = (NAN, NAN, NAN)
+    if motion.inertial(setup, state.mode):
+        g = state.earth.gravity
+        (fx, fy, fz), (bx, by, bz), (ux, uy, uz) = nav.force, nav.accelerometer_bias, nav.up
+        acceleration = (fx - bx - g * ux, fy - by - g * uy, fz - bz - g * uz)
+    return VehicleMotion(nav.body_velocity(base), nav.turn_rate, acceleration, lever, covariance)
+
+
+def _twist_covariance(setup: Setup, nav: Nav) -> tuple[float, ...]:
+    """Return the 36 numbers of velocity and turn rate of the rolling frame along its own axes, row-major."""
+    n = setup.layout.size
+    H = np.zeros((6, n))
+    H[:3] = jacobian_of_body_velocity(nav, setup.rig.base, n)
+    H[3:, 9:12] = -np.eye(3)
+    twist = H @ nav.covariance @ H.T
+    twist[3:, 3:] += np.eye(3) * setup.settings.gyro_noise**2 / 0.02
+    return tuple(twist.ravel().tolist())
 
 
 def _followed(setup: Setup, state: FilterState, utime: int) -> tuple[Vector3, Vector3]:
@@ -252,15 +280,9 @@ def navigation(setup: Setup, state: FilterState) -> NavigationState | None:
     if nav is None:
         return None
     base = setup.rig.base
-    n = setup.layout.size
     latitude = longitude = height = NAN
     if state.site is not None and state.phase is Phase.ALIGNED:
         latitude, longitude, height = geodetic_from_ecef(state.site.ecef)
-    H = np.zeros((6, n))
-    H[:3] = jacobian_of_body_velocity(nav, base, n)
-    H[3:, 9:12] = -np.eye(3)
-    twist = H @ nav.covariance @ H.T
-    twist[3:, 3:] += np.eye(3) * setup.settings.gyro_noise**2 / 0.02
     values = (
         *nav.position,
         *nav.velocity,
@@ -282,7 +304,7 @@ def navigation(setup: Setup, state: FilterState) -> NavigationState | None:
         Pose(nav.point(base), nav.attitude),
         nav.body_velocity(base),
         nav.turn_rate,
-        tuple(twist.ravel().tolist()),
+        _twist_covariance(setup, nav),
         setup.layout.names,
         tuple(map(float, values)),
         tuple(nav.covariance.ravel().tolist()),

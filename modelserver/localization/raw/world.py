@@ -38,6 +38,7 @@ def estimate(state: RawState, utime: int) -> Estimate:
             quality=quality,
             pose_epoch=state.pose_epoch,
             origin=state.origin,
+            odom_walks=True,
         )
 
     heading = state.heading
@@ -81,6 +82,7 @@ def estimate(state: RawState, utime: int) -> Estimate:
         horizontal_bound,
         heading_bound,
         NAN if invalid else max(remaining, 0.0),
+        odom_walks=True,
     )
 
 

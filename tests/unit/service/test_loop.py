@@ -17,19 +17,25 @@ from modelserver.messages import (
     Estimate,
     GetBodyFrameList,
     GetBodyList,
+    GetExplanation,
     GetHistory,
     GetHTransform,
+    GetMotion,
     GetStateVector,
     GetTransformation,
+    GetTransformations,
     Health,
     Mode,
     NavigationState,
     Policy,
     PoseAnswer,
     PublishDecisions,
+    ReloadModel,
     Reply,
     RequestHeader,
     SensorHeader,
+    SetHTransform,
+    SetStateVector,
     SwitchMode,
     TimeQuery,
 )
@@ -38,6 +44,8 @@ from modelserver.service.fake_bus import FakeBus
 from modelserver.service.heard import Heard
 from modelserver.service.log import MAX_CAUSES, PERIOD_S, RateLimited
 from modelserver.service.loop import REFUSALS_PER_PASS, SENSORS_PER_PASS, Loop, LoopSettings
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.transformation import Transformation
 from modelserver.wire.channels import REQUESTS
 from modelserver.wire.codec import decode, encode
 
@@ -344,6 +352,12 @@ def test_given_random_bytes_on_any_channel_then_they_are_counted_and_the_next_go
                 (GetStateVector, ()),
                 (GetHTransform, ()),
                 (GetHistory, (START, START, 1.0)),
+                (GetTransformations, ((("Camera:Origin", "Cart:Base"),), (START,))),
+                (GetMotion, ("Camera:Origin", "Cart:Base")),
+                (GetExplanation, ("Camera:Origin", "World:UTM")),
+                (ReloadModel, ()),
+                (SetStateVector, (PoseAnswer(Transformation("Cart:Base", "World:UTM", Pose())),)),
+                (SetHTransform, (PoseAnswer(Transformation("Cart:Base", "World:UTM", Pose())),)),
             )
             if CHANNEL_OF[kind] == channel
         )

@@ -1,6 +1,7 @@
 """`modelserver check`."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -51,6 +52,26 @@ def test_a_warning_exits_1_and_the_size_is_told(check):
     code, out, _ = check(cart=YAML.replace("constraints:", "  Lamp: {frames: {Origin: }}\nconstraints:"))
     assert code == 1
     assert out.splitlines()[-1] == "cart: 3 bodies, 4 frames, 1 constraint; 1 warning"
+
+
+def test_given_two_constraints_on_a_frame_then_strict_alone_refuses_the_second(check):
+    text = YAML.replace("constraints:", "  Lamp: {frames: {Origin: }}\nconstraints:")
+    text += "  LampFixed: {from: Cart:Mast, to: Lamp:Origin}\n"
+    assert check(cart=text)[:2] == (0, "cart: 3 bodies, 4 frames, 2 constraints; clean\n")
+    code, out, _ = check("--strict", cart=text)
+    assert code == 1
+    assert "frame Cart:Mast already has constraint CameraFixed" in out
+    assert out.splitlines()[-1] == "cart: 1 error"
+
+
+def test_given_a_vehicle_file_then_strict_counts_for_its_geometry(check, tmp_path):
+    text = YAML.replace("constraints:", "  Lamp: {frames: {Origin: }}\nconstraints:")
+    (tmp_path / "geometry.yaml").write_text(text + "  LampFixed: {from: Cart:Mast, to: Lamp:Origin}\n")
+    vehicle = "vehicle: cart\ngeometry: geometry.yaml\nbase_frame: Cart:Origin\n"
+    assert check(**{"vehicle.yaml": vehicle})[0] == 0
+    code, out, _ = check("--strict", **{"vehicle.yaml": vehicle})
+    assert code == 1
+    assert "already has constraint CameraFixed" in out
 
 
 def test_notes_are_counted_printed_when_asked_for_and_change_no_exit_code(check):
@@ -210,4 +231,57 @@ def test_one_wheel_of_a_steered_vehicle_and_wheels_without_names_are_warned_of(c
         code, out, _ = check(**{"vehicle.yaml": f"{VEHICLE}sensors:\n  wheels: {wheels}\n"})
         assert code == 1
         assert "vehicle.yaml:5: warning: " in out
+        assert words in out
+
+
+def test_everything_wrong_with_drivers_is_told_at_once_with_lines(check, tmp_path):
+    (tmp_path / "geometry.yaml").write_text(YAML)
+    (tmp_path / "cart.dbc").write_text('BO_ 5 Wheels: 8 A\n SG_ Left : 0|16@1+ (1,0) [0|0] "" A\n')
+    text = (
+        VEHICLE
+        + """\
+sensors:
+  wheels: {kinematics: differential, frames: {left: Cart:Mast}}
+drivers:
+  gps: {device: novatel, port: /dev/ttyUSB0, buads: [9600]}
+  imu: {device: gx1, port: /dev/ttyUSB0}
+  second: {device: gx1, port: /dev/ttyUSB0}
+  empty:
+  wheels: {device: wheels, can: can0, dbc: card.dbc, wheels: {left: {speed: {signal: Wheels.Left}}}}
+  others:
+    device: wheels
+    can: can0
+    dbc: cart.dbc
+    wheels:
+      lefft:
+        speed: {signal: Wheels.Lefft}
+  own: {device: wheels, can: can0, dbc: cart.dbc, channel: MINE, wheels: {any: {speed: {signal: Wheels.Left}}}}
+  axis:
+    device: axis
+    address: "127.0.0.1:5020"
+    joint: CameraFixd
+    registers: {angle: {address: 0, scale_deg: 0.01}}
+"""
+    )
+    code, out, _ = check(**{"vehicle.yaml": text})
+    assert code == 1
+    assert re.findall(r"^vehicle.yaml:(\d+): (\w+): ", out, re.MULTILINE) == [
+        ("7", "error"),
+        ("9", "warning"),
+        ("10", "error"),
+        ("11", "error"),
+        ("17", "warning"),
+        ("18", "error"),
+        ("23", "warning"),
+    ]
+    for words in (
+        "unknown key 'buads'",
+        "drivers imu and second have one line",
+        "drivers.empty is empty",
+        "card.dbc' cannot be read",
+        "cart.dbc: message Wheels has no signal 'Lefft'",
+        "sensors.wheels.frames has no 'lefft'",
+        "the geometry has no constraint 'CameraFixd'",
+        "write CameraFixed",
+    ):
         assert words in out

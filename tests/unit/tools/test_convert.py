@@ -5,6 +5,7 @@ import stat
 
 import pytest
 from support_formats import YAML, assert_same_transforms, miro, miro_body, tree, tree_frame
+from support_urdf import BOT_FRAMES, URDF
 
 from modelserver.formats import load_model
 from mstools.cli import main
@@ -29,6 +30,14 @@ def test_the_ending_chooses_the_form_and_the_transforms_stay(convert):
     assert convert("cart.yaml", "cart.xml") == (0, "", "cart.xml: 2 bodies, 3 frames, 1 constraint\n")
     assert convert("cart.xml", "again.yml")[0] == 0
     assert_same_transforms(load_model("cart.yaml"), load_model("again.yml"))
+
+
+def test_urdf_and_libbot2_frames_are_read_and_urdf_is_written(convert, tmp_path):
+    (tmp_path / "frames.cfg").write_text(BOT_FRAMES)
+    assert convert("frames.cfg", "frames.urdf")[0] == 0
+    assert load_model("frames.urdf").get_body_list() == ["local", "body", "laser"]
+    (tmp_path / "robot.urdf").write_text(URDF)
+    assert convert("robot.urdf", "again.urdf") == (0, "", "again.urdf: 3 bodies, 5 frames, 2 constraints\n")
 
 
 def test_what_the_form_cannot_hold_is_said(convert, tmp_path):

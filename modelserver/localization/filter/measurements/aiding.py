@@ -83,8 +83,8 @@ class AbsolutePose(_Anywhere):
 
     def compare(self, scene: Scene, sample: AbsolutePoseSample) -> Compared | str:
         """Compare what is told, position first."""
-        if not scene.rig.knows(sample.frame_of_interest):
-            return "frame"
+        if fault := scene.rig.fault(sample.frame_of_interest):
+            return fault
         position, orientation = sample.position, sample.orientation
         found = in_site(scene, sample.frame_of_reference, position or (0.0, 0.0, 0.0))
         if isinstance(found, str):
@@ -144,8 +144,8 @@ class BeaconRange(_Anywhere):
 
     def compare(self, scene: Scene, sample: RangeSample) -> Compared | str:
         """Compare the distance; next to the beacon, where its direction is not known, there is nothing to compare."""
-        if not scene.rig.knows(sample.frame):
-            return "frame"
+        if fault := scene.rig.fault(sample.frame):
+            return fault
         if not (math.isfinite(sample.distance) and sample.distance >= 0.0):
             return "nan" if not math.isfinite(sample.distance) else "range"
         found = in_site(scene, sample.frame_of_reference, sample.beacon_position)
@@ -183,8 +183,8 @@ class RelativePose(_Anywhere):
         dt = (sample.header.utime - sample.since_utime) * 1e-6
         if not 0.0 < dt <= LONGEST_RELATIVE:
             return "interval"
-        if not scene.rig.knows(sample.frame):
-            return "frame"
+        if fault := scene.rig.fault(sample.frame):
+            return fault
         if not all(map(math.isfinite, sample.position)):
             return "nan"
         try:

@@ -1,0 +1,59 @@
+"""A static get_transformation of PlatformMirror, beside a live daemon, as a ratio to that of the model in-process."""
+
+from __future__ import annotations
+
+import random
+import statistics
+import time
+from collections.abc import Callable
+
+from benchmarks.support import RAPTOR, daemon, free_url, ratio, verdict
+from modelserver.client.mirror import PlatformMirror
+from modelserver.formats import load_model
+
+ROUNDS = 41
+PAIRS = 200
+TIMES = 50
+
+
+def _seconds(get: Callable[[str, str], object], pairs: list[tuple[str, str]]) -> float:
+    """Return the seconds of a lookup: many times the same pairs, as one who asks all the time does."""
+    begin = time.perf_counter()
+    for _ in range(TIMES):
+        for a, b in pairs:
+            get(a, b)
+    return (time.perf_counter() - begin) / (TIMES * len(pairs))
+
+
+def main() -> int:
+    model = load_model(RAPTOR / "geometry.yaml")
+    names = [f"{body.name}:{frame.name}" for body in model.bodies for frame in body]
+    rng = random.Random(1)
+    url = free_url()
+    with daemon(url, RAPTOR / "vehicle.yaml"), PlatformMirror(url) as mirror:
+        mirror.wait(20.0)  # poses too, if none that is valid: the listening thread has its usual work
+        pairs: list[tuple[str, str]] = []
+        while len(pairs) < PAIRS:
+            pair = (rng.choice(names), rng.choice(names))
+            if not model.route(*pair).legs:
+                pairs.append(pair)
+        for pair in pairs:
+            here, there = mirror.get_transformation(*pair), model.get_transformation(*pair)
+            if not here.pose.is_close(there.pose):
+                print(f"  {pair}: the mirror says {here}, the model {there}")
+                return 1
+        mine, own = [], []
+        for number in range(ROUNDS):
+            # each goes first in every other round
+            for get, times in ((mirror.get_transformation, mine), (model.get_transformation, own))[
+                :: 1 - number % 2 * 2
+            ]:
+                times.append(_seconds(get, pairs))
+        begin = time.perf_counter()
+        for _ in range(1000):
+            mirror.get_transformation("Raptor:CG", "Odom:Origin")
+        moving = (time.perf_counter() - begin) / 1000
+        heard = mirror.age
+    print(f"  model {statistics.median(own) * 1e9:.0f} ns, mirror {statistics.median(mine) * 1e9:.0f} ns")
+    print(f"  of the vehicle in Odom, latest: {moving * 1e6:.1f} us; the last POSE came {heard.pose * 1e3:.0f} ms ago")
+    return 0 if verdict("static lookup: mirror to model in-process", ratio(mine, own), 1.1, "x") else 1

@@ -1,0 +1,176 @@
+"""How sure an answer is, against samples of everything it rests on: surveys, joints and the vehicle."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support_moving import BASE, DEEP, SCAN, T0, UTM, S, estimate, vehicle, view
+
+from modelserver.history import History
+from modelserver.messages import TimeQuery
+from modelserver.platform import PlatformView
+from modelserver.platform.between import between
+from modelserver.spatial import arrays
+from modelserver.spatial.arrays import Poses
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.so3 import Array
+
+COUNT = 20_000
+AT, LATER = 1.2, 1.9
+FINGER = "Finger:Tip"
+
+
+@cache
+def held() -> PlatformView:
+    return view(2.0)
+
+
+def utime(seconds: float) -> int:
+    return T0 + round(seconds * S)
+
+
+class Samples:
+    """A world in which everything is off by a sample of its error: surveys for good, joints at each time anew."""
+
+    def __init__(self, seed: int, platform: PlatformView):
+        self.rng = np.random.default_rng(seed)
+        self.platform = platform
+        self.drawn: dict[object, Array] = {}
+
+    def error(self, source: object, size: int) -> Array:
+        if source not in self.drawn:
+            self.drawn[source] = self.rng.standard_normal((COUNT, size))
+        return self.drawn[source]
+
+    def off(self, X: Pose, error: Array) -> Poses:
+        """Return a pose with errors (n, 6) along the axes it is told in."""
+        turned = arrays.multiplied(arrays.exponentials(error[:, 3:]), np.array([X.wxyz]))
+        return Poses(np.array(X.xyz) + error[:, :3], turned)
+
+    def within(self, interest: str, reference: str, seconds: float) -> Poses:
+        """Return a frame in another of the vehicle at a time."""
+        model = self.platform.model
+        poses = Poses.of(Pose.identity())
+        for edge in model.route(interest, reference).edges:
+            if edge.joint is None:
+                sigma = (0.0,) * 6 if edge.sigma is None else (*edge.sigma.position, *edge.sigma.rotation)
+                step = self.off(edge.pose, self.error(edge.name, 6) * sigma)
+            else:
+                drive = model.drives[edge.name]
+                columns = []
+                for name in drive.names:
+                    reading = self.platform.joints.tracks[name].interpolated(utime(seconds))
+                    off = self.error((name, seconds), 1)[:, 0] * 0.001
+                    columns.append(drive.multiplier * (reading.position + off) + drive.offset)
+                moved = [edge.joint.motion(row) for row in np.stack(columns, axis=1).tolist()]
+                step = Poses(np.array([each.xyz for each in moved]), np.array([each.wxyz for each in moved]))
+            poses = poses @ (step if edge.forward else step.inverse())
+        return poses
+
+    def vehicle(self, sigmas: Array, seconds: float) -> Poses:
+        return self.off(self.platform.history.at(utime(seconds)).utm or Pose.identity(), self.error(UTM, 6) * sigmas)
+
+
+def spread(poses: Poses, about: Pose) -> Array:
+    """Return the errors (n, 6) of poses."""
+    p, q = np.broadcast_to(poses.p, (COUNT, 3)), np.broadcast_to(poses.q, (COUNT, 4))
+    w, x, y, z = about.wxyz
+    turned = Rotation.from_quat(q[:, (1, 2, 3, 0)]) * Rotation.from_quat([x, y, z, w]).inv()
+    return np.hstack((p - about.position, turned.as_rotvec()))
+
+
+def check(poses: Poses, about: Pose, covariance: Array | None) -> None:
+    """Assert that the samples spread as the covariance says."""
+    assert covariance is not None
+    errors = spread(poses, about)
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), errors.T)
+    assert np.linalg.norm(whitened @ whitened.T / COUNT - np.eye(6), 2) < 0.05
+    # nor is it off on the whole by more than the second order that a covariance leaves out
+    assert np.abs(whitened.mean(axis=1)).max() < 0.1
+
+
+WITHIN = [(SCAN, BASE), (BASE, SCAN), (DEEP, SCAN), (SCAN, DEEP), (FINGER, SCAN), (FINGER, "Upper:Root")]
+
+
+@pytest.mark.parametrize(("interest", "reference"), WITHIN)
+def test_given_surveys_and_joints_then_the_spread_within_the_vehicle_is_as_told(interest: str, reference: str) -> None:
+    told = held().transformation(interest, reference, TimeQuery(utime(AT))).transformation
+    check(Samples(1, held()).within(interest, reference, AT), told.pose, told.covariance)
+
+
+SIGMAS = np.array([0.05] * 3 + [0.01] * 3)
+
+
+@pytest.mark.parametrize("frame", [SCAN, DEEP, FINGER])
+def test_given_surveys_joints_and_vehicle_then_the_spread_in_the_world_is_as_told_both_ways(frame: str) -> None:
+    samples = Samples(2, held())
+    poses = samples.vehicle(SIGMAS, AT) @ samples.within(frame, BASE, AT)
+    forth = held().transformation(frame, UTM, TimeQuery(utime(AT))).transformation
+    check(poses, forth.pose, forth.covariance)
+    back = held().transformation(UTM, frame, TimeQuery(utime(AT))).transformation
+    check(poses.inverse(), back.pose, back.covariance)
+
+
+def drift(samples: Samples) -> Poses:
+    """Return the vehicle's way from one time to the later one, by an Odom that drifts as `support_moving` says."""
+    before, after = vehicle(AT), vehicle(LATER)
+    tilt = 1e-3 * min(math.sqrt(2.0), LATER - AT)
+    sigmas = np.array([0.01 * (LATER - AT)] * 3 + [tilt, tilt, 0.001 * (LATER - AT)])
+    errors = samples.error("drift", 6) * sigmas
+    back = before.rotation.T
+    # Odom stands apart from the world by a turn about up alone, and x and y are as sure as each other
+    turned = np.hstack((errors[:, :3] @ back.T, errors[:, 3:] @ back.T))
+    return samples.off(before.inverse() @ after, turned)
+
+
+@pytest.mark.parametrize(("interest", "reference"), [(SCAN, SCAN), (SCAN, BASE), (DEEP, SCAN), (FINGER, SCAN)])
+def test_given_two_times_then_surveys_are_shared_joints_are_not_and_odom_drifts(interest: str, reference: str) -> None:
+    samples = Samples(3, held())
+    poses = samples.within(reference, BASE, AT).inverse() @ drift(samples) @ samples.within(interest, BASE, LATER)
+    told = between(held(), interest, utime(LATER), reference, utime(AT)).transformation
+    check(poses, told.pose, told.covariance)
+
+
+def test_given_a_frame_bolted_to_the_vehicle_at_two_times_then_its_survey_cancels_but_for_the_turn_between() -> None:
+    told = between(held(), "Rover:Mast", utime(AT + 1e-3), "Rover:Mast", utime(AT)).transformation
+    assert told.covariance is not None
+    # what is held of Odom's drift is that of the samples around
+    assert math.sqrt(told.covariance[0, 0]) < 2e-4
+
+
+def test_given_two_times_through_the_world_then_the_covariance_bounds_what_any_correlation_gives() -> None:
+    told = between(held(), SCAN, utime(LATER), SCAN, utime(AT), UTM).transformation
+    assert told.covariance is not None
+    for correlation in (-1.0, 0.0, 1.0):
+        samples = Samples(4, held())
+        first = samples.error("first", 6) * SIGMAS
+        other = samples.error("other", 6) * SIGMAS
+        second = correlation * first + math.sqrt(1.0 - correlation**2) * other
+        there = samples.off(vehicle(AT), first) @ samples.within(SCAN, BASE, AT)
+        here = samples.off(vehicle(LATER), second) @ samples.within(SCAN, BASE, LATER)
+        errors = spread(there.inverse() @ here, told.pose)
+        whitened = np.linalg.solve(np.linalg.cholesky(told.covariance), errors.T)
+        assert np.linalg.eigvalsh(whitened @ whitened.T / COUNT).max() < 1.05
+
+
+@pytest.mark.parametrize("frame", [SCAN, DEEP])
+def test_given_a_heading_unsure_by_20_deg_then_a_95_percent_ellipsoid_covers_90_percent(frame: str) -> None:
+    # as from a satellite receiver alone, before the vehicle has moved
+    sigmas = np.array([0.5] * 3 + [0.01, 0.01, math.radians(20.0)])
+    history = History(60.0)
+    for at in (AT - 0.01, AT, AT + 0.01):
+        unsure = replace(estimate(at), covariance=tuple(np.diag(sigmas**2).ravel().tolist()))
+        history = history.extended(unsure)
+    platform = replace(held(), history=history)
+    samples = Samples(5, platform)
+    told = platform.transformation(frame, UTM, TimeQuery(utime(AT))).transformation
+    assert told.covariance is not None
+    errors = spread(samples.vehicle(sigmas, AT) @ samples.within(frame, BASE, AT), told.pose)
+    whitened = np.linalg.solve(np.linalg.cholesky(told.covariance), errors.T)
+    # 12.59: 95 % of a chi-squared distribution of six degrees of freedom
+    assert (np.sum(whitened**2, axis=0) < 12.59).mean() > 0.90

@@ -1,0 +1,359 @@
+"""Reading the geometry anew while running: what localization makes of it, what the loop sends, what the log says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support_samples import GEOMETRY, ME, START, VEHICLE, Scripted, cart, drive, imu, started, write_vehicle
+
+from modelserver.config import load_config
+from modelserver.core import CoreState
+from modelserver.errors import Status
+from modelserver.localization.modes import ModeLocalizer
+from modelserver.messages import (
+    GetExplanation,
+    JointSample,
+    JointsSample,
+    LoadModel,
+    ReloadModel,
+    ReloadReply,
+    SensorHeader,
+    SnapshotPart,
+)
+from modelserver.reload import ModelLoaded
+from modelserver.service.clock import FakeClock
+from modelserver.service.daemon import Vehicle, load_vehicle
+from modelserver.service.fake_bus import FakeBus
+from modelserver.service.loop import Loop, LoopSettings
+from modelserver.service.snapshots import SnapshotWriter
+from modelserver.snapshot import read
+from modelserver.wire.codec import decode, encode
+from modelserver.wire.snapshot import PART_BYTES, Assembler
+
+S = 1_000_000
+FULL, RAW = VEHICLE, VEHICLE + "localization: {mode: raw}\n"
+HIGHER_CAMERA = GEOMETRY.replace("xyz: [0, 0, 0.1]", "xyz: [0, 0, 0.2]")
+MOVED_ANTENNA = GEOMETRY.replace("[-0.4, 0.2, 1.2]", "[-0.4, 0.2, 1.5]")
+NODDING = GEOMETRY.replace("xyz: [0, 0, 0.1]", "xyz: [0, 0, 0.1], joint: {type: revolute, axis: [0, 1, 0]}")
+
+
+def loaded(folder: Path, text: str = VEHICLE, geometry: str = GEOMETRY) -> Vehicle:
+    return load_vehicle(load_config(write_vehicle(folder, text, geometry)))
+
+
+# --- localization ---------------------------------------------------------------------------------------------------
+
+
+def driven(vehicle: Vehicle, seconds: float = 8.0) -> ModeLocalizer:
+    localizer = vehicle.core(FakeClock(START).now()).localizer
+    assert isinstance(localizer, ModeLocalizer)
+    for sample in drive(seconds):
+        localizer, _ = localizer.take(sample)
+    return localizer
+
+
+def remade(folder: Path, text: str, geometry: str) -> tuple[ModeLocalizer, ModeLocalizer]:
+    """A localizer after a drive, and the one that goes on after the geometry was read anew."""
+    before = driven(loaded(folder, text))
+    makings = loaded(folder, text, geometry).makings()
+    assert makings is not None
+    return before, before.remade(makings)
+
+
+@pytest.mark.parametrize("text", [FULL, RAW], ids=["filter", "raw"])
+def test_given_that_nothing_moved_that_localization_rests_on_then_it_goes_on_as_if_nothing_were(
+    tmp_path: Path, text: str
+) -> None:
+    before, after = remade(tmp_path, text, HIGHER_CAMERA)
+    utime = before.utime
+    assert after.utime == utime
+    assert after.makings is not before.makings
+    for at in (utime, utime + 100_000):
+        now, was = after.estimate(at), before.estimate(at)
+        assert (now.odom, now.utm, now.covariance) == (was.odom, was.utm, was.covariance)
+        assert (now.invalid, now.quality, now.pose_epoch) == (was.invalid, was.quality, was.pose_epoch)
+    for sample in drive(0.5, utime + 20_000):
+        before, after = before.take(sample)[0], after.take(sample)[0]
+    assert after.estimate(after.utime).utm == before.estimate(before.utime).utm
+
+
+@pytest.mark.parametrize("text", [FULL, RAW], ids=["filter", "raw"])
+def test_given_an_antenna_that_moved_then_a_new_epoch_begins_and_odom_makes_no_step(tmp_path: Path, text: str) -> None:
+    before, after = remade(tmp_path, text, MOVED_ANTENNA)
+    utime = before.utime
+    was, now = before.estimate(utime), after.estimate(utime)
+    assert was.utm is not None
+    assert now.pose_epoch == was.pose_epoch + 1
+    assert now.origin == was.origin
+    last = was.odom
+    for sample in drive(1.0, utime + 20_000):
+        after, _ = after.take(sample)
+        odom = after.estimate(after.utime).odom
+        metres, radians = last.distance(odom)
+        assert metres < 0.15  # 2 m/s at 50 Hz are 0.04 m
+        assert radians < 0.05
+        last = odom
+
+
+@pytest.mark.parametrize("text", [FULL, RAW], ids=["filter", "raw"])
+def test_given_no_sample_yet_then_it_begins_anew_without_an_epoch(tmp_path: Path, text: str) -> None:
+    vehicle = loaded(tmp_path, text)
+    localizer = vehicle.core(FakeClock(START).now()).localizer
+    makings = loaded(tmp_path, text, MOVED_ANTENNA).makings()
+    assert isinstance(localizer, ModeLocalizer)
+    assert makings is not None
+    after = localizer.remade(makings)
+    assert (after.utime, after.epochs, after.makings) == (0, 0, makings)
+    assert type(after.active) is type(localizer.active)
+
+
+@pytest.mark.parametrize("text", [FULL, RAW], ids=["filter", "raw"])
+def test_given_an_antenna_that_moved_then_what_odom_had_drifted_goes_on_growing(tmp_path: Path, text: str) -> None:
+    before, after = remade(tmp_path, text, MOVED_ANTENNA)
+    utime = before.utime
+    was = before.estimate(utime).odom_covariance
+    assert was is not None
+    for sample in drive(1.0, utime + 20_000):
+        after, _ = after.take(sample)
+    now = after.estimate(after.utime).odom_covariance
+    assert now is not None
+    for place in (0, 7, 14, 35):
+        assert now[place] > was[place]
+
+
+def test_given_two_reloads_in_a_row_in_raw_mode_then_odom_stays_where_it_was(tmp_path: Path) -> None:
+    before, after = remade(tmp_path, RAW, MOVED_ANTENNA)
+    makings = loaded(tmp_path, RAW, GEOMETRY).makings()
+    assert makings is not None
+    twice = after.remade(makings)
+    assert before.estimate(before.utime).odom.distance(twice.estimate(before.utime).odom)[0] < 0.1
+    assert twice.drift == after.drift != ()
+
+
+# --- the daemon's reading -------------------------------------------------------------------------------------------
+
+
+def test_given_a_file_that_suits_then_model_and_localizer_come_together(tmp_path: Path) -> None:
+    vehicle = loaded(tmp_path)
+    state = vehicle.core(FakeClock(START).now())
+    (tmp_path / "geometry.yaml").write_text(HIGHER_CAMERA)
+    found = vehicle.reloaded(LoadModel(), state)
+    assert found.why == ""
+    assert found.model is not None
+    assert found.model.revision != state.model.revision
+    assert isinstance(found.localizer, ModeLocalizer)
+    assert found.localizer.makings.setup.rig.model is found.model
+
+
+@pytest.mark.parametrize(
+    ("geometry", "why"),
+    [
+        (GEOMETRY.replace("Base:", "Bsae:"), "Cart:Bsae"),
+        (GEOMETRY.replace("Antenna:", "Aerial:"), "sensors.gps.frame"),
+        (GEOMETRY.replace("to: Camera", "to: Camrea"), "Camrea"),
+        (GEOMETRY[:200], "geometry.yaml"),
+        (GEOMETRY[: GEOMETRY.rindex("from:")].rpartition("\n")[0].rpartition("\n")[0] + "\n", "still being written"),
+        ("", "geometry.yaml"),
+        (None, "geometry.yaml cannot be read"),
+        ("\x00\x01", "geometry.yaml"),
+    ],
+)
+def test_given_a_file_that_is_wrong_or_does_not_suit_then_nothing_comes_but_why(
+    tmp_path: Path, geometry: str | None, why: str
+) -> None:
+    vehicle = loaded(tmp_path)
+    state = vehicle.core(FakeClock(START).now())
+    path = tmp_path / "geometry.yaml"
+    path.unlink() if geometry is None else path.write_text(geometry)
+    found = vehicle.reloaded(LoadModel(), state, str(tmp_path / "vehicle.yaml"))
+    assert (found.model, found.localizer) == (None, None)
+    assert why in found.why
+
+
+# --- the loop -------------------------------------------------------------------------------------------------------
+
+
+class Rig:
+    """A loop whose geometry file is there."""
+
+    def __init__(self, folder: Path, text: str = VEHICLE, geometry: str = GEOMETRY):
+        self.folder, self.clock = folder, FakeClock(START)
+        self.bus = FakeBus(self.clock)
+        self.vehicle = loaded(folder, text, geometry)
+        self.loop = Loop(
+            self.bus,
+            self.clock,
+            self.vehicle.core(self.clock.now()),
+            LoopSettings(20_000_000, self.vehicle.sensor_channels()),
+            on_load=self.vehicle.reloaded,
+            snapshot=self.vehicle.snapshot,
+            channels=lambda state: self.vehicle.sensor_channels(state.model),
+        )
+
+    def write(self, geometry: str) -> None:
+        (self.folder / "geometry.yaml").write_text(geometry)
+
+    def turns(self, count: int = 2) -> None:
+        for _ in range(count):
+            self.loop.turn()
+
+    @property
+    def parts(self) -> list[SnapshotPart]:
+        return [decode("model_snapshot_t", data) for data in self.bus.said("MODEL_SNAPSHOT")]
+
+
+def test_given_the_signal_then_the_next_pass_reads_the_file_and_sends_it_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    rig = Rig(tmp_path)
+    rig.turns()
+    old = rig.loop.state.model.revision
+    assert [part.model_revision for part in rig.parts] == [old]
+    rig.write(HIGHER_CAMERA)
+    rig.loop.reload()
+    assert rig.loop.state.model.revision == old
+    rig.turns()
+    new = rig.loop.state.model.revision
+    assert new != old
+    assert [part.model_revision for part in rig.parts] == [old, new]
+    assert caplog.messages[-1] == f"the geometry was read anew: revision {new}, it was {old}"
+    content = Assembler().add(rig.parts[-1])
+    assert content is not None
+    snapshot = read(content)
+    assert (snapshot.model.revision, snapshot.vehicle, snapshot.base_frame) == (new, "cart", "Cart:Base")
+
+
+def test_given_the_signal_and_a_bad_file_then_the_old_model_answers_and_the_log_says_why(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rig = Rig(tmp_path)
+    rig.turns()
+    before = rig.loop.state.view
+    rig.write(GEOMETRY.replace("Camera:Origin", "Camrea:Origin"))
+    rig.loop.reload()
+    rig.turns()
+    assert rig.loop.state.model is before.model
+    assert len(rig.parts) == 1
+    assert dict(rig.loop.state.rejected) == {("PLATFORM_RELOAD_MODEL", "rejected"): 1}
+    assert before.model.revision in caplog.messages[-1]
+    assert "Camrea" in caplog.messages[-1]
+
+
+def reply_to(rig: Rig, request: Any) -> ReloadReply:
+    rig.bus.publish("PLATFORM_RELOAD_MODEL", encode(request))
+    rig.turns()
+    (data,) = rig.bus.said("REPLY_TEST")
+    reply: ReloadReply = decode("reload_model_reply_t", data)
+    return reply
+
+
+@pytest.mark.parametrize("dry_run", [False, True])
+def test_given_a_client_that_may_then_it_is_told_what_changes(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, dry_run: bool
+) -> None:
+    caplog.set_level("INFO")
+    rig = Rig(tmp_path, VEHICLE + "commands: {reload: true}\n")
+    old = rig.loop.state.model.revision
+    rig.write(HIGHER_CAMERA)
+    reply = reply_to(rig, ReloadModel(ME, dry_run))
+    assert reply.header.status is Status.OK
+    assert reply.changes == ("constraint Mounted moves by 100 mm and 0 deg",)
+    assert (rig.loop.state.model.revision == old) is dry_run
+    assert bool(caplog.messages) is not dry_run
+
+
+def test_given_a_client_that_may_not_then_the_file_is_not_even_read(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    (tmp_path / "geometry.yaml").unlink()
+    reply = reply_to(rig, ReloadModel(ME))
+    assert reply.header.status is Status.FORBIDDEN
+
+
+def test_given_the_first_joint_with_a_reload_then_joints_are_heard_from_then_on(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    told = encode(JointsSample(SensorHeader(START, "arm"), (JointSample("Mounted", 0.25),)))
+    rig.bus.publish("JOINTS", told)
+    rig.turns()
+    assert "sensor:arm" not in rig.loop.state.traffic
+    rig.write(NODDING)
+    rig.loop.reload()
+    rig.turns()
+    rig.loop.reload()
+    rig.turns()
+    rig.bus.publish("JOINTS", told)
+    rig.turns()
+    # heard once, though the geometry was read twice
+    assert rig.loop.state.traffic["sensor:arm"].count == 1
+    assert "Mounted" in rig.loop.state.view.joints.tracks
+    rig.bus.publish("PLATFORM_GET_EXPLANATION", encode(GetExplanation(ME, "Camera:Origin", "Cart:Base")))
+    rig.turns()
+    (data,) = rig.bus.said("REPLY_TEST")
+    edges = decode("get_explanation_reply_t", data).answer.edges
+    assert [(each.name, each.coordinates) for each in edges if each.kind == "joint"] == [("Mounted", (0.25,))]
+
+
+@pytest.mark.parametrize("fail", [RuntimeError("odd"), OSError("disk")])
+def test_given_a_reading_that_breaks_then_the_loop_goes_on_and_counts_it(tmp_path: Path, fail: Exception) -> None:
+    rig = Rig(tmp_path)
+
+    def broken(wish: LoadModel, state: CoreState) -> ModelLoaded:
+        raise fail
+
+    rig.loop._on_load = broken
+    rig.loop.reload()
+    rig.turns()
+    rig.bus.sensors.put("IMU", encode(imu(START)))
+    rig.turns()
+    assert rig.loop.state.handler_errors == 1
+    assert rig.loop.state.traffic["sensor:imu"].count == 1
+
+
+def test_given_a_loop_without_a_file_then_a_wish_to_reload_is_rejected_and_says_so() -> None:
+    clock = FakeClock(START)
+    bus = FakeBus(clock)
+    loop = Loop(bus, clock, started(Scripted(), may_reload=True), LoopSettings(20_000_000))
+    bus.publish("PLATFORM_RELOAD_MODEL", encode(ReloadModel(ME)))
+    loop.turn()
+    loop.turn()
+    reply = decode("reload_model_reply_t", bus.said("REPLY_TEST")[0])
+    assert reply.header.status is Status.REJECTED
+    assert "no file" in reply.header.message
+
+
+# --- the broadcast --------------------------------------------------------------------------------------------------
+
+
+def counting(size: int) -> tuple[Callable[[CoreState], bytes], list[int]]:
+    calls: list[int] = []
+
+    def write(state: CoreState) -> bytes:
+        calls.append(len(calls))
+        return bytes(size)
+
+    return write, calls
+
+
+@pytest.mark.parametrize("size", [1, PART_BYTES, PART_BYTES + 1, 5 * PART_BYTES])
+def test_given_snapshots_of_one_model_then_its_bytes_are_written_once_and_parts_carry_their_instant(size: int) -> None:
+    write, calls = counting(size)
+    writer, state = SnapshotWriter(write), started()
+    first, second = writer.parts(state, START), writer.parts(state, START + S)
+    assert len(calls) == 1
+    assert {part.utime for part in first} == {START}
+    assert second == [replace(part, utime=START + S) for part in first]
+    assert b"".join(part.data for part in second) == bytes(size)
+    assert {(part.parts, part.model_revision) for part in first} == {(-(-size // PART_BYTES), state.model.revision)}
+
+
+def test_given_another_model_then_its_bytes_are_written_anew() -> None:
+    write, calls = counting(10)
+    writer, state = SnapshotWriter(write), started()
+    writer.parts(state, START)
+    # equal is not enough to be told apart cheaply: it is the model in force, or another
+    writer.parts(state._replace(view=replace(state.view, model=cart())), START)
+    assert len(calls) == 2
