@@ -67,7 +67,7 @@ def test_miro_xml_gives_back_all_transforms_and_says_what_it_lost(model):
     frames = [frame for body in model.bodies for frame in body]
     lost = " ".join(saved.losses)
     assert ("sigmas of" in lost) == any(each.sigma for each in (*frames, *model.constraints))
-    assert ("joints of" in lost) == bool(model.joints)
+    assert ("motion of" in lost) == bool(model.joints)
     assert ("inertia" in lost) == any(body.inertia is not None for body in model.bodies)
     assert [folded(body.description) for body in model.bodies] == [body.description for body in again.bodies]
     assert [frame.name for frame in frames] == [frame.name for body in again.bodies for frame in body]
@@ -77,7 +77,7 @@ def test_miro_xml_gives_back_all_transforms_and_says_what_it_lost(model):
 @settings(max_examples=25)
 def test_a_frame_tree_has_every_frame_at_its_place(model):
     saved = save_model(model, "miro-frames")
-    assert any("joints of" in loss for loss in saved.losses) == bool(model.joints)
+    assert any("motion of" in loss for loss in saved.losses) == bool(model.joints)
     again = read(saved.text)
     frames = {f"{body.name}:{frame.name}": frame.name for body in again.bodies for frame in body}
     by_instance = {frame: full for full, frame in frames.items() if frame != "Origin"}
