@@ -94,7 +94,7 @@ def _memory() -> tuple[int, int]:
         at = START + sample * STEP_US
         joints = joints.taken(JointsSample(SensorHeader(at, "arm"), (JointSample("Joint0", 0.1),)), at)[0]
     track = joints.tracks["Joint0"]
-    return len(track), len(track._times)
+    return len(track), sum(len(block.times) for block in track._blocks)
 
 
 def arm_joints() -> dict[str, object]:

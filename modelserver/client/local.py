@@ -253,8 +253,8 @@ class LocalPlatform(ABC):
         if known.pose_heard == NEVER:
             return NoPoseError(
                 f"no POSE with its POSE_ODOM has been heard {self.where}, so there is no pose in the world: the "
-                "vehicle file names no sensor to localize by, the service has only been listened to for a moment (give "
-                "wait_ms), or one of the two channels does not come through"
+                "vehicle file names no sensor to localize by, none has spoken yet, the service has only been listened "
+                "to for a moment (give wait_ms), or one of the two channels does not come through"
             )
         latest = not time.at or time.policy in (Policy.LATEST, Policy.PREDICTED)
         if latest and ages.pose > self.limit:
