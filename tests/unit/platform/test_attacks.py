@@ -65,7 +65,7 @@ def test_given_a_frame_behind_a_joint_then_localization_does_not_take_what_is_to
     assert rig.fault("Rover:Mats") == "frame"
 
 
-def test_given_the_truth_then_the_review_scripts_own_check_holds_here_too():
+def test_given_two_times_through_odom_then_the_way_between_is_the_true_one():
     platform = view(2.0)
     found = between(platform, SCAN, T0 + S, SCAN, T0 + S // 2).transformation.pose
     assert found.is_close(truth(SCAN, SCAN, 1.0, 0.5), 1e-3, math.radians(0.02))
