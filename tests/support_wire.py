@@ -295,6 +295,7 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
             UTIME, 99.5, "0.1.0", "raptor", "ab12", 1, Invalid(0), 2, -77, 4950, 12, 1, 3, 1, 1e-4, 2e-3,
             (ChannelHealth("GPS", 99, 1.0, 0.4), ChannelHealth("IMU", 0, 0.0, math.nan)),
             (("GPS", "truncated", 4), ("sensor:gps", "stale", 1)),
+            (("journal", "the disk is full"),),
         ),
     ),
     "vehicle_status_t": (

@@ -12,11 +12,11 @@ import mslcm
 class health_t(object):
     """ How the daemon is, once a second. Counts are since the start. """
 
-    __slots__ = ["utime", "uptime", "version", "vehicle", "model_revision", "state", "invalid_reasons", "invalid_text", "pose_epoch", "origin_id", "poses_published", "requests_answered", "requests_parked", "ticks_missed", "handler_errors", "tick_lateness_p50", "tick_lateness_max", "num_channels", "channels", "num_rejected", "rejected"]
+    __slots__ = ["utime", "uptime", "version", "vehicle", "model_revision", "state", "invalid_reasons", "invalid_text", "pose_epoch", "origin_id", "poses_published", "requests_answered", "requests_parked", "ticks_missed", "handler_errors", "tick_lateness_p50", "tick_lateness_max", "num_channels", "channels", "num_rejected", "rejected", "num_notices", "notice_subjects", "notice_texts"]
 
-    __typenames__ = ["int64_t", "double", "string", "string", "string", "int8_t", "int32_t", "string", "int32_t", "int64_t", "int64_t", "int64_t", "int32_t", "int64_t", "int64_t", "double", "double", "int32_t", "mslcm.channel_health_t", "int32_t", "mslcm.rejected_count_t"]
+    __typenames__ = ["int64_t", "double", "string", "string", "string", "int8_t", "int32_t", "string", "int32_t", "int64_t", "int64_t", "int64_t", "int32_t", "int64_t", "int64_t", "double", "double", "int32_t", "mslcm.channel_health_t", "int32_t", "mslcm.rejected_count_t", "int32_t", "string", "string"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_channels"], None, ["num_rejected"]]
+    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_channels"], None, ["num_rejected"], None, ["num_notices"], ["num_notices"]]
 
     STARTING = 0
     """ No valid pose was published yet. """
@@ -152,6 +152,24 @@ class health_t(object):
         LCM Type: mslcm.rejected_count_t[num_rejected]
         """
 
+        self.num_notices = 0
+        """
+        Number of notices.
+        LCM Type: int32_t
+        """
+
+        self.notice_subjects = []
+        """
+        What each notice is about, e.g. journal; once each.
+        LCM Type: string[num_notices]
+        """
+
+        self.notice_texts = []
+        """
+        What people who watch should know of it, until it is over.
+        LCM Type: string[num_notices]
+        """
+
 
     def encode(self):
         buf = BytesIO()
@@ -186,6 +204,17 @@ class health_t(object):
         for i0 in range(self.num_rejected):
             assert self.rejected[i0]._get_packed_fingerprint() == mslcm.rejected_count_t._get_packed_fingerprint()
             self.rejected[i0]._encode_one(buf)
+        buf.write(struct.pack(">i", self.num_notices))
+        for i0 in range(self.num_notices):
+            __notice_subjects_encoded = self.notice_subjects[i0].encode('utf-8')
+            buf.write(struct.pack('>I', len(__notice_subjects_encoded)+1))
+            buf.write(__notice_subjects_encoded)
+            buf.write(b"\0")
+        for i0 in range(self.num_notices):
+            __notice_texts_encoded = self.notice_texts[i0].encode('utf-8')
+            buf.write(struct.pack('>I', len(__notice_texts_encoded)+1))
+            buf.write(__notice_texts_encoded)
+            buf.write(b"\0")
 
     @staticmethod
     def decode(data: bytes):
@@ -218,13 +247,22 @@ class health_t(object):
         self.rejected = []
         for i0 in range(self.num_rejected):
             self.rejected.append(mslcm.rejected_count_t._decode_one(buf))
+        self.num_notices = struct.unpack(">i", buf.read(4))[0]
+        self.notice_subjects = []
+        for i0 in range(self.num_notices):
+            __notice_subjects_len = struct.unpack('>I', buf.read(4))[0]
+            self.notice_subjects.append(buf.read(__notice_subjects_len)[:-1].decode('utf-8', 'replace'))
+        self.notice_texts = []
+        for i0 in range(self.num_notices):
+            __notice_texts_len = struct.unpack('>I', buf.read(4))[0]
+            self.notice_texts.append(buf.read(__notice_texts_len)[:-1].decode('utf-8', 'replace'))
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if health_t in parents: return 0
         newparents = parents + [health_t]
-        tmphash = (0x9afa6b8cbfd1ed69+ mslcm.channel_health_t._get_hash_recursive(newparents)+ mslcm.rejected_count_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x453e87f172243ba2+ mslcm.channel_health_t._get_hash_recursive(newparents)+ mslcm.rejected_count_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -26,6 +26,7 @@ from modelserver.core.state import (
     Step,
     Traffic,
     check_bolted,
+    noticed,
     rejected,
     start,
 )
@@ -45,6 +46,7 @@ from modelserver.messages import (
     GpsSample,
     ImuSample,
     JointsSample,
+    Noticed,
     RangeSample,
     Rejected,
     RelativePoseSample,
@@ -74,6 +76,7 @@ _HANDLERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], Step]]] = {
     SwitchMode: mode_wished,
     Tick: ticked,
     Rejected: rejected,
+    Noticed: noticed,
     GetTransformation: requested,
     GetBodyList: requested,
     GetBodyFrameList: requested,

@@ -18,6 +18,7 @@ from modelserver.messages import (
     GetMotion,
     GetStateVector,
     GetTransformation,
+    Noticed,
     Output,
     Rejected,
 )
@@ -106,6 +107,7 @@ class CoreState(NamedTuple):
     run_state: int = STARTING
     futures: int = 0
     snapshot_due_ns: int = 0
+    notices: Mapping[str, str] = MappingProxyType({})
     requests_answered: int = 0  # stays last: see `_request`
 
     @property
@@ -149,6 +151,17 @@ def check_bolted(model: Model, base_frame: str, rolling_frame: str) -> None:
 def rejected(state: CoreState, rejected: Rejected, now: Instant) -> Step:
     """Count something that was not understood."""
     return counted(state, rejected.channel, rejected.reason), ()
+
+
+def noticed(state: CoreState, notice: Noticed, now: Instant) -> Step:
+    """Take a notice up, or back; the next tick tells of the change."""
+    known = state.notices.get(notice.subject, "")
+    if known == notice.text or (not known and len(state.notices) >= MAX_COUNTERS):
+        return state, ()
+    notices = {subject: text for subject, text in state.notices.items() if subject != notice.subject}
+    if notice.text:
+        notices[notice.subject] = notice.text
+    return state._replace(notices=notices, health_due_ns=now.monotonic_ns), ()
 
 
 def counted(state: CoreState, channel: str, reason: str) -> CoreState:

@@ -84,6 +84,7 @@ def _report(state: CoreState, now: Instant) -> tuple[CoreState, PublishHealth]:
         tick_lateness_max=late[-1],
         channels=channels,
         rejected=tuple((channel, reason, count) for (channel, reason), count in sorted(state.rejected.items())),
+        notices=tuple(sorted(state.notices.items())),
     )
     state = state._replace(
         traffic={name: replace(traffic, reported=traffic.count) for name, traffic in state.traffic.items()},

@@ -14,6 +14,7 @@ from modelserver.messages.estimates import Estimate, Origin, VehicleMotion
 from modelserver.messages.events import (
     Event,
     LoadModel,
+    Noticed,
     OriginLatched,
     Output,
     PublishDecisions,
@@ -141,6 +142,7 @@ __all__ = [
     "MotionReply",
     "NameListReply",
     "NavigationState",
+    "Noticed",
     "OrientationReference",
     "Origin",
     "OriginLatched",

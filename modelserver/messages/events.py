@@ -35,6 +35,17 @@ class Rejected:
 
 
 @dataclass(frozen=True, slots=True)
+class Noticed:
+    """Something about the service itself that people who watch should know until it is over; see health_t.
+
+    `subject` names what it is about, e.g. journal; an empty `text` takes the notice back.
+    """
+
+    subject: str
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class SwitchMode:
     """The operator's wish that localization uses other sources from `header.utime` on; see localization_mode_t."""
 
@@ -42,7 +53,7 @@ class SwitchMode:
     mode: Mode
 
 
-Event: TypeAlias = Sample | SwitchMode | Request | Tick | Rejected
+Event: TypeAlias = Sample | SwitchMode | Request | Tick | Rejected | Noticed
 
 
 class SendReply(NamedTuple):

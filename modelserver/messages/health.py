@@ -39,3 +39,4 @@ class Health:
     tick_lateness_max: float
     channels: tuple[ChannelHealth, ...] = ()
     rejected: tuple[tuple[str, str, int], ...] = ()
+    notices: tuple[tuple[str, str], ...] = ()

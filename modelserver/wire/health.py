@@ -46,6 +46,9 @@ def write_health(health: Health) -> health_t:
         rejected = rejected_count_t()
         rejected.channel, rejected.reason, rejected.count = name, reason, count
         message.rejected.append(rejected)
+    message.num_notices = len(health.notices)
+    message.notice_subjects = [subject for subject, _ in health.notices]
+    message.notice_texts = [text for _, text in health.notices]
     return message
 
 
@@ -53,9 +56,12 @@ def read_health(message: health_t) -> Health:
     """Return the report of a message. Raises WireError."""
     fields.checked_count(message.num_channels, message.channels, "num_channels")
     fields.checked_count(message.num_rejected, message.rejected, "num_rejected")
+    fields.checked_count(message.num_notices, message.notice_subjects, "num_notices")
+    fields.checked_count(message.num_notices, message.notice_texts, "num_notices")
     return Health(
         invalid_reasons=Invalid(message.invalid_reasons),
         channels=tuple(ChannelHealth(each.channel, each.count, each.rate_hz, each.age) for each in message.channels),
         rejected=tuple((each.channel, each.reason, each.count) for each in message.rejected),
+        notices=tuple(zip(message.notice_subjects, message.notice_texts, strict=True)),
         **{name: getattr(message, name) for name in _PLAIN},
     )

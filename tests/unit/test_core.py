@@ -34,6 +34,7 @@ from modelserver.messages import (
     JointsSample,
     Mode,
     NameListReply,
+    Noticed,
     OriginLatched,
     Output,
     Policy,
@@ -620,6 +621,18 @@ def test_given_ticks_late_and_missed_then_health_tells_since_the_last_report() -
     assert health.ticks_missed == 6
     again = run.health(1.8, Tick(0.004))
     assert (again.tick_lateness_max, again.ticks_missed) == (pytest.approx(0.004), 6)
+
+
+def test_given_a_notice_then_the_next_tick_tells_it_until_it_is_taken_back() -> None:
+    run = Run()
+    run.health(0.0)
+    run.feed(Noticed("journal", "the disk is full"), 0.1)
+    assert run.health(0.2).notices == (("journal", "the disk is full"),)
+    run.feed(Noticed("journal", "the disk is full"), 0.3)
+    # nothing new: nothing is due before the period is over
+    assert not [each for each in run.feed(Tick(), 0.4) if isinstance(each, PublishHealth)]
+    run.feed(Noticed("journal"), 0.5)
+    assert run.health(0.6).notices == ()
 
 
 def test_given_what_was_done_then_health_tells_it() -> None:
