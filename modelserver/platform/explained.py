@@ -11,6 +11,7 @@ from modelserver.platform.path import Step, way
 from modelserver.platform.view import PlatformView
 from modelserver.spatial import chain
 
+_NOTHING = np.zeros((6, 1))
 _HOW_OF_FLAG = (
     (Quality.PREDICTED, How.PREDICTED),
     (Quality.HELD, How.HELD),
@@ -31,9 +32,11 @@ def explained(view: PlatformView, interest: str, reference: str, time: TimeQuery
         for number, link in enumerate(path.links)
     ]
     shares = chain.contributions(known) or {}
-    traces = [
-        (float(np.sum(shares[link.source][:3] ** 2)), float(np.sum(shares[link.source][3:] ** 2))) for link in known
-    ]
+    traces = []
+    for link in known:
+        share = shares[link.source]
+        bent = shares.get((*link.source, chain.BEND), _NOTHING)
+        traces.append((float(np.sum(share[:3] ** 2) + np.sum(bent**2)), float(np.sum(share[3:] ** 2))))
     position, rotation = (sum(each[side] for each in traces) for side in (0, 1))
     return Explanation(
         answer,

@@ -183,7 +183,7 @@ def _vehicle(view: PlatformView, world: str, rows: _Rows) -> tuple[Links, _Rows]
         factors = _factors(np.fromiter(some, float, 36 * len(numbers)).reshape(-1, 6, 6))
         factors[unsure] = math.nan
         factor = factors[end]
-    return Links(poses, True, factor, (EdgeKind.VEHICLE, world)), rows
+    return Links(poses, True, factor, (EdgeKind.VEHICLE, world), bends=True), rows
 
 
 def _jumps(held: list[Estimate]) -> npt.NDArray[np.bool_]:
@@ -307,6 +307,7 @@ def _met(view: PlatformView, there: Way, links: list[Links], rows: _Rows, fixed:
             True,
             _drifts(view, last.estimate, rows),
             (EdgeKind.VEHICLE, "drift"),
+            bends=True,
         )
         return [*before[:-1], travelled, *links[1:]], rows
     apart = rows.utimes != last.estimate.utime
@@ -368,7 +369,7 @@ def _is_fixed(link: Links) -> bool:
 
 
 def _constant(step: Step) -> Links:
-    return Links(Poses.of(step.X_FT), step.edge.forward, step.factor, step.source)
+    return Links(Poses.of(step.X_FT), step.edge.forward, step.factor, step.source, step.link.bends)
 
 
 def _drifts(view: PlatformView, since: Estimate, rows: _Rows) -> Array | None:

@@ -36,7 +36,8 @@ class Step(NamedTuple):
     @property
     def link(self) -> Link:
         """The step as a link of a chain."""
-        return Link(self.X_FT, self.edge.forward, self.factor, self.source)
+        bends = self.edge.kind is EdgeKind.VEHICLE
+        return Link(self.X_FT, self.edge.forward, self.factor, self.source, bends)
 
 
 class Way(NamedTuple):

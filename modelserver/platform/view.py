@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -93,11 +93,7 @@ class PlatformView:
         )
         route = self.route_from_vehicle(frame)
         estimate, mounted = self.moment(route, time, now)
-        forth, forth_cov = self._in_world(frame, world_frame, estimate, route, mounted)
-        pose, covariance = forth, forth_cov
-        if not reference:
-            pose = forth.inverse()
-            covariance = None if forth_cov is None else partial(_inverted, forth, forth_cov)
+        pose, covariance = self._in_world(frame, world_frame, estimate, route, mounted, back=not reference)
         return self._answer(frame_of_interest, frame_of_reference, pose, covariance, estimate, mounted, route)
 
     def _within(self, frame_of_interest: str, frame_of_reference: str, time: TimeQuery, now: int) -> PoseAnswer:
@@ -268,13 +264,17 @@ class PlatformView:
             raise
 
     def _in_world(
-        self, frame: str, world: str, estimate: Estimate, route: Route, mounted: Placed
+        self, frame: str, world: str, estimate: Estimate, route: Route, mounted: Placed, back: bool = False
     ) -> tuple[Pose, Callable[[], Array | None] | None]:
-        """Return a frame's pose in a world frame, and what works out its covariance; None where nobody knows it."""
+        """Return a frame's pose in a world frame, and what works out its covariance; None where nobody knows it.
+
+        With `back` the world frame's pose in the frame.
+        """
         X_WB = pose_in(world, estimate)
         numbers = estimate.odom_covariance if world == names.ODOM else estimate.covariance
         if frame == self.rolling_frame:
-            return X_WB, None if numbers is None else partial(_matrix, numbers)
+            at_base = None if numbers is None else partial(_back if back else _matrix, numbers, X_WB)
+            return X_WB.inverse() if back else X_WB, at_base
         if route.legs:
             X_BF = route.pose(mounted.positions)
             survey = partial(_mount_covariance, route, mounted)
@@ -282,7 +282,10 @@ class PlatformView:
             fixed = self.model.get_transformation(frame, self.rolling_frame)
             X_BF = fixed.pose
             survey = partial(_fixed_covariance, fixed, route)
-        return X_WB @ X_BF, None if numbers is None else partial(_composed, X_WB, numbers, X_BF, survey)
+        carried = _carried_back if back else _carried
+        X_WF = X_WB @ X_BF
+        known = None if numbers is None else partial(carried, numbers, X_WB, X_BF, survey)
+        return X_WF.inverse() if back else X_WF, known
 
     def check_carried(self, frame: str) -> None:
         """Raise where the frame does not exist, or nothing joins it to the frame whose pose is known."""
@@ -350,18 +353,40 @@ ODOM_INVALID = Invalid.NO_IMU | Invalid.STALE_IMU | Invalid.CLOCK_STEPPED | Inva
 _STALE = Invalid.STALE_GPS | Invalid.STALE_IMU
 
 
-def _matrix(numbers: tuple[float, ...]) -> Array:
+Survey: TypeAlias = Callable[[], Array | None]
+"""Works out how sure the way from the vehicle to a frame is."""
+
+
+def _matrix(numbers: tuple[float, ...], X_WB: Pose) -> Array:
     return np.array(numbers).reshape(6, 6)
 
 
-def _composed(X_WB: Pose, numbers: tuple[float, ...], X_BF: Pose, survey: Callable[[], Array | None]) -> Array | None:
+def _back(numbers: tuple[float, ...], X_WB: Pose) -> Array:
+    """Return the covariance of a world in the vehicle: its origin swings on a long arm as the vehicle's turn is off."""
+    X_BW = X_WB.inverse()
+    found = cov.invert(X_WB, _matrix(numbers, X_WB))
+    found[:3, :3] += cov.bend(found[3:, 3:], X_BW.position)
+    return found
+
+
+def _carried(numbers: tuple[float, ...], X_WB: Pose, X_BF: Pose, survey: Survey) -> Array | None:
+    """Return the covariance of a frame of the vehicle in a world."""
     mounted = survey()
-    return None if mounted is None else cov.compose(X_WB, _matrix(numbers), X_BF, mounted)
+    if mounted is None:
+        return None
+    own = _matrix(numbers, X_WB)
+    found = cov.compose(X_WB, own, X_BF, mounted)
+    # before the vehicle has moved its heading may be off by tens of degrees
+    found[:3, :3] += cov.bend(own[3:, 3:], X_WB.rotation @ X_BF.position)
+    return found
 
 
-def _inverted(X_WF: Pose, covariance: Callable[[], Array | None]) -> Array | None:
-    found = covariance()
-    return None if found is None else cov.invert(X_WF, found)
+def _carried_back(numbers: tuple[float, ...], X_WB: Pose, X_BF: Pose, survey: Survey) -> Array | None:
+    """Return the covariance of a world in a frame of the vehicle."""
+    mounted = survey()
+    if mounted is None:
+        return None
+    return cov.compose(X_BF.inverse(), cov.invert(X_BF, mounted), X_WB.inverse(), _back(numbers, X_WB))
 
 
 def _mount_covariance(route: Route, mounted: Placed) -> Array | None:

@@ -9,31 +9,39 @@ moves the far end by `R_F (dp + dtheta x ...)`, in sum
 with R_F the orientation of F, p_T the place of T and p_N that of the far end, all in the first frame; the sign is minus
 where the link is passed backwards. A link whose errors are the same at several places of a chain, as where it goes to
 another time and back, is one source: its contributions are added before they are squared, so what is shared cancels.
+
+That is first order. Where a link's turn may be large, as the vehicle's heading before it has moved, the arc on which
+the far end swings is not its tangent: see `covariance.bend`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
+from modelserver.spatial import covariance as cov
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array
+
+BEND: Final = "bend"
 
 
 class Link(NamedTuple):
     """One link of a chain: `X_FT`, passed from F to T where `forward`.
 
     `factor` (6, n) times its transpose is the covariance of its perturbation; None: nobody stated one. `source` names
-    where its errors come from: links of one source have the same errors, column by column.
+    where its errors come from: links of one source have the same errors, column by column. `bends`: whether its turn
+    may be so large that the second order counts.
     """
 
     X_FT: Pose
     forward: bool
     factor: Array | None
     source: tuple[Hashable, ...]
+    bends: bool = False
 
 
 def product(links: Sequence[Link]) -> Pose:
@@ -47,7 +55,7 @@ def product(links: Sequence[Link]) -> Pose:
 def contributions(links: Sequence[Link]) -> dict[tuple[Hashable, ...], Array] | None:
     """Return for each source the (6, n) matrix whose square is its share of the covariance of `product(links)`.
 
-    None where a link that is there states no covariance.
+    None where a link that is there states no covariance. What a link bends is a source of its own, `(*source, BEND)`.
     """
     places: list[Pose] = [Pose.identity()]
     for link in links:
@@ -64,6 +72,9 @@ def contributions(links: Sequence[Link]) -> dict[tuple[Hashable, ...], Array] | 
             share = -share
         known = shares.get(link.source)
         shares[link.source] = share if known is None else known + share
+        if link.bends:
+            off = cov.bend(share[3:] @ share[3:].T, np.array(far) - X_T.xyz)
+            shares[(*link.source, BEND)] = np.vstack((factor(off), np.zeros((3, 3))))
     return shares
 
 
@@ -100,7 +111,7 @@ def carried_rows(q: so3.Quaternion, r: so3.Vector3) -> tuple[tuple[float, ...], 
 
 
 def factor(covariance: Array) -> Array:
-    """Return a (6, 6) factor of a covariance, which need not have full rank."""
+    """Return a factor (n, n) of a covariance (n, n), which need not have full rank."""
     try:
         return np.asarray(np.linalg.cholesky(covariance))
     except np.linalg.LinAlgError:

@@ -21,6 +21,7 @@ class Links(NamedTuple):
     forward: bool
     factor: Array | None
     source: tuple[Hashable, ...]
+    bends: bool = False
 
 
 def product(links: Sequence[Links]) -> Poses:
@@ -41,6 +42,7 @@ def covariances(links: Sequence[Links], count: int) -> Array | None:
     far = places[-1].p
     turns = [matrices(place.q) for place in places]
     shares: dict[tuple[Hashable, ...], Array] = {}
+    total = np.zeros((count, 6, 6))
     for number, link in enumerate(links):
         if link.factor is None:
             return None
@@ -53,16 +55,27 @@ def covariances(links: Sequence[Links], count: int) -> Array | None:
         r = (far - places[T].p)[:, :, None]
         share = np.concatenate(np.broadcast_arrays(moved + crossed(swung, r), swung), axis=1)
         share = share if link.forward else -share
+        if link.bends:
+            total[:, :3, :3] += _bends(swung @ np.swapaxes(swung, 1, 2), r)
         known = shares.get(link.source)
         shares[link.source] = share if known is None else known + share
     constant = [share for share in shares.values() if len(share) == 1]
     varying = [share for share in shares.values() if len(share) > 1]
-    total = np.zeros((count, 6, 6))
     for some in (constant, varying):
         if some:
             root = np.concatenate(some, axis=2)
             total += root @ np.swapaxes(root, 1, 2)
     return total
+
+
+def _bends(S: Array, r: Array) -> Array:
+    """Return `covariance.bend` row by row: of turns (m, 3, 3) and levers (n, 3, 1)."""
+    Sr, rt = S @ r, np.swapaxes(r, 1, 2)
+    t = np.trace(S, axis1=1, axis2=2)[:, None, None]
+    squares = np.sum(S * S, axis=(1, 2))[:, None, None]
+    across = (t * Sr + 2.0 * (S @ Sr)) @ rt
+    rest = S * (rt @ Sr) + 2.0 * Sr @ np.swapaxes(Sr, 1, 2) + (t * t + 2.0 * squares) * (r @ rt)
+    return np.asarray((rest - across - np.swapaxes(across, 1, 2)) / 4.0)
 
 
 def _turned(R: Array, factor: Array) -> Array:

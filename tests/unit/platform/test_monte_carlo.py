@@ -158,10 +158,13 @@ def test_given_two_times_through_the_world_then_the_covariance_bounds_what_any_c
         assert np.linalg.eigvalsh(whitened @ whitened.T / COUNT).max() < 1.05
 
 
+@pytest.mark.parametrize("metres", [0.5, 0.1, 0.05])
 @pytest.mark.parametrize("frame", [SCAN, DEEP])
-def test_given_a_heading_unsure_by_20_deg_then_a_95_percent_ellipsoid_covers_90_percent(frame: str) -> None:
+def test_given_a_heading_unsure_by_20_deg_then_a_95_percent_ellipsoid_covers_90_percent(
+    frame: str, metres: float
+) -> None:
     # as from a satellite receiver alone, before the vehicle has moved
-    sigmas = np.array([0.5] * 3 + [0.01, 0.01, math.radians(20.0)])
+    sigmas = np.array([metres] * 3 + [0.01, 0.01, math.radians(20.0)])
     history = History(60.0)
     for at in (AT - 0.01, AT, AT + 0.01):
         unsure = replace(estimate(at), covariance=tuple(np.diag(sigmas**2).ravel().tolist()))

@@ -88,7 +88,7 @@ def links() -> list[Links]:
     """Return a chain of all kinds: one row and many, factors one and many, both ways, sources shared."""
     rng = np.random.default_rng(5)
     return [
-        Links(poses(10), True, rng.normal(size=(COUNT, 6, 6)), ("vehicle",)),
+        Links(poses(10), True, rng.normal(size=(COUNT, 6, 6)), ("vehicle",), bends=True),
         Links(poses(11, 1), True, rng.normal(size=(6, 6)), ("survey",)),
         Links(poses(12), False, rng.normal(size=(1, 6, 1)) * rng.normal(size=(COUNT, 1, 1)), ("joint",)),
         Links(poses(13, 1), True, np.zeros((6, 1)), ("exact",)),
@@ -104,6 +104,7 @@ def rows(some: list[Links], number: int) -> list[Link]:
             each.forward,
             each.factor if each.factor is None or each.factor.ndim == 2 else each.factor[number],
             each.source,
+            each.bends,
         )
         for each in some
     ]
