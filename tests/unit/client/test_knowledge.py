@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support_between import between
 from support_mirror import DELAY, Told, drive, fed, joints, parts, pose, snapshot
 from support_moving import BASE, DEEP, ODOM, SCAN, SURVEY, T0, UTM, S, estimate, joints_at, rover, truth, twist, vehicle
 from support_moving import view as exact_view
@@ -19,7 +20,6 @@ from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
 from modelserver.messages import Invalid, Policy, Quality, SnapshotPart, TimeQuery
 from modelserver.platform import PlatformView
-from modelserver.platform.between import between
 from modelserver.platform.explained import explained
 from modelserver.platform.many import many
 from modelserver.platform.moving import motion

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from support_between import between
 from support_moving import BASE, ODOM, SCAN, T0, UTM, S, rover, truth, view
 
 from modelserver.geometry.builder import ModelBuilder
@@ -13,7 +14,6 @@ from modelserver.geometry.joint import Joint, JointType
 from modelserver.joints import Joints
 from modelserver.localization.rig import Rig
 from modelserver.messages import Invalid, JointSample, JointsSample, Quality, SensorHeader, TimeQuery
-from modelserver.platform.between import between
 from modelserver.platform.many import many
 from modelserver.platform.moving import motion
 from modelserver.spatial.pose import Pose

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from support_between import between
 from support_moving import BASE, DEEP, ENU, ODOM, ORIGIN, SCAN, T0, UTM, S, estimate, joints_at, rover, view
 
 from modelserver.errors import LimitError, NoPoseError, QueryError, Status, UnknownFrameError
@@ -15,7 +16,6 @@ from modelserver.history import History
 from modelserver.joints import NO_JOINTS, Joints
 from modelserver.messages import MOST_INSTANTS, Invalid, JointSample, PoseAnswer, Quality, TimeQuery
 from modelserver.platform import PlatformView
-from modelserver.platform.between import between
 from modelserver.platform.many import many
 from modelserver.spatial.pose import Pose
 

@@ -9,12 +9,12 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support_between import between
 from support_moving import BASE, DEEP, SCAN, T0, UTM, S, estimate, vehicle, view
 
 from modelserver.history import History
 from modelserver.messages import TimeQuery
 from modelserver.platform import PlatformView
-from modelserver.platform.between import between
 from modelserver.spatial import arrays
 from modelserver.spatial.arrays import Poses
 from modelserver.spatial.pose import Pose

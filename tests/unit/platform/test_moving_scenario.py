@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from support_between import between
 from support_moving import BASE, DEEP, ENU, ODOM, SCAN, T0, UTM, S, estimate, joints_at, rover, truth, view
 
 from modelserver.core import CoreSettings, Instant, start, step
@@ -26,7 +27,6 @@ from modelserver.messages import (
     TransformReply,
 )
 from modelserver.platform import PlatformView
-from modelserver.platform.between import between
 from modelserver.platform.many import many
 from modelserver.spatial.pose import Pose
 

@@ -1,4 +1,7 @@
-"""Where a frame is at one time in another at another time, through a frame that is taken to stand still between."""
+"""Where a frame is at one time in another at another time: `platform.many` for one instant, step by step.
+
+Written for itself, from links and their covariances, so that the rows of `many` have something to be held against.
+"""
 
 from __future__ import annotations
 
