@@ -74,6 +74,13 @@ def _rotation(reader: NodeReader, key: str, node: Node, place: str) -> Quaternio
     angles = reader.numbers(node, 3, place, key, "degrees" if degrees else "radians")
     if angles is None:
         return None
+    largest = max(angles, key=abs)
+    if not degrees and abs(largest) > math.tau:
+        reader.builder.warning(
+            f"rpy has {largest:.6g} rad, which is {abs(largest) / math.tau:.3g} turns",
+            reader.at(node, place),
+            "where degrees were meant, write rpy_deg",
+        )
     roll, pitch, yaw = (math.radians(angle) for angle in angles) if degrees else angles
     return so3.from_rpy(roll, pitch, yaw)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from modelserver.geometry.joint import Joint
 from modelserver.geometry.model import Model
 from modelserver.geometry.names import joined
 from modelserver.geometry.parts import Constraint
@@ -55,9 +56,52 @@ def _constraints(was: dict[str, Constraint], now: dict[str, Constraint]) -> list
         if old.sigma != each.sigma:
             lines.append(f"constraint {name} states another sigma")
         if old.joint != each.joint:
-            kind = f"is {each.joint.type}, it was {old.joint.type}" if old.joint.type != each.joint.type else "changes"
-            lines.append(f"the joint of constraint {name} {kind}")
+            lines.append(f"the joint of constraint {name} {_of_joint(old.joint, each.joint)}")
     return lines
+
+
+def _of_joint(old: Joint, new: Joint) -> str:
+    if old.type != new.type:
+        return f"is {new.type}, it was {old.type}"
+    said = []
+    if old.axis != new.axis:
+        said.append(f"the axis {_numbers(new.axis)}, it was {_numbers(old.axis)}")
+    for key, what in _QUANTITIES:
+        values = [_values(each, getattr(each, key)) for each in (new, old)]
+        if values[0] != values[1]:
+            said.append(f"{what} {values[0]}, it was {values[1]}")
+    if old.mimic != new.mimic:
+        said.append(f"{_leader(new)}, {_leader(old)} before".replace("  ", " "))
+    return "has " + "; ".join(said) if said else "changes by less than is shown"
+
+
+_QUANTITIES = (
+    ("lower", "the lower limit"),
+    ("upper", "the upper limit"),
+    ("rate_limit", "the rate limit"),
+    ("default", "the default"),
+    ("sigma", "sigma"),
+)
+
+
+def _values(joint: Joint, values: tuple[float, ...]) -> str:
+    """Return what a joint states of its coordinates: angles in degrees, lengths in metres."""
+    told = [
+        f"{math.degrees(value):.6g} deg" if angle else f"{value:.6g} m"
+        for value, angle in zip(values, joint.is_angle, strict=False)
+    ]
+    return ", ".join(told) or "none"
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return " ".join(f"{value:.6g}" for value in values)
+
+
+def _leader(joint: Joint) -> str:
+    mimic = joint.mimic
+    if mimic is None:
+        return "no joint that it follows"
+    return f"{mimic.joint} to follow, times {mimic.multiplier:.6g} plus {mimic.offset:.6g}"
 
 
 def _moved(what: str, old: Pose, new: Pose) -> list[str]:

@@ -20,6 +20,10 @@ REACH = 1e9
 """Metres or radians; what rests beyond would lose the millimetres of everything else."""
 
 
+MOST_TURNED = 2.0 * math.tau
+"""Radians; an angle beyond two turns is rather one in degrees."""
+
+
 class Finding(NamedTuple):
     """What is wrong with a joint, where, and what to do."""
 
@@ -147,6 +151,7 @@ class JointRules:
 
     def _settled(self, placed: Sequence[Placed]) -> tuple[Placed, ...]:
         placed = self._within_reach(placed)
+        self._warn_of_degrees(placed)
         settled = at_rest(constraint for constraint, _ in placed)
         for (stated, source), each in zip(placed, settled, strict=True):
             joint, mimic = each.joint, each.joint.mimic
@@ -161,6 +166,14 @@ class JointRules:
                         f"remove it, or state the default of {mimic.joint}",
                     )
                 )
+            if stated.joint.sigma:
+                self.warnings.append(
+                    Finding(
+                        f"{label}: the sigma of its joint counts for nothing, for it follows {mimic.joint}",
+                        source,
+                        f"remove it, or state the sigma of {mimic.joint}: a follower errs with its leader",
+                    )
+                )
             if joint.out_of_limits(joint.default):
                 self.warnings.append(
                     Finding(
@@ -170,6 +183,28 @@ class JointRules:
                     )
                 )
         return tuple((each, source) for (_, source), each in zip(placed, settled, strict=True))
+
+    def _warn_of_degrees(self, placed: Sequence[Placed]) -> None:
+        """Say where angles are so large that they look like degrees written as radians."""
+        for constraint, source in placed:
+            joint = constraint.joint
+            for key in ("lower", "upper", "default"):
+                turns = [
+                    value
+                    for value, angle in zip(getattr(joint, key), joint.is_angle, strict=False)
+                    if angle and MOST_TURNED < abs(value) < math.inf
+                ]
+                if turns:
+                    what = "default" if key == "default" else f"{key} limit"
+                    self.warnings.append(
+                        Finding(
+                            f"constraint {shown(constraint.name)}: the {what} of its joint is {turns[0]:.6g} rad, "
+                            f"{abs(turns[0]) / math.tau:.3g} turns",
+                            source,
+                            "where that is degrees, name them so (limits_deg, default_deg); a winch may turn that far",
+                        )
+                    )
+                    break
 
     def _within_reach(self, placed: Sequence[Placed]) -> list[Placed]:
         """Return those whose positions at rest are numbers; what follows one that is none is none either."""

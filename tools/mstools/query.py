@@ -97,6 +97,8 @@ def command(
     else:
         source = answers(model, settings, url, prefix, timeout)
     utime = _utime(at) if utime is None else utime
+    if log is None:
+        _check_unit(utime)
     if explain or motion:
         when = TimeQuery(utime, POLICIES[policy], wait_ms)
         ends = (frame_of_interest, frame_of_reference)
@@ -132,6 +134,17 @@ def _moved(source: object, interest: str, reference: str, axes: str, time: TimeQ
         interest, reference, expressed_in=axes, at=time.at, policy=time.policy, wait_ms=time.wait_ms
     )
     return _Told(found.pose, describe_motion(found), as_dict(found.pose) | motion_as_data(found))
+
+
+_SECONDS = (1_000_000_000, 10_000_000_000)
+"""What seconds since 1970 are in this age; as microseconds that is the first three hours of 1970."""
+
+
+def _check_unit(utime: int) -> None:
+    if _SECONDS[0] < utime < _SECONDS[1]:
+        raise typer.BadParameter(
+            f"{utime} looks like seconds since 1970; times are microseconds: {utime}000000", param_hint="--at"
+        )
 
 
 def _utime(text: str) -> int:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -65,9 +67,23 @@ def test_given_another_model_then_each_change_is_told_in_its_line(new: Model, to
     assert changes(cart(), new) == told
 
 
-def test_given_a_joint_with_other_limits_then_its_joint_changes() -> None:
-    limited = Joint(JointType.REVOLUTE, (0.0, 1.0, 0.0), (-1.0,), (1.0,))
-    assert changes(cart(joint=NOD), cart(joint=limited)) == ("the joint of constraint Mounted changes",)
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"axis": (0.0, 0.0, 1.0)}, "the axis 0 0 1, it was 0 1 0"),
+        ({"lower": (math.radians(-30.0),)}, "the lower limit -30 deg, it was none"),
+        ({"sigma": (math.radians(0.5),)}, "sigma 0.5 deg, it was none"),
+        ({"default": (math.radians(5.0),)}, "the default 5 deg, it was none"),
+        ({"default": (1e-12,)}, "the default 5.72958e-11 deg, it was none"),
+        (
+            {"rate_limit": (math.radians(40.0),), "upper": (math.radians(20.0),)},
+            "the upper limit 20 deg, it was none; the rate limit 40 deg, it was none",
+        ),
+    ],
+)
+def test_given_a_joint_that_states_otherwise_then_each_number_is_told(change: dict[str, Any], told: str) -> None:
+    found = changes(cart(joint=NOD), cart(joint=replace(NOD, **change)))
+    assert found == (f"the joint of constraint Mounted has {told}",)
 
 
 def test_given_constraints_that_come_and_go_and_another_root_then_it_is_told() -> None:

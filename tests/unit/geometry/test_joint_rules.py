@@ -190,6 +190,26 @@ def test_given_a_default_of_a_joint_that_follows_then_that_is_a_warning_and_it_c
     assert place(model, "b") == 0.5
 
 
+def test_given_a_sigma_of_a_joint_that_follows_then_that_is_a_warning():
+    model = comb(A=slide(sigma=(0.001,)), B=slide(Mimic("A"), sigma=(0.002,))).build()
+    (problem,) = model.problems
+    assert "the sigma of its joint counts for nothing, for it follows A" in problem.message
+
+
+@pytest.mark.parametrize("stated", [{"lower": (-30.0,)}, {"upper": (45.0,)}, {"default": (20.0,)}])
+def test_given_an_angle_beyond_two_turns_then_degrees_are_suspected(stated):
+    (problem,) = comb(A=Joint(JointType.REVOLUTE, X, **stated)).build().problems
+    assert problem.severity is Severity.WARNING
+    assert "turns" in problem.message
+    assert "limits_deg" in (problem.fix or "")
+
+
+@pytest.mark.parametrize("stated", [{"lower": (-6.3,), "upper": (6.3,)}, {"rate_limit": (30.0,)}])
+def test_given_angles_up_to_two_turns_then_nobody_is_warned(stated):
+    assert not comb(A=Joint(JointType.REVOLUTE, X, **stated)).build().problems
+    assert not comb(A=slide(lower=(-30.0,), upper=(30.0,))).build().problems
+
+
 def test_given_joints_then_the_revision_changes_with_each_of_their_numbers():
     def revision(**changes):
         stated = {"lower": (-1.0,), "upper": (1.0,), "rate_limit": (2.0,), "default": (0.5,), "sigma": (0.1,)} | changes

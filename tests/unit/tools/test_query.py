@@ -228,6 +228,7 @@ def test_given_a_file_then_bodies_and_frames_list_it(run: Command, annex: Path) 
         ["query", "A:B", "C:D", "--nonsense"],
         ["query", "A:B", "C:D", "--policy", "guess"],
         ["query", "A:B", "C:D", "--at", "noon"],
+        ["query", "A:B", "C:D", "--at", "1763790000"],
         ["query", "A:B", "C:D", "--wait-ms", "-1"],
         ["query", "A:B", "C:D", "--timeout", "0"],
         ["query", "A:B", "C:D", "--timeout", "nan"],
