@@ -60,7 +60,8 @@ def many(
     if fixed or any(link.source[0] in (EdgeKind.VEHICLE, EdgeKind.JOINT) for link in links):
         doubt = view.doubt & Invalid.CLOCK_STEPPED if fixed else view.doubt
         rows = rows.told(int(doubt), 0)
-    poses = chains.product(links)
+    places = chains.places(links)
+    poses = places[-1].canonical()
     origin = None
     if {interest, reference, fixed} & {names.WORLD_UTM, names.WORLD_ENU} and len(view.history):
         origin, rows = _origin(view, rows)
@@ -68,7 +69,7 @@ def many(
     # each is one row where it is the same in all
     whole = np.hstack((np.broadcast_to(poses.p, (count, 3)), np.broadcast_to(poses.q, (count, 4))))
     vectors = np.where(good, whole, math.nan)
-    covariances = chains.covariances(links, count) if with_covariance else None
+    covariances = chains.covariances(links, count, places) if with_covariance else None
     if covariances is not None:
         covariances = np.where(good, covariances.reshape(count, 36), math.nan)
     return ManyPoses(
@@ -171,7 +172,8 @@ def _origin(view: PlatformView, rows: Rows) -> tuple[Origin | None, Rows]:
     good = np.flatnonzero(rows.status == Status.OK)
     if not len(good):
         return view.history.newest.origin, rows
-    held, before = view.history.around(np.clip(rows.utimes, view.history.first, view.history.last))
+    history = view.history
+    held, before = rows.around or history.around(np.clip(rows.utimes, history.first, history.last))
     newest = held[before[good[np.argmax(rows.utimes[good])]]].origin
     of_others = np.array([differ(each.origin, newest) for each in held])[before] & (rows.status == Status.OK)
     return newest, replace(rows, status=np.where(of_others, int(Status.NO_POSE), rows.status).astype(np.int32))

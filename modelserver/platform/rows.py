@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from modelserver.errors import Status
+from modelserver.messages import Estimate
 
 Times = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.int32]
@@ -17,7 +18,8 @@ Flags = npt.NDArray[np.int32]
 class Rows:
     """The instants, and what is found of each on the way: status, reasons, flags, pose epoch; arrays of n.
 
-    with_covariance: whether it is asked how sure each is.
+    with_covariance: whether it is asked how sure each is. around: the vehicle's estimates around the instants, as
+    `History.around`, once they were looked up.
     """
 
     utimes: Times
@@ -26,6 +28,7 @@ class Rows:
     quality: Flags
     epochs: Flags
     with_covariance: bool = True
+    around: tuple[list[Estimate], npt.NDArray[np.intp]] | None = None
 
     def within(self, first: int, last: int) -> Rows:
         """Return the rows with those marked that lie outside a span, their times moved to its edge."""

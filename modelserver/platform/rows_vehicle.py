@@ -26,6 +26,7 @@ from modelserver.spatial.so3 import Array
 TILT_TIME_S: Final = 1.0
 """Over which the tilt of a pose in Odom may change by as much as it is unsure."""
 
+_NOWHERE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 _NOTHING = (0.0,) * 36
 
 
@@ -40,8 +41,9 @@ def vehicle(view: PlatformView, world: str, rows: Rows) -> tuple[Links, Rows]:
     known = np.array([pose is not None for pose in found])
     if not known.any():
         raise NoPoseError(f"the vehicle's pose in {world} was not known then: {held[0].invalid.explain()}")
-    p = np.array([(0.0, 0.0, 0.0) if pose is None else pose.xyz for pose in found])
-    q = np.array([(1.0, 0.0, 0.0, 0.0) if pose is None else pose.wxyz for pose in found])
+    told = itertools.chain.from_iterable([_NOWHERE if pose is None else pose.xyz + pose.wxyz for pose in found])
+    vectors = np.fromiter(told, float, 7 * len(found)).reshape(-1, 7)
+    p, q = vectors[:, :3], vectors[:, 3:]
     times = np.array([each.utime for each in held])
     epochs = np.array([each.pose_epoch for each in held], dtype=np.int32)
     after = np.minimum(before + 1, len(held) - 1)
@@ -57,7 +59,7 @@ def vehicle(view: PlatformView, world: str, rows: Rows) -> tuple[Links, Rows]:
     quality = np.array([int(each.quality) for each in held], dtype=np.int32)
     between = np.where(exact, 0, np.where(jump, int(Quality.HELD), int(Quality.INTERPOLATED))).astype(np.int32)
     status = np.where((known[before] & known[end]) | (rows.status != 0), rows.status, int(Status.NO_POSE))
-    rows = replace(rows, status=status.astype(np.int32), epochs=epochs[end])
+    rows = replace(rows, status=status.astype(np.int32), epochs=epochs[end], around=(held, before))
     rows = rows.told(invalid[before] | invalid[end], quality[before] | quality[end] | between)
     factor = _vehicle_factor(world, held, end) if rows.with_covariance else None
     return Links(poses, True, factor, (EdgeKind.VEHICLE, world), bends=True), rows

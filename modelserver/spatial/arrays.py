@@ -109,13 +109,6 @@ def skews(v: Array) -> Array:
     return K
 
 
-def crossed(a: Array, b: Array) -> Array:
-    """Return a x b of vectors along the last axis but one: (..., 3, k). `numpy.cross` takes three times as long."""
-    ax, ay, az = a[..., 0, :], a[..., 1, :], a[..., 2, :]
-    bx, by, bz = b[..., 0, :], b[..., 1, :], b[..., 2, :]
-    return np.stack((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx), axis=-2)
-
-
 def slerped(a: Array, b: Array, part: Array) -> Array:
     """Return the rotations `part` (n) of the way from a to b at constant rate, the short way round."""
     d = multiplied(conjugated(a), b)

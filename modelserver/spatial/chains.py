@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from modelserver.spatial.arrays import Poses, crossed, matrices
+from modelserver.spatial.arrays import Poses, matrices
 from modelserver.spatial.so3 import Array
 
 
@@ -26,63 +26,82 @@ class Links(NamedTuple):
 
 def product(links: Sequence[Links]) -> Poses:
     """Return the poses of the chains' last frames in their first."""
-    poses = Poses(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))
+    return places(links)[-1].canonical()
+
+
+def places(links: Sequence[Links]) -> list[Poses]:
+    """Return the poses of all frames of the chains in their first: of that itself, and behind each link."""
+    found = [Poses(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))]
     for link in links:
-        poses = poses @ (link.X_FT if link.forward else link.X_FT.inverse())
-    return poses.canonical()
+        found.append(found[-1] @ (link.X_FT if link.forward else link.X_FT.inverse()))
+    return found
 
 
-def covariances(links: Sequence[Links], count: int) -> Array | None:
-    """Return the covariances (n, 6, 6) of the chains, along the axes of their first frames; None where unknown."""
+def covariances(links: Sequence[Links], count: int, known: list[Poses] | None = None) -> Array | None:
+    """Return the covariances (n, 6, 6) of the chains, along the axes of their first frames; None where unknown.
+
+    `known` are the links' `places`, where they have been worked out already.
+    """
     if not count:
         return np.zeros((0, 6, 6))
-    places = [Poses(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))]
-    for link in links:
-        places.append(places[-1] @ (link.X_FT if link.forward else link.X_FT.inverse()))
-    far = places[-1].p
-    turns = [matrices(place.q) for place in places]
-    shares: dict[tuple[Hashable, ...], Array] = {}
-    total = np.zeros((count, 6, 6))
-    for number, link in enumerate(links):
-        if link.factor is None:
-            return None
-        if not link.factor.any():
+    stated = [(number, link, link.factor) for number, link in enumerate(links) if link.factor is not None]
+    if len(stated) < len(links):
+        return None
+    where = known or places(links)
+    far = where[-1].p
+    turns = [matrices(place.q) for place in where]
+    # the columns of each source stand side by side, and what shares a source is added
+    columns: dict[tuple[Hashable, ...], slice] = {}
+    width = 0
+    for _, link, factor in stated:
+        if link.source not in columns:
+            columns[link.source] = slice(width, width + factor.shape[-1])
+            width += factor.shape[-1]
+    one = all(len(place.p) == len(place.q) == 1 for place in where) and all(f.ndim == 2 for _, _, f in stated)
+    rows = 1 if one else count
+    root = np.zeros((rows, 6, width))
+    total = np.zeros((rows, 6, 6))
+    for number, link, factor in stated:
+        if not factor.any():
             continue
         F, T = (number, number + 1) if link.forward else (number + 1, number)
         # J = +-[[R, -[r]x R], [0, R]] in two steps, as `chain` has it: turned first, then swung
-        turned = _turned(turns[F], link.factor) if F else link.factor.reshape(-1, *link.factor.shape[-2:])
-        moved, swung = turned[:, :3], turned[:, 3:]
-        r = (far - places[T].p)[:, :, None]
-        share = np.concatenate(np.broadcast_arrays(moved + crossed(swung, r), swung), axis=1)
-        share = share if link.forward else -share
+        moved, swung = _turned(turns[F], factor) if F else (factor[..., :3, :], factor[..., 3:, :])
+        r = (far - where[T].p)[:, :, None]
+        sign = 1.0 if link.forward else -1.0
+        share = root[:, :, columns[link.source]]
+        share[:, :3] += sign * moved
+        share[:, 3:] += sign * swung
+        _add_crossed(share[:, :3], sign * swung, r)
         if link.bends:
-            total[:, :3, :3] += _bends(swung @ np.swapaxes(swung, 1, 2), r)
-        known = shares.get(link.source)
-        shares[link.source] = share if known is None else known + share
-    constant = [share for share in shares.values() if len(share) == 1]
-    varying = [share for share in shares.values() if len(share) > 1]
-    for some in (constant, varying):
-        if some:
-            root = np.concatenate(some, axis=2)
-            total += root @ np.swapaxes(root, 1, 2)
-    return total
+            total[:, :3, :3] += _bends(swung @ np.swapaxes(swung, -1, -2), r)
+    total += root @ np.swapaxes(root, 1, 2)
+    return np.broadcast_to(total, (count, 6, 6)).copy() if one else total
+
+
+def _add_crossed(to: Array, a: Array, b: Array) -> None:
+    """Add a x b of vectors along the last axis but one."""
+    ax, ay, az = a[..., 0, :], a[..., 1, :], a[..., 2, :]
+    bx, by, bz = b[..., 0, :], b[..., 1, :], b[..., 2, :]
+    to[:, 0] += ay * bz - az * by
+    to[:, 1] += az * bx - ax * bz
+    to[:, 2] += ax * by - ay * bx
 
 
 def _bends(S: Array, r: Array) -> Array:
-    """Return `covariance.bend` row by row: of turns (m, 3, 3) and levers (n, 3, 1)."""
+    """Return `covariance.bend` row by row: of turns (m, 3, 3), or one (3, 3), and levers (n, 3, 1)."""
     Sr, rt = S @ r, np.swapaxes(r, 1, 2)
-    t = np.trace(S, axis1=1, axis2=2)[:, None, None]
-    squares = np.sum(S * S, axis=(1, 2))[:, None, None]
-    across = (t * Sr + 2.0 * (S @ Sr)) @ rt
-    rest = S * (rt @ Sr) + 2.0 * Sr @ np.swapaxes(Sr, 1, 2) + (t * t + 2.0 * squares) * (r @ rt)
-    return np.asarray((rest - across - np.swapaxes(across, 1, 2)) / 4.0)
+    t = np.trace(S, axis1=-2, axis2=-1)[..., None, None]
+    squares = np.sum(S * S, axis=(-2, -1))[..., None, None]
+    # off + off' is what is of r on one side, half of what is of r on both with it
+    off = (((0.5 * t * t + squares) * r - t * Sr) - 2.0 * (S @ Sr)) @ rt + Sr @ np.swapaxes(Sr, 1, 2)
+    return np.asarray((S * (rt @ Sr) + off + np.swapaxes(off, 1, 2)) * 0.25)
 
 
-def _turned(R: Array, factor: Array) -> Array:
+def _turned(R: Array, factor: Array) -> tuple[Array, Array]:
     """Return both halves of a factor, (6, k) or (n, 6, k), turned by rotations (m, 3, 3)."""
-    stack = factor if factor.ndim == 3 else factor[None]
-    rows, columns = len(stack), stack.shape[2]
-    halves = stack.reshape(rows, 2, 3, columns).swapaxes(1, 2).reshape(rows, 3, 2 * columns)
+    if factor.ndim == 3:
+        return R @ factor[:, :3], R @ factor[:, 3:]
     # one product of tall matrices where the factor is one for all: much the faster
-    turned = (R.reshape(-1, 3) @ halves[0]).reshape(-1, 3, 2 * columns) if rows == 1 else R @ halves
-    return np.concatenate((turned[:, :, :columns], turned[:, :, columns:]), axis=1)
+    tall = R.reshape(-1, 3)
+    return (tall @ factor[:3]).reshape(len(R), 3, -1), (tall @ factor[3:]).reshape(len(R), 3, -1)

@@ -79,11 +79,6 @@ def test_given_one_pose_for_all_rows_then_it_counts_in_each() -> None:
             assert row(found, number).is_close(pick(number), 1e-13, 1e-13)
 
 
-def test_given_vectors_then_the_cross_product_is_numpys() -> None:
-    a, b = RNG.normal(size=(5, 3, 4)), RNG.normal(size=(5, 3, 4))
-    assert np.allclose(arrays.crossed(a, b), np.cross(a, b, axis=1), atol=1e-15)
-
-
 def links() -> list[Links]:
     """Return a chain of all kinds: one row and many, factors one and many, both ways, sources shared."""
     rng = np.random.default_rng(5)
