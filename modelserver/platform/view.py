@@ -362,11 +362,8 @@ def _matrix(numbers: tuple[float, ...], X_WB: Pose) -> Array:
 
 
 def _back(numbers: tuple[float, ...], X_WB: Pose) -> Array:
-    """Return the covariance of a world in the vehicle: its origin swings on a long arm as the vehicle's turn is off."""
-    X_BW = X_WB.inverse()
-    found = cov.invert(X_WB, _matrix(numbers, X_WB))
-    found[:3, :3] += cov.bend(found[3:, 3:], X_BW.position)
-    return found
+    """Return the covariance of a world in the vehicle: its origin is at the end of a long lever."""
+    return cov.rotated(X_WB.rotation.T, cov.at_end(_matrix(numbers, X_WB), -X_WB.position))
 
 
 def _carried(numbers: tuple[float, ...], X_WB: Pose, X_BF: Pose, survey: Survey) -> Array | None:
@@ -374,11 +371,8 @@ def _carried(numbers: tuple[float, ...], X_WB: Pose, X_BF: Pose, survey: Survey)
     mounted = survey()
     if mounted is None:
         return None
-    own = _matrix(numbers, X_WB)
-    found = cov.compose(X_WB, own, X_BF, mounted)
     # before the vehicle has moved its heading may be off by tens of degrees
-    found[:3, :3] += cov.bend(own[3:, 3:], X_WB.rotation @ X_BF.position)
-    return found
+    return cov.at_end(_matrix(numbers, X_WB), X_WB.rotation @ X_BF.position) + cov.rotated(X_WB.rotation, mounted)
 
 
 def _carried_back(numbers: tuple[float, ...], X_WB: Pose, X_BF: Pose, survey: Survey) -> Array | None:

@@ -11,7 +11,7 @@ where the link is passed backwards. A link whose errors are the same at several 
 another time and back, is one source: its contributions are added before they are squared, so what is shared cancels.
 
 That is first order. Where a link's turn may be large, as the vehicle's heading before it has moved, the arc on which
-the far end swings is not its tangent: see `covariance.bend`.
+the far end swings is not its tangent: see `swing`.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from modelserver.spatial import covariance as cov
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array
+from modelserver.spatial.swing import swing
 
 BEND: Final = "bend"
 
@@ -70,11 +70,13 @@ def contributions(links: Sequence[Link]) -> dict[tuple[Hashable, ...], Array] | 
         share = _carried(X_F, X_T, far) @ link.factor
         if not link.forward:
             share = -share
+        if link.bends:
+            r, turn = np.array(far) - X_T.xyz, share[3:]
+            M, more = swing(turn @ turn.T, r)
+            share[:3] -= so3.skew(r) @ (M @ turn - turn)
+            shares[(*link.source, BEND)] = np.vstack((factor(more), np.zeros((3, 3))))
         known = shares.get(link.source)
         shares[link.source] = share if known is None else known + share
-        if link.bends:
-            off = cov.bend(share[3:] @ share[3:].T, np.array(far) - X_T.xyz)
-            shares[(*link.source, BEND)] = np.vstack((factor(off), np.zeros((3, 3))))
     return shares
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from modelserver.spatial.arrays import Poses, matrices
 from modelserver.spatial.so3 import Array
+from modelserver.spatial.swing import swing
 
 
 class Links(NamedTuple):
@@ -72,9 +73,11 @@ def covariances(links: Sequence[Links], count: int, known: list[Poses] | None = 
         share = root[:, :, columns[link.source]]
         share[:, :3] += sign * moved
         share[:, 3:] += sign * swung
-        _add_crossed(share[:, :3], sign * swung, r)
         if link.bends:
-            total[:, :3, :3] += _bends(swung @ np.swapaxes(swung, -1, -2), r)
+            M, more = swing(swung @ np.swapaxes(swung, -1, -2), r[..., 0])
+            total[:, :3, :3] += more
+            swung = M @ swung
+        _add_crossed(share[:, :3], sign * swung, r)
     total += root @ np.swapaxes(root, 1, 2)
     return np.broadcast_to(total, (count, 6, 6)).copy() if one else total
 
@@ -86,16 +89,6 @@ def _add_crossed(to: Array, a: Array, b: Array) -> None:
     to[:, 0] += ay * bz - az * by
     to[:, 1] += az * bx - ax * bz
     to[:, 2] += ax * by - ay * bx
-
-
-def _bends(S: Array, r: Array) -> Array:
-    """Return `covariance.bend` row by row: of turns (m, 3, 3), or one (3, 3), and levers (n, 3, 1)."""
-    Sr, rt = S @ r, np.swapaxes(r, 1, 2)
-    t = np.trace(S, axis1=-2, axis2=-1)[..., None, None]
-    squares = np.sum(S * S, axis=(-2, -1))[..., None, None]
-    # off + off' is what is of r on one side, half of what is of r on both with it
-    off = (((0.5 * t * t + squares) * r - t * Sr) - 2.0 * (S @ Sr)) @ rt + Sr @ np.swapaxes(Sr, 1, 2)
-    return np.asarray((S * (rt @ Sr) + off + np.swapaxes(off, 1, 2)) * 0.25)
 
 
 def _turned(R: Array, factor: Array) -> tuple[Array, Array]:

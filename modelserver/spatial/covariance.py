@@ -13,6 +13,7 @@ import numpy as np
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array
+from modelserver.spatial.swing import swing
 
 
 def compose(X_AB: Pose, cov_AB: Array, X_BC: Pose, cov_BC: Array) -> Array:
@@ -40,23 +41,17 @@ def invert(X_AB: Pose, cov_AB: Array) -> Array:
     return _symmetric(J @ cov_AB @ J.T)
 
 
-def bend(turn: Array, r: Array) -> Array:
-    """Return what a turn that is unsure adds to the position at the end of a lever, to second order: (3, 3).
+def at_end(cov: Array, r: Array) -> Array:
+    """Return the covariance (6, 6) at the end of a lever `r` (3,), of one whose turn may be large; see `swing`.
 
-    An arm `r` (3,) that turns by theta does not end on the tangent but on an arc, off it by
-    `b = (theta theta' - |theta|^2 I) r / 2`. That is small beside `theta x r` while the angle is, and at 20 degrees it
-    is what matters most along the arm. `turn` (3, 3) is the covariance of theta, along the axes of `r`. By Isserlis'
-    theorem for the fourth moments of a normal distribution, with S the turn and t its trace,
-
-        4 E[b b'] = S (r' S r) + 2 S r r' S - (t S + 2 S^2) r r' - r r' (t S + 2 S^2) + (t^2 + 2 tr S^2) r r'
-
-    b is even in theta and `theta x r` odd, so the two do not correlate; nor do b and theta.
+    `cov` is of the pose at the lever's beginning, all along the same axes.
     """
-    Sr = turn @ r
-    t = float(np.trace(turn))
-    across = np.outer(t * Sr + 2.0 * (turn @ Sr), r)
-    along = (t * t + 2.0 * float(np.sum(turn * turn))) * np.outer(r, r)
-    return np.asarray((turn * float(r @ Sr) + 2.0 * np.outer(Sr, Sr) - across - across.T + along) / 4.0)
+    M, more = swing(cov[3:, 3:], r)
+    J = np.eye(6)
+    J[:3, 3:] = -so3.skew(r) @ M
+    found = J @ cov @ J.T
+    found[:3, :3] += more
+    return _symmetric(found)
 
 
 def rotated(R: Array, cov: Array) -> Array:

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
-import math
-
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from modelserver.spatial import Pose, Transformation, covariance
@@ -128,17 +123,3 @@ def test_given_matrices_that_are_no_covariance_then_it_is_said_why():
         bad = good.copy()
         bad[row, column] = value
         assert said in covariance.fault(bad)
-
-
-@given(seed=st.integers(0, 1 << 32), rank=st.integers(1, 3))
-def test_given_an_unsure_turn_of_an_arm_then_its_bend_is_the_fourth_moment_that_samples_have(seed, rank):
-    rng = np.random.default_rng(seed)
-    root, arm = 0.3 * rng.normal(size=(3, rank)), rng.normal(size=3)
-    # the 27 nodes at which a normal distribution's moments up to the fifth are summed exactly (Gauss and Hermite)
-    nodes, weights = np.array([-1.0, 0.0, 1.0]) * math.sqrt(3.0), np.array([1.0, 4.0, 1.0]) / 6.0
-    expected = np.zeros((3, 3))
-    for which in itertools.product(range(3), repeat=rank):
-        theta = root @ nodes[list(which)]
-        off = 0.5 * np.cross(theta, np.cross(theta, arm))
-        expected += weights[list(which)].prod() * np.outer(off, off)
-    np.testing.assert_allclose(covariance.bend(root @ root.T, arm), expected, rtol=1e-9, atol=1e-12)
