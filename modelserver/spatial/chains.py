@@ -9,7 +9,7 @@ import numpy as np
 
 from modelserver.spatial.arrays import Poses, matrices
 from modelserver.spatial.so3 import Array
-from modelserver.spatial.swing import swing
+from modelserver.spatial.swing import swings
 
 
 class Links(NamedTuple):
@@ -74,7 +74,7 @@ def covariances(links: Sequence[Links], count: int, known: list[Poses] | None = 
         share[:, :3] += sign * moved
         share[:, 3:] += sign * swung
         if link.bends:
-            M, more = swing(swung @ np.swapaxes(swung, -1, -2), r[..., 0])
+            M, more = swings((swung @ np.swapaxes(swung, -1, -2)).reshape(-1, 3, 3), r[..., 0])
             total[:, :3, :3] += more
             swung = M @ swung
         _add_crossed(share[:, :3], sign * swung, r)

@@ -19,58 +19,120 @@ and cosine are known at any angle: each of the three is scaled by a function of 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
 import numpy as np
 
 from modelserver.spatial.so3 import Array
 
-_SMALL = 1e-2
+_SMALL: Final = 1e-2
 """Square radians below which the functions' own formulas would lose their digits, and three terms do."""
 
 
-def swing(S: Array, r: Array) -> tuple[Array, Array]:
-    """Return M (..., 3, 3) and what is to be added to the position's covariance (..., 3, 3).
+class _Symmetric(NamedTuple):
+    """The entries of a symmetric matrix; each a float, or an array of as many as there are matrices."""
 
-    `S` (..., 3, 3) is the covariance of the turn and `r` (..., 3) the lever, along the same axes. The end errs by
+    xx: Any
+    xy: Any
+    xz: Any
+    yy: Any
+    yz: Any
+    zz: Any
+
+
+def swing(S: Array, r: Array) -> tuple[Array, Array]:
+    """Return M (3, 3) and what is to be added to the position's covariance (3, 3).
+
+    `S` (3, 3) is the covariance of the turn and `r` (3,) the lever, along the same axes. The end errs by
     `(M theta) x r` and, apart from that, by the second.
     """
-    t = np.trace(S, axis1=-2, axis2=-1)[..., None, None]
-    shorter, along, across = _scales(t)
-    eye = np.eye(3)
-    square = S @ S
-    whole = np.trace(square, axis1=-2, axis2=-1)[..., None, None]
-    column = r[..., :, None]
-    row = r[..., None, :]
-    Sr = S @ column
-    # half of what is of r on both sides, with all that is on one
-    half = ((0.5 * t * t + whole) * column - t * Sr - 2.0 * (S @ Sr)) @ row + Sr @ np.swapaxes(Sr, -1, -2)
-    b = S * (row @ Sr) + half + np.swapaxes(half, -1, -2)
-    K = _skew(r)
-    c = K @ (2.0 * whole * S + 4.0 * (square @ S)) @ np.swapaxes(K, -1, -2)
-    return eye - shorter * (t * eye + 2.0 * S) / 6.0, (0.25 * along) * b + (across / 36.0) * c
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = S.tolist()
+    M, more = _swung(_Symmetric(xx, xy, xz, yy, yz, zz), r.tolist(), _scales(xx + yy + zz))
+    return np.array(_rows(M)), np.array(_rows(more))
 
 
-def _scales(t: Array) -> tuple[Array, Array, Array]:
-    """Return by what M's shortening, b's and c's moments are scaled; each is 1 at 0.
+def swings(S: Array, r: Array) -> tuple[Array, Array]:
+    """Return `swing` row by row, of turns (n, 3, 3) or (1, 3, 3) and levers (n, 3): (n, 3, 3) each."""
+    xx, xy, xz = S[:, 0, 0], S[:, 0, 1], S[:, 0, 2]
+    yy, yz, zz = S[:, 1, 1], S[:, 1, 2], S[:, 2, 2]
+    found = _swung(_Symmetric(xx, xy, xz, yy, yz, zz), r.T, _many_scales(xx + yy + zz))
+    M, more = (np.empty((len(r), 3, 3)) for _ in range(2))
+    for matrix, entries in zip((M, more), found, strict=True):
+        for row, values in enumerate(_rows(entries)):
+            for column, value in enumerate(values):
+                matrix[:, row, column] = value
+    return M, more
+
+
+def _rows(m: _Symmetric) -> tuple[tuple[Any, Any, Any], ...]:
+    return ((m.xx, m.xy, m.xz), (m.xy, m.yy, m.yz), (m.xz, m.yz, m.zz))
+
+
+def _swung(S: _Symmetric, r: Any, scales: Any) -> tuple[_Symmetric, _Symmetric]:
+    """Return M and what is added. Entry by entry, so that one is worked out without an array, and many in one go."""
+    xx, xy, xz, yy, yz, zz = S
+    x, y, z = r
+    shorter, along, across = scales
+    t = xx + yy + zz
+    # the square of S, and what is left of its third power
+    sxx, sxy, sxz = xx * xx + xy * xy + xz * xz, xx * xy + xy * yy + xz * yz, xx * xz + xy * yz + xz * zz
+    syy, syz, szz = xy * xy + yy * yy + yz * yz, xy * xz + yy * yz + yz * zz, xz * xz + yz * yz + zz * zz
+    whole = sxx + syy + szz
+    # S r and S S r
+    a, b, c = xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
+    d, e, f = sxx * x + sxy * y + sxz * z, sxy * x + syy * y + syz * z, sxz * x + syz * y + szz * z
+    q = x * a + y * b + z * c
+    size = 0.5 * t * t + whole
+    h, i, j = size * x - t * a - 2.0 * d, size * y - t * b - 2.0 * e, size * z - t * c - 2.0 * f
+    # E[c c'] without the part that the shorter lever has: Q = 2 tr(S^2) S + 4 S^3 from both sides by r x
+    w = 2.0 * whole
+    Qxx = w * xx + 4.0 * (sxx * xx + sxy * xy + sxz * xz)
+    Qxy = w * xy + 4.0 * (sxx * xy + sxy * yy + sxz * yz)
+    Qxz = w * xz + 4.0 * (sxx * xz + sxy * yz + sxz * zz)
+    Qyy = w * yy + 4.0 * (sxy * xy + syy * yy + syz * yz)
+    Qyz = w * yz + 4.0 * (sxy * xz + syy * yz + syz * zz)
+    Qzz = w * zz + 4.0 * (sxz * xz + syz * yz + szz * zz)
+    across = across / 36.0
+    along = 0.25 * along
+    more = _Symmetric(
+        along * (xx * q + 2.0 * (a * a + h * x)) + across * (y * y * Qzz - 2.0 * y * z * Qyz + z * z * Qyy),
+        along * (xy * q + 2.0 * a * b + h * y + i * x) + across * (z * (x * Qyz + y * Qxz - z * Qxy) - x * y * Qzz),
+        along * (xz * q + 2.0 * a * c + h * z + j * x) + across * (y * (x * Qyz + z * Qxy - y * Qxz) - x * z * Qyy),
+        along * (yy * q + 2.0 * (b * b + i * y)) + across * (z * z * Qxx - 2.0 * x * z * Qxz + x * x * Qzz),
+        along * (yz * q + 2.0 * b * c + i * z + j * y) + across * (x * (y * Qxz + z * Qxy - x * Qyz) - y * z * Qxx),
+        along * (zz * q + 2.0 * (c * c + j * z)) + across * (x * x * Qyy - 2.0 * x * y * Qxy + y * y * Qxx),
+    )
+    g = shorter / 6.0
+    rest, s = 1.0 - g * t, -2.0 * g
+    return _Symmetric(rest + s * xx, s * xy, s * xz, rest + s * yy, s * yz, rest + s * zz), more
+
+
+def _scales(t: float) -> tuple[Any, Any, Any]:
+    return _series(t) if t < _SMALL else _exact(t, math.exp, math.expm1)
+
+
+def _many_scales(t: Array) -> tuple[Any, ...]:
+    small = t < _SMALL
+    large = np.where(small, 1.0, t)
+    pairs = zip(_series(t), _exact(large, np.exp, np.expm1), strict=True)
+    return tuple([np.where(small, series, exact) for series, exact in pairs])
+
+
+def _exact(t: Any, exp: Callable[[Any], Any], expm1: Callable[[Any], Any]) -> tuple[Any, Any, Any]:
+    """Return by what M's shortening, b's and c's moments are scaled.
 
     For theta about one axis and normal, of variance t: `E[theta sin theta] = t exp(-t/2)`,
     `E[(1 - cos theta)^2] = 3/2 - 2 exp(-t/2) + exp(-2t)/2` and `E[sin^2 theta] = (1 - exp(-2t))/2`.
     """
-    small = t < _SMALL
-    s = np.where(small, 1.0, t)
-    shorter = np.where(small, 1.0 - t / 4.0 + t * t / 24.0, -2.0 * np.expm1(-0.5 * s) / s)
-    along = (1.5 - 2.0 * np.exp(-0.5 * s) + 0.5 * np.exp(-2.0 * s)) / (0.75 * s * s)
-    across = (-0.5 * np.expm1(-2.0 * s) - s * np.exp(-s)) * 6.0 / (s * s * s)
     return (
-        shorter,
-        np.where(small, 1.0 - t * (5.0 / 6.0) + t * t * (7.0 / 16.0), along),
-        np.where(small, 1.0 - t + t * t * 0.55, across),
+        -2.0 * expm1(-0.5 * t) / t,
+        (1.5 - 2.0 * exp(-0.5 * t) + 0.5 * exp(-2.0 * t)) / (0.75 * t * t),
+        (-0.5 * expm1(-2.0 * t) - t * exp(-t)) * 6.0 / (t * t * t),
     )
 
 
-def _skew(r: Array) -> Array:
-    K = np.zeros((*r.shape, 3))
-    x, y, z = np.moveaxis(r, -1, 0)
-    K[..., 0, 1], K[..., 0, 2] = -z, y
-    K[..., 1, 0], K[..., 1, 2] = z, -x
-    K[..., 2, 0], K[..., 2, 1] = -y, x
-    return K
+def _series(t: Any) -> tuple[Any, Any, Any]:
+    """Return the first three terms of what `_exact` does; each is 1 at 0."""
+    return 1.0 - t / 4.0 + t * t / 24.0, 1.0 - t * (5.0 / 6.0) + t * t * (7.0 / 16.0), 1.0 - t + t * t * 0.55

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from modelserver.spatial.so3 import Array
-from modelserver.spatial.swing import swing
+from modelserver.spatial.swing import swing, swings
 
 
 def moments(root: Array, arm: Array) -> tuple[Array, Array]:
@@ -70,7 +70,7 @@ def test_given_many_then_each_row_is_as_one() -> None:
     rng = np.random.default_rng(1)
     roots, arms = 0.4 * rng.normal(size=(7, 3, 3)), rng.normal(size=(7, 3))
     S = roots @ np.swapaxes(roots, 1, 2)
-    M, more = swing(S, arms)
+    M, more = swings(S, arms)
     for number in range(7):
         one, rest = swing(S[number], arms[number])
         np.testing.assert_allclose(M[number], one, rtol=1e-12)
