@@ -150,6 +150,10 @@ class ModelServerError(Exception):
     """Base of everything this package raises on purpose."""
 
 
+class KeyFileError(ModelServerError):
+    """A file of keys that commands are signed with cannot be used."""
+
+
 class FrameMismatchError(ModelServerError, ValueError):
     """Two transformations were multiplied whose adjacent frames differ."""
 

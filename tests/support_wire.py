@@ -18,6 +18,7 @@ from modelserver.messages import (
     DriverHealth,
     DriverPhase,
     EdgeReport,
+    Envelope,
     Explanation,
     ExplanationReply,
     FixType,
@@ -37,6 +38,7 @@ from modelserver.messages import (
     Invalid,
     JointSample,
     JointsSample,
+    LocalizationHealth,
     ManyPoses,
     ManyReply,
     Mode,
@@ -275,7 +277,7 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
                     EdgeReport("vehicle", "World:UTM", False, ("World:UTM", "Raptor:CG"), Pose((1.0, 2.0, 3.0)),
                                "predicted", UTIME, -0.25, "localization", (), 0.75, 1.0),
                     EdgeReport("joint", "Nod", True, ("a:b", "c:d"), Pose.from_rpy((0, 0, 0), 0.1, 0.2, 0.3), "at_rest",
-                               coordinates=(0.1, 0.2, 0.3)),
+                               coordinates=(0.1, 0.2, 0.3), doubt="never heard"),
                 ),
             ),
         ),
@@ -285,6 +287,10 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
     "set_state_vector_request_t": (SetStateVector(_REQUEST, answer()), SetStateVector(_REQUEST, bare_answer())),
     "set_h_transform_request_t": (SetHTransform(_REQUEST, answer()), SetHTransform(_REQUEST, bare_answer())),
     "acknowledgement_t": (Acknowledgement(_UNKNOWN), Acknowledgement(_OK)),
+    "signed_t": (
+        Envelope("raptor", "me@here", UTIME, 1, "PLATFORM_RELOAD_MODEL", b"", bytes(32)),
+        Envelope("", "", 0, -(1 << 63), "Räptor", bytes(range(256)), bytes(range(32))),
+    ),
     "model_snapshot_t": (SnapshotPart(UTIME, "ab12", 0, 1, b""), SnapshotPart(UTIME, "ab12", 2, 5, bytes(range(256)))),
     "health_t": (
         Health(
@@ -293,9 +299,11 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
         ),
         Health(
             UTIME, 99.5, "0.1.0", "raptor", "ab12", 1, Invalid(0), 2, -77, 4950, 12, 1, 3, 1, 1e-4, 2e-3,
-            (ChannelHealth("GPS", 99, 1.0, 0.4), ChannelHealth("IMU", 0, 0.0, math.nan)),
+            (ChannelHealth("sensor:gps", 99, 1.0, 0.4, 2e-3), ChannelHealth("IMU", 0, 0.0, math.nan, math.nan, True)),
             (("GPS", "truncated", 4), ("sensor:gps", "stale", 1)),
             (("journal", "the disk is full"),),
+            5e-4, 1e-3, "raptor-pc", 4711, 3, 150_000_000, 0.125,
+            LocalizationHealth(Mode.NO_GPS, Phase.ALIGNED, True, 1.5, 0.05, 12.0, 0.3),
         ),
     ),
     "vehicle_status_t": (

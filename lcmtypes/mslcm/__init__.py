@@ -46,6 +46,7 @@ from .request_header_t import request_header_t as request_header_t
 from .sensor_header_t import sensor_header_t as sensor_header_t
 from .set_h_transform_request_t import set_h_transform_request_t as set_h_transform_request_t
 from .set_state_vector_request_t import set_state_vector_request_t as set_state_vector_request_t
+from .signed_t import signed_t as signed_t
 from .time_query_t import time_query_t as time_query_t
 from .vehicle_command_t import vehicle_command_t as vehicle_command_t
 from .vehicle_status_t import vehicle_status_t as vehicle_status_t

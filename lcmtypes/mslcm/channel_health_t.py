@@ -8,24 +8,25 @@ from io import BytesIO
 import struct
 
 class channel_health_t(object):
-    """ Traffic of one channel that the daemon listens to. """
+    """ Traffic of one source that the daemon hears, or of a sensor of the vehicle file that it never heard. """
 
-    __slots__ = ["channel", "count", "rate_hz", "age"]
+    __slots__ = ["channel", "count", "rate_hz", "age", "delay_max", "silent"]
 
-    __typenames__ = ["string", "int64_t", "double", "double"]
+    __typenames__ = ["string", "int64_t", "double", "double", "double", "boolean"]
 
-    __dimensions__ = [None, None, None, None]
+    __dimensions__ = [None, None, None, None, None, None]
 
     def __init__(self):
         self.channel = ""
         """
-        Name of the channel, with the vehicle's prefix.
+        `sensor:NAME` or `command:NAME` with the source's own name for itself (header.source); for a sensor of the vehicle
+        file that was never heard, the name of its channel with the vehicle's prefix.
         LCM Type: string
         """
 
         self.count = 0
         """
-        Messages taken since the start.
+        Messages taken since the start; 0 = never heard.
         LCM Type: int64_t
         """
 
@@ -41,6 +42,19 @@ class channel_health_t(object):
         LCM Type: double
         """
 
+        self.delay_max = 0.0
+        """
+        Greatest time over the last report's interval from when the host received a sample (header.host_utime) until the
+        daemon handled it, seconds: driver, bus and queue together; nan = no sample, or none that tells when it was received.
+        LCM Type: double
+        """
+
+        self.silent = False
+        """
+        Whether it has been silent for longer than five of its usual intervals and than a second, or was never heard.
+        LCM Type: boolean
+        """
+
 
     def encode(self):
         buf = BytesIO()
@@ -53,7 +67,7 @@ class channel_health_t(object):
         buf.write(struct.pack('>I', len(__channel_encoded)+1))
         buf.write(__channel_encoded)
         buf.write(b"\0")
-        buf.write(struct.pack(">qdd", self.count, self.rate_hz, self.age))
+        buf.write(struct.pack(">qdddb", self.count, self.rate_hz, self.age, self.delay_max, self.silent))
 
     @staticmethod
     def decode(data: bytes):
@@ -70,13 +84,14 @@ class channel_health_t(object):
         self = channel_health_t()
         __channel_len = struct.unpack('>I', buf.read(4))[0]
         self.channel = buf.read(__channel_len)[:-1].decode('utf-8', 'replace')
-        self.count, self.rate_hz, self.age = struct.unpack(">qdd", buf.read(24))
+        self.count, self.rate_hz, self.age, self.delay_max = struct.unpack(">qddd", buf.read(32))
+        self.silent = bool(struct.unpack('b', buf.read(1))[0])
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if channel_health_t in parents: return 0
-        tmphash = (0x72d2b096c4583c99) & 0xffffffffffffffff
+        tmphash = (0x31d844d729f511a9) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -10,13 +10,17 @@ import struct
 import mslcm
 
 class health_t(object):
-    """ How the daemon is, once a second. Counts are since the start. """
+    """
+    How the daemon is, once a second and when something changes that people who watch should know at once: the state, why
+    the pose may not be used, the geometry, a notice, a sensor that falls silent or returns; then at most ten times a
+    second. Counts are since the start. Rates and the lateness of ticks are of the last whole period, not of a change.
+    """
 
-    __slots__ = ["utime", "uptime", "version", "vehicle", "model_revision", "state", "invalid_reasons", "invalid_text", "pose_epoch", "origin_id", "poses_published", "requests_answered", "requests_parked", "ticks_missed", "handler_errors", "tick_lateness_p50", "tick_lateness_max", "num_channels", "channels", "num_rejected", "rejected", "num_notices", "notice_subjects", "notice_texts"]
+    __slots__ = ["utime", "uptime", "version", "vehicle", "model_revision", "host", "pid", "state", "invalid_reasons", "invalid_text", "pose_epoch", "origin_id", "poses_published", "requests_answered", "requests_parked", "requests_queued", "ticks_missed", "handler_errors", "tick_lateness_p50", "tick_lateness_p90", "tick_lateness_p99", "tick_lateness_max", "memory", "cpu_share", "mode", "phase", "standing", "horizontal_bound", "heading_bound", "seconds_to_limit", "fix_age", "num_channels", "channels", "num_rejected", "rejected", "num_notices", "notice_subjects", "notice_texts"]
 
-    __typenames__ = ["int64_t", "double", "string", "string", "string", "int8_t", "int32_t", "string", "int32_t", "int64_t", "int64_t", "int64_t", "int32_t", "int64_t", "int64_t", "double", "double", "int32_t", "mslcm.channel_health_t", "int32_t", "mslcm.rejected_count_t", "int32_t", "string", "string"]
+    __typenames__ = ["int64_t", "double", "string", "string", "string", "string", "int32_t", "int8_t", "int32_t", "string", "int32_t", "int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "int64_t", "int64_t", "double", "double", "double", "double", "int64_t", "double", "int8_t", "int8_t", "boolean", "double", "double", "double", "double", "int32_t", "mslcm.channel_health_t", "int32_t", "mslcm.rejected_count_t", "int32_t", "string", "string"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_channels"], None, ["num_rejected"], None, ["num_notices"], ["num_notices"]]
+    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_channels"], None, ["num_rejected"], None, ["num_notices"], ["num_notices"]]
 
     STARTING = 0
     """ No valid pose was published yet. """
@@ -54,6 +58,18 @@ class health_t(object):
         """
         Content hash of the geometry in use.
         LCM Type: string
+        """
+
+        self.host = ""
+        """
+        The machine that the daemon runs on, as it calls itself; empty = not known.
+        LCM Type: string
+        """
+
+        self.pid = 0
+        """
+        The daemon's process number there; 0 = not known. With host it tells two daemons on one bus apart.
+        LCM Type: int32_t
         """
 
         self.state = 0
@@ -104,6 +120,12 @@ class health_t(object):
         LCM Type: int32_t
         """
 
+        self.requests_queued = 0
+        """
+        Requests that wait for the daemon to look at them right now.
+        LCM Type: int32_t
+        """
+
         self.ticks_missed = 0
         """
         Ticks of the timer that were skipped because the loop came too late.
@@ -122,21 +144,87 @@ class health_t(object):
         LCM Type: double
         """
 
+        self.tick_lateness_p90 = 0.0
+        """
+        Lateness that nine of ten ticks since the last report stayed within, seconds; 0 = no tick.
+        LCM Type: double
+        """
+
+        self.tick_lateness_p99 = 0.0
+        """
+        Lateness that 99 of 100 ticks since the last report stayed within, seconds; 0 = no tick.
+        LCM Type: double
+        """
+
         self.tick_lateness_max = 0.0
         """
         Greatest lateness of a tick since the last report, seconds; 0 = no tick.
         LCM Type: double
         """
 
+        self.memory = 0
+        """
+        Memory that the daemon holds (resident), bytes; 0 = not known.
+        LCM Type: int64_t
+        """
+
+        self.cpu_share = 0.0
+        """
+        Share of one processor's time that the daemon took over the last report's interval; nan = not known.
+        LCM Type: double
+        """
+
+        self.mode = 0
+        """
+        Which sources localization uses: one of the constants of localization_mode_t, FULL to DEAD_RECKONING; -1 = none.
+        LCM Type: int8_t
+        """
+
+        self.phase = 0
+        """
+        How far the filter has come: as in navigation_state_t, LEVELLING to ALIGNED; -1 = no filter is at work (raw mode).
+        LCM Type: int8_t
+        """
+
+        self.standing = False
+        """
+        Whether the vehicle is taken to stand.
+        LCM Type: boolean
+        """
+
+        self.horizontal_bound = 0.0
+        """
+        The horizontal position error is taken to be within this, as in pose_transform_t, metres; nan = not known.
+        LCM Type: double
+        """
+
+        self.heading_bound = 0.0
+        """
+        The heading error is taken to be within this either way, as in pose_transform_t, radians; nan = not known.
+        LCM Type: double
+        """
+
+        self.seconds_to_limit = 0.0
+        """
+        Seconds until a configured limit is passed if nothing more arrives; nan = not known, or passed already.
+        LCM Type: double
+        """
+
+        self.fix_age = 0.0
+        """
+        Time since the last GPS fix that was used, seconds; nan = none yet.
+        LCM Type: double
+        """
+
         self.num_channels = 0
         """
-        Number of channels listened to.
+        Number of sources of samples and wishes, and of sensors that are yet to be heard.
         LCM Type: int32_t
         """
 
         self.channels = []
         """
-        Traffic of each channel.
+        Traffic of each.
         LCM Type: mslcm.channel_health_t[num_channels]
         """
 
@@ -191,12 +279,16 @@ class health_t(object):
         buf.write(struct.pack('>I', len(__model_revision_encoded)+1))
         buf.write(__model_revision_encoded)
         buf.write(b"\0")
-        buf.write(struct.pack(">bi", self.state, self.invalid_reasons))
+        __host_encoded = self.host.encode('utf-8')
+        buf.write(struct.pack('>I', len(__host_encoded)+1))
+        buf.write(__host_encoded)
+        buf.write(b"\0")
+        buf.write(struct.pack(">ibi", self.pid, self.state, self.invalid_reasons))
         __invalid_text_encoded = self.invalid_text.encode('utf-8')
         buf.write(struct.pack('>I', len(__invalid_text_encoded)+1))
         buf.write(__invalid_text_encoded)
         buf.write(b"\0")
-        buf.write(struct.pack(">iqqqiqqddi", self.pose_epoch, self.origin_id, self.poses_published, self.requests_answered, self.requests_parked, self.ticks_missed, self.handler_errors, self.tick_lateness_p50, self.tick_lateness_max, self.num_channels))
+        buf.write(struct.pack(">iqqqiiqqddddqdbbbddddi", self.pose_epoch, self.origin_id, self.poses_published, self.requests_answered, self.requests_parked, self.requests_queued, self.ticks_missed, self.handler_errors, self.tick_lateness_p50, self.tick_lateness_p90, self.tick_lateness_p99, self.tick_lateness_max, self.memory, self.cpu_share, self.mode, self.phase, self.standing, self.horizontal_bound, self.heading_bound, self.seconds_to_limit, self.fix_age, self.num_channels))
         for i0 in range(self.num_channels):
             assert self.channels[i0]._get_packed_fingerprint() == mslcm.channel_health_t._get_packed_fingerprint()
             self.channels[i0]._encode_one(buf)
@@ -236,10 +328,14 @@ class health_t(object):
         self.vehicle = buf.read(__vehicle_len)[:-1].decode('utf-8', 'replace')
         __model_revision_len = struct.unpack('>I', buf.read(4))[0]
         self.model_revision = buf.read(__model_revision_len)[:-1].decode('utf-8', 'replace')
-        self.state, self.invalid_reasons = struct.unpack(">bi", buf.read(5))
+        __host_len = struct.unpack('>I', buf.read(4))[0]
+        self.host = buf.read(__host_len)[:-1].decode('utf-8', 'replace')
+        self.pid, self.state, self.invalid_reasons = struct.unpack(">ibi", buf.read(9))
         __invalid_text_len = struct.unpack('>I', buf.read(4))[0]
         self.invalid_text = buf.read(__invalid_text_len)[:-1].decode('utf-8', 'replace')
-        self.pose_epoch, self.origin_id, self.poses_published, self.requests_answered, self.requests_parked, self.ticks_missed, self.handler_errors, self.tick_lateness_p50, self.tick_lateness_max, self.num_channels = struct.unpack(">iqqqiqqddi", buf.read(68))
+        self.pose_epoch, self.origin_id, self.poses_published, self.requests_answered, self.requests_parked, self.requests_queued, self.ticks_missed, self.handler_errors, self.tick_lateness_p50, self.tick_lateness_p90, self.tick_lateness_p99, self.tick_lateness_max, self.memory, self.cpu_share, self.mode, self.phase = struct.unpack(">iqqqiiqqddddqdbb", buf.read(102))
+        self.standing = bool(struct.unpack('b', buf.read(1))[0])
+        self.horizontal_bound, self.heading_bound, self.seconds_to_limit, self.fix_age, self.num_channels = struct.unpack(">ddddi", buf.read(36))
         self.channels = []
         for i0 in range(self.num_channels):
             self.channels.append(mslcm.channel_health_t._decode_one(buf))
@@ -262,7 +358,7 @@ class health_t(object):
     def _get_hash_recursive(parents):
         if health_t in parents: return 0
         newparents = parents + [health_t]
-        tmphash = (0x453e87f172243ba2+ mslcm.channel_health_t._get_hash_recursive(newparents)+ mslcm.rejected_count_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x2f359b4dd9cbbc0b+ mslcm.channel_health_t._get_hash_recursive(newparents)+ mslcm.rejected_count_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -10,11 +10,11 @@ import struct
 class path_edge_t(object):
     """ One edge of the way from a frame of reference to a frame of interest. """
 
-    __slots__ = ["kind", "name", "from_end", "to_end", "forward", "vector", "how", "stamp", "age", "source", "num_coordinates", "coordinates", "position_share", "rotation_share"]
+    __slots__ = ["kind", "name", "from_end", "to_end", "forward", "vector", "how", "stamp", "age", "source", "num_coordinates", "coordinates", "position_share", "rotation_share", "doubt"]
 
-    __typenames__ = ["int8_t", "string", "string", "string", "boolean", "double", "int8_t", "int64_t", "double", "string", "int32_t", "double", "double", "double"]
+    __typenames__ = ["int8_t", "string", "string", "string", "boolean", "double", "int8_t", "int64_t", "double", "string", "int32_t", "double", "double", "double", "string"]
 
-    __dimensions__ = [None, None, None, None, None, [7], None, None, None, None, None, ["num_coordinates"], None, None]
+    __dimensions__ = [None, None, None, None, None, [7], None, None, None, None, None, ["num_coordinates"], None, None, None]
 
     FRAME = 0
     """ From a body to a frame of it. """
@@ -94,7 +94,7 @@ class path_edge_t(object):
 
         self.source = ""
         """
-        Who told: a channel, or localization; empty = nobody.
+        Who told: the source in the header of a joint's newest sample, or localization; empty = nobody.
         LCM Type: string
         """
 
@@ -120,6 +120,12 @@ class path_edge_t(object):
         """
         Its part of the sum of the variances of the rotation, 0 to 1; nan as above.
         LCM Type: double
+        """
+
+        self.doubt = ""
+        """
+        What speaks against it in words, e.g. that a joint was silent or stands beyond its limits; empty = nothing.
+        LCM Type: string
         """
 
 
@@ -153,6 +159,10 @@ class path_edge_t(object):
         buf.write(struct.pack(">i", self.num_coordinates))
         buf.write(struct.pack('>%dd' % self.num_coordinates, *self.coordinates[:self.num_coordinates]))
         buf.write(struct.pack(">dd", self.position_share, self.rotation_share))
+        __doubt_encoded = self.doubt.encode('utf-8')
+        buf.write(struct.pack('>I', len(__doubt_encoded)+1))
+        buf.write(__doubt_encoded)
+        buf.write(b"\0")
 
     @staticmethod
     def decode(data: bytes):
@@ -182,12 +192,14 @@ class path_edge_t(object):
         self.num_coordinates = struct.unpack(">i", buf.read(4))[0]
         self.coordinates = struct.unpack('>%dd' % self.num_coordinates, buf.read(self.num_coordinates * 8))
         self.position_share, self.rotation_share = struct.unpack(">dd", buf.read(16))
+        __doubt_len = struct.unpack('>I', buf.read(4))[0]
+        self.doubt = buf.read(__doubt_len)[:-1].decode('utf-8', 'replace')
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if path_edge_t in parents: return 0
-        tmphash = (0xc2790ae3651b206f) & 0xffffffffffffffff
+        tmphash = (0xb8ad9eaa70e537ab) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

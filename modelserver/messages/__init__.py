@@ -12,7 +12,10 @@ from modelserver.messages.decisions import Decision, Verdict
 from modelserver.messages.driver_health import DriverHealth, DriverPhase
 from modelserver.messages.estimates import Estimate, Origin, VehicleMotion
 from modelserver.messages.events import (
+    Commanded,
+    Denied,
     Event,
+    KeepState,
     LoadModel,
     Noticed,
     OriginLatched,
@@ -25,12 +28,14 @@ from modelserver.messages.events import (
     Rejected,
     SendReply,
     SnapshotPart,
+    StartTold,
     SwitchMode,
     Tick,
 )
 from modelserver.messages.flags import (
     NAN,
     NO_FLAGS,
+    SILENCE,
     VALID,
     Direction,
     FixType,
@@ -40,8 +45,9 @@ from modelserver.messages.flags import (
     Quality,
     YawSource,
 )
-from modelserver.messages.health import ChannelHealth, Health
-from modelserver.messages.navigation import Mode, NavigationState, Phase
+from modelserver.messages.health import ChannelHealth, Gauges, Health, LocalizationHealth
+from modelserver.messages.kept import Kept, KeptPose, Recalled
+from modelserver.messages.navigation import LocalizerSummary, Mode, NavigationState, Phase
 from modelserver.messages.replies import (
     Acknowledgement,
     EdgeReport,
@@ -94,29 +100,37 @@ from modelserver.messages.samples import (
     WheelSample,
     WheelsSample,
 )
+from modelserver.messages.signed import MAC_BYTES, MAX_PAYLOAD, Envelope
 from modelserver.messages.vehicle import DeviceSample, VehicleCommand, VehicleMode, VehicleStatusSample
 
 __all__ = [
     "CHANNEL_OF",
+    "MAC_BYTES",
     "MAX_CHANNEL_LENGTH",
+    "MAX_PAYLOAD",
     "MOST_INSTANTS",
     "NAN",
     "NO_FLAGS",
+    "SILENCE",
     "VALID",
     "AbsolutePoseSample",
     "Acknowledgement",
     "ChannelHealth",
+    "Commanded",
     "Decision",
+    "Denied",
     "DeviceSample",
     "Direction",
     "DriverHealth",
     "DriverPhase",
     "EdgeReport",
+    "Envelope",
     "Estimate",
     "Event",
     "Explanation",
     "ExplanationReply",
     "FixType",
+    "Gauges",
     "GetBodyFrameList",
     "GetBodyList",
     "GetExplanation",
@@ -133,7 +147,12 @@ __all__ = [
     "Invalid",
     "JointSample",
     "JointsSample",
+    "KeepState",
+    "Kept",
+    "KeptPose",
     "LoadModel",
+    "LocalizationHealth",
+    "LocalizerSummary",
     "ManyPoses",
     "ManyReply",
     "Matrix3",
@@ -157,6 +176,7 @@ __all__ = [
     "PublishSnapshot",
     "Quality",
     "RangeSample",
+    "Recalled",
     "Rejected",
     "RelativePoseSample",
     "ReloadModel",
@@ -171,6 +191,7 @@ __all__ = [
     "SetHTransform",
     "SetStateVector",
     "SnapshotPart",
+    "StartTold",
     "StateVectorReply",
     "SwitchMode",
     "Tick",

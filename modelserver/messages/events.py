@@ -7,10 +7,11 @@ from typing import NamedTuple, TypeAlias
 
 from modelserver.messages.decisions import Decision
 from modelserver.messages.estimates import Origin
-from modelserver.messages.health import Health
+from modelserver.messages.health import Gauges, Health
+from modelserver.messages.kept import Kept
 from modelserver.messages.navigation import Mode, NavigationState
 from modelserver.messages.replies import PoseAnswer, Reply
-from modelserver.messages.requests import ReloadModel, Request
+from modelserver.messages.requests import ReloadModel, Request, RequestHeader, SetHTransform, SetStateVector
 from modelserver.messages.samples import Sample, SensorHeader
 
 
@@ -18,20 +19,23 @@ from modelserver.messages.samples import Sample, SensorHeader
 class Tick:
     """The clock has reached a due time, `late` seconds after it; `missed` due times before it were skipped.
 
-    `answered`: requests that were answered from what is remembered, without the core, since the last tick.
+    `answered`: requests that were answered from what is remembered, without the core, since the last tick. `gauges`
+    comes with ticks at which a health report is due.
     """
 
     late: float = 0.0
     missed: int = 0
     answered: int = 0
+    gauges: Gauges | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """Something that came in and was not understood: counted by channel and reason."""
+    """Something that came in and was not understood or not taken, `count` times: counted by channel and reason."""
 
     channel: str
     reason: str
+    count: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +57,31 @@ class SwitchMode:
     mode: Mode
 
 
-Event: TypeAlias = Sample | SwitchMode | Request | Tick | Rejected | Noticed
+@dataclass(frozen=True, slots=True)
+class Commanded:
+    """What changes the service, from a sender who has proved to know the vehicle's key."""
+
+    order: ReloadModel | SetStateVector | SetHTransform | SwitchMode
+    sender: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Denied:
+    """A signed command that is not obeyed: counted under `channel` by `reason`.
+
+    Where its signature is right and it wants a reply, `kind` and `header` say which, and `why` is told, as of something
+    `malformed` or else forbidden; who does not know the key is told nothing.
+    """
+
+    channel: str
+    reason: str
+    why: str = ""
+    kind: type[Request] | None = None
+    header: RequestHeader | None = None
+    malformed: bool = False
+
+
+Event: TypeAlias = Sample | SwitchMode | Request | Commanded | Denied | Tick | Rejected | Noticed
 
 
 class SendReply(NamedTuple):
@@ -125,6 +153,20 @@ class SnapshotPart:
     data: bytes
 
 
+@dataclass(frozen=True, slots=True)
+class KeepState:
+    """Keep this for the next run of the service, in place of what was kept before."""
+
+    kept: Kept
+
+
+@dataclass(frozen=True, slots=True)
+class StartTold:
+    """How the start goes, for the log: warm, or cold and why."""
+
+    text: str
+
+
 Output: TypeAlias = (
     SendReply
     | PublishPose
@@ -134,4 +176,6 @@ Output: TypeAlias = (
     | PublishNavigation
     | LoadModel
     | PublishSnapshot
+    | KeepState
+    | StartTold
 )

@@ -124,5 +124,8 @@ _QUALITY_TEXT = {
 }
 
 
+SILENCE = Invalid.STALE_GPS | Invalid.STALE_IMU
+"""What speaks against a pose because sensors have fallen silent."""
+
 VALID = Invalid(0)
 NO_FLAGS = Quality(0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import NamedTuple
 
 from modelserver.messages.flags import Invalid
 from modelserver.spatial.pose import Pose
@@ -34,6 +35,15 @@ class Phase(IntEnum):
     """Level and moving in Odom; heading in the world not known yet."""
     ALIGNED = 2
     """Known in the world."""
+
+
+class LocalizerSummary(NamedTuple):
+    """What a localizer is about: `phase` is None where no filter is at work, `fix_utime` 0 before a fix was used."""
+
+    mode: Mode
+    phase: Phase | None = None
+    standing: bool = False
+    fix_utime: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

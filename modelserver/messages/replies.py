@@ -51,7 +51,8 @@ class EdgeReport(NamedTuple):
     `kind` is frame, constraint, joint or vehicle; `ends` the names at its two ends, passed from the first to the second
     where `forward`; `pose` that of the far end in the near one, as passed. `how` is fixed, measured, interpolated,
     held, predicted or at_rest; `stamp` the utime of the newest measurement in it, 0 for none, `age` its age in seconds.
-    `position_share` and `rotation_share` are its parts of the variance, 0 to 1; nan: it states none.
+    `position_share` and `rotation_share` are its parts of the variance, 0 to 1; nan: it states none. `doubt` says in
+    words what speaks against it, empty: nothing.
     """
 
     kind: str
@@ -66,6 +67,7 @@ class EdgeReport(NamedTuple):
     coordinates: tuple[float, ...] = ()
     position_share: float = NAN
     rotation_share: float = NAN
+    doubt: str = ""
 
 
 class Explanation(NamedTuple):

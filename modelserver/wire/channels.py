@@ -11,6 +11,9 @@ DEFAULT_URL = "udpm://239.255.76.67:7667?ttl=0"
 
 REPLY_PREFIX = "REPLY_"
 
+PROBE_CHANNEL = "MODELSERVER_PROBE"
+"""Where a program tries out whether the bus delivers: random bytes, for itself alone."""
+
 
 class Way(StrEnum):
     """Who speaks on a channel."""
@@ -46,6 +49,7 @@ CHANNELS = (
     Channel("VEHICLE_STATUS", "vehicle_status_t", Way.SENSOR, "1-20 Hz", "what the vehicle controller says"),
     Channel("VEHICLE_COMMAND", "vehicle_command_t", Way.COMMAND, "10 Hz and more", "wish to the vehicle controller"),
     Channel("LOCALIZATION_MODE", "localization_mode_t", Way.COMMAND, "on demand", "which sources localization uses"),
+    Channel("MODELSERVER_SIGNED", "signed_t", Way.COMMAND, "on demand", "what changes something, signed"),
     Channel("POSE", "pose_transform_t", Way.BROADCAST, "timer or event", "base frame in World:UTM"),
     Channel("POSE_VECTOR", "pose_vector_t", Way.BROADCAST, "with POSE", "the same as a 7-vector"),
     Channel("POSE_ODOM", "pose_transform_t", Way.BROADCAST, "with POSE", "base frame in Odom:Origin, never jumps"),
@@ -58,7 +62,8 @@ CHANNELS = (
     ),
     Channel("LOCALIZATION_STATE", "navigation_state_t", Way.BROADCAST, "timer, 5 Hz", "the filter's whole state"),
     Channel("MODEL_SNAPSHOT", "model_snapshot_t", Way.BROADCAST, "at start, on change, every 5 s", "the geometry"),
-    Channel("MODELSERVER_HEALTH", "health_t", Way.BROADCAST, "1 Hz", "state, traffic, rejected input"),
+    Channel("JOINTS_HELD", "joints_t", Way.BROADCAST, "with MODEL_SNAPSHOT", "the newest reading of each joint"),
+    Channel("MODELSERVER_HEALTH", "health_t", Way.BROADCAST, "1 Hz, on change", "state, traffic, rejected input"),
     Channel(
         "DRIVER_HEALTH", "driver_health_t", Way.REPORT, "1 Hz, on change", "how each driver is: phase, rate, clock"
     ),

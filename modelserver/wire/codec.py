@@ -22,6 +22,7 @@ from modelserver.wire import (
     queries,
     requests,
     sensors,
+    signed,
     snapshot,
     vehicle,
 )
@@ -60,6 +61,7 @@ from mslcm.reload_model_reply_t import reload_model_reply_t
 from mslcm.reload_model_request_t import reload_model_request_t
 from mslcm.set_h_transform_request_t import set_h_transform_request_t
 from mslcm.set_state_vector_request_t import set_state_vector_request_t
+from mslcm.signed_t import signed_t
 from mslcm.vehicle_command_t import vehicle_command_t
 from mslcm.vehicle_status_t import vehicle_status_t
 from mslcm.wheels_t import wheels_t
@@ -170,6 +172,7 @@ _CODECS = (
         set_h_transform_request_t, messages.SetHTransform, commands.read_set_transform, commands.write_set_transform
     ),
     _packed(acknowledgement_t, messages.Acknowledgement, commands.read_acknowledgement, commands.write_acknowledgement),
+    _packed(signed_t, messages.Envelope, signed.read_signed, signed.write_signed),
     _generated(model_snapshot_t, messages.SnapshotPart, snapshot.read_snapshot, snapshot.write_snapshot),
     _generated(health_t, messages.Health, health.read_health, health.write_health),
     _generated(

@@ -2,7 +2,8 @@
 
 lcm's own reader stops at the first damaged event as if the log ended there, and a length field that was
 overwritten makes it crash the process (lcm 1.5.3). `scan` is a pure function over the bytes: it yields the
-events, and in their order what lies between them that is none. Writing is left to `lcm.EventLog`.
+events, and in their order what lies between them that is none. `written` is its inverse for one event; whole logs are
+left to `lcm.EventLog`.
 """
 
 from __future__ import annotations
@@ -56,6 +57,11 @@ class Damage:
         if self.tail:
             return f"the log breaks off {place}: the last {self.length} bytes are no whole event"
         return f"{self.length} bytes {place}, are no event and were skipped"
+
+
+def written(number: int, utime: int, channel: bytes, data: bytes) -> bytes:
+    """Return an event as it stands in a log; `channel` is ASCII, of 1 to MAX_CHANNEL_LENGTH characters."""
+    return _HEAD.pack(0xEDA1DA01, number, utime, len(channel), len(data)) + channel + data
 
 
 def scan(data: Buffer) -> Iterator[LogEvent | Damage]:

@@ -163,6 +163,7 @@ def _edge_body(edge: EdgeReport) -> bytes:
             text(edge.source),
             struct.pack(f">i{len(edge.coordinates)}d", len(edge.coordinates), *edge.coordinates),
             _SHARES.pack(edge.position_share, edge.rotation_share),
+            text(edge.doubt),
         )
     )
 
@@ -199,6 +200,7 @@ def _read_edge(data: bytes, at: int) -> tuple[EdgeReport, int]:
     coordinates = struct.unpack_from(f">{count}d", data, at + 4)
     at += 4 + 8 * count
     position, rotation = _SHARES.unpack_from(data, at)
+    doubt, at = read_text(data, at + _SHARES.size)
     if not (0 <= kind < len(KINDS) and 0 <= how < len(HOWS)):
         raise WireError("malformed", f"an edge of kind {kind}, come by as {how}: cannot be")
     name, from_end, to_end = names
@@ -215,5 +217,6 @@ def _read_edge(data: bytes, at: int) -> tuple[EdgeReport, int]:
         coordinates,
         position,
         rotation,
+        doubt,
     )
-    return edge, at + _SHARES.size
+    return edge, at

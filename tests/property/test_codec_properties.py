@@ -161,6 +161,7 @@ edges = st.builds(
     st.lists(numbers, max_size=6).map(tuple),
     numbers,
     numbers,
+    texts,
 )
 failed = reply_headers(st.sampled_from([status for status in Status if status is not Status.OK]))
 fine = reply_headers(st.just(Status.OK))
@@ -272,6 +273,16 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
     "set_state_vector_request_t": st.builds(messages.SetStateVector, request_headers, answers()),
     "set_h_transform_request_t": st.builds(messages.SetHTransform, request_headers, answers()),
     "acknowledgement_t": st.builds(messages.Acknowledgement, fine | failed),
+    "signed_t": st.builds(
+        messages.Envelope,
+        texts,
+        texts,
+        utimes,
+        int64,
+        texts,
+        st.binary(max_size=messages.MAX_PAYLOAD),
+        st.binary(min_size=messages.MAC_BYTES, max_size=messages.MAC_BYTES),
+    ),
     "model_snapshot_t": st.builds(
         messages.SnapshotPart,
         utimes,
@@ -298,8 +309,25 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
         count64,
         numbers,
         numbers,
-        st.lists(st.builds(messages.ChannelHealth, texts, count64, numbers, numbers), max_size=3).map(tuple),
+        st.lists(
+            st.builds(messages.ChannelHealth, texts, count64, numbers, numbers, numbers, st.booleans()), max_size=3
+        ).map(tuple),
         st.lists(st.tuples(texts, texts, count64), max_size=3).map(tuple),
+        st.lists(st.tuples(texts, texts), max_size=3).map(tuple),
+        numbers,
+        numbers,
+        texts,
+        int32,
+        int32,
+        int64,
+        numbers,
+        st.builds(
+            messages.LocalizationHealth,
+            st.none() | st.sampled_from(messages.Mode),
+            st.none() | st.sampled_from(messages.Phase),
+            st.booleans(),
+            *[numbers] * 4,
+        ),
     ),
     "vehicle_status_t": st.builds(
         messages.VehicleStatusSample,
