@@ -15,9 +15,13 @@ from modelserver.localization.raw.settings import RawSettings
 from modelserver.messages import (
     Decision,
     Estimate,
+    Invalid,
+    Kept,
+    LocalizerSummary,
     Mode,
     NavigationState,
     Origin,
+    Recalled,
     Rejected,
     Sample,
     SwitchMode,
@@ -55,8 +59,10 @@ class ModeLocalizer:
     drift: tuple[float, ...] = ()
 
     @classmethod
-    def start(cls, makings: Makings, mode: Mode, origin: Origin | None = None) -> ModeLocalizer:
-        """Return a localizer that has seen nothing yet.
+    def start(
+        cls, makings: Makings, mode: Mode, origin: Origin | None = None, recalled: Recalled | None = None
+    ) -> ModeLocalizer:
+        """Return a localizer that has seen nothing yet; `recalled` is what an earlier run kept, where it may be used.
 
         Raises GeodesyError for an origin that is no place, ValueError for raw mode without GPS or inertial unit.
         """
@@ -64,7 +70,7 @@ class ModeLocalizer:
             if makings.mounts is None:
                 raise ValueError("raw mode takes a GPS and an inertial unit")
             return cls(makings, RawLocalizer.start(makings.mounts, makings.raw, origin), Pose.identity())
-        return cls(makings, FilterLocalizer.start(makings.setup, origin, mode), Pose.identity())
+        return cls(makings, FilterLocalizer.start(makings.setup, origin, mode, recalled), Pose.identity())
 
     @property
     def utime(self) -> int:
@@ -94,6 +100,18 @@ class ModeLocalizer:
     def navigation(self, utime: int) -> NavigationState | None:
         """Return the filter's whole state; None in raw mode."""
         return self.active.navigation(utime)
+
+    def kept(self) -> Kept | None:
+        """Return what the next run should know; None where it is no better than what was kept before."""
+        return self.active.kept() if isinstance(self.active, FilterLocalizer) else None
+
+    def silence(self, utime: int) -> Invalid:
+        """Return what of SILENCE speaks against an estimate at `utime`."""
+        return self.active.silence(utime)
+
+    def summary(self, utime: int) -> LocalizerSummary:
+        """Return what the localizer at work is about."""
+        return self.active.summary(utime)
 
     def _continued(self, estimate: Estimate) -> Estimate:
         if not self.epochs:

@@ -73,7 +73,13 @@ class Clocks(NamedTuple):
             # within the horizon it is used as long as it may be chance: what counts must not hang on the arrival
             return self._with(name, source), Verdict.ORDER if ahead < -horizon else Verdict.GOOD
         elif self.newest and ahead < -horizon:
-            return self, Verdict.LATE
+            if source.newest or rank < self.rank:
+                return self, Verdict.LATE
+            # heard for the first time: it may be the stamps before that are wrong, and they would keep it out for ever
+            source = _odd(source, utime, self.lead_utime)
+            if source.odd >= settings.clock_samples:
+                return Clocks(utime, rank, utime, MappingProxyType({name: Source(utime, seq)})), Verdict.STEPPED_BACK
+            return self._with(name, source), Verdict.LATE
         if utime < source.newest:
             return self, Verdict.GOOD
         source = Source(utime, seq)

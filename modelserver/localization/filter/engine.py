@@ -13,14 +13,16 @@ from modelserver.localization.filter import fixes, fixing, inertial, motion, rol
 from modelserver.localization.filter.handling import begun_anew, begun_level, counts, measured, scene_of
 from modelserver.localization.filter.items import INERTIAL, NOTHING, Fused, Item, took_up
 from modelserver.localization.filter.measurements.aiding import AbsolutePose
+from modelserver.localization.filter.resuming import gone_on
 from modelserver.localization.filter.setup import Setup
-from modelserver.localization.filter.state import FilterState
-from modelserver.messages import AbsolutePoseSample, Decision, Mode, Phase, SwitchMode
+from modelserver.localization.filter.state import FilterState, Resuming
+from modelserver.messages import AbsolutePoseSample, Decision, Mode, Phase, Recalled, SwitchMode
 
 
-def first(setup: Setup, mode: Mode, geodesy: Geodesy | None) -> FilterState:
-    """Return the state that has seen nothing yet."""
-    return FilterState(mode=mode, geodesy=geodesy)
+def first(setup: Setup, mode: Mode, geodesy: Geodesy | None, recalled: Recalled | None = None) -> FilterState:
+    """Return the state that has seen nothing yet; `recalled` is what an earlier run kept, where that may be used."""
+    resuming = None if recalled is None or recalled.kept is None else Resuming(recalled)
+    return FilterState(mode=mode, geodesy=geodesy, resuming=resuming)
 
 
 def fused(setup: Setup, state: FilterState, item: Item) -> Fused:
@@ -33,6 +35,9 @@ def fused(setup: Setup, state: FilterState, item: Item) -> Fused:
     if nav is not None and not (updates.sound if more else updates.plausible)(nav, setup.settings):
         state, diverged = _diverged(setup, state, item)
         more = (*more, diverged)
+    if state.resuming is not None:
+        state, resumed = gone_on(setup, state, item.utime)
+        more = (*more, *resumed)
     return state, decisions + more
 
 

@@ -11,6 +11,7 @@ from modelserver.localization.filter.items import NOTHING, Fused, Item, refused,
 from modelserver.localization.filter.measurements.base import wrapped
 from modelserver.localization.filter.measurements.gps import GpsBaseline, GpsPosition, baseline_sigma
 from modelserver.localization.filter.measurements.orientation import Yaw, yaw_told
+from modelserver.localization.filter.proving import proved
 from modelserver.localization.filter.setup import Setup
 from modelserver.localization.filter.state import FilterState
 from modelserver.messages import GpsSample, ImuSample, Mode, Phase, Verdict, YawSource
@@ -51,6 +52,10 @@ def fix(setup: Setup, state: FilterState, item: Item) -> Fused:
             return state, NOTHING
         state = fixes.aligned(setup, state, fit, by_unit=by_unit)
         return state, (took_up(item, f"heading to {math.degrees(fit.sigma):.1f} deg by {fit.distance:.1f} m driven"),)
+    if state.proving is not None and not unused:
+        state, proof = proved(setup, state, newest)
+        if proof:
+            return state, proof
     resting = fixes.at_rest(setup, scene_of(setup, state), fix)
     if not resting:
         state = state._replace(nav=fixes.widened(setup, nav, state.restless, since))

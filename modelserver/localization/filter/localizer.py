@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from modelserver.geodesy import Geodesy
-from modelserver.localization.filter import clocks, engine, inertial, motion, start, world
+from modelserver.localization.filter import clocks, engine, inertial, keeping, motion, start, world
 from modelserver.localization.filter.clocks import Clocks
 from modelserver.localization.filter.items import INERTIAL, Item, items
 from modelserver.localization.filter.odometry import Odometry
@@ -15,13 +15,18 @@ from modelserver.localization.filter.state import FilterState, Said
 from modelserver.localization.filter.timeline import Timeline
 from modelserver.localization.interface import Note
 from modelserver.messages import (
+    SILENCE,
     Decision,
     Estimate,
     ImuSample,
+    Invalid,
+    Kept,
+    LocalizerSummary,
     Mode,
     NavigationState,
     Origin,
     OriginLatched,
+    Recalled,
     Sample,
     SwitchMode,
     Verdict,
@@ -73,13 +78,14 @@ class FilterLocalizer:
         setup: Setup,
         origin: Origin | None = None,
         mode: Mode = Mode.FULL,
+        recalled: Recalled | None = None,
     ) -> FilterLocalizer:
         """Return a localizer that has seen nothing yet.
 
-        `origin` is the configured or persisted one; None captures it from the first good fixes. Raises GeodesyError for
-        an origin that is no place.
+        `origin` is the configured or persisted one; None captures it from the first good fixes. `recalled` is what an
+        earlier run kept, where it may be used. Raises GeodesyError for an origin that is no place.
         """
-        first = engine.first(setup, mode, None if origin is None else Geodesy(origin))
+        first = engine.first(setup, mode, None if origin is None else Geodesy(origin), recalled)
         return cls(setup, Timeline(first), first, latched=origin is not None)
 
     @property
@@ -211,6 +217,20 @@ class FilterLocalizer:
     def navigation(self, utime: int) -> NavigationState | None:
         """Return the whole state as of the newest sample; None before levelling."""
         return world.navigation(self.setup, motion.caught_up(self.setup, self.head))
+
+    def kept(self) -> Kept | None:
+        """Return what the next run should know; None where it is no better than what was kept before."""
+        nav = self.head.nav
+        return None if nav is None else keeping.kept(self.setup, self.head, self.estimate(nav.utime).invalid)
+
+    def silence(self, utime: int) -> Invalid:
+        """Return what of SILENCE speaks against an estimate at `utime`, which is not before the newest sample."""
+        return world.invalid(self.setup, self.head, utime) & SILENCE
+
+    def summary(self, utime: int) -> LocalizerSummary:
+        """Return mode and phase, whether the vehicle stands, and when a fix was last used."""
+        head = self.head
+        return LocalizerSummary(head.mode, head.phase, head.standing, head.fix_utime)
 
 
 def _rank(sample: Sample | SwitchMode) -> int:

@@ -12,7 +12,7 @@ from modelserver.localization.filter.nav import Nav
 from modelserver.localization.filter.stillness import Stillness
 from modelserver.localization.filter.strapdown import Earth
 from modelserver.localization.origin import Capture
-from modelserver.messages import Mode, Origin, Phase
+from modelserver.messages import Mode, Origin, Phase, Recalled
 from modelserver.spatial.so3 import Vector3
 
 LINE = 3e-4
@@ -72,6 +72,34 @@ class Pending(NamedTuple):
     take_up: bool = False
 
 
+class Resuming(NamedTuple):
+    """What an earlier run kept, while it waits for evidence.
+
+    `since` is when it began to wait, 0 before levelling, `looked` the last look at the evidence. `fixes` counts those
+    in a row that agree with the kept pose, below 0 those that do not; `seen` is the last one's instant.
+    """
+
+    recalled: Recalled
+    since: int = 0
+    looked: int = 0
+    fixes: int = 0
+    seen: int = 0
+
+
+class Proving(NamedTuple):
+    """A stretch of fixes that a resumed heading is held against, from `begin` to `utime` (0: none yet).
+
+    `place` is where the rolling frame was by the first fix, `way` what was driven since along the heading, metres, and
+    `velocity` what it is now, m/s; all complex, east + i north.
+    """
+
+    utime: int = 0
+    begin: int = 0
+    place: complex = 0j
+    way: complex = 0j
+    velocity: complex = 0j
+
+
 class FilterState(NamedTuple):
     """Nominal state, covariance, and everything that decisions rest on. Make the first with the engine's `first`.
 
@@ -87,7 +115,8 @@ class FilterState(NamedTuple):
     `allowance` is what one outlier just within its gate may have moved the position by, metres, and
     `conflict_utime` when a fix from beyond its gate was last used. `biases` are the gyros' with their sigma, kept
     where the rest begins anew. `tilt` is how far gravity is off the geometry's up at start-up, where that is too
-    far; infinite where what is felt is no gravity.
+    far; infinite where what is felt is no gravity. `resuming` is what an earlier run kept, until it is used or not;
+    `proving` what a resumed heading is held against, until it is right or not.
     """
 
     nav: Nav | None = None
@@ -133,6 +162,8 @@ class FilterState(NamedTuple):
     level_count: int = 0
     biases: tuple[Vector3, float] | None = None
     stepped: bool = False
+    resuming: Resuming | None = None
+    proving: Proving | None = None
 
     def felt(self, nav: Nav, stillness: Stillness, said: Said, imu_utime: int) -> FilterState:
         """Return the state after an inertial sample.

@@ -38,9 +38,9 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     """Return the rolling frame's pose at `utime` from a state not newer than it; `newest` is that of all samples."""
     nav = state.nav
     origin = None if state.geodesy is None else state.geodesy.origin
-    invalid = _invalid(setup, state, utime)
+    reasons = invalid(setup, state, utime)
     if nav is None:
-        return Estimate(utime, odom.pose(utime), invalid=invalid, pose_epoch=state.epoch, origin=origin)
+        return Estimate(utime, odom.pose(utime), invalid=reasons, pose_epoch=state.epoch, origin=origin)
     ahead = motion.at(setup, state, utime)
     nav = ahead.nav
     assert nav is not None
@@ -52,7 +52,7 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
             utime,
             X_odom,
             odom_covariance=odom_covariance,
-            invalid=invalid,
+            invalid=reasons,
             quality=quality,
             pose_epoch=state.epoch,
             origin=origin,
@@ -67,11 +67,11 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
     horizontal = bounds.horizontal(P, state.allowance, settings)
     heading = bounds.heading(float(P[5, 5]), settings)
     if heading > settings.heading_limit:
-        invalid |= Invalid.STATIONARY_HEADING if state.standing else Invalid.BOUND_EXCEEDED
+        reasons |= Invalid.STATIONARY_HEADING if state.standing else Invalid.BOUND_EXCEEDED
     if horizontal > settings.horizontal_limit:
-        invalid |= Invalid.BOUND_EXCEEDED
+        reasons |= Invalid.BOUND_EXCEEDED
         if state.refused_count:
-            invalid |= Invalid.GPS_REJECTED
+            reasons |= Invalid.GPS_REJECTED
     enu = utm = None
     if state.geodesy is not None:
         x, y, z = nav.point(setup.rig.base)
@@ -84,13 +84,13 @@ def estimate(setup: Setup, state: FilterState, odom: Odometry, utime: int, newes
         utm,
         tuple(P.ravel().tolist()),
         odom_covariance,
-        invalid,
+        reasons,
         quality,
         state.epoch,
         origin,
         horizontal,
         heading,
-        NAN if invalid else _seconds_left(setup, state, nav, utime, horizontal),
+        NAN if reasons else _seconds_left(setup, state, nav, utime, horizontal),
         vehicle_motion(setup, ahead, nav),
     )
 
@@ -198,7 +198,8 @@ def _world_poses(
     )
 
 
-def _invalid(setup: Setup, state: FilterState, utime: int) -> Invalid:
+def invalid(setup: Setup, state: FilterState, utime: int) -> Invalid:
+    """Return what speaks against an estimate at `utime`, but for its bounds."""
     # numbers, not members: putting flags together costs more than all else here
     settings, nav = setup.settings, state.nav
     invalid = 0
@@ -296,7 +297,7 @@ def navigation(setup: Setup, state: FilterState) -> NavigationState | None:
         state.mode,
         state.phase,
         state.standing,
-        _invalid(setup, state, nav.utime),
+        invalid(setup, state, nav.utime),
         state.epoch,
         latitude,
         longitude,

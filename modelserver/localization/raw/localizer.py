@@ -25,9 +25,13 @@ from modelserver.localization.raw.state import RawState
 from modelserver.localization.raw.still import Stillness
 from modelserver.localization.raw.world import estimate
 from modelserver.messages import (
+    SILENCE,
     Estimate,
     GpsSample,
     ImuSample,
+    Invalid,
+    LocalizerSummary,
+    Mode,
     NavigationState,
     Origin,
     OriginLatched,
@@ -92,6 +96,16 @@ class RawLocalizer(RawState):
     def navigation(self, utime: int) -> NavigationState | None:
         """Return None: raw mode has no filter."""
         return None
+
+    def silence(self, utime: int) -> Invalid:
+        """Return what of SILENCE speaks against an estimate at `utime`."""
+        return self.estimate(utime).invalid & SILENCE
+
+    def summary(self, utime: int) -> LocalizerSummary:
+        """Return whether the vehicle stands, and when a fix was last used."""
+        anchor = self.fixes.anchor
+        standing = self.stillness.standing(utime, self.settings)
+        return LocalizerSummary(Mode.RAW, None, standing, 0 if anchor is None else anchor.utime)
 
     # --- inertial samples -----------------------------------------------------------------------------------
 

@@ -36,6 +36,7 @@ from modelserver.messages import (
     SensorHeader,
     SwitchMode,
     Verdict,
+    WheelsSample,
 )
 from modelserver.simulation import Event, GpsModel, Timing
 from modelserver.simulation.scenario import START_UTIME
@@ -375,3 +376,16 @@ def test_given_a_time_within_the_horizon_when_asked_then_the_state_of_then_answe
         assert (estimate.odom.inverse() @ found.estimate(found.utime).odom).xyz[0] == pytest.approx(
             3.0 * back * 1e-6, abs=0.15
         )
+
+
+def test_given_a_first_stamp_of_a_far_future_then_a_better_source_sets_the_time_and_the_pose_comes():
+    stray = WheelsSample(SensorHeader(START_UTIME + 10**15, "stray"), ())
+    found = taken(localizer(), (stray, *within(0.0, WARM)))
+    assert not found.estimate(found.utime).invalid
+    assert found.utime == within(0.0, WARM)[-1].header.utime
+
+
+def test_given_a_first_stamp_of_a_far_future_then_a_lesser_source_cannot_set_the_time():
+    stray = ImuSample(SensorHeader(START_UTIME + 10**15, "stray"))
+    found = taken(localizer(), (stray, *(each for each in within(0.0, WARM) if isinstance(each, GpsSample))))
+    assert found.clocks.newest == START_UTIME + 10**15

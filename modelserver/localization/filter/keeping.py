@@ -1,0 +1,130 @@
+"""What is kept of the filter's state for the next run, and whether what an earlier run kept may be looked at."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from functools import lru_cache
+
+from modelserver.errors import shown
+from modelserver.geodesy import geodetic_from_ecef
+from modelserver.localization.filter import motion
+from modelserver.localization.filter.nav import Nav
+from modelserver.localization.filter.setup import Setup
+from modelserver.localization.filter.state import FilterState
+from modelserver.messages import Kept, KeptPose, Mode, Phase, Recalled, WheelsSample
+
+KEPT = "kept"
+"""The kind of the ledger's words on what was kept."""
+
+
+@lru_cache(maxsize=8)
+def named(setup: Setup) -> str:
+    """Return a word that stands for all that a kept state rests on: equal where it may be gone on from."""
+    rig = setup.rig
+    words = repr((rig.places(), rig.kinematics, setup.layout.names))
+    return hashlib.sha256(words.encode()).hexdigest()[:16]
+
+
+def kept(setup: Setup, state: FilterState, invalid: int) -> Kept | None:
+    """Return what is worth keeping of a state; None where there is nothing better than what was kept before.
+
+    `invalid` are the reasons of the pose now: one that is not valid is not kept, its biases are.
+    """
+    nav = state.nav
+    if nav is None or state.resuming is not None:
+        return None
+    state = motion.caught_up(setup, state)
+    nav = state.nav
+    assert nav is not None
+    numbers = tuple(nav.covariance.ravel().tolist())
+    if not all(map(math.isfinite, (*numbers, *nav.gyro_bias, *nav.accelerometer_bias, *nav.extras))):
+        return None
+    return Kept(
+        "",
+        0,
+        0,
+        "",
+        named(setup),
+        nav.utime,
+        setup.layout.names,
+        nav.gyro_bias,
+        nav.accelerometer_bias,
+        tuple(map(float, nav.extras)),
+        numbers,
+        None if invalid or not state.standing else _kept_pose(state, nav),
+    )
+
+
+def _kept_pose(state: FilterState, nav: Nav) -> KeptPose | None:
+    site = state.site
+    if site is None or state.phase is not Phase.ALIGNED:
+        return None
+    place = (*nav.position, *nav.attitude, *state.shown, *state.doubt, state.allowance, state.restless)
+    if not all(map(math.isfinite, place)):
+        return None
+    source, seq = "", 0
+    told: tuple[tuple[str, float], ...] = ()
+    seen = state.last.get((state.wheels_source, "seen"))
+    if seen is not None and isinstance(seen.sample, WheelsSample):
+        source, seq = state.wheels_source, seen.sample.header.seq
+        told = ways(seen.sample)
+    return KeptPose(
+        *geodetic_from_ecef(site.ecef),
+        nav.position,
+        nav.attitude,
+        state.shown,
+        state.doubt,
+        state.allowance,
+        state.restless,
+        state.fix_utime,
+        state.confirmed,
+        state.epoch,
+        source,
+        seq,
+        told,
+    )
+
+
+def ways(sample: WheelsSample) -> tuple[tuple[str, float], ...]:
+    """Return the way that each wheel of a sample tells, metres."""
+    return tuple((wheel.name, wheel.travel) for wheel in sample.wheels if math.isfinite(wheel.travel))
+
+
+def judged(recalled: Recalled, vehicle: str, setup: Setup) -> Recalled:
+    """Return what was recalled, without what is kept of another vehicle, other mounts, or too long ago; it says why."""
+    kept = recalled.kept
+    if kept is None:
+        return recalled
+    why = ""
+    if kept.vehicle != vehicle:
+        why = f"it is of vehicle {shown(kept.vehicle)}, not of {shown(vehicle)}"
+    elif kept.setup != named(setup):
+        why = "mounts, wheels or measurements of the vehicle have changed since"
+    elif kept.names != setup.layout.names or len(kept.covariance) != setup.layout.size**2:
+        why = "its error states are others"
+    elif recalled.age > recalled.most_age:
+        why = "it is older than restart.max_age_s"
+    if not why:
+        return recalled
+    return recalled._replace(kept=None, why=f"what was kept {ago(recalled.age)} is not used: {why}")
+
+
+def opened(recalled: Recalled | None, vehicle: str, setup: Setup, mode: Mode) -> tuple[Recalled | None, str]:
+    """Return what a start goes on from, None where it is cold; and what is said about it, empty where nobody asked."""
+    if recalled is None:
+        return None, ""
+    if mode is Mode.RAW:
+        recalled = recalled._replace(kept=None, why="raw mode goes on from nothing but the origin")
+    recalled = judged(recalled, vehicle, setup)
+    if recalled.kept is None:
+        return None, f"cold start: {recalled.why}"
+    return recalled, f"warm start: what was kept {ago(recalled.age)} waits for the sensors"
+
+
+def ago(seconds: float) -> str:
+    """Return an age in words that people read at a glance."""
+    for size, unit in ((86400.0, "days"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= 2.0 * size:
+            return f"{seconds / size:.0f} {unit} ago"
+    return f"{seconds:.0f} s ago"
