@@ -115,6 +115,17 @@ class History:
         other._start, other._end, other._horizon = self._start, self._end, round(seconds * 1e6)
         return other
 
+    def recent(self, seconds: float) -> History:
+        """Return what is held of the last seconds before the newest, in lists of its own that nobody else extends."""
+        other = History.__new__(History)
+        start = self._start
+        if self._end > start:
+            oldest = self._times[self._end - 1] - round(seconds * 1e6)
+            start = bisect_left(self._times, oldest, start, self._end)
+        other._times, other._estimates = self._times[start : self._end], self._estimates[start : self._end]
+        other._start, other._end, other._horizon = 0, self._end - start, self._horizon
+        return other
+
     def at(self, utime: int) -> Estimate:
         """Return the estimate at a time, interpolated between the two around it.
 

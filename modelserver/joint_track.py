@@ -70,7 +70,7 @@ class JointTrack:
     end; where one is put between others, or to an old track, the block concerned is copied, and no other.
     """
 
-    __slots__ = ("_blocks", "_count", "_end", "_firsts", "_horizon", "_start", "_turns")
+    __slots__ = ("_blocks", "_count", "_end", "_firsts", "_horizon", "_start", "_turns", "source")
 
     def __init__(self, seconds: float, turns: bool = False):
         """Hold so many seconds; `turns`: an angle without limits, whose readings may begin anew at a full turn."""
@@ -83,6 +83,8 @@ class JointTrack:
         """Of the last block; of the others all are held."""
         self._count = 0
         self._horizon = round(seconds * 1e6)
+        self.source = ""
+        """Who told the newest reading, as he names himself; whoever makes a longer track says it anew."""
 
     def __len__(self) -> int:
         return self._count
@@ -100,7 +102,14 @@ class JointTrack:
     def _twin(self) -> JointTrack:
         twin = JointTrack.__new__(JointTrack)
         twin._blocks, twin._firsts, twin._start, twin._end = self._blocks, self._firsts, self._start, self._end
-        twin._count, twin._horizon, twin._turns = self._count, self._horizon, self._turns
+        twin._count, twin._horizon, twin._turns, twin.source = self._count, self._horizon, self._turns, self.source
+        return twin
+
+    def apart(self) -> JointTrack:
+        """Return the same readings in a last block that no successor extends."""
+        twin = self._twin()
+        if self._blocks:
+            twin._blocks = (*self._blocks[:-1], self._blocks[-1].copied(0, self._end))
         return twin
 
     def turning(self, turns: bool) -> JointTrack:

@@ -13,7 +13,7 @@ from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Constraint
 from modelserver.joint_reading import LONGEST_GAP_S, How, Reading
 from modelserver.joint_track import MOST_READINGS, PREDICTION_LIMIT_S, JointTrack
-from modelserver.messages import NAN, JointSample, JointsSample
+from modelserver.messages import NAN, JointSample, JointsSample, SensorHeader
 
 AHEAD_S: Final = 0.1
 """So far may a driver's clock be ahead of this one's. What is held of later was told before this was set back."""
@@ -115,13 +115,45 @@ class Joints:
                 if track.is_late(sample.header.utime):
                     refused.append("late")
                 continue
+            if sample.header.utime >= longer.last:
+                longer.source = sample.header.source
             tracks = dict(self.tracks) if tracks is None else tracks
             tracks[joint.name] = longer
-        if tracks is None:
-            return self, tuple(refused)
+        return (self if tracks is None else self._with(tracks)), tuple(refused)
+
+    def _with(self, tracks: dict[str, JointTrack]) -> Joints:
         known = Joints.__new__(Joints)
         known._coordinates, known._seconds, known.tracks = self._coordinates, self._seconds, MappingProxyType(tracks)
-        return known, tuple(refused)
+        return known
+
+    def newest(self, utime: int) -> list[JointsSample]:
+        """Return the newest reading of every joint, as samples that were sent at `utime`: one for each instant."""
+        found: dict[tuple[int, str], list[JointSample]] = {}
+        for name, track in self.tracks.items():
+            reading = track.newest
+            joint = JointSample(name, reading.position, reading.sigma, reading.rate, reading.rate_sigma)
+            found.setdefault((reading.utime, track.source), []).append(joint)
+        return [
+            JointsSample(SensorHeader(stamp, source, 0, utime), tuple(joints))
+            for (stamp, source), joints in sorted(found.items())
+        ]
+
+    def recalled(self, sample: JointsSample) -> Joints:
+        """Return what is known with what another one held: of any age, where nothing newer is known here.
+
+        What of it cannot be is passed over.
+        """
+        utime = sample.header.utime
+        tracks = dict(self.tracks)
+        for joint in sample.joints:
+            known = tracks.get(joint.name)
+            if joint.position != joint.position or (known is not None and known.last >= utime) or self._fault(joint):
+                continue
+            track = known or JointTrack(self._seconds, self._coordinates[joint.name].turns)
+            longer = track.extended(utime, (joint.position, self._sigma(joint), joint.rate, joint.rate_sigma))
+            longer.source = sample.header.source
+            tracks[joint.name] = longer
+        return self._with(tracks) if any(track is not self.tracks.get(name) for name, track in tracks.items()) else self
 
     def _sigma(self, joint: JointSample) -> float:
         if joint.position_sigma == joint.position_sigma:
@@ -141,6 +173,13 @@ class Joints:
         if abs(joint.rate) >= ABSURD or joint.rate_sigma < 0.0 or joint.rate_sigma >= ABSURD:
             return f"bad rate of {joint.name}"
         return ""
+
+    def apart(self) -> Joints:
+        """Return the same knowledge in lists that no successor extends."""
+        other = Joints.__new__(Joints)
+        other._coordinates, other._seconds = self._coordinates, self._seconds
+        other.tracks = MappingProxyType({name: track.apart() for name, track in self.tracks.items()})
+        return other
 
     def for_model(self, model: Model) -> Joints:
         """Return what of this is known of the joints of another model: of those that are of the same type there."""

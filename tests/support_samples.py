@@ -16,6 +16,7 @@ from modelserver.geodesy import Geodesy, origin_at
 from modelserver.geometry import Model, ModelBuilder, Sigma
 from modelserver.localization.interface import Note
 from modelserver.messages import (
+    SILENCE,
     VALID,
     Decision,
     Estimate,
@@ -23,6 +24,7 @@ from modelserver.messages import (
     GpsSample,
     ImuSample,
     Invalid,
+    LocalizerSummary,
     Mode,
     NavigationState,
     Origin,
@@ -209,6 +211,12 @@ class Scripted:
             (0.5,),
             (0.25,),
         )
+
+    def silence(self, utime: int) -> Invalid:
+        return self.estimate(utime).invalid & SILENCE
+
+    def summary(self, utime: int) -> LocalizerSummary:
+        return LocalizerSummary(self.mode, Phase.ALIGNED if self.filtering else None, False, self.newest)
 
     def deferred(self, utime: int) -> Estimate:
         return self.estimate(utime)

@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from modelserver.core.commands import OPERATOR, SET_COVARIANCE, model_loaded, pose_set, reload_wished
-from modelserver.core.requests import fail, refuse, requested, turn_back
-from modelserver.core.samples import FUTURE_LIMIT_S, FUTURE_SAMPLES, mode_wished, sample_taken
+from modelserver.core.commands import OPERATOR, SET_COVARIANCE, commanded, model_loaded, unsigned
+from modelserver.core.keeping import START, kept, start_told
+from modelserver.core.requests import denied, fail, refuse, requested, turn_back
+from modelserver.core.samples import AHEAD_LIMIT_S, FUTURE_LIMIT_S, FUTURE_SAMPLES, mode_wished, sample_taken
 from modelserver.core.state import (
     DEGRADED,
     MAX_COUNTERS,
@@ -20,6 +21,7 @@ from modelserver.core.state import (
     STARTING,
     CoreSettings,
     CoreState,
+    Expected,
     Instant,
     Outputs,
     Parked,
@@ -33,6 +35,8 @@ from modelserver.core.state import (
 from modelserver.core.ticks import LATENESS_KEPT, ticked
 from modelserver.messages import (
     AbsolutePoseSample,
+    Commanded,
+    Denied,
     Event,
     GetBodyFrameList,
     GetBodyList,
@@ -77,6 +81,7 @@ _HANDLERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], Step]]] = {
     Tick: ticked,
     Rejected: rejected,
     Noticed: noticed,
+    Denied: denied,
     GetTransformation: requested,
     GetBodyList: requested,
     GetBodyFrameList: requested,
@@ -86,13 +91,15 @@ _HANDLERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], Step]]] = {
     GetTransformations: requested,
     GetMotion: requested,
     GetExplanation: requested,
-    ReloadModel: reload_wished,
+    Commanded: commanded,
     ModelLoaded: model_loaded,
-    SetStateVector: pose_set,
-    SetHTransform: pose_set,
+    ReloadModel: unsigned,
+    SetStateVector: unsigned,
+    SetHTransform: unsigned,
 }
 
 __all__ = [
+    "AHEAD_LIMIT_S",
     "DEGRADED",
     "FUTURE_LIMIT_S",
     "FUTURE_SAMPLES",
@@ -101,9 +108,11 @@ __all__ = [
     "OPERATOR",
     "RUNNING",
     "SET_COVARIANCE",
+    "START",
     "STARTING",
     "CoreSettings",
     "CoreState",
+    "Expected",
     "Instant",
     "Outputs",
     "Parked",
@@ -111,8 +120,10 @@ __all__ = [
     "Traffic",
     "check_bolted",
     "fail",
+    "kept",
     "refuse",
     "start",
+    "start_told",
     "step",
     "turn_back",
 ]

@@ -1,4 +1,4 @@
-"""Requests that change what the service knows: the geometry read anew, a pose that is set."""
+"""Requests that change what the service knows: the geometry read anew, a pose that is set. Only signed ones count."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from modelserver.core.requests import turned_down
-from modelserver.core.samples import FUTURE_LIMIT_S, localized
+from modelserver.core.samples import FUTURE_LIMIT_S, localized, mode_wished
 from modelserver.core.state import CoreState, Instant, Step, counted
 from modelserver.errors import Status
 from modelserver.geometry import names
@@ -19,6 +19,7 @@ from modelserver.messages import (
     CHANNEL_OF,
     AbsolutePoseSample,
     Acknowledgement,
+    Commanded,
     Decision,
     LoadModel,
     Origin,
@@ -34,6 +35,7 @@ from modelserver.messages import (
     SensorHeader,
     SetHTransform,
     SetStateVector,
+    SwitchMode,
     Verdict,
 )
 from modelserver.reload import ModelLoaded
@@ -46,7 +48,35 @@ OPERATOR: Final = "operator"
 """The source under which a pose that was set is known to localization and its ledger."""
 
 
-def reload_wished(state: CoreState, request: ReloadModel, now: Instant) -> Step:
+UNSIGNED: Final = (
+    "it is not signed: whoever asks needs the vehicle's key (Platform(key_file=...), --key FILE or "
+    "$MODELSERVER_KEY_FILE; docs/wire.md for other languages)"
+)
+"""What is said to who asks without a signature for what would be done with one."""
+
+
+def unsigned(state: CoreState, request: ReloadModel | SetStateVector | SetHTransform, now: Instant) -> Step:
+    """Turn down what changes the service and comes without a signature."""
+    if not request.header.is_answerable(state.settings.reply_prefix):
+        return counted(state, CHANNEL_OF[type(request)], "reply_channel"), ()
+    reload = isinstance(request, ReloadModel)
+    if not (state.settings.may_reload if reload else state.settings.may_set_pose):
+        return _forbidden(state, request, "commands.reload" if reload else "commands.set_pose", now)
+    state = counted(state, CHANNEL_OF[type(request)], "unsigned")
+    return state, turned_down(state, type(request), request.header, Status.FORBIDDEN, UNSIGNED, now)
+
+
+def commanded(state: CoreState, command: Commanded, now: Instant) -> Step:
+    """Do what a sender who has proved to know the key asks for, where the vehicle file allows it."""
+    order = command.order
+    if isinstance(order, SwitchMode):
+        return mode_wished(state, order, now)
+    if isinstance(order, ReloadModel):
+        return _reload_wished(state, order, now)
+    return _pose_set(state, order, now)
+
+
+def _reload_wished(state: CoreState, request: ReloadModel, now: Instant) -> Step:
     """Have the geometry read anew, where clients may ask for that."""
     if not request.header.is_answerable(state.settings.reply_prefix):
         return counted(state, CHANNEL_OF[ReloadModel], "reply_channel"), ()
@@ -77,7 +107,7 @@ def model_loaded(state: CoreState, loaded: ModelLoaded, now: Instant) -> Step:
     return state, tuple(outputs)
 
 
-def pose_set(state: CoreState, request: SetStateVector | SetHTransform, now: Instant) -> Step:
+def _pose_set(state: CoreState, request: SetStateVector | SetHTransform, now: Instant) -> Step:
     """Tell localization where the vehicle is, where clients may do that."""
     if not request.header.is_answerable(state.settings.reply_prefix):
         return counted(state, CHANNEL_OF[type(request)], "reply_channel"), ()
@@ -150,5 +180,5 @@ def _forbidden(state: CoreState, request: Request, key: str, now: Instant) -> St
     state = counted(state, CHANNEL_OF[type(request)], "forbidden")
     section, _, name = key.partition(".")
     allowing = f"{section}: {{{name}: true}}"
-    why = f"the vehicle file does not allow it; write {allowing}, and know that whoever is on the bus can then do it"
+    why = f"the vehicle file does not allow it; write {allowing} and a key_file beside it, whose key clients sign with"
     return state, turned_down(state, type(request), request.header, Status.FORBIDDEN, why, now)

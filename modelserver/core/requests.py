@@ -10,6 +10,7 @@ from modelserver.errors import Status
 from modelserver.geometry import names
 from modelserver.messages import (
     CHANNEL_OF,
+    Denied,
     GetExplanation,
     GetHTransform,
     GetMotion,
@@ -84,6 +85,17 @@ def fail(state: CoreState, request: Request, now: Instant) -> Outputs:
     """Return the reply to a request that an error of the server's own kept from being answered."""
     message = "the server failed on its side; its log says why"
     return turned_down(state, type(request), request.header, Status.INTERNAL, message, now)
+
+
+def denied(state: CoreState, denied: Denied, now: Instant) -> Step:
+    """Count a signed command that is not obeyed, and say why to who has proved to know the key."""
+    state = counted(state, denied.channel, denied.reason)
+    if denied.kind is None or denied.header is None:
+        return state, ()
+    if denied.malformed:
+        return state, turn_back(state, denied.kind, denied.header, denied.why, now)
+    why = f"the command is not obeyed: {denied.why}"
+    return state, turned_down(state, denied.kind, denied.header, Status.FORBIDDEN, why, now)
 
 
 def turn_back(state: CoreState, kind: type[Request], header: RequestHeader, why: str, now: Instant) -> Outputs:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
+from modelserver.core.keeping import KEPT, start_told
 from modelserver.core.requests import answer_parked
-from modelserver.core.state import DEGRADED, RUNNING, STARTING, CoreState, Instant, Step, counted, traffic_noted
+from modelserver.core.state import DEGRADED, RUNNING, STARTING, CoreState, Instant, Step, counted, heard, traffic_noted
 from modelserver.geometry import names
 from modelserver.localization.interface import Localizer
 from modelserver.messages import (
@@ -26,7 +27,11 @@ from modelserver.messages import (
 from modelserver.platform import PlatformView
 
 FUTURE_LIMIT_S: Final = 1.0
-"""A sample stamped this far ahead of the host's clock is refused: one of the two clocks is wrong."""
+"""A wish stamped this far ahead of the host's clock is refused: one of the two clocks is wrong."""
+
+AHEAD_LIMIT_S: Final = 0.25
+"""The same for a sample, which nobody can have taken before it is: clocks that are kept together differ by less, and a
+fix that is taken for one of a quarter of a second later is off by what the vehicle drives in that."""
 
 FUTURE_SAMPLES: Final = 3
 """So many of them in a row are no strays: the host's clock was set back, and no pose is valid until one fits."""
@@ -35,8 +40,10 @@ FUTURE_SAMPLES: Final = 3
 def sample_taken(state: CoreState, sample: Sample, now: Instant) -> Step:
     """Take a sensor's sample."""
     source = f"sensor:{sample.header.source}"
-    state = traffic_noted(state, source, now)
-    if sample.header.utime > now.utime + FUTURE_LIMIT_S * 1e6:
+    state = traffic_noted(state, source, sample.header.host_utime, now)
+    if state.unheard:
+        state = heard(state, sample)
+    if sample.header.utime > now.utime + AHEAD_LIMIT_S * 1e6:
         state = counted(state._replace(futures=state.futures + 1), source, "future")
         if state.futures >= FUTURE_SAMPLES:
             # one clock was set: what is held is of another time than what is asked for now
@@ -68,7 +75,7 @@ def joints_told(state: CoreState, sample: JointsSample, now: Instant) -> Step:
 def mode_wished(state: CoreState, wish: SwitchMode, now: Instant) -> Step:
     """Take a wish for other sources."""
     source = f"command:{wish.header.source}"
-    state = traffic_noted(state, source, now)
+    state = traffic_noted(state, source, wish.header.host_utime, now)
     if wish.header.utime > now.utime + FUTURE_LIMIT_S * 1e6:
         # unlike a sensor's this says nothing of the host's clock: it may be the operator's that is wrong
         return counted(state, source, "future"), ()
@@ -91,6 +98,9 @@ def localized(state: CoreState, before: Localizer, sample: Sample | SwitchMode, 
             outputs.append(note)
         else:
             decisions.append(note)
+            if note.kind == KEPT:
+                state, said = start_told(state, note, now)
+                outputs.extend(said)
             if note.verdict is Verdict.REJECTED:
                 state = counted(state, f"sensor:{note.source}", note.reason or "rejected")
                 # what is said late is of an earlier sample
@@ -128,5 +138,9 @@ def published(state: CoreState, utime: int) -> tuple[CoreState, PublishPose]:
     run_state = RUNNING if world.transformation.valid else DEGRADED
     if run_state == DEGRADED and state.run_state == STARTING:
         run_state = STARTING
-    state = state._replace(poses_published=state.poses_published + 1, run_state=run_state)
+    state = state._replace(
+        poses_published=state.poses_published + 1,
+        run_state=run_state,
+        pose_invalid=world.transformation.invalid_reasons,
+    )
     return state, PublishPose(world, view.broadcast(estimate, names.ODOM))

@@ -13,6 +13,8 @@ from modelserver.history import History
 from modelserver.joints import Joints
 from modelserver.localization.interface import Localizer
 from modelserver.messages import (
+    NAN,
+    Gauges,
     GetExplanation,
     GetHTransform,
     GetMotion,
@@ -21,6 +23,7 @@ from modelserver.messages import (
     Noticed,
     Output,
     Rejected,
+    Sample,
 )
 from modelserver.platform import PlatformView
 
@@ -28,6 +31,16 @@ MAX_COUNTERS: Final = 256
 """Distinct causes of rejection that are told apart; further ones are counted together."""
 
 STARTING, RUNNING, DEGRADED = 0, 1, 2
+
+SILENT_INTERVALS: Final = 5.0
+SILENT_LEAST_S: Final = 1.0
+"""A source is silent after so many of its usual intervals, and so many seconds at least."""
+
+INTERVAL_GAIN: Final = 0.1
+"""By how much each interval counts for the usual one."""
+
+CHANGE_PERIOD_NS: Final = 100_000_000
+"""Nanoseconds between two looks for what a health report goes out for at once: changes to and fro cannot flood."""
 
 
 TimedRequest: TypeAlias = GetTransformation | GetStateVector | GetHTransform | GetMotion | GetExplanation
@@ -48,7 +61,9 @@ class CoreSettings:
     ticks_per_pose: in timer mode POSE goes out at the first of each so many ticks; missed ones are counted too.
     ticks_per_state: the same for the filter's state; 0 = it does not go out.
     publish_decisions: whether what became of measurements goes out.
-    may_reload, may_set_pose: whether clients may have that done.
+    keep_period_ns: how often that goes out which the next run of the service should know; 0 = never.
+    may_reload, may_set_pose: whether clients may have that done, where they sign.
+    sensors: those of the vehicle file, so that the health report can tell which were never heard.
     """
 
     base_frame: str
@@ -66,6 +81,8 @@ class CoreSettings:
     snapshot_period_ns: int = 5_000_000_000
     may_reload: bool = False
     may_set_pose: bool = False
+    keep_period_ns: int = 0
+    sensors: tuple[Expected, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,13 +93,54 @@ class Parked:
     until_ns: int
 
 
+class Expected(NamedTuple):
+    """A sensor of the vehicle file: its channel, what its samples are, and, where that is told, its name for itself."""
+
+    channel: str
+    kind: type[Sample]
+    source: str = ""
+
+
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """Messages of one source: how many, the last one's arrival, and how many there were at the last report."""
+    """Messages of one source: how many, the last one's arrival, and how many there were at the last whole report.
+
+    `interval` is the usual time between two, seconds; 0 = not known yet. `delay` is the greatest from the host's
+    receipt to handling since the last whole report, seconds. `rate` and `told_delay` are what that report said.
+    """
 
     count: int = 0
     last_ns: int = 0
     reported: int = 0
+    interval: float = 0.0
+    delay: float = NAN
+    rate: float = 0.0
+    told_delay: float = NAN
+
+
+class Signs(NamedTuple):
+    """What a report goes out for at once when it changes. `silent` names sources, `unheard` channels."""
+
+    run_state: int = STARTING
+    invalid: int = 0
+    revision: str = ""
+    silent: tuple[str, ...] = ()
+    unheard: tuple[str, ...] = ()
+    notices: Mapping[str, str] = MappingProxyType({})
+
+
+class Watch(NamedTuple):
+    """What the health report needs beside the rest.
+
+    `gauges`: the last that came, at `gauged_ns`; `cpu_share` what follows from the last two. `due_ns`: when signs are
+    looked at again; `said`: what they were at the last report.
+    """
+
+    gauges: Gauges = Gauges()
+    gauged_ns: int = 0
+    cpu_share: float = NAN
+    due_ns: int = 0
+    said: Signs = Signs()
 
 
 class CoreState(NamedTuple):
@@ -108,6 +166,10 @@ class CoreState(NamedTuple):
     futures: int = 0
     snapshot_due_ns: int = 0
     notices: Mapping[str, str] = MappingProxyType({})
+    keep_due_ns: int = 0
+    unheard: tuple[Expected, ...] = ()
+    pose_invalid: int = 0
+    watch: Watch = Watch()
     requests_answered: int = 0  # stays last: see `_request`
 
     @property
@@ -136,7 +198,7 @@ def start(settings: CoreSettings, model: Model, localizer: Localizer | None, now
     view = PlatformView(model, settings.base_frame, localizer, history, settings.rolling_frame, joints=joints)
     check_bolted(model, view.base_frame, view.rolling_frame)
     due = now.monotonic_ns
-    return CoreState(settings, view, due, health_due_ns=due, snapshot_due_ns=due)
+    return CoreState(settings, view, due, health_due_ns=due, snapshot_due_ns=due, unheard=settings.sensors)
 
 
 def check_bolted(model: Model, base_frame: str, rolling_frame: str) -> None:
@@ -150,36 +212,58 @@ def check_bolted(model: Model, base_frame: str, rolling_frame: str) -> None:
 
 def rejected(state: CoreState, rejected: Rejected, now: Instant) -> Step:
     """Count something that was not understood."""
-    return counted(state, rejected.channel, rejected.reason), ()
+    return counted(state, rejected.channel, rejected.reason, rejected.count), ()
 
 
 def noticed(state: CoreState, notice: Noticed, now: Instant) -> Step:
-    """Take a notice up, or back; the next tick tells of the change."""
+    """Take a notice up, or back; a health report tells of the change within `CHANGE_PERIOD_NS`."""
     known = state.notices.get(notice.subject, "")
     if known == notice.text or (not known and len(state.notices) >= MAX_COUNTERS):
         return state, ()
     notices = {subject: text for subject, text in state.notices.items() if subject != notice.subject}
     if notice.text:
         notices[notice.subject] = notice.text
-    return state._replace(notices=notices, health_due_ns=now.monotonic_ns), ()
+    return state._replace(notices=notices), ()
 
 
-def counted(state: CoreState, channel: str, reason: str) -> CoreState:
-    """Return the state with one rejection more, by channel and reason."""
+def counted(state: CoreState, channel: str, reason: str, count: int = 1) -> CoreState:
+    """Return the state with one rejection more, or `count`, by channel and reason."""
     key = (channel, reason)
     if key not in state.rejected and len(state.rejected) >= MAX_COUNTERS:
         key = ("*", "other")
     counts = dict(state.rejected)
-    counts[key] = counts.get(key, 0) + 1
-    errors = state.handler_errors + (reason == "handler")
+    counts[key] = counts.get(key, 0) + count
+    errors = state.handler_errors + count * (reason == "handler")
     return state._replace(rejected=counts, handler_errors=errors)
 
 
-def traffic_noted(state: CoreState, source: str, now: Instant) -> CoreState:
-    """Return the state with one message more of a source."""
+def traffic_noted(state: CoreState, source: str, host_utime: int, now: Instant) -> CoreState:
+    """Return the state with one message more of a source, which the host received at `host_utime` (0 = not told)."""
     known = state.traffic.get(source)
     if known is None and len(state.traffic) >= MAX_COUNTERS:
         return state
     known = known or Traffic()
-    updated = Traffic(known.count + 1, now.monotonic_ns, known.reported)
+    interval, delay = known.interval, known.delay
+    if known.count:
+        since = (now.monotonic_ns - known.last_ns) * 1e-9
+        # a pause counts for no more than what makes it silent, or its return would be long forgotten for
+        usual = min(since, silent_after(interval)) if interval else since
+        interval += (usual - interval) * (INTERVAL_GAIN if known.count > 1 else 1.0)
+    if host_utime:
+        took = (now.utime - host_utime) * 1e-6
+        # a nan fails the comparison
+        delay = delay if delay >= took else took
+    updated = Traffic(known.count + 1, now.monotonic_ns, known.reported, interval, delay, known.rate, known.told_delay)
     return state._replace(traffic={**state.traffic, source: updated})
+
+
+def silent_after(interval: float) -> float:
+    """Return after how many seconds a source with this usual interval is silent."""
+    return max(SILENT_LEAST_S, SILENT_INTERVALS * interval)
+
+
+def heard(state: CoreState, sample: Sample) -> CoreState:
+    """Return the state in which the sensors that a sample may be of are heard."""
+    kind, source = type(sample), sample.header.source
+    still = tuple([each for each in state.unheard if each.kind is not kind or each.source not in ("", source)])
+    return state if len(still) == len(state.unheard) else state._replace(unheard=still)

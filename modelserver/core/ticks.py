@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Final
 
+from modelserver.core import health
+from modelserver.core.keeping import keep_if_due
 from modelserver.core.requests import answer_parked
 from modelserver.core.samples import published
-from modelserver.core.state import CoreState, Instant, Step, Traffic
-from modelserver.messages import (
-    VALID,
-    ChannelHealth,
-    Health,
-    Output,
-    PublishHealth,
-    PublishNavigation,
-    PublishSnapshot,
-    Tick,
-)
-from modelserver.version import __version__
+from modelserver.core.state import CoreState, Instant, Step
+from modelserver.messages import Output, PublishNavigation, PublishSnapshot, Tick
 
 LATENESS_KEPT: Final = 512
 
@@ -45,12 +36,14 @@ def ticked(state: CoreState, tick: Tick, now: Instant) -> Step:
     if state.parked:
         state, replies = answer_parked(state, now)
         outputs.extend(replies)
-    if now.monotonic_ns >= state.health_due_ns:
-        state, health = _report(state, now)
-        outputs.append(health)
+    state, reports = health.told(state, tick.gauges, now)
+    outputs.extend(reports)
     if now.monotonic_ns >= state.snapshot_due_ns:
         state = state._replace(snapshot_due_ns=now.monotonic_ns + settings.snapshot_period_ns)
         outputs.append(PublishSnapshot(now.utime))
+    if settings.keep_period_ns:
+        state, keeping = keep_if_due(state, now)
+        outputs.extend(keeping)
     return state, tuple(outputs)
 
 
@@ -58,44 +51,3 @@ def _is_due(every: int, before: int, after: int) -> bool:
     """Return whether, of ticks counted from 0, the next after `before` of them up to `after` hold one in `every`."""
     # the first tick is one at which all is due
     return (after - 1) // every > (before - 1) // every
-
-
-def _report(state: CoreState, now: Instant) -> tuple[CoreState, PublishHealth]:
-    elapsed = (now.monotonic_ns - state.health_sent_ns) * 1e-9 if state.health_sent_ns else 0.0
-    late = sorted(state.lateness) or [0.0]
-    estimate = None if state.localizer is None else state.localizer.estimate(now.utime)
-    channels = tuple(_channel_health(name, traffic, elapsed, now) for name, traffic in sorted(state.traffic.items()))
-    health = Health(
-        utime=now.utime,
-        uptime=(now.monotonic_ns - state.started_ns) * 1e-9,
-        version=__version__,
-        vehicle=state.settings.vehicle,
-        model_revision=state.model.revision,
-        state=state.run_state,
-        invalid_reasons=state.view.doubt | (VALID if estimate is None else estimate.invalid),
-        pose_epoch=0 if estimate is None else estimate.pose_epoch,
-        origin_id=0 if estimate is None or estimate.origin is None else estimate.origin.origin_id,
-        poses_published=state.poses_published,
-        requests_answered=state.requests_answered,
-        requests_parked=len(state.parked),
-        ticks_missed=state.ticks_missed,
-        handler_errors=state.handler_errors,
-        tick_lateness_p50=late[len(late) // 2],
-        tick_lateness_max=late[-1],
-        channels=channels,
-        rejected=tuple((channel, reason, count) for (channel, reason), count in sorted(state.rejected.items())),
-        notices=tuple(sorted(state.notices.items())),
-    )
-    state = state._replace(
-        traffic={name: replace(traffic, reported=traffic.count) for name, traffic in state.traffic.items()},
-        lateness=(),
-        health_sent_ns=now.monotonic_ns,
-        # from now, not from the due time: after a pause one report is enough
-        health_due_ns=now.monotonic_ns + state.settings.health_period_ns,
-    )
-    return state, PublishHealth(health)
-
-
-def _channel_health(name: str, traffic: Traffic, elapsed: float, now: Instant) -> ChannelHealth:
-    rate = (traffic.count - traffic.reported) / elapsed if elapsed > 0 else 0.0
-    return ChannelHealth(name, traffic.count, rate, (now.monotonic_ns - traffic.last_ns) * 1e-9)

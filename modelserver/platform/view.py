@@ -30,7 +30,18 @@ from modelserver.geometry.route import Route
 from modelserver.history import History, at_time
 from modelserver.joints import NO_JOINTS, Joints, JointTrack
 from modelserver.localization.interface import Localizer
-from modelserver.messages import NAN, NO_FLAGS, VALID, Estimate, Invalid, Policy, PoseAnswer, Quality, TimeQuery
+from modelserver.messages import (
+    NAN,
+    NO_FLAGS,
+    SILENCE,
+    VALID,
+    Estimate,
+    Invalid,
+    Policy,
+    PoseAnswer,
+    Quality,
+    TimeQuery,
+)
 from modelserver.platform.placing import NOTHING, Placed, heard, placed
 from modelserver.platform.worlds import WORLD_FRAMES, check_not_reserved, is_absolute, known_in, pose_in
 from modelserver.spatial import covariance as cov
@@ -152,7 +163,7 @@ class PlatformView:
         utime = min((track.last for _, track in tracks), default=newest.utime)
         try:
             if utime < newest.utime:
-                silent = newest.invalid & _STALE
+                silent = newest.invalid & SILENCE
                 newest = self.history.at(utime)
                 if silent not in newest.invalid:
                     newest = replace(newest, invalid=newest.invalid | silent)
@@ -201,7 +212,7 @@ class PlatformView:
             raise self.no_pose()
         if time.at == 0 or time.policy is Policy.LATEST:
             newest = self.history.newest
-            silent = self.localizer.estimate(now).invalid & _STALE if now > newest.utime else VALID
+            silent = self.localizer.silence(now) if now > newest.utime else VALID
             return newest if silent in newest.invalid else replace(newest, invalid=newest.invalid | silent)
         if time.policy is Policy.HELD:
             held = self.history.held(time.at)
@@ -349,8 +360,6 @@ class PlatformView:
 _ZERO = np.zeros((6, 6))
 ODOM_INVALID = Invalid.NO_IMU | Invalid.STALE_IMU | Invalid.CLOCK_STEPPED | Invalid.TILTED
 """What speaks against a pose in Odom: it needs no fix and no origin."""
-
-_STALE = Invalid.STALE_GPS | Invalid.STALE_IMU
 
 
 Survey: TypeAlias = Callable[[], Array | None]

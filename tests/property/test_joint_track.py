@@ -41,6 +41,24 @@ def block(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
+@given(readings, readings)
+def test_given_a_track_held_apart_when_the_first_grows_then_it_does_not_and_goes_on_alike(some, more) -> None:
+    track = JointTrack(8e-6)
+    for utime, values in some:
+        track = track.extended(utime, values)
+    apart = track.apart()
+    blocks = repr(apart._blocks)
+    grown = track
+    for utime, values in more:
+        grown = grown.extended(utime, values)
+    assert repr(apart._blocks) == blocks
+    for utime, values in more:
+        apart = apart.extended(utime, values)
+    assert len(apart) == len(grown)
+    for utime in range(grown.first, grown.last + 1):
+        assert repr(apart.held(utime)) == repr(grown.held(utime))
+
+
 @given(readings, st.randoms(use_true_random=False))
 def test_given_readings_in_any_order_and_twice_then_the_same_is_held(some, random) -> None:
     shuffled = some + random.sample(some, random.randint(0, len(some)))

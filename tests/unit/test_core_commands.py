@@ -21,6 +21,7 @@ from modelserver.messages import (
     CHANNEL_OF,
     AbsolutePoseSample,
     Acknowledgement,
+    Commanded,
     GetBodyList,
     GetTransformation,
     LoadModel,
@@ -63,7 +64,8 @@ def moved_cart() -> Model:
 
 
 def fed(state: CoreState, event: Any, at: float = 0.0) -> tuple[CoreState, tuple[Output, ...]]:
-    return step(state, event, now_at(START + round(at * S)))
+    signed = isinstance(event, (ReloadModel, SetStateVector, SetHTransform))
+    return step(state, Commanded(event, "me") if signed else event, now_at(START + round(at * S)))
 
 
 def replied(state: CoreState, event: Any, at: float = 0.0) -> tuple[CoreState, Any]:

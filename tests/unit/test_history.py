@@ -56,6 +56,20 @@ def test_given_a_history_that_was_extended_then_the_old_one_is_unchanged() -> No
         old.at(START + 2 * S)
 
 
+def test_given_a_history_when_only_the_recent_is_wanted_then_that_is_held_apart_and_can_be_extended() -> None:
+    old = history(0, 1, 2, 3, 4, horizon=3.0)
+    recent = old.recent(1.5)
+    assert times(recent) == [3, 4]
+    longer = old.extended(estimate(5))
+    assert times(recent.extended(estimate(4.5))) == [3, 4, 4.5]
+    assert times(longer) == [2, 3, 4, 5]
+    assert times(recent) == [3, 4]
+    # and it forgets as the other does
+    assert times(recent.extended(estimate(7))) == [4, 7]
+    assert times(old.recent(60.0)) == times(old)
+    assert len(History(60.0).recent(1.0)) == 0
+
+
 def test_given_two_histories_extended_from_one_then_neither_sees_the_other() -> None:
     root = history(0, 1)
     left = root.extended(estimate(2, -2.0))

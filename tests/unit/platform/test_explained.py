@@ -11,7 +11,7 @@ import pytest
 from support_moving import BASE, DEEP, ODOM, SCAN, T0, UTM, S, view
 
 from modelserver.joints import Joints
-from modelserver.messages import Policy, TimeQuery
+from modelserver.messages import JointSample, JointsSample, Policy, SensorHeader, TimeQuery
 from modelserver.platform import PlatformView
 from modelserver.platform.explained import explained
 from modelserver.spatial.pose import Pose
@@ -53,7 +53,7 @@ def test_given_a_laser_in_the_world_then_each_edge_says_what_it_is_between_what_
         ("vehicle", UTM, (UTM, BASE), "interpolated", "localization"),
         ("frame", "Rover:Mast", ("Rover", "Rover:Mast"), "fixed", ""),
         ("constraint", "Nod", ("Rover:Mast", "Laser:Axle"), "fixed", ""),
-        ("joint", "Nod", ("Rover:Mast", "Laser:Axle"), "interpolated", "JOINTS"),
+        ("joint", "Nod", ("Rover:Mast", "Laser:Axle"), "interpolated", "arm"),
         ("frame", SCAN, ("Laser", SCAN), "fixed", ""),
     ]
     # the newest measurement in it: the next sample after the instant, of the vehicle at 100 Hz and of joints at 50
@@ -86,9 +86,56 @@ def test_given_joints_never_heard_then_they_are_at_rest_with_no_stamp_and_no_sou
     assert (nod.kind, nod.how, nod.stamp, nod.source) == ("joint", "at_rest", 0, "")
 
 
+NOD = JointSample("Nod", 0.7)
+
+
+@pytest.mark.parametrize(
+    ("time", "now", "frame", "doubts"),
+    [
+        (BETWEEN, NOW, SCAN, {"Nod": ""}),
+        (TimeQuery(), NOW, SCAN, {"Nod": ""}),
+        (TimeQuery(), NOW + 3 * S, SCAN, {"Nod": "silent for 3.0 s"}),
+        (TimeQuery(T0 + 4 * S, Policy.HELD), NOW, SCAN, {"Nod": "silent for 2.0 s"}),
+        (TimeQuery(), T0, SCAN, {"Nod": "told of the future: the clock was set back"}),
+        (BETWEEN, NOW, DEEP, {"Slide": "", "Ball": "", "Table": ""}),
+    ],
+)
+def test_given_a_joint_that_flags_the_answer_then_its_edge_says_so_and_no_other(time, now, frame, doubts) -> None:
+    platform = replace(held(), localizer=None) if time.policy is Policy.HELD else held()
+    found = explained(platform, frame, BASE, time, now)
+    assert {each.name: each.doubt for each in found.edges if each.kind == "joint"} == doubts
+    assert bool(found.answer.transformation.invalid_reasons) == any(doubts.values())
+    assert not any(each.doubt for each in found.edges if each.kind != "joint")
+
+
+def test_given_a_joint_beyond_its_limits_or_never_heard_then_its_edge_says_so() -> None:
+    bare = Joints(held().model.joints.values(), 60.0)
+    beyond, _ = bare.taken(JointsSample(SensorHeader(T0, "laser head"), (NOD,)), T0)
+    (edge,) = (
+        each
+        for each in explained(replace(held(), joints=beyond), SCAN, BASE, TimeQuery(T0), T0).edges
+        if each.kind == "joint"
+    )
+    assert (edge.doubt, edge.source) == ("beyond its limits", "laser head")
+    found = explained(replace(held(), joints=bare), DEEP, BASE, BETWEEN, NOW).edges
+    assert {each.name: each.doubt for each in found if each.kind == "joint"} == {
+        "Slide": "never heard: at its default",
+        "Ball": "never heard, and no default is stated",
+        "Table": "never heard, and no default is stated",
+    }
+
+
+def test_given_two_tellers_of_a_joint_then_the_source_is_who_told_last() -> None:
+    joints, _ = held().joints.taken(JointsSample(SensorHeader(T0 + 2 * S + 20_000, "spare"), (NOD,)), NOW + S)
+    late, _ = joints.taken(JointsSample(SensorHeader(T0 + S + 1, "arm"), (NOD,)), NOW + S)
+    for each in (joints, late):
+        found = explained(replace(held(), joints=each), SCAN, BASE, TimeQuery(T0 + S), NOW).edges
+        assert [edge.source for edge in found if edge.kind == "joint"] == ["spare"]
+
+
 def test_given_a_follower_then_its_source_names_the_leader() -> None:
     found = explained(held(), "Finger:Tip", DEEP, BETWEEN, NOW).edges
-    assert [each.source for each in found if each.kind == "joint"] == ["JOINTS of Nod"]
+    assert [each.source for each in found if each.kind == "joint"] == ["arm of Nod"]
 
 
 def test_given_edges_that_state_no_sigma_then_their_shares_are_unknown_and_the_others_add_up() -> None:

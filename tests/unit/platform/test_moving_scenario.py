@@ -14,9 +14,13 @@ from support_moving import BASE, DEEP, ENU, ODOM, SCAN, T0, UTM, S, estimate, jo
 from modelserver.core import CoreSettings, Instant, start, step
 from modelserver.localization.interface import Localizer
 from modelserver.messages import (
+    SILENCE,
     Estimate,
     GetTransformation,
     ImuSample,
+    Invalid,
+    LocalizerSummary,
+    Mode,
     Policy,
     Quality,
     RequestHeader,
@@ -111,6 +115,12 @@ class Told:
 
     def navigation(self, utime: int) -> None:
         return None
+
+    def silence(self, utime: int) -> Invalid:
+        return self.estimate(utime).invalid & SILENCE
+
+    def summary(self, utime: int) -> LocalizerSummary:
+        return LocalizerSummary(Mode.FULL)
 
 
 def test_given_samples_through_the_core_then_replies_agree_with_truth() -> None:
