@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from modelserver.errors import ForbiddenError as ForbiddenError
     from modelserver.errors import FrameMismatchError as FrameMismatchError
     from modelserver.errors import GeometryError as GeometryError
+    from modelserver.errors import KeyFileError as KeyFileError
     from modelserver.errors import LimitError as LimitError
     from modelserver.errors import MalformedRequestError as MalformedRequestError
     from modelserver.errors import ModelServerError as ModelServerError
@@ -85,6 +86,7 @@ _HOMES = {
         "ForbiddenError",
         "FrameMismatchError",
         "GeometryError",
+        "KeyFileError",
         "LimitError",
         "MalformedRequestError",
         "ModelServerError",

@@ -190,6 +190,7 @@ class SensorsConfig:
 
     joints: where the joints are told of; heard wherever the geometry has any that move.
     aiding: further sources, each by the name that it gives itself in its messages (header.source).
+    second_writer: what is done with samples of a second writer on a channel while the first one speaks: ignore or use.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
@@ -198,6 +199,7 @@ class SensorsConfig:
     wheels: WheelsConfig | None = None
     joints: JointsConfig = field(default_factory=JointsConfig)
     aiding: dict[str, AidingConfig] = field(default_factory=dict)
+    second_writer: Literal["ignore", "use"] = "ignore"
 
     def __post_init__(self) -> None:
         for name in self.aiding:
@@ -238,8 +240,9 @@ class OriginConfig:
 class LocalizationConfig:
     """How the pose comes about.
 
-    mode: which sources are used from the start, see `modelserver.messages.Mode`. mode_channel: where wishes for another
-    mode are heard; empty: nobody can switch from the bus. raw, filter: the settings of raw mode and of the filter.
+    mode: which sources are used from the start, see `modelserver.messages.Mode`. mode_channel: what signed wishes for
+    another mode name as their channel; empty: nobody can switch from the bus. raw, filter: the settings of raw mode and
+    of the filter.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
@@ -267,6 +270,8 @@ class LimitsConfig:
     parked_requests: requests that may wait for data at once. wait_ms: the longest wait granted, milliseconds.
     queued_requests: requests held between two passes of the loop; more are refused and counted.
     requests_per_pass: requests answered before sensors are looked at again.
+    client_hz: requests a second that each client is sure of; more are answered while there is time.
+    request_share: how much of the time may go into requests before only those are answered that clients are sure of.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
@@ -275,9 +280,15 @@ class LimitsConfig:
     wait_ms: int = 2000
     queued_requests: int = 256
     requests_per_pass: int = 16
+    client_hz: float = 500.0
+    request_share: float = 0.25
 
     def __post_init__(self) -> None:
         problems = []
+        if not 1.0 <= self.client_hz <= 100_000.0:
+            problems.append(f"client_hz is between 1 and 100000, got {self.client_hz:g}")
+        if not 0.0 <= self.request_share <= 1.0:
+            problems.append(f"request_share is between 0 and 1, got {self.request_share:g}")
         if not 0.0 < self.history_s <= 600.0:
             problems.append(f"history_s is above 0 and at most 600, got {self.history_s:g}")
         for name, low, high in (
@@ -291,17 +302,88 @@ class LimitsConfig:
         _refuse(problems)
 
 
+MAKE_KEY = (
+    "only signed messages change the service; modelserver key new /etc/modelserver/commands.key makes a key, then "
+    "write key_file: /etc/modelserver/commands.key under commands"
+)
+
+
 @dataclass(frozen=True, slots=True)
 class CommandsConfig:
     """What may be asked of the service from the bus that changes what it knows. Nothing by default.
 
     reload: reading the geometry file anew. set_pose: telling localization where the vehicle is.
-    Whoever can speak on the bus can then do it.
+    key_file: the secrets that such a message must be signed with, relative to this file; see `modelserver.keys`.
+    window_s: how old a signed message may be, seconds, by the vehicle's clock.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     reload: bool = False
     set_pose: bool = False
+    key_file: str = ""
+    window_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        problems = []
+        if not 0.1 <= self.window_s <= 300.0:
+            problems.append(f"window_s is between 0.1 and 300 seconds, got {self.window_s:g}")
+        if not self.key_file:
+            problems += [f"{name} needs a key_file beside it: {MAKE_KEY}" for name in self._allowed()]
+        _refuse(problems)
+
+    def _allowed(self) -> list[str]:
+        return [name for name in ("reload", "set_pose") if getattr(self, name)]
+
+
+@dataclass(frozen=True, slots=True)
+class RestartConfig:
+    """What is kept for the next start, in state_directory, and when that start uses it.
+
+    keep: whether localization's state is kept. period_s: seconds between two writes.
+    max_age_s: the greatest age, seconds, at which kept biases and scales are used.
+    max_pose_age_s: the pose of a vehicle that stood is used where nobody watched it for no longer, seconds; 0: never.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    keep: bool = True
+    period_s: float = 5.0
+    max_age_s: float = 86400.0
+    max_pose_age_s: float = 20.0
+
+    def __post_init__(self) -> None:
+        _refuse(
+            f"{name} is between {low:g} and {high:g}, got {getattr(self, name):g}"
+            for name, low, high in (
+                ("period_s", 0.5, 600.0),
+                ("max_age_s", 0.0, 31536000.0),
+                ("max_pose_age_s", 0.0, 600.0),
+            )
+            if not low <= getattr(self, name) <= high
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class JournalConfig:
+    """The black box: everything that is handled and said, on disk; see docs/journal.md.
+
+    directory: where, relative to this file; empty: `journal-` and the vehicle's name in the state directory.
+    megabytes: what it may take, 32 at least; 0: no journal. By default 1024 under systemd or where a directory is
+        named, else none.
+    sync_s: seconds between two times that the disk is told to hold it: what a loss of power costs at most.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    directory: str = ""
+    megabytes: int | None = None
+    sync_s: float = 2.0
+
+    def __post_init__(self) -> None:
+        problems = []
+        if self.megabytes is not None and self.megabytes != 0 and not 32 <= self.megabytes <= 1_000_000:
+            problems.append(f"megabytes is 0 for no journal, or 32 to 1000000, got {self.megabytes}")
+        if not 0.2 <= self.sync_s <= 60.0:
+            problems.append(f"sync_s is between 0.2 and 60 seconds, got {self.sync_s:g}")
+        _refuse(problems)
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,7 +394,7 @@ class VehicleConfig:
     variables: values for the $NAMES in a frame-tree file. base_frame: the frame that POSE describes.
     rolling_frame: the frame that moves along its own x axis when the vehicle turns: the middle of the rear axle of one
         with steered front wheels, the middle of a skid-steered one. Empty for base_frame.
-    state_directory: where the captured origin is kept, relative to this file; empty for the user's state directory.
+    state_directory: where origin and state are kept, relative to this file; empty for the user's state directory.
     drivers: for each driver's name the kind of its device and what that kind wants to know. The service does not look
         into them; `msdrivers.settings` does.
     """
@@ -331,6 +413,8 @@ class VehicleConfig:
     localization: LocalizationConfig = field(default_factory=LocalizationConfig)
     limits: LimitsConfig = field(default_factory=LimitsConfig)
     commands: CommandsConfig = field(default_factory=CommandsConfig)
+    restart: RestartConfig = field(default_factory=RestartConfig)
+    journal: JournalConfig = field(default_factory=JournalConfig)
     drivers: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -395,6 +479,12 @@ def _with_paths(config: VehicleConfig, path: Path) -> VehicleConfig:
         config,
         geometry=absolute(config.geometry),
         state_directory=absolute(config.state_directory) if config.state_directory else "",
+        commands=dataclasses.replace(
+            config.commands, key_file=absolute(config.commands.key_file) if config.commands.key_file else ""
+        ),
+        journal=dataclasses.replace(
+            config.journal, directory=absolute(config.journal.directory) if config.journal.directory else ""
+        ),
     )
 
 

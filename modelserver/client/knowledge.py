@@ -100,6 +100,7 @@ class Knowledge:
         self._pose = f"{channel_prefix}POSE"
         self._odom = f"{channel_prefix}POSE_ODOM"
         self._model = f"{channel_prefix}MODEL_SNAPSHOT"
+        self._held = f"{channel_prefix}JOINTS_HELD"
         self._state = f"{channel_prefix}LOCALIZATION_STATE"
         self._keeping = keeping
         self._rejected: dict[tuple[str, str], int] = {}
@@ -120,7 +121,7 @@ class Knowledge:
     @property
     def channels(self) -> tuple[str, ...]:
         """The channels to listen to; that of the joints comes with the first snapshot."""
-        always = (self._model, self._pose, self._odom, self._state)
+        always = (self._model, self._held, self._pose, self._odom, self._state)
         snapshot = self.known.snapshot
         return (*always, snapshot.joints_channel) if snapshot is not None else always
 
@@ -144,6 +145,8 @@ class Knowledge:
                 self._filter_heard = now
             elif before.snapshot is not None and channel == before.snapshot.joints_channel:
                 self._take_joints(decode("joints_t", data), now, before.snapshot)
+            elif before.snapshot is not None and channel == self._held:
+                self._take_held(decode("joints_t", data), now, before.snapshot)
         except WireError as error:
             self._reject(channel, error.reason)
         return self.known is not before
@@ -314,6 +317,16 @@ class Knowledge:
         if joints is not known.joints:
             view = _view(snapshot, known.carried, known.history, joints)
             self.known = replace(known, joints=joints, view=view, joints_heard=now)
+
+    def _take_held(self, sample: JointsSample, now: int, snapshot: Snapshot) -> None:
+        """Take what the service holds of joints: told before this listened. It does not make them heard of now."""
+        known = self.known
+        if sample.header.utime > known.service_time(now) + AHEAD_US:
+            self._reject(self._held, "future")
+            return
+        joints = known.joints.recalled(sample)
+        if joints is not known.joints:
+            self.known = replace(known, joints=joints, view=_view(snapshot, known.carried, known.history, joints))
 
 
 def _view(snapshot: Snapshot, carried: Carried, history: History, joints: Joints) -> PlatformView:

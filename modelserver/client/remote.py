@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from modelserver.client import commands
 from modelserver.client.parts import Parts, stacked
+from modelserver.client.signing import Signer, signer
 from modelserver.errors import MalformedRequestError, NoServerError, Status, WireError, error_for_status
 from modelserver.messages import (
     CHANNEL_OF,
@@ -108,7 +109,9 @@ class Platform:
     It has an LCM instance of its own, so it may be used inside another instance's handler, and by several
     threads (one asks at a time). `url` is the LCM provider, by default $LCM_DEFAULT_URL, else loopback.
     `timeout` is how long one try waits for its reply, seconds; `retries` how many more tries follow.
-    `name` names this program on the bus; its reply channel is made of it.
+    `name` names this program on the bus; its reply channel is made of it. `key_file` holds the vehicle's key, by
+    default $MODELSERVER_KEY_FILE names it: only what is signed with it may change the service. It is read when it is
+    first needed.
     """
 
     def __init__(
@@ -120,6 +123,7 @@ class Platform:
         timeout: float = 1.0,
         retries: int = 2,
         name: str = "",
+        key_file: str | os.PathLike[str] = "",
     ):
         if not timeout > 0:
             raise ValueError(f"timeout is above 0 s, got {timeout}")
@@ -128,9 +132,12 @@ class Platform:
         self.url = resolve_url(url)
         self.timeout = timeout
         self.retries = retries
+        self._key_file, self._prefix = os.fspath(key_file), channel_prefix
+        self._signer: Signer | None = None
         self._channels = {kind: f"{channel_prefix}{channel}" for kind, channel in CHANNEL_OF.items()}
         # stable for a program, not random: every process on the bus keeps each channel name it ever saw
-        self.reply_channel = _reply_channel(reply_prefix, name or os.path.basename(sys.argv[0] or "python"))
+        self._name = name or os.path.basename(sys.argv[0] or "python")
+        self.reply_channel = _reply_channel(reply_prefix, self._name)
         # ids need to differ between programs, not to be unguessable
         self._ids = random.Random(secrets.randbits(128))
         self._lock = threading.Lock()
@@ -313,7 +320,8 @@ class Platform:
         """Have the service read its geometry file anew; return the file's revision and what changes, a line each.
 
         With `dry_run` nothing is changed. Raises NoServerError, ForbiddenError where the vehicle file does not allow
-        it, RejectedError where the file is wrong or does not suit the vehicle: the geometry in force stays.
+        it or the signature does not do, KeyFileError, RejectedError where the file is wrong or does not suit the
+        vehicle: the geometry in force stays.
         """
         return self._ask(ReloadModel(self._header(), dry_run), ReloadReply)
 
@@ -323,7 +331,8 @@ class Platform:
         `pose` is as `get_state_vector` returns it: of the base frame, at its `utime` (0: now), from the origin that its
         `origin_id` names (0: the service's own), as sure as its covariance says (None: 1 m and 5 degrees). It is
         weighed like a measurement of source "operator"; LOCALIZATION_DECISIONS tells what became of it. Sent once:
-        where NoServerError is raised it may have been taken all the same. Raises ForbiddenError, RejectedError.
+        where NoServerError is raised it may have been taken all the same. Raises ForbiddenError, KeyFileError,
+        RejectedError.
         """
         self._ask(commands.pose_to_set(self._header(), pose, as_vector=True), Acknowledgement)
 
@@ -347,9 +356,14 @@ class Platform:
             raise _unwritable(error, getattr(getattr(request, "time", None), "at", 0)) from error
         channel = self._channels[type(request)]
         patience, tries = self.timeout + wait_ms * 1e-3, 1 + self.retries
+        wanted = data[_ID]
         if isinstance(request, commands.COMMANDS):
             patience, tries = patience * tries, 1
-        return _opened(self._exchange(channel, data, patience, whole, tries), reply_kind)
+            self._signer = self._signer or signer(self._key_file, self._prefix, self._name)
+            # without a key it goes out as it is: the service says that it must be signed, and how
+            if self._signer is not None:
+                channel, data = self._signer.channel, self._signer.sealed(CHANNEL_OF[type(request)], data)
+        return _opened(self._exchange(channel, data, patience, whole, tries, wanted), reply_kind)
 
     def _exchange(
         self,
@@ -358,13 +372,15 @@ class Platform:
         patience: float,
         whole: Callable[[bytes], bool] | None = None,
         tries: int = 0,
+        wanted: bytes = b"",
     ) -> bytes:
         """Send a request until its reply comes, or `whole` says so of its parts; `tries` times, 0: as `retries` says.
 
+        `wanted` is the id of the reply, by default the one that the request begins with.
         Asking twice does no harm: questions change nothing.
         """
         tries = tries or 1 + self.retries
-        wanted = request[_ID]
+        wanted = wanted or request[_ID]
         fresh = self._fresh
         with self._lock:
             bus = self._lcm

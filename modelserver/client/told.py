@@ -13,9 +13,12 @@ from modelserver.geodesy import Geodesy, GeodesyError
 from modelserver.history import Later
 from modelserver.messages import (
     NAN,
+    SILENCE,
     VALID,
     Estimate,
     Invalid,
+    LocalizerSummary,
+    Mode,
     NavigationState,
     Origin,
     PoseAnswer,
@@ -196,6 +199,18 @@ class Carried:
     def navigation(self, utime: int) -> NavigationState | None:
         """Return None: there is no filter here."""
         return None
+
+    def silence(self, utime: int) -> Invalid:
+        """Return what of SILENCE speaks against an estimate at `utime`."""
+        if self.last is None:
+            return VALID
+        last = self.last if isinstance(self.last, Estimate) else self.last.resolved()
+        missed = (utime - last.utime) * 1e-6 > self._patience
+        return SILENCE if missed else last.invalid & SILENCE
+
+    def summary(self, utime: int) -> LocalizerSummary:
+        """Return nothing that is known: the service's own health tells how its localization is."""
+        return LocalizerSummary(Mode.FULL)
 
 
 def _carried(last: Estimate, utime: int, ahead: float, missed: bool) -> Estimate:

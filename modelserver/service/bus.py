@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import select
+import time
 from collections.abc import Callable
-from typing import Protocol, TypeAlias
+from typing import Final, Protocol, TypeAlias
 
+from modelserver.service.membership import RENEW_S, Membership
 from modelserver.wire.channels import literal
 from modelserver.wire.provider import open_lcm, resolve_url
+
+UNREAD: Final = 50_000
+"""Messages of a channel that LCM holds until they are taken; at 10,000 a second that is five seconds' worth."""
 
 Handler: TypeAlias = Callable[[str, bytes], None]
 
@@ -41,8 +46,8 @@ class Bus(Protocol):
         """Send a message to everyone."""
         ...
 
-    def wait(self, seconds: float) -> None:
-        """Return when something has come or the time is up."""
+    def wait(self, seconds: float, requests: bool = True) -> None:
+        """Return when something has come or the time is up; without `requests` only samples count."""
         ...
 
 
@@ -58,8 +63,9 @@ class LcmInbox:
     def subscribe(self, channel: str, handler: Handler) -> None:
         """Hand every message of exactly `channel` to `handler`."""
         subscription = self.lcm.subscribe(literal(channel), handler)
-        # 0 is no limit: LCM would drop silently, the loop refuses and counts
-        subscription.set_queue_capacity(0)
+        # LCM drops silently what comes beyond it, so the loop refuses and counts long before; a flood that is faster
+        # than the loop can refuse must not fill the memory
+        subscription.set_queue_capacity(UNREAD)
 
     def drain(self, limit: int) -> int:
         """Hand over what has come, at most `limit` messages, without waiting; return how many."""
@@ -84,9 +90,18 @@ class LcmBus:
         for inbox in (self.sensors, self.requests):
             self._poll.register(inbox.fileno, select.POLLIN)
         self.publish = self.requests.lcm.publish
+        self._membership = Membership(self.url)
+        self._renew_at = time.monotonic() + RENEW_S
 
-    def wait(self, seconds: float) -> None:
-        """Return when something has come or the time is up."""
+    def wait(self, seconds: float, requests: bool = True) -> None:
+        """Return when something has come or the time is up; without `requests` only samples count."""
+        if time.monotonic() >= self._renew_at:
+            self._renew_at = time.monotonic() + RENEW_S
+            self._membership.renew()
+        if not requests:
+            readable, _, _ = select.select((self.sensors.fileno,), (), (), max(0.0, seconds))
+            self.sensors.may_have = bool(readable)
+            return
         # poll is the cheaper call but counts in milliseconds; select keeps the deadline to the microsecond
         milliseconds = int(seconds * 1e3)
         ready = self._poll.poll(milliseconds)

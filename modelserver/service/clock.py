@@ -23,6 +23,10 @@ class Clock(Protocol):
         """Return both times: monotonic, and microseconds since the Unix epoch."""
         ...
 
+    def sleep(self, seconds: float) -> None:
+        """Let so much time pass."""
+        ...
+
 
 class SystemClock:
     """The host's clocks."""
@@ -38,6 +42,10 @@ class SystemClock:
     def now(self) -> Instant:
         """Return both times."""
         return Instant(time.monotonic_ns(), time.time_ns() // 1000)
+
+    def sleep(self, seconds: float) -> None:
+        """Let so much time pass."""
+        time.sleep(seconds)
 
 
 class FakeClock:
@@ -63,6 +71,10 @@ class FakeClock:
         """Let time pass."""
         self._monotonic_ns += round(seconds * 1e9)
         self._utime_ns += round(seconds * 1e9)
+
+    def sleep(self, seconds: float) -> None:
+        """Let so much time pass."""
+        self.advance(seconds)
 
     def step_utime(self, seconds: float) -> None:
         """Step the time of day, as an administrator or a time server does; monotonic time does not notice."""

@@ -5,27 +5,56 @@ from __future__ import annotations
 import gc
 import logging
 import math
+import os
 import signal
+import socket
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from modelserver import core
-from modelserver.config import VehicleConfig, with_lines
-from modelserver.core import CoreSettings, CoreState, Instant
-from modelserver.errors import ConfigError, GeometryError, Problem, QueryError, Severity, Source, shown
+from modelserver.config import MAKE_KEY, GpsConfig, JointsConfig, SensorConfig, VehicleConfig, WheelsConfig, with_lines
+from modelserver.core import CoreSettings, CoreState, Expected, Instant
+from modelserver.errors import ConfigError, GeometryError, KeyFileError, Problem, QueryError, Severity, Source, shown
 from modelserver.formats import load_model
 from modelserver.geodesy import GeodesyError, make_origin
 from modelserver.geometry import Model
+from modelserver.keys import read_keys
 from modelserver.localization.mounts import Mounts
 from modelserver.localization.rig import Rig
-from modelserver.messages import LoadModel, Mode, Origin, OriginLatched, SwitchMode
+from modelserver.messages import (
+    AbsolutePoseSample,
+    GpsSample,
+    ImuSample,
+    JointsSample,
+    LoadModel,
+    Mode,
+    Origin,
+    OriginLatched,
+    RangeSample,
+    Recalled,
+    RelativePoseSample,
+    Sample,
+    SwitchMode,
+    WheelsSample,
+)
 from modelserver.reload import ModelLoaded
 from modelserver.service.bus import LcmBus
+from modelserver.service.bus_probe import probe, tell
 from modelserver.service.clock import SystemClock
+from modelserver.service.gate import Gate
+from modelserver.service.gauges import read_gauges
 from modelserver.service.heard import Heard
+from modelserver.service.hooks import Hooks
+from modelserver.service.journal import NoJournal
+from modelserver.service.journal_place import make_writer
 from modelserver.service.keep import OriginKeeper, default_directory
 from modelserver.service.loop import Loop, LoopSettings
+from modelserver.service.notify import Notifier
+from modelserver.service.restart import StateKeeper
+from modelserver.service.rivals import Rivals
+from modelserver.service.supervised import Supervision
 from modelserver.snapshot import Snapshot, written
 from modelserver.version import __version__
 from modelserver.wire.channels import CHANNELS, Way
@@ -42,6 +71,13 @@ HOUSEKEEPING_HZ = 50.0
 MODE_CHANNEL = "LOCALIZATION_MODE"
 """The customary channel for wishes about localization's mode."""
 
+AIDING_SAMPLES: Mapping[str, type[Sample]] = {
+    "absolute_pose": AbsolutePoseSample,
+    "relative_pose": RelativePoseSample,
+    "range": RangeSample,
+}
+"""What a further source's messages become, by the type that the vehicle file gives it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
@@ -55,16 +91,23 @@ class Vehicle:
     mounts: Mounts | None
     rig: Rig | None = None
 
-    def core(self, now: Instant, origin: Origin | None = None) -> CoreState:
-        """Return the core's first state; `origin` is one kept from an earlier run, a configured one goes first."""
+    def core(self, now: Instant, origin: Origin | None = None, recalled: Recalled | None = None) -> CoreState:
+        """Return the core's first state; `origin` is one kept from an earlier run, a configured one goes first.
+
+        `recalled` is what else is known of the run before; None: nothing is, and nothing is said about it.
+        """
         config = self.config
         localizer = None
+        said = ""
         makings = self.makings()
         if makings is not None:
+            from modelserver.localization.filter.keeping import opened
             from modelserver.localization.modes import ModeLocalizer
 
             origin = configured_origin(config) or origin
-            localizer = ModeLocalizer.start(makings, config.localization.first_mode, origin)
+            mode = config.localization.first_mode
+            recalled, said = opened(recalled, config.vehicle, makings.setup, mode)
+            localizer = ModeLocalizer.start(makings, mode, origin, recalled)
         settings = CoreSettings(
             base_frame=config.base_frame,
             rolling_frame=config.rolling_frame,
@@ -81,8 +124,11 @@ class Vehicle:
             snapshot_period_ns=round(config.publish.snapshot_s * 1e9),
             may_reload=config.commands.reload,
             may_set_pose=config.commands.set_pose,
+            keep_period_ns=round(config.restart.period_s * 1e9) if config.restart.keep else 0,
+            sensors=self.expected(),
         )
-        return core.start(settings, self.model, localizer, now)
+        state = core.start(settings, self.model, localizer, now)
+        return state._replace(notices={core.START: said}) if said else state
 
     def makings(self) -> Makings | None:
         """Return what the localizers are made of, None for a vehicle without a sensor to localize by."""
@@ -92,6 +138,17 @@ class Vehicle:
         from modelserver.localization.modes import Makings
 
         return Makings(Setup(self.rig, self.config.localization.filter), self.config.localization.raw, self.mounts)
+
+    def gate(self, started_ns: int, file: str = "") -> Gate:
+        """Return what opens signed commands. Raises ConfigError where the key file cannot be used."""
+        config = self.config
+        try:
+            keys = read_keys(config.commands.key_file) if config.commands.key_file else ()
+        except KeyFileError as error:
+            problem = Problem(Severity.ERROR, str(error), Source(file, element="commands.key_file"))
+            raise ConfigError(with_lines([problem], file)) from None
+        mode_channel = config.localization.mode_channel
+        return Gate(keys, config.lcm.channel_prefix, config.commands.window_s, mode_channel, started_ns)
 
     def snapshot(self, state: CoreState) -> bytes:
         """Return the bytes of the snapshot of the model in force."""
@@ -146,6 +203,23 @@ class Vehicle:
         """Return how many ticks there are to a report of the filter's state, 0 where none is wanted."""
         state_hz = self.config.publish.state_hz
         return max(1, round(self.tick_hz() / state_hz)) if state_hz else 0
+
+    def expected(self) -> tuple[Expected, ...]:
+        """Return the sensors that the vehicle file names, with the channels they are to be heard on."""
+        prefix, sensors = self.config.lcm.channel_prefix, self.config.sensors
+        named: list[tuple[GpsConfig | SensorConfig | WheelsConfig | JointsConfig | None, type[Sample]]] = [
+            (sensors.gps, GpsSample),
+            (sensors.imu, ImuSample),
+            (sensors.wheels, WheelsSample),
+            (sensors.joints, JointsSample),
+        ]
+        return (
+            *(Expected(f"{prefix}{each.channel}", kind) for each, kind in named if each is not None),
+            *(
+                Expected(f"{prefix}{each.channel}", AIDING_SAMPLES[each.type], name)
+                for name, each in sensors.aiding.items()
+            ),
+        )
 
     def sensor_channels(self, model: Model | None = None) -> dict[str, Heard]:
         """Return what is heard on each channel that localization listens to, with the prefix.
@@ -215,6 +289,9 @@ def load_vehicle(config: VehicleConfig, file: str = "", strict: bool = False) ->
         why = "raw mode takes a GPS and an IMU, and sensors does not name both"
         problems.append(Problem(Severity.ERROR, why, Source(file, element="localization.mode"), "write mode: full"))
     problems += _channel_problems(config, file)
+    if config.localization.mode_channel and not config.commands.key_file:
+        why = f"wishes about the mode are heard signed alone: {MAKE_KEY}"
+        problems.append(Problem(Severity.ERROR, why, Source(file, element="localization.mode_channel")))
     try:
         configured_origin(config)
     except GeodesyError as error:
@@ -326,47 +403,68 @@ def _mode(state: CoreState) -> Mode | None:
     return active.mode if isinstance(active, FilterLocalizer) else Mode.RAW
 
 
-def run(vehicle: Vehicle, url: str = "", file: str = "") -> None:
+def run(vehicle: Vehicle, url: str = "", file: str = "", notifier: Notifier | None = None) -> None:
     """Serve a vehicle until SIGTERM or SIGINT; SIGHUP has its geometry read anew. `file` is the vehicle file.
 
-    Raises BusError where the bus cannot be joined.
+    `notifier` tells a service manager. Raises BusError where the bus cannot be joined, or does not deliver.
     """
     config = vehicle.config
     clock = SystemClock()
+    notifier = notifier or Notifier.of_environment()
+    notifier.starting("joining the bus")
+    directory = Path(config.state_directory) if config.state_directory else default_directory()
+    if directory is None:
+        log.warning("there is no home directory, so nothing is kept for a restart; set state_directory in vehicle file")
     keeper = None
-    if config.origin.keep and config.origin.initial_utm is None:
-        directory = Path(config.state_directory) if config.state_directory else default_directory()
-        if directory is None:
-            log.warning(
-                "there is no home directory, so the origin is not kept; set state_directory in the vehicle file"
-            )
-        else:
-            keeper = OriginKeeper(directory, config.vehicle)
+    if directory is not None and config.origin.keep and config.origin.initial_utm is None:
+        keeper = OriginKeeper(directory, config.vehicle)
     origin = keeper.load() if keeper else None
+    states, recalled, restart = None, None, config.restart
+    if directory is not None and restart.keep and vehicle.rig is not None:
+        states = StateKeeper(directory, config.vehicle)
+        recalled = states.recall(clock.now(), restart.max_pose_age_s, restart.max_age_s)
 
     def keep(note: OriginLatched) -> None:
         if keeper is not None:
             keeper.save(note.origin)
 
+    gate = vehicle.gate(clock.monotonic_ns(), file)
     bus = LcmBus(resolve_url(url or config.lcm.url))
+    notifier.starting("probing the bus")
+    findings = probe(bus.url)
     settings = LoopSettings(
         period_ns=round(1e9 / vehicle.tick_hz()),
         sensors=vehicle.sensor_channels(),
         channel_prefix=config.lcm.channel_prefix,
         queued_requests=config.limits.queued_requests,
         requests_per_pass=config.limits.requests_per_pass,
+        client_hz=config.limits.client_hz,
+        request_share=config.limits.request_share,
+        second_writer=config.sensors.second_writer,
+        shared=frozenset({f"{config.lcm.channel_prefix}{config.sensors.joints.channel}"}),
     )
+    supervision = Supervision(notifier, clock, lambda channel: loop.hears(channel))
+    journal = make_writer(config, file, clock)
     loop = Loop(
         bus,
         clock,
-        vehicle.core(clock.now(), origin),
+        vehicle.core(clock.now(), origin, recalled),
         settings,
-        keep,
-        log_wish,
-        lambda wish, state: vehicle.reloaded(wish, state, file),
-        vehicle.snapshot,
-        lambda state: vehicle.sensor_channels(state.model),
+        Hooks(
+            on_origin=keep,
+            on_wish=log_wish,
+            on_load=supervision.loading(lambda wish, state: vehicle.reloaded(wish, state, file)),
+            snapshot=vehicle.snapshot,
+            channels=lambda state: vehicle.sensor_channels(state.model),
+            on_keep=states.keep if states is not None else lambda kept: "",
+            gauges=read_gauges,
+            on_tick=supervision.ticked,
+            gate=gate,
+            journal=NoJournal() if journal is None else journal[0],
+        ),
     )
+    tell(findings, loop.notice)
+    Rivals(socket.gethostname(), os.getpid(), loop.notice, clock).watch(bus.requests, config.lcm.channel_prefix)
     signal.signal(signal.SIGHUP, lambda *_: loop.reload())
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: loop.stop())
@@ -388,8 +486,19 @@ def run(vehicle: Vehicle, url: str = "", file: str = "") -> None:
             origin.zone,
             "N" if origin.north else "S",
         )
+    if loop.state.notices:
+        log.info("%s", "; ".join(loop.state.notices.values()))
     # what is loaded lives as long as the process: the collector need not look at it again
     gc.collect()
     gc.freeze()
-    loop.run()
+    if journal is not None:
+        journal[1].start()
+    try:
+        with supervision.ending():
+            loop.run()
+    finally:
+        if states is not None:
+            states.close(core.kept(loop.state, clock.now()))
+        if journal is not None:
+            journal[1].close()
     log.info("ended")

@@ -55,9 +55,9 @@ class FakeBus:
         self.sensors.put(channel, data)
         self.requests.put(channel, data)
 
-    def wait(self, seconds: float) -> None:
+    def wait(self, seconds: float, requests: bool = True) -> None:
         """Let the clock run on where nothing is pending."""
-        if not (self.sensors.pending or self.requests.pending):
+        if not (self.sensors.pending or (requests and self.requests.pending)):
             self._clock.advance(max(seconds, 0.0))
 
     def said(self, channel: str) -> list[bytes]:

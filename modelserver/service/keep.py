@@ -1,4 +1,4 @@
-"""What the daemon keeps across restarts: the captured origin. Written whole or not at all."""
+"""Files that the daemon keeps across restarts, written whole or not at all; and the one with the captured origin."""
 
 from __future__ import annotations
 
@@ -37,12 +37,43 @@ def default_directory() -> Path | None:
     return Path(base) / "modelserver"
 
 
+def safe(vehicle: str) -> str:
+    """Return a vehicle's name as part of the name of a file."""
+    return "".join(character if character.isalnum() or character in "-_" else "_" for character in vehicle)
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all: a power cut leaves the old one or the new one. Raises OSError.
+
+    Directories that are not there are made. What was written is on the disk when this returns, and takes as long.
+    """
+    fresh: Path | None = None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        # a temporary file, synced and renamed; the directory is synced too, or the new name may be lost
+        with tempfile.NamedTemporaryFile("wb", dir=path.parent, prefix=path.name, delete=False) as file:
+            fresh = Path(file.name)
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        fresh.replace(path)
+    except OSError:
+        if fresh is not None:
+            with contextlib.suppress(OSError):
+                fresh.unlink()
+        raise
+    directory = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(directory)
+    finally:
+        os.close(directory)
+
+
 class OriginKeeper:
     """Keeps the origin of one vehicle in a file."""
 
     def __init__(self, directory: Path, vehicle: str):
-        safe = "".join(character if character.isalnum() or character in "-_" else "_" for character in vehicle)
-        self.path = directory / f"origin-{safe}.json"
+        self.path = directory / f"origin-{safe(vehicle)}.json"
 
     def load(self) -> Origin | None:
         """Return the kept origin; None where there is none or the file is damaged, which is logged."""
@@ -63,23 +94,10 @@ class OriginKeeper:
     def save(self, origin: Origin) -> None:
         """Keep an origin. A disk that refuses is logged: the daemon goes on, a restart captures anew."""
         content = json.dumps({"version": VERSION, **dataclasses.asdict(origin)}, indent=1)
-        fresh: Path | None = None
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            # a temporary file, synced and renamed: a power cut leaves the old file or the new one
-            with tempfile.NamedTemporaryFile(
-                "w", encoding="utf-8", dir=self.path.parent, prefix=self.path.name, delete=False
-            ) as file:
-                fresh = Path(file.name)
-                file.write(content + "\n")
-                file.flush()
-                os.fsync(file.fileno())
-            fresh.replace(self.path)
+            write_whole(self.path, (content + "\n").encode())
         except OSError as error:
             log.warning("the origin cannot be kept in %s: %s; a restart will capture a new one", self.path, error)
-            if fresh is not None:
-                with contextlib.suppress(OSError):
-                    fresh.unlink()
 
 
 def _origin(content: dict[str, Any]) -> Origin:

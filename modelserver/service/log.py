@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import logging
 import traceback
+from typing import TYPE_CHECKING, Final
 
-from modelserver.service.clock import Clock
+if TYPE_CHECKING:
+    from modelserver.service.clock import Clock
 
 PERIOD_S = 5.0
 MAX_CAUSES = 256
+
+CAUSE: Final = "cause"
+"""Attribute of a log record: what the line is about, e.g. GPS:malformed; the journal's field MODELSERVER_CAUSE."""
 
 
 class RateLimited:
@@ -43,9 +48,16 @@ class RateLimited:
         if trace:
             # indented, so that nothing in it can pass for a line of its own
             text += "".join(f"\n    {plain(line)}" for line in traceback.format_exc().splitlines())
-        self._logger.log(level, "%s", text)
+        self._logger.log(level, "%s", text, extra={CAUSE: cause}, stacklevel=3)
+
+
+def plain_lines(text: str) -> str:
+    """Return text of several lines with each plain, indented after the first: none passes for a line of its own."""
+    return "\n    ".join(plain(line) for line in text.splitlines())
 
 
 def plain(text: str) -> str:
     """Return `text` with everything escaped that a terminal or a log reader would take for more than text."""
+    if text.isprintable():
+        return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

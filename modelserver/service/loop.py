@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import logging
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from modelserver import core
 from modelserver.core import CoreState, Instant
 from modelserver.errors import WireError
 from modelserver.geometry import names
 from modelserver.messages import (
-    CHANNEL_OF,
+    Commanded,
     Event,
-    GetHistory,
-    GetTransformations,
+    KeepState,
     LoadModel,
+    Noticed,
     OriginLatched,
     Output,
     PublishDecisions,
@@ -26,36 +26,40 @@ from modelserver.messages import (
     PublishPose,
     PublishSnapshot,
     Rejected,
-    Request,
     SendReply,
+    StartTold,
     SwitchMode,
     Tick,
 )
 from modelserver.reload import ModelLoaded
+from modelserver.service.ahead import Lead
 from modelserver.service.bus import Bus
 from modelserver.service.clock import Clock
+from modelserver.service.desk import DeskLimits
 from modelserver.service.heard import Heard
-from modelserver.service.log import RateLimited
+from modelserver.service.hooks import Hooks
+from modelserver.service.log import RateLimited, plain, plain_lines
+from modelserver.service.reception import Reception
 from modelserver.service.snapshots import SnapshotWriter
-from modelserver.wire.channels import BY_NAME, REQUESTS
-from modelserver.wire.codec import decode, encode
+from modelserver.service.watch import Watch
+from modelserver.wire.codec import encode
+from modelserver.wire.journal import Kind
 from modelserver.wire.navigation import MAX_DECISIONS
-from modelserver.wire.requests import request_header
-from modelserver.wire.timeless import TIMELESS_TYPE, TimelessReplies
 
 log = logging.getLogger(__name__)
 
 SENSORS_PER_PASS = 100
 """Samples taken before the clock is looked at again: a flood of samples must not stop the ticks."""
 
-PAIR = 4
-INSTANTS_FOR_ONE = 25
-POSES_OF_HISTORY = 8
-"""What a question for many instants takes of a pass's budget of requests: so many for each pair, and one for each so
-many instants of it; and what one for a stretch of history takes."""
 
-REFUSALS_PER_PASS = 64
-"""Refusals that are answered in one pass; further ones are only counted."""
+NO_NETWORK = frozenset({errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENODEV, errno.ENOBUFS})
+"""What sending fails with while the network is away: no error of the service's own."""
+
+FLOOD_PAUSE_S = 0.002
+"""How long requests wait for the next pass while too many come, at most, seconds."""
+
+
+_NO_HOOKS = Hooks()
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +67,8 @@ class LoopSettings:
     """How the loop runs.
 
     period_ns: between ticks. sensors: for each channel that is heard, what it carries.
-    channel_prefix, queued_requests, requests_per_pass: see `modelserver.config`.
+    channel_prefix, queued_requests, requests_per_pass, client_hz, request_share: see `modelserver.config`.
+    second_writer: see `modelserver.config`; empty: nobody looks. shared: channels that several may write on.
     """
 
     period_ns: int
@@ -71,59 +76,48 @@ class LoopSettings:
     channel_prefix: str = ""
     queued_requests: int = 256
     requests_per_pass: int = 16
+    client_hz: float = 500.0
+    request_share: float = 0.25
+    second_writer: Literal["", "ignore", "use"] = ""
+    shared: frozenset[str] = frozenset()
 
 
 class Loop:
-    """Serves one core on one bus. `run` returns when it is told to `stop`.
+    """Serves one core on one bus. `run` returns when it is told to `stop`."""
 
-    `on_origin` is told of an origin that was captured, `on_wish` of a wish for a mode and the states around it.
-    `on_load` reads the geometry anew, `snapshot` gives its bytes for the bus, and `channels` which sensors are heard
-    once another is in force: joints, where it has any.
-    """
-
-    def __init__(
-        self,
-        bus: Bus,
-        clock: Clock,
-        state: CoreState,
-        settings: LoopSettings,
-        on_origin: Callable[[OriginLatched], None] = lambda note: None,
-        on_wish: Callable[[SwitchMode, CoreState, CoreState], None] = lambda wish, before, after: None,
-        on_load: Callable[[LoadModel, CoreState], ModelLoaded] = lambda wish, state: ModelLoaded(
-            wish.request, why="this service has no file to read its geometry from"
-        ),
-        snapshot: Callable[[CoreState], bytes] = lambda state: b"",
-        channels: Callable[[CoreState], Mapping[str, Heard]] = lambda state: {},
-    ):
+    def __init__(self, bus: Bus, clock: Clock, state: CoreState, settings: LoopSettings, hooks: Hooks = _NO_HOOKS):
         self.state = state
         self._bus = bus
         self._clock = clock
         self._settings = settings
-        self._on_origin = on_origin
-        self._on_wish = on_wish
-        self._on_load = on_load
-        self._snapshot = SnapshotWriter(snapshot)
-        self._channels = channels
+        self._on_origin = hooks.on_origin
+        self._on_wish = hooks.on_wish
+        self._on_load = hooks.on_load
+        self._snapshot = SnapshotWriter(hooks.snapshot)
+        self._channels = hooks.channels
+        self._on_keep = hooks.on_keep
+        self._on_tick = hooks.on_tick
+        self._journal = hooks.journal
         self._hearing: set[str] = set()
         self._reloading = False
+        self._gauges = hooks.gauges
         self._log = RateLimited(log, clock)
-        self._queue: deque[tuple[str, str, bytes]] = deque()
-        self._refusals_left = REFUSALS_PER_PASS
-        self._budget = 0
-        self._timeless = TimelessReplies()
-        self._answered = 0  # from `_timeless`, since the last tick
+        self._gate = hooks.gate
         self._told: set[tuple[str, str]] = set()
-        self._asked = b""  # the request that the core is answering
         self._due_ns = clock.monotonic_ns()
+        self._lead = Lead()
+        self._hold_ns = 0  # the deadline that the tick's pose waits for
+        self._late_ns = 0  # of the last pose that a tick published
         self._stopping = False
         prefix = settings.channel_prefix
         self._pose, self._pose_vector = f"{prefix}POSE", f"{prefix}POSE_VECTOR"
         self._odom, self._health = f"{prefix}POSE_ODOM", f"{prefix}MODELSERVER_HEALTH"
-        self._model = f"{prefix}MODEL_SNAPSHOT"
+        self._model, self._held = f"{prefix}MODEL_SNAPSHOT", f"{prefix}JOINTS_HELD"
         self._decisions, self._state = f"{prefix}LOCALIZATION_DECISIONS", f"{prefix}LOCALIZATION_STATE"
+        self._watch = Watch(self.step, self._log, settings.second_writer, settings.shared)
         self._hear(settings.sensors)
-        for request in REQUESTS:
-            bus.requests.subscribe(f"{prefix}{request.name}", self._request_handler(request.type_name))
+        limits = DeskLimits(settings.queued_requests, settings.client_hz, settings.request_share)
+        self._reception = Reception(self, bus, clock, self._log, prefix, limits, settings.requests_per_pass, hooks.gate)
 
     def run(self) -> None:
         """Serve until `stop` is called."""
@@ -134,175 +128,229 @@ class Loop:
         """Make `run` return after the pass that is under way. May be called from a signal handler."""
         self._stopping = True
 
+    def hears(self, channel: str) -> bool:
+        """Return whether a channel is one of samples."""
+        return channel in self._hearing
+
     def reload(self) -> None:
         """Have the geometry read anew in the next pass. May be called from a signal handler."""
         self._reloading = True
 
+    def notice(self, subject: str, text: str = "") -> None:
+        """Have the health report tell something of the service itself; an empty text takes it back."""
+        self.step(Noticed(subject, text), self._clock.now())
+
     def turn(self) -> None:
         """Make one pass: sensors, the tick when it is due, requests within their budget, then wait."""
+        if self._journal.wants_state:
+            self._journal.begin(self.state, self._clock.now())
         if self._reloading:
             self._reloading = False
-            self._send((LoadModel(),))
+            self.send((LoadModel(),))
         busy = self._bus.sensors.drain(SENSORS_PER_PASS) == SENSORS_PER_PASS
         self._tick_if_due()
-        self._refusals_left = REFUSALS_PER_PASS
-        self._budget = self._settings.requests_per_pass
-        while self._queue and self._budget:
-            self._budget -= 1
-            self._answer(*self._queue.popleft())
-        self._bus.requests.drain(self._settings.queued_requests)
-        if not busy and not self._queue and not self._stopping:
-            self._bus.wait(max(0.0, (self._due_ns - self._clock.monotonic_ns()) * 1e-9))
+        begin_ns = self._due_ns - self._lead.ns
+        self._reception.serve(begin_ns)
+        if not busy and not self._reception.pressing and not self._stopping:
+            seconds = max(0.0, (begin_ns - self._clock.monotonic_ns()) * 1e-9)
+            if self._reception.flooded:
+                # waking for each request of a flood would be most of the work
+                self._bus.wait(min(seconds, FLOOD_PAUSE_S), requests=False)
+            else:
+                self._bus.wait(seconds)
 
     def _tick_if_due(self) -> None:
-        late_ns = self._clock.monotonic_ns() - self._due_ns
-        if late_ns < 0:
+        now = self._clock.now()
+        due = self._due_ns
+        ahead = due - now.monotonic_ns
+        if ahead > self._lead.ns:
             return
         # a tick that was missed is skipped and counted: catching up would burst old poses
-        missed = late_ns // self._settings.period_ns
+        missed = max(-ahead, 0) // self._settings.period_ns
         self._due_ns += (missed + 1) * self._settings.period_ns
-        answered, self._answered = self._answered, 0
+        late_ns = -ahead
+        if ahead > 0:
+            # what it says holds for the deadline, at which it is published; how late that was the next tick tells
+            now, late_ns = Instant(due, now.utime + ahead // 1000), self._late_ns
+        self._watch.look(now)
+        self._hold_ns = due
         try:
-            self._step(Tick(late_ns * 1e-9, missed, answered), self._clock.now())
+            # gauges are read where they will be told
+            gauges = self._gauges(self._reception.waiting) if now.monotonic_ns >= self.state.health_due_ns else None
+            self.step(Tick(late_ns * 1e-9, missed, self._reception.taken_answered(), gauges), now)
+            self._on_tick(self.state)
         except Exception as error:
-            self._failed("tick", error)
+            self.failed("tick", error)
+        if self._hold_ns and ahead > 0:
+            # nothing was published; what is handled next comes after it all the same
+            self._clock.sleep(max(0, due - self._clock.monotonic_ns()) * 1e-9)
+        self._hold_ns = 0
+        for notice in self._journal.news():
+            self.step(notice, self._clock.now())
+
+    def _hold(self) -> None:
+        """Wait for the deadline of the tick under way; learn from when all was ready how early to begin the next."""
+        due, self._hold_ns = self._hold_ns, 0
+        if not due:
+            return
+        ready = self._clock.monotonic_ns()
+        self._lead.learn(ready - (due - self._lead.ns))
+        if ready < due:
+            self._clock.sleep((due - ready) * 1e-9)
+            ready = self._clock.monotonic_ns()
+        self._late_ns = ready - due
+
+    @property
+    def requests_waiting(self) -> int:
+        """Requests that wait to be answered."""
+        return self._reception.waiting
+
+    def obey(self, command: Commanded, now: Instant) -> None:
+        """Have a signed command obeyed."""
+        before = self.state
+        self.step(command, now)
+        if isinstance(command.order, SwitchMode):
+            self._on_wish(command.order, before, self.state)
 
     def _hear(self, channels: Mapping[str, Heard]) -> None:
         for channel, heard in channels.items():
             if channel not in self._hearing:
                 self._hearing.add(channel)
-                self._bus.sensors.subscribe(channel, self._sensor_handler(heard))
+                self._bus.sensors.subscribe(channel, self._sensor_handler(channel, heard))
 
-    def _sensor_handler(self, heard: Heard) -> Callable[[str, bytes], None]:
+    def _sensor_handler(self, own: str, heard: Heard) -> Callable[[str, bytes], None]:
+        writer = self._watch.writer(own)
+
         def handle(channel: str, data: bytes) -> None:
             try:
-                event, before = heard.read(data), self.state
-                self._step(event, self._clock.now())
+                event, now = heard.read(data), self._clock.now()
                 if isinstance(event, SwitchMode):
-                    self._on_wish(event, before, self.state)
-            except Exception as error:
-                self._failed(channel, error)
-
-        return handle
-
-    def _request_handler(self, type_name: str) -> Callable[[str, bytes], None]:
-        def handle(channel: str, data: bytes) -> None:
-            if self._budget and not self._queue:
-                self._budget -= 1
-                self._answer(channel, type_name, data)
-            elif len(self._queue) < self._settings.queued_requests:
-                self._queue.append((channel, type_name, data))
-            else:
-                self._refuse(channel, type_name, data)
-
-        return handle
-
-    def _refuse(self, channel: str, type_name: str, data: bytes) -> None:
-        now = self._clock.now()
-        self._step(Rejected(channel, "load"), now)
-        if self._refusals_left > 0:
-            self._refusals_left -= 1
-            try:
-                request = decode(type_name, data)
-            except Exception:
-                return  # counted already: as refused
-            self._send(core.refuse(self.state, request, now))
-
-    def _answer(self, channel: str, type_name: str, data: bytes) -> None:
-        """Answer a request, also one that makes no sense or that an error keeps from being answered."""
-        try:
-            if type_name == TIMELESS_TYPE:
-                remembered = self._timeless.find(data, self._clock.utime(), self.state.view.model)
-                if remembered is not None:
-                    self._bus.publish(*remembered)
-                    self._answered += 1
+                    self._wished(channel, event, now)
                     return
-            request = decode(type_name, data)
-        except Exception as error:
-            self._failed(channel, error)
-            header = request_header(data) if isinstance(error, WireError) and error.reason == "malformed" else None
-            if header is not None:
-                kind = _REQUEST_KINDS[type_name]
-                self._send(core.turn_back(self.state, kind, header, str(error), self._clock.now()))
-            return
-        self._asked = data
-        # one that asks for much leaves less of the pass for others: the next tick must not wait for them all
-        self._budget = max(0, self._budget - effort(request))
-        now = self._clock.now()
-        try:
-            self._step(request, now)
-        except Exception as error:
-            self._failed(channel, error)
-            self._send(core.fail(self.state, request, now))
-        self._asked = b""
+                if writer is None:
+                    ignored = self._watch.refuses(channel, event.header, now)
+                else:
+                    ignored = writer.is_second(event.header, now.monotonic_ns) and self._watch.told(
+                        channel, writer, event.header, now
+                    )
+                if ignored:
+                    self.note(Kind.IGNORED, channel, data, now)
+                else:
+                    self.step(event, now, (channel, data))
+            except Exception as error:
+                self.failed(channel, error, data)
 
-    def _failed(self, channel: str, error: Exception) -> None:
+        return handle
+
+    def _wished(self, channel: str, wish: SwitchMode, now: Instant) -> None:
+        """Take a wish for a mode that came without a signature, where none is asked for; else count it."""
+        if self._gate is None:
+            self.obey(Commanded(wish), now)
+            return
+        self.step(Rejected(channel, "unsigned"), now)
+        self._told.add((channel, "unsigned"))
+        self._log.warning(
+            f"{channel}:unsigned",
+            "a wish for a mode on %s is not signed, so it does not count (commands.key_file)",
+            channel,
+        )
+
+    def failed(self, channel: str, error: Exception, data: bytes = b"") -> None:
         """Count and log what went wrong with a message or a tick: an exception never leaves the bus."""
         now = self._clock.now()
         if isinstance(error, WireError):
-            self._step(Rejected(channel, error.reason), now)
+            if data:
+                self.note(Kind.UNREAD, channel, data, now)
+            self.step(Rejected(channel, error.reason), now)
             self._told.add((channel, error.reason))
             self._log.warning(f"{channel}:{error.reason}", "rejected a message on %s: %s", channel, error)
+        elif isinstance(error, OSError) and error.errno in NO_NETWORK:
+            self.step(Rejected(channel, "network"), now)
+            self._told.add((channel, "network"))
+            self._log.warning(f"{channel}:network", "%s could not be sent: %s", channel, error)
         else:
-            self._step(Rejected(channel, "handler"), now)
+            self.step(Rejected(channel, "handler"), now)
             self._told.add((channel, "handler"))
             self._log.exception(f"{channel}:handler", "an error of the server's own while handling %s", channel)
 
-    def _step(self, event: Event | ModelLoaded, now: Instant) -> None:
+    def step(self, event: Event | ModelLoaded, now: Instant, heard: tuple[str, bytes] | None = None) -> None:
+        """Hand the core an event, and send what it says; `heard` is the message that the event was read from."""
+        self._journal.step(event, now, heard)
         self.state, outputs = core.step(self.state, event, now)
         if outputs:
-            self._send(outputs)
+            self.send(outputs)
 
-    def _send(self, outputs: tuple[Output, ...]) -> None:
+    def note(self, kind: Kind, channel: str, data: bytes, now: Instant) -> None:
+        """Have the journal note a message with which something else is done than handing it to the core."""
+        self._journal.note(kind, (channel, data), now)
+
+    def publish(self, channel: str, data: bytes) -> None:
+        """Send a message to everyone: the only place where anything is said."""
+        self._journal.said(channel, data)
+        self._bus.publish(channel, data)
+
+    def send(self, outputs: tuple[Output, ...]) -> None:
+        """Send what the core says."""
         for output in outputs:
             try:
                 _SENDERS[type(output)](self, output)
             except Exception as error:
                 # one that cannot be sent must not take the others with it
-                self._failed(type(output).__name__, error)
+                self.failed(type(output).__name__, error)
 
     def _send_reply(self, output: SendReply) -> None:
         encoded = encode(output.reply)
-        self._bus.publish(output.channel, encoded)
-        if self._asked:
-            self._timeless.learn(self._asked, output, encoded, self.state.model)
+        self.publish(output.channel, encoded)
+        self._reception.learn(output, encoded)
 
     def _send_pose(self, output: PublishPose) -> None:
-        self._bus.publish(self._pose, encode(output.world))
-        self._bus.publish(self._pose_vector, encode(output.world, "pose_vector_t"))
-        self._bus.publish(self._odom, encode(output.odom))
+        world, vector, odom = encode(output.world), encode(output.world, "pose_vector_t"), encode(output.odom)
+        self._hold()
+        self.publish(self._pose, world)
+        self.publish(self._pose_vector, vector)
+        self.publish(self._odom, odom)
 
     def _send_decisions(self, output: PublishDecisions) -> None:
         for start in range(0, len(output.decisions), MAX_DECISIONS):
             part = output.decisions[start : start + MAX_DECISIONS]
-            self._bus.publish(self._decisions, encode(PublishDecisions(output.utime, part)))
+            self.publish(self._decisions, encode(PublishDecisions(output.utime, part)))
 
     def _send_navigation(self, output: PublishNavigation) -> None:
-        self._bus.publish(self._state, encode(output.state))
+        self.publish(self._state, encode(output.state))
 
     def _send_health(self, output: PublishHealth) -> None:
-        self._bus.publish(self._health, encode(output.health))
+        self.publish(self._health, encode(output.health))
         for source, reason, count in output.health.rejected:
             if (source, reason) not in self._told:
                 self._told.add((source, reason))
                 log.warning(
-                    "%s: %d refused so far, reason: %s; the counts go on in %s", source, count, reason, self._health
+                    "%s: %d refused so far, reason: %s; the counts go on in %s",
+                    plain(source),
+                    count,
+                    plain(reason),
+                    self._health,
                 )
 
     def _load(self, output: LoadModel) -> None:
         before = self.state.model.revision
         loaded = self._on_load(output, self.state)
-        self._step(loaded, self._clock.now())
+        self.step(loaded, self._clock.now())
         dry = output.request is not None and output.request.dry_run
         if loaded.model is None:
-            log.error("the geometry was read anew and is not used; that of revision %s stays: %s", before, loaded.why)
+            log.error(
+                "the geometry was read anew and is not used; that of revision %s stays: %s",
+                before,
+                plain_lines(loaded.why),
+            )
         elif not dry:
             self._hear(self._channels(self.state))
             log.info("the geometry was read anew: revision %s, it was %s", loaded.model.revision, before)
 
     def _send_snapshot(self, output: PublishSnapshot) -> None:
         for part in self._snapshot.parts(self.state, output.utime):
-            self._bus.publish(self._model, encode(part))
+            self.publish(self._model, encode(part))
+        for held in self.state.view.joints.newest(output.utime):
+            self.publish(self._held, encode(held))
 
     def _send_origin(self, output: OriginLatched) -> None:
         origin = output.origin
@@ -315,17 +363,12 @@ class Loop:
         )
         self._on_origin(output)
 
+    def _keep(self, output: KeepState) -> None:
+        self.step(Noticed("restart", self._on_keep(output.kept)), self._clock.now())
 
-def effort(request: Request) -> int:
-    """Return how many usual requests' time one takes beyond its own."""
-    if isinstance(request, GetTransformations):
-        return len(request.pairs) * (PAIR + len(request.at) // INSTANTS_FOR_ONE)
-    if isinstance(request, GetHistory):
-        return POSES_OF_HISTORY
-    return 0
+    def _tell_start(self, output: StartTold) -> None:
+        log.info("%s", output.text)
 
-
-_REQUEST_KINDS: Mapping[str, type[Request]] = {BY_NAME[channel].type_name: kind for kind, channel in CHANNEL_OF.items()}
 
 _SENDERS: Mapping[type, Callable[[Loop, Any], None]] = {
     SendReply: Loop._send_reply,
@@ -336,4 +379,6 @@ _SENDERS: Mapping[type, Callable[[Loop, Any], None]] = {
     PublishNavigation: Loop._send_navigation,
     LoadModel: Loop._load,
     PublishSnapshot: Loop._send_snapshot,
+    KeepState: Loop._keep,
+    StartTold: Loop._tell_start,
 }

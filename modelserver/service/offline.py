@@ -17,11 +17,14 @@ from modelserver.core import CoreState, Instant
 from modelserver.errors import NoPoseError, TooNewError, TooOldError, WireError
 from modelserver.geometry import names
 from modelserver.localization.interface import Localizer
-from modelserver.messages import NAN, Decision, Event, Policy, PublishDecisions, Rejected, TimeQuery
+from modelserver.messages import NAN, Decision, Envelope, Event, Policy, PublishDecisions, Rejected, TimeQuery
 from modelserver.service.daemon import Vehicle
+from modelserver.service.gate import MODE_TYPE
 from modelserver.service.heard import Heard
 from modelserver.spatial.so3 import Quaternion
+from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent
+from modelserver.wire.signed import SIGNED
 
 CSV_HEADER: Final = "utime,easting,northing,up,qw,qx,qy,qz,pose_valid,invalid_reasons"
 
@@ -96,6 +99,8 @@ class Run:
                 yield self._row(due)
                 number += 1
                 due = next(ticks, None) if ticks else self.first_utime + round(number * 1e6 / rate_hz)
+            if event.channel.endswith(SIGNED):
+                event = _unsealed(event, channels)
             self._take(event, channels.get(event.channel))
         while ticks and due is not None:
             yield self._row(due)
@@ -155,6 +160,22 @@ class Run:
             found.valid,
             int(found.invalid_reasons),
         )
+
+
+def _unsealed(event: LogEvent, channels: Mapping[str, Heard]) -> LogEvent:
+    """Return the wish for a mode in an envelope as if it had come by itself; any other event as it is.
+
+    Whether it was signed well is not asked again: a recording has no key.
+    """
+    try:
+        envelope: Envelope = decode("signed_t", event.data)
+    except WireError:
+        return event
+    channel = f"{event.channel.removesuffix(SIGNED)}{envelope.channel}"
+    heard = channels.get(channel)
+    if heard is None or heard.type_name != MODE_TYPE:
+        return event
+    return replace(event, channel=channel, data=envelope.payload)
 
 
 def _instant(utime: int) -> Instant:

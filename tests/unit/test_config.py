@@ -17,8 +17,10 @@ from support_samples import VEHICLE, write_vehicle
 
 from modelserver.config import (
     AidingConfig,
+    CommandsConfig,
     GpsConfig,
     LocalizationConfig,
+    RestartConfig,
     VehicleConfig,
     load_config,
     parse_config,
@@ -74,6 +76,15 @@ def test_given_nothing_said_of_localization_then_all_sources_count_and_nobody_sw
     assert (config.publish.state_hz, config.publish.decisions) == (5.0, True)
     assert config.sensors.wheels is not None
     assert (config.sensors.wheels.kinematics, config.sensors.wheels.latency) == ("differential", 0.0)
+
+
+def test_given_a_restart_section_then_it_is_taken_and_its_ranges_are_held() -> None:
+    assert parse_config(BASE.encode()).restart == RestartConfig(True, 5.0, 86400.0, 20.0)
+    text = BASE + "restart: {keep: false, period_s: 0.5, max_age_s: 3600, max_pose_age_s: 0}\n"
+    assert parse_config(text.encode()).restart == RestartConfig(False, 0.5, 3600.0, 0.0)
+    for key, value in (("period_s", 0.1), ("max_age_s", -1), ("max_pose_age_s", 601)):
+        with pytest.raises(ConfigError, match=f"{key} is between"):
+            parse_config(f"{BASE}restart: {{{key}: {value}}}\n".encode())
 
 
 @pytest.mark.parametrize("mode", Mode)
@@ -281,6 +292,10 @@ def test_given_a_key_twice_then_both_lines_are_told(text: str, element: str, lin
         (f"limits:\n  wait_ms: {'9' * 5000}", "limits.wait_ms", "integer"),
         (f"limits:\n  wait_ms: {'9' * 4000}", "limits.wait_ms", "integer|between"),
         (f"limits:\n  history_s: {'9' * 400}", "limits.history_s", "number|finite"),
+        ("journal:\n  megabytes: 31", "journal.megabytes", "0 for no journal, or 32 to 1000000, got 31"),
+        ("journal:\n  megabytes: -1", "journal.megabytes", "got -1"),
+        ("journal:\n  sync_s: 0.1", "journal.sync_s", "between 0.2 and 60 seconds, got 0.1"),
+        ("journal:\n  directory: 3", "journal.directory", "string"),
         ("origin:\n  keep: 'yes'", "origin.keep", "boolean"),
         ("origin:\n  zone: 61", "origin", "given together"),
         ("origin:\n  initial_utm: [1, 2]", "origin.initial_utm", "too few numbers"),
@@ -302,6 +317,12 @@ def test_given_a_key_twice_then_both_lines_are_told(text: str, element: str, lin
         ("localization:\n  filter: {uere: -1}", "localization.filter.uere", "above 0"),
         ("localization:\n  mode: Full", "localization.mode", "'full', 'raw'.*got 'Full'"),
         ("localization:\n  mode_channel: 'A B'", "localization.mode_channel", "mode_channel has 1 to 39"),
+        ("limits:\n  client_hz: 0.5", "limits.client_hz", "between 1 and 100000, got 0.5"),
+        ("limits:\n  request_share: 1.5", "limits.request_share", "between 0 and 1, got 1.5"),
+        ("sensors:\n  second_writer: both", "sensors.second_writer", "'ignore' or 'use'.*got 'both'"),
+        ("commands:\n  window_s: 0.01", "commands.window_s", "between 0.1 and 300"),
+        ("commands:\n  reload: true", "commands.reload", "key_file.*modelserver key new"),
+        ("commands:\n  set_pose: true", "commands.set_pose", "key_file.*modelserver key new"),
         ("localization:\n  magnetometer: {hard_iron: [1, 2]}", "localization.magnetometer.hard_iron", "too few"),
         ("localization:\n  magnetometer: {declination_deg: 181}", "localization.magnetometer.declination_deg", "-180"),
         ("localization:\n  magnetometer: {soft_iron: [0, 0, 0, 0, 0, 0, 0, 0, 0]}",
@@ -322,6 +343,14 @@ def test_given_a_value_that_cannot_be_then_line_key_and_why_are_told(text: str, 
     assert found.line == (5 if "\n" in text and element != "origin" else 4)
     assert re.search(message, found.message)
     assert len(found.message) < 300
+
+
+def test_given_a_key_file_then_its_path_starts_from_the_vehicle_file(tmp_path: Path) -> None:
+    path, text = tmp_path / "vehicle.yaml", "vehicle: v\ngeometry: g.yaml\nbase_frame: A:B\n"
+    path.write_text(f"{text}commands: {{reload: true, key_file: keys/commands.key}}\n")
+    assert load_config(path).commands.key_file == str(tmp_path / "keys" / "commands.key")
+    path.write_text(text)
+    assert load_config(path).commands == CommandsConfig()
 
 
 def test_given_a_zone_that_is_none_then_it_is_refused() -> None:

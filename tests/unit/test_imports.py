@@ -15,7 +15,8 @@ GEOMETRY = VALUES | {"geometry"}
 POSES = VALUES | {"messages", "geodesy", "earth", "magnetism", "history"}
 CORE = GEOMETRY | POSES | {"joints", "joint_reading", "joint_track", "joint_vector", "localization", "platform"}
 WIRE = VALUES | {"messages", "wire", "mslcm"}
-SERVICE = CORE | WIRE | {"core", "config", "formats", "reload", "snapshot"}
+SIGNING = {"keys", "signing"}
+SERVICE = CORE | WIRE | {"core", "config", "formats", "reload", "snapshot"} | SIGNING
 
 MAY_IMPORT: dict[str, set[str]] = {
     "version": set(),
@@ -23,6 +24,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "spatial": {"errors"},
     "geometry": VALUES,
     "messages": VALUES,
+    "signing": VALUES | {"messages"},
+    "keys": VALUES | {"messages", "signing"},
     "geodesy": VALUES | {"messages"},
     "earth": VALUES,
     "magnetism": VALUES,
@@ -43,7 +46,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "config_reader": {"errors"},
     "wire": WIRE,
     "service": SERVICE,
-    "client": WIRE | GEOMETRY | POSES | {"formats", "joints", "platform", "snapshot"},
+    "client": WIRE | GEOMETRY | POSES | {"formats", "joints", "platform", "snapshot"} | SIGNING,
     "msdrivers.protocol": VALUES | {"messages"},
     "msdrivers.station": VALUES | {"messages"},
     "msdrivers.devices": VALUES | {"messages", "msdrivers.protocol", "msdrivers.station"},
@@ -76,6 +79,7 @@ PURE = {
     "magnetism",
     "localization",
     "messages",
+    "signing",
     "history",
     "joint_reading",
     "joint_track",

@@ -193,7 +193,7 @@ def test_given_damage_then_it_is_counted_and_what_is_known_stays(heard: Knowledg
     }
 
 
-CHANNELS = st.sampled_from(["MODEL_SNAPSHOT", "POSE", "POSE_ODOM", "JOINTS", "LOCALIZATION_STATE"])
+CHANNELS = st.sampled_from(["MODEL_SNAPSHOT", "POSE", "POSE_ODOM", "JOINTS", "JOINTS_HELD", "LOCALIZATION_STATE"])
 GOOD = [data for _, _, data in list(drive(0.05))]
 
 

@@ -8,16 +8,28 @@ import pytest
 from support_samples import GEOMETRY, ORIGIN, VEHICLE, now_at, write_vehicle
 from support_samples import START as START_UTIME
 
+from modelserver import core
 from modelserver.config import load_config
 from modelserver.errors import ConfigError, GeometryError, Problem
 from modelserver.localization.filter.localizer import FilterLocalizer
 from modelserver.localization.modes import ModeLocalizer
 from modelserver.localization.raw.localizer import RawLocalizer
-from modelserver.messages import Mode, SensorHeader, SwitchMode
+from modelserver.messages import (
+    GpsSample,
+    ImuSample,
+    JointsSample,
+    Mode,
+    PublishHealth,
+    RelativePoseSample,
+    SensorHeader,
+    SwitchMode,
+    Tick,
+)
 from modelserver.service.clock import FakeClock
 from modelserver.service.daemon import Vehicle, configured_origin, load_vehicle, log_wish
 from modelserver.service.fake_bus import FakeBus
 from modelserver.service.heard import Heard
+from modelserver.service.hooks import Hooks
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.wire.codec import encode
 
@@ -47,6 +59,8 @@ def test_given_the_vehicles_of_this_project_then_they_load_whole(path: Path) -> 
     assert (loaded.tick_hz(), loaded.ticks_per_pose(), loaded.ticks_per_state()) == (50.0, 1, 10)
 
 
+KEY = "commands: {key_file: commands.key}\n"
+
 AIDING = """\
   aiding:
     vo: {channel: VO, type: relative_pose, latency: 0.08}
@@ -58,7 +72,7 @@ AIDING = """\
 @pytest.mark.parametrize("prefix", ["", "V1_"])
 def test_given_further_sources_and_a_channel_for_modes_then_they_are_heard(tmp_path: Path, prefix: str) -> None:
     text = VEHICLE.replace("frame: Cart:Antenna", "frame: Cart:Antenna, latency: 0.12") + AIDING
-    text += f"localization: {{mode_channel: LOCALIZATION_MODE}}\nlcm: {{channel_prefix: '{prefix}'}}\n"
+    text += f"{KEY}localization: {{mode_channel: LOCALIZATION_MODE}}\nlcm: {{channel_prefix: '{prefix}'}}\n"
     assert vehicle(tmp_path, text).sensor_channels() == {
         f"{prefix}GPS": Heard("gps_t", 120_000),
         f"{prefix}IMU": Heard("imu_t"),
@@ -71,15 +85,21 @@ def test_given_further_sources_and_a_channel_for_modes_then_they_are_heard(tmp_p
 
 @pytest.mark.parametrize("channel", ["GPS", "VO", "POSE", "LOCALIZATION_STATE", "POSE_GET_HISTORY", "VEHICLE_COMMAND"])
 def test_given_a_channel_for_modes_that_is_used_otherwise_then_it_is_refused(tmp_path: Path, channel: str) -> None:
-    (found,) = problems(tmp_path, f"{VEHICLE}{AIDING}localization: {{mode_channel: {channel}}}\n")
+    (found,) = problems(tmp_path, f"{VEHICLE}{AIDING}{KEY}localization: {{mode_channel: {channel}}}\n")
     assert (found.element, found.fix) == ("localization.mode_channel", "write LOCALIZATION_MODE")
     assert channel in found.message
 
 
 @pytest.mark.parametrize("channel", ["LOCALIZATION_MODE", "MODE", "console/mode"])
 def test_given_a_channel_for_modes_of_its_own_then_it_is_taken(tmp_path: Path, channel: str) -> None:
-    text = f"{VEHICLE}localization: {{mode_channel: {channel}}}\n"
+    text = f"{VEHICLE}{KEY}localization: {{mode_channel: {channel}}}\n"
     assert vehicle(tmp_path, text).sensor_channels()[channel] == Heard("localization_mode_t")
+
+
+def test_given_a_channel_for_modes_without_a_key_then_it_is_refused_with_what_makes_one(tmp_path: Path) -> None:
+    (found,) = problems(tmp_path, VEHICLE + "localization: {mode_channel: LOCALIZATION_MODE}\n")
+    assert found.element == "localization.mode_channel"
+    assert "modelserver key new" in found.message
 
 
 @pytest.mark.parametrize("channel", ["POSE", "LOCALIZATION_DECISIONS", "LOCALIZATION_MODE"])
@@ -89,7 +109,7 @@ def test_given_a_further_source_on_a_channel_of_the_service_then_it_is_refused(t
 
 
 def test_given_a_channel_for_modes_that_replies_may_use_then_it_is_refused(tmp_path: Path) -> None:
-    (found,) = problems(tmp_path, VEHICLE + "localization: {mode_channel: REPLY_MODE}\n")
+    (found,) = problems(tmp_path, VEHICLE + KEY + "localization: {mode_channel: REPLY_MODE}\n")
     assert found.element == "lcm.reply_prefix"
 
 
@@ -242,6 +262,23 @@ def test_given_event_mode_then_ticks_are_for_housekeeping_alone(tmp_path: Path) 
     assert (loaded.ticks_per_pose(), loaded.tick_hz()) == (1, 50.0)
 
 
+def test_given_the_sensors_of_a_vehicle_file_then_the_core_knows_what_to_expect_and_where(tmp_path: Path) -> None:
+    text = VEHICLE.replace("sensors:\n", "sensors:\n  aiding: {vo: {channel: VO, type: relative_pose}}\n")
+    loaded = vehicle(tmp_path, text + "lcm: {channel_prefix: V1_}\n")
+    expected = {(each.channel, each.kind, each.source) for each in loaded.expected()}
+    assert expected == {
+        ("V1_GPS", GpsSample, ""),
+        ("V1_IMU", ImuSample, ""),
+        ("V1_JOINTS", JointsSample, ""),
+        ("V1_VO", RelativePoseSample, "vo"),
+    }
+    state = loaded.core(now_at(START_UTIME))
+    # the cart has no joints: they are not missed
+    _, outputs = core.step(state, Tick(), now_at(START_UTIME))
+    health = next(each.health for each in outputs if isinstance(each, PublishHealth))
+    assert [each.channel for each in health.channels] == ["V1_GPS", "V1_IMU", "V1_VO"]
+
+
 def without(*left_out: str) -> str:
     return "".join(line for line in VEHICLE.splitlines(keepends=True) if not line.strip().startswith(left_out))
 
@@ -267,12 +304,16 @@ def test_given_a_wish_for_another_mode_then_the_switch_is_logged_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
-    text = VEHICLE + "localization: {mode_channel: M}\n"
+    text = VEHICLE + KEY + "localization: {mode_channel: M}\n"
     loaded = vehicle(tmp_path, text)
     clock = FakeClock(START_UTIME)
     bus = FakeBus(clock)
     loop = Loop(
-        bus, clock, loaded.core(clock.now()), LoopSettings(20_000_000, loaded.sensor_channels()), on_wish=log_wish
+        bus,
+        clock,
+        loaded.core(clock.now()),
+        LoopSettings(20_000_000, loaded.sensor_channels()),
+        Hooks(on_wish=log_wish),
     )
     for number, wanted in enumerate((Mode.RAW, Mode.RAW, Mode.NO_GPS)):
         header = SensorHeader(START_UTIME + number, "operator", number, START_UTIME + number)

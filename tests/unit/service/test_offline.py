@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from support_signing import envelope
 
 from modelserver import core
 from modelserver.core import CoreSettings, CoreState, Instant
@@ -14,12 +15,14 @@ from modelserver.errors import UnknownFrameError
 from modelserver.geometry import ModelBuilder
 from modelserver.localization.interface import Note
 from modelserver.messages import (
+    SILENCE,
     AbsolutePoseSample,
     Decision,
     Estimate,
     FixType,
     GpsSample,
     Invalid,
+    LocalizerSummary,
     Mode,
     Origin,
     Rejected,
@@ -53,6 +56,12 @@ class Counting:
 
     def navigation(self, utime: int) -> None:
         return None
+
+    def silence(self, utime: int) -> Invalid:
+        return self.estimate(utime).invalid & SILENCE
+
+    def summary(self, utime: int) -> LocalizerSummary:
+        return LocalizerSummary(Mode.FULL)
 
     def estimate(self, utime: int) -> Estimate:
         if not self.taken:
@@ -168,6 +177,19 @@ def test_given_further_sources_and_modes_when_replayed_then_they_are_heard_at_th
     assert taken(run, 100) == [3]
     assert [(each.source, each.utime - T0) for each in told] == [("gps", 10), ("map", -20), ("console", 30)]
     assert (run.samples, run.unheard) == (3, set())
+
+
+def test_given_a_signed_wish_for_a_mode_when_replayed_then_it_is_heard_as_a_plain_one() -> None:
+    wish = SwitchMode(SensorHeader(T0 + 30, "console"), Mode.NO_GPS)
+    sealed = encode(envelope(wish, T0 + 30, channel="MODE"))
+    other = encode(envelope(wish, T0 + 30, channel="PLATFORM_RELOAD_MODEL"))
+    told: list[Decision] = []
+    log = [gps(10)]
+    log += [LogEvent(0, T0 + 30, "MODELSERVER_SIGNED", data, 30) for data in (sealed, other, b"junk", sealed[:-1])]
+    run = Run(vehicle(), log, "V:Base", told.append)
+    assert taken(run, 100) == [2]
+    assert [(each.source, each.utime - T0) for each in told] == [("gps", 10), ("console", 30)]
+    assert (run.samples, run.unheard) == (2, {"MODELSERVER_SIGNED"})
 
 
 def test_given_nobody_who_wants_decisions_when_replayed_then_the_rows_are_the_same() -> None:

@@ -15,6 +15,7 @@ from modelserver.core import CoreState
 from modelserver.errors import Status
 from modelserver.localization.modes import ModeLocalizer
 from modelserver.messages import (
+    Commanded,
     GetExplanation,
     JointSample,
     JointsSample,
@@ -28,6 +29,7 @@ from modelserver.reload import ModelLoaded
 from modelserver.service.clock import FakeClock
 from modelserver.service.daemon import Vehicle, load_vehicle
 from modelserver.service.fake_bus import FakeBus
+from modelserver.service.hooks import Hooks
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.service.snapshots import SnapshotWriter
 from modelserver.snapshot import read
@@ -189,9 +191,11 @@ class Rig:
             self.clock,
             self.vehicle.core(self.clock.now()),
             LoopSettings(20_000_000, self.vehicle.sensor_channels()),
-            on_load=self.vehicle.reloaded,
-            snapshot=self.vehicle.snapshot,
-            channels=lambda state: self.vehicle.sensor_channels(state.model),
+            Hooks(
+                on_load=self.vehicle.reloaded,
+                snapshot=self.vehicle.snapshot,
+                channels=lambda state: self.vehicle.sensor_channels(state.model),
+            ),
         )
 
     def write(self, geometry: str) -> None:
@@ -245,7 +249,7 @@ def test_given_the_signal_and_a_bad_file_then_the_old_model_answers_and_the_log_
 
 
 def reply_to(rig: Rig, request: Any) -> ReloadReply:
-    rig.bus.publish("PLATFORM_RELOAD_MODEL", encode(request))
+    rig.loop.obey(Commanded(request), rig.clock.now())
     rig.turns()
     (data,) = rig.bus.said("REPLY_TEST")
     reply: ReloadReply = decode("reload_model_reply_t", data)
@@ -257,7 +261,7 @@ def test_given_a_client_that_may_then_it_is_told_what_changes(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, dry_run: bool
 ) -> None:
     caplog.set_level("INFO")
-    rig = Rig(tmp_path, VEHICLE + "commands: {reload: true}\n")
+    rig = Rig(tmp_path, VEHICLE + "commands: {reload: true, key_file: k}\n")
     old = rig.loop.state.model.revision
     rig.write(HIGHER_CAMERA)
     reply = reply_to(rig, ReloadModel(ME, dry_run))
@@ -295,6 +299,15 @@ def test_given_the_first_joint_with_a_reload_then_joints_are_heard_from_then_on(
     (data,) = rig.bus.said("REPLY_TEST")
     edges = decode("get_explanation_reply_t", data).answer.edges
     assert [(each.name, each.coordinates) for each in edges if each.kind == "joint"] == [("Mounted", (0.25,))]
+    # and told again with each snapshot
+    assert not rig.bus.said("JOINTS_HELD")
+    rig.clock.advance(6.0)
+    rig.turns()
+    (data,) = rig.bus.said("JOINTS_HELD")
+    held = decode("joints_t", data)
+    assert (held.header.utime, held.header.source) == (START, "arm")
+    assert held.header.host_utime >= START + 6_000_000
+    assert [(each.name, each.position) for each in held.joints] == [("Mounted", 0.25)]
 
 
 @pytest.mark.parametrize("fail", [RuntimeError("odd"), OSError("disk")])
@@ -317,7 +330,7 @@ def test_given_a_loop_without_a_file_then_a_wish_to_reload_is_rejected_and_says_
     clock = FakeClock(START)
     bus = FakeBus(clock)
     loop = Loop(bus, clock, started(Scripted(), may_reload=True), LoopSettings(20_000_000))
-    bus.publish("PLATFORM_RELOAD_MODEL", encode(ReloadModel(ME)))
+    loop.obey(Commanded(ReloadModel(ME)), clock.now())
     loop.turn()
     loop.turn()
     reply = decode("reload_model_reply_t", bus.said("REPLY_TEST")[0])

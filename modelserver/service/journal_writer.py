@@ -1,0 +1,250 @@
+"""The journal's writer: takes what the loop has left in the queue, and makes sealed segments of it.
+
+It works on a thread of its own and never makes the loop wait: neither for the disk, nor, for longer than a fraction of
+a millisecond, for the interpreter. `work` is one round of it, so that tests need no thread.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from modelserver.core import Instant
+from modelserver.messages import CHANNEL_OF
+from modelserver.service import journal_events, journal_state
+from modelserver.service.clock import Clock
+from modelserver.service.journal import Beginning, Entry, JournalQueue
+from modelserver.service.journal_ring import Ring, Segment
+from modelserver.wire.journal import (
+    FORMAT,
+    Kind,
+    Record,
+    batch_written,
+    end_written,
+    file_written,
+    head_written,
+    state_written,
+)
+
+log = logging.getLogger(__name__)
+
+ROUND_S: Final = 0.2
+"""Seconds between two rounds: what a process that is killed loses at most of what it did."""
+
+RETRY_S: Final = 5.0
+"""Seconds after which a disk that refused is tried again."""
+
+BATCH: Final = 32
+"""Records that are sealed together: less than half a millisecond of work, for which the loop may have to wait."""
+
+PAUSE_S: Final = 5e-5
+"""Seconds between two of them in which the loop can have the interpreter."""
+
+CLOSING_S: Final = 1.5
+"""How long the end of the service waits for the rest to be written."""
+
+LARGEST_FILE: Final = 4 << 20
+"""A larger file is named, not copied, at the beginning of every segment."""
+
+
+@dataclass(frozen=True, slots=True)
+class Origins:
+    """What every segment begins with beside the state: whose journal it is.
+
+    facts: about service, build and machine; JSON holds them. files: name and bytes of what the service was started
+    with, for people; nothing is run again from them. config: the vehicle's configuration.
+    """
+
+    facts: Mapping[str, Any]
+    files: Iterable[tuple[str, bytes]]
+    config: Any
+
+
+def pause() -> None:
+    """Let another thread have the interpreter."""
+    time.sleep(PAUSE_S)
+
+
+class JournalWriter:
+    """Writes what a queue holds into a ring. `start` runs it on a thread, `close` ends that.
+
+    `sync_s`: seconds between two times that the disk is told to hold what it was given.
+    """
+
+    def __init__(
+        self,
+        queue: JournalQueue,
+        ring: Ring,
+        origins: Origins,
+        clock: Clock,
+        sync_s: float = 2.0,
+        pause: Callable[[], object] = pause,
+    ):
+        self._queue = queue
+        self._ring = ring
+        self._origins = origins
+        self._clock = clock
+        self._sync_ns = round(sync_s * 1e9)
+        self._pause = pause
+        self._segment: Segment | None = None
+        self._part = 0
+        self._batch = 0
+        self._lost = 0
+        self._due_ns = 0
+        self._retry_ns = 0
+        self._failed: OSError | None = None
+        self._unsynced = False
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
+        queue.ask()
+
+    def start(self) -> None:
+        """Begin to write."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Write what is left, close the segment, and wait for that a moment."""
+        self._ending.set()
+        self._thread.join(CLOSING_S)
+        if self._thread.is_alive():
+            log.warning("the journal's end is not written: its disk does not answer")
+
+    def _run(self) -> None:
+        while not self._ending.wait(ROUND_S):
+            try:
+                self.work()
+            except Exception as error:
+                log.exception("an error of the server's own while writing the journal")
+                self._fail(OSError(0, f"an error of the server's own: {error}"))
+        self.finish()
+
+    def finish(self) -> None:
+        """Write what is left and close the segment."""
+        with contextlib.suppress(Exception):
+            self.work()
+            self._end()
+        self._ring.release()
+
+    def work(self) -> None:
+        """Write what has come since, and have it held where that is due. An error of the disk ends up in a notice."""
+        now_ns = self._clock.monotonic_ns()
+        try:
+            while entries := self._queue.take(BATCH):
+                self._write(entries)
+                self._pause()
+            if self._segment is not None:
+                if self._unsynced and now_ns >= self._due_ns:
+                    self._due_ns = now_ns + self._sync_ns
+                    self._segment.sync()
+                    self._unsynced = False
+                if self._segment.size >= self._ring.segment_bytes or not self._queue.is_open:
+                    self._queue.ask()
+            elif now_ns >= self._retry_ns and not self._queue.wants_state:
+                self._queue.ask()
+        except OSError as error:
+            self._fail(error)
+
+    def _write(self, entries: list[Entry]) -> None:
+        """Write entries, each stretch of them between two beginnings in one batch."""
+        records: list[Record] = []
+        for number, entry in enumerate(entries):
+            if isinstance(entry.event, Beginning):
+                try:
+                    self._seal(records)
+                    records = []
+                    self._begin(entry.event, entry.now)
+                except Exception:
+                    self._lost += len(entries) - number - 1
+                    raise
+            elif self._segment is None:
+                self._lost += 1
+            else:
+                records.append(self._record(entry))
+        self._seal(records)
+
+    def _record(self, entry: Entry) -> Record:
+        kind, data = entry.kind, entry.data
+        if kind is Kind.EVENT:
+            kind, data = journal_events.written(entry.event, self._pause)
+        elif kind is Kind.REQUEST and type(entry.event) not in CHANNEL_OF:
+            kind = Kind.SAMPLE
+        return Record(kind, entry.now.monotonic_ns, entry.now.utime, entry.channel, data)
+
+    def _seal(self, records: list[Record]) -> None:
+        if not records or self._segment is None:
+            self._lost += len(records)
+            return
+        try:
+            self._segment.append(batch_written(self._batch, records))
+        except OSError:
+            self._lost += len(records)
+            raise
+        self._batch += 1
+        self._unsynced = True
+
+    def _begin(self, beginning: Beginning, now: Instant) -> None:
+        """Close the segment and begin the next with what is known now."""
+        lost = self._lost + beginning.lost
+        try:
+            self._end()
+            state = journal_state.written((self._origins.config, journal_state.apart(beginning.state)), self._pause)
+            segment = self._ring.fresh()
+        except OSError:
+            self._lost = lost
+            raise
+        facts = {"format": FORMAT, "part": self._part, "lost": lost, "utime": now.utime, **self._origins.facts}
+        facts["kept_s"] = journal_state.KEPT_S if len(beginning.state.history) else None
+        self._segment, self._batch = segment, 0
+        try:
+            segment.append(head_written(facts, now.utime))
+            for name, data in self._origins.files:
+                segment.append(file_written(name, data[:LARGEST_FILE], now.utime))
+            segment.append(state_written(state, now.utime))
+        except OSError:
+            self._lost = lost
+            raise
+        self._part += 1
+        self._lost = 0
+        self._unsynced = True
+        if self._failed is not None:
+            log.info("the journal is kept again in %s; %d records are lost", segment.path, lost)
+            self._queue.tell("")
+            self._failed = None
+        elif lost:
+            log.warning("%d records of the journal are lost: they came faster than they could be written", lost)
+
+    def _end(self) -> None:
+        segment, self._segment = self._segment, None
+        if segment is not None:
+            try:
+                segment.append(end_written(segment.digest.digest(), self._clock.utime()))
+                segment.sync()
+            finally:
+                segment.close()
+
+    def _fail(self, error: OSError) -> None:
+        """Write no more until the disk is tried again; what comes meanwhile is dropped and counted."""
+        if self._segment is not None:
+            self._segment.close()
+            self._segment = None
+        self._retry_ns = self._clock.monotonic_ns() + round(RETRY_S * 1e9)
+        said = _words(error)
+        if self._failed is None or _words(self._failed) != said:
+            log.warning("the journal is not kept: %s; it is tried again every %g s", said, RETRY_S)
+            self._queue.tell(f"not kept: {said}")
+        self._failed = error
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            # what happens now is worth more than what was long ago
+            with contextlib.suppress(OSError):
+                self._ring.make_room()
+
+
+def _words(error: OSError) -> str:
+    why = error.strerror or str(error)
+    return f"{error.filename}: {why}" if error.filename else why

@@ -1,0 +1,310 @@
+"""A journal verified: every record is run again, and what is said is compared with what was said, bit for bit.
+
+A run is the life of one service: its segments follow each other, and each is gone on into with what is known from the
+one before. Where that is missing (the ring has dropped it, records were lost, bytes are damaged) the run is taken up
+again with the state that the next segment begins with.
+
+That state holds the last seconds of the history of poses only. Until as much is known again as then, a reply about the
+past may rest on poses that are gone: where such a reply differs it is counted as `old`, and as no difference.
+"""
+
+from __future__ import annotations
+
+import mmap
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from modelserver.errors import RecordingError
+from modelserver.service import journal_build
+from modelserver.service.journal_ring import segments
+from modelserver.service.rerun import Rerun, Said
+from modelserver.wire.journal import FORMAT, Broken, End, Head, Kind, Record, State, read
+
+POSES: Final = ("POSE", "POSE_VECTOR", "POSE_ODOM")
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """The first thing that was not said again as it was: where, what was said, and what is said now (None: nothing)."""
+
+    segment: Path
+    at: int
+    utime: int
+    channel: str
+    was: bytes | None
+    now: bytes | None
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """Something that is to be known of a place in the journal. `damage`: bytes are wrong that were right once."""
+
+    segment: Path
+    text: str
+    damage: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.segment}: {self.text}"
+
+
+@dataclass(slots=True)
+class Verified:
+    """What was found. `said` counts the messages that were said again, bit for bit, by channel without prefix.
+
+    skipped: messages that were said where it is not known from what. old: see the module. difference: the first.
+    other: what is other with build or machine than it was then, in words.
+    """
+
+    segments: int = 0
+    runs: int = 0
+    handled: int = 0
+    said: Counter[str] = field(default_factory=Counter)
+    skipped: Counter[str] = field(default_factory=Counter)
+    old: int = 0
+    lost: int = 0
+    first_utime: int = 0
+    last_utime: int = 0
+    bytes: int = 0
+    remarks: list[Remark] = field(default_factory=list)
+    other: list[str] = field(default_factory=list)
+    difference: Difference | None = None
+
+    @property
+    def poses(self) -> int:
+        """The poses that are reproduced."""
+        return sum(self.said[name] for name in POSES)
+
+    @property
+    def proved(self) -> bool:
+        """Whether something was verified, all of it holds, and no bytes are damaged."""
+        return bool(self.said) and self.difference is None and not any(each.damage for each in self.remarks)
+
+
+@dataclass(slots=True)
+class _Group:
+    """What was handled at a time, with everything that was said to it, then and now."""
+
+    segment: Path
+    record: Record
+    now: list[Said]
+    was: list[Record] = field(default_factory=list)
+
+
+def files_of(journal: Path) -> list[Path]:
+    """Return the segments of a journal: of a directory, or the one file. Raises RecordingError, OSError."""
+    if not journal.is_dir():
+        return [journal]
+    found = segments(journal)
+    if not found:
+        raise RecordingError(f"{journal}: holds no segment of a journal (journal-*.lcm)")
+    return found
+
+
+def verify(files: Sequence[Path], show: Callable[[int], object] = lambda done: None) -> Verified:
+    """Run a journal again up to the first difference. `show` is told how many bytes are done.
+
+    Raises RecordingError for a file that is no journal, OSError where one cannot be read.
+    """
+    verifier = _Verifier(show)
+    for path in files:
+        verifier.segment(path)
+        if verifier.found.difference is not None:
+            break
+    verifier.close()
+    return verifier.found
+
+
+class _Verifier:
+    def __init__(self, show: Callable[[int], object]):
+        self.found = Verified()
+        self._show = show
+        self._rerun: Rerun | None = None
+        self._group: _Group | None = None
+        self._follows: tuple[str, int] | None = None
+        """Run and number of the segment that would go on from here."""
+        self._old_until = 0
+        self._path = Path()
+        self._run = ""
+        self._ended = False
+
+    def segment(self, path: Path) -> None:
+        """Verify a segment more."""
+        self._path, self._ended, going_on = path, False, False
+        found, before = self.found, self.found.bytes
+        facts: dict[str, Any] | None = None
+        with path.open("rb") as file:
+            size = file.seek(0, 2)
+            data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
+        try:
+            for item in read(data):
+                if found.difference is not None:
+                    return
+                if isinstance(item, Record):
+                    if found.handled % 512 == 0:
+                        self._show(before + item.at)
+                    self._take(item)
+                elif isinstance(item, Head):
+                    facts = item.facts
+                    going_on = self._headed(facts)
+                elif isinstance(item, State):
+                    if not going_on:
+                        self._begin(item, facts)
+                elif isinstance(item, Broken):
+                    self._broken(item)
+                elif isinstance(item, End):
+                    self._ended = True
+                    if not item.intact:
+                        self._remark("the checksum over the whole segment is wrong", damage=True)
+        finally:
+            found.bytes = before + size
+            if not isinstance(data, bytes):
+                data.close()
+        if facts is None:
+            if size == 0 or any(each.segment == path for each in found.remarks):
+                self._stop()
+                if size == 0:
+                    self._remark("is empty: the machine stopped as it was made")
+                return
+            raise RecordingError(f"{path}: is no journal of a modelserver")
+        found.segments += 1
+        if not self._ended:
+            if not any(each.segment == path for each in found.remarks):
+                self._remark("is not closed: it is being written, or process or machine were stopped")
+            self.close()
+            self._rerun = self._follows = None
+
+    def _headed(self, facts: dict[str, Any]) -> bool:
+        """Take note of who wrote a segment; return whether it goes on from the one before."""
+        run, part, lost = str(facts.get("run")), facts.get("part"), facts.get("lost")
+        if facts.get("format") != FORMAT or not isinstance(part, int) or not isinstance(lost, int):
+            raise RecordingError(
+                f"{self._path}: is a journal of format {facts.get('format')}, this build reads {FORMAT}; "
+                "take the build that wrote it"
+            )
+        for each in journal_build.differences(facts):
+            if each not in self.found.other:
+                self.found.other.append(each)
+        if run != self._run:
+            self._run = run
+            self.found.runs += 1
+        going_on = self._rerun is not None and self._follows == (run, part) and not lost
+        if not going_on:
+            self.close()
+            self._rerun = None
+        self._follows = (run, part + 1)
+        if lost:
+            self.found.lost += lost
+            self._remark(f"{lost} records before it are lost: the disk refused them, or was too slow")
+        return going_on
+
+    def _begin(self, state: State, facts: dict[str, Any] | None) -> None:
+        self.close()
+        self._rerun = None
+        try:
+            self._rerun = rerun = Rerun(state.data)
+        except RecordingError as error:
+            self._remark(f"cannot be run again: {error}", damage=True)
+            return
+        if facts is not None and facts.get("kept_s") is not None:
+            history = rerun.state.settings.history_s
+            self._old_until = int(facts.get("utime", 0)) + round(history * 1e6)
+
+    def _take(self, record: Record) -> None:
+        found, rerun = self.found, self._rerun
+        found.first_utime = found.first_utime or record.utime
+        found.last_utime = record.utime
+        if rerun is None:
+            if record.kind is Kind.SAID:
+                found.skipped[record.channel] += 1
+            return
+        if record.kind is Kind.SAID:
+            if self._group is None:
+                self._group = _Group(self._path, record, [])
+            self._group.was.append(record)
+            return
+        found.handled += 1
+        if self._group is not None and not self._is_refusal(record):
+            self._compare()
+            if found.difference is not None:
+                return
+        try:
+            said = rerun.handle(record)
+        except RecordingError as error:
+            self._remark(f"at byte {record.at}: {error}", damage=True)
+            self._stop()
+            return
+        if self._group is None:
+            self._group = _Group(self._path, record, said)
+        else:
+            self._group.now += said
+
+    @staticmethod
+    def _is_refusal(record: Record) -> bool:
+        """Return whether it may stand between two things that are said at once: one could not be sent, or kept."""
+        return record.kind is Kind.EVENT and record.data.startswith((b'["Rejected"', b'["Noticed"'))
+
+    def _compare(self) -> None:
+        group, self._group = self._group, None
+        assert group is not None
+        assert self._rerun is not None
+        found = self.found
+        prefix, replies = self._rerun.config.lcm.channel_prefix, self._rerun.config.lcm.reply_prefix
+        if [(each.channel, each.data) for each in group.was] == group.now:
+            for each in group.was:
+                found.said["replies" if each.channel.startswith(replies) else each.channel.removeprefix(prefix)] += 1
+            return
+        old = group.record.utime < self._old_until
+        for was, now in _paired(group.was, group.now):
+            if was is not None and now == (was.channel, was.data):
+                found.said["replies" if was.channel.startswith(replies) else was.channel.removeprefix(prefix)] += 1
+                continue
+            channel = was.channel if was is not None else now[0] if now is not None else ""
+            if old and channel.startswith(replies):
+                found.old += was is not None
+                continue
+            found.difference = Difference(
+                group.segment,
+                group.record.at if was is None else was.at,
+                group.record.utime,
+                channel,
+                None if was is None else was.data,
+                None if now is None else now[1],
+            )
+            return
+
+    def _broken(self, broken: Broken) -> None:
+        if broken.tail:
+            self._remark(
+                f"breaks off at byte {broken.start}: the last {broken.length} bytes are not sealed and not used "
+                "(it is being written, or process or machine were stopped)"
+            )
+        else:
+            self._remark(f"{broken}; what follows is verified from the next segment on", damage=True)
+        self._stop()
+
+    def _stop(self) -> None:
+        """Compare what is there; what comes then does not follow from what is known."""
+        if self._group is not None:
+            # the batch that is missing may hold the rest of what was said to it
+            self._group.now = self._group.now[: len(self._group.was)]
+        self.close()
+        self._rerun = self._follows = None
+
+    def close(self) -> None:
+        """Compare what was said last, as far as that was written."""
+        if self._group is not None and self._rerun is not None and self.found.difference is None:
+            if not self._ended:
+                self._group.now = self._group.now[: len(self._group.was)]
+            self._compare()
+        self._group = None
+
+    def _remark(self, text: str, damage: bool = False) -> None:
+        self.found.remarks.append(Remark(self._path, text, damage))
+
+
+def _paired(was: Sequence[Record], now: Sequence[Said]) -> Iterator[tuple[Record | None, Said | None]]:
+    for number in range(max(len(was), len(now))):
+        yield was[number] if number < len(was) else None, now[number] if number < len(now) else None
