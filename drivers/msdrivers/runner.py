@@ -96,6 +96,11 @@ class Runner(Generic[U]):
         """How many samples have gone out."""
         return self._reporter.samples
 
+    @property
+    def state(self) -> tuple[DriverPhase, str]:
+        """The phase that the driver is in, and what there is to say of it for a person."""
+        return self._reporter.state
+
     def run(self, attend: Callable[[], object] = lambda: None) -> None:
         """Run until `stop` is called or a recording has ended, then leave the device as the station will have it.
 

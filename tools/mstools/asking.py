@@ -23,6 +23,10 @@ UrlOption = Annotated[
     str, typer.Option("--url", metavar="URL", help="LCM provider. Default: $LCM_DEFAULT_URL, else loopback.")
 ]
 PrefixOption = Annotated[str, typer.Option("--prefix", metavar="TEXT", help="Channel prefix of the vehicle.")]
+KeyOption = Annotated[
+    Path | None,
+    typer.Option("--key", metavar="FILE", help="The vehicle's key, to sign with. Default: $MODELSERVER_KEY_FILE."),
+]
 TimeoutOption = Annotated[
     float,
     typer.Option("--timeout", metavar="SECONDS", min=0.01, max=3600.0, help="How long one try waits for the daemon."),

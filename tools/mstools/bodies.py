@@ -8,6 +8,7 @@ import typer
 
 from mstools.asking import JsonOption, ModelOption, PrefixOption, TimeoutOption, UrlOption, answers
 from mstools.options import Variables
+from mstools.output import safe
 
 
 def command(
@@ -25,4 +26,4 @@ def command(
     Example: modelserver bodies --model config/raptor/geometry.yaml
     """
     bodies = answers(model, settings, url, prefix, timeout).get_body_list()
-    typer.echo(json.dumps(bodies) if as_json else "\n".join(bodies))
+    typer.echo(json.dumps(bodies) if as_json else "\n".join(map(safe, bodies)))

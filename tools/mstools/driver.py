@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from modelserver.errors import ConfigError, ModelServerError, RecordingError, Severity, nearest_names, shown
+from modelserver.service.log_format import set_up
 from mstools.asking import UrlOption
 from mstools.output import print_problem, safe
-from mstools.run import LEVELS
+from mstools.run import LEVELS, FormatOption, check_log
 
 if TYPE_CHECKING:
     from modelserver.config import VehicleConfig
@@ -53,6 +54,7 @@ def command(
     ] = False,
     url: UrlOption = "",
     log_level: Annotated[str, typer.Option("--log-level", help=f"One of {', '.join(LEVELS)}.")] = "info",
+    log_format: FormatOption = "auto",
 ) -> None:
     """Read a device and publish what it measures, until SIGTERM or Ctrl-C.
 
@@ -70,8 +72,7 @@ def command(
 
     modelserver driver imu -c vehicle.yaml --hard-iron --seconds 90
     """
-    if log_level not in LEVELS:
-        raise typer.BadParameter(f"{log_level!r} is not one of {', '.join(LEVELS)}", param_hint="--log-level")
+    check_log(log_level, log_format)
     if list_ports:
         show_ports()
         if config is not None:
@@ -86,7 +87,7 @@ def command(
     vehicle, settings = load_driver(name, config)
     if hard_iron and not settings.kind.hard_iron:
         raise typer.BadParameter(f"a {settings.kind.name} has no such procedure", param_hint="--hard-iron")
-    logging.basicConfig(level=log_level.upper(), format="%(levelname)s %(name)s: %(message)s")
+    set_up(log_level, log_format, f"modelserver-driver-{settings.name}")
     warn_of_names(vehicle, settings)
     with contextlib.ExitStack() as stack:
         link = _line(stack, settings, record_raw, round(record_limit * 1e6), play_raw)
@@ -211,10 +212,12 @@ def _line(
 
 def run(vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], folder: Path, url: str) -> None:
     """Run a driver on a line until it is told to end. Raises ConfigError, OSError, BusError."""
+    from modelserver.service.notify import Notifier
     from modelserver.wire.provider import open_lcm, resolve_url
     from msdrivers.making import station_of
     from msdrivers.publishing import Publisher
     from msdrivers.runner import Runner, RunnerSettings, SystemTime
+    from mstools.driver_supervised import DriverSupervision
 
     kind = settings.kind
     station = station_of(settings, folder)
@@ -229,7 +232,9 @@ def run(vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], folde
         attend = _hear_commands(bus, f"{vehicle.lcm.channel_prefix}{kind.commands}", runner)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: runner.stop())
-    runner.run(attend)
+    supervision = DriverSupervision(runner, Notifier.of_environment())
+    with supervision.ending():
+        runner.run(supervision.attending(attend))
 
 
 def _hear_commands(bus: Any, channel: str, runner: Any) -> Callable[[], object]:

@@ -12,6 +12,7 @@ from modelserver.errors import ModelServerError
 from modelserver.messages import EdgeReport, Explanation, MotionAnswer, Policy
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
+from mstools.output import safe
 from mstools.table import drawable, table
 
 _HEAD = ("kind", "name", "passed", "how", "age", "source", "stands at", "position", "rotation")
@@ -60,7 +61,7 @@ def explaining(source: object) -> Explains:
 def describe_edges(explanation: Explanation) -> str:
     """Return the edges of an explanation as a table for people to read, from the frame of reference on."""
     transformation = explanation.answer.transformation
-    heading = f"{transformation.frame_of_interest} in {transformation.frame_of_reference} rests on"
+    heading = safe(f"{transformation.frame_of_interest} in {transformation.frame_of_reference} rests on")
     if not explanation.edges:
         return f"{heading} nothing: both stand in one place by definition"
     rows = [
@@ -81,6 +82,7 @@ def describe_edges(explanation: Explanation) -> str:
              _sum(each.rotation_share for each in explanation.edges))  # fmt: skip
     lines = [heading, table(_HEAD, [*rows, total], numbers=(4, 7, 8))]
     lines.append("  position and rotation: shares of the sum of the variances")
+    lines += [f"  {edge.name}: {edge.doubt}" for edge in explanation.edges if edge.doubt]
     if any(math.isnan(edge.position_share) for edge in explanation.edges):
         lines.append("  no share: nobody states a sigma there; it counts as exact for the shares of the others")
     return drawable("\n".join(lines))
@@ -142,6 +144,7 @@ def edges_as_data(explanation: Explanation) -> list[dict[str, Any]]:
             "coordinates": list(edge.coordinates),
             "position_share": _known(edge.position_share),
             "rotation_share": _known(edge.rotation_share),
+            "doubt": edge.doubt or None,
         }
         for edge in explanation.edges
     ]
@@ -161,8 +164,8 @@ def describe_motion(motion: MotionAnswer) -> str:
         ("turn acceleration", motion.turn_acceleration, math.degrees(1.0), "deg/s2", ()),
     ]
     lines = [
-        f"{transformation.frame_of_interest} moves in {transformation.frame_of_reference}, "
-        f"along the axes of {motion.expressed_in}"
+        safe(f"{transformation.frame_of_interest} moves in {transformation.frame_of_reference}, ")
+        + safe(f"along the axes of {motion.expressed_in}")
     ]
     for name, values, scale, unit, sigma in rows:
         text = f"  {name:<19}{_scaled(values, scale, unit)}"

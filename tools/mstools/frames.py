@@ -10,6 +10,7 @@ import typer
 from modelserver.geometry import names
 from mstools.asking import JsonOption, ModelOption, PrefixOption, TimeoutOption, UrlOption, answers
 from mstools.options import Variables
+from mstools.output import safe
 
 
 def command(
@@ -29,4 +30,4 @@ def command(
     """
     found = answers(model, settings, url, prefix, timeout).get_body_frame_list(body)
     frames = [names.joined(body, frame) for frame in found]
-    typer.echo(json.dumps(frames) if as_json else "\n".join(frames))
+    typer.echo(json.dumps(frames) if as_json else "\n".join(map(safe, frames)))

@@ -19,7 +19,7 @@ from modelserver.messages import MAX_CHANNEL_LENGTH, SensorHeader
 from modelserver.wire import codec
 from mstools.bag_messages import DEFAULTS, ROS_TYPES, Altitude, Converter, ImuOrientation, Kind, Options, converter
 from mstools.bag_reader import Bag, Topic, open_bag
-from mstools.output import check_target
+from mstools.output import check_target, safe
 from mstools.progress import progress
 
 
@@ -109,8 +109,8 @@ class Report:
         lines = [f"{self.log}: {total} messages, {self.seconds:.1f} s"]
         for each in self.topics:
             what = f"{each.channel}: {each.written} messages" if each.channel else f"skipped: {each.skipped}"
-            lines.append(f"  {each.topic} ({each.type_name}) -> {what}")
-            lines.extend(f"    note: {note}" for note in each.notes)
+            lines.append(safe(f"  {each.topic} ({each.type_name}) -> {what}"))
+            lines.extend(safe(f"    note: {note}") for note in each.notes)
         return "\n".join(lines)
 
 

@@ -137,7 +137,9 @@ class LogAnswers(LocalPlatform):
             raise RecordingError(self._outside(at, begin, end))
         snapshot = self._given or self._contents.snapshot
         knowledge = Knowledge(self._prefix, snapshot, self._given is not None)
-        channels, geometry = set(knowledge.channels), f"{self._prefix}MODEL_SNAPSHOT"
+        channels = set(knowledge.channels)
+        # what these tell of may be of any age
+        ageless = (f"{self._prefix}MODEL_SNAPSHOT", f"{self._prefix}JOINTS_HELD")
         history_us = round((HISTORY_S if snapshot is None else snapshot.history_s) * 1e6)
         oldest = (at or end) - history_us
         now = 0
@@ -146,7 +148,7 @@ class LogAnswers(LocalPlatform):
                 if event.channel not in channels:
                     continue
                 stamp = _stamp(event)
-                if event.channel != geometry and stamp < oldest:
+                if event.channel not in ageless and stamp < oldest:
                     continue
                 if at and policy is Policy.LATEST and stamp > at:
                     continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,8 +20,10 @@ from modelserver.errors import (
     nearest_names,
     shown,
 )
+from modelserver.keys import ENVIRONMENT
 from modelserver.messages import Health, Mode, NavigationState, PublishDecisions, SensorHeader, SwitchMode
-from mstools.asking import UrlOption
+from modelserver.wire.signed import SIGNED
+from mstools.asking import KeyOption, UrlOption
 
 if TYPE_CHECKING:
     import lcm
@@ -38,16 +41,19 @@ def command(
     mode: Annotated[str, typer.Argument(metavar="MODE", help=f"One of {', '.join(MODES)}.")],
     config: Annotated[Path, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file.")],
     url: UrlOption = "",
+    key: KeyOption = None,
 ) -> None:
     """Tell the running daemon which sources its localization is to use from now on, and say what it does.
 
-    The wish goes out once, on the channel that the vehicle file names (localization.mode_channel); the daemon must
-    have been started with the same. Then LOCALIZATION_STATE and LOCALIZATION_DECISIONS are listened to for up to two
+    The wish goes out once, signed, for the channel that the vehicle file names (localization.mode_channel); the daemon
+    must have been started with the same. It is signed with the key of --key, else of $MODELSERVER_KEY_FILE, else of the
+    vehicle file (commands.key_file). Then LOCALIZATION_STATE and LOCALIZATION_DECISIONS are listened to for up to two
     seconds: they tell which mode is in force. Exits 1 where nobody answers, or the mode stays another.
 
     Example: modelserver mode no_gps -c config/husky/vehicle.yaml
     """
     wanted = parse_mode(mode)
+    from modelserver.client.signing import signer
     from modelserver.config import load_config
     from modelserver.wire.codec import encode
     from modelserver.wire.provider import open_lcm, resolve_url
@@ -60,15 +66,20 @@ def command(
         raise ConfigError([Problem(Severity.ERROR, why, source, fix)])
     prefix, state_hz = vehicle.lcm.channel_prefix, vehicle.publish.state_hz
     channel = f"{prefix}{vehicle.localization.mode_channel}"
+    given = str(key or "") or os.environ.get(ENVIRONMENT, "") or vehicle.commands.key_file
+    signing = signer(given, prefix, "modelserver")
+    if signing is None:
+        raise ModelServerError(f"the wish must be signed: name the daemon's key with --key or ${ENVIRONMENT}")
     provider = resolve_url(url or vehicle.lcm.url)
     bus = open_lcm(provider)
-    ear = Ear(bus, prefix)
+    ear = Ear(bus, prefix, vehicle.localization.mode_channel)
     if state_hz:
         ear.listen(min(PATIENCE_S, 2.5 / state_hz), lambda: ear.mode is not None)
     was = ear.mode
     utime = time.time_ns() // 1000
     ear.forget(utime)
-    bus.publish(channel, encode(SwitchMode(SensorHeader(utime, OPERATOR, host_utime=utime), wanted)))
+    wish = encode(SwitchMode(SensorHeader(utime, OPERATOR, host_utime=utime), wanted))
+    bus.publish(signing.channel, signing.sealed(vehicle.localization.mode_channel, wish))
     told = f"told {channel}: {wanted.name.lower()}"
     confirmed = ear.listen(PATIENCE_S, lambda: wanted in (ear.mode, ear.decided))
     if not ear.heard:
@@ -95,7 +106,7 @@ class Ear:
     `since`: wishes of before count for nothing. `refusal`: why a wish was refused, by the health report.
     """
 
-    def __init__(self, bus: lcm.LCM, prefix: str):
+    def __init__(self, bus: lcm.LCM, prefix: str, mode_channel: str):
         from modelserver.wire.channels import literal
 
         self.heard = False
@@ -103,6 +114,9 @@ class Ear:
         self.decided: Mode | None = None
         self.refusal = ""
         self.since = 0
+        # what the daemon counted of signed wishes that it did not obey; before this one, for later it is compared
+        self._sources = (f"{prefix}{mode_channel}", f"{prefix}{SIGNED}")
+        self._counts: dict[tuple[str, str], int] = {}
         self._bus = bus
         self._state_at = 0.0
         handlers = {
@@ -154,10 +168,32 @@ class Ear:
 
         health: Health = decode("health_t", data)
         self.heard = True
-        self.refusal = next((why for source, why, _ in health.rejected if source == f"command:{OPERATOR}"), "")
+        self.refusal = next(
+            (why for source, why, _ in health.rejected if source == f"command:{OPERATOR}"), self.refusal
+        )
+        counts = {(name, why): count for name, why, count in health.rejected if name in self._sources}
+        # where nothing was heard before the wish, what was refused earlier counts too: it is the likeliest cause
+        before, self._counts = self._counts, counts
+        if self.since:
+            for (name, why), count in counts.items():
+                if count > before.get((name, why), 0):
+                    self.refusal = f"{why}: {_WHY.get(why, 'see its log')}"
+            ahead = (health.utime - time.time_ns() // 1000) * 1e-6
+            if self.refusal.startswith("stale") and abs(ahead) > 1.0:
+                side = "ahead of" if ahead > 0 else "behind"
+                self.refusal += f"; the daemon's clock is {abs(ahead):.1f} s {side} this one"
 
     def _on_pose(self, _: str, data: bytes) -> None:
         self.heard = True
+
+
+_WHY = {
+    "unknown_key": "the daemon has no key of that name; it was started with another key file",
+    "bad_signature": "the daemon's key of that name is another one, or its channel prefix",
+    "stale": "it is too old or of the future by the daemon's clock, or the daemon has just started",
+    "replayed": "the daemon took a newer one of this sender; was a clock set back?",
+}
+"""Reasons that the daemon counts for signed messages, in words."""
 
 
 def parse_mode(text: str) -> Mode:

@@ -23,6 +23,7 @@ from mstools.asking import (
 )
 from mstools.explain import describe_edges, describe_motion, edges_as_data, explaining, motion_as_data
 from mstools.options import Variables
+from mstools.output import safe
 
 POLICIES = {policy.name.lower(): policy for policy in Policy}
 
@@ -170,7 +171,7 @@ def describe(answer: PoseAnswer, matrix: bool = False) -> str:
     roll, pitch, yaw = (math.degrees(angle) + 0.0 for angle in transformation.rpy)
     quaternion = " ".join(f"{value:.6f}" for value in transformation.pose.wxyz)
     lines = [
-        f"{transformation.frame_of_interest} in {transformation.frame_of_reference}",
+        safe(f"{transformation.frame_of_interest} in {transformation.frame_of_reference}"),
         f"  position        {x + 0.0:.4f}  {y + 0.0:.4f}  {z + 0.0:.4f}  m",
         f"  roll pitch yaw  {roll:.3f}  {pitch:.3f}  {yaw:.3f}  deg",
         f"  quaternion      {quaternion}  (w x y z)",

@@ -9,12 +9,12 @@ import typer
 
 from modelserver.errors import ForbiddenError, ModelServerError, RejectedError
 from modelserver.messages import ReloadReply
-from mstools.asking import JsonOption, PrefixOption, TimeoutOption, UrlOption
+from mstools.asking import JsonOption, KeyOption, PrefixOption, TimeoutOption, UrlOption
 from mstools.output import safe
 
 PERMIT = (
-    "write commands: {reload: true} in its vehicle file and start it anew, or on its own machine: kill -HUP with the "
-    "daemon's process number (needs no permission; the daemon's log says what came of it)"
+    "or do it on its own machine: kill -HUP with the daemon's process number (needs no permission; the daemon's log "
+    "says what came of it)"
 )
 
 
@@ -24,22 +24,26 @@ def command(
     url: UrlOption = "",
     prefix: PrefixOption = "",
     timeout: TimeoutOption = 10.0,
+    key: KeyOption = None,
 ) -> None:
     """Have the running daemon read its geometry file anew, and say what changes.
 
     All of the file suits the vehicle and counts from now on, or nothing changes and every reason is told. The vehicle
     file itself is not read anew: start the daemon anew for that. The daemon obeys where its vehicle file says commands:
-    {reload: true}; kill -HUP on its own machine needs no permission. Exits 1 where the geometry is not taken.
+    {reload: true, key_file: ...} and the wish is signed with that key (--key); kill -HUP on its own machine needs no
+    permission. Exits 1 where the geometry is not taken.
 
     Example: modelserver reload --dry-run
     """
     from modelserver.client.remote import Platform
 
-    with Platform(url, channel_prefix=prefix, timeout=timeout, retries=0, name="modelserver") as platform:
+    with Platform(
+        url, channel_prefix=prefix, timeout=timeout, retries=0, name="modelserver", key_file=key or ""
+    ) as platform:
         try:
             reply = platform.reload_model(dry_run=dry_run)
-        except ForbiddenError:
-            raise ModelServerError(f"the daemon does not reload for who asks on the bus; {PERMIT}") from None
+        except ForbiddenError as error:
+            raise ModelServerError(f"the daemon does not reload: {error}; {PERMIT}") from None
         except RejectedError as error:
             for line in str(error).splitlines():
                 typer.echo(safe(line), err=True)

@@ -22,7 +22,7 @@ from modelserver.messages import Decision, Invalid, Verdict
 from modelserver.wire.eventlog import LogEvent, LogFile
 from modelserver.wire.kinds import is_of_service
 from mstools.asking import JsonOption, UrlOption
-from mstools.output import check_target, counted, written_whole
+from mstools.output import check_target, counted, safe, written_whole
 from mstools.progress import progress
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ TIMES_LIMIT = 64 << 20
 
 
 def command(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="LCM event log.")],
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="LCM event log; with --verify a journal, or its folder.")],
     config: Annotated[Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file.")] = None,
     poses: Annotated[
         str, typer.Option(metavar="CSV", help="Work offline, and write the poses here; - is standard output.")
@@ -68,6 +68,10 @@ def command(
     everything: Annotated[
         bool, typer.Option("--all", help="Onto the bus, send recorded poses, requests and replies too.")
     ] = False,
+    verify: Annotated[
+        bool,
+        typer.Option("--verify", help="LOG is a journal: run it again and compare all that was said, bit for bit."),
+    ] = False,
     url: UrlOption = "",
     as_json: JsonOption = False,
 ) -> None:
@@ -80,6 +84,7 @@ def command(
     even or listed times, each from nothing but what had arrived before it; docs/recordings.md says exactly what that
     means. --report draws the same run: track, innovations, biases, gaps, validity, and what looks wrong.
     A log that breaks off in its last event is used up to there; for other damage the exit code is 1.
+    With --verify a service's journal is run again, and the first message that is not reproduced is named: exit code 1.
     Files named by --poses, --decisions and --report that exist are replaced, without --force.
 
     \b
@@ -88,7 +93,17 @@ def command(
       modelserver replay drive.lcm --speed 2
       modelserver replay drive.lcm -c config/husky/vehicle.yaml --poses poses.csv --frame Antenna:PhaseCentre --rate 10
       modelserver replay drive.lcm -c config/husky/vehicle.yaml --report drive.html
+      modelserver replay --verify /var/lib/modelserver/journal-Husky
     """
+    if verify:
+        if any(
+            (config, poses, decisions, report, frame, rate, at_times, channel, everything, url, restamp, speed != "1")
+        ):
+            raise typer.BadParameter("--verify stands alone, but for --json: all it needs is in the journal")
+        from mstools.replay_verify import verified
+
+        verified(log, as_json)
+        return
     channels = frozenset(channel or ())
     if poses or report:
         if config is None:
@@ -325,7 +340,7 @@ def _print_counts(
     ]
     for (source, reason), count in sorted(run.rejected.items()):
         of = ", ".join(kind if n == count else f"{n} {kind}" for kind, n in kinds[source, reason].items())
-        lines.append(f"  not used: {count} of {source}, {reason}{f' ({of})' if of else ''}")
+        lines.append(safe(f"  not used: {count} of {source}, {reason}{f' ({of})' if of else ''}"))
     typer.echo(json.dumps(counts) if as_json else "\n".join(lines), err=on_stderr)
 
 
@@ -437,7 +452,7 @@ def _inputs(recording: Iterable[LogEvent]) -> Iterator[LogEvent]:
 
 def _report_damage(recording: LogFile) -> None:
     for each in recording.damage[:20]:
-        typer.echo(f"modelserver: {recording.path}: {each}", err=True)
+        typer.echo(safe(f"modelserver: {recording.path}: {each}"), err=True)
     if len(recording.damage) > 20:
         typer.echo(f"modelserver: {recording.path}: {len(recording.damage) - 20} more damaged places", err=True)
     if recording.torn:

@@ -5,19 +5,25 @@ from __future__ import annotations
 import logging
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import typer
 
+from modelserver.service.log_format import FORMATS, set_up
 from mstools.asking import UrlOption
 
 LEVELS = ("debug", "info", "warning", "error")
+
+FormatOption: TypeAlias = Annotated[
+    str, typer.Option("--log-format", help=f"One of {', '.join(FORMATS)}; auto: journal where systemd reads the log.")
+]
 
 
 def command(
     config: Annotated[Path, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file.")],
     url: UrlOption = "",
     log_level: Annotated[str, typer.Option("--log-level", help=f"One of {', '.join(LEVELS)}.")] = "info",
+    log_format: FormatOption = "auto",
 ) -> None:
     """Run the service for a vehicle file, until SIGTERM or Ctrl-C.
 
@@ -27,16 +33,25 @@ def command(
 
     Example: modelserver run -c config/raptor/vehicle.yaml
     """
-    if log_level not in LEVELS:
-        raise typer.BadParameter(f"{log_level!r} is not one of {', '.join(LEVELS)}", param_hint="--log-level")
+    check_log(log_level, log_format)
     # one thread serves; idle BLAS threads would only disturb its timing
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from modelserver.config import load_config
     from modelserver.service import daemon
+    from modelserver.service.notify import Notifier
 
-    logging.basicConfig(level=log_level.upper(), format="%(levelname)s %(name)s: %(message)s")
+    set_up(log_level, log_format)
+    notifier = Notifier.of_environment()
+    notifier.starting(f"reading {config}")
     vehicle = daemon.load_vehicle(load_config(config), str(config))
     for problem in vehicle.model.problems:
         logging.getLogger("modelserver").warning("%s", problem)
-    daemon.run(vehicle, url, str(config))
+    daemon.run(vehicle, url, str(config), notifier)
+
+
+def check_log(level: str, form: str) -> None:
+    """Raise typer.BadParameter, a usage error, for a level or a form of log that there is not."""
+    for option, given, known in (("--log-level", level, LEVELS), ("--log-format", form, FORMATS)):
+        if given not in known:
+            raise typer.BadParameter(f"{given!r} is not one of {', '.join(known)}", param_hint=option)

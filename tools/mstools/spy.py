@@ -1,4 +1,4 @@
-"""`modelserver spy`: lcm-spy with this project's types, so that it shows every message decoded."""
+"""`modelserver spy`: every channel decoded, in lcm-spy with this project's types or in the terminal."""
 
 from __future__ import annotations
 
@@ -22,27 +22,84 @@ from mstools.lcm_wheel import MissingToolError, binary, java_library, type_files
 
 
 def command(
+    terminal: Annotated[
+        bool, typer.Option("--terminal", "-t", help="A table in the terminal, also where there is a screen.")
+    ] = False,
+    window: Annotated[
+        bool, typer.Option("--window", help="lcm-spy's window, and an error where it cannot be opened.")
+    ] = False,
+    channel: Annotated[
+        str, typer.Option("--channel", metavar="NAME", help="In the terminal: show this channel's fields.")
+    ] = "",
+    once: Annotated[bool, typer.Option("--once", help="In the terminal: listen for 2 s, print, and end.")] = False,
+    seconds: Annotated[
+        float, typer.Option("--seconds", metavar="N", min=0.0, max=86400.0, help="The same, for so many seconds.")
+    ] = 0.0,
+    config: Annotated[
+        Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file, for its bus.")
+    ] = None,
     url: UrlOption = "",
     build_only: Annotated[
         bool, typer.Option("--build-only", help="Build the types for Java, print the jar's path, and end.")
     ] = False,
 ) -> None:
-    """Watch the channels with lcm-spy, decoded. Double-click a channel to see its fields.
+    """Watch the channels, decoded.
 
-    Needs Java (default-jre), and at its first run a Java compiler (default-jdk-headless): the types are compiled
-    once for each version of the wire contract and kept in the user's cache.
+    With a screen and Java this starts lcm-spy; double-click a channel there to see its fields. Its first run needs a
+    Java compiler (default-jdk-headless) too: the types are compiled once for each version of the wire contract and kept
+    in the user's cache.
 
-    Example: modelserver spy --url "udpm://239.255.76.67:7667?ttl=0"
+    Without, as over ssh, or with --terminal, it is a table in the terminal: every channel that is heard with its type,
+    rate, jitter, size and age; bad counts damaged messages. Up and down choose a channel, enter shows the fields of its
+    last message, q ends. Where the output is no terminal, the table is printed once.
+
+    Examples:
+
+    modelserver spy
+
+    modelserver spy --terminal --channel POSE
+
+    modelserver spy --once --channel MODELSERVER_HEALTH
     """
     if build_only:
         typer.echo(str(types_jar()))
         return
-    check_java()
-    jar = types_jar()
+    plain = terminal or bool(channel) or once or bool(seconds)
+    if window and plain:
+        raise typer.BadParameter(
+            "lcm-spy knows none of --terminal, --channel, --once and --seconds", param_hint="--window"
+        )
+    if config is not None and not url:
+        from modelserver.config import load_config
+
+        url = load_config(config).lcm.url
+    if not plain:
+        start_window(url, window)
+    from modelserver.wire.provider import open_lcm, resolve_url
+    from mstools.spy_terminal import LISTEN_S, show
+
+    show(open_lcm(resolve_url(url)), channel, seconds or (LISTEN_S if once else 0.0))
+
+
+def start_window(url: str, is_wanted: bool) -> None:
+    """Make this process lcm-spy. Return where it cannot be, and say why, unless there is no screen at all.
+
+    Raises MissingToolError instead where it is wanted all the same.
+    """
+    if not (is_wanted or os.environ.get("DISPLAY")):
+        return
+    try:
+        check_java()
+        jar = types_jar()
+        spy = binary("lcm-spy")
+    except MissingToolError as error:
+        if is_wanted:
+            raise
+        typer.echo(f"modelserver: {error}. Until then, in the terminal:", err=True)
+        return
     environment = dict(os.environ)
     environment["CLASSPATH"] = os.pathsep.join(filter(None, (str(jar), environment.get("CLASSPATH", ""))))
     provider = url or environment.get("LCM_DEFAULT_URL", "") or DEFAULT_URL
-    spy = binary("lcm-spy")
     sys.stdout.flush()
     # lcm-spy takes this process's place, so that signals reach it and its exit code is ours
     os.execve(spy, [str(spy), f"--lcm-url={provider}"], environment)
@@ -60,8 +117,8 @@ def check_java() -> None:
         raise MissingToolError("lcm-spy opens a window, and this Java has no windows: sudo apt install default-jre")
     if not os.environ.get("DISPLAY"):
         raise MissingToolError(
-            "lcm-spy opens a window, and there is no display (DISPLAY is empty). Over ssh use ssh -X, or watch from "
-            "another machine on the same bus"
+            "lcm-spy opens a window, and there is no display (DISPLAY is empty). Over ssh use ssh -X, or "
+            "modelserver spy --terminal"
         )
 
 

@@ -26,6 +26,17 @@ def test_given_an_unknown_command_then_the_nearest_is_offered(
     assert words in err
 
 
+@pytest.mark.parametrize("command", [("run",), ("driver", "gps")])
+@pytest.mark.parametrize("option", ["--log-level", "--log-format"])
+def test_given_a_log_that_there_is_not_then_those_there_are_are_told(
+    capsys: pytest.CaptureFixture[str], command: tuple[str, ...], option: str
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([*command, "-c", "vehicle.yaml", option, "loud"])
+    assert ended.value.code == 2
+    assert f"{option}: 'loud' is not one of " in " ".join(capsys.readouterr().err.split())
+
+
 def test_given_the_words_of_others_then_they_lead_to_commands_that_there_are() -> None:
     assert set(OTHER_WORDS.values()) <= COMMANDS.keys()
     assert not OTHER_WORDS.keys() & COMMANDS.keys()

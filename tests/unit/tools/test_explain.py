@@ -143,7 +143,7 @@ def test_given_a_vehicle_and_joints_that_were_heard_then_how_age_and_source_are_
     rows = {line.split()[0]: line for line in text.splitlines() if not line.startswith("  no")}
     assert "World:UTM → Rover:Base" in rows["vehicle"]
     assert "localization" in rows["vehicle"]
-    for part in ("interpolated", "1.980 s", "JOINTS", " deg "):
+    for part in ("interpolated", "1.980 s", "arm", " deg "):
         assert part in rows["joint"]
 
 

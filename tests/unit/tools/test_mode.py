@@ -11,11 +11,14 @@ import lcm
 import pytest
 import typer
 from support_lcm import Listener, reserved_url
-from support_samples import START, VEHICLE, write_vehicle
+from support_samples import START, VEHICLE
+from support_samples import write_vehicle as write_files
+from support_signing import KEY, write_test_key
 
 from modelserver.messages import (
     VALID,
     Decision,
+    Envelope,
     Mode,
     NavigationState,
     Phase,
@@ -23,12 +26,13 @@ from modelserver.messages import (
     SwitchMode,
     Verdict,
 )
+from modelserver.signing import is_genuine
 from modelserver.spatial import Pose
 from modelserver.wire.codec import decode, encode
 from mstools.cli import main
 from mstools.mode import MODES, parse_mode
 
-LISTENS = VEHICLE + "localization: {mode_channel: console/mode}\n"
+LISTENS = VEHICLE + "commands: {key_file: commands.key}\nlocalization: {mode_channel: console/mode}\n"
 Run = Callable[..., tuple[int, str, str]]
 
 
@@ -45,6 +49,12 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
     return mode
 
 
+def write_vehicle(folder: Path, vehicle: str = VEHICLE) -> Path:
+    """Write a vehicle's files, and the key beside them."""
+    write_test_key(folder)
+    return write_files(folder, vehicle)
+
+
 class Answering:
     """A daemon that hears wishes and tells its state, as far as a test wants it to."""
 
@@ -52,7 +62,7 @@ class Answering:
         self.mode, self.obeys, self.decides, self.prefix = mode, obeys, decides, prefix
         self.wishes: list[SwitchMode] = []
         self.bus = lcm.LCM(url)
-        self.bus.subscribe(f"{prefix}console/mode", self.heard)
+        self.bus.subscribe(f"{prefix}MODELSERVER_SIGNED", self.heard)
         self.ended = threading.Event()
         self.thread = threading.Thread(target=self.run)
 
@@ -72,7 +82,10 @@ class Answering:
             self.bus.publish(f"{self.prefix}POSE", b"")
 
     def heard(self, _: str, data: bytes) -> None:
-        wish: SwitchMode = decode("localization_mode_t", data)
+        envelope: Envelope = decode("signed_t", data)
+        assert envelope.channel == "console/mode"
+        assert is_genuine(KEY, self.prefix, envelope)
+        wish: SwitchMode = decode("localization_mode_t", envelope.payload)
         self.wishes.append(wish)
         if self.obeys:
             self.mode = wish.mode
@@ -132,7 +145,7 @@ def test_given_nobody_then_it_is_told_what_was_sent_and_that_nobody_answers(
     monkeypatch.setattr("mstools.mode.PATIENCE_S", 0.1)
     with reserved_url() as url:
         config = write_vehicle(tmp_path, f"{LISTENS}lcm: {{url: '{url}'}}\n")
-        listener = Listener(url, "console/mode")
+        listener = Listener(url, "MODELSERVER_SIGNED")
         code, out, err = run("full", "--config", config)
         assert (code, out) == (1, "")
         assert "told console/mode: full, but nobody answers" in err

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 import pytest
 from support_mirror import DELAY, drive, joints, parts, pose, snapshot
-from support_moving import BASE, ODOM, SCAN, T0, UTM, S, estimate, rover, truth, vehicle
+from support_moving import BASE, ODOM, SCAN, T0, UTM, S, estimate, joints_at, rover, truth, vehicle
 from support_recordings import write_log
 
 from modelserver.formats import save_model
+from modelserver.joints import Joints
 from modelserver.spatial import Pose
+from modelserver.wire.codec import encode
 from mstools.cli import main
 
 Command: TypeAlias = Callable[..., tuple[int, str, str]]
@@ -161,6 +164,24 @@ def test_given_a_log_with_a_prefix_then_it_has_to_be_said(run: Command, tmp_path
     code, out, _ = run("query", SCAN, UTM, "--log", path, "--prefix", "V1_", "--at", T0 + S, "--json")
     assert code == 0
     assert said(out).is_close(truth(SCAN, UTM, 1.0), 1e-9, 1e-9)
+
+
+def test_given_a_log_that_begins_after_a_joint_was_told_then_it_has_where_it_was_held(
+    run: Command, tmp_path: Path
+) -> None:
+    now = T0 + 3600 * S
+    held = Joints(rover().joints.values(), 60.0).taken(joints_at(0.0), T0)[0].newest(now)
+    events = [(now + n, *message) for n, message in enumerate(parts(snapshot(), now))]
+    events += [(now + 50 + n, "JOINTS_HELD", encode(each)) for n, each in enumerate(held)]
+    events += [
+        (now + 10_000 * n, channel, data)
+        for n in range(20)
+        for channel, data in pose(replace(estimate(0.0), utime=now + 10_000 * n))
+    ]
+    path = write_log(tmp_path / "late.lcm", events)
+    code, out, _ = run("query", SCAN, BASE, "--log", path, "--at", now + S // 10, "--policy", "held", "--json")
+    assert code == 0
+    assert said(out).is_close(truth(SCAN, BASE, 0.0), 1e-9, 1e-9)
 
 
 def test_given_a_mistyped_frame_then_the_nearest_is_said(run: Command, log: Path) -> None:

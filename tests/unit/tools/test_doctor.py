@@ -1,0 +1,216 @@
+"""`modelserver doctor`: findings for people and scripts, exit codes, and what a vehicle file needs of the machine."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from support_samples import GEOMETRY, VEHICLE, write_vehicle
+
+from modelserver.config import load_config
+from modelserver.errors import Problem, Severity
+from modelserver.service import listening, machine
+from modelserver.service.findings import Finding, Grade, worst
+from modelserver.service.probe import BusFacts, Interface, UdpAddress
+from modelserver.service.probe_clock import ClockFacts
+from modelserver.service.probe_servers import Answers, Server
+from modelserver.wire.channels import DEFAULT_URL
+from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
+from msdrivers.settings import read_drivers
+from mstools import doctor, doctor_vehicle
+from mstools.cli import main
+from mstools.doctor_vehicle import file_finding, line_findings, state_findings, vehicle_findings
+
+LO = Interface("lo", loopback=True)
+WELL = BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), True, True, RECEIVE_BUFFER_BYTES, RECEIVE_BUFFER_BYTES, 0)
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """The command on a machine that is well, but for what `facts` and `answers` say."""
+
+    def command(*arguments: object, facts: BusFacts = WELL, answers: Answers | None = None) -> tuple[int, str, str]:
+        from modelserver.version import __version__
+
+        answers = answers or Answers((Server("pc", 1, "cart", __version__),), 1)
+        monkeypatch.setattr(machine, "bus_facts", lambda url, delivery=None: facts)
+        monkeypatch.setattr(listening, "who_answers", lambda *_: answers)
+        monkeypatch.setattr(machine.ClockWatch, "facts", lambda self: ClockFacts(1_800_000_000_000_000, True, 0.01))
+        with pytest.raises(SystemExit) as ended:
+            main(["doctor", *map(str, arguments)])
+        said = capsys.readouterr()
+        return int(ended.value.code or 0), said.out, said.err
+
+    return command
+
+
+def test_given_a_machine_that_is_well_then_it_says_so_and_exits_0(run: Run) -> None:
+    code, out, _ = run()
+    assert code == 0
+    assert out.splitlines()[-1] == "all is well"
+    assert "modelserver" in out.splitlines()[0]
+
+
+@pytest.mark.parametrize(
+    ("facts", "code", "words"),
+    [
+        (BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), True, True, 1000, 1 << 22), 1, "1 warning"),
+        (BusFacts(DEFAULT_URL, UdpAddress(), None, (LO,)), 3, "$ sudo ip link set lo up multicast on"),
+        (BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), False), 3, "1 error"),
+    ],
+)
+def test_given_something_to_mend_then_command_and_exit_code_tell(
+    run: Run, facts: BusFacts, code: int, words: str
+) -> None:
+    found, out, _ = run(facts=facts)
+    assert found == code
+    assert words in out
+
+
+def test_given_two_daemons_then_it_is_an_error(run: Run) -> None:
+    code, out, _ = run(answers=Answers((Server("a", 1), Server("b", 2)), 2))
+    assert code == 3
+    assert "2 answer at once: process 1 on 'a', process 2 on 'b'" in out
+    assert "$ kill 2" in out
+
+
+def test_given_json_then_scripts_get_every_finding(run: Run) -> None:
+    code, out, _ = run("--json", facts=BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), False))
+    data = json.loads(out)
+    assert (code, data["exit_code"]) == (3, 3)
+    found = next(each for each in data["findings"] if each["subject"] == "own message")
+    assert found["grade"] == "error"
+    assert "iptables" in found["command"]
+
+
+def test_given_a_vehicle_file_then_it_is_looked_at_too(run: Run, tmp_path: Path) -> None:
+    code, out, _ = run("-c", write_vehicle(tmp_path, VEHICLE))
+    assert code == 0
+    assert "loads, and its geometry" in out
+    assert f"{tmp_path / 'state'} may be written" in out
+
+
+@pytest.mark.parametrize("text", [VEHICLE.replace("vehicle:", "vehicel:"), "[", f"{VEHICLE}x: 1\n"])
+def test_given_a_vehicle_file_that_is_wrong_then_it_is_an_error_that_check_explains(
+    run: Run, tmp_path: Path, text: str
+) -> None:
+    path = write_vehicle(tmp_path, text)
+    code, out, _ = run("-c", path)
+    assert code == 3
+    assert f"$ modelserver check {path}" in out
+    assert "own message" in out
+
+
+def test_given_no_such_vehicle_file_then_it_says_so(run: Run, tmp_path: Path) -> None:
+    code, _, err = run("-c", tmp_path / "none.yaml")
+    assert code == 1
+    assert "none.yaml" in err
+
+
+def test_given_findings_with_odd_words_then_they_are_escaped() -> None:
+    text = doctor.describe([Finding(Grade.ERROR, "x\x1b", "y\n\x1b[2J", "z\x07", "rm\r")])
+    assert all(line.isprintable() for line in text.split("\n"))
+
+
+# --- the vehicle file ---------------------------------------------------------------------------------------
+
+
+def test_given_a_geometry_that_is_missing_then_the_vehicle_file_is_an_error(tmp_path: Path) -> None:
+    path = write_vehicle(tmp_path, VEHICLE, GEOMETRY)
+    config = load_config(path)
+    Path(config.geometry).unlink()
+    assert worst(vehicle_findings(config, path)) is Grade.ERROR
+
+
+@pytest.mark.parametrize(
+    ("severities", "grade"),
+    [
+        ([], Grade.OK),
+        ([Severity.NOTE], Grade.OK),
+        ([Severity.NOTE, Severity.WARNING], Grade.WARNING),
+        ([Severity.WARNING, Severity.ERROR, Severity.ERROR], Grade.ERROR),
+    ],
+)
+def test_given_problems_of_a_file_then_the_gravest_counts(severities: list[Severity], grade: Grade) -> None:
+    found = file_finding([Problem(each, f"it is {each}") for each in severities], Path("v.yaml"))
+    assert found.grade is grade
+    assert bool(found.command) == (grade is not Grade.OK)
+
+
+class Usage(NamedTuple):
+    total: int
+    used: int
+    free: int
+
+
+def state(directory: Path | None) -> Finding:
+    (found,) = state_findings(directory)
+    return found
+
+
+def test_given_a_place_for_the_state_then_it_is_found_out_whether_it_can_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert state(tmp_path / "new" / "deeper").grade is Grade.OK
+    assert not (tmp_path / "new").exists()
+    assert state(None).grade is Grade.WARNING
+    (tmp_path / "file").write_text("")
+    assert (state(tmp_path / "file" / "x").grade, state(tmp_path / "file").grade) == (Grade.WARNING,) * 2
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "access", lambda path, mode: False)
+        found = state(tmp_path / "mine")
+    assert (found.grade, f"sudo mkdir -p {tmp_path / 'mine'}" in found.command) == (Grade.WARNING, True)
+    monkeypatch.setattr(doctor_vehicle.shutil, "disk_usage", lambda path: Usage(10**9, 10**9, 10**6))
+    assert (state(tmp_path).grade, "1 MB of room" in state(tmp_path).seen) == (Grade.WARNING, True)
+
+
+def lines(sections: dict[str, dict[str, Any]], networks: Sequence[Interface] = ()) -> list[Finding]:
+    drivers, problems = read_drivers(sections)
+    assert not problems
+    return list(line_findings(drivers.values(), networks))
+
+
+def test_given_a_serial_port_then_who_may_use_it_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from msdrivers.links import ports
+
+    port = tmp_path / "ttyX"
+    sections = {"gps": {"device": "nmea", "port": str(port)}}
+    (found,) = lines(sections)
+    assert (found.grade, found.subject, found.command) == (Grade.WARNING, "driver gps", "modelserver driver --list")
+    port.write_text("")
+    assert lines(sections)[0].grade is Grade.OK
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    hint = "it belongs to group dialout: sudo usermod -aG dialout ann, then log in again"
+    monkeypatch.setattr(ports, "permission_fix", lambda path: hint)
+    (found,) = lines(sections)
+    assert (found.grade, found.command) == (Grade.ERROR, "sudo usermod -aG dialout ann")
+    monkeypatch.setattr(ports, "permission_fix", lambda path: "give this user access")
+    assert lines(sections)[0].command == f"ls -l {port}"
+
+
+def test_given_a_port_in_use_then_it_is_worth_knowing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from msdrivers.links import ports
+
+    port = tmp_path / "ttyX"
+    port.write_text("")
+    monkeypatch.setattr(ports, "hint_for", lambda path: "in use by process 3 (minicom)")
+    (found,) = lines({"gps": {"device": "nmea", "port": str(port)}})
+    assert (found.grade, "minicom" in found.seen) == (Grade.NOTE, True)
+
+
+def test_given_a_can_network_then_it_must_be_there_and_up() -> None:
+    raptor = Path(__file__).resolve().parents[3] / "config" / "raptor" / "vehicle.yaml"
+    config = load_config(raptor)
+    section = {"wheels": config.drivers["wheels"]}
+    grades = [
+        lines(section, networks)[0].grade for networks in ((), (Interface("can0", up=False),), (Interface("can0"), LO))
+    ]
+    assert grades == [Grade.WARNING, Grade.ERROR, Grade.OK]
+    assert lines(section, (Interface("can0", up=False),))[0].command.startswith("sudo ip link set can0 up type can")
+    trying = {"wheels": {**config.drivers["wheels"], "can": "239.74.163.2:4000", "interface": "udp_multicast"}}
+    assert lines(trying)[0].grade is Grade.OK

@@ -1,0 +1,73 @@
+"""A driver under a service manager: a device that is away is no reason to end it, a driver that only fails is."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any, cast
+
+from modelserver.messages import DriverPhase
+from modelserver.service.notify import Notifier
+from modelserver.service.progress import PATIENCE_S
+from msdrivers.runner import Runner
+from mstools.driver_supervised import DriverSupervision
+
+
+class Runs:
+    """What is asked of a runner, and a service manager that writes down what it is told."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self.samples = 0
+        self.state = (DriverPhase.CLOSED, "/dev/ttyUSB0: there is no such port")
+        self.now_ns = 10**9
+        self.told: list[str] = []
+        notifier = Notifier(lambda datagram: self.told.append(datagram.decode()), 10**9, lambda: self.now_ns)
+        self.attended = 0
+        supervision = DriverSupervision(cast(Runner[Any], self), notifier, lambda: self.now_ns)
+        self.attend = supervision.attending(self._count)
+
+    def _count(self) -> None:
+        self.attended += 1
+
+    def runs(self, seconds: float, *, samples: int = 0, errors: int = 0) -> int:
+        """Make passes at 50 Hz; return how many signs of life were given."""
+        self.told.clear()
+        for _ in range(round(seconds * 50)):
+            self.samples += samples
+            self.counts["errors.received"] += errors
+            self.attend()
+            self.now_ns += 10**9 // 50
+        return self.told.count("WATCHDOG=1")
+
+
+def test_given_a_device_that_is_away_then_the_driver_is_ready_and_lives() -> None:
+    driver = Runs()
+    driver.attend()
+    assert driver.told == []
+    driver.attend()
+    assert driver.told == ["READY=1\nSTATUS=closed: /dev/ttyUSB0: there is no such port"]
+    driver.counts["commands_lost"] = 3
+    assert driver.runs(60.0) >= 60
+    assert driver.attended == 3002
+
+
+def test_given_a_driver_that_measures_then_the_status_says_so() -> None:
+    driver = Runs()
+    driver.runs(1.0)
+    driver.state = (DriverPhase.STREAMING, "")
+    driver.runs(2.0, samples=1, errors=1)
+    assert "STATUS=streaming" in driver.told
+
+
+def test_given_a_driver_that_only_fails_then_signs_of_life_end() -> None:
+    driver = Runs()
+    driver.runs(1.0)
+    driver.runs(PATIENCE_S + 0.5, errors=1)
+    assert driver.runs(10.0, errors=1) == 0
+
+
+def test_given_nobody_to_tell_then_only_what_was_to_be_done_is_done() -> None:
+    def attend() -> None:
+        """Do it."""
+
+    assert DriverSupervision(cast(Runner[Any], None), Notifier(None)).attending(attend) is attend

@@ -1,0 +1,101 @@
+"""What strangers say to the commands: a false daemon's names and texts never steer the terminal."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import lcm
+import pytest
+from support_lcm import reserved_url
+
+from modelserver.errors import Status
+from modelserver.messages import (
+    CHANNEL_OF,
+    EdgeReport,
+    Explanation,
+    ExplanationReply,
+    GetBodyFrameList,
+    GetBodyList,
+    GetExplanation,
+    GetMotion,
+    GetTransformation,
+    MotionAnswer,
+    MotionReply,
+    NameListReply,
+    PoseAnswer,
+    ReloadModel,
+    ReloadReply,
+    ReplyHeader,
+    TransformReply,
+)
+from modelserver.spatial import Pose, Transformation
+from modelserver.wire.channels import BY_NAME
+from modelserver.wire.codec import decode, encode
+from mstools.cli import main
+
+EVIL = "x\n\x1b[2J\x1b]0;owned\x07\r\u202eFORGED"
+THREE = (0.0, 0.0, 0.0)
+ANSWER = PoseAnswer(Transformation(EVIL, EVIL, Pose(), model_revision=EVIL))
+EDGE = EdgeReport("joint", EVIL, True, (EVIL, EVIL), Pose(), "predicted", source=EVIL)
+GOOD: dict[type, Any] = {
+    GetBodyList: lambda header: NameListReply(header, (EVIL, EVIL), (EVIL, EVIL)),
+    GetBodyFrameList: lambda header: NameListReply(header, (EVIL,), (EVIL,)),
+    GetTransformation: lambda header: TransformReply(header, ANSWER),
+    GetExplanation: lambda header: ExplanationReply(header, Explanation(ANSWER, (EDGE, EDGE))),
+    GetMotion: lambda header: MotionReply(header, MotionAnswer(ANSWER, EVIL, THREE, THREE, THREE, THREE)),
+    ReloadModel: lambda header: ReloadReply(header, EVIL, (EVIL, EVIL)),
+}
+
+
+@contextmanager
+def false_daemon(status: Status) -> Iterator[str]:
+    """A stranger that answers before the daemon does, with texts of its own."""
+    with reserved_url() as url:
+        bus = lcm.LCM(url)
+        ended = threading.Event()
+
+        def answering(kind: type) -> Any:
+            def answer(_: str, data: bytes) -> None:
+                header = decode(BY_NAME[CHANNEL_OF[kind]].type_name, data).header
+                told = ReplyHeader(header.request_id, 1, status, "" if status is Status.OK else EVIL, (EVIL,), EVIL)
+                bus.publish(header.reply_channel, encode(GOOD[kind](told)))
+
+            return answer
+
+        for kind in GOOD:
+            bus.subscribe(CHANNEL_OF[kind], answering(kind))
+
+        def run() -> None:
+            while not ended.is_set():
+                bus.handle_timeout(20)
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        try:
+            yield url
+        finally:
+            ended.set()
+            thread.join()
+
+
+@pytest.mark.parametrize("status", [Status.OK, Status.UNKNOWN_FRAME, Status.FORBIDDEN, Status.REJECTED])
+@pytest.mark.parametrize("arguments", [
+    ["bodies"], ["frames", "A"], ["query", "A:A", "B:B"], ["query", "A:A", "B:B", "--explain"],
+    ["query", "A:A", "B:B", "--motion"], ["reload"], ["tree", "--live"],
+    ["bodies", "--json"], ["query", "A:A", "B:B", "--json"], ["reload", "--json"],
+])  # fmt: skip
+def test_given_hostile_replies_then_every_line_on_the_terminal_is_plain(
+    status: Status, arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("MODELSERVER_KEY_FILE", raising=False)
+    with false_daemon(status) as url, pytest.raises(SystemExit):
+        main([*arguments, "--url", url, "--timeout", "1" if arguments[0] != "tree" else "0.2"])
+    out, err = capsys.readouterr()
+    assert out + err
+    # only line breaks of our own: nothing that a stranger said begins a line
+    for line in (out + err).splitlines():
+        assert line.isprintable(), line
+        assert not line.startswith("FORGED")

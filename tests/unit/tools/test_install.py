@@ -1,0 +1,345 @@
+"""`modelserver install` and `uninstall` on a system of their own: a folder."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from modelserver.errors import ModelServerError
+from modelserver.keys import new_key, write_key
+from mstools import install, install_steps
+from mstools.cli import main
+from mstools.install_files import (
+    SerialDriver,
+    check_drivers,
+    check_seen,
+    credential,
+    hidden_by,
+    limits,
+    loopback_group,
+    realtime,
+    rules,
+    units,
+)
+from mstools.install_plan import SYSCTL, Facts
+
+RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
+OWN_KEY, FAR_KEY = "commands.key", "/etc/keys/rover.key"
+TEMPLATES = install.templates()
+
+Said = tuple[int, str, str]
+
+
+@pytest.fixture
+def run(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Said]:
+    """A function that runs a command on a system below a folder, with an installation that the units can see."""
+    monkeypatch.setattr(install, "check_installation", lambda: None)
+    monkeypatch.setattr(install, "program", lambda: "/opt/modelserver/bin/modelserver")
+    # there may be no systemd here, and what it is told is looked at elsewhere
+    monkeypatch.setattr(install_steps.shutil, "which", lambda name, path: "/bin/true")
+    root = tmp_path / "root"
+    (root / "etc").mkdir(parents=True)
+
+    def command(*words: str) -> Said:
+        try:
+            main([*words, "--root", str(root)])
+        except SystemExit as ended:
+            code = ended.code
+        out, err = capsys.readouterr()
+        assert isinstance(code, int)
+        return code, out, err
+
+    return command
+
+
+@pytest.fixture
+def vehicle(tmp_path: Path) -> Path:
+    folder = tmp_path / "given"
+    shutil.copytree(RAPTOR, folder)
+    (folder / "vehicle.yaml").rename(folder / "raptor.yaml")
+    return folder / "raptor.yaml"
+
+
+def tree(root: Path) -> dict[str, bytes | None]:
+    return {str(path.relative_to(root)): path.read_bytes() if path.is_file() else None for path in root.rglob("*")}
+
+
+def test_given_a_dry_run_then_all_is_told_and_nothing_done(
+    run: Callable[..., Said], vehicle: Path, tmp_path: Path
+) -> None:
+    code, out, _ = run("install", "--vehicle", str(vehicle), "--dry-run", "--serial", "gps=usb-X_1-if00")
+    assert code == 0
+    for words in (
+        "write   /etc/modelserver/vehicle.yaml",
+        "ExecStart=/opt/modelserver/bin/modelserver run -c /etc/modelserver/vehicle.yaml",
+        "/dev/modelserver/gps",
+        "enable modelserver-loopback.service modelserver.service modelserver-driver@gps.service",
+        "nothing was done",
+    ):
+        assert words in out
+    assert tree(tmp_path / "root") == {"etc": None}
+
+
+def test_given_an_installation_then_a_removal_leaves_nothing_of_it(
+    run: Callable[..., Said], vehicle: Path, tmp_path: Path
+) -> None:
+    assert run("install", "--vehicle", str(vehicle), "--drivers", "gps,wheels")[0] == 0
+    there = tree(tmp_path / "root")
+    assert there["etc/modelserver/vehicle.yaml"] == vehicle.read_bytes()
+    assert there["etc/modelserver/raptor.dbc"] == (RAPTOR / "raptor.dbc").read_bytes()
+    unit = there["etc/systemd/system/modelserver.service"] or b""
+    assert b"ExecStart=/opt/modelserver/bin/modelserver run" in unit
+    assert not re.search(rb"@[A-Z]+@", unit)
+    assert run("uninstall")[0] == 0
+    assert tree(tmp_path / "root") == {"etc": None}
+
+
+@pytest.mark.parametrize(
+    ("named", "where"),
+    [(OWN_KEY, f"/etc/modelserver/{OWN_KEY}"), (FAR_KEY, FAR_KEY)],
+)
+def test_given_a_key_then_systemd_hands_it_over_and_nobody_else_may_read_it(
+    run: Callable[..., Said], vehicle: Path, tmp_path: Path, named: str, where: str
+) -> None:
+    with vehicle.open("a") as file:
+        file.write(f"commands: {{reload: true, key_file: {named}}}\n")
+    secret = write_key_file(vehicle.parent / "commands.key")
+    code, out, err = run("install", "--vehicle", str(vehicle), "--drivers", "none")
+    assert code == 0, err
+    assert secret not in out
+    root = tmp_path / "root"
+    drop_in = (root / "etc/systemd/system/modelserver.service.d/60-key.conf").read_text()
+    assert f"LoadCredential={where.rpartition('/')[2]}:{where}\n" in drop_in
+    copied = root / "etc/modelserver/commands.key"
+    assert copied.exists() == (named == "commands.key")
+    if copied.exists():
+        assert stat.S_IMODE(copied.stat().st_mode) == 0o600
+        assert secret in copied.read_text()
+    assert run("uninstall")[0] == 0
+    assert tree(root) == {"etc": None}
+
+
+def write_key_file(path: Path) -> str:
+    key = new_key()
+    write_key(path, key)
+    return key.secret.hex()
+
+
+def test_given_a_key_file_whose_name_a_unit_would_take_for_something_else_then_it_is_refused() -> None:
+    with pytest.raises(ModelServerError, match="cannot stand in a unit"):
+        credential("/etc/my keys/%n")
+
+
+def test_given_an_edited_vehicle_file_then_it_stays_and_counts(
+    run: Callable[..., Said], vehicle: Path, tmp_path: Path
+) -> None:
+    run("install", "--vehicle", str(vehicle))
+    installed = tmp_path / "root" / "etc" / "modelserver" / "vehicle.yaml"
+    edited = installed.read_text().replace("  gps: # the Sokkia", "  receiver: # the Sokkia")
+    installed.write_text(edited)
+    code, out, err = run("install", "--vehicle", str(vehicle))
+    assert code == 0, err
+    assert "leave   /etc/modelserver/vehicle.yaml: it was edited" in out
+    assert "modelserver-driver@receiver.service" in out
+    assert installed.read_text() == edited
+    # without a file the one that is installed counts
+    assert "modelserver-driver@receiver.service" in run("install", "--dry-run")[1]
+
+
+def test_given_no_vehicle_file_then_it_is_said_where_examples_are(run: Callable[..., Said]) -> None:
+    code, _, err = run("install")
+    assert code == 1
+    assert "name the vehicle file: --vehicle FILE" in err
+
+
+def test_given_a_wrong_vehicle_file_then_nothing_is_installed(
+    run: Callable[..., Said], vehicle: Path, tmp_path: Path
+) -> None:
+    vehicle.write_text(vehicle.read_text().replace("Raptor:CG", "Raptor:GC"))
+    code, _, err = run("install", "--vehicle", str(vehicle))
+    assert code == 1
+    assert "body Raptor has no frame 'GC'" in err
+    assert tree(tmp_path / "root") == {"etc": None}
+
+
+def test_given_a_geometry_outside_the_folder_then_it_is_refused(run: Callable[..., Said], vehicle: Path) -> None:
+    (vehicle.parent / "geometry.yaml").rename(vehicle.parent.parent / "other.yaml")
+    vehicle.write_text(vehicle.read_text().replace("geometry: geometry.yaml", "geometry: ../other.yaml"))
+    code, _, err = run("install", "--vehicle", str(vehicle))
+    assert code == 1
+    assert "outside its folder; put it beside the vehicle file" in err
+
+
+def test_given_a_user_without_rights_then_the_command_with_sudo_is_said(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    for command in ("install", "uninstall"):
+        with pytest.raises(SystemExit):
+            main([command])
+        assert f"needs root: sudo {install.program()} {command}" in capsys.readouterr().err
+
+
+def test_given_a_command_that_fails_then_it_is_said_which_and_what_it_said(
+    run: Callable[..., Said], vehicle: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(install_steps.shutil, "which", lambda name, path: "/bin/false")
+    code, _, err = run("install", "--vehicle", str(vehicle))
+    assert code == 1
+    assert "/bin/false --root=" in err
+    assert "failed" in err
+
+
+@pytest.mark.parametrize(
+    ("path", "why"),
+    [
+        ("/root/.pyenv/bin/python", "ProtectHome"),
+        ("/home/me/venv/bin/python", "ProtectHome"),
+        ("/tmp/venv", "PrivateTmp"),
+        ("/opt/modelserver", ""),
+        ("/homes/me", ""),
+        ("/usr/bin/python3", ""),
+    ],
+)
+def test_given_a_path_then_it_is_known_what_hides_it(path: str, why: str) -> None:
+    assert hidden_by(path) == why
+
+
+def test_given_an_installation_that_the_units_do_not_see_then_it_is_refused_with_the_way_out() -> None:
+    with pytest.raises(ModelServerError, match=r"its Python is /root/x, which .*ProtectHome=yes.*/opt/modelserver"):
+        check_seen([("/usr/bin/x", "a"), ("/root/x", "its Python")], install.ELSEWHERE)
+
+
+def test_given_an_installation_that_others_may_not_read_then_it_is_known_what_is_closed(tmp_path: Path) -> None:
+    folder = tmp_path / "venv"
+    (folder / "bin").mkdir(parents=True)
+    for part in (tmp_path, *tmp_path.parents):
+        if "/pytest-of-" in str(part):  # the tests' own
+            part.chmod(0o755)
+    assert install.closed_to_others(str(folder / "bin")) == ""
+    folder.chmod(0o700)
+    assert install.closed_to_others(str(folder / "bin")) == str(folder)
+
+
+@pytest.mark.parametrize(
+    ("url", "group"),
+    [
+        ("udpm://239.255.76.67:7667?ttl=0", "239.255.76.67"),
+        ("udpm://239.1.2.3:7667", "239.1.2.3"),
+        ("udpm://?ttl=0", "239.255.76.67"),
+        ("udpm://", "239.255.76.67"),
+        ("udpm://239.255.76.67:7667?ttl=1", ""),
+        ("udpm://239.255.76.67:7667?recv_buf_size=9&ttl=2", ""),
+        ("tcpq://127.0.0.1:7700", ""),
+        ("memq://", ""),
+        ("udpm://$(reboot):7667", "239.255.76.67"),
+    ],
+)
+def test_given_a_bus_then_it_has_a_group_on_loopback_where_it_stays_on_the_machine(url: str, group: str) -> None:
+    assert loopback_group(url) == group
+
+
+@pytest.mark.parametrize(
+    ("wanted", "expected"), [("all", ("gps", "imu")), ("none", ()), ("imu", ("imu",)), ("imu, gps", ("imu", "gps"))]
+)
+def test_given_names_of_drivers_then_they_are_taken(wanted: str, expected: tuple[str, ...]) -> None:
+    assert check_drivers(wanted, ["gps", "imu"]) == expected
+
+
+@pytest.mark.parametrize(
+    ("wanted", "known", "said"),
+    [
+        ("gsp", ["gps", "imu"], "did you mean gps?"),
+        ("x", [], "it has: none"),
+        ("all", ["gps/1"], "cannot be the name of a unit"),
+        ("all", ["-gps"], "cannot be the name of a unit"),
+        ("all", ["gps%n"], "cannot be the name of a unit"),
+    ],
+)
+def test_given_a_driver_that_cannot_be_then_it_is_said_why(wanted: str, known: list[str], said: str) -> None:
+    with pytest.raises(ModelServerError, match=said.replace("?", r"\?")):
+        check_drivers(wanted, known)
+
+
+@pytest.mark.parametrize(
+    "program", ["bin/modelserver", "/opt/my programs/modelserver", "/opt/%h/modelserver", "/a\n/b"]
+)
+def test_given_a_path_that_a_unit_would_take_for_something_else_then_it_is_refused(program: str) -> None:
+    with pytest.raises(ModelServerError, match="cannot stand in a unit"):
+        units(TEMPLATES, program, "", "/sbin/ip", drivers=False)
+
+
+def test_given_a_bus_that_leaves_the_machine_and_no_drivers_then_there_is_the_service_alone() -> None:
+    assert [each.path for each in units(TEMPLATES, "/opt/x/modelserver", "", "/sbin/ip", drivers=False)] == [
+        "/etc/systemd/system/modelserver.service"
+    ]
+
+
+BY_ID = {"usb-FTDI_A1-if00-port0": "/dev/ttyUSB0"}
+
+
+@pytest.mark.parametrize(
+    ("port", "given", "facts", "device"),
+    [
+        ("/dev/serial/by-id/usb-X_1-if00", {}, Facts(), "usb-X_1-if00"),
+        ("/dev/ttyUSB0", {}, Facts(by_id=BY_ID), "usb-FTDI_A1-if00-port0"),
+        ("/dev/ttyUSB0", {"gps": "/dev/serial/by-id/usb-Y"}, Facts(by_id=BY_ID), "usb-Y"),
+        ("/dev/modelserver/gps", {"gps": "usb-Y"}, Facts(), "usb-Y"),
+    ],
+)
+def test_given_a_serial_driver_then_its_device_gets_a_name_by_its_id(
+    port: str, given: dict[str, str], facts: Facts, device: str
+) -> None:
+    (write,), notes = rules([SerialDriver("gps", port)], given, facts)
+    line = write.content.decode().splitlines()[1]
+    assert line == (
+        f'SUBSYSTEM=="tty", SYMLINK=="serial/by-id/{device}", ENV{{ID_MM_DEVICE_IGNORE}}="1", '
+        'SYMLINK+="modelserver/gps"'
+    )
+    assert bool(notes) == (port == "/dev/ttyUSB0")
+    # unplugged at the next installation it keeps its name
+    again, _ = rules([SerialDriver("gps", "/dev/ttyUSB0")], {}, Facts(rules=write.content.decode()))
+    assert again == [write]
+
+
+def test_given_a_device_that_nobody_knows_then_a_note_says_what_to_do() -> None:
+    writes, (note,) = rules([SerialDriver("gps", "/dev/ttyUSB0")], {}, Facts())
+    assert writes == []
+    assert "--serial gps=/dev/serial/by-id/..." in note
+
+
+@pytest.mark.parametrize("device", ['x", RUN+="/bin/sh', "a b", "a*", "../x"])
+def test_given_a_device_name_that_would_be_more_than_a_name_then_it_is_refused(device: str) -> None:
+    with pytest.raises(ModelServerError, match="is no name below"):
+        rules([SerialDriver("gps", f"/dev/serial/by-id/{device}")], {"gps": device}, Facts())
+
+
+def test_given_an_id_for_a_driver_that_there_is_not_then_it_is_refused() -> None:
+    with pytest.raises(ModelServerError, match="which is no driver on a serial port"):
+        rules([SerialDriver("gps", "/dev/ttyUSB0")], {"imu": "usb-Y"}, Facts())
+
+
+def test_given_a_machine_that_can_then_the_loop_goes_before_other_programs() -> None:
+    assert realtime(Facts()) == []
+    (write,) = realtime(Facts(realtime=True))
+    assert write.content.decode().splitlines()[1:] == ["[Service]", "CPUSchedulingPolicy=rr", "CPUSchedulingPriority=1"]
+
+
+@pytest.mark.parametrize(
+    ("facts", "count"),
+    [
+        (Facts(rmem_max=212_992), 1),
+        (Facts(), 1),
+        (Facts(rmem_max=8_000_000), 0),
+        # raised by an earlier installation: it stays ours
+        (Facts(rmem_max=4_194_304, files={SYSCTL: "x"}), 1),
+    ],
+)
+def test_given_a_limit_then_it_is_raised_where_it_is_too_low(facts: Facts, count: int) -> None:
+    assert len(limits(4_194_304, facts)) == count

@@ -1,0 +1,231 @@
+"""`modelserver status`: the report in words, and what is said where none comes."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support_wire import EXAMPLES
+
+from modelserver.core import DEGRADED, RUNNING, STARTING
+from modelserver.messages import ChannelHealth, DriverHealth, DriverPhase, Health, Invalid, LocalizationHealth
+from modelserver.wire.codec import encode
+from mstools import status
+from mstools.status_text import MAX_ROWS, as_data, clock, duration, is_well, line, report
+
+BARE, FULL = EXAMPLES["health_t"]
+WELL: Health = replace(FULL, state=RUNNING)
+DRIVERS: tuple[DriverHealth, ...] = EXAMPLES["driver_health_t"]
+
+
+# --- in words -----------------------------------------------------------------------------------------------
+
+
+def test_given_a_report_then_all_of_it_is_told() -> None:
+    text = report(WELL, DRIVERS[1:], ("gps", "imu"))
+    for words in (
+        "raptor: RUNNING, up 1 min 39 s; modelserver 0.1.0, process 4711 on raptor-pc",
+        "valid",
+        "within 1.50 m, heading 2.9 deg; 12.0 s to a limit",
+        "mode no_gps, aligned, standing; last fix used 300 ms ago",
+        "epoch 2, origin ffffffffffffffb3, 4950 poses published",
+        "revision ab12",
+        "late by 0.10 / 0.50 / 1.00 / 2.00 ms",
+        "12% of a processor, 150 MB",
+        "12 answered, 1 wait for data, 3 in the queue",
+        "journal: the disk is full",
+        "never heard",
+        "streaming",
+        "NOT HEARD",
+        "truncated",
+    ):
+        assert words in text, words
+
+
+def test_given_a_pose_that_may_not_be_used_then_every_reason_is_told_in_words() -> None:
+    health = replace(WELL, state=DEGRADED, invalid_reasons=Invalid.STALE_GPS | Invalid.TILTED)
+    text = report(health)
+    assert "raptor: DEGRADED" in text
+    assert "NOT VALID: the last usable GPS fix is too old; gravity says" in text
+
+
+def test_given_a_report_in_which_little_is_known_then_no_number_is_made_up() -> None:
+    text = report(BARE)
+    assert "the vehicle file names no sensor to localize by" in text
+    assert "nan" not in text
+    assert "not known, memory not known" in text
+
+
+def test_given_a_silent_sensor_then_it_stands_out() -> None:
+    silent = ChannelHealth("sensor:imu", 5, 0.0, 7.5, math.nan, True)
+    assert "SILENT" in report(replace(WELL, channels=(silent,)))
+    assert "sensor:imu SILENT" in line(replace(WELL, channels=(silent,)))
+
+
+def test_given_a_driver_that_is_not_well_then_its_phase_stands_out() -> None:
+    assert "CLOSED" in report(WELL, DRIVERS[:1])
+    assert DRIVERS[0].phase is DriverPhase.CLOSED
+
+
+def test_given_words_of_a_stranger_then_they_are_escaped_and_endless_tables_are_cut() -> None:
+    evil = "\x1b[2J\nEVIL"
+    health = replace(
+        WELL,
+        host=evil,
+        vehicle=evil,
+        version=evil,
+        channels=tuple(ChannelHealth(f"{evil}{n}", 1, 1.0, 1.0) for n in range(500)),
+        rejected=tuple((evil, f"{evil}{n}", 1) for n in range(500)),
+        notices=((evil, evil),),
+    )
+    text = report(health, [replace(DRIVERS[1], source=evil, text=evil, link=evil)], [evil])
+    assert all(each.isprintable() for each in text.split("\n"))
+    assert f"and {500 - MAX_ROWS} more" in text
+    assert "\nEVIL" not in text
+    assert line(health).isprintable()
+
+
+@pytest.mark.parametrize(
+    ("health", "well"),
+    [
+        (WELL, True),
+        (replace(WELL, state=STARTING), False),
+        (replace(WELL, state=DEGRADED), False),
+        (replace(WELL, invalid_reasons=Invalid.NO_FIX), False),
+        (replace(BARE, localization=LocalizationHealth()), True),
+    ],
+)
+def test_given_a_report_then_it_is_well_or_not(health: Health, well: bool) -> None:
+    assert is_well(health) is well
+
+
+def test_given_a_report_for_scripts_then_it_is_json_with_names_and_nulls() -> None:
+    data = json.loads(json.dumps(as_data(WELL, DRIVERS), allow_nan=False))
+    assert (data["state"], data["well"], data["invalid_reasons"]) == ("RUNNING", True, 0)
+    assert data["localization"]["mode"] == "NO_GPS"
+    assert data["channels"][1]["age"] is None
+    assert data["notices"] == {"journal": "the disk is full"}
+    assert [each["phase"] for each in data["drivers"]] == ["CLOSED", "STREAMING"]
+    assert data["drivers"][1]["counters"]["bestpos"] == 450
+    assert json.dumps(as_data(BARE), allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.0, "0 ms"),
+        (0.0124, "12 ms"),
+        (0.9996, "1.0 s"),
+        (59.94, "59.9 s"),
+        (61.0, "1 min 01 s"),
+        (3_725.0, "1 h 02 min"),
+        (180_000.0, "2 days 2 h"),
+        (math.nan, "-"),
+        (math.inf, "-"),
+    ],
+)
+def test_given_a_time_then_it_is_told_in_the_units_that_people_use(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+@given(st.floats(), st.integers(-(1 << 63), (1 << 63) - 1))
+def test_given_any_numbers_then_they_are_told(seconds: float, utime: int) -> None:
+    assert duration(seconds)
+    assert clock(utime)
+
+
+# --- nobody there -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("instead", "words"),
+    [
+        ({}, "Nobody speaks there at all: is the daemon running (modelserver run -c FILE"),
+        ({"GPS": False, "IMU": False}, "Others speak there ('GPS', 'IMU'), the daemon does not"),
+        ({"A_MODELSERVER_HEALTH": True}, "Heard instead: 'A_MODELSERVER_HEALTH'. Did you mean --prefix 'A_'?"),
+        (
+            {"RAPTOR_MODELSERVER_HEALTH": True, "HUSKY_MODELSERVER_HEALTH": True},
+            "Did you mean --prefix 'HUSKY_'?",
+        ),
+        ({"MODELSERVER_HEALTH": True}, "Did you mean no --prefix?"),
+        ({"HUSKI_MODELSERVER_HEALTH": False}, "another version"),
+    ],
+)
+def test_given_no_report_then_it_says_what_was_there_instead_and_what_to_do(
+    instead: dict[str, bool], words: str
+) -> None:
+    text = status.nobody("udpm://x", "HUSKI_", 2.5, instead)
+    assert text.startswith("nothing was heard on HUSKI_MODELSERVER_HEALTH for 2.5 s, on udpm://x. ")
+    assert words in text
+
+
+def test_given_endless_channels_of_strangers_then_few_are_named_and_escaped() -> None:
+    text = status.nobody("udpm://x", "", 2.5, {f"\x1b[2J{n:03}": False for n in range(500)})
+    assert "and 494 more" in text
+    assert text.isprintable()
+
+
+ALWAYS_READY = os.open(os.devnull, os.O_RDONLY)
+"""A file that `select` finds to be readable at any time."""
+
+
+class FakeLcm:
+    """Hands over what is queued to whoever listens to its channel."""
+
+    def __init__(self, *messages: tuple[str, bytes]):
+        self.queue = list(messages)
+        self.handlers: dict[str, Callable[[str, bytes], None]] = {}
+        self._always_ready = ALWAYS_READY
+
+    def subscribe(self, pattern: str, handler: Callable[[str, bytes], None]) -> None:
+        self.handlers[pattern.removesuffix(r"\z")] = handler
+
+    def fileno(self) -> int:
+        return self._always_ready
+
+    def handle_timeout(self, milliseconds: int) -> int:
+        if not self.queue:
+            return 0
+        channel, data = self.queue.pop(0)
+        handler = self.handlers.get(channel) or self.handlers.get(".*")
+        if handler is not None:
+            handler(channel, data)
+        return 1
+
+
+def test_given_reports_then_the_ear_knows_the_last_ones_and_passes_over_what_is_none() -> None:
+    driver: Any = DRIVERS[1]
+    bus = FakeLcm(
+        ("A_MODELSERVER_HEALTH", b"rubbish"),
+        ("A_MODELSERVER_HEALTH", encode(WELL)),
+        ("A_DRIVER_HEALTH", b""),
+        ("A_DRIVER_HEALTH", encode(driver)),
+        ("MODELSERVER_HEALTH", encode(BARE)),
+    )
+    ear = status.Ear(bus, "A_")  # type: ignore[arg-type]
+    assert ear.listen(10.0, lambda: ear.knows(("gps",)))
+    assert ear.health is not None
+    assert (ear.health.state, ear.reports) == (RUNNING, 1)
+    assert not ear.knows(())
+    assert not ear.knows(("gps", "imu"))
+
+
+def test_given_endless_drivers_of_a_stranger_then_so_many_are_kept() -> None:
+    driver: Any = DRIVERS[1]
+    reports = [("DRIVER_HEALTH", encode(replace(driver, source=f"d{n}"))) for n in range(status.MAX_NAMES + 9)]
+    bus = FakeLcm(*reports)
+    ear = status.Ear(bus, "")  # type: ignore[arg-type]
+    assert ear.listen(60.0, lambda: not bus.queue)
+    assert len(ear.drivers) == status.MAX_NAMES
+
+
+def test_given_a_bus_then_what_is_there_instead_is_told_with_whether_it_is_a_report() -> None:
+    bus = FakeLcm(("B_MODELSERVER_HEALTH", encode(BARE)), ("X", b"12345678"))
+    assert status.heard_instead(bus, 0.05) == {"B_MODELSERVER_HEALTH": True, "X": False}  # type: ignore[arg-type]

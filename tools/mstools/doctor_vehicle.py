@@ -1,0 +1,153 @@
+"""What `modelserver doctor` says of a vehicle file: does it load, may state be kept, are the drivers' lines there."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shutil
+from collections.abc import Iterable, Iterator
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from modelserver.config import VehicleConfig, load_config
+from modelserver.errors import ConfigError, GeometryError, Problem, Severity
+from modelserver.service.findings import Finding, Grade
+from modelserver.service.keep import default_directory
+from modelserver.service.probe import Interface
+from modelserver.version import __version__
+from mstools.output import counted
+
+if TYPE_CHECKING:
+    from msdrivers.settings import DriverSettings
+
+LEAST_FREE = 200_000_000
+"""Bytes of room on the disk of the state below which it is told."""
+
+
+def versions() -> Finding:
+    """Return what runs here."""
+    seen = f"modelserver {__version__}, lcm {version('lcm')}, Python {platform.python_version()}"
+    return Finding(Grade.OK, "versions", seen)
+
+
+def read_vehicle(file: Path) -> VehicleConfig:
+    """Return a vehicle file. Raises ConfigError, OSError."""
+    return load_config(file)
+
+
+def vehicle_findings(vehicle: VehicleConfig, file: Path) -> tuple[Finding, ...]:
+    """Return what is to be said of a vehicle file on this machine."""
+    from modelserver.service.machine import interfaces
+
+    problems, drivers = _read(vehicle, file)
+    directory = Path(vehicle.state_directory) if vehicle.state_directory else default_directory()
+    return (
+        file_finding(problems, file),
+        *state_findings(directory),
+        *line_findings(drivers, tuple(interfaces())),
+    )
+
+
+def _read(vehicle: VehicleConfig, file: Path) -> tuple[tuple[Problem, ...], Iterable[DriverSettings]]:
+    from modelserver.config import config_lines
+    from modelserver.service.daemon import load_vehicle
+    from msdrivers.settings import Place, read_drivers
+    from mstools.check_drivers import drivers_problems
+
+    model = None
+    try:
+        model = load_vehicle(vehicle, str(file)).model
+        problems = model.problems
+    except (ConfigError, GeometryError) as error:
+        problems = error.problems
+    drivers, _ = read_drivers(vehicle.drivers, Place(str(file), config_lines(file)))
+    return (*problems, *drivers_problems(vehicle, str(file), model)), drivers.values()
+
+
+def file_finding(problems: Iterable[Problem], file: Path) -> Finding:
+    """Return what is to be said of a vehicle file with these problems."""
+    problems = tuple(problems)
+    command = f"modelserver check {file}"
+    errors = [each for each in problems if each.severity is Severity.ERROR]
+    warnings = [each for each in problems if each.severity is Severity.WARNING]
+    if errors:
+        seen = f"{file} has {counted(len(errors), 'error')}, the first: {errors[0].message}"
+        return Finding(Grade.ERROR, "vehicle file", seen, "the service or a driver does not start with it", command)
+    if warnings:
+        seen = f"{file} loads, with {counted(len(warnings), 'warning')}, the first: {warnings[0].message}"
+        return Finding(Grade.WARNING, "vehicle file", seen, "it may not be what is meant", command)
+    return Finding(Grade.OK, "vehicle file", f"{file} loads, and its geometry")
+
+
+def state_findings(directory: Path | None) -> Iterator[Finding]:
+    """Yield what is to be said of the place where state is kept; None: there is no home to keep it in."""
+    subject = "state"
+    if directory is None:
+        why = "the origin is lost with every restart"
+        yield Finding(Grade.WARNING, subject, "there is no home directory", why, "set state_directory: /var/lib/...")
+        return
+    # what is not there yet is made below the first folder that is
+    there = next(each for each in (directory, *directory.parents) if each.exists())
+    if not there.is_dir():
+        why = "the origin is lost with every restart"
+        yield Finding(Grade.WARNING, subject, f"{there} is no folder", why, f"mv {there} {there}.aside")
+        return
+    if not os.access(there, os.W_OK | os.X_OK):
+        why = "the origin is lost with every restart"
+        command = f"sudo mkdir -p {directory} && sudo chown {os.geteuid()} {directory}"
+        yield Finding(Grade.WARNING, subject, f"{directory} may not be written by this user", why, command)
+        return
+    free = shutil.disk_usage(there).free
+    if free < LEAST_FREE:
+        seen = f"{directory} has {free / 1e6:.0f} MB of room left"
+        command = f"du -xh --max-depth=2 {there} | sort -h | tail"
+        yield Finding(Grade.WARNING, subject, seen, "a full disk keeps neither origin nor journal", command)
+        return
+    yield Finding(Grade.OK, subject, f"{directory} may be written, {free / 1e9:.1f} GB free")
+
+
+def line_findings(drivers: Iterable[DriverSettings], networks: Iterable[Interface]) -> Iterator[Finding]:
+    """Yield what is to be said of the lines of drivers; `networks` are the network interfaces of this machine."""
+    from msdrivers.line_settings import CanSettings, SerialSettings
+
+    by_name = {each.name: each for each in networks}
+    for driver in drivers:
+        subject = f"driver {driver.name}"
+        if isinstance(driver.line, SerialSettings):
+            yield _serial(subject, driver.line.port)
+        elif isinstance(driver.line, CanSettings) and driver.line.interface == "socketcan":
+            yield _can(subject, driver.line.can, by_name)
+        else:
+            yield Finding(Grade.OK, subject, f"{driver.line}: only trying it tells")
+
+
+def _serial(subject: str, port: str) -> Finding:
+    from msdrivers.links.ports import hint_for, near_ports, permission_fix
+
+    if not os.path.exists(port):
+        near = near_ports(port)
+        seen = f"{port} is not there" + (f"; there are: {', '.join(near[:3])}" if near else "")
+        why = "the driver waits until it is"
+        return Finding(Grade.WARNING, subject, seen, why, "modelserver driver --list")
+    if not os.access(port, os.R_OK | os.W_OK):
+        why = permission_fix(port)
+        joining = re.search(r"sudo usermod -aG \S+ [^\s,]+", why)
+        command = joining.group() if joining else f"ls -l {port}"
+        return Finding(Grade.ERROR, subject, f"{port} may not be opened by this user", why, command)
+    hint = hint_for(port)
+    return Finding(Grade.NOTE, subject, f"{port} is {hint}") if hint else Finding(Grade.OK, subject, f"{port} is free")
+
+
+def _can(subject: str, name: str, networks: dict[str, Interface]) -> Finding:
+    bring_up = f"sudo ip link set {name} up type can bitrate 500000"
+    network = networks.get(name)
+    if network is None:
+        why = "the driver waits until it is"
+        command = f"modelserver driver --list; {bring_up}"
+        return Finding(Grade.WARNING, subject, f"network interface {name} is not there", why, command)
+    if not network.up:
+        why = "no frame comes or goes; the bitrate is the bus's own"
+        return Finding(Grade.ERROR, subject, f"network interface {name} is down", why, bring_up)
+    return Finding(Grade.OK, subject, f"network interface {name} is up")

@@ -1,0 +1,205 @@
+"""The files that an installation consists of: units with this installation's paths in them, rules, limits. Pure."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+from urllib.parse import parse_qs, urlsplit
+
+from modelserver.errors import ModelServerError, nearest_names, shown
+from mstools.install_plan import CONFIGURATION, DRIVER, LOOPBACK, RULES, SERVICE, SYSCTL, UNITS, Facts, Write
+
+BY_ID: Final = "/dev/serial/by-id/"
+OWN_NAMES: Final = "/dev/modelserver/"
+REALTIME: Final = f"{UNITS}/{SERVICE}.d/50-realtime.conf"
+
+CREDENTIAL: Final = f"{UNITS}/{SERVICE}.d/60-key.conf"
+
+HIDDEN: Final = {
+    "/root": "ProtectHome",
+    "/home": "ProtectHome",
+    "/run/user": "ProtectHome",
+    "/tmp": "PrivateTmp",
+    "/var/tmp": "PrivateTmp",
+}
+"""Folders that the hardened units do not see, and by which of their settings."""
+
+INSTANCE: Final = re.compile(r"[A-Za-z0-9_.:][A-Za-z0-9_.:-]*")
+"""A driver's name that is the same as an instance of a unit, without systemd's escapes."""
+
+_DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9#+.:=@_-]+")
+"""What udev puts into names of devices (its white list)."""
+
+
+@dataclass(frozen=True, slots=True)
+class SerialDriver:
+    """A driver on a serial port: its name, and the port as the vehicle file gives it."""
+
+    name: str
+    port: str
+
+
+def hidden_by(path: str) -> str:
+    """Return which setting of the units hides a path from the service, empty where none does."""
+    return next((why for folder, why in HIDDEN.items() if path == folder or path.startswith(f"{folder}/")), "")
+
+
+def check_seen(paths: Iterable[tuple[str, str]], fix: str) -> None:
+    """Raise ModelServerError for the first path that the service would not see. `paths` are each with what it is."""
+    for path, what in paths:
+        why = hidden_by(path)
+        if why:
+            raise ModelServerError(f"{what} is {path}, which the hardened units do not see ({why}=yes). {fix}")
+
+
+def check_drivers(wanted: str, known: Iterable[str]) -> tuple[str, ...]:
+    """Return the drivers that `wanted` names: all, none, or names with commas. Raises ModelServerError."""
+    known = tuple(known)
+    names = tuple(name.strip() for name in wanted.split(",") if name.strip())
+    if names in (("all",), ()):
+        names = known
+    elif names == ("none",):
+        names = ()
+    for name in names:
+        if name not in known:
+            near = nearest_names(name, known)
+            offer = f"did you mean {near[0]}?" if near else f"it has: {', '.join(known) or 'none'}"
+            raise ModelServerError(f"the vehicle file has no driver {shown(name, 40)}; {offer}")
+        if not INSTANCE.fullmatch(name):
+            raise ModelServerError(
+                f"driver {shown(name, 40)} cannot be the name of a unit; rename it in the vehicle file with letters, "
+                "digits, _ . : and - only"
+            )
+    return names
+
+
+def loopback_group(url: str) -> str:
+    """Return the multicast group of a bus that stays on this machine, empty for one that leaves it or needs none."""
+    parts = urlsplit(url)
+    ttl = parse_qs(parts.query).get("ttl", ["0"])[-1]
+    if parts.scheme != "udpm" or ttl.strip() not in ("", "0"):
+        return ""
+    group = parts.netloc.rpartition(":")[0] or parts.netloc
+    return group if re.fullmatch(r"2(2[4-9]|3[0-9])(\.[0-9]{1,3}){3}", group) else "239.255.76.67"
+
+
+def units(templates: Mapping[str, str], program: str, group: str, ip: str, drivers: bool) -> list[Write]:
+    """Return the units with what is this installation's in them. `program` is the path of its command."""
+    if not re.fullmatch(r"/[A-Za-z0-9/._+@-]+", program):
+        raise ModelServerError(f"{program!r} cannot stand in a unit: install to a folder without blanks and the like")
+    wanted = {SERVICE: "the service"}
+    wanted |= {DRIVER: "one driver, by its name"} if drivers else {}
+    wanted |= {LOOPBACK: "multicast on the loopback interface"} if group else {}
+    writes = []
+    for name, what in wanted.items():
+        text = templates[name].replace("@MODELSERVER@", program).replace("@GROUP@", group).replace("@IP@", ip)
+        summary = "\n".join(line for line in text.splitlines() if line.startswith("ExecStart="))
+        writes.append(Write(f"{UNITS}/{name}", text.encode(), what, summary))
+    return writes
+
+
+def configuration(sources: Mapping[str, bytes], secret: Container[str] = ()) -> list[Write]:
+    """Return the vehicle's files. `sources` are by their paths relative to the vehicle file, which is vehicle.yaml.
+
+    Those that are `secret` are for root alone.
+    """
+    writes = []
+    for path, content in sources.items():
+        what = "the vehicle file" if path == "vehicle.yaml" else "of the vehicle"
+        if path in secret:
+            writes.append(Write(f"{CONFIGURATION}/{path}", content, "the key of signed commands", mode=0o600))
+        else:
+            writes.append(Write(f"{CONFIGURATION}/{path}", content, what))
+    return writes
+
+
+def limits(wanted: int, facts: Facts) -> list[Write]:
+    """Return the file that raises the kernel's limit of receive buffers, nothing where it is high enough without."""
+    if facts.rmem_max >= wanted and SYSCTL not in facts.files:
+        return []
+    line = f"net.core.rmem_max = {wanted}"
+    text = f"# ModelServer: bursts on the bus fit into the buffer that LCM asks for.\n{line}\n"
+    return [Write(SYSCTL, text.encode(), "room for bursts on the bus", line)]
+
+
+def realtime(facts: Facts) -> list[Write]:
+    """Return the drop-in by which the service's loop goes before other programs, nothing where that cannot be.
+
+    With two programs beside it that took all they got on two cores, ticks were up to 20 ms late without, nice or not,
+    and 0.1 ms with it.
+    """
+    if not facts.realtime:
+        return []
+    lines = "CPUSchedulingPolicy=rr\nCPUSchedulingPriority=1\n"
+    text = f"# Written by `modelserver install`, where the machine can do it.\n[Service]\n{lines}"
+    return [Write(REALTIME, text.encode(), "the loop goes before other programs", lines)]
+
+
+def credential(key_file: str) -> list[Write]:
+    """Return the drop-in by which systemd hands the file of keys to the service, nothing for a vehicle without one.
+
+    The service's user may not read what is root's alone, and a key is. Raises ModelServerError for a path that cannot
+    stand in a unit.
+    """
+    if not key_file:
+        return []
+    if not re.fullmatch(r"/[A-Za-z0-9/._+@-]+", key_file):
+        raise ModelServerError(f"the key file {shown(key_file)} cannot stand in a unit: blanks and the like; rename it")
+    line = f"LoadCredential={key_file.rpartition('/')[2]}:{key_file}"
+    about = "# Written by `modelserver install`: the file stays root's, and is read as the service starts."
+    text = f"{about}\n[Service]\n{line}\n"
+    return [Write(CREDENTIAL, text.encode(), "the key that commands are signed with", line)]
+
+
+def rules(drivers: Iterable[SerialDriver], given: Mapping[str, str], facts: Facts) -> tuple[list[Write], list[str]]:
+    """Return the udev rules that give each driver's device a name of its own, and what to tell of them.
+
+    `given` are names below /dev/serial/by-id by driver, which go before what is found. Raises ModelServerError.
+    """
+    lines, notes = [], []
+    drivers = list(drivers)
+    for name in given:
+        if name not in [each.name for each in drivers]:
+            raise ModelServerError(f"--serial names {shown(name, 40)}, which is no driver on a serial port here")
+    for driver in drivers:
+        own = f"{OWN_NAMES}{driver.name}"
+        device = given.get(driver.name, "") or _id_of(driver.port, facts)
+        known = _known_rule(driver.name, facts.rules)
+        if device:
+            lines.append(_rule(driver.name, device.removeprefix(BY_ID)))
+        elif known:
+            lines.append(known)
+        else:
+            fix = f"plug it in, or: --serial {driver.name}={BY_ID}..."
+            notes.append(f"no device is known by its id for driver {driver.name} (port {driver.port}); {fix}")
+            continue
+        if driver.port != own and not driver.port.startswith(BY_ID):
+            notes.append(f"driver {driver.name}: write port: {own} into the vehicle file; {driver.port} may change")
+    if not lines:
+        return [], notes
+    text = "# ModelServer: the devices of the vehicle file, by their ids.\n" + "".join(f"{line}\n" for line in lines)
+    summary = "\n".join(f"{OWN_NAMES}{line.rpartition('/')[2].rstrip(chr(34))}" for line in lines)
+    return [Write(RULES, text.encode(), "names for the serial devices", summary)], notes
+
+
+def _id_of(port: str, facts: Facts) -> str:
+    """Return the name below /dev/serial/by-id of a port, empty where there is none."""
+    if port.startswith(BY_ID):
+        return port.removeprefix(BY_ID)
+    return next((name for name, device in sorted(facts.by_id.items()) if device == port), "")
+
+
+def _rule(name: str, device: str) -> str:
+    if not _DEVICE_NAME.fullmatch(device):
+        raise ModelServerError(f"{shown(device)} is no name below {BY_ID}: letters, digits and #+-.:=@_ only")
+    # the link by id was made by systemd's own rules, from vendor, product and serial number
+    match = f'SUBSYSTEM=="tty", SYMLINK=="{BY_ID.removeprefix("/dev/")}{device}"'
+    # ModemManager would speak to it otherwise, and some devices never recover from that
+    return f'{match}, ENV{{ID_MM_DEVICE_IGNORE}}="1", SYMLINK+="modelserver/{name}"'
+
+
+def _known_rule(name: str, text: str) -> str:
+    ending = f'SYMLINK+="modelserver/{name}"'
+    return next((line for line in text.splitlines() if line.startswith("SUBSYSTEM") and line.endswith(ending)), "")

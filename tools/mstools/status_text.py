@@ -1,0 +1,214 @@
+"""The health report in words."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from enum import IntEnum, IntFlag
+from typing import Any, Final
+
+from modelserver.core import DEGRADED, RUNNING, STARTING
+from modelserver.messages import ChannelHealth, DriverHealth, DriverPhase, Health
+from mstools.output import safe
+from mstools.table import table
+
+STATES: Final = {STARTING: "STARTING", RUNNING: "RUNNING", DEGRADED: "DEGRADED"}
+
+MAX_ROWS: Final = 40
+"""Rows of a table that are shown; a stranger may make up as many sources as the daemon tells apart."""
+
+
+def is_well(health: Health) -> bool:
+    """Return whether the pose may be used, or the vehicle file asks for none."""
+    return health.localization.mode is None or (health.state == RUNNING and not health.invalid_reasons)
+
+
+def report(health: Health, drivers: Iterable[DriverHealth] = (), expected: Iterable[str] = ()) -> str:
+    """Return a report for people to read; `expected` names the drivers that there should be."""
+    drivers = sorted(drivers, key=lambda each: each.source)
+    missing = [name for name in expected if name not in {each.source for each in drivers}]
+    parts = [_head(health), _body(health)]
+    if health.notices:
+        parts.append("notices\n" + "\n".join(f"  {safe(name)}: {safe(text)}" for name, text in health.notices))
+    if health.channels:
+        parts.append("heard\n" + _channels(health.channels))
+    if drivers or missing:
+        parts.append("drivers\n" + _drivers(drivers, missing))
+    if health.rejected:
+        rows = [(name, reason, str(count)) for name, reason, count in health.rejected]
+        parts.append("refused\n" + _table(("what", "reason", "count"), rows, numbers=(2,)))
+    return "\n\n".join(parts)
+
+
+def _head(health: Health) -> str:
+    state = STATES.get(health.state, str(health.state))
+    who = f", process {health.pid} on {health.host}" if health.pid else ""
+    return safe(
+        f"{health.vehicle}: {state}, up {duration(health.uptime)}; modelserver {health.version}{who}, "
+        f"{clock(health.utime)}"
+    )
+
+
+def _body(health: Health) -> str:
+    said = health.localization
+    rows: list[tuple[str, str]] = []
+    if said.mode is None:
+        rows.append(("pose", "none: the vehicle file names no sensor to localize by"))
+    else:
+        reasons = health.invalid_reasons.explain()
+        rows.append(("pose", f"NOT VALID: {reasons}" if health.invalid_reasons else "valid"))
+        bounds = f"within {number(said.horizontal_bound, 2)} m, heading {degrees(said.heading_bound)} deg"
+        if math.isfinite(said.seconds_to_limit):
+            bounds += f"; {duration(said.seconds_to_limit)} to a limit if nothing more arrives"
+        rows.append(("", bounds))
+        phase = "no filter" if said.phase is None else said.phase.name.lower()
+        stands = "standing" if said.standing else "moving"
+        fix = "no fix used yet" if math.isnan(said.fix_age) else f"last fix used {duration(said.fix_age)} ago"
+        rows.append(("filter", f"mode {said.mode.name.lower()}, {phase}, {stands}; {fix}"))
+        origin = f"origin {health.origin_id & (1 << 64) - 1:016x}" if health.origin_id else "no origin yet"
+        rows.append(("", f"epoch {health.pose_epoch}, {origin}, {health.poses_published} poses published"))
+    rows.append(("geometry", f"revision {health.model_revision}"))
+    late = (health.tick_lateness_p50, health.tick_lateness_p90, health.tick_lateness_p99, health.tick_lateness_max)
+    rows.append(
+        ("loop", f"late by {' / '.join(number(each * 1e3, 2) for each in late)} ms (p50, p90, p99, most); "
+         f"{health.ticks_missed} ticks missed, {health.handler_errors} errors of its own")
+    )  # fmt: skip
+    cpu = "not known" if math.isnan(health.cpu_share) else f"{health.cpu_share:.0%} of a processor"
+    memory = f"{health.memory / 1e6:.0f} MB" if health.memory else "memory not known"
+    rows.append(("process", f"{cpu}, {memory}"))
+    rows.append(
+        (
+            "requests",
+            f"{health.requests_answered} answered, {health.requests_parked} wait for data, "
+            f"{health.requests_queued} in the queue",
+        )
+    )
+    return "\n".join(f"{name:<9} {safe(text)}".rstrip() for name, text in rows)
+
+
+def _channels(channels: Iterable[ChannelHealth]) -> str:
+    rows = [
+        (
+            each.channel,
+            str(each.count),
+            number(each.rate_hz, 1),
+            age(each.age),
+            number(each.delay_max * 1e3, 1),
+            "never heard" if not each.count else "SILENT" if each.silent else "",
+        )
+        for each in channels
+    ]
+    return _table(("source", "count", "Hz", "age", "delay ms", ""), rows, numbers=(1, 2, 3, 4))
+
+
+def _drivers(drivers: Iterable[DriverHealth], missing: Iterable[str]) -> str:
+    rows = [
+        (
+            each.source,
+            each.device,
+            each.phase.name.lower() if each.phase is DriverPhase.STREAMING else each.phase.name,
+            number(each.rate_hz, 1),
+            age(each.age),
+            str(each.reconnects),
+            each.link,
+            each.text,
+        )
+        for each in drivers
+    ]
+    rows += [(name, "", "NOT HEARD", "", "", "", "", f"modelserver driver {name} -c FILE") for name in missing]
+    head = ("driver", "device", "phase", "Hz", "age", "reopened", "line", "")
+    return _table(head, rows, numbers=(3, 4, 5))
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int]) -> str:
+    text = table(head, rows[:MAX_ROWS], numbers=numbers)
+    return f"{text}\n  and {len(rows) - MAX_ROWS} more" if len(rows) > MAX_ROWS else text
+
+
+def line(health: Health) -> str:
+    """Return a report in one line, for logs."""
+    said = health.localization
+    parts = [clock(health.utime), STATES.get(health.state, str(health.state))]
+    if said.mode is not None:
+        within = f"within {number(said.horizontal_bound, 2)} m {degrees(said.heading_bound)} deg"
+        parts.append(f"pose not valid: {health.invalid_reasons.explain()}" if health.invalid_reasons else within)
+    parts += [
+        f"{each.channel} {'never heard' if not each.count else 'SILENT' if each.silent else f'{each.rate_hz:.1f} Hz'}"
+        for each in health.channels[:MAX_ROWS]
+    ]
+    parts.append(f"late p99 {health.tick_lateness_p99 * 1e3:.2f} ms")
+    parts += [f"{name}: {text}" for name, text in health.notices]
+    return safe("; ".join(parts))
+
+
+def as_data(health: Health, drivers: Iterable[DriverHealth] = ()) -> dict[str, Any]:
+    """Return a report for scripts: enumerations by name, null for what is not known."""
+    data: dict[str, Any] = {
+        each.name: plain(getattr(health, each.name))
+        for each in dataclasses.fields(health)
+        if each.name not in ("channels", "rejected", "notices", "localization", "state")
+    }
+    data["state"] = STATES.get(health.state, health.state)
+    data["well"] = is_well(health)
+    data["invalid_text"] = health.invalid_reasons.explain()
+    data["localization"] = fields_of(health.localization)
+    data["channels"] = [fields_of(each) for each in health.channels]
+    data["rejected"] = [{"channel": a, "reason": b, "count": c} for a, b, c in health.rejected]
+    data["notices"] = dict(health.notices)
+    data["drivers"] = [
+        fields_of(each) | {"counters": dict(each.counters)} for each in sorted(drivers, key=lambda each: each.source)
+    ]
+    return data
+
+
+def fields_of(value: Any) -> dict[str, Any]:
+    """Return the fields of a dataclass, each as `plain`."""
+    return {each.name: plain(getattr(value, each.name)) for each in dataclasses.fields(value)}
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON has it: nan is null, an enumeration its name, flags their number."""
+    if isinstance(value, IntFlag):
+        return int(value)
+    if isinstance(value, IntEnum):
+        return value.name
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def number(value: float, digits: int) -> str:
+    """Return a number with so many digits, - for one that is not known."""
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
+
+
+def degrees(radians: float) -> str:
+    """Return an angle in degrees."""
+    return number(math.degrees(radians), 1)
+
+
+def age(seconds: float) -> str:
+    """Return an age, - for what never was."""
+    return duration(seconds) if math.isfinite(seconds) else "-"
+
+
+def duration(seconds: float) -> str:
+    """Return a time in the units that people read at a glance."""
+    if not math.isfinite(seconds):
+        return "-"
+    if seconds < 0.9995:
+        return f"{seconds * 1e3:.0f} ms"
+    if seconds < 60.0:
+        return f"{seconds:.1f} s"
+    minutes, hours = int(seconds // 60), int(seconds // 3600)
+    if hours == 0:
+        return f"{minutes} min {int(seconds) % 60:02d} s"
+    return f"{hours} h {minutes % 60:02d} min" if hours < 48 else f"{hours // 24} days {hours % 24} h"
+
+
+def clock(utime: int) -> str:
+    """Return an instant as people tell it, in UTC; its number where it is no time of day."""
+    try:
+        return datetime.fromtimestamp(utime * 1e-6, UTC).strftime("%H:%M:%S.%f")[:-5] + " UTC"
+    except (OverflowError, ValueError, OSError):
+        return str(utime)
