@@ -14,9 +14,11 @@ from typing import Any
 import pytest
 from support_lcm import MODELSERVER, PATIENCE_S, Listener, reserved_url, started, wait_until
 from support_samples import GEOMETRY, VEHICLE, drive, write_vehicle
+from support_signing import ALLOWED, write_test_key
 
 from modelserver.client.remote import Platform
 from modelserver.messages import Health
+from modelserver.signing import AHEAD_S
 from modelserver.wire.codec import decode, encode
 
 BRISK = VEHICLE + "publish: {rate_hz: 50, health_hz: 20}\n"
@@ -59,6 +61,8 @@ class Daemon:
 
     def health(self, enough: Callable[[Health], bool] = lambda health: True) -> Health:
         """Return the first health report from now on that is as wanted."""
+        while self.listener.bus.handle_timeout(0):
+            pass  # what waits there is of before
         self.listener.heard.clear()
         found: list[Health] = []
 
@@ -121,6 +125,23 @@ def start_daemon(lcm_url: str, tmp_path: Path) -> Iterator[Callable[..., Daemon]
             return stack.enter_context(daemon_at(lcm_url, folder, vehicle, **options))
 
         yield start
+
+
+@pytest.fixture
+def start_signed(
+    start_daemon: Callable[..., Daemon], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Daemon]:
+    """A function that starts a daemon that obeys who signs; clients and tools of this test have the key."""
+
+    def start(vehicle: str = BRISK + ALLOWED, folder: Path = tmp_path, **options: str) -> Daemon:
+        folder.mkdir(exist_ok=True)
+        monkeypatch.setenv("MODELSERVER_KEY_FILE", str(write_test_key(folder)))
+        daemon = start_daemon(vehicle, folder, **options)
+        # before, it takes nothing that it might have taken before it started
+        daemon.health(lambda health: health.uptime > AHEAD_S + 0.1)
+        return daemon
+
+    return start
 
 
 @pytest.fixture(scope="module")

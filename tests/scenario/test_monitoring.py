@@ -1,0 +1,314 @@
+"""Looking at the running daemon: status, spy and doctor as processes of their own on its bus."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import select
+import shutil
+import signal
+import subprocess
+import termios
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import pytest
+from conftest import BRISK, Daemon
+from support_lcm import MODELSERVER, PATIENCE_S, started
+from support_samples import VEHICLE, write_vehicle
+
+from modelserver.messages import Invalid
+from modelserver.service.listening import hears_itself, who_answers
+
+StartDaemon = Callable[..., Daemon]
+NO_SENSORS = "".join(
+    line for line in VEHICLE.splitlines(keepends=True) if not line.strip().startswith(("sensors:", "gps:", "imu:"))
+)
+
+
+def ran(url: str, *arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
+    """Run a subcommand on a bus until it ends."""
+    environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"} | {"LCM_DEFAULT_URL": url}
+    return subprocess.run(
+        [*MODELSERVER, *map(str, arguments)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=2 * PATIENCE_S,
+        **options,  # type: ignore[call-overload]
+    )
+
+
+# --- health -------------------------------------------------------------------------------------------------
+
+
+def test_given_a_real_daemon_then_its_report_tells_of_process_loop_and_sensors(start_daemon: StartDaemon) -> None:
+    daemon = start_daemon()
+    fresh = daemon.health()
+    assert {each.channel: (each.count, each.silent) for each in fresh.channels} == {
+        "GPS": (0, True),
+        "IMU": (0, True),
+    }
+    assert fresh.pid == daemon.process.pid
+    assert fresh.host
+    later = daemon.health(lambda health: health.cpu_share == health.cpu_share)
+    assert 0.0 < later.cpu_share < 1.5
+    assert 30_000_000 < later.memory < 1_000_000_000
+    assert (
+        0.0 < later.tick_lateness_p50 <= later.tick_lateness_p90 <= later.tick_lateness_p99 <= later.tick_lateness_max
+    )
+    # then the sensors speak, and fall silent
+    daemon.fed()
+    silent = daemon.health(
+        lambda health: {"sensor:gps", "sensor:imu"} == {each.channel for each in health.channels if each.silent}
+    )
+    assert all(each.count for each in silent.channels)
+    assert Invalid.STALE_IMU in silent.invalid_reasons
+
+
+# --- status -------------------------------------------------------------------------------------------------
+
+
+def test_given_a_daemon_without_a_pose_then_status_tells_why_and_exits_3(start_daemon: StartDaemon) -> None:
+    daemon = start_daemon()
+    done = ran(daemon.url, "status")
+    assert done.returncode == 3, done.stderr
+    for words in ("cart: STARTING", "NOT VALID: no usable GPS fix yet", "never heard", f"process {daemon.process.pid}"):
+        assert words in done.stdout
+    data = json.loads(ran(daemon.url, "status", "--json").stdout)
+    assert (data["state"], data["well"], data["pid"]) == ("STARTING", False, daemon.process.pid)
+
+
+def test_given_a_vehicle_without_sensors_then_it_is_well_and_status_exits_0(start_daemon: StartDaemon) -> None:
+    done = ran(start_daemon(NO_SENSORS).url, "status")
+    assert done.returncode == 0, done.stderr
+    assert "names no sensor to localize by" in done.stdout
+
+
+def test_given_the_wrong_prefix_then_status_offers_the_one_that_is_heard(start_daemon: StartDaemon) -> None:
+    daemon = start_daemon(BRISK + "lcm: {channel_prefix: RAPTOR_}\n", prefix="RAPTOR_")
+    done = ran(daemon.url, "status", "--prefix", "RAPTR_", "--timeout", "0.5")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "Did you mean --prefix 'RAPTOR_'?" in done.stderr
+    # and the vehicle file knows it
+    assert ran(daemon.url, "status", "-c", daemon.folder / "vehicle.yaml").returncode == 3
+
+
+def test_given_an_empty_bus_then_status_says_what_to_look_at_and_exits_1(lcm_url: str) -> None:
+    done = ran(lcm_url, "status", "--timeout", "0.2")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "modelserver doctor looks at the bus" in done.stderr
+    assert lcm_url in done.stderr
+
+
+def test_given_watch_into_a_pipe_then_there_is_a_line_for_each_report_until_it_is_interrupted(
+    start_daemon: StartDaemon,
+) -> None:
+    daemon = start_daemon()
+    with started([*MODELSERVER, "status", "--watch"], daemon.url, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        with process.stdout:
+            lines = [process.stdout.readline() for _ in range(3)]
+            process.send_signal(signal.SIGINT)
+            assert process.wait(PATIENCE_S) == 0
+    assert all("STARTING; pose not valid" in line for line in lines)
+
+
+# --- spy ----------------------------------------------------------------------------------------------------
+
+
+def test_given_no_screen_then_spy_prints_every_channel_once_and_the_fields_of_one(start_daemon: StartDaemon) -> None:
+    daemon = start_daemon()
+    done = ran(daemon.url, "spy", "--seconds", "1", "--channel", "MODELSERVER_HEALTH")
+    assert done.returncode == 0, done.stderr
+    rows = {row[0]: row for row in map(str.split, done.stdout.splitlines()) if row}
+    assert {"POSE", "POSE_VECTOR", "POSE_ODOM", "MODELSERVER_HEALTH"} <= rows.keys()
+    assert rows["POSE"][1] == "pose_transform_t"
+    assert 10.0 < float(rows["POSE"][3]) < 75.0
+    assert rows["invalid_reasons"][2] == "(no"
+    assert rows["state"] == ["state", "0", "STARTING"]
+
+
+def test_given_a_mistyped_channel_then_spy_offers_the_nearest_that_is_heard(start_daemon: StartDaemon) -> None:
+    done = ran(start_daemon().url, "spy", "--seconds", "1", "--channel", "POSE_ODON")
+    assert done.returncode == 1
+    assert "nothing came on 'POSE_ODON'; nearest: 'POSE_ODOM'" in done.stderr
+
+
+class Screen:
+    """A terminal with a program in it."""
+
+    def __init__(self, arguments: Sequence[str], url: str):
+        self.main, self.end = pty.openpty()
+        self.before = termios.tcgetattr(self.end)
+        termios.tcsetwinsize(self.end, (40, 140))
+        left_out = ("DISPLAY", "COLUMNS", "LINES")
+        environment = {key: value for key, value in os.environ.items() if key not in left_out}
+        self.process = subprocess.Popen(
+            [*MODELSERVER, *arguments],
+            stdin=self.end,
+            stdout=self.end,
+            stderr=self.end,
+            env=environment | {"LCM_DEFAULT_URL": url, "TERM": "xterm-256color"},
+            start_new_session=True,
+        )
+        self.said = ""
+
+    def shows(self, pattern: str) -> bool:
+        """Return whether what matches comes, from now on, in time."""
+        deadline = time.monotonic() + PATIENCE_S
+        seen = ""
+        while time.monotonic() < deadline:
+            ready, _, _ = select.select([self.main], [], [], 0.5)
+            if ready:
+                try:
+                    seen += os.read(self.main, 65536).decode(errors="replace")
+                except OSError:
+                    break  # the program has ended
+            if re.search(pattern, seen):
+                return True
+        self.said = seen
+        return False
+
+    def press(self, keys: bytes) -> None:
+        os.write(self.main, keys)
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+        os.close(self.main)
+        os.close(self.end)
+
+
+@pytest.fixture
+def screen(start_daemon: StartDaemon) -> Iterator[Callable[..., Screen]]:
+    url = start_daemon().url
+    opened: list[Screen] = []
+
+    def show(*arguments: str) -> Screen:
+        opened.append(Screen(arguments, url))
+        return opened[-1]
+
+    yield show
+    for each in opened:
+        each.close()
+
+
+def test_given_a_terminal_then_spy_shows_the_channels_and_keys_open_the_fields(
+    screen: Callable[..., Screen],
+) -> None:
+    spy = screen("spy")
+    assert spy.shows(r"POSE_VECTOR +pose_vector_t"), spy.said
+    spy.press(b"\x1b[F\x1b[H\r")
+    # the first channel by its name is that of the health report
+    assert spy.shows(r"uptime +[0-9.]+ "), spy.said
+    spy.press(b"q")
+    assert spy.process.wait(PATIENCE_S) == 0
+    # echo and line editing are as they were
+    assert termios.tcgetattr(spy.end)[3] == spy.before[3]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_given_a_channel_in_a_terminal_then_its_fields_are_open_and_a_signal_ends_it_cleanly(
+    screen: Callable[..., Screen], number: signal.Signals
+) -> None:
+    spy = screen("spy", "--channel", "POSE")
+    assert spy.shows(r"frame_of_reference +'World:UTM'"), spy.said
+    spy.process.send_signal(number)
+    assert spy.process.wait(PATIENCE_S) == 0
+    assert termios.tcgetattr(spy.end)[3] == spy.before[3]
+
+
+def test_given_a_terminal_then_status_watch_shows_the_report_until_ctrl_c(screen: Callable[..., Screen]) -> None:
+    watch = screen("status", "--watch")
+    assert watch.shows("cart: STARTING"), watch.said
+    watch.process.send_signal(signal.SIGINT)
+    assert watch.process.wait(PATIENCE_S) == 0
+
+
+# --- doctor, and the probe at the start ---------------------------------------------------------------------
+
+
+def test_given_a_bus_that_is_well_then_our_own_messages_come_back_and_one_daemon_answers(
+    start_daemon: StartDaemon,
+) -> None:
+    daemon = start_daemon()
+    assert hears_itself(daemon.url) == (True, True)
+    answers = who_answers(daemon.url, "")
+    assert answers.replies == 1
+    (server,) = answers.servers
+    assert (server.pid, server.vehicle, server.prefix) == (daemon.process.pid, "cart", "")
+    done = ran(daemon.url, "doctor", "-c", daemon.folder / "vehicle.yaml", "--json")
+    said = {each["subject"]: each for each in json.loads(done.stdout)["findings"]}
+    assert said["own message"]["grade"] == "ok"
+    assert f"process {daemon.process.pid} on" in said["daemon"]["seen"]
+    assert said["vehicle file"]["grade"] == said["state"]["grade"] == "ok"
+    assert done.returncode in (0, 1)
+
+
+def test_given_two_daemons_on_one_bus_then_each_notices_the_other_until_it_is_gone_and_doctor_finds_both(
+    start_daemon: StartDaemon, tmp_path: Path
+) -> None:
+    first = start_daemon()
+    second = start_daemon(folder=tmp_path / "second")
+    pids = {first.process.pid, second.process.pid}
+
+    def noticed(pid: int, other: int) -> bool:
+        health = first.health(lambda health: health.pid == pid and "servers" in dict(health.notices))
+        return f"process {other} on" in dict(health.notices)["servers"]
+
+    assert noticed(first.process.pid, second.process.pid)
+    assert noticed(second.process.pid, first.process.pid)
+    done = ran(first.url, "doctor")
+    assert done.returncode == 3
+    assert "2 answer at once" in done.stdout
+    assert all(f"process {pid} on" in done.stdout for pid in pids)
+    assert second.end() == 0
+    first.health(lambda health: health.pid == first.process.pid and "servers" not in dict(health.notices))
+
+
+def unshared() -> list[str]:
+    """The words before a command that give it a network of its own, without any route."""
+    words = ["unshare", "--net"] if os.geteuid() == 0 else ["unshare", "--net", "--map-root-user"]
+    if shutil.which("unshare") is None or shutil.which("ip") is None:
+        pytest.skip("unshare or ip is missing, so there is no network to take away")
+    if subprocess.run([*words, "true"], capture_output=True).returncode:
+        pytest.skip("this system gives nobody a network of its own (unshare --net)")
+    return words
+
+
+SCRIPT = """\
+"$@" run -c vehicle.yaml 2>run.log; echo run $?
+"$@" doctor --json >before.json; echo before $?
+python - <<'END' >mend.sh
+import json
+findings = json.load(open("before.json"))["findings"]
+print(next(each["command"] for each in findings if each["grade"] == "error").replace("sudo ", ""))
+END
+sh -e mend.sh; echo mended $?
+"$@" doctor --json >after.json; echo after $?
+"""
+
+
+def test_given_a_machine_without_a_route_then_the_daemon_refuses_and_doctors_command_mends_it(tmp_path: Path) -> None:
+    words = unshared()
+    write_vehicle(tmp_path)
+    python = MODELSERVER[0]
+    done = subprocess.run(
+        [*words, "sh", "-c", SCRIPT.replace("python -", f"{python} -"), "sh", *MODELSERVER],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=2 * PATIENCE_S,
+        env=os.environ | {"LCM_DEFAULT_URL": ""},
+    )
+    codes = dict(line.split() for line in done.stdout.splitlines())
+    assert (codes["run"], codes["before"], codes["mended"]) == ("1", "3", "0"), done.stdout + done.stderr
+    assert "ip route add 224.0.0.0/4 dev lo" in (tmp_path / "run.log").read_text()
+    assert codes["after"] in ("0", "1")
+    found = {each["subject"]: each for each in json.loads((tmp_path / "after.json").read_text())["findings"]}
+    assert (found["own message"]["grade"], found["multicast route"]["grade"]) == ("ok", "ok")

@@ -1,0 +1,98 @@
+"""The real daemon killed and begun again beside a vehicle that stands: its pose is back before the vehicle moves."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import pytest
+from conftest import Daemon
+from support_lcm import wait_until
+
+from modelserver.errors import ModelServerError
+from modelserver.formats import save_model
+from modelserver.messages import GpsSample, ImuSample
+from modelserver.service.kept_form import KeptError, kept_from_bytes
+from modelserver.simulation import Event, Phase
+from modelserver.wire.codec import encode
+from tests.support_filter import RIG, simulation
+from tests.support_restart import TO_A_STOP
+
+VEHICLE = """\
+vehicle: car
+geometry: geometry.yaml
+base_frame: Car:Base
+state_directory: state
+sensors:
+  gps: {channel: GPS, frame: Car:Antenna}
+  imu: {channel: IMU, frame: Car:Imu}
+  wheels: {channel: WHEELS, frames: {left: Car:Left, right: Car:Right}}
+publish: {rate_hz: 50, health_hz: 20}
+restart: {period_s: 0.5}
+"""
+FIRST, LOST, AGAIN = 34.0, 1.0, 6.0
+AT_ONCE = 100
+"""Messages between two looks at whether the daemon keeps up."""
+
+
+def feed(daemon: Daemon, events: Iterable[Event]) -> int:
+    """Publish samples as fast as the daemon takes them; return the stamp of the last."""
+    channels: dict[type, str] = {GpsSample: "GPS", ImuSample: "IMU"}
+    utime = 0
+    for number, event in enumerate(events):
+        daemon.publish(channels.get(type(event), "WHEELS"), encode(event))
+        utime = max(utime, event.header.utime)
+        if number % AT_ONCE == AT_ONCE - 1:
+            daemon.health()
+    return utime
+
+
+def started_word(daemon: Daemon, part: str) -> str:
+    return dict(daemon.health(lambda health: part in dict(health.notices).get("start", "")).notices)["start"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_given_a_daemon_that_ends_while_the_vehicle_stands_then_its_successor_knows_the_pose_at_once(
+    start_daemon: Callable[..., Daemon], tmp_path: Path, number: signal.Signals
+) -> None:
+    geometry = save_model(RIG.model, "yaml").text
+    begin = time.time_ns() // 1000 - round((FIRST + LOST + AGAIN) * 1e6)
+    sim = simulation((*TO_A_STOP, Phase(60.0)), start_utime=begin)
+    first = start_daemon(VEHICLE, geometry=geometry)
+    assert started_word(first, "cold start") == "cold start: nothing is kept of an earlier run"
+    last = feed(first, sim.events(FIRST))
+    kept = tmp_path / "state" / "state-car.json"
+
+    def is_kept() -> bool:
+        try:
+            pose = kept_from_bytes(kept.read_bytes())
+        except (FileNotFoundError, KeptError):
+            return False
+        return pose.pose is not None and pose.sensor_utime > last - 2_000_000
+
+    assert wait_until(first.listener.bus, is_kept)
+    before = first.platform().get_pose("Car:Base", "World:UTM", at=last - 200_000, wait_ms=2000)
+    first.end(number)
+
+    for _ in sim.events(LOST):
+        pass
+    second = start_daemon(VEHICLE, geometry=geometry)
+    assert "waits for the sensors" in started_word(second, "warm start")
+    last = feed(second, sim.events(AGAIN))
+    assert "3 fixes agree" in started_word(second, "3 fixes agree")
+    after = second.platform().get_pose("Car:Base", "World:UTM", at=last - 200_000, wait_ms=2000)
+    assert before.transformation.valid
+    assert after.transformation.valid
+    assert after.origin == before.origin
+    assert after.transformation.pose.is_close(before.transformation.pose, 1.0, 0.02)
+    assert after.transformation.pose_epoch == before.transformation.pose_epoch + 1
+    assert "warm start: the pose kept" in second.log
+    # a state that is torn is a cold start
+    second.end(signal.SIGKILL)
+    kept.write_bytes(kept.read_bytes()[:-40])
+    third = start_daemon(VEHICLE, geometry=geometry)
+    assert "it is damaged" in started_word(third, "cold start")
+    with pytest.raises(ModelServerError):
+        third.platform().get_transformation("Car:Base", "World:UTM")
