@@ -1,0 +1,270 @@
+"""POSE beside 10,000 queries a second from one client, against the same without; and another client's answers."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import random
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import lcm
+
+from benchmarks.support import free_url, process, verdict
+from modelserver.client.remote import Platform
+from modelserver.errors import NoPoseError, NoServerError, RefusedError
+from modelserver.messages import (
+    GetTransformation,
+    GpsSample,
+    Health,
+    ImuSample,
+    RequestHeader,
+    SensorHeader,
+    WheelSample,
+    WheelsSample,
+)
+from modelserver.messages.flags import FixType
+from modelserver.wire.codec import decode, encode
+from modelserver.wire.provider import resolve_url
+
+ROUNDS = 3
+SECONDS = float(sys.argv[2]) if sys.argv[1:2] == ["seconds"] else 10.0
+"""Of each of the rounds' two parts: 30 s of flood in all."""
+
+POSE_HZ = 100.0
+FLOOD_HZ = 10_000.0
+LATER = 0.5
+"""Seconds at the begin of a part that do not count: processes start."""
+
+GEOMETRY = """\
+modelserver: geometry/1
+name: cart
+bodies:
+  Cart: {frames: {Base: , Antenna: {xyz: [-0.4, 0.2, 1.2]}, Imu: {xyz: [0.1, 0, 0.3]}, Left: {xyz: [0, 0.3, 0]},
+    Right: {xyz: [0, -0.3, 0]}}}
+"""
+VEHICLE = f"""\
+vehicle: cart
+geometry: geometry.yaml
+base_frame: Cart:Base
+state_directory: state
+publish: {{rate_hz: {POSE_HZ:g}}}
+sensors:
+  gps: {{channel: GPS, frame: Cart:Antenna}}
+  imu: {{channel: IMU, frame: Cart:Imu}}
+  wheels: {{channel: WHEELS, frames: {{left: Cart:Left, right: Cart:Right}}}}
+"""
+
+
+def sensors() -> None:
+    """Be an inertial unit at 200 Hz, wheels at 100 Hz and a receiver at 5 Hz, on a level drive."""
+    bus = lcm.LCM(resolve_url())
+    begin, shaken = time.monotonic(), random.Random(1).gauss
+    for n in itertools.count():
+        time.sleep(max(0.0, begin + n / 200.0 - time.monotonic()))
+        utime = time.time_ns() // 1000
+        rate = (shaken(0.0, 0.02), shaken(0.0, 0.02), shaken(0.0, 0.02))
+        force = (shaken(0.0, 0.3), shaken(0.0, 0.3), 9.80665 + shaken(0.0, 0.3))
+        bus.publish("IMU", encode(ImuSample(SensorHeader(utime, "imu", n), rate, force)))
+        if n % 2 == 0:
+            wheels = tuple(WheelSample(name, 2.0 * n / 200.0, speed=2.0) for name in ("left", "right"))
+            bus.publish("WHEELS", encode(WheelsSample(SensorHeader(utime, "wheels", n // 2), wheels)))
+        if n % 40 == 0:
+            east = 2.0 * n / 200.0
+            fix = GpsSample(
+                SensorHeader(utime, "gps", n // 40),
+                FixType.FIX_3D,
+                50.27,
+                -111.1 + east / 71_200.0,
+                700.0,
+                position_covariance=(0.25, 0.0, 0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0),
+                velocity=(2.0, 0.0, 0.0),
+                velocity_covariance=(0.01, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.01),
+            )
+            bus.publish("GPS", encode(fix))
+
+
+def flood(seconds: float) -> None:
+    """Ask at the flood's rate, without waiting for replies; say how often."""
+    bus = lcm.LCM(resolve_url())
+    requests = [
+        encode(GetTransformation(RequestHeader(n, "REPLY_FLOOD"), "Cart:Base", "World:UTM")) for n in range(1000)
+    ]
+    begin, sent = time.monotonic(), 0
+    while (now := time.monotonic()) < begin + seconds:
+        due = round((now - begin) * FLOOD_HZ)
+        while sent < due:
+            bus.publish("PLATFORM_GET_TRANSFORMATION", requests[sent % 1000])
+            sent += 1
+        time.sleep(0.001)
+    Path(sys.argv[3]).write_text(str(sent))
+
+
+def beat(seconds: float) -> None:
+    """Be the least that can be late: a bare loop that sleeps until absolute deadlines at the rate of POSE."""
+    late, begin = [], time.monotonic()
+    for n in range(1, round(seconds * POSE_HZ)):
+        due = begin + n / POSE_HZ
+        time.sleep(max(0.0, due - time.monotonic()))
+        late.append(time.monotonic() - due)
+    Path(sys.argv[3]).write_text(json.dumps(late))
+
+
+class Ear:
+    """Hears POSE and health in a thread of its own, with the instant of arrival."""
+
+    def __init__(self, url: str):
+        self.late: list[float] = []
+        self.health: list[Health] = []
+        self._bus = lcm.LCM(resolve_url(url))
+        self._bus.subscribe("POSE", self._pose)
+        self._bus.subscribe("MODELSERVER_HEALTH", lambda _, data: self.health.append(decode("health_t", data)))
+        self._end = threading.Event()
+        self._last = 0.0
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def _pose(self, _: str, data: bytes) -> None:
+        # in timer mode a pose is stamped at the instant of its tick: the deadlines are a grid with the period's spacing
+        utime = decode("pose_transform_t", data).transformation.utime
+        self.late.append(utime * 1e-6)
+
+    def _listen(self) -> None:
+        while not self._end.is_set():
+            self._bus.handle_timeout(100)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._end.set()
+
+
+def lateness(stamps: list[float]) -> list[float]:
+    """Return how late each pose was by its stamp, against the grid of deadlines that the earliest ones lie on.
+
+    One that is late by a whole period or more shows as a missed tick instead.
+    """
+    period = 1.0 / POSE_HZ
+    base = stamps[0]
+    phases = [(stamp - base) - round((stamp - base) / period) * period for stamp in stamps]
+    low = statistics.quantiles(phases, n=100)[1]
+    return [max(0.0, phase - low) for phase in phases]
+
+
+def cpu_seconds(pid: int) -> float:
+    """Return the processor time that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def p99(values: list[float]) -> float:
+    return statistics.quantiles(values, n=100)[98]
+
+
+@contextmanager
+def polite(url: str, replies: list[float], lost: list[str]) -> Iterator[None]:
+    """Ask ten times a second beside whatever goes on."""
+    end = threading.Event()
+
+    def ask() -> None:
+        with Platform(url, timeout=0.5, retries=0, name="polite") as platform:
+            while not end.wait(0.1):
+                begin = time.perf_counter()
+                try:
+                    with suppress(NoPoseError):
+                        platform.get_pose("Cart:Base", "World:UTM")
+                    replies.append(time.perf_counter() - begin)
+                except (NoServerError, RefusedError) as error:
+                    lost.append(type(error).__name__)
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    try:
+        yield
+    finally:
+        end.set()
+        thread.join()
+
+
+def main() -> int:
+    url = free_url()
+    late: dict[bool, list[float]] = {False: [], True: []}
+    replies: dict[bool, list[float]] = {False: [], True: []}
+    lost: dict[bool, list[str]] = {False: [], True: []}
+    bare: dict[bool, list[float]] = {False: [], True: []}
+    busy = {False: 0.0, True: 0.0}
+    sent = 0
+    with tempfile.TemporaryDirectory() as folder:
+        config = Path(folder) / "vehicle.yaml"
+        config.write_text(VEHICLE)
+        (Path(folder) / "geometry.yaml").write_text(GEOMETRY)
+        count, bare_file = Path(folder) / "sent", Path(folder) / "bare"
+        run = ("-c", "from mstools.cli import main; main()", "run", "-c", str(config), "--log-level", "error")
+        with process(*run, url=url) as served, process("-m", "benchmarks.flood", "sensors", url=url):
+            ear = Ear(url)
+            time.sleep(5.0)
+            for number in range(2 * ROUNDS):
+                flooded = bool(number % 2)
+                count.write_text("0")
+                before = cpu_seconds(served.pid)
+                with (
+                    polite(url, replies[flooded], lost[flooded]),
+                    process("-m", "benchmarks.flood", "beat", str(SECONDS), str(bare_file), url=url) as bare_loop,
+                ):
+                    if flooded:
+                        with process("-m", "benchmarks.flood", "flood", str(SECONDS), str(count), url=url):
+                            time.sleep(LATER)
+                            ear.late.clear()
+                            time.sleep(SECONDS)
+                            heard = list(ear.late)
+                            time.sleep(LATER)
+                    else:
+                        ear.late.clear()
+                        time.sleep(SECONDS)
+                        heard = list(ear.late)
+                    bare_loop.wait()
+                bare[flooded] += json.loads(bare_file.read_text())
+                busy[flooded] += cpu_seconds(served.pid) - before
+                sent += int(count.read_text())
+                late[flooded] += lateness(heard)
+                time.sleep(2.0)
+            health = ear.health[-1]
+            ear.close()
+    refused = sum(each for _, why, each in health.rejected if why == "load")
+    notices = sorted({text for each in ear.health for subject, text in each.notices if subject == "requests"})
+    for flooded, name in ((False, "quiet"), (True, "flood")):
+        times, asked = late[flooded], replies[flooded]
+        print(
+            f"  {name}: {len(times)} poses, lateness p50 {statistics.median(times) * 1e3:.2f} ms, "
+            f"p99 {p99(times) * 1e3:.2f} ms, most {max(times) * 1e3:.2f} ms; polite client at 10 Hz: "
+            f"{len(asked)} answers, p50 {statistics.median(asked) * 1e3:.2f} ms, p99 {p99(asked) * 1e3:.2f} ms, "
+            f"{len(lost[flooded])} not answered; the daemon's CPU {busy[flooded] / ROUNDS / SECONDS:.0%} of a core"
+        )
+    print(
+        f"  a bare loop at the same rate beside it: p99 {p99(bare[False]) * 1e3:.2f} ms quiet, "
+        f"{p99(bare[True]) * 1e3:.2f} ms with the flood: so much is the machine's"
+    )
+    print(f"  sent {sent}; answered {health.requests_answered}, refused and counted {refused}")
+    print(f"  ticks missed {health.ticks_missed}; last notice: {notices[-1] if notices else 'none'}")
+    unseen = sent - refused - health.requests_answered
+    print(f"  neither answered nor counted (lost before they were seen; polite ones count against it): {unseen}")
+    holds = verdict("POSE's p99 lateness with the flood, more than without", (p99(late[True]) - p99(late[False])) * 1e3,
+                    2.0, "ms")  # fmt: skip
+    holds &= verdict("requests of the polite client not answered", len(lost[True]), 0, "")
+    return 0 if holds and refused else 1
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["sensors"]:
+        sensors()
+    elif sys.argv[1:2] == ["beat"]:
+        beat(float(sys.argv[2]))
+    elif sys.argv[1:2] == ["flood"]:
+        flood(float(sys.argv[2]))
+    else:
+        sys.exit(main())

@@ -1,0 +1,122 @@
+"""What the journal costs the loop: for each sample and tick, and while a segment is closed and the next begun."""
+
+from __future__ import annotations
+
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from benchmarks.support import RAPTOR, ratio, verdict
+from modelserver.config import VehicleConfig, load_config
+from modelserver.messages import GpsSample, ImuSample, Sample, WheelsSample
+from modelserver.service import journal_state
+from modelserver.service.clock import FakeClock
+from modelserver.service.daemon import Vehicle, load_vehicle
+from modelserver.service.fake_bus import FakeBus
+from modelserver.service.hooks import Hooks
+from modelserver.service.journal import Journal, JournalQueue, NoJournal
+from modelserver.service.journal_ring import Ring
+from modelserver.service.journal_writer import JournalWriter, Origins, pause
+from modelserver.service.loop import Loop, LoopSettings
+from modelserver.wire.codec import encode
+from mstools.demo_drive import simulation
+
+START = 1_700_000_000_000_000
+ROUNDS, SAMPLES = 40, 200
+CHANNELS = {GpsSample: "GPS", ImuSample: "IMU", WheelsSample: "WHEELS"}
+STATES = 40
+
+
+class Bench:
+    """A loop of the Raptor that hears a drive; the bus keeps nothing."""
+
+    def __init__(self, vehicle: Vehicle, journal: Journal):
+        self.clock = FakeClock(START, 10**9)
+        self.bus = FakeBus(self.clock)
+        settings = LoopSettings(10_000_000, vehicle.sensor_channels())
+        state = vehicle.core(self.clock.now())
+        self.loop = Loop(self.bus, self.clock, state, settings, Hooks(snapshot=vehicle.snapshot, journal=journal))
+
+    def hear(self, samples: list[tuple[str, bytes, int]]) -> float:
+        """Hear samples, and tick when it is due; return seconds a sample."""
+        begin = time.perf_counter()
+        for channel, data, utime in samples:
+            self.clock.advance((utime - self.clock.utime()) * 1e-6)
+            self.bus.sensors.put(channel, data)
+            self.loop.turn()
+        took = time.perf_counter() - begin
+        self.bus.published.clear()
+        return took / len(samples)
+
+
+def heard(config: VehicleConfig) -> Iterator[tuple[str, bytes, int]]:
+    """The drive's samples as they stand on the bus."""
+    run = simulation(config, START, 300.0, sensors=(GpsSample, ImuSample, WheelsSample))
+    for event in run.events(300.0):
+        sample: Sample = getattr(event, "sample", event)
+        yield CHANNELS[type(sample)], encode(sample), sample.header.utime
+
+
+class Chunks:
+    """Takes the place of the writer's pause: notes how long its thread has held the interpreter, at most, seconds."""
+
+    def __init__(self) -> None:
+        self.longest: list[float] = []
+        self._since = time.thread_time()
+
+    def begin(self) -> None:
+        """Begin another round."""
+        self.longest.append(0.0)
+        self._since = time.thread_time()
+
+    def __call__(self) -> None:
+        """Pause."""
+        self.longest[-1] = max(self.longest[-1], time.thread_time() - self._since)
+        pause()
+        self._since = time.thread_time()
+
+
+def main() -> int:
+    config = load_config(RAPTOR / "vehicle.yaml")
+    config = replace(config, publish=replace(config.publish, rate_hz=100.0))
+    vehicle = load_vehicle(config)
+    with tempfile.TemporaryDirectory() as folder:
+        queue = JournalQueue()
+        with_it, without = Bench(vehicle, queue), Bench(vehicle, NoJournal())
+        ring = Ring(Path(folder) / "journal", 1 << 30, 16 << 20)
+        write = JournalWriter(queue, ring, Origins({"run": "bench"}, [], config), with_it.clock)
+        samples = heard(config)
+        costs: dict[str, list[float]] = {"with": [], "without": [], "thread": []}
+        for number in range(ROUNDS):
+            portion = [next(samples) for _ in range(SAMPLES)]
+            # who goes first has the caches cold
+            order = [("with", with_it), ("without", without)]
+            for name, bench in order if number % 2 else reversed(order):
+                costs[name].append(bench.hear(portion))
+            records, begin = len(queue), time.perf_counter()
+            write.work()
+            costs["thread"].append((time.perf_counter() - begin) / max(records, 1))
+        # the first rounds have no pose yet
+        costs = {name: values[ROUNDS // 4 :] for name, values in costs.items()}
+        medians = {name: statistics.median(values) * 1e6 for name, values in costs.items()}
+        print(
+            f"  a sample with its ticks: {medians['with']:.1f} us with a journal, {medians['without']:.1f} us without"
+        )
+        print(f"  the thread takes {medians['thread']:.1f} us for a record")
+        holds = verdict("a sample with a journal, to one without", ratio(costs["with"], costs["without"]), 1.10, "")
+        chunks = Chunks()
+        for _ in range(STATES):
+            chunks.begin()
+            size = len(journal_state.written((config, journal_state.apart(with_it.loop.state)), chunks))
+            chunks()
+        write.finish()
+    told = f"longest hold of the interpreter for a state of {size >> 10} KiB, median"
+    held = verdict(told, statistics.median(chunks.longest) * 1e3, 3.0, "ms")
+    print(f"  the longest of all {STATES}: {max(chunks.longest) * 1e3:.2f} ms")
+    return 0 if holds and held else 1

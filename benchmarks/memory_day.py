@@ -1,0 +1,119 @@
+"""What the daemon holds of memory through a day of traffic, told at full speed; and what a stranger's channel costs.
+
+The whole loop, codec and core, on a bus and a clock within the process: sensors at modest rates, poses, a question now
+and then, and everything that is refused. An hour of traffic unless told otherwise:
+`python -m benchmarks.memory_day HOURS`. Memory is compared from a quarter of the way on, when history and every table
+are full. liblcm remembers each channel name that it has ever heard, whoever speaks on it: how much a name takes is
+measured on a real bus.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import os
+import sys
+import time
+from pathlib import Path
+
+import lcm
+
+from benchmarks.support import RAPTOR, free_url, verdict
+from modelserver.config import load_config
+from modelserver.messages import GetTransformation, GpsSample, ImuSample, RequestHeader, WheelsSample
+from modelserver.service.clock import FakeClock
+from modelserver.service.daemon import load_vehicle
+from modelserver.service.fake_bus import FakeBus
+from modelserver.service.loop import Loop, LoopSettings
+from modelserver.simulation import GpsModel, ImuModel, Timing, WheelsModel
+from modelserver.wire.codec import encode
+from modelserver.wire.provider import resolve_url
+from mstools.demo_drive import simulation
+
+START = 1_700_000_000_000_000
+IMU_HZ, WHEELS_HZ, GPS_HZ, ODD_EVERY = 20.0, 5.0, 1.0, 50
+CHANNELS = {GpsSample: "GPS", ImuSample: "IMU", WheelsSample: "WHEELS"}
+NAMES = 100_000
+SPARE_KB = 1024
+"""What an hour may take more: pages that the allocator has begun; a leak of a byte a message takes 90 kB."""
+
+
+def held_kb() -> int:
+    """Return what this process holds of the machine's memory."""
+    gc.collect()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 1024
+
+
+def day(hours: float) -> tuple[int, float, int]:
+    """Return how many samples there were, and how memory grew in the last three quarters: kB an hour, and at most."""
+    logging.disable()
+    config = load_config(RAPTOR / "vehicle.yaml")
+    vehicle = load_vehicle(config)
+    clock = FakeClock(START)
+    bus = FakeBus(clock)
+    settings = LoopSettings(round(1e9 / vehicle.tick_hz()), vehicle.sensor_channels())
+    loop = Loop(bus, clock, vehicle.core(clock.now()), settings)
+    seconds = hours * 3600.0
+    run = simulation(
+        config,
+        START,
+        seconds,
+        sensors=tuple(CHANNELS),
+        imu_model=ImuModel(Timing(IMU_HZ)),
+        wheels_model=WheelsModel(Timing(WHEELS_HZ)),
+        gps_model=GpsModel(Timing(GPS_HZ)),
+    )
+    question = GetTransformation(RequestHeader(1, "REPLY_DAY"), "Digiclops:ImagePlane", "World:UTM")
+    count, begun, held = 0, 0.0, []
+    for sample in run.events(seconds):
+        while sample.header.host_utime > clock.utime():
+            loop.turn()
+        data = encode(sample)
+        bus.sensors.put(CHANNELS[type(sample)], data)
+        count += 1
+        if count % ODD_EVERY == 0:
+            # one that is cut off, one of a stranger with a name of its own, and a question
+            bus.sensors.put("IMU", data[: count % len(data)])
+            stranger = sample.header.__class__(sample.header.utime, f"stranger{count}")
+            bus.sensors.put("IMU", encode(ImuSample(stranger)))
+            bus.requests.put("PLATFORM_GET_TRANSFORMATION", encode(question))
+            bus.published.clear()
+        since = (clock.utime() - START) * 1e-6
+        if since >= begun:
+            begun += seconds / 40.0
+            if since >= seconds / 4.0:
+                held.append(held_kb())
+    assert loop.state.handler_errors == 0, dict(loop.state.rejected)
+    return count, (held[-1] - held[0]) / (0.75 * hours), max(held) - held[0]
+
+
+def name_bytes() -> float:
+    """Return how many bytes liblcm keeps for each channel name that it hears and nobody has asked for."""
+    url = resolve_url(free_url())
+    speaker, hearer = lcm.LCM(url), lcm.LCM(url)
+    heard: list[bytes] = []
+    hearer.subscribe("LAST", lambda _, data: heard.append(data))
+    before = held_kb()
+    for number in range(NAMES):
+        speaker.publish(f"STRANGER_{number:011d}", b"")
+        if number % 100 == 0:
+            heard.clear()
+            speaker.publish("LAST", b"")
+            while not heard:
+                if not hearer.handle_timeout(2000):
+                    raise TimeoutError("the bus does not deliver")
+    return (held_kb() - before) * 1024 / NAMES
+
+
+def main(hours: float = 1.0) -> int:
+    print(
+        f"  a channel name of 20 characters that nobody asked for: {name_bytes():.0f} bytes in liblcm for each instance"
+    )
+    begin = time.monotonic()
+    count, growth, most = day(hours)
+    print(f"  {hours:g} h of traffic, {count} samples, in {time.monotonic() - begin:.0f} s; at most {most} kB more")
+    return 0 if verdict("growth an hour", growth, SPARE_KB, "kB") else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(*map(float, sys.argv[1:2])))
