@@ -15,14 +15,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from benchmarks.support import RAPTOR, ratio, verdict
 from modelserver.config import VehicleConfig, load_config
 from modelserver.messages import GpsSample, ImuSample, Sample, WheelsSample
-from modelserver.service import journal_state
 from modelserver.service.clock import FakeClock
 from modelserver.service.daemon import Vehicle, load_vehicle
 from modelserver.service.fake_bus import FakeBus
 from modelserver.service.hooks import Hooks
-from modelserver.service.journal import Journal, JournalQueue, NoJournal
-from modelserver.service.journal_ring import Ring
-from modelserver.service.journal_writer import JournalWriter, Origins, pause
+from modelserver.service.journal import state as journal_state
+from modelserver.service.journal.queue import Journal, JournalQueue, NoJournal
+from modelserver.service.journal.ring import Ring
+from modelserver.service.journal.writer import JournalWriter, Origins, pause
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.wire.codec import encode
 from mstools.demo_drive import simulation

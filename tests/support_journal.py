@@ -11,14 +11,14 @@ from support_signing import ALLOWED, KEY, envelope, write_test_key
 
 from modelserver.config import load_config
 from modelserver.messages import CHANNEL_OF
-from modelserver.service import journal_build
 from modelserver.service.clock import FakeClock
 from modelserver.service.daemon import load_vehicle
 from modelserver.service.fake_bus import FakeBus
 from modelserver.service.hooks import Hooks
-from modelserver.service.journal import JournalQueue
-from modelserver.service.journal_ring import Ring, segments
-from modelserver.service.journal_writer import JournalWriter, Origins
+from modelserver.service.journal import build as journal_build
+from modelserver.service.journal.queue import JournalQueue
+from modelserver.service.journal.ring import Ring, segments
+from modelserver.service.journal.writer import JournalWriter, Origins
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.signing import Key
 from modelserver.wire.codec import encode

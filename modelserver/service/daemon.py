@@ -41,20 +41,20 @@ from modelserver.messages import (
 )
 from modelserver.reload import ModelLoaded
 from modelserver.service.bus import LcmBus
-from modelserver.service.bus_probe import probe, tell
 from modelserver.service.clock import SystemClock
-from modelserver.service.gate import Gate
 from modelserver.service.gauges import read_gauges
 from modelserver.service.heard import Heard
 from modelserver.service.hooks import Hooks
-from modelserver.service.journal import NoJournal
-from modelserver.service.journal_place import make_writer
-from modelserver.service.keep import OriginKeeper, default_directory
+from modelserver.service.journal.place import make_writer
+from modelserver.service.journal.queue import NoJournal
+from modelserver.service.keeping.origin import OriginKeeper, default_directory
+from modelserver.service.keeping.state import StateKeeper
 from modelserver.service.loop import Loop, LoopSettings
-from modelserver.service.notify import Notifier
-from modelserver.service.restart import StateKeeper
-from modelserver.service.rivals import Rivals
-from modelserver.service.supervised import Supervision
+from modelserver.service.probing.rivals import Rivals
+from modelserver.service.probing.start import probe, tell
+from modelserver.service.requests.gate import Gate
+from modelserver.service.supervision.notify import Notifier
+from modelserver.service.supervision.supervised import Supervision
 from modelserver.snapshot import Snapshot, written
 from modelserver.version import __version__
 from modelserver.wire.channels import CHANNELS, Way

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from modelserver.core import CoreState
 from modelserver.messages import Gauges, Kept, LoadModel, OriginLatched, SwitchMode
 from modelserver.reload import ModelLoaded
-from modelserver.service.gate import Gate
 from modelserver.service.heard import Heard
-from modelserver.service.journal import Journal, NoJournal
+from modelserver.service.journal.queue import Journal, NoJournal
+from modelserver.service.requests.gate import Gate
 
 
 def _nothing_to_load(wish: LoadModel, state: CoreState) -> ModelLoaded:

@@ -35,11 +35,11 @@ from modelserver.reload import ModelLoaded
 from modelserver.service.ahead import Lead
 from modelserver.service.bus import Bus
 from modelserver.service.clock import Clock
-from modelserver.service.desk import DeskLimits
 from modelserver.service.heard import Heard
 from modelserver.service.hooks import Hooks
 from modelserver.service.log import RateLimited, plain, plain_lines
-from modelserver.service.reception import Reception
+from modelserver.service.requests.desk import DeskLimits
+from modelserver.service.requests.reception import Reception
 from modelserver.service.snapshots import SnapshotWriter
 from modelserver.service.watch import Watch
 from modelserver.wire.codec import encode

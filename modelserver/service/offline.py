@@ -19,8 +19,8 @@ from modelserver.geometry import names
 from modelserver.localization.interface import Localizer
 from modelserver.messages import NAN, Decision, Envelope, Event, Policy, PublishDecisions, Rejected, TimeQuery
 from modelserver.service.daemon import Vehicle
-from modelserver.service.gate import MODE_TYPE
 from modelserver.service.heard import Heard
+from modelserver.service.requests.gate import MODE_TYPE
 from modelserver.spatial.so3 import Quaternion
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent

@@ -15,13 +15,13 @@ from support_lcm import PATIENCE_S
 from modelserver.client.mirror import PlatformMirror
 from modelserver.errors import NoServerError
 from modelserver.geodesy import origin_at
-from modelserver.service.keep import OriginKeeper
+from modelserver.service.keeping.origin import OriginKeeper
 
 SAVING = """
 import sys
 from pathlib import Path
 from modelserver.geodesy import origin_at
-from modelserver.service.keep import OriginKeeper
+from modelserver.service.keeping.origin import OriginKeeper
 keeper, n = OriginKeeper(Path(sys.argv[1]), "raptor"), 0
 while True:
     n += 1

@@ -21,7 +21,7 @@ from support_lcm import MODELSERVER, PATIENCE_S, started
 from support_samples import VEHICLE, write_vehicle
 
 from modelserver.messages import Invalid
-from modelserver.service.listening import hears_itself, who_answers
+from modelserver.service.probing.listening import hears_itself, who_answers
 
 StartDaemon = Callable[..., Daemon]
 NO_SENSORS = "".join(

@@ -14,7 +14,7 @@ from support_lcm import wait_until
 from modelserver.errors import ModelServerError
 from modelserver.formats import save_model
 from modelserver.messages import GpsSample, ImuSample
-from modelserver.service.kept_form import KeptError, kept_from_bytes
+from modelserver.service.keeping.form import KeptError, kept_from_bytes
 from modelserver.simulation import Event, Phase
 from modelserver.wire.codec import encode
 from tests.support_filter import RIG, simulation

@@ -15,7 +15,7 @@ from mstools.output import counted, safe
 
 if TYPE_CHECKING:
     from modelserver.config import VehicleConfig
-    from modelserver.service.findings import Finding
+    from modelserver.service.probing.findings import Finding
 
 EXIT_WARNINGS = 1
 EXIT_ERRORS = 3
@@ -52,12 +52,12 @@ def command(
 
 def examine(config: Path | None, url: str, prefix: str) -> tuple[Finding, ...]:
     """Return all that is found. Takes two seconds, most of it waiting for who answers."""
-    from modelserver.service.findings import Finding, Grade
-    from modelserver.service.listening import hears_itself, who_answers
-    from modelserver.service.machine import ClockWatch, bus_facts
-    from modelserver.service.probe import bus_findings
-    from modelserver.service.probe_clock import clock_findings
-    from modelserver.service.probe_servers import server_findings
+    from modelserver.service.probing.clock import clock_findings
+    from modelserver.service.probing.findings import Finding, Grade
+    from modelserver.service.probing.listening import hears_itself, who_answers
+    from modelserver.service.probing.machine import ClockWatch, bus_facts
+    from modelserver.service.probing.probe import bus_findings
+    from modelserver.service.probing.servers import server_findings
     from modelserver.version import __version__
     from modelserver.wire.channels import REPLY_PREFIX
     from modelserver.wire.provider import resolve_url
@@ -91,7 +91,7 @@ def examine(config: Path | None, url: str, prefix: str) -> tuple[Finding, ...]:
 
 def exit_code(findings: Sequence[Finding]) -> int:
     """Return the exit code that findings make."""
-    from modelserver.service.findings import Grade, worst
+    from modelserver.service.probing.findings import Grade, worst
 
     return {Grade.WARNING: EXIT_WARNINGS, Grade.ERROR: EXIT_ERRORS}.get(worst(findings), 0)
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 from modelserver.config import VehicleConfig, load_config
 from modelserver.errors import ConfigError, GeometryError, Problem, Severity
-from modelserver.service.findings import Finding, Grade
-from modelserver.service.keep import default_directory
-from modelserver.service.probe import Interface
+from modelserver.service.keeping.origin import default_directory
+from modelserver.service.probing.findings import Finding, Grade
+from modelserver.service.probing.probe import Interface
 from modelserver.version import __version__
 from mstools.output import counted
 
@@ -39,7 +39,7 @@ def read_vehicle(file: Path) -> VehicleConfig:
 
 def vehicle_findings(vehicle: VehicleConfig, file: Path) -> tuple[Finding, ...]:
     """Return what is to be said of a vehicle file on this machine."""
-    from modelserver.service.machine import interfaces
+    from modelserver.service.probing.machine import interfaces
 
     problems, drivers = _read(vehicle, file)
     directory = Path(vehicle.state_directory) if vehicle.state_directory else default_directory()

@@ -212,7 +212,7 @@ def _line(
 
 def run(vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], folder: Path, url: str) -> None:
     """Run a driver on a line until it is told to end. Raises ConfigError, OSError, BusError."""
-    from modelserver.service.notify import Notifier
+    from modelserver.service.supervision.notify import Notifier
     from modelserver.wire.provider import open_lcm, resolve_url
     from msdrivers.making import station_of
     from msdrivers.publishing import Publisher

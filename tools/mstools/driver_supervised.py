@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from modelserver.service.notify import Notifier
-from modelserver.service.progress import Progress
+from modelserver.service.supervision.notify import Notifier
+from modelserver.service.supervision.progress import Progress
 from msdrivers.runner import Runner
 
 READY_PASSES = 2

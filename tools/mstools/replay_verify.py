@@ -14,7 +14,7 @@ from mstools.output import counted, safe
 from mstools.progress import progress
 
 if TYPE_CHECKING:
-    from modelserver.service.verify import Difference, Verified
+    from modelserver.service.journal.verify import Difference, Verified
 
 MOST_FIELDS = 12
 """Fields of a message that are printed where they differ."""
@@ -27,7 +27,7 @@ def verified(journal: Path, as_json: bool) -> None:
     # as the daemon does: the sums of the linear algebra come in another order with more threads
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from modelserver.service.verify import files_of, verify
+    from modelserver.service.journal.verify import files_of, verify
 
     files = files_of(journal)
     with progress(f"verifying {journal.name}", sum(path.stat().st_size for path in files)) as show:

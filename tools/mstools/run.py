@@ -39,7 +39,7 @@ def command(
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from modelserver.config import load_config
     from modelserver.service import daemon
-    from modelserver.service.notify import Notifier
+    from modelserver.service.supervision.notify import Notifier
 
     set_up(log_level, log_format)
     notifier = Notifier.of_environment()

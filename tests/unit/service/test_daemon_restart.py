@@ -18,8 +18,8 @@ from modelserver.service.clock import FakeClock
 from modelserver.service.daemon import Vehicle, load_vehicle
 from modelserver.service.fake_bus import FakeBus
 from modelserver.service.hooks import Hooks
+from modelserver.service.keeping.state import StateKeeper
 from modelserver.service.loop import Loop, LoopSettings
-from modelserver.service.restart import StateKeeper
 from modelserver.wire.codec import decode
 from tests.support_kept import KEPT, SETUP
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modelserver.service.desk import HELD, IDLE_NS, REFUSALS_TOLD, SWEEP_NS, Desk, DeskLimits, Lane, Waiting
-from modelserver.service.reception import client_of
+from modelserver.service.requests.desk import HELD, IDLE_NS, REFUSALS_TOLD, SWEEP_NS, Desk, DeskLimits, Lane, Waiting
+from modelserver.service.requests.reception import client_of
 from modelserver.wire.packed import text
 
 MS = 1_000_000

@@ -17,10 +17,10 @@ from modelserver.messages import Rejected, Sample, SwitchMode
 from modelserver.service.clock import FakeClock
 from modelserver.service.daemon import log_wish
 from modelserver.service.fake_bus import FakeBus
-from modelserver.service.gate import COMMANDS, Gate
 from modelserver.service.heard import Heard
 from modelserver.service.hooks import Hooks
 from modelserver.service.loop import Loop, LoopSettings
+from modelserver.service.requests.gate import COMMANDS, Gate
 from modelserver.wire.channels import CHANNELS, Way
 from modelserver.wire.codec import decode, encode
 

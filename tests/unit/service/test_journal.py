@@ -14,13 +14,14 @@ from support_journal import SMALL, Kept
 from modelserver.config import JournalConfig, VehicleConfig
 from modelserver.core import Instant
 from modelserver.messages import GetBodyList, Noticed, Rejected, RequestHeader, Tick
-from modelserver.service import journal, journal_writer
-from modelserver.service.journal import JournalQueue, NoJournal
-from modelserver.service.journal_place import journal_directory, make_writer
-from modelserver.service.journal_ring import Ring, Segment
-from modelserver.service.journal_writer import RETRY_S
+from modelserver.service.journal import queue as journal
+from modelserver.service.journal import writer as journal_writer
+from modelserver.service.journal.place import journal_directory, make_writer
+from modelserver.service.journal.queue import JournalQueue, NoJournal
+from modelserver.service.journal.ring import Ring, Segment
+from modelserver.service.journal.verify import verify
+from modelserver.service.journal.writer import RETRY_S
 from modelserver.service.loop import Loop
-from modelserver.service.verify import verify
 from modelserver.wire.journal import Head, Kind, Record, read
 
 NOW = Instant(1, 2)

@@ -29,7 +29,8 @@ from modelserver.messages import (
     TimeQuery,
 )
 from modelserver.reload import ModelLoaded
-from modelserver.service import journal_events, journal_state
+from modelserver.service.journal import events as journal_events
+from modelserver.service.journal import state as journal_state
 from modelserver.wire.journal import Kind
 
 NODDING = GEOMETRY.replace("xyz: [0, 0, 0.1]", "xyz: [0, 0, 0.1], joint: {type: revolute, axis: [0, 1, 0]}")

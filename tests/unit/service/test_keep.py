@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from support_samples import ORIGIN
 
-from modelserver.service.keep import OriginKeeper, default_directory
+from modelserver.service.keeping.origin import OriginKeeper, default_directory
 
 GOOD = {"version": 1, **dataclasses.asdict(ORIGIN)}
 
@@ -170,7 +170,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from modelserver.geodesy import make_origin
-from modelserver.service.keep import OriginKeeper
+from modelserver.service.keeping.origin import OriginKeeper
 def kill(*_): os.kill(os.getpid(), signal.SIGKILL)
 if sys.argv[2] == "sync": os.fsync = kill
 else: Path.replace = kill

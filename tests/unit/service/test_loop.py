@@ -40,12 +40,12 @@ from modelserver.messages import (
     TimeQuery,
 )
 from modelserver.service.clock import FakeClock
-from modelserver.service.desk import REFUSALS_TOLD
 from modelserver.service.fake_bus import FakeBus
 from modelserver.service.heard import Heard
 from modelserver.service.hooks import Hooks
 from modelserver.service.log import MAX_CAUSES, PERIOD_S, RateLimited
 from modelserver.service.loop import SENSORS_PER_PASS, Loop, LoopSettings
+from modelserver.service.requests.desk import REFUSALS_TOLD
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.transformation import Transformation
 from modelserver.wire.channels import REQUESTS

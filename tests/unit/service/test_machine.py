@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from modelserver.errors import BusError
-from modelserver.service import machine
 from modelserver.service.gauges import read_gauges, resident_bytes
-from modelserver.service.probe import UdpAddress
+from modelserver.service.probing import machine
+from modelserver.service.probing.probe import UdpAddress
 from modelserver.wire.channels import DEFAULT_URL
 
 UDP = """  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid timeout inode ref p drops

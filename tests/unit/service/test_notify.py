@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from modelserver.service.notify import LONGEST_STATUS, Notifier, manager_socket, watchdog_ns
+from modelserver.service.supervision.notify import LONGEST_STATUS, Notifier, manager_socket, watchdog_ns
 
 SECOND = 1_000_000_000
 

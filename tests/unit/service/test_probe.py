@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modelserver.errors import BusError
-from modelserver.service.bus_probe import probe, tell
-from modelserver.service.findings import Finding, Grade, of_weight, worst
-from modelserver.service.probe import BusFacts, Interface, UdpAddress, bus_findings, udp_address
-from modelserver.service.probe_clock import ClockFacts, clock_findings
-from modelserver.service.probe_servers import Answers, Server, server_findings
+from modelserver.service.probing.clock import ClockFacts, clock_findings
+from modelserver.service.probing.findings import Finding, Grade, of_weight, worst
+from modelserver.service.probing.probe import BusFacts, Interface, UdpAddress, bus_findings, udp_address
+from modelserver.service.probing.servers import Answers, Server, server_findings
+from modelserver.service.probing.start import probe, tell
 from modelserver.wire.channels import DEFAULT_URL
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES, resolve_url
 

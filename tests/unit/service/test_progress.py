@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modelserver.service.progress import PATIENCE_S, Progress
+from modelserver.service.supervision.progress import PATIENCE_S, Progress
 
 MS = 1_000_000
 PATIENCE_MS = round(PATIENCE_S * 1000)

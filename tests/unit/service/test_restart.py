@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 
 from modelserver.core import Instant
 from modelserver.messages import Kept, Recalled
-from modelserver.service import restart
-from modelserver.service.keep import write_whole
-from modelserver.service.kept_form import (
+from modelserver.service.keeping import state as restart
+from modelserver.service.keeping.form import (
     MAX_BYTES,
     KeptError,
     from_bytes,
@@ -25,8 +24,9 @@ from modelserver.service.kept_form import (
     kept_to_bytes,
     to_bytes,
 )
-from modelserver.service.kept_form import _sealed as sealed
-from modelserver.service.restart import StateKeeper, boot_id
+from modelserver.service.keeping.form import _sealed as sealed
+from modelserver.service.keeping.origin import write_whole
+from modelserver.service.keeping.state import StateKeeper, boot_id
 from tests.support_kept import KEPT, POSE, UTIME
 
 NOW = Instant(KEPT.monotonic_ns + 7_000_000_000, UTIME + 7_000_000)

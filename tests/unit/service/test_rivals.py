@@ -12,7 +12,7 @@ from support_wire import EXAMPLES
 from modelserver.messages import Health
 from modelserver.service.clock import FakeClock
 from modelserver.service.fake_bus import FakeBus
-from modelserver.service.rivals import GONE_AFTER_S, READ_PER_S, Rivals
+from modelserver.service.probing.rivals import GONE_AFTER_S, READ_PER_S, Rivals
 from modelserver.wire.codec import encode
 
 

@@ -25,10 +25,10 @@ from modelserver.messages import (
 from modelserver.reload import ModelLoaded
 from modelserver.service.clock import FakeClock
 from modelserver.service.fake_bus import FakeBus
-from modelserver.service.gate import Gate
 from modelserver.service.heard import Heard
 from modelserver.service.hooks import Hooks
 from modelserver.service.loop import Loop, LoopSettings
+from modelserver.service.requests.gate import Gate
 from modelserver.signing import Key
 from modelserver.spatial import Pose, Transformation
 from modelserver.wire.codec import decode, encode

@@ -16,9 +16,9 @@ from modelserver.service.fake_bus import FakeBus
 from modelserver.service.heard import Heard
 from modelserver.service.hooks import Hooks
 from modelserver.service.loop import Loop, LoopSettings
-from modelserver.service.notify import Notifier
-from modelserver.service.progress import PATIENCE_S
-from modelserver.service.supervised import Supervision
+from modelserver.service.supervision.notify import Notifier
+from modelserver.service.supervision.progress import PATIENCE_S
+from modelserver.service.supervision.supervised import Supervision
 from modelserver.wire.codec import encode
 
 HZ = 50

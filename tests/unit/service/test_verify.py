@@ -31,7 +31,7 @@ from modelserver.messages import (
     SwitchMode,
     TimeQuery,
 )
-from modelserver.service.verify import Verified, files_of, verify
+from modelserver.service.journal.verify import Verified, files_of, verify
 from modelserver.wire.codec import encode
 from modelserver.wire.journal import Record, batch_written, read
 

@@ -13,11 +13,11 @@ from support_samples import GEOMETRY, VEHICLE, write_vehicle
 
 from modelserver.config import load_config
 from modelserver.errors import Problem, Severity
-from modelserver.service import listening, machine
-from modelserver.service.findings import Finding, Grade, worst
-from modelserver.service.probe import BusFacts, Interface, UdpAddress
-from modelserver.service.probe_clock import ClockFacts
-from modelserver.service.probe_servers import Answers, Server
+from modelserver.service.probing import listening, machine
+from modelserver.service.probing.clock import ClockFacts
+from modelserver.service.probing.findings import Finding, Grade, worst
+from modelserver.service.probing.probe import BusFacts, Interface, UdpAddress
+from modelserver.service.probing.servers import Answers, Server
 from modelserver.wire.channels import DEFAULT_URL
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
 from msdrivers.settings import read_drivers

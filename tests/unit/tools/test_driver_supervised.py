@@ -6,8 +6,8 @@ from collections import Counter
 from typing import Any, cast
 
 from modelserver.messages import DriverPhase
-from modelserver.service.notify import Notifier
-from modelserver.service.progress import PATIENCE_S
+from modelserver.service.supervision.notify import Notifier
+from modelserver.service.supervision.progress import PATIENCE_S
 from msdrivers.runner import Runner
 from mstools.driver_supervised import DriverSupervision
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from modelserver.core import Instant
 from modelserver.messages import Kept, Recalled
-from modelserver.service.keep import safe, write_whole
-from modelserver.service.kept_form import MAX_BYTES, KeptError, kept_from_bytes, kept_to_bytes
+from modelserver.service.keeping.form import MAX_BYTES, KeptError, kept_from_bytes, kept_to_bytes
+from modelserver.service.keeping.origin import safe, write_whole
 from modelserver.service.log import plain
 
 log = logging.getLogger(__name__)

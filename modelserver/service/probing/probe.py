@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from urllib.parse import parse_qsl, urlsplit
 
 from modelserver.errors import shown
-from modelserver.service.findings import Finding, Grade
+from modelserver.service.probing.findings import Finding, Grade
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
 
 SYSCTL_FILE = "/etc/sysctl.d/60-modelserver.conf"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from modelserver.service.findings import Finding, Grade
+from modelserver.service.probing.findings import Finding, Grade
 
 MOST_SLEW = 500e-6
 """By how much a clock is slewed at most (ntp_adjtime(2), the kernel's limit); more between two looks was a step."""

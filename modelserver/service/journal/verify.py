@@ -18,9 +18,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from modelserver.errors import RecordingError
-from modelserver.service import journal_build
-from modelserver.service.journal_ring import segments
-from modelserver.service.rerun import Rerun, Said
+from modelserver.service.journal import build as journal_build
+from modelserver.service.journal.rerun import Rerun, Said
+from modelserver.service.journal.ring import segments
 from modelserver.wire.journal import FORMAT, Broken, End, Head, Kind, Record, State, read
 
 POSES: Final = ("POSE", "POSE_VECTOR", "POSE_ODOM")

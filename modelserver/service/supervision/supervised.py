@@ -15,8 +15,8 @@ from modelserver.errors import shown
 from modelserver.messages import Invalid, LoadModel
 from modelserver.reload import ModelLoaded
 from modelserver.service.clock import Clock
-from modelserver.service.notify import Notifier
-from modelserver.service.progress import LocalizationProgress
+from modelserver.service.supervision.notify import Notifier
+from modelserver.service.supervision.progress import LocalizationProgress
 
 READY_TICKS: Final = 2
 """With the second tick a whole turn of the loop has gone through: sensors, tick, requests."""

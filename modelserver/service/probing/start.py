@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from modelserver.errors import BusError
-from modelserver.service.findings import Finding, Grade, of_weight
-from modelserver.service.listening import hears_itself
-from modelserver.service.machine import bus_facts
-from modelserver.service.probe import BusFacts, bus_findings
+from modelserver.service.probing.findings import Finding, Grade, of_weight
+from modelserver.service.probing.listening import hears_itself
+from modelserver.service.probing.machine import bus_facts
+from modelserver.service.probing.probe import BusFacts, bus_findings
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ import lcm
 
 from modelserver.errors import WireError
 from modelserver.messages import GetBodyList, Health, RequestHeader
-from modelserver.service.probe_servers import Answers, Server
+from modelserver.service.probing.servers import Answers, Server
 from modelserver.wire.channels import PROBE_CHANNEL, REPLY_PREFIX, literal
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.provider import open_lcm

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import ClassVar, Final
 
 from modelserver.errors import BusError
-from modelserver.service.probe import BusFacts, Interface, UdpAddress, udp_address
-from modelserver.service.probe_clock import ClockFacts
+from modelserver.service.probing.clock import ClockFacts
+from modelserver.service.probing.probe import BusFacts, Interface, UdpAddress, udp_address
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
 
 _SIOCGIFFLAGS: Final = 0x8913

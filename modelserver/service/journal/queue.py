@@ -1,7 +1,7 @@
 """The black box, as the loop sees it: it tells what it handles and says, which costs it an append to a queue each.
 
-`modelserver.service.journal_writer` turns that into files on a thread of its own, `modelserver.service.rerun` runs it
-again. What the loop tells is immutable, so that the thread may look at it whenever it comes to it.
+`writer` turns that into files on a thread of its own, `rerun` runs it again. What the loop tells is immutable, so that
+the thread may look at it whenever it comes to it.
 """
 
 from __future__ import annotations

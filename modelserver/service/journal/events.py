@@ -10,7 +10,7 @@ from typing import Any
 
 from modelserver import messages
 from modelserver.errors import RecordingError
-from modelserver.service import journal_state
+from modelserver.service.journal import state as journal_state
 from modelserver.wire.journal import Kind
 
 

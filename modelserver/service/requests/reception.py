@@ -24,9 +24,9 @@ from modelserver.messages import (
 )
 from modelserver.service.bus import Bus
 from modelserver.service.clock import Clock
-from modelserver.service.desk import SIGNED_CLIENT, Desk, DeskLimits, Lane, Waiting
-from modelserver.service.gate import Gate
 from modelserver.service.log import RateLimited, plain
+from modelserver.service.requests.desk import SIGNED_CLIENT, Desk, DeskLimits, Lane, Waiting
+from modelserver.service.requests.gate import Gate
 from modelserver.wire.channels import BY_NAME, REQUESTS
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.journal import Kind

@@ -17,10 +17,11 @@ from typing import Any, Final
 
 from modelserver.core import Instant
 from modelserver.messages import CHANNEL_OF
-from modelserver.service import journal_events, journal_state
 from modelserver.service.clock import Clock
-from modelserver.service.journal import Beginning, Entry, JournalQueue
-from modelserver.service.journal_ring import Ring, Segment
+from modelserver.service.journal import events as journal_events
+from modelserver.service.journal import state as journal_state
+from modelserver.service.journal.queue import Beginning, Entry, JournalQueue
+from modelserver.service.journal.ring import Ring, Segment
 from modelserver.wire.journal import (
     FORMAT,
     Kind,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from modelserver.errors import shown
-from modelserver.service.findings import Finding, Grade
+from modelserver.service.probing.findings import Finding, Grade
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,13 +18,14 @@ from modelserver.messages import (
     Request,
     SendReply,
 )
-from modelserver.service import journal_events, journal_state
 from modelserver.service.bus import Handler
 from modelserver.service.daemon import Vehicle
 from modelserver.service.heard import Heard
 from modelserver.service.hooks import Hooks
+from modelserver.service.journal import events as journal_events
+from modelserver.service.journal import state as journal_state
 from modelserver.service.loop import Loop, LoopSettings
-from modelserver.service.reception import request_kind
+from modelserver.service.requests.reception import request_kind
 from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode
 from modelserver.wire.journal import Kind, Record

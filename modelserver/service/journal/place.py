@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Final
 
 from modelserver.config import VehicleConfig
-from modelserver.service import journal_build
 from modelserver.service.clock import Clock
-from modelserver.service.journal import JournalQueue
-from modelserver.service.journal_ring import Ring
-from modelserver.service.journal_writer import JournalWriter, Origins
-from modelserver.service.keep import default_directory
+from modelserver.service.journal import build as journal_build
+from modelserver.service.journal.queue import JournalQueue
+from modelserver.service.journal.ring import Ring
+from modelserver.service.journal.writer import JournalWriter, Origins
+from modelserver.service.keeping.origin import default_directory
 
 MEGABYTES: Final = 1024
 """Of a journal that is kept without a word on how large it may be."""
