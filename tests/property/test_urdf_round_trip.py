@@ -90,6 +90,11 @@ def test_urdf_through_yaml_and_back_keeps_joints_limits_mimic_and_every_transfor
     assert_same_places(model, again, {full: full for full in all_frames(model)}, data.draw(positions(model)))
 
 
+def plain(most):
+    """Numbers that are 0 or no smaller than 1e-6: the other loader takes for nothing what turns by less than 1e-8."""
+    return st.floats(-most, most).map(lambda value: round(value, 6))
+
+
 @st.composite
 def robots(draw):
     """Return a model that was URDF, with names and joints that the other loader takes: no mimic of a mimic."""
@@ -103,7 +108,7 @@ def robots(draw):
         if number:
             joint = draw(joints(forward=False, leaders=leaders))
             parent = draw(st.integers(0, number - 1))
-            pose = Pose.from_rpy(*draw(st.tuples(st.tuples(*[st.floats(-5, 5)] * 3), *[st.floats(-3, 3)] * 3)))
+            pose = Pose.from_rpy(*draw(st.tuples(st.tuples(*[plain(5)] * 3), *[plain(3)] * 3)))
             name = f"joint{number}"
             builder.constraint(name, f"link{parent}:{name}", f"link{number}:Origin", pose, joint=joint)
             if joint.moves and joint.mimic is None:
@@ -115,7 +120,7 @@ def robots(draw):
 @settings(max_examples=40)
 def test_another_loader_reads_what_is_written_and_agrees_on_every_pair_of_links(data):
     model = data.draw(robots())
-    values = data.draw(positions(model))
+    values = {name: round(value, 6) for name, value in data.draw(positions(model)).items()}
     text = save_model(model, "urdf").text
     other = yourdfpy.URDF.load(io.BytesIO(text.encode()), load_meshes=False, build_collision_scene_graph=False)
     other.update_cfg(values)
