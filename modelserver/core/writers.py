@@ -4,13 +4,14 @@ A sensor's channel has one writer. A second one, be it a driver that was started
 bus or a stranger, shows by another name (header.source), or by two rows of numbers (header.seq) side by side:
 
 - another name while the first still speaks is a second writer at once;
-- a number far off, or one already heard with another instant, may be the first of a driver that was started anew, or of
-  a log that begins again: then the old row has ended. Where the old row goes on, and then the new one again, there are
-  two writers.
+- a number far off, or one already heard with another instant, may be the first of a driver that was started anew, of a
+  log that begins again, or a stray. Where the old row is silent from then on it has ended, and the new one is the
+  channel's. Where it goes on between such numbers, again and again, there are two writers.
 
 The same number with the same instant is a message that came twice; a number a little lower that was not heard yet came
-late; one a little higher says that some were lost. Sources that do not count (all numbers alike) are told apart by name
-alone. The first writer keeps the channel until it has been silent for `SILENCE_NS`.
+late; one a little higher says that some were lost. Sources that do not count have one number alone; whoever counts
+beside such a one is another. The first writer keeps the channel until it has been silent for some of its own
+intervals, and towards another name for `SILENCE_NS`.
 """
 
 from __future__ import annotations
@@ -31,6 +32,16 @@ FAR: Final = 4096
 RIVAL_NS: Final = 10_000_000_000
 """A second writer that was not heard for so long is gone."""
 
+QUIET_NS: Final = 200_000_000
+QUIET_INTERVALS: Final = 5
+"""A row that was silent for so long, and for so many of its intervals, has ended where another of its name speaks."""
+
+STRAYS: Final = 2
+"""So often numbers may be off the row while the row goes on, within `SILENCE_NS`; more are another writer's."""
+
+MUTE: Final = 3
+"""After so many samples with one number a source is known not to count."""
+
 _MASK: Final = NEAR - 1
 _NEVER: Final = -1 << 64
 """No number of a message."""
@@ -40,8 +51,8 @@ _NOBODY: Final = SensorHeader(0, seq=_NEVER)
 class Writer:
     """Watches one channel. It changes as it is told of samples: a value for each would cost more than all the rest."""
 
-    __slots__ = ("_counts", "_heard", "_last", "_last_ns", "_old_went_on", "_other", "rival", "rival_ns",
-                 "source")  # fmt: skip
+    __slots__ = ("_counts", "_heard", "_interval_ns", "_last", "_last_ns", "_off_ns", "_same", "_strays", "_went_on",
+                 "rival", "rival_ns", "source")  # fmt: skip
 
     def __init__(self) -> None:
         self.source = ""
@@ -50,26 +61,23 @@ class Writer:
         """Name of the second writer that was heard last, empty for none yet."""
         self.rival_ns = 0
         """When that was, monotonic nanoseconds."""
-        self._last_ns = -SILENCE_NS - 1
-        self._last = 0
-        self._counts = False
-        self._heard = [_NOBODY] * NEAR
-        self._other = _NEVER  # the newest number of what may be a second row
-        self._old_went_on = False
+        self._heard: list[SensorHeader] = []
+        self._last = self._last_ns = self._interval_ns = self._off_ns = self._same = self._strays = 0
+        self._counts = self._went_on = False
+        self._begin(_NOBODY, -SILENCE_NS - 1)
 
     def is_second(self, header: SensorHeader, now_ns: int) -> bool:
         """Return whether a sample is a second writer's."""
         seq = header.seq
         ahead = seq - self._last
-        if header.source != self.source or now_ns - self._last_ns > SILENCE_NS:
-            if now_ns - self._last_ns > SILENCE_NS:
+        passed = now_ns - self._last_ns
+        if header.source != self.source or passed > SILENCE_NS:
+            if passed > SILENCE_NS:
                 self._begin(header, now_ns)
                 return False
             return self._is_rival(header.source, now_ns)
-        if 0 < ahead <= FAR:
+        if 0 < ahead <= FAR and self._same < MUTE:
             self._counts = True
-            if self._other is not _NEVER:
-                self._old_went_on = True
         elif -NEAR < ahead <= 0 and self._counts:
             known = self._heard[seq & _MASK]
             if known.seq == seq:
@@ -80,22 +88,28 @@ class Writer:
             return False
         elif ahead:
             return self._off_the_row(header, now_ns)
+        else:
+            self._same += 1
         self._last = seq
         self._last_ns = now_ns
+        self._interval_ns += (passed - self._interval_ns) >> 3
+        self._went_on = True
         self._heard[seq & _MASK] = header
         return False
 
     def _off_the_row(self, header: SensorHeader, now_ns: int) -> bool:
-        """Return whether a number off the row is of a second row that goes on beside it."""
-        other, self._other = self._other, header.seq
-        if other is _NEVER or not 0 < header.seq - other <= FAR:
-            self._old_went_on = False
+        """Return whether a number off the row is of a second writer, beside whom the row goes on."""
+        if now_ns - self._last_ns > max(QUIET_NS, QUIET_INTERVALS * self._interval_ns):
+            # whoever spoke before was started anew
+            self._begin(header, now_ns)
             return False
-        if self._old_went_on:
-            return self._is_rival(header.source, now_ns)
-        # two of the new row and none of the old between them: whoever spoke before was started anew
-        self._begin(header, now_ns)
-        return False
+        if now_ns - self._off_ns > SILENCE_NS:
+            self._strays = 0
+        self._off_ns = now_ns
+        if self._went_on:
+            self._strays += 1
+            self._went_on = False
+        return self._strays > STRAYS and self._is_rival(header.source, now_ns)
 
     def _is_rival(self, source: str, now_ns: int) -> bool:
         self.rival, self.rival_ns = source, now_ns
@@ -103,6 +117,7 @@ class Writer:
 
     def _begin(self, header: SensorHeader, now_ns: int) -> None:
         self.source, self._last, self._last_ns = header.source, header.seq, now_ns
-        self._counts, self._other, self._old_went_on = False, _NEVER, False
+        self._counts, self._same, self._strays, self._went_on = False, 0, 0, True
+        self._interval_ns = self._off_ns = 0
         self._heard = [_NOBODY] * NEAR
         self._heard[header.seq & _MASK] = header

@@ -47,8 +47,9 @@ class Rig:
 
     def places(self) -> tuple[object, ...]:
         """Return all that localization takes from the geometry beforehand: equal where nothing of it has moved."""
-        frames = (self.imu_frame, self.gps_frame, self.second_antenna_frame, *sorted(self.wheel_frames.values()))
-        return (self.rolling_frame, *((frame, self.pose(frame)) for frame in frames if frame))
+        frames = (self.imu_frame, self.gps_frame, self.second_antenna_frame)
+        wheels = ((wheel, frame, self.pose(frame)) for wheel, frame in sorted(self.wheel_frames.items()))
+        return (self.rolling_frame, *((frame, self.pose(frame)) for frame in frames if frame), *wheels)
 
     def fault(self, frame: str) -> str:
         """Return in a word why what is told of a frame cannot be used; empty where it can.

@@ -55,6 +55,9 @@ SENSORS_PER_PASS = 100
 NO_NETWORK = frozenset({errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENODEV, errno.ENOBUFS})
 """What sending fails with while the network is away: no error of the service's own."""
 
+MOST_NOTED = 512
+"""Bytes that the journal keeps of a message that is not used: a stranger's are not to push out what is."""
+
 FLOOD_PAUSE_S = 0.002
 """How long requests wait for the next pass while too many come, at most, seconds."""
 
@@ -180,13 +183,18 @@ class Loop:
             self.step(Tick(late_ns * 1e-9, missed, self._reception.taken_answered(), gauges), now)
             self._on_tick(self.state)
         except Exception as error:
+            self._wait_for(due, ahead)
             self.failed("tick", error)
-        if self._hold_ns and ahead > 0:
-            # nothing was published; what is handled next comes after it all the same
-            self._clock.sleep(max(0, due - self._clock.monotonic_ns()) * 1e-9)
-        self._hold_ns = 0
+        else:
+            self._wait_for(due, ahead)
         for notice in self._journal.news():
             self.step(notice, self._clock.now())
+
+    def _wait_for(self, due: int, ahead: int) -> None:
+        """Let nothing be handled before the instant of a tick that published nothing."""
+        if self._hold_ns and ahead > 0:
+            self._clock.sleep(max(0, due - self._clock.monotonic_ns()) * 1e-9)
+        self._hold_ns = 0
 
     def _hold(self) -> None:
         """Wait for the deadline of the tick under way; learn from when all was ready how early to begin the next."""
@@ -282,12 +290,16 @@ class Loop:
 
     def note(self, kind: Kind, channel: str, data: bytes, now: Instant) -> None:
         """Have the journal note a message with which something else is done than handing it to the core."""
-        self._journal.note(kind, (channel, data), now)
+        self._journal.note(kind, (channel, data[:MOST_NOTED]), now)
 
     def publish(self, channel: str, data: bytes) -> None:
         """Send a message to everyone: the only place where anything is said."""
         self._journal.said(channel, data)
-        self._bus.publish(channel, data)
+        try:
+            self._bus.publish(channel, data)
+        except Exception as error:
+            # what is said beside it is sent all the same
+            self.failed(channel, error)
 
     def send(self, outputs: tuple[Output, ...]) -> None:
         """Send what the core says."""

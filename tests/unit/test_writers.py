@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import random
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given
@@ -121,3 +122,45 @@ def test_given_lost_messages_then_there_is_no_second() -> None:
 def test_given_one_stray_number_then_nobody_is_accused() -> None:
     samples = merged(row(1000, 200), row(9_999_999, 1, at_ms=301.0), row(-NEAR * 100, 1, at_ms=401.0))
     assert not any(seconds_of(samples))
+
+
+def used(samples: list[tuple[float, SensorHeader]], of: list[tuple[float, SensorHeader]]) -> int:
+    """How many samples of one writer are used."""
+    found = zip(seconds_of(samples), sorted(samples, key=lambda each: each[0]), strict=True)
+    return sum(not second for second, sample in found if sample in of)
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        lambda n: 1_000_000 + n,
+        lambda n: 1_000_000 - n,
+        lambda n: 1_000_000 + 5000 * n,
+        lambda n: -7 - 3 * n,
+    ],
+    ids=["rising", "falling", "far apart", "below"],
+)
+@pytest.mark.parametrize("burst", [1, 2, 5])
+def test_given_an_intruder_of_the_same_name_then_the_first_keeps_its_channel(
+    numbers: Callable[[int], int], burst: int
+) -> None:
+    mine = row(500, 600)
+    times = [301.0 + 0.1 * n for n in range(burst)] + [310.2 + 5.0 * n for n in range(400)]
+    theirs = [(t, SensorHeader(START + round(t * 1000) + 1, "imu", numbers(n))) for n, t in enumerate(times)]
+    samples = merged(mine, theirs)
+    assert used(samples, mine) == len(mine)
+    assert used(samples, theirs) <= burst + 4
+
+
+def test_given_a_source_that_does_not_count_and_another_of_its_name_that_does_then_that_one_is_the_second() -> None:
+    mute = [(t, SensorHeader(header.utime, "gps", 0)) for t, header in row(0, 400)]
+    counting = row(1, 200, "gps", at_ms=501.0)
+    samples = merged(mute, counting)
+    assert used(samples, mute) == len(mute)
+    assert used(samples, counting) <= 4
+
+
+def test_given_a_slow_driver_that_starts_anew_then_its_row_is_taken_up() -> None:
+    before = row(40, 30, every_ms=250.0)
+    after = row(0, 30, at_ms=before[-1][0] + 700.0, every_ms=250.0)
+    assert not any(seconds_of(before + after))

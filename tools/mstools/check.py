@@ -87,7 +87,9 @@ def _checked_vehicle(file: str, strict: bool) -> tuple[Model | None, tuple[Probl
         return None, problems
     model = None
     try:
-        model = load_vehicle(config, file, strict).model
+        vehicle = load_vehicle(config, file, strict)
+        vehicle.gate(0, file)
+        model = vehicle.model
         more = model.problems
     except (ConfigError, GeometryError) as error:
         more = error.problems

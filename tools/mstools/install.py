@@ -20,6 +20,7 @@ from mstools.install_plan import (
     LOOPBACK,
     RULES,
     SERVICE,
+    STATE,
     SYSCTL,
     UNITS,
     VEHICLE,
@@ -139,6 +140,11 @@ def _plan(
     units = (*((LOOPBACK,) if group else ()), SERVICE, *(f"modelserver-driver@{name}.service" for name in names))
     if made.config.state_directory:
         notes.append("the vehicle file sets state_directory; without it the state goes where the unit may write")
+    if made.config.journal.directory:
+        notes.append(
+            "the vehicle file sets journal.directory, where the unit may not write unless it lies in "
+            f"{STATE[0]}; without it (megabytes alone) the journal is kept there"
+        )
     if facts.is_live and os.geteuid() != 0:
         notes.append("root is also told whether the service can be scheduled in real time, and the drop-in for that")
     if not facts.is_live and facts.root == "/":
@@ -162,7 +168,7 @@ class Made:
         from msdrivers.settings import Place, read_drivers
 
         config = load_config(vehicle)
-        load_vehicle(config, str(vehicle))
+        load_vehicle(config, str(vehicle)).gate(0, str(vehicle))
         drivers, problems = read_drivers(config.drivers, Place(str(vehicle)))
         if any(problem.severity is Severity.ERROR for problem in problems):
             raise ConfigError(problems)
@@ -186,7 +192,8 @@ def sources_of(made: Made) -> dict[str, bytes]:
     raw = yaml.safe_load(text)
     named = [str(raw["geometry"])]
     named += [dbc for each in made.drivers.values() if (dbc := getattr(each.station, "dbc", ""))]
-    named += [key] if (key := key_of(made)) else []
+    # systemd reads one that lies elsewhere, and hands it over
+    named += [key] if (key := key_of(made)) and not Path(key).is_absolute() else []
     found = {"vehicle.yaml": text}
     folder = vehicle.resolve().parent
     for name in dict.fromkeys(named):

@@ -291,7 +291,7 @@ def _unit(name: Any) -> str:
 
 def _folder(path: Any) -> str:
     # only ever removed where it is empty
-    if not isinstance(path, str) or not path.startswith("/etc/") or ".." in path.split("/"):
+    if not isinstance(path, str) or not (path == "/etc" or path.startswith("/etc/")) or ".." in path.split("/"):
         raise ValueError(f"{path!r} is no folder of this installation")
     return path
 

@@ -50,7 +50,7 @@ def verified(journal: Path, as_json: bool) -> None:
 def lines(found: Verified) -> list[str]:
     """Return what was found, in words."""
     span = (found.last_utime - found.first_utime) * 1e-6
-    where = f"{counted(found.segments, 'segment')} of {counted(found.runs, 'run')}, {span:.1f} s"
+    where = f"{counted(found.segments, 'segment')} of {counted(found.runs, 'run')}, {found.seconds:.1f} of {span:.1f} s"
     told = [f"{where} ({_when(found.first_utime)} to {_when(found.last_utime)}), {found.handled} records run again"]
     said = sum(found.said.values())
     if said:
@@ -131,7 +131,8 @@ def _as_json(found: Verified) -> dict[str, Any]:
         "proved": found.proved,
         "segments": found.segments,
         "runs": found.runs,
-        "seconds": (found.last_utime - found.first_utime) * 1e-6,
+        "seconds": found.seconds,
+        "span": (found.last_utime - found.first_utime) * 1e-6,
         "records": found.handled,
         "poses": found.poses,
         "said": dict(sorted(found.said.items())),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import secrets
 from pathlib import Path
@@ -14,6 +15,8 @@ from modelserver.service.journal.queue import JournalQueue
 from modelserver.service.journal.ring import Ring
 from modelserver.service.journal.writer import JournalWriter, Origins
 from modelserver.service.keeping.origin import default_directory
+
+log = logging.getLogger(__name__)
 
 MEGABYTES: Final = 1024
 """Of a journal that is kept without a word on how large it may be."""
@@ -50,6 +53,7 @@ def make_writer(config: VehicleConfig, file: str, clock: Clock) -> tuple[Journal
     if directory is None:
         return None
     most = (config.journal.megabytes or MEGABYTES) << 20
+    log.info("the journal is kept in %s, %d MB at most", directory, most >> 20)
     ring = Ring(directory, most, min(LARGEST_SEGMENT, most // SEGMENTS))
     facts = {**journal_build.facts(), "vehicle": config.vehicle, "run": secrets.token_hex(8), "pid": os.getpid()}
     files = [(str(path), path.read_bytes()) for path in (Path(file), Path(config.geometry)) if path.is_file()]

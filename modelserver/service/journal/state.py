@@ -15,8 +15,8 @@ import io
 import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from types import MappingProxyType
-from typing import Any, Final
+from types import BuiltinFunctionType, FunctionType, MappingProxyType, ModuleType
+from typing import Any, ClassVar, Final
 
 from modelserver.core import CoreState
 from modelserver.errors import RecordingError
@@ -73,7 +73,19 @@ class _Writer(pickle.Pickler):
         return NotImplemented
 
 
-class _Reader(pickle.Unpickler):
+class _Reader(pickle._Unpickler):
+    # Python's own, for what C's does not let one do: no state is set on a class or a module, which would change what
+    # runs here
+    dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
+
+    def load_build(self) -> None:
+        target = self.stack[-2]  # type: ignore[attr-defined]
+        if isinstance(target, (type, ModuleType, FunctionType, BuiltinFunctionType)):
+            raise pickle.UnpicklingError(f"a state for {target!r:.60} has no place in a journal")
+        super().load_build()  # type: ignore[misc]
+
+    dispatch[pickle.BUILD[0]] = load_build
+
     def find_class(self, module: str, name: str) -> Any:
         if module in PLAIN and name in PLAIN[module]:
             return super().find_class(module, name)

@@ -17,10 +17,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from modelserver.errors import RecordingError
+from modelserver.errors import RecordingError, WireError
+from modelserver.messages import GetHistory, GetTransformations
 from modelserver.service.journal import build as journal_build
 from modelserver.service.journal.rerun import Rerun, Said
-from modelserver.service.journal.ring import segments
+from modelserver.service.journal.ring import SEGMENT_NAME, segments
+from modelserver.wire.channels import BY_NAME
+from modelserver.wire.codec import decode
 from modelserver.wire.journal import FORMAT, Broken, End, Head, Kind, Record, State, read
 
 POSES: Final = ("POSE", "POSE_VECTOR", "POSE_ODOM")
@@ -55,6 +58,7 @@ class Verified:
     """What was found. `said` counts the messages that were said again, bit for bit, by channel without prefix.
 
     skipped: messages that were said where it is not known from what. old: see the module. difference: the first.
+    seconds: how long of it was run again, of the span from first_utime to last_utime.
     other: what is other with build or machine than it was then, in words.
     """
 
@@ -68,6 +72,7 @@ class Verified:
     first_utime: int = 0
     last_utime: int = 0
     bytes: int = 0
+    seconds: float = 0.0
     remarks: list[Remark] = field(default_factory=list)
     other: list[str] = field(default_factory=list)
     difference: Difference | None = None
@@ -125,7 +130,11 @@ class _Verifier:
         self._group: _Group | None = None
         self._follows: tuple[str, int] | None = None
         """Run and number of the segment that would go on from here."""
-        self._old_until = 0
+        self._before: tuple[Path, str, int, bool] | None = None
+        """The segment before: its run, its number in that, and whether it was closed."""
+        self._held_until = 0
+        """When as much is known again as when a state was written, by the sensors' time."""
+        self._at_ns = 0
         self._path = Path()
         self._run = ""
         self._ended = False
@@ -165,11 +174,14 @@ class _Verifier:
         if facts is None:
             if size == 0 or any(each.segment == path for each in found.remarks):
                 self._stop()
+                if self._before is not None:
+                    self._before = (path, *self._before[1:])
                 if size == 0:
                     self._remark("is empty: the machine stopped as it was made")
                 return
             raise RecordingError(f"{path}: is no journal of a modelserver")
         found.segments += 1
+        self._before = (path, str(facts["run"]), facts["part"], self._ended)
         if not self._ended:
             if not any(each.segment == path for each in found.remarks):
                 self._remark("is not closed: it is being written, or process or machine were stopped")
@@ -184,6 +196,8 @@ class _Verifier:
                 f"{self._path}: is a journal of format {facts.get('format')}, this build reads {FORMAT}; "
                 "take the build that wrote it"
             )
+        if self._before is not None:
+            self._check_follows(*self._before, run, part, lost)
         for each in journal_build.differences(facts):
             if each not in self.found.other:
                 self.found.other.append(each)
@@ -200,17 +214,30 @@ class _Verifier:
             self._remark(f"{lost} records before it are lost: the disk refused them, or was too slow")
         return going_on
 
+    def _check_follows(self, before: Path, was: str, number: int, closed: bool, run: str, part: int, lost: int) -> None:
+        """Remark on what should stand between a segment and the one before it, or at that one's end, and does not."""
+        names = [SEGMENT_NAME.fullmatch(path.name) for path in (before, self._path)]
+        apart = 1 if None in names else int(names[1][1]) - int(names[0][1])  # type: ignore[index]
+        skipped = part - number - 1 if run == was else part
+        missing = max(apart - 1, 0 if lost else skipped)
+        if missing > 0:
+            why = f"{missing} segments before it are missing, behind {before.name}: removed, or lost"
+            self._remark(why, damage=True)
+        elif run == was and not closed and not lost:
+            self._remark(f"goes on from {before.name}, whose end was cut off after it was written", damage=True)
+
     def _begin(self, state: State, facts: dict[str, Any] | None) -> None:
         self.close()
-        self._rerun = None
+        self._rerun, self._at_ns = None, 0
         try:
             self._rerun = rerun = Rerun(state.data)
         except RecordingError as error:
             self._remark(f"cannot be run again: {error}", damage=True)
             return
         if facts is not None and facts.get("kept_s") is not None:
-            history = rerun.state.settings.history_s
-            self._old_until = int(facts.get("utime", 0)) + round(history * 1e6)
+            history = rerun.state.history
+            if len(history):
+                self._held_until = history.last + round(rerun.state.settings.history_s * 1e6)
 
     def _take(self, record: Record) -> None:
         found, rerun = self.found, self._rerun
@@ -226,6 +253,9 @@ class _Verifier:
             self._group.was.append(record)
             return
         found.handled += 1
+        if self._at_ns:
+            found.seconds += max(record.monotonic_ns - self._at_ns, 0) * 1e-9
+        self._at_ns = record.monotonic_ns
         if self._group is not None and not self._is_refusal(record):
             self._compare()
             if found.difference is not None:
@@ -256,7 +286,7 @@ class _Verifier:
             for each in group.was:
                 found.said["replies" if each.channel.startswith(replies) else each.channel.removeprefix(prefix)] += 1
             return
-        old = group.record.utime < self._old_until
+        old = self._asks_for_the_past(group.record)
         for was, now in _paired(group.was, group.now):
             if was is not None and now == (was.channel, was.data):
                 found.said["replies" if was.channel.startswith(replies) else was.channel.removeprefix(prefix)] += 1
@@ -274,6 +304,23 @@ class _Verifier:
                 None if now is None else now[1],
             )
             return
+
+    def _asks_for_the_past(self, record: Record) -> bool:
+        """Return whether a reply to a record may rest on poses that the state no longer held, when it was taken up."""
+        rerun = self._rerun
+        if rerun is None or not len(rerun.state.history) or rerun.state.history.last >= self._held_until:
+            return False
+        if record.kind not in (Kind.REQUEST, Kind.REMEMBERED, Kind.MALFORMED, Kind.REFUSED, Kind.FAILED):
+            # one that waited is answered later
+            return True
+        channel = BY_NAME.get(record.channel.removeprefix(rerun.config.lcm.channel_prefix))
+        try:
+            request = None if channel is None else decode(channel.type_name, record.data)
+        except WireError:
+            return False
+        if isinstance(request, (GetHistory, GetTransformations)):
+            return True
+        return bool(getattr(getattr(request, "time", None), "at", 0))
 
     def _broken(self, broken: Broken) -> None:
         if broken.tail:

@@ -70,6 +70,9 @@ class StateKeeper:
             if ran < 0.0 or age < ran - CLOCKS_AGREE:
                 return nothing._replace(why=f"the clock was set back by {ran - age:.0f} s since the state was kept")
             age = max(age, ran)
+        elif kept.pose is not None:
+            # by the time of day alone, which may have been set to anything, nobody knows how long nobody watched
+            kept = kept._replace(pose=None)
         return nothing._replace(kept=kept, age=max(age, 0.0))
 
     def _tidy(self) -> None:

@@ -275,7 +275,8 @@ class Reception:
 def client_of(data: bytes) -> bytes:
     """Return the reply channel in the bytes of a request, empty where there is none that could be answered on."""
     end = 19 + int.from_bytes(data[16:20], "big")
-    return data[20:end] if 20 < end <= 83 and end < len(data) else b""
+    # a name that begins with what cannot stand in one is no client's: `SIGNED_CLIENT` is the desk's own
+    return data[20:end] if 20 < end <= 83 and end < len(data) and data[20] > 0x20 else b""
 
 
 def effort(request: Request) -> int:

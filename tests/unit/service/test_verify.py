@@ -187,10 +187,33 @@ def test_given_an_error_of_the_core_and_one_of_the_bus_when_verified_then_all_is
     assert kept.loop.state.handler_errors == 5
     kept.drive(0.5)
     found = verify(kept.finish())
-    # what was told after the error was never said, and is said now: that is a difference, and it is named
-    assert found.difference is not None
-    assert found.difference.channel == "POSE_ODOM"
-    assert found.difference.was is None
+    # one that could not be sent takes no other with it, neither then nor now
+    assert proved(found)
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_given_a_segment_taken_out_of_the_middle_when_verified_then_that_is_damage(tmp_path: Path, number: int) -> None:
+    kept = Kept(tmp_path, SMALL, segment_bytes=150_000)
+    kept.drive(12.0)
+    segments = kept.finish()
+    assert len(segments) > 3
+    segments[number].unlink()
+    found = verify(kept.segments)
+    assert not found.proved
+    assert found.difference is None
+    assert f"1 segments before it are missing, behind {segments[number - 1].name}" in str(found.remarks[0])
+    whole = (found.last_utime - found.first_utime) * 1e-6
+    assert 1.0 < found.seconds < whole - 0.1
+
+
+def test_given_a_segment_cut_off_in_the_middle_when_verified_then_that_is_damage(tmp_path: Path) -> None:
+    kept = Kept(tmp_path, SMALL, segment_bytes=150_000)
+    kept.drive(12.0)
+    segments = kept.finish()
+    segments[1].write_bytes(segments[1].read_bytes()[:100_000])
+    found = verify(segments)
+    assert not found.proved
+    assert any("whose end was cut off after it was written" in str(each) for each in found.remarks)
 
 
 def tampered(path: Path, channel: str, number: int, change: Callable[[bytes], bytes]) -> int:
@@ -270,7 +293,9 @@ def test_given_a_segment_that_is_missing_when_verified_then_the_run_is_taken_up_
     files = kept.finish()
     assert len(files) > 3
     found = verify([*files[:1], *files[2:]])
-    assert found.proved
+    # what is there is reproduced, and yet not all that there was
+    assert found.difference is None
+    assert not found.proved
     assert found.segments == len(files) - 1
 
 

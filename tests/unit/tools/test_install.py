@@ -30,7 +30,7 @@ from mstools.install_files import (
 from mstools.install_plan import SYSCTL, Facts
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
-OWN_KEY, FAR_KEY = "commands.key", "/etc/keys/rover.key"
+OWN_KEY = "commands.key"
 TEMPLATES = install.templates()
 
 Said = tuple[int, str, str]
@@ -102,14 +102,17 @@ def test_given_an_installation_then_a_removal_leaves_nothing_of_it(
 
 @pytest.mark.parametrize(
     ("named", "where"),
-    [(OWN_KEY, f"/etc/modelserver/{OWN_KEY}"), (FAR_KEY, FAR_KEY)],
+    [(OWN_KEY, f"/etc/modelserver/{OWN_KEY}"), ("", "")],
+    ids=["beside it", "elsewhere"],
 )
 def test_given_a_key_then_systemd_hands_it_over_and_nobody_else_may_read_it(
     run: Callable[..., Said], vehicle: Path, tmp_path: Path, named: str, where: str
 ) -> None:
+    named = named or str(tmp_path / "rover.key")
+    where = where or named
+    secret = write_key_file(vehicle.parent / named)
     with vehicle.open("a") as file:
         file.write(f"commands: {{reload: true, key_file: {named}}}\n")
-    secret = write_key_file(vehicle.parent / "commands.key")
     code, out, err = run("install", "--vehicle", str(vehicle), "--drivers", "none")
     assert code == 0, err
     assert secret not in out
@@ -117,7 +120,7 @@ def test_given_a_key_then_systemd_hands_it_over_and_nobody_else_may_read_it(
     drop_in = (root / "etc/systemd/system/modelserver.service.d/60-key.conf").read_text()
     assert f"LoadCredential={where.rpartition('/')[2]}:{where}\n" in drop_in
     copied = root / "etc/modelserver/commands.key"
-    assert copied.exists() == (named == "commands.key")
+    assert copied.exists() == (named == OWN_KEY)
     if copied.exists():
         assert stat.S_IMODE(copied.stat().st_mode) == 0o600
         assert secret in copied.read_text()
