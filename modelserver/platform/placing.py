@@ -72,11 +72,22 @@ def placed(route: Route, model: Model, joints: Joints, utime: int, policy: Polic
         return NOTHING
     invalid = quality = 0
     positions, readings = [], []
+    drives, tracks = model.drives, joints.tracks
+    # a policy is looked at once, and a track that may be interpolated is asked without a detour: it is nearly always so
+    plainly = policy is not Policy.HELD and policy is not Policy.PREDICTED
     for leg in route.legs:
-        drive = model.drives[leg.name]
+        drive = drives[leg.name]
         # one by one where there is but one, which is nearly always
         if len(drive.names) == 1:
-            found: tuple[Reading, ...] = (_reading(drive.names[0], drive, model, joints, utime, policy),)
+            (name,) = drive.names
+            found: tuple[Reading, ...]
+            track = tracks.get(name) if plainly else None
+            try:
+                found = () if track is None else (track.interpolated(utime),)
+            except (TooOldError, TooNewError):
+                found = ()
+            if not found:
+                found = (_reading(name, drive, model, joints, utime, policy),)
         else:
             found = tuple([_reading(name, drive, model, joints, utime, policy) for name in drive.names])
             if leg.joint.type in VECTORS:
