@@ -202,7 +202,7 @@ def test_given_a_command_that_fails_then_it_is_said_which_and_what_it_said(
 @pytest.mark.parametrize(
     ("path", "why"),
     [
-        ("/root/.pyenv/bin/python", "ProtectHome"),
+        ("/root/python/bin/python", "ProtectHome"),
         ("/home/me/venv/bin/python", "ProtectHome"),
         ("/tmp/venv", "PrivateTmp"),
         ("/opt/modelserver", ""),
