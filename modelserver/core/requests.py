@@ -87,15 +87,15 @@ def fail(state: CoreState, request: Request, now: Instant) -> Outputs:
     return turned_down(state, type(request), request.header, Status.INTERNAL, message, now)
 
 
-def denied(state: CoreState, denied: Denied, now: Instant) -> Step:
+def denied(state: CoreState, command: Denied, now: Instant) -> Step:
     """Count a signed command that is not obeyed, and say why to who has proved to know the key."""
-    state = counted(state, denied.channel, denied.reason)
-    if denied.kind is None or denied.header is None:
+    state = counted(state, command.channel, command.reason)
+    if command.kind is None or command.header is None:
         return state, ()
-    if denied.malformed:
-        return state, turn_back(state, denied.kind, denied.header, denied.why, now)
-    why = f"the command is not obeyed: {denied.why}"
-    return state, turned_down(state, denied.kind, denied.header, Status.FORBIDDEN, why, now)
+    if command.malformed:
+        return state, turn_back(state, command.kind, command.header, command.why, now)
+    why = f"the command is not obeyed: {command.why}"
+    return state, turned_down(state, command.kind, command.header, Status.FORBIDDEN, why, now)
 
 
 def turn_back(state: CoreState, kind: type[Request], header: RequestHeader, why: str, now: Instant) -> Outputs:

@@ -14,7 +14,7 @@ from modelserver.service.journal import build as journal_build
 from modelserver.service.journal.queue import JournalQueue
 from modelserver.service.journal.ring import Ring
 from modelserver.service.journal.writer import JournalWriter, Origins
-from modelserver.service.keeping.origin import default_directory
+from modelserver.service.keeping.origin import default_directory, safe
 
 log = logging.getLogger(__name__)
 
@@ -43,8 +43,7 @@ def journal_directory(config: VehicleConfig) -> Path | None:
     base = Path(config.state_directory) if config.state_directory else default_directory()
     if base is None:
         return None
-    safe = "".join(character if character.isalnum() or character in "-_" else "_" for character in config.vehicle)
-    return base / f"journal-{safe}"
+    return base / f"journal-{safe(config.vehicle)}"
 
 
 def make_writer(config: VehicleConfig, file: str, clock: Clock) -> tuple[JournalQueue, JournalWriter] | None:
