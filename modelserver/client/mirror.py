@@ -18,7 +18,7 @@ from modelserver.errors import OutOfDateError
 from modelserver.messages import Policy, PoseAnswer
 from modelserver.spatial.transformation import Transformation
 from modelserver.wire.channels import literal
-from modelserver.wire.provider import open_lcm, resolve_url
+from modelserver.wire.provider import open_lcm, resolve_url, take_message
 
 log = logging.getLogger(__name__)
 
@@ -211,6 +211,6 @@ def _listen(whose: weakref.ref[PlatformMirror], bus: lcm.LCM, end: threading.Eve
                 subscription = bus.subscribe(literal(channel), lambda channel, data: fresh.append((channel, data)))
                 subscription.set_queue_capacity(UNREAD)
         del mirror
-        bus.handle_timeout(int(POLL_S * 1000))
-        while len(fresh) < AT_ONCE and bus.handle_timeout(0):
+        take_message(bus, int(POLL_S * 1000))
+        while len(fresh) < AT_ONCE and take_message(bus):
             pass

@@ -59,7 +59,7 @@ from modelserver.spatial.transformation import Transformation
 from modelserver.wire.channels import REPLY_PREFIX, literal
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.many import MAX_PAIRS
-from modelserver.wire.provider import open_lcm, resolve_url
+from modelserver.wire.provider import open_lcm, resolve_url, take_message
 from modelserver.wire.queries import known_answer, write_question
 
 R = TypeVar(
@@ -395,7 +395,7 @@ class Platform:
                 bus.publish(channel, request)
                 left = patience
                 while left > 0:
-                    bus.handle_timeout(int(left * 1000) + 1 if left < LONGEST_WAIT_S else _LONGEST_WAIT_MS)
+                    take_message(bus, int(left * 1000) + 1 if left < LONGEST_WAIT_S else _LONGEST_WAIT_MS)
                     for reply in fresh:
                         if reply[_ID] == wanted and (whole is None or whole(reply)):
                             return reply
@@ -446,7 +446,7 @@ def _found(answer: PoseAnswer | None) -> PoseAnswer:
 
 def _discard_unread(bus: lcm.LCM) -> None:
     for _ in range(UNREAD_REPLIES):
-        if not bus.handle_timeout(0):
+        if not take_message(bus):
             return
 
 

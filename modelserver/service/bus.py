@@ -9,7 +9,7 @@ from typing import Final, Protocol, TypeAlias
 
 from modelserver.service.membership import RENEW_S, Membership
 from modelserver.wire.channels import literal
-from modelserver.wire.provider import open_lcm, resolve_url
+from modelserver.wire.provider import open_lcm, resolve_url, take_message
 
 UNREAD: Final = 50_000
 """Messages of a channel that LCM holds until they are taken; at 10,000 a second that is five seconds' worth."""
@@ -72,9 +72,8 @@ class LcmInbox:
         if not self.may_have:
             self.may_have = True
             return 0
-        handle = self.lcm.handle_timeout
         for count in range(limit):
-            if not handle(0):
+            if not take_message(self.lcm):
                 return count
         return limit
 

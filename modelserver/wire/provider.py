@@ -1,8 +1,9 @@
-"""Joining LCM: which provider, with which buffer, and what to look at when it fails."""
+"""LCM: which provider, with which buffer, what to look at when joining fails, and how messages are taken."""
 
 from __future__ import annotations
 
 import os
+from typing import Final
 
 import lcm
 
@@ -30,3 +31,21 @@ def open_lcm(url: str) -> lcm.LCM:
             f"cannot join the bus at {url}: {error}. Is the address right (udpm://239.255.76.67:7667?ttl=0), and has "
             "the machine a multicast route? Try: ip route add 224.0.0.0/4 dev lo"
         ) from None
+
+
+_INTERRUPTED: Final = ("lcm_handle_timeout() returned -1",)
+"""What `LCM.handle_timeout` raises OSError with, without an errno, when a signal interrupted it."""
+
+
+def take_message(bus: lcm.LCM, milliseconds: int = 0) -> bool:
+    """Hand over the next message, waiting for it so long at most; return whether there was one.
+
+    A signal ends the waiting, as if nothing had come: no reload, end, resized window or profiler of the program that
+    gets one may make it fail.
+    """
+    try:
+        return bool(bus.handle_timeout(milliseconds))
+    except OSError as error:
+        if error.args != _INTERRUPTED:
+            raise
+        return False

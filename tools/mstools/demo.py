@@ -15,6 +15,7 @@ import typer
 from modelserver.errors import NoServerError, QueryError
 from modelserver.messages import DriverHealth, DriverPhase, Invalid, PoseAnswer
 from modelserver.spatial.pose import Pose
+from modelserver.wire.provider import open_lcm, resolve_url, take_message
 from mstools.demo_children import MODELSERVER, Children, DemoError
 from mstools.demo_lines import Lines, lay_lines
 
@@ -156,7 +157,6 @@ class Ear:
     def __init__(self, url: str, prefix: str):
         from modelserver.wire.channels import literal
         from modelserver.wire.codec import decode
-        from modelserver.wire.provider import open_lcm, resolve_url
 
         self.poses: list[PoseAnswer] = []
         self.health: dict[str, DriverHealth] = {}
@@ -192,7 +192,7 @@ def wait_for_drivers(ear: Ear, lines: Lines, children: Children) -> None:
     """Wait until every driver has said how it is. Raises DemoError where one fails or takes too long."""
     deadline = time.monotonic() + START_LIMIT
     while unheard := [name for name in lines.devices if name not in ear.health]:
-        ear.bus.handle_timeout(100)
+        take_message(ear.bus, 100)
         children.check()
         if time.monotonic() > deadline:
             raise DemoError(f"no word within {START_LIMIT:g} s of: driver {', '.join(unheard)}; see --verbose")
@@ -211,7 +211,7 @@ def poses(ear: Ear, start_utime: int, seconds: float, children: Children) -> Ite
     """Yield what is broadcast from the start of the drive on, until its end."""
     end = time.monotonic() + start_utime * 1e-6 - time.time() + seconds
     while time.monotonic() < end:
-        ear.bus.handle_timeout(100)
+        take_message(ear.bus, 100)
         yield from (pose for pose in ear.poses if pose.transformation.utime >= start_utime)
         ear.poses.clear()
         children.check()

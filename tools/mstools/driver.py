@@ -242,6 +242,7 @@ def _hear_commands(bus: Any, channel: str, runner: Any) -> Callable[[], object]:
     from modelserver.errors import WireError
     from modelserver.wire.channels import literal
     from modelserver.wire.codec import decode
+    from modelserver.wire.provider import take_message
 
     def handle(_: str, data: bytes) -> None:
         try:
@@ -254,7 +255,7 @@ def _hear_commands(bus: Any, channel: str, runner: Any) -> Callable[[], object]:
     bus.subscribe(literal(channel), handle)
 
     def attend() -> None:
-        while bus.handle_timeout(0):
+        while take_message(bus):
             pass
 
     return attend

@@ -22,6 +22,7 @@ from modelserver.errors import (
 )
 from modelserver.keys import ENVIRONMENT
 from modelserver.messages import Health, Mode, NavigationState, PublishDecisions, SensorHeader, SwitchMode
+from modelserver.wire.provider import open_lcm, resolve_url, take_message
 from modelserver.wire.signed import SIGNED
 from mstools.asking import KeyOption, UrlOption
 
@@ -56,7 +57,6 @@ def command(
     from modelserver.client.signing import signer
     from modelserver.config import load_config
     from modelserver.wire.codec import encode
-    from modelserver.wire.provider import open_lcm, resolve_url
 
     vehicle = load_config(config)
     if not vehicle.localization.mode_channel:
@@ -140,7 +140,7 @@ class Ear:
             left = deadline - time.monotonic()
             if left <= 0.0:
                 return False
-            self._bus.handle_timeout(int(left * 1e3) + 1)
+            take_message(self._bus, int(left * 1e3) + 1)
         return True
 
     def is_silent(self, state_hz: float) -> bool:

@@ -16,6 +16,7 @@ import mslcm
 from modelserver.errors import ModelServerError, WireError, nearest_names, shown
 from modelserver.wire.codec import decode, type_names
 from modelserver.wire.kinds import type_name_of
+from modelserver.wire.provider import take_message
 from mstools.interrupts import Interrupts
 from mstools.output import safe
 from mstools.spy_fields import fields
@@ -58,7 +59,7 @@ class Ear:
 
     def take(self, until: float) -> None:
         """Take what has come, without waiting, and not for longer than `until`: a flood must not stop the picture."""
-        while self._bus.handle_timeout(0) and self._clock() < until:
+        while take_message(self._bus) and self._clock() < until:
             pass
 
     def listen(self, until: float, also: int = -1) -> bool:

@@ -14,6 +14,7 @@ import typer
 
 from modelserver.errors import NoServerError, WireError, nearest_names, shown
 from modelserver.messages import DriverHealth, Health
+from modelserver.wire.provider import open_lcm, resolve_url, take_message
 from mstools.asking import JsonOption, PrefixOption, UrlOption
 from mstools.interrupts import Interrupts
 from mstools.status_text import as_data, is_well, line, report
@@ -69,7 +70,6 @@ def command(
 
     Example: modelserver status --watch
     """
-    from modelserver.wire.provider import open_lcm, resolve_url
 
     drivers: tuple[str, ...] = ()
     if config is not None:
@@ -139,7 +139,7 @@ class Ear:
             if left <= 0.0:
                 return False
             if select.select((self._bus.fileno(),), (), (), min(left, LOOK_S))[0]:
-                self._bus.handle_timeout(0)
+                take_message(self._bus)
         return True
 
 
@@ -156,7 +156,7 @@ def heard_instead(bus: lcm.LCM, seconds: float = INSTEAD_S) -> dict[str, bool]:
     bus.subscribe(".*", hear)
     deadline = time.monotonic() + seconds
     while (left := deadline - time.monotonic()) > 0.0:
-        bus.handle_timeout(int(left * 1e3) + 1)
+        take_message(bus, int(left * 1e3) + 1)
     return found
 
 

@@ -10,6 +10,7 @@ import typer
 
 from modelserver.errors import NoServerError
 from modelserver.geometry.model import Model
+from modelserver.wire.provider import open_lcm, resolve_url, take_message
 from mstools.asking import PrefixOption, UrlOption
 from mstools.graph import Node, crossing_words, nodes
 from mstools.options import Variables, parse_variables
@@ -90,7 +91,6 @@ def heard(url: str, prefix: str, seconds: float) -> Snapshot:
     from modelserver.snapshot import read as read_snapshot
     from modelserver.wire.channels import literal
     from modelserver.wire.codec import decode
-    from modelserver.wire.provider import open_lcm, resolve_url
     from modelserver.wire.snapshot import Assembler
 
     provider = resolve_url(url)
@@ -116,7 +116,7 @@ def heard(url: str, prefix: str, seconds: float) -> Snapshot:
                 "(modelserver run -c vehicle.yaml), on this bus ($LCM_DEFAULT_URL) and with this --prefix? Its vehicle "
                 "file says how often it tells (publish.snapshot_s): --wait longer than that"
             )
-        bus.handle_timeout(int(left * 1e3) + 1)
+        take_message(bus, int(left * 1e3) + 1)
     return whole[0]
 
 

@@ -14,7 +14,7 @@ from modelserver.messages import GetBodyList, Health, RequestHeader
 from modelserver.service.probing.servers import Answers, Server
 from modelserver.wire.channels import PROBE_CHANNEL, REPLY_PREFIX, literal
 from modelserver.wire.codec import decode, encode
-from modelserver.wire.provider import open_lcm
+from modelserver.wire.provider import open_lcm, take_message
 
 PATIENCE_S: Final = 2.0
 """How long our own message is waited for: it takes less than a millisecond where nothing is wrong."""
@@ -92,5 +92,5 @@ def _listen(ear: lcm.LCM, seconds: float, until: Callable[[], bool]) -> bool:
         left = deadline - time.monotonic()
         if left <= 0.0:
             return False
-        ear.handle_timeout(int(left * 1e3) + 1)
+        take_message(ear, int(left * 1e3) + 1)
     return True
