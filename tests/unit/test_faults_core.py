@@ -8,7 +8,8 @@ import pytest
 from support_faults import FAULTS, FROM_S, INERTIAL
 from support_ride import LONGEST_LIE_S, CoreRun, Ride, told_to_core
 
-from modelserver.simulation import GpsModel
+from modelserver.messages import GpsSample
+from modelserver.simulation import Event, GpsModel
 
 START = 1_700_000_000_000_000
 SECONDS = 36.0
@@ -42,6 +43,40 @@ def test_given_fixes_that_stay_700_m_away_then_they_are_refused_until_they_have_
     assert all(each.off < 2.0 for each in found.between(FROM_S, FROM_S + 20.0) if each.valid)
     # who looks at the epoch sees that it was taken up anew; which of the two places was the right one nobody can tell
     assert epochs == {first.transformation.pose_epoch + 1}
+
+
+def older(ride: Ride, seconds: float, since: float) -> list[Event]:
+    """What arrives where fixes are older than their stamps from an instant on."""
+
+    def aged(event: Event) -> Event:
+        header = event.header
+        if not isinstance(event, GpsSample) or header.utime < START + since * 1e6:
+            return event
+        late = round(seconds * 1e6)
+        return replace(event, header=replace(header, utime=header.utime + late, host_utime=header.host_utime + late))
+
+    return sorted(map(aged, ride.events()), key=lambda event: event.header.host_utime)
+
+
+@pytest.mark.parametrize("since", [0.0, FROM_S], ids=["from the start", "while driving"])
+@pytest.mark.parametrize("seconds", [0.2, 0.3, 0.5, 1.0])
+def test_given_fixes_older_than_their_stamps_by_what_nobody_told_then_the_pose_stays_within_its_bounds(
+    seconds: float, since: float
+) -> None:
+    ride = Ride.at(START, SECONDS, imu_model=INERTIAL)
+    found = told_to_core(ride, older(ride, seconds, since))
+    assert found.lie <= LONGEST_LIE_S
+    assert all(each.valid for each in found.between(8.0, SECONDS))
+    # at 3 m/s what nobody told is 3 m at most; turns tell it, so it is less in the end
+    assert all(each.off < 3.0 * seconds + 0.3 for each in found.between(0.0) if each.valid)
+    assert all(each.off < 0.5 * 3.0 * seconds for each in found.between(SECONDS - 2.0, SECONDS))
+
+
+def test_given_late_fixes_in_a_circle_from_the_start_then_the_heading_that_they_tell_is_as_unsure_as_they_are() -> None:
+    ride = Ride.at(START, ENOUGH, "circle", imu_model=INERTIAL, gps_model=GpsModel(unstated_latency=0.15))
+    found = told_to_core(ride, ride.events())
+    assert found.lie <= LONGEST_LIE_S
+    assert all(each.off < 1.5 for each in found.between(0.0) if each.valid)
 
 
 @pytest.mark.parametrize("hours", [-1.0, 1.0], ids=["back", "ahead"])

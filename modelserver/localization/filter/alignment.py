@@ -4,6 +4,9 @@ With u_i where the way says the antenna was, and p_i where the fixes say (both h
 p_i = p_0 + c u_i. The straight-line fit c = sum conj(u_i - mean u) (p_i - mean p) / sum |u_i - mean u|^2 turns the
 way by arg c; |c| should be 1. Wheels know backward from forward, so a vehicle that starts in reverse is right. Where
 nothing tells the speed, u is the way at speed 1 and |c| the speed: then the vehicle is taken to drive forward.
+
+Fixes that are late by t tell p(u - t u'), which turns the way too little, by t Im sum conj(u_i - mean u) u'_i over
+sum |u_i - mean u|^2: in a circle by as much as the vehicle turns in that time.
 """
 
 from __future__ import annotations
@@ -38,14 +41,24 @@ class Passed(NamedTuple):
     up_sigma: float
 
 
+class Turn(NamedTuple):
+    """By how much N must be turned about up, rad, known to `sigma`.
+
+    `turning` is how much farther for each second that the fixes are late that told it, rad/s.
+    """
+
+    angle: float
+    sigma: float
+    turning: float = 0.0
+
+
 class Fit(NamedTuple):
-    """What a stretch of fixes tells: N must be turned by `turn` (rad), known to `sigma`; the factor |c|.
+    """What a stretch of fixes tells: how N must be turned; the factor |c|.
 
     `distance` is how far the ends of the stretch are apart, metres; `scatter` the fixes' mean deviation from the way.
     """
 
-    turn: float
-    sigma: float
+    turn: Turn
     factor: float
     factor_sigma: float
     distance: float
@@ -86,7 +99,8 @@ def fitted(stretch: tuple[Passed, ...], settings: FilterSettings, *, by_unit: bo
     size = math.sqrt(spread)
     if factor <= 0.0 or size <= 0.0:
         return None
-    ends = (stretch[-1].unit - stretch[0].unit) if by_unit else (stretch[-1].way - stretch[0].way)
+    ways = [each.unit if by_unit else each.way for each in stretch]
+    ends = ways[-1] - ways[0]
     distance = abs(ends) * (factor if by_unit else 1.0)
     newest = stretch[-1]
     # what lingers is shared by neighbours and has changed by this between the ends
@@ -95,14 +109,28 @@ def fitted(stretch: tuple[Passed, ...], settings: FilterSettings, *, by_unit: bo
         return None
     variance = (newest.white / (size * factor)) ** 2 + (changed / distance) ** 2 + (0.5 * rate_sigma * seconds) ** 2
     return Fit(
-        cmath.phase(c),
-        math.sqrt(variance),
+        Turn(cmath.phase(c), math.sqrt(variance), _turning(stretch, ways, spread)),
         factor,
         factor * math.sqrt((newest.white / (size * factor)) ** 2 + (changed / distance) ** 2),
         distance,
         scatter,
         seconds,
     )
+
+
+def velocities(stretch: tuple[Passed, ...], ways: list[complex]) -> list[complex]:
+    """Return how fast the way goes at each fix, from its neighbours."""
+    last = len(ways) - 1
+    pairs = [(max(k - 1, 0), min(k + 1, last)) for k in range(len(ways))]
+    return [(ways[b] - ways[a]) / ((stretch[b].utime - stretch[a].utime) * 1e-6) for a, b in pairs]
+
+
+def _turning(stretch: tuple[Passed, ...], ways: list[complex], spread: float) -> float:
+    """Return by how much the turn of a fit grows with the fixes' lateness, rad/s; `spread` is sum |u_i - mean u|^2."""
+    mean = sum(ways) / len(ways)
+    pairs = zip(ways, velocities(stretch, ways), strict=True)
+    found: float = sum(((way - mean).conjugate() * velocity).imag for way, velocity in pairs)
+    return found / spread
 
 
 def _line(stretch: tuple[Passed, ...], ways: list[complex], arms: list[complex]) -> tuple[complex, float, float] | None:

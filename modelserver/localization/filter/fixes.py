@@ -13,8 +13,8 @@ import numpy as np
 
 from modelserver.geodesy import GeodesyError, LocalFrame, ecef_from_geodetic, geodetic_from_ecef, origin_at
 from modelserver.localization import gate
-from modelserver.localization.filter import alignment, placing, updates
-from modelserver.localization.filter.alignment import Fit, Passed, horizontal
+from modelserver.localization.filter import alignment, lateness, placing, updates
+from modelserver.localization.filter.alignment import Fit, Passed, Turn, horizontal
 from modelserver.localization.filter.measurements.aiding import AbsolutePose
 from modelserver.localization.filter.measurements.base import Compared, Scene, wrapped
 from modelserver.localization.filter.measurements.gps import WANDER, place_of, shares, stated_velocity
@@ -23,7 +23,7 @@ from modelserver.localization.filter.setup import Setup
 from modelserver.localization.filter.state import FilterState, Pending
 from modelserver.localization.filter.strapdown import Earth
 from modelserver.localization.gate import GoodFix
-from modelserver.messages import AbsolutePoseSample, Decision, FixType, GpsSample, Mode, Phase, Verdict
+from modelserver.messages import AbsolutePoseSample, Decision, FixType, GpsSample, Phase, Verdict
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import Vector3
 
@@ -114,7 +114,7 @@ def moving(setup: Setup, state: FilterState, sample: GpsSample) -> bool:
 
 def speed_known(setup: Setup, state: FilterState, nav: Nav) -> bool:
     """Return whether the state knows how fast, and which way along its own axis, the vehicle goes."""
-    if state.mode is not Mode.NO_WHEELS and state.wheels_utime and (nav.utime - state.wheels_utime) * 1e-6 < 1.0:
+    if state.on_wheels(nav.utime):
         return True
     P = nav.covariance
     sigma = math.sqrt(max(P[3, 3], P[4, 4]))
@@ -130,7 +130,7 @@ def sought(setup: Setup, state: FilterState, newest: Passed) -> tuple[FilterStat
     rate_sigma = math.sqrt(nav.covariance[11, 11])
     known = speed_known(setup, state, nav)
     fit = alignment.fitted(stretch, settings, by_unit=not known, rate_sigma=rate_sigma)
-    if fit is None or fit.sigma > settings.align_sigma or not alignment.agrees(fit, newest):
+    if fit is None or fit.turn.sigma > settings.align_sigma or not alignment.agrees(fit, newest):
         return state, None
     if known and not 0.6 < fit.factor < 1.6:
         # not the way that was driven: fixes that wander, or wheels that spin
@@ -147,10 +147,10 @@ def aligned(setup: Setup, state: FilterState, fit: Fit, *, by_unit: bool) -> Fil
     assert newest is not None
     if by_unit:
         nav = placing.at_speed(nav, fit.factor, fit.factor_sigma)
-    return into_world(setup, state, nav, fit.turn, fit.sigma, newest)
+    return into_world(setup, state, nav, fit.turn, newest)
 
 
-def into_world(setup: Setup, state: FilterState, nav: Nav, turn: float, sigma: float, newest: Passed) -> FilterState:
+def into_world(setup: Setup, state: FilterState, nav: Nav, turn: Turn, newest: Passed) -> FilterState:
     """Return the state turned by a heading that was found, with its antenna at the newest fix.
 
     `nav` is the state's own, or that with a speed that was just found. Finding it shifted the place by all that was
@@ -162,8 +162,9 @@ def into_world(setup: Setup, state: FilterState, nav: Nav, turn: float, sigma: f
         way = complex(x, y) - newest.way
     else:
         way = horizontal(nav.point_velocity(lever)) * (nav.utime - newest.utime) * 1e-6
-    moved = way * cmath.rect(1.0, turn)
-    nav = placing.placed(placing.turned(nav, turn, sigma), newest, moved, lever, setup.layout)
+    moved = way * cmath.rect(1.0, turn.angle)
+    nav = lateness.doubted(nav, lateness.told(state.passed), setup.layout)
+    nav = placing.placed(placing.turned(nav, turn, setup.layout), newest, moved, lever, setup.layout)
     site = state.site
     assert site is not None
     latitude, _, height = geodetic_from_ecef(site.ecef)
@@ -180,8 +181,8 @@ def into_world(setup: Setup, state: FilterState, nav: Nav, turn: float, sigma: f
     )
 
 
-def by_velocity(setup: Setup, state: FilterState, sample: GpsSample, utime: int) -> tuple[float, float, float] | None:
-    """Return turn, sigma and speed (nan: known already) by the receiver's velocity; None where it does not tell.
+def by_velocity(setup: Setup, state: FilterState, sample: GpsSample, utime: int) -> tuple[Turn, float] | None:
+    """Return the turn by the receiver's velocity, and the speed (nan: known already); None where it does not tell.
 
     Where the speed is not known the vehicle is taken to drive forward, and slower than twice `align_speed` not at all.
     """
@@ -201,10 +202,10 @@ def by_velocity(setup: Setup, state: FilterState, sample: GpsSample, utime: int)
         v = horizontal(nav.point_velocity(setup.rig.lever(setup.rig.gps_frame)))
         if not 0.6 * size < abs(v) < 1.6 * size:
             return None
-        return wrapped(cmath.phase(z) - cmath.phase(v)), sigma, math.nan
+        return Turn(wrapped(cmath.phase(z) - cmath.phase(v)), sigma, nav.turn_rate[2]), math.nan
     if size < 2.0 * settings.align_speed:
         return None
-    return wrapped(cmath.phase(z) - nav.yaw), sigma, size
+    return Turn(wrapped(cmath.phase(z) - nav.yaw), sigma, nav.turn_rate[2]), size
 
 
 # --- jumps --------------------------------------------------------------------------------------------------
@@ -303,9 +304,13 @@ def put(
         return allowed(state, nav, compared, decision), (decision,)
     if decision.verdict is Verdict.MONITORED:
         decision = decision._replace(verdict=Verdict.REJECTED, reason="gate")
+    since = (newest.utime - state.refused[-1].utime) * 1e-6 if state.refused else 0.0
     refused = alignment.kept(state.refused, newest, 2.0 * settings.recovery_time)
     state = state._replace(
-        refused=refused, refused_since=state.refused_since or utime, refused_count=state.refused_count + 1
+        nav=lateness.tardy(setup, state, nav, compared.residual.tolist(), min(since, 2.0)),
+        refused=refused,
+        refused_since=state.refused_since or utime,
+        refused_count=state.refused_count + 1,
     )
     # refused fixes that have agreed with the way driven for long enough are right, and the state is not
     if _recovery(setup, state) is not None:
@@ -365,7 +370,7 @@ def _recovery(setup: Setup, state: FilterState) -> Fit | None:
     fit = alignment.fitted(refused, settings, by_unit=False, rate_sigma=math.sqrt(nav.covariance[11, 11]))
     if fit is None or fit.distance < settings.recovery_distance or not alignment.agrees(fit, refused[-1]):
         return None
-    if not 0.7 < fit.factor < 1.4 or fit.sigma > settings.align_sigma:
+    if not 0.7 < fit.factor < 1.4 or fit.turn.sigma > settings.align_sigma:
         return None
     return fit
 
@@ -376,10 +381,9 @@ def taken_up(setup: Setup, state: FilterState) -> tuple[FilterState, Decision | 
     nav = state.nav
     if fit is None or nav is None:
         return state, None
-    sigma = math.hypot(fit.sigma, math.sqrt(nav.covariance[8, 8]))
-    turn, turn_sigma = (fit.turn, fit.sigma) if abs(fit.turn) > 3.0 * sigma else (0.0, 0.0)
-    newest = state.refused[-1]
-    state = into_world(setup, state, nav, turn, turn_sigma, newest)
+    sigma = math.hypot(fit.turn.sigma, math.sqrt(nav.covariance[8, 8]))
+    turn = fit.turn if abs(fit.turn.angle) > 3.0 * sigma else Turn(0.0, 0.0)
+    state = into_world(setup, state, nav, turn, state.refused[-1])
     decision = Decision(
         nav.utime, "filter", 0, "gps_position", Verdict.TOOK_UP, "fixes agree with the way driven, the state does not"
     )
@@ -410,7 +414,7 @@ def set_from(
         return state, (updates.refused(nav.utime, source, seq, measurement.kind, reason),)
     # the turn outright, for it may be of any size
     turn = wrapped(float(compared.residual[5]))
-    nav = placing.turned(nav, turn, math.sqrt(float(compared.noise[5, 5])))
+    nav = placing.turned(nav, Turn(turn, math.sqrt(float(compared.noise[5, 5]))), setup.layout)
     again = measurement.compare(scene._replace(nav=nav), sample)
     assert not isinstance(again, str)
     x, y, z = nav.position

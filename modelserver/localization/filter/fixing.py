@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from modelserver.localization.filter import fixes, motion, placing, updates
-from modelserver.localization.filter.alignment import Passed
+from modelserver.localization.filter import fixes, lateness, motion, placing, updates
+from modelserver.localization.filter.alignment import Passed, Turn
 from modelserver.localization.filter.handling import begun_level, measured, scene_of, without_gps
 from modelserver.localization.filter.items import NOTHING, Fused, Item, refused, took_up
 from modelserver.localization.filter.measurements.base import wrapped
@@ -51,7 +51,9 @@ def fix(setup: Setup, state: FilterState, item: Item) -> Fused:
         if fit is None:
             return state, NOTHING
         state = fixes.aligned(setup, state, fit, by_unit=by_unit)
-        return state, (took_up(item, f"heading to {math.degrees(fit.sigma):.1f} deg by {fit.distance:.1f} m driven"),)
+        return state, (
+            took_up(item, f"heading to {math.degrees(fit.turn.sigma):.1f} deg by {fit.distance:.1f} m driven"),
+        )
     if state.proving is not None and not unused:
         state, proof = proved(setup, state, newest)
         if proof:
@@ -70,7 +72,11 @@ def fix(setup: Setup, state: FilterState, item: Item) -> Fused:
         return state, (decision,)
     state, decisions = fixes.put(setup, state, compared, newest, item.source, item.seq, steady=steady)
     if not resting and decisions[0].verdict is Verdict.USED:
-        state = state._replace(restless=fixes.learnt(setup, state.restless, decisions[0], since))
+        restless = fixes.learnt(setup, state.restless, decisions[0], since)
+        nav = state.nav
+        assert nav is not None
+        nav = lateness.restless(setup, state, nav, decisions[0].residual, restless, since)
+        state = state._replace(restless=restless, nav=nav)
         state = fixes.shown(setup, state, (newest.lingering, newest.lingering, 0.0), since, slice(0, 2))
     return state, decisions
 
@@ -119,11 +125,11 @@ def velocity(setup: Setup, state: FilterState, item: Item) -> Fused:
     nav, newest = state.nav, state.fixed
     if found is None or nav is None or newest is None:
         return state, NOTHING
-    turn, sigma, speed = found
+    turn, speed = found
     if math.isfinite(speed):
         nav = placing.at_speed(nav, speed, setup.settings.velocity_sigma)
-    state = fixes.into_world(setup, state, nav, turn, sigma, newest)
-    return state, (took_up(item, f"heading, to {math.degrees(sigma):.1f} deg, by the receiver's velocity"),)
+    state = fixes.into_world(setup, state, nav, turn, newest)
+    return state, (took_up(item, f"heading, to {math.degrees(turn.sigma):.1f} deg, by the receiver's velocity"),)
 
 
 def baseline(setup: Setup, state: FilterState, item: Item) -> Fused:
@@ -164,5 +170,5 @@ def _by_azimuth(setup: Setup, state: FilterState, item: Item, turn: float, sigma
     nav, newest = state.nav, state.fixed
     if nav is None or newest is None or (item.utime - newest.utime) * 1e-6 > fixes.FRESH:
         return state, NOTHING
-    state = fixes.into_world(setup, state, nav, turn, sigma, newest)
+    state = fixes.into_world(setup, state, nav, Turn(turn, sigma), newest)
     return state, (took_up(item, f"heading, to {math.degrees(sigma):.1f} deg"),)

@@ -6,7 +6,7 @@ import numpy as np
 
 from modelserver.geodesy import about_up
 from modelserver.localization.filter import kalman
-from modelserver.localization.filter.alignment import Passed
+from modelserver.localization.filter.alignment import Passed, Turn
 from modelserver.localization.filter.layout import Layout
 from modelserver.localization.filter.measurements.gps import LATENCY, WANDER
 from modelserver.localization.filter.nav import Nav
@@ -14,12 +14,14 @@ from modelserver.spatial import so3
 from modelserver.spatial.so3 import Vector3
 
 
-def turned(nav: Nav, turn: float, sigma: float) -> Nav:
-    """Return the state with N turned by `turn` radians about up, known to `sigma`: everything in N turns with it.
+def turned(nav: Nav, turn: Turn, layout: Layout) -> Nav:
+    """Return the state with N turned about up: everything in N turns with it.
 
-    An error of the turn is one of yaw, and turns the velocity with it.
+    An error of the turn is one of yaw, and turns the velocity with it. Where late fixes told too little, as much more
+    is turned as is known of their lateness; what is not known of it is an error that the two share.
     """
-    spin = about_up(turn)
+    late = nav.extras[layout.extra(LATENCY)] if turn.turning else 0.0
+    spin = about_up(turn.angle + turn.turning * late)
     velocity = so3.rotate(spin, nav.velocity)
     n = len(nav.covariance)
     T = np.eye(n)
@@ -29,7 +31,11 @@ def turned(nav: Nav, turn: float, sigma: float) -> Nav:
     P = T @ nav.covariance @ T.T
     G = np.zeros(n)
     G[3], G[4], G[8] = -velocity[1], velocity[0], 1.0
-    P += np.outer(G, G) * sigma * sigma
+    P += np.outer(G, G) * turn.sigma**2
+    if turn.turning:
+        L = np.eye(n)
+        L[:, layout.index(LATENCY)] += turn.turning * G
+        P = L @ P @ L.T
     return nav._replace(
         position=so3.rotate(spin, nav.position),
         velocity=velocity,

@@ -10,7 +10,7 @@ import cmath
 import math
 
 from modelserver.localization.filter import fixes
-from modelserver.localization.filter.alignment import Passed
+from modelserver.localization.filter.alignment import Passed, Turn
 from modelserver.localization.filter.items import NOTHING, Fused
 from modelserver.localization.filter.keeping import KEPT
 from modelserver.localization.filter.setup import Setup
@@ -55,7 +55,7 @@ def proved(setup: Setup, state: FilterState, newest: Passed) -> Fused:
         return state, (
             _word(state, Verdict.USED, f"the resumed heading is right: {abs(way):.1f} m driven agree with it"),
         )
-    state = fixes.into_world(setup, state, nav, turn, sigma, newest)
+    state = fixes.into_world(setup, state, nav, Turn(turn, sigma), newest)
     state = state._replace(epoch=state.epoch + 1, allowance=0.0)
     off = f"the kept heading was off by {abs(math.degrees(turn)):.0f} deg: the vehicle was turned while nobody watched"
     return state, (_word(state, Verdict.TOOK_UP, f"cold start of the pose after all, {off}"),)

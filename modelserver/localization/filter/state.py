@@ -86,6 +86,10 @@ class Resuming(NamedTuple):
     seen: int = 0
 
 
+WHEELS_LAST = 1_000_000
+"""Microseconds for which what wheels said tells how fast the vehicle goes."""
+
+
 class Proving(NamedTuple):
     """A stretch of fixes that a resumed heading is held against, from `begin` to `utime` (0: none yet).
 
@@ -164,6 +168,10 @@ class FilterState(NamedTuple):
     stepped: bool = False
     resuming: Resuming | None = None
     proving: Proving | None = None
+
+    def on_wheels(self, utime: int) -> bool:
+        """Return whether wheels tell how fast the vehicle goes at an instant."""
+        return self.mode is not Mode.NO_WHEELS and self.wheels_utime > 0 and utime - self.wheels_utime < WHEELS_LAST
 
     def felt(self, nav: Nav, stillness: Stillness, said: Said, imu_utime: int) -> FilterState:
         """Return the state after an inertial sample.

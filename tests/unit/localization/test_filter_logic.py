@@ -11,9 +11,10 @@ import pytest
 from support_cart import ANTENNA, GEODESY, WHEELS, localizer, model, rig, some_nav
 from support_cart import IMU as IMU_FRAME
 
-from modelserver.localization.filter import alignment, clocks, engine, inertial, placing, start
-from modelserver.localization.filter.alignment import Passed
+from modelserver.localization.filter import alignment, clocks, engine, inertial, lateness, placing, start
+from modelserver.localization.filter.alignment import Passed, Turn
 from modelserver.localization.filter.clocks import Clocks, Verdict
+from modelserver.localization.filter.lateness import Lateness
 from modelserver.localization.filter.measurements.gps import LATENCY, WANDER
 from modelserver.localization.filter.measurements.wheels import WheelSpeed, _mean, rolling, standing_wheels, turn_rate
 from modelserver.localization.filter.nav import ZERO
@@ -294,8 +295,8 @@ def stretch(turn: float, speed: float = 2.0, noise: float = 0.02, arm: complex =
 def test_given_the_way_driven_forward_or_in_reverse_then_it_lies_on_the_fixes_turned_by_as_much(turn, speed):
     fit = alignment.fitted(stretch(turn, speed), SETTINGS, by_unit=False, rate_sigma=1e-3)
     assert fit is not None
-    assert abs(math.remainder(fit.turn - turn, math.tau)) < 4.0 * fit.sigma
-    assert fit.sigma < 0.05
+    assert abs(math.remainder(fit.turn.angle - turn, math.tau)) < 4.0 * fit.turn.sigma
+    assert fit.turn.sigma < 0.05
     assert fit.factor == pytest.approx(1.0, abs=0.02)
     assert fit.distance > 20.0
     assert alignment.agrees(fit, stretch(turn, speed)[-1])
@@ -304,7 +305,7 @@ def test_given_the_way_driven_forward_or_in_reverse_then_it_lies_on_the_fixes_tu
 def test_given_no_speed_then_the_way_at_speed_one_tells_it_with_heading():
     fit = alignment.fitted(stretch(1.0), SETTINGS, by_unit=True, rate_sigma=1e-3)
     assert fit is not None
-    assert fit.turn == pytest.approx(1.0, abs=0.02)
+    assert fit.turn.angle == pytest.approx(1.0, abs=0.02)
     assert fit.factor == pytest.approx(2.0, abs=0.02)
 
 
@@ -333,15 +334,112 @@ def test_given_a_long_stretch_then_it_is_thinned_and_cut():
 # --- setting the state --------------------------------------------------------------------------------------
 
 
+def late_stretch(late: float, speed: str, rate: float = 0.0) -> tuple[Passed, ...]:
+    """Eight seconds from rest to 3 m/s, or steadily at that; fixes tell where the vehicle was `late` seconds before."""
+    turn, noise = 0.7, 0.02
+    shaken = random.Random(2).gauss
+
+    def way(t: float) -> complex:
+        steps = 400
+        dt = t / steps
+        found = 0j
+        for n in range(steps):
+            at = (n + 0.5) * dt
+            v = 3.0 if speed == "steady" else min(max(at - 2.0, 0.0), 3.0)
+            found += v * dt * cmath.rect(1.0, rate * at)
+        return found
+
+    return tuple(
+        Passed(
+            T0 + n * 250_000,
+            20.0 + cmath.rect(1.0, turn) * way(n * 0.25 - late) + complex(shaken(0.0, noise), shaken(0.0, noise)),
+            0.0,
+            way(n * 0.25),
+            0j,
+            0j,
+            noise,
+            0.1,
+            0.1,
+        )
+        for n in range(33)
+    )
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.3])
+@pytest.mark.parametrize("late", [0.0, 0.1, 0.4])
+def test_given_fixes_that_are_late_then_a_way_of_changing_speed_tells_by_how_much(late, rate):
+    found = lateness.told(late_stretch(late, "from rest", rate=rate))
+    assert found is not None
+    assert found.sigma < 0.02
+    # to the first order of lateness, and with corners that four fixes a second round off
+    assert abs(found.seconds - late) < 4.0 * found.sigma + 0.15 * late + 0.01
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.5])
+def test_given_a_steady_way_then_it_does_not_tell_how_late_fixes_are(rate):
+    found = lateness.told(late_stretch(0.4, "steady", rate=rate))
+    assert found is None or found.sigma > 1.0
+
+
+def test_given_too_few_fixes_then_they_do_not_tell_how_late_they_are():
+    assert lateness.told(late_stretch(0.0, "from rest")[:5]) is None
+    still = tuple(each._replace(way=0j) for each in late_stretch(0.0, "from rest"))
+    assert lateness.told(still) is None
+
+
+def test_given_late_fixes_in_a_circle_then_the_turn_says_how_much_of_it_is_their_lateness():
+    rate, late = 0.5, 0.2
+    prompt = alignment.fitted(late_stretch(0.0, "steady", rate=rate), SETTINGS, by_unit=False, rate_sigma=1e-3)
+    tardy = alignment.fitted(late_stretch(late, "steady", rate=rate), SETTINGS, by_unit=False, rate_sigma=1e-3)
+    assert prompt is not None
+    assert tardy is not None
+    assert prompt.turn.turning == pytest.approx(rate, rel=0.02)
+    assert prompt.turn.angle - tardy.turn.angle == pytest.approx(rate * late, abs=0.01)
+
+
+def test_given_a_turn_that_late_fixes_told_then_yaw_and_lateness_share_their_error():
+    nav = some_nav(SETUP, 5)
+    late_at, extra = SETUP.layout.index(LATENCY), SETUP.layout.extra(LATENCY)
+    P = nav.covariance.copy()
+    P[late_at, :] = P[:, late_at] = 0.0
+    P[late_at, late_at] = 0.1**2
+    extras = tuple(0.05 if n == extra else value for n, value in enumerate(nav.extras))
+    nav = nav._replace(covariance=P, extras=extras)
+    plain = placing.turned(nav, Turn(0.8 + 0.6 * 0.05, 0.02), SETUP.layout)
+    after = placing.turned(nav, Turn(0.8, 0.02, turning=0.6), SETUP.layout)
+    assert after.yaw == pytest.approx(plain.yaw)
+    assert after.covariance[8, 8] == pytest.approx(plain.covariance[8, 8] + (0.6 * 0.1) ** 2)
+    assert after.covariance[8, late_at] == pytest.approx(0.6 * 0.1**2)
+    vx, vy, _ = after.velocity
+    assert after.covariance[3:5, late_at] == pytest.approx(np.array((-vy, vx)) * 0.6 * 0.1**2)
+    assert np.linalg.eigvalsh(after.covariance)[0] > -1e-12
+
+
+def test_given_lateness_that_nobody_expected_then_it_is_unsure_between_what_was_expected_and_what_was_found():
+    nav = some_nav(SETUP, 5)
+    late_at, extra = SETUP.layout.index(LATENCY), SETUP.layout.extra(LATENCY)
+    P = nav.covariance.copy()
+    P[late_at, late_at] = 0.1**2
+    extras = tuple(0.0 if n == extra else value for n, value in enumerate(nav.extras))
+    nav = nav._replace(covariance=P, extras=extras)
+    assert lateness.doubted(nav, Lateness(0.3, 0.01), SETUP.layout) is nav
+    assert lateness.doubted(nav, Lateness(0.8, 5.0), SETUP.layout) is nav
+    after = lateness.doubted(nav, Lateness(0.8, 0.01), SETUP.layout)
+    assert after.extras[extra] == pytest.approx(0.4)
+    assert after.covariance[late_at, late_at] == pytest.approx(0.8**2 + 0.01**2)
+    assert np.count_nonzero(after.covariance[late_at]) == 1
+    assert np.count_nonzero(after.covariance[:, late_at]) == 1
+
+
 def test_given_a_heading_that_was_found_then_all_in_n_turns_with_it_and_only_yaw_is_less_sure():
     nav = some_nav(SETUP, 5)
-    after = placing.turned(nav, 0.8, 0.1)
+    after = placing.turned(nav, Turn(0.8, 0.1), SETUP.layout)
     spin = so3.from_rpy(0.0, 0.0, 0.8)
     assert after.position == pytest.approx(so3.rotate(spin, nav.position))
     assert after.velocity == pytest.approx(so3.rotate(spin, nav.velocity))
     assert after.body_velocity(ZERO) == pytest.approx(nav.body_velocity(ZERO))
     assert math.remainder(after.yaw - nav.yaw - 0.8, math.tau) == pytest.approx(0.0, abs=1e-9)
-    level = placing.turned(nav, 0.8, 0.0).covariance
+    level = placing.turned(nav, Turn(0.8, 0.0), SETUP.layout).covariance
     assert after.covariance[8, 8] == pytest.approx(level[8, 8] + 0.01)
     # velocity turns with yaw: its error is that of yaw across it
     vx, vy, _ = after.velocity

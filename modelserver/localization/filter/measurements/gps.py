@@ -198,13 +198,16 @@ class GpsVelocity(_AtAntenna):
         nav, layout = scene.nav, scene.layout
         expected = nav.point_velocity(self.lever)
         H = jacobian_of_point_velocity(nav, self.lever, layout.size)[:m]
-        # how late the place is says how late the velocity may be too, which counts while it changes
+        # as late as the place is the velocity is: in a turn it tells the heading of then, with every fix alike. What is
+        # felt along the way shakes too much to tell lateness by
+        turning = nav.turn_rate[2]
+        change = np.array((-turning * expected[1], turning * expected[0], 0.0))[:m]
         x, y, z = so3.rotate(nav.attitude, nav.force)
-        change = np.array((x, y, z - STANDARD_GRAVITY))[:m]
-        late_at = layout.index(LATENCY)
-        late = nav.covariance[late_at, late_at] + scene.extra(LATENCY) ** 2
-        R = R + late * np.outer(change, change)
-        return Compared(np.subtract(measured, expected)[:m], H, R)
+        rest = np.array((x, y, z - STANDARD_GRAVITY))[:m] - change
+        late_at, late = layout.index(LATENCY), scene.extra(LATENCY)
+        H[:, late_at] = -change
+        R = R + (nav.covariance[late_at, late_at] + late * late) * np.outer(rest, rest)
+        return Compared(np.subtract(measured, expected)[:m] + change * late, H, R)
 
 
 @register
