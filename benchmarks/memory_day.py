@@ -83,6 +83,8 @@ def day(hours: float) -> tuple[int, float, int]:
             begun += seconds / 40.0
             if since >= seconds / 4.0:
                 held.append(held_kb())
+            if sys.stderr.isatty() or hours > 1.0:
+                print(f"    {since / 3600.0:.1f} of {hours:g} h, {held_kb()} kB", file=sys.stderr, flush=True)
     assert loop.state.handler_errors == 0, dict(loop.state.rejected)
     return count, (held[-1] - held[0]) / (0.75 * hours), max(held) - held[0]
 

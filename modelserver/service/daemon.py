@@ -10,7 +10,6 @@ import signal
 import socket
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from modelserver import core
@@ -47,8 +46,8 @@ from modelserver.service.heard import Heard
 from modelserver.service.hooks import Hooks
 from modelserver.service.journal.place import make_writer
 from modelserver.service.journal.queue import NoJournal
-from modelserver.service.keeping.origin import OriginKeeper, default_directory
-from modelserver.service.keeping.state import StateKeeper
+from modelserver.service.keeping.store import SUBJECT as RESTART
+from modelserver.service.keeping.store import Store, open_store
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.service.probing.rivals import Rivals
 from modelserver.service.probing.start import probe, tell
@@ -408,21 +407,22 @@ def run(vehicle: Vehicle, url: str = "", file: str = "", notifier: Notifier | No
 
     `notifier` tells a service manager. Raises BusError where the bus cannot be joined, or does not deliver.
     """
-    config = vehicle.config
-    clock = SystemClock()
     notifier = notifier or Notifier.of_environment()
     notifier.starting("joining the bus")
-    directory = Path(config.state_directory) if config.state_directory else default_directory()
-    if directory is None:
-        log.warning("there is no home directory, so nothing is kept for a restart; set state_directory in vehicle file")
-    keeper = None
-    if directory is not None and config.origin.keep and config.origin.initial_utm is None:
-        keeper = OriginKeeper(directory, config.vehicle)
+    store = open_store(vehicle.config, localizes=vehicle.rig is not None)
+    try:
+        _serve(vehicle, store, notifier, url, file)
+    finally:
+        store.close()
+    log.info("ended")
+
+
+def _serve(vehicle: Vehicle, store: Store, notifier: Notifier, url: str, file: str) -> None:
+    config = vehicle.config
+    clock = SystemClock()
+    keeper, states, restart = store.origin, store.state, config.restart
     origin = keeper.load() if keeper else None
-    states, recalled, restart = None, None, config.restart
-    if directory is not None and restart.keep and vehicle.rig is not None:
-        states = StateKeeper(directory, config.vehicle)
-        recalled = states.recall(clock.now(), restart.max_pose_age_s, restart.max_age_s)
+    recalled = states.recall(clock.now(), restart.max_pose_age_s, restart.max_age_s) if states else None
 
     def keep(note: OriginLatched) -> None:
         if keeper is not None:
@@ -444,7 +444,7 @@ def run(vehicle: Vehicle, url: str = "", file: str = "", notifier: Notifier | No
         shared=frozenset({f"{config.lcm.channel_prefix}{config.sensors.joints.channel}"}),
     )
     supervision = Supervision(notifier, clock, lambda channel: loop.hears(channel))
-    journal = make_writer(config, file, clock)
+    journal = make_writer(config, file, clock, store.lock)
     loop = Loop(
         bus,
         clock,
@@ -464,6 +464,8 @@ def run(vehicle: Vehicle, url: str = "", file: str = "", notifier: Notifier | No
         ),
     )
     tell(findings, loop.notice)
+    if store.trouble:
+        loop.notice(RESTART, store.trouble)
     Rivals(socket.gethostname(), os.getpid(), loop.notice, clock).watch(bus.requests, config.lcm.channel_prefix)
     signal.signal(signal.SIGHUP, lambda *_: loop.reload())
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -501,4 +503,3 @@ def run(vehicle: Vehicle, url: str = "", file: str = "", notifier: Notifier | No
             states.close(core.kept(loop.state, clock.now()))
         if journal is not None:
             journal[1].close()
-    log.info("ended")

@@ -9,6 +9,7 @@ import lcm
 
 from modelserver.errors import BusError
 from modelserver.wire.channels import DEFAULT_URL
+from modelserver.wire.multicast import group_of, route
 
 RECEIVE_BUFFER_BYTES = 4 * 1024 * 1024
 """Kernel buffer asked for: the default loses an eighth of 20,000 messages a second (measured)."""
@@ -29,7 +30,8 @@ def open_lcm(url: str) -> lcm.LCM:
     except (OSError, RuntimeError) as error:
         raise BusError(
             f"cannot join the bus at {url}: {error}. Is the address right (udpm://239.255.76.67:7667?ttl=0), and has "
-            "the machine a multicast route? Try: ip route add 224.0.0.0/4 dev lo"
+            f"the machine a route for multicast? On one machine: sudo ip link set lo up multicast on && sudo "
+            f"{route(group_of(url))} (modelserver doctor says what is missing)"
         ) from None
 
 

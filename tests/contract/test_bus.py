@@ -226,6 +226,6 @@ def test_given_the_names_of_this_service_then_they_are_plain_and_short_enough_fo
 
 @pytest.mark.parametrize("url", ["nonsense://", "udpm://300.1.1.1:7667?ttl=0", "udpm://1.2.3.4:7667?ttl=0"])
 def test_given_a_bus_that_cannot_be_joined_then_the_error_says_what_to_look_at(url: str) -> None:
-    with pytest.raises(BusError, match="Try: ip route add") as caught:
+    with pytest.raises(BusError, match="sudo ip route replace") as caught:
         LcmBus(url)
     assert url in str(caught.value)

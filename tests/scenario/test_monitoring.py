@@ -308,7 +308,7 @@ def test_given_a_machine_without_a_route_then_the_daemon_refuses_and_doctors_com
     )
     codes = dict(line.split() for line in done.stdout.splitlines())
     assert (codes["run"], codes["before"], codes["mended"]) == ("1", "3", "0"), done.stdout + done.stderr
-    assert "ip route add 224.0.0.0/4 dev lo" in (tmp_path / "run.log").read_text()
+    assert "ip route replace 239.255.76.67/32 dev lo" in (tmp_path / "run.log").read_text()
     assert codes["after"] in ("0", "1")
     found = {each["subject"]: each for each in json.loads((tmp_path / "after.json").read_text())["findings"]}
     assert (found["own message"]["grade"], found["multicast route"]["grade"]) == ("ok", "ok")

@@ -225,9 +225,20 @@ def test_given_a_vehicle_file_that_is_wrong_then_the_journal_says_so_and_once_it
     site.machine.run("sed", "-i.good", "s/^base_frame:/base_farme:/", file)
     site.machine.systemctl("restart", "--no-block", SERVICE)
     site.until(lambda: "base_farme" in site.machine.journal(SERVICE, "--priority=err"), "nothing was said")
+    # it is not started anew for nothing, and says what it waits for
+    site.until(lambda: site.status().startswith("refused, waits for the file to be mended"), "the status does not tell")
+    waiting = site.main_pid()
     site.machine.run("mv", f"{file}.good", file)
     site.until(lambda: site.machine.shown(SERVICE, "ActiveState") == "active", "it did not come back")
+    assert site.main_pid() != waiting
     assert site.answered() > 0
+
+
+def test_given_the_installed_unit_then_doctor_looks_where_that_keeps_its_state(site: Site) -> None:
+    said = site.machine.run(site.program, "doctor", "-c", "/etc/modelserver/vehicle.yaml", check=False).stdout
+    assert re.search(r"^ok +state +/var/lib/modelserver may be written", said, re.MULTILINE), said
+    journal = r"^ok +journal +/var/lib/modelserver/journal-\S+ may be written; \d+ of 1024 MB are used"
+    assert re.search(journal, said, re.MULTILINE), said
 
 
 def test_given_a_record_then_the_journal_has_its_fields(site: Site) -> None:

@@ -55,7 +55,7 @@ def command(
 def _checked(file: str, variables: dict[str, str], strict: bool) -> tuple[Model | None, tuple[Problem, ...]]:
     try:
         if is_vehicle_file(file):
-            return _checked_vehicle(file, strict)
+            return checked_vehicle(file, strict)
         if os.path.isfile(file) and not os.path.getsize(file):
             fix = "see docs/geometry-files.md, or docs/vehicle-file.md for a vehicle file, for an example to begin with"
             return None, (Problem(Severity.ERROR, "the file is empty", Source(file), fix),)
@@ -74,7 +74,8 @@ def is_vehicle_file(file: str) -> bool:
     return all(re.search(rb"^%b\s*:" % key, head, re.MULTILINE) for key in (b"vehicle", b"base_frame"))
 
 
-def _checked_vehicle(file: str, strict: bool) -> tuple[Model | None, tuple[Problem, ...]]:
+def checked_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tuple[Problem, ...]]:
+    """Return the model of a vehicle file, None where anything is wrong, and every problem. Raises OSError."""
     # imported here: a geometry file needs neither the configuration's libraries nor geodesy
     from modelserver.config import load_partly, with_lines
     from modelserver.service.daemon import load_vehicle

@@ -1,6 +1,7 @@
 """The `modelserver` command: runs the subcommand's module, and turns errors into one readable line.
 
-Exit codes: 0 done, 1 the input is wrong or nobody answered, 2 wrong usage, 130 interrupted.
+Exit codes: 0 done, 1 the input is wrong or nobody answered, 2 wrong usage, 130 interrupted. `doctor` grades what it
+finds by its own: 1 warnings, 3 errors.
 """
 
 from __future__ import annotations

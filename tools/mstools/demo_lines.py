@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 
+from modelserver.wire.multicast import route
 from mstools.demo_children import DemoError
 
 BUS_GROUP = "239.255.76.67"
@@ -73,8 +74,8 @@ def _checked(group: str, held: contextlib.ExitStack) -> int:
     if not hears_itself(group, port):
         raise DemoError(
             f"multicast does not work on this machine: what is sent to {group} does not come back. The demo cannot do "
-            "without: LCM needs it, and so does CAN over UDP. Try: ip link set lo multicast on; "
-            "ip route add 224.0.0.0/4 dev lo"
+            "without: LCM needs it, and so does CAN over UDP. Try: sudo ip link set lo up "
+            f"multicast on && sudo {route(group)}"
         )
     return port
 

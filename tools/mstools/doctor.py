@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
+import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from modelserver.errors import ConfigError
+from modelserver.errors import ConfigError, nearest_names
 from mstools.asking import JsonOption, PrefixOption, UrlOption
 from mstools.output import counted, safe
 
@@ -19,7 +22,7 @@ if TYPE_CHECKING:
 
 EXIT_WARNINGS = 1
 EXIT_ERRORS = 3
-"""2 is wrong usage, as for every command."""
+"""2 is wrong usage, as for every command; and a vehicle file that is not there, with which nothing is looked at."""
 
 WORDS = ("ok", "note", "warning", "error")
 """What the grades of findings are called, by their number."""
@@ -36,18 +39,41 @@ def command(
     """Look at the bus, the clock, and what a vehicle file needs of this machine; print the commands that mend it.
 
     It sends a message to itself, and asks who answers: two daemons on one bus are found. Nothing is changed. With
-    a vehicle file also: does it load, may the state be kept, are the drivers' lines there and may they be used.
-    Run it as the user that the service runs as.
+    a vehicle file also: does it load, may state and journal be kept, is the key file well, are the drivers' lines
+    there and may they be used. Run it as the user that the service runs as; for the unit's own, as root.
 
-    Exit code: 0 nothing to mend, 1 warnings, 3 errors (2 is wrong usage).
+    Exit code: 0 nothing to mend, 1 warnings, 3 errors. 2 is wrong usage, also a vehicle file that is not there: then
+    nothing was looked at. (Other commands have 1 for wrong input, which here would look like a warning.)
 
     Example: modelserver doctor -c config/raptor/vehicle.yaml
     """
+    if config is not None:
+        check_there(config)
     findings = examine(config, url, prefix)
     typer.echo(json.dumps(as_data(findings), indent=2) if as_json else describe(findings))
     code = exit_code(findings)
     if code:
         raise typer.Exit(code)
+
+
+def check_there(config: Path) -> None:
+    """Raise typer.BadParameter, a usage error, where there is no such vehicle file.
+
+    One that is there and may not be read is a finding.
+    """
+    try:
+        wrong = f"{config} is a folder; name the vehicle file in it" if os.path.isdir(config) else ""
+        os.stat(config)
+    except (FileNotFoundError, NotADirectoryError):
+        near: tuple[str, ...] = ()
+        with suppress(OSError):
+            near = nearest_names(config.name, os.listdir(config.parent), 1)
+        offer = f"; did you mean {config.parent / near[0]}?" if near else ""
+        wrong = f"there is no vehicle file {config}{offer}"
+    except OSError:
+        return
+    if wrong:
+        raise typer.BadParameter(safe(wrong), param_hint="--config")
 
 
 def examine(config: Path | None, url: str, prefix: str) -> tuple[Finding, ...]:
@@ -69,9 +95,14 @@ def examine(config: Path | None, url: str, prefix: str) -> tuple[Finding, ...]:
     if config is not None:
         try:
             vehicle = read_vehicle(config)
+        except OSError as error:
+            seen = f"{safe(str(config))} cannot be read: {error.strerror}"
+            # which of the folders around it is closed, if it is not the file
+            command = f"{'sudo chmod a+r' if os.path.exists(config) else 'sudo namei -l'} {shlex.quote(str(config))}"
+            found.append(Finding(Grade.ERROR, "vehicle file", seen, "the service does not start without it", command))
         except ConfigError as error:
             seen = f"{safe(str(config))} is wrong: {safe(str(error.problems[0].message))}"
-            command = f"modelserver check {safe(str(config))}"
+            command = f"modelserver check {shlex.quote(str(config))}"
             found.append(Finding(Grade.ERROR, "vehicle file", seen, "the service does not start with it", command))
     if vehicle is not None:
         url, prefix = url or vehicle.lcm.url, prefix or vehicle.lcm.channel_prefix

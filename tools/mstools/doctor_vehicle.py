@@ -1,11 +1,11 @@
-"""What `modelserver doctor` says of a vehicle file: does it load, may state be kept, are the drivers' lines there."""
+"""What `modelserver doctor` says of a vehicle file: does it load, and are the drivers' lines there."""
 
 from __future__ import annotations
 
 import os
 import platform
 import re
-import shutil
+import shlex
 from collections.abc import Iterable, Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -13,17 +13,14 @@ from typing import TYPE_CHECKING
 
 from modelserver.config import VehicleConfig, load_config
 from modelserver.errors import ConfigError, GeometryError, Problem, Severity
-from modelserver.service.keeping.origin import default_directory
 from modelserver.service.probing.findings import Finding, Grade
 from modelserver.service.probing.probe import Interface
 from modelserver.version import __version__
+from mstools.doctor_files import file_findings
 from mstools.output import counted
 
 if TYPE_CHECKING:
     from msdrivers.settings import DriverSettings
-
-LEAST_FREE = 200_000_000
-"""Bytes of room on the disk of the state below which it is told."""
 
 
 def versions() -> Finding:
@@ -42,10 +39,9 @@ def vehicle_findings(vehicle: VehicleConfig, file: Path) -> tuple[Finding, ...]:
     from modelserver.service.probing.machine import interfaces
 
     problems, drivers = _read(vehicle, file)
-    directory = Path(vehicle.state_directory) if vehicle.state_directory else default_directory()
     return (
         file_finding(problems, file),
-        *state_findings(directory),
+        *file_findings(vehicle, file),
         *line_findings(drivers, tuple(interfaces())),
     )
 
@@ -69,7 +65,7 @@ def _read(vehicle: VehicleConfig, file: Path) -> tuple[tuple[Problem, ...], Iter
 def file_finding(problems: Iterable[Problem], file: Path) -> Finding:
     """Return what is to be said of a vehicle file with these problems."""
     problems = tuple(problems)
-    command = f"modelserver check {file}"
+    command = f"modelserver check {shlex.quote(str(file))}"
     errors = [each for each in problems if each.severity is Severity.ERROR]
     warnings = [each for each in problems if each.severity is Severity.WARNING]
     if errors:
@@ -79,33 +75,6 @@ def file_finding(problems: Iterable[Problem], file: Path) -> Finding:
         seen = f"{file} loads, with {counted(len(warnings), 'warning')}, the first: {warnings[0].message}"
         return Finding(Grade.WARNING, "vehicle file", seen, "it may not be what is meant", command)
     return Finding(Grade.OK, "vehicle file", f"{file} loads, and its geometry")
-
-
-def state_findings(directory: Path | None) -> Iterator[Finding]:
-    """Yield what is to be said of the place where state is kept; None: there is no home to keep it in."""
-    subject = "state"
-    if directory is None:
-        why = "the origin is lost with every restart"
-        yield Finding(Grade.WARNING, subject, "there is no home directory", why, "set state_directory: /var/lib/...")
-        return
-    # what is not there yet is made below the first folder that is
-    there = next(each for each in (directory, *directory.parents) if each.exists())
-    if not there.is_dir():
-        why = "the origin is lost with every restart"
-        yield Finding(Grade.WARNING, subject, f"{there} is no folder", why, f"mv {there} {there}.aside")
-        return
-    if not os.access(there, os.W_OK | os.X_OK):
-        why = "the origin is lost with every restart"
-        command = f"sudo mkdir -p {directory} && sudo chown {os.geteuid()} {directory}"
-        yield Finding(Grade.WARNING, subject, f"{directory} may not be written by this user", why, command)
-        return
-    free = shutil.disk_usage(there).free
-    if free < LEAST_FREE:
-        seen = f"{directory} has {free / 1e6:.0f} MB of room left"
-        command = f"du -xh --max-depth=2 {there} | sort -h | tail"
-        yield Finding(Grade.WARNING, subject, seen, "a full disk keeps neither origin nor journal", command)
-        return
-    yield Finding(Grade.OK, subject, f"{directory} may be written, {free / 1e9:.1f} GB free")
 
 
 def line_findings(drivers: Iterable[DriverSettings], networks: Iterable[Interface]) -> Iterator[Finding]:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from msdrivers.links import Link
     from msdrivers.registry import Kind
     from msdrivers.settings import DriverSettings
+    from mstools.refusal import Start
 
 COMMANDS_LOOK_S = 0.02
 """How often a driver that takes commands looks for them."""
@@ -72,6 +73,9 @@ def command(
 
     modelserver driver imu -c vehicle.yaml --hard-iron --seconds 90
     """
+    from modelserver.service.supervision.notify import Notifier
+    from mstools.refusal import Start
+
     check_log(log_level, log_format)
     if list_ports:
         show_ports()
@@ -84,7 +88,9 @@ def command(
         raise typer.BadParameter("a recording that is played is not recorded again", param_hint="--record-raw")
     if all_axes and not hard_iron:
         raise typer.BadParameter("belongs to --hard-iron, which is not given", param_hint="--all-axes")
-    vehicle, settings = load_driver(name, config)
+    start = Start(config, Notifier.of_environment())
+    with start.patient():
+        vehicle, settings = load_driver(name, config)
     if hard_iron and not settings.kind.hard_iron:
         raise typer.BadParameter(f"a {settings.kind.name} has no such procedure", param_hint="--hard-iron")
     set_up(log_level, log_format, f"modelserver-driver-{settings.name}")
@@ -96,7 +102,7 @@ def command(
 
             run_hard_iron(settings, link, seconds, all_axes)
             return
-        run(vehicle, settings, link, config.parent, url)
+        run(vehicle, settings, link, config.parent, url, start)
 
 
 def show_ports() -> None:
@@ -210,7 +216,9 @@ def _line(
     return RecordingLink(link, form, writer, SystemTime())
 
 
-def run(vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], folder: Path, url: str) -> None:
+def run(
+    vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], folder: Path, url: str, start: Start
+) -> None:
     """Run a driver on a line until it is told to end. Raises ConfigError, OSError, BusError."""
     from modelserver.service.supervision.notify import Notifier
     from modelserver.wire.provider import open_lcm, resolve_url
@@ -220,7 +228,10 @@ def run(vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], folde
     from mstools.driver_supervised import DriverSupervision
 
     kind = settings.kind
-    station = station_of(settings, folder)
+    with start.patient():
+        if database := getattr(settings.station, "dbc", ""):
+            start.needs(folder / Path(database).expanduser())
+        station = station_of(settings, folder)
     bus = open_lcm(resolve_url(url or vehicle.lcm.url))
     publisher = Publisher(bus.publish, channels_of(vehicle, settings), vehicle.lcm.channel_prefix)
     how = RunnerSettings(settings.name, kind.name)

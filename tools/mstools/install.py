@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-import stat
-import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from modelserver.errors import ConfigError, ModelServerError, Severity, shown
+from modelserver.errors import ConfigError, Severity, shown
 from mstools import install_files
+from mstools.gathered import Gathered
+from mstools.install_place import check_installation, examples, program
 from mstools.install_plan import (
     CONFIGURATION,
     LOOPBACK,
@@ -28,6 +28,7 @@ from mstools.install_plan import (
     Plan,
     Write,
     digest,
+    in_root,
     plan_install,
 )
 from mstools.install_steps import carry_out, check_may, configuration_there, read_facts, read_manifest, show
@@ -35,11 +36,6 @@ from mstools.install_steps import carry_out, check_may, configuration_there, rea
 if TYPE_CHECKING:
     from modelserver.config import VehicleConfig
     from msdrivers.settings import DriverSettings
-
-ELSEWHERE = (
-    "Install to a folder that all may read: sudo python3 -m venv /opt/modelserver && sudo /opt/modelserver/bin/pip "
-    "install modelserver, then sudo /opt/modelserver/bin/modelserver install"
-)
 
 DROP_INS = (install_files.REALTIME, install_files.CREDENTIAL)
 
@@ -86,38 +82,74 @@ def command(
 def show_or_do(plan: Plan, root: Path, dry_run: bool) -> None:
     """Print a plan, or carry it out."""
     if dry_run:
-        show(plan)
+        show(plan, root)
         typer.echo("nothing was done")
     else:
         carry_out(plan, root)
 
 
 def planned(vehicle: Path | None, drivers: str, serial: Mapping[str, str], start: bool, root: Path) -> Plan:
-    """Return what there is to do. Raises ModelServerError, ConfigError, GeometryError, OSError."""
-    check_installation()
+    """Return what there is to do.
+
+    Raises ConfigError with everything that stands in the way; ModelServerError, OSError.
+    """
+    gathered = Gathered()
+    with gathered.of("this installation"):
+        check_installation()
     found = configuration_there(root)
     if vehicle is None and found is None:
-        raise ModelServerError(
-            f"name the vehicle file: --vehicle FILE; there is none in {CONFIGURATION} yet, and examples are in "
-            f"{examples()}"
-        )
-    given = None if vehicle is None else Made.of(vehicle)
-    copied = [] if given is None else install_files.configuration(sources_of(given), {key_of(given)})
+        there = in_root(str(root), CONFIGURATION)
+        why = f"there is no vehicle file in {there} yet, and none is given"
+        gathered.add("--vehicle", why, f"--vehicle FILE; examples are in {examples()}")
+    given = None if vehicle is None else _made(vehicle, gathered)
+    copied: list[Write] = []
+    if given is not None:
+        with gathered.of(str(vehicle)):
+            copied = install_files.configuration(sources_of(given), {key_of(given)})
+    made = given
     # the one that will be in force: one that was edited stays
-    if given is not None and (found is None or _is_ours(found, given.path, root)):
-        made = given
-    else:
-        assert found is not None
-        made = Made.of(found)
-        geometry = Path(made.config.geometry).resolve()
-        inside = Path("/") / geometry.relative_to(root) if geometry.is_relative_to(root) else geometry
-        install_files.check_seen([(str(inside), "the geometry")], f"Copy it to {CONFIGURATION}")
-    names = install_files.check_drivers(drivers, made.config.drivers)
-    broken = [name for name in names if name not in made.drivers]
-    if broken:
-        raise ModelServerError(f"driver {broken[0]} is not described well: modelserver check {made.path}")
+    if found is not None and (vehicle is None or (given is not None and not _is_ours(found, vehicle, root))):
+        made = _made(found, gathered)
+        with gathered.of(str(found)):
+            _check_geometry(made, root)
+    known = made.config.drivers if made is not None else _names_in(vehicle or found)
+    names = tuple(known or ())
+    if known is not None:
+        with gathered.of("--drivers"):
+            names = install_files.check_drivers(drivers, known)
+    if made is not None:
+        with gathered.of("commands.key_file"):
+            install_files.credential(installed_key(made))
+        with gathered.of("--serial"):
+            install_files.check_serial(serial, made.serial_of(names))
+    gathered.check()
+    assert made is not None
     facts = read_facts([*(each.path for each in copied), RULES, SYSCTL, *_units(), *DROP_INS], root)
     return _plan(copied, made, names, serial, start, facts)
+
+
+def _made(vehicle: Path, gathered: Gathered) -> Made | None:
+    made: list[Made] = []
+    with gathered.of(str(vehicle)):
+        made.append(Made.of(vehicle))
+    return made[0] if made else None
+
+
+def _names_in(vehicle: Path | None) -> Iterable[str] | None:
+    """Return the drivers in a vehicle file of which something is wrong; None where they cannot be made out."""
+    from modelserver.config import load_partly
+
+    with contextlib.suppress(ConfigError, OSError):
+        config = None if vehicle is None else load_partly(vehicle)[0]
+        return None if config is None else config.drivers
+    return None
+
+
+def _check_geometry(made: Made | None, root: Path) -> None:
+    if made is not None:
+        geometry = Path(made.config.geometry).resolve()
+        inside = Path("/") / geometry.relative_to(root) if geometry.is_relative_to(root) else geometry
+        install_files.check_seen([(str(inside), "the geometry")], f"copy it to {CONFIGURATION}", str(made.path))
 
 
 def _plan(
@@ -164,15 +196,15 @@ class Made:
     def of(cls, vehicle: Path) -> Made:
         """Return a vehicle file with everything in it checked. Raises ConfigError, GeometryError, OSError."""
         from modelserver.config import load_config
-        from modelserver.service.daemon import load_vehicle
         from msdrivers.settings import Place, read_drivers
+        from mstools.check import checked_vehicle
 
+        _, problems = checked_vehicle(str(vehicle))
+        errors = [problem for problem in problems if problem.severity is Severity.ERROR]
+        if errors:
+            raise ConfigError(errors)
         config = load_config(vehicle)
-        load_vehicle(config, str(vehicle)).gate(0, str(vehicle))
-        drivers, problems = read_drivers(config.drivers, Place(str(vehicle)))
-        if any(problem.severity is Severity.ERROR for problem in problems):
-            raise ConfigError(problems)
-        return cls(vehicle, config, drivers)
+        return cls(vehicle, config, read_drivers(config.drivers, Place(str(vehicle)))[0])
 
     def serial_of(self, names: Iterable[str]) -> list[install_files.SerialDriver]:
         """Return those of the named drivers that are on serial ports."""
@@ -183,7 +215,8 @@ class Made:
 def sources_of(made: Made) -> dict[str, bytes]:
     """Return a vehicle's files by their paths relative to the vehicle file, which itself is vehicle.yaml.
 
-    Raises ModelServerError for one outside the folder of the vehicle file, which would not be found again; OSError.
+    Raises ConfigError for those outside the folder of the vehicle file, which would not be found again, and those that
+    cannot be read; OSError.
     """
     import yaml
 
@@ -196,18 +229,24 @@ def sources_of(made: Made) -> dict[str, bytes]:
     named += [key] if (key := key_of(made)) and not Path(key).is_absolute() else []
     found = {"vehicle.yaml": text}
     folder = vehicle.resolve().parent
+    gathered = Gathered()
     for name in dict.fromkeys(named):
         path = Path(name)
         if path.is_absolute():
-            install_files.check_seen([(str(path), f"a file that {vehicle} names")], "Put it beside the vehicle file")
+            with gathered.of(str(vehicle)):
+                seen = [(str(path), "a file that it names")]
+                install_files.check_seen(seen, "put it beside the vehicle file", str(vehicle))
             continue
         whole = os.path.normpath(folder / path)
-        if Path(whole).parent != folder and folder not in Path(whole).parents:
-            raise ModelServerError(f"{vehicle} names {shown(name)}, outside its folder; put it beside the vehicle file")
         relative = os.path.relpath(whole, folder)
-        if relative in found or relative == "installed.json":
-            raise ModelServerError(f"{vehicle} names {shown(name)}, a name that is taken; give the file another one")
-        found[relative] = Path(whole).read_bytes()
+        if Path(whole).parent != folder and folder not in Path(whole).parents:
+            gathered.add(str(vehicle), f"it names {shown(name)}, outside its folder", "put it beside the vehicle file")
+        elif relative in found or relative == "installed.json":
+            gathered.add(str(vehicle), f"it names {shown(name)}, a name that is taken", "give the file another one")
+        else:
+            with gathered.of(whole):
+                found[relative] = Path(whole).read_bytes()
+    gathered.check()
     return found
 
 
@@ -236,51 +275,10 @@ def serial_of(given: Iterable[str] | None) -> dict[str, str]:
     return found
 
 
-def program() -> str:
-    """Return the path of this installation's command."""
-    return os.path.join(os.path.dirname(os.path.abspath(sys.executable)), "modelserver")
-
-
-def check_installation() -> None:
-    """Raise ModelServerError where the units would not see this installation, or could not read it."""
-    package = str(Path(str(files("modelserver"))).resolve())
-    paths = [
-        (program(), "the command of this installation"),
-        (os.path.realpath(sys.executable), "its Python"),
-        (sys.base_prefix, "its Python's library"),
-        (package, "its package"),
-    ]
-    install_files.check_seen(paths, ELSEWHERE)
-    if not os.path.isfile(program()):
-        raise ModelServerError(f"there is no {program()}: this is not an installation of the package. {ELSEWHERE}")
-    for path, what in paths:
-        closed = closed_to_others(path)
-        if closed:
-            raise ModelServerError(
-                f"{what} is {path}, and the service's user may not read {closed}: chmod -R o+rX {closed}"
-            )
-
-
-def closed_to_others(path: str) -> str:
-    """Return which part of a path keeps other users from it, empty where none does."""
-    for part in (*reversed(Path(path).parents), Path(path)):
-        mode = part.stat().st_mode
-        needed = stat.S_IXOTH if stat.S_ISDIR(mode) else stat.S_IROTH
-        if not mode & needed:
-            return str(part)
-    return ""
-
-
 def templates() -> dict[str, str]:
     """Return the units as they are in the package, or beside it in a source tree."""
     folder = examples() / "systemd"
     return {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.service"))}
-
-
-def examples() -> Path:
-    """Return the folder of vehicle files and units that comes with the package."""
-    installed = Path(str(files("modelserver"))) / "share" / "config"
-    return installed if installed.is_dir() else Path(__file__).resolve().parents[2] / "config"
 
 
 def _is_ours(found: Path, vehicle: Path, root: Path) -> bool:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NoReturn
 from urllib.parse import parse_qs, urlsplit
 
-from modelserver.errors import ModelServerError, nearest_names, shown
+from modelserver.errors import ConfigError, ModelServerError, Problem, Severity, Source, nearest_names, shown
+from modelserver.wire.multicast import group_of
 from mstools.install_plan import CONFIGURATION, DRIVER, LOOPBACK, RULES, SERVICE, SYSCTL, UNITS, Facts, Write
 
 BY_ID: Final = "/dev/serial/by-id/"
@@ -46,33 +47,63 @@ def hidden_by(path: str) -> str:
     return next((why for folder, why in HIDDEN.items() if path == folder or path.startswith(f"{folder}/")), "")
 
 
-def check_seen(paths: Iterable[tuple[str, str]], fix: str) -> None:
-    """Raise ModelServerError for the first path that the service would not see. `paths` are each with what it is."""
-    for path, what in paths:
-        why = hidden_by(path)
-        if why:
-            raise ModelServerError(f"{what} is {path}, which the hardened units do not see ({why}=yes). {fix}")
+def check_seen(paths: Iterable[tuple[str, str]], fix: str, whose: str = "this installation") -> None:
+    """Raise ConfigError where the service would not see some of the paths; they are given each with what it is.
+
+    `whose` they are is the place that the error names, `fix` what to do about it.
+    """
+    unseen = [(path, what, hidden_by(path)) for path, what in paths if hidden_by(path)]
+    if unseen:
+        which = ", ".join(f"{what} is {path}" for path, what, _ in unseen)
+        why = " and ".join(f"{setting}=yes" for setting in dict.fromkeys(setting for *_, setting in unseen))
+        _refuse(f"{which}, which the hardened units do not see ({why})", whose, fix)
+
+
+def check_program(program: str) -> None:
+    """Raise ConfigError for the path of a command that cannot stand in a unit."""
+    if not re.fullmatch(r"/[A-Za-z0-9/._+@-]+", program):
+        fix = "install to a folder without blanks and the like"
+        _refuse(f"{program!r} cannot stand in a unit", "this installation", fix)
 
 
 def check_drivers(wanted: str, known: Iterable[str]) -> tuple[str, ...]:
-    """Return the drivers that `wanted` names: all, none, or names with commas. Raises ModelServerError."""
+    """Return the drivers that `wanted` names: all, none, or names with commas. Raises ConfigError, with all problems.
+
+    A driver that is called all or none can be named beside others alone.
+    """
     known = tuple(known)
-    names = tuple(name.strip() for name in wanted.split(",") if name.strip())
+    names = tuple(dict.fromkeys(name.strip() for name in wanted.split(",") if name.strip()))
     if names in (("all",), ()):
         names = known
     elif names == ("none",):
         names = ()
+    problems = []
     for name in names:
-        if name not in known:
+        if name in ("all", "none") and name not in known:
+            others = ",".join(each for each in names if each not in ("all", "none"))
+            why = f"{name} stands beside other names in {shown(wanted, 80)}, and means "
+            why += "every driver" if name == "all" else "no driver at all"
+            fix = f"--drivers {name}, or only the names" + (f": --drivers {others}" if others else "")
+            problems.append(_problem(why, "--drivers", fix))
+        elif name not in known:
             near = nearest_names(name, known)
             offer = f"did you mean {near[0]}?" if near else f"it has: {', '.join(known) or 'none'}"
-            raise ModelServerError(f"the vehicle file has no driver {shown(name, 40)}; {offer}")
-        if not INSTANCE.fullmatch(name):
-            raise ModelServerError(
-                f"driver {shown(name, 40)} cannot be the name of a unit; rename it in the vehicle file with letters, "
-                "digits, _ . : and - only"
-            )
+            problems.append(_problem(f"the vehicle file has no driver {shown(name, 40)}; {offer}", "--drivers"))
+        elif not INSTANCE.fullmatch(name):
+            why = f"driver {shown(name, 40)} cannot be the name of a unit"
+            fix = "rename it in the vehicle file with letters, digits, _ . : and - only"
+            problems.append(_problem(why, "--drivers", fix))
+    if problems:
+        raise ConfigError(problems)
     return names
+
+
+def _refuse(why: str, whose: str, fix: str = "") -> NoReturn:
+    raise ConfigError([_problem(why, whose, fix)])
+
+
+def _problem(why: str, whose: str, fix: str = "") -> Problem:
+    return Problem(Severity.ERROR, why, Source(whose), fix)
 
 
 def loopback_group(url: str) -> str:
@@ -81,14 +112,12 @@ def loopback_group(url: str) -> str:
     ttl = parse_qs(parts.query).get("ttl", ["0"])[-1]
     if parts.scheme != "udpm" or ttl.strip() not in ("", "0"):
         return ""
-    group = parts.netloc.rpartition(":")[0] or parts.netloc
-    return group if re.fullmatch(r"2(2[4-9]|3[0-9])(\.[0-9]{1,3}){3}", group) else "239.255.76.67"
+    return group_of(url)
 
 
 def units(templates: Mapping[str, str], program: str, group: str, ip: str, drivers: bool) -> list[Write]:
     """Return the units with what is this installation's in them. `program` is the path of its command."""
-    if not re.fullmatch(r"/[A-Za-z0-9/._+@-]+", program):
-        raise ModelServerError(f"{program!r} cannot stand in a unit: install to a folder without blanks and the like")
+    check_program(program)
     wanted = {SERVICE: "the service"}
     wanted |= {DRIVER: "one driver, by its name"} if drivers else {}
     wanted |= {LOOPBACK: "multicast on the loopback interface"} if group else {}
@@ -160,9 +189,7 @@ def rules(drivers: Iterable[SerialDriver], given: Mapping[str, str], facts: Fact
     """
     lines, notes = [], []
     drivers = list(drivers)
-    for name in given:
-        if name not in [each.name for each in drivers]:
-            raise ModelServerError(f"--serial names {shown(name, 40)}, which is no driver on a serial port here")
+    check_serial(given, drivers)
     for driver in drivers:
         own = f"{OWN_NAMES}{driver.name}"
         device = given.get(driver.name, "") or _id_of(driver.port, facts)
@@ -184,6 +211,26 @@ def rules(drivers: Iterable[SerialDriver], given: Mapping[str, str], facts: Fact
     return [Write(RULES, text.encode(), "names for the serial devices", summary)], notes
 
 
+def check_serial(given: Mapping[str, str], drivers: Iterable[SerialDriver]) -> None:
+    """Raise ConfigError for every device of --serial that cannot be. `given` are names by driver."""
+    known = [each.name for each in drivers]
+    problems = []
+    for name, device in given.items():
+        if name not in known:
+            near = nearest_names(name, known)
+            offer = f"did you mean {near[0]}?" if near else f"there are: {', '.join(known) or 'none'}"
+            why = f"it names {shown(name, 40)}, which is no driver on a serial port here; {offer}"
+            problems.append(_problem(why, "--serial"))
+        if not _DEVICE_NAME.fullmatch(device.removeprefix(BY_ID)):
+            problems.append(_problem(_odd(device.removeprefix(BY_ID)), "--serial"))
+    if problems:
+        raise ConfigError(problems)
+
+
+def _odd(device: str) -> str:
+    return f"{shown(device)} is no name below {BY_ID}: letters, digits and #+-.:=@_ only"
+
+
 def _id_of(port: str, facts: Facts) -> str:
     """Return the name below /dev/serial/by-id of a port, empty where there is none."""
     if port.startswith(BY_ID):
@@ -193,7 +240,7 @@ def _id_of(port: str, facts: Facts) -> str:
 
 def _rule(name: str, device: str) -> str:
     if not _DEVICE_NAME.fullmatch(device):
-        raise ModelServerError(f"{shown(device)} is no name below {BY_ID}: letters, digits and #+-.:=@_ only")
+        raise ModelServerError(_odd(device))
     # the link by id was made by systemd's own rules, from vendor, product and serial number
     match = f'SUBSYSTEM=="tty", SYMLINK=="{BY_ID.removeprefix("/dev/")}{device}"'
     # ModemManager would speak to it otherwise, and some devices never recover from that

@@ -110,8 +110,8 @@ class Manifest:
         return (json.dumps(content, indent=1) + "\n").encode()
 
     @classmethod
-    def decoded(cls, raw: bytes) -> Manifest:
-        """Return the one that a file holds. Raises ModelServerError for a damaged one."""
+    def decoded(cls, raw: bytes, file: str = MANIFEST) -> Manifest:
+        """Return the one that a `file` holds. Raises ModelServerError for a damaged one."""
         try:
             content = json.loads(raw)
             if content["version"] != MANIFEST_VERSION:
@@ -120,7 +120,7 @@ class Manifest:
             return cls(files, tuple(map(_unit, content["units"])), tuple(map(_folder, content["folders"])))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ModelServerError(
-                f"{MANIFEST}, which holds what was installed, is damaged ({error}); remove it, and what was written "
+                f"{file}, which holds what was installed, is damaged ({error}); remove it, and what was written "
                 "counts as your own"
             ) from None
 
@@ -148,6 +148,11 @@ class Facts:
     realtime: bool = False
     is_live: bool = True
     root: str = "/"
+
+
+def in_root(root: str, path: str) -> str:
+    """Return where an absolute path of a system is, whose root is another folder perhaps."""
+    return path if root == "/" else f"{root.rstrip('/')}{path}"
 
 
 def digest(content: bytes) -> str:
@@ -210,7 +215,9 @@ def plan_uninstall(facts: Facts, *, purge: bool) -> Plan:
     """
     manifest = facts.manifest
     if not manifest.files:
-        raise ModelServerError(f"there is nothing to take back: {MANIFEST} tells of no installation")
+        raise ModelServerError(
+            f"there is nothing to take back: {in_root(facts.root, MANIFEST)} tells of no installation"
+        )
     steps: list[Step] = []
     if manifest.units:
         ended = _systemctl(facts, "they end, and start no more", "disable", *_now(facts), *manifest.units)
@@ -236,7 +243,7 @@ def plan_uninstall(facts: Facts, *, purge: bool) -> Plan:
     if SYSCTL in removed:
         notes.append("the kernel's limit of receive buffers is as it was set until the machine starts anew")
     if not purge:
-        notes.append(f"what the service kept is still in {STATE[0]}; --purge removes it too")
+        notes.append(f"what the service kept is still in {in_root(facts.root, STATE[0])}; --purge removes it too")
     return Plan(tuple(steps), tuple(notes))
 
 

@@ -9,6 +9,7 @@ import subprocess
 import tempfile
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -29,6 +30,7 @@ from mstools.install_plan import (
     Write,
     digest,
     folders_around,
+    in_root,
 )
 from mstools.output import safe
 
@@ -69,12 +71,12 @@ def read_facts(paths: Iterable[str], root: Path) -> Facts:
 def read_manifest(root: Path) -> Manifest:
     """Return what was installed below `root`; an empty one where nothing was. Raises ModelServerError."""
     raw = _content(below(root, MANIFEST))
-    return Manifest() if raw is None else Manifest.decoded(raw)
+    return Manifest() if raw is None else Manifest.decoded(raw, str(below(root, MANIFEST)))
 
 
 def below(root: Path, path: str) -> Path:
     """Return where an absolute path of the system is below its root."""
-    return root / path.lstrip("/")
+    return Path(in_root(str(root), path))
 
 
 def check_may(root: Path, command: str) -> None:
@@ -83,10 +85,10 @@ def check_may(root: Path, command: str) -> None:
         raise ModelServerError(f"this changes /etc and needs root: sudo {command} (to see what it would do: --dry-run)")
 
 
-def show(plan: Plan) -> None:
-    """Print a plan."""
+def show(plan: Plan, root: Path) -> None:
+    """Print a plan for the system below `root`."""
     for step in plan.steps:
-        _say(str(step))
+        _say(_words(step, root))
     for note in plan.notes:
         _say(f"note    {note}")
 
@@ -94,10 +96,15 @@ def show(plan: Plan) -> None:
 def carry_out(plan: Plan, root: Path) -> None:
     """Do what a plan says, telling each step. Raises ModelServerError, OSError at the first that fails."""
     for step in plan.steps:
-        _say(str(step))
+        _say(_words(step, root))
         _carry_out(step, root)
     for note in plan.notes:
         _say(f"note    {note}")
+
+
+def _words(step: Step, root: Path) -> str:
+    """Return a step for people, with the path that is touched."""
+    return str(step if isinstance(step, Command) else replace(step, path=str(below(root, step.path))))
 
 
 def _carry_out(step: Step, root: Path) -> None:

@@ -28,8 +28,9 @@ def command(
     """Run the service for a vehicle file, until SIGTERM or Ctrl-C.
 
     Loads the geometry, listens to the sensors, broadcasts POSE and answers requests. Refuses to start where the
-    vehicle file or the geometry is wrong, and says everything that is. Logs go to stderr. SIGHUP has it read the
-    geometry file anew: all of it is used, or, where it is wrong, nothing changes and the log says why.
+    vehicle file or the geometry is wrong, and says everything that is; under a service manager, which would start it
+    anew at once, it ends only when one of the files has changed, or after 30 s. Logs go to stderr. SIGHUP has it read
+    the geometry file anew: all of it is used, or, where it is wrong, nothing changes and the log says why.
 
     Example: modelserver run -c config/raptor/vehicle.yaml
     """
@@ -40,11 +41,17 @@ def command(
     from modelserver.config import load_config
     from modelserver.service import daemon
     from modelserver.service.supervision.notify import Notifier
+    from mstools.refusal import Start
 
     set_up(log_level, log_format)
     notifier = Notifier.of_environment()
     notifier.starting(f"reading {config}")
-    vehicle = daemon.load_vehicle(load_config(config), str(config))
+    start = Start(config, notifier)
+    with start.patient():
+        settings = load_config(config)
+        start.needs(settings.geometry, settings.commands.key_file)
+        vehicle = daemon.load_vehicle(settings, str(config))
+        vehicle.gate(0, str(config))
     for problem in vehicle.model.problems:
         logging.getLogger("modelserver").warning("%s", problem)
     daemon.run(vehicle, url, str(config), notifier)

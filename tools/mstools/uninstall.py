@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from mstools import install
 from mstools.install import DryRunOption, RootOption, show_or_do
+from mstools.install_place import program
 from mstools.install_plan import plan_uninstall
 from mstools.install_steps import check_may, read_facts
 
@@ -28,5 +28,5 @@ def command(
     """
     root = root.resolve()
     if not dry_run:
-        check_may(root, f"{install.program()} uninstall{' --purge' if purge else ''}")
+        check_may(root, f"{program()} uninstall{' --purge' if purge else ''}")
     show_or_do(plan_uninstall(read_facts((), root), purge=purge), root, dry_run)

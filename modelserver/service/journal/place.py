@@ -14,7 +14,8 @@ from modelserver.service.journal import build as journal_build
 from modelserver.service.journal.queue import JournalQueue
 from modelserver.service.journal.ring import Ring
 from modelserver.service.journal.writer import JournalWriter, Origins
-from modelserver.service.keeping.origin import default_directory, safe
+from modelserver.service.keeping.lock import Lock
+from modelserver.service.keeping.origin import safe, state_directory
 
 log = logging.getLogger(__name__)
 
@@ -27,8 +28,10 @@ SEGMENTS: Final = 8
 LARGEST_SEGMENT: Final = 16 << 20
 
 
-def journal_directory(config: VehicleConfig) -> Path | None:
+def journal_directory(config: VehicleConfig, given: str | None = None) -> Path | None:
     """Return where the journal is kept; None where none is wanted, or no place is known.
+
+    `given`: the state directory that systemd gives the service; by default what it has given this process.
 
     By default one is kept only by a service that systemd has given a state directory, or where one is named: what a
     developer tries out at the desk is not to fill the home directory.
@@ -38,22 +41,34 @@ def journal_directory(config: VehicleConfig) -> Path | None:
         return None
     if settings.directory:
         return Path(settings.directory)
-    if settings.megabytes is None and not os.environ.get("STATE_DIRECTORY"):
+    given = os.environ.get("STATE_DIRECTORY", "") if given is None else given
+    if settings.megabytes is None and not given:
         return None
-    base = Path(config.state_directory) if config.state_directory else default_directory()
+    base = state_directory(config.state_directory or given.split(":")[0])
     if base is None:
         return None
     return base / f"journal-{safe(config.vehicle)}"
 
 
-def make_writer(config: VehicleConfig, file: str, clock: Clock) -> tuple[JournalQueue, JournalWriter] | None:
-    """Return the queue for the loop and the writer for it, None where no journal is kept. `file`: the vehicle file."""
+def bound(config: VehicleConfig) -> int:
+    """Return how many bytes a vehicle's journal may take, where one is kept."""
+    return (config.journal.megabytes or MEGABYTES) << 20
+
+
+def make_writer(
+    config: VehicleConfig, file: str, clock: Clock, lock: Lock | None = None
+) -> tuple[JournalQueue, JournalWriter] | None:
+    """Return the queue for the loop and the writer for it, None where no journal is kept.
+
+    `file`: the vehicle file. `lock`: that of the state directory, which counts where the journal lies within.
+    """
     directory = journal_directory(config)
     if directory is None:
         return None
-    most = (config.journal.megabytes or MEGABYTES) << 20
+    most = bound(config)
     log.info("the journal is kept in %s, %d MB at most", directory, most >> 20)
-    ring = Ring(directory, most, min(LARGEST_SEGMENT, most // SEGMENTS))
+    within = lock if lock is not None and directory.is_relative_to(lock.path.parent) else None
+    ring = Ring(directory, most, min(LARGEST_SEGMENT, most // SEGMENTS), within)
     facts = {**journal_build.facts(), "vehicle": config.vehicle, "run": secrets.token_hex(8), "pid": os.getpid()}
     files = [(str(path), path.read_bytes()) for path in (Path(file), Path(config.geometry)) if path.is_file()]
     queue = JournalQueue()

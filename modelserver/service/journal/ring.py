@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import os
 import re
 from pathlib import Path
 from typing import Final
+
+from modelserver.service.keeping.lock import Lock
 
 SEGMENT_NAME: Final = re.compile(r"journal-(\d{8})\.lcm")
 
@@ -55,18 +56,24 @@ class Segment:
 
 
 class Ring:
-    """The directory. One writer at a time holds it. Methods raise OSError."""
+    """The directory. One writer at a time holds it. Methods raise OSError.
 
-    def __init__(self, directory: Path, most_bytes: int, segment_bytes: int):
+    `within`: the lock of a directory around it that another service may hold; None: there is none.
+    """
+
+    def __init__(self, directory: Path, most_bytes: int, segment_bytes: int, within: Lock | None = None):
         self.directory = directory
         self.most_bytes = most_bytes
         self.segment_bytes = segment_bytes
-        self._lock: int | None = None
+        self._within = within
+        self._lock = Lock(directory / LOCK_NAME)
 
     def fresh(self) -> Segment:
         """Return a new segment, numbered behind all others, once the oldest have made room for it."""
+        if self._within is not None:
+            self._within.claim()
         self.directory.mkdir(parents=True, exist_ok=True)
-        self._hold()
+        self._lock.hold()
         held = segments(self.directory)
         sizes = [path.stat().st_size for path in held]
         excess = sum(sizes) + self.segment_bytes - self.most_bytes
@@ -91,29 +98,7 @@ class Ring:
 
     def release(self) -> None:
         """Let another writer have the directory."""
-        if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
-
-    def _hold(self) -> None:
-        if self._lock is not None:
-            # a directory that was removed and made again has another lock
-            with contextlib.suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(self._lock), (self.directory / LOCK_NAME).stat()):
-                    return
-            self.release()
-        lock = os.open(self.directory / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o640)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(lock)
-            raise BlockingIOError(
-                errno.EWOULDBLOCK, "another service keeps its journal here", str(self.directory)
-            ) from None
-        except OSError:
-            os.close(lock)
-            raise
-        self._lock = lock
+        self._lock.release()
 
     def _sync_directory(self) -> None:
         file = os.open(self.directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)

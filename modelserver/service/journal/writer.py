@@ -22,6 +22,8 @@ from modelserver.service.journal import events as journal_events
 from modelserver.service.journal import state as journal_state
 from modelserver.service.journal.queue import Beginning, Entry, JournalQueue
 from modelserver.service.journal.ring import Ring, Segment
+from modelserver.service.keeping.trouble import words_on
+from modelserver.service.log import plain
 from modelserver.wire.journal import (
     FORMAT,
     Kind,
@@ -235,17 +237,20 @@ class JournalWriter:
             self._segment.close()
             self._segment = None
         self._retry_ns = self._clock.monotonic_ns() + round(RETRY_S * 1e9)
-        said = _words(error)
-        if self._failed is None or _words(self._failed) != said:
-            log.warning("the journal is not kept: %s; it is tried again every %g s", said, RETRY_S)
-            self._queue.tell(f"not kept: {said}")
+        said = self._words(error)
+        if self._failed is None or self._words(self._failed) != said:
+            log.warning("%s", said)
+            self._queue.tell(said)
         self._failed = error
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             # what happens now is worth more than what was long ago
             with contextlib.suppress(OSError):
                 self._ring.make_room()
 
-
-def _words(error: OSError) -> str:
-    why = error.strerror or str(error)
-    return f"{error.filename}: {why}" if error.filename else why
+    def _words(self, error: OSError) -> str:
+        directory = self._ring.directory
+        why = words_on(error, directory, "journal.directory")
+        place = plain(str(directory))
+        return (
+            f"nothing is recorded: the journal cannot be kept in {place}: {why}. It is tried again every {RETRY_S:g} s"
+        )

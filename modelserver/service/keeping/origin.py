@@ -13,6 +13,8 @@ from typing import Any
 
 from modelserver.geodesy import make_origin
 from modelserver.messages import Origin
+from modelserver.service.keeping.lock import Lock
+from modelserver.service.keeping.trouble import words_on
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +37,11 @@ def default_directory() -> Path | None:
     except RuntimeError:
         return None
     return Path(base) / "modelserver"
+
+
+def state_directory(named: str) -> Path | None:
+    """Return where state is kept: where the vehicle file says, else `default_directory`."""
+    return Path(named) if named else default_directory()
 
 
 def safe(vehicle: str) -> str:
@@ -70,9 +77,10 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 class OriginKeeper:
-    """Keeps the origin of one vehicle in a file."""
+    """Keeps the origin of one vehicle in a file. Only who has the directory's `lock` writes; None: there is none."""
 
-    def __init__(self, directory: Path, vehicle: str):
+    def __init__(self, directory: Path, vehicle: str, lock: Lock | None = None):
+        self._lock = lock
         self.path = directory / f"origin-{safe(vehicle)}.json"
 
     def load(self) -> Origin | None:
@@ -95,9 +103,12 @@ class OriginKeeper:
         """Keep an origin. A disk that refuses is logged: the daemon goes on, a restart captures anew."""
         content = json.dumps({"version": VERSION, **dataclasses.asdict(origin)}, indent=1)
         try:
+            if self._lock is not None:
+                self._lock.claim()
             write_whole(self.path, (content + "\n").encode())
         except OSError as error:
-            log.warning("the origin cannot be kept in %s: %s; a restart will capture a new one", self.path, error)
+            why = words_on(error, self.path.parent, "state_directory")
+            log.warning("the origin cannot be kept in %s: %s. A restart will capture a new one", self.path, why)
 
 
 def _origin(content: dict[str, Any]) -> Origin:

@@ -11,7 +11,9 @@ from pathlib import Path
 from modelserver.core import Instant
 from modelserver.messages import Kept, Recalled
 from modelserver.service.keeping.form import MAX_BYTES, KeptError, kept_from_bytes, kept_to_bytes
+from modelserver.service.keeping.lock import HeldError, Lock
 from modelserver.service.keeping.origin import safe, write_whole
+from modelserver.service.keeping.trouble import words_on
 from modelserver.service.log import plain
 
 log = logging.getLogger(__name__)
@@ -33,21 +35,38 @@ def boot_id() -> str:
         return ""
 
 
-class StateKeeper:
-    """Keeps the state of one vehicle in a file. `keep` and `close` are called by one thread, the loop's."""
+def held_words(error: HeldError, directory: Path) -> str:
+    """Return what to say where another service has the state directory."""
+    why = words_on(error, directory, "state_directory")
+    return f"nothing is kept for a restart in {plain(str(directory))}: {why}"
 
-    def __init__(self, directory: Path, vehicle: str, boot: str | None = None):
+
+class StateKeeper:
+    """Keeps the state of one vehicle in a file. `keep` and `close` are called by one thread, the loop's.
+
+    Only who has the directory's `lock` reads and writes it; None: there is none. `trouble`: why nothing can be kept, as
+    it was said already.
+    """
+
+    def __init__(
+        self, directory: Path, vehicle: str, boot: str | None = None, lock: Lock | None = None, trouble: str = ""
+    ):
         self.path = directory / f"state-{safe(vehicle)}.json"
+        self._lock = lock
         self._boot = boot_id() if boot is None else boot
         self._change = threading.Condition()
         self._waiting: Kept | None = None
         self._closing = False
-        self._trouble = ""
+        self._trouble = trouble
         self._thread: threading.Thread | None = None
 
     def recall(self, now: Instant, pose_age: float, most_age: float) -> Recalled:
         """Return what an earlier run kept with its age, or why nothing is known. Never raises for what it finds."""
         nothing = Recalled(pose_age=pose_age, most_age=most_age)
+        try:
+            self._claim()
+        except HeldError as error:
+            return nothing._replace(why=f"what is kept in {self.path} is that of {error.holder}, which is running")
         self._tidy()
         try:
             # a pipe in its place is not waited for
@@ -112,11 +131,20 @@ class StateKeeper:
                 return
             self._write(kept)
 
+    def _claim(self) -> None:
+        if self._lock is not None:
+            self._lock.claim()
+
     def _write(self, kept: Kept) -> None:
         try:
+            self._claim()
             write_whole(self.path, kept_to_bytes(kept._replace(boot=self._boot)))
+        except HeldError as error:
+            trouble = held_words(error, self.path.parent)
         except (OSError, ValueError) as error:
-            trouble = f"the state cannot be kept in {plain(str(self.path))}: {error}; a restart will be a cold one"
+            directory = self.path.parent
+            why = words_on(error, directory, "state_directory") if isinstance(error, OSError) else str(error)
+            trouble = f"the state cannot be kept in {plain(str(directory))}: {why}. A restart will be a cold one"
         else:
             trouble = ""
         if trouble != self._trouble:

@@ -11,12 +11,10 @@ from urllib.parse import parse_qsl, urlsplit
 
 from modelserver.errors import shown
 from modelserver.service.probing.findings import Finding, Grade
+from modelserver.wire.multicast import GROUP, route
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
 
 SYSCTL_FILE = "/etc/sysctl.d/60-modelserver.conf"
-
-GROUPS = "224.0.0.0/4"
-"""All multicast groups, as a route names them."""
 
 MIB = 1 << 20
 
@@ -28,7 +26,7 @@ LOST = "lost packets"
 class UdpAddress:
     """An LCM provider over UDP multicast: group, port, how many routers its packets pass, buffer asked for (bytes)."""
 
-    group: str = "239.255.76.67"
+    group: str = GROUP
     port: int = 7667
     ttl: int = 0
     buffer: int = 0
@@ -102,10 +100,10 @@ def _route(facts: BusFacts, address: UdpAddress) -> tuple[Finding, ...]:
     subject = "multicast route"
     lo = next((each.name for each in facts.interfaces if each.loopback), "lo")
     outward = next((each.name for each in facts.interfaces if each.up and each.multicast and not each.loopback), "")
-    by_lo = f"sudo ip link set {lo} up multicast on && sudo ip route add {GROUPS} dev {lo}"
+    by_lo = f"sudo ip link set {lo} up multicast on && sudo {route(address.group, lo)}"
     interface = facts.interface
     if interface is None:
-        command = by_lo if address.ttl == 0 or not outward else f"sudo ip route add {GROUPS} dev {outward}"
+        command = by_lo if address.ttl == 0 or not outward else f"sudo {route(address.group, outward)}"
         why = "LCM cannot be joined, so nothing is heard or said"
         return (Finding(Grade.ERROR, subject, f"there is none to {address.group}", why, command),)
     if not interface.name:
@@ -126,7 +124,9 @@ def _route(facts: BusFacts, address: UdpAddress) -> tuple[Finding, ...]:
         return (Finding(Grade.NOTE, subject, seen, why, by_lo),)
     if address.ttl > 0 and interface.loopback:
         why = f"the URL says ttl={address.ttl}, and yet no other machine hears anything"
-        command = f"sudo ip route replace {GROUPS} dev {outward}" if outward else f"sudo ip route del {GROUPS} dev {lo}"
+        # whichever routes they are that lead the group there
+        away = f"sudo ip route flush match {address.group} dev {lo}"
+        command = f"sudo {route(address.group, outward)}" if outward else away
         return (Finding(Grade.WARNING, subject, seen, why, command),)
     return (Finding(Grade.OK, subject, seen),)
 

@@ -142,7 +142,10 @@ def test_given_a_directory_that_cannot_be_made_then_the_service_says_so_and_trie
     (tmp_path / "journal").write_text("in the way")
     kept = Kept(tmp_path, SMALL)
     kept.drive(1.0)
-    assert "exists" in notices(kept)["journal"].lower()
+    assert notices(kept)["journal"] == (
+        f"nothing is recorded: the journal cannot be kept in {kept.directory}: File exists; move away what is there "
+        f"and is no folder (ls -ld {kept.directory}), or name another journal.directory. It is tried again every 5 s"
+    )
     assert len(kept.bus.said("POSE")) > 45
     (tmp_path / "journal").unlink()
     kept.drive(RETRY_S + 1.0)
@@ -202,7 +205,7 @@ def test_given_two_services_on_one_directory_then_the_second_keeps_off_until_the
     first, second = Kept(tmp_path, SMALL, run="one"), Kept(tmp_path, SMALL, run="two")
     first.drive(0.5)
     second.drive(0.5)
-    assert "another service" in notices(second)["journal"]
+    assert f"another service (process {os.getpid()}) writes there already; end one" in notices(second)["journal"]
     assert notices(first) == {}
     first.finish()
     second.drive(RETRY_S + 1.0)
@@ -230,7 +233,9 @@ def test_given_an_error_of_the_servers_own_in_the_thread_then_it_goes_on_and_say
     monkeypatch.setattr(kept.writer, "work", broken)
     with caplog.at_level(logging.ERROR):
         kept.writer._run()
-    assert list(kept.queue.news()) == [Noticed("journal", "not kept: an error of the server's own: oh")]
+    (notice,) = kept.queue.news()
+    assert notice == Noticed("journal", notice.text)
+    assert f"cannot be kept in {kept.directory}: an error of the server's own: oh; the log has its trace" in notice.text
 
 
 def test_given_a_thread_when_closed_then_all_is_written_and_sealed(tmp_path: Path) -> None:

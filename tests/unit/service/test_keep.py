@@ -135,7 +135,7 @@ def test_given_a_directory_that_cannot_be_made_then_the_daemon_goes_on(
     keeper = OriginKeeper(tmp_path / "file", "cart")
     keeper.save(ORIGIN)
     assert keeper.load() is None
-    assert "a restart will capture a new one" in caplog.records[0].getMessage()
+    assert "A restart will capture a new one" in caplog.records[0].getMessage()
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes into read-only directories")

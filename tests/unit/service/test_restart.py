@@ -195,7 +195,7 @@ def test_given_a_disk_that_refuses_then_it_is_said_once_and_taken_back(
         keeper._write(KEPT)
         trouble = keeper.keep(KEPT)
     assert "No space left on device" in trouble
-    assert "a restart will be a cold one" in trouble
+    assert "A restart will be a cold one" in trouble
     assert [record.levelno for record in caplog.records].count(logging.WARNING) == 1
     saved(keeper)
     assert "kept again" in caplog.records[-1].getMessage()

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 from support_samples import GEOMETRY, VEHICLE, write_vehicle
@@ -23,7 +24,7 @@ from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
 from msdrivers.settings import read_drivers
 from mstools import doctor, doctor_vehicle
 from mstools.cli import main
-from mstools.doctor_vehicle import file_finding, line_findings, state_findings, vehicle_findings
+from mstools.doctor_vehicle import file_finding, line_findings, vehicle_findings
 
 LO = Interface("lo", loopback=True)
 WELL = BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), True, True, RECEIVE_BUFFER_BYTES, RECEIVE_BUFFER_BYTES, 0)
@@ -107,9 +108,30 @@ def test_given_a_vehicle_file_that_is_wrong_then_it_is_an_error_that_check_expla
 
 
 def test_given_no_such_vehicle_file_then_it_says_so(run: Run, tmp_path: Path) -> None:
-    code, _, err = run("-c", tmp_path / "none.yaml")
-    assert code == 1
-    assert "none.yaml" in err
+    code, out, err = run("-c", tmp_path / "vehicel.yaml")
+    assert (code, out) == (2, "")
+    assert "there is no vehicle file" in err
+    assert "did you mean" not in err
+    write_vehicle(tmp_path, VEHICLE)
+    assert re.search(r"did you mean\s[\s\S]*vehicle\.yaml", run("-c", tmp_path / "vehicel.yaml")[2])
+    assert run("-c", tmp_path / "vehicle.yaml" / "x")[0] == 2
+    code, _, err = run("-c", tmp_path)
+    assert (code, "is a folder" in err) == (2, True)
+
+
+def test_given_a_vehicle_file_that_may_not_be_read_then_it_is_a_finding(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_vehicle(tmp_path, VEHICLE)
+
+    def closed(file: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(file))
+
+    monkeypatch.setattr(doctor_vehicle, "load_config", closed)
+    code, out, _ = run("-c", path)
+    assert code == 3
+    assert f"{path} cannot be read: Permission denied" in out
+    assert f"$ sudo chmod a+r {path}" in out
 
 
 def test_given_findings_with_odd_words_then_they_are_escaped() -> None:
@@ -140,33 +162,6 @@ def test_given_problems_of_a_file_then_the_gravest_counts(severities: list[Sever
     found = file_finding([Problem(each, f"it is {each}") for each in severities], Path("v.yaml"))
     assert found.grade is grade
     assert bool(found.command) == (grade is not Grade.OK)
-
-
-class Usage(NamedTuple):
-    total: int
-    used: int
-    free: int
-
-
-def state(directory: Path | None) -> Finding:
-    (found,) = state_findings(directory)
-    return found
-
-
-def test_given_a_place_for_the_state_then_it_is_found_out_whether_it_can_be_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert state(tmp_path / "new" / "deeper").grade is Grade.OK
-    assert not (tmp_path / "new").exists()
-    assert state(None).grade is Grade.WARNING
-    (tmp_path / "file").write_text("")
-    assert (state(tmp_path / "file" / "x").grade, state(tmp_path / "file").grade) == (Grade.WARNING,) * 2
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "access", lambda path, mode: False)
-        found = state(tmp_path / "mine")
-    assert (found.grade, f"sudo mkdir -p {tmp_path / 'mine'}" in found.command) == (Grade.WARNING, True)
-    monkeypatch.setattr(doctor_vehicle.shutil, "disk_usage", lambda path: Usage(10**9, 10**9, 10**6))
-    assert (state(tmp_path).grade, "1 MB of room" in state(tmp_path).seen) == (Grade.WARNING, True)
 
 
 def lines(sections: dict[str, dict[str, Any]], networks: Sequence[Interface] = ()) -> list[Finding]:

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from modelserver.errors import ModelServerError
+from modelserver.errors import ConfigError, ModelServerError
 from modelserver.keys import new_key, write_key
-from mstools import install, install_steps
+from mstools import install, install_place, install_steps
 from mstools.cli import main
 from mstools.install_files import (
     SerialDriver,
@@ -76,7 +76,7 @@ def test_given_a_dry_run_then_all_is_told_and_nothing_done(
     code, out, _ = run("install", "--vehicle", str(vehicle), "--dry-run", "--serial", "gps=usb-X_1-if00")
     assert code == 0
     for words in (
-        "write   /etc/modelserver/vehicle.yaml",
+        f"write   {tmp_path}/root/etc/modelserver/vehicle.yaml",
         "ExecStart=/opt/modelserver/bin/modelserver run -c /etc/modelserver/vehicle.yaml",
         "/dev/modelserver/gps",
         "enable modelserver-loopback.service modelserver.service modelserver-driver@gps.service",
@@ -148,7 +148,7 @@ def test_given_an_edited_vehicle_file_then_it_stays_and_counts(
     installed.write_text(edited)
     code, out, err = run("install", "--vehicle", str(vehicle))
     assert code == 0, err
-    assert "leave   /etc/modelserver/vehicle.yaml: it was edited" in out
+    assert f"leave   {installed}: it was edited" in out
     assert "modelserver-driver@receiver.service" in out
     assert installed.read_text() == edited
     # without a file the one that is installed counts
@@ -158,7 +158,8 @@ def test_given_an_edited_vehicle_file_then_it_stays_and_counts(
 def test_given_no_vehicle_file_then_it_is_said_where_examples_are(run: Callable[..., Said]) -> None:
     code, _, err = run("install")
     assert code == 1
-    assert "name the vehicle file: --vehicle FILE" in err
+    assert "no vehicle file in" in err
+    assert "fix:     --vehicle FILE; examples are in" in err
 
 
 def test_given_a_wrong_vehicle_file_then_nothing_is_installed(
@@ -176,7 +177,7 @@ def test_given_a_geometry_outside_the_folder_then_it_is_refused(run: Callable[..
     vehicle.write_text(vehicle.read_text().replace("geometry: geometry.yaml", "geometry: ../other.yaml"))
     code, _, err = run("install", "--vehicle", str(vehicle))
     assert code == 1
-    assert "outside its folder; put it beside the vehicle file" in err
+    assert "outside its folder\n    fix:     put it beside the vehicle file" in err
 
 
 def test_given_a_user_without_rights_then_the_command_with_sudo_is_said(
@@ -186,7 +187,7 @@ def test_given_a_user_without_rights_then_the_command_with_sudo_is_said(
     for command in ("install", "uninstall"):
         with pytest.raises(SystemExit):
             main([command])
-        assert f"needs root: sudo {install.program()} {command}" in capsys.readouterr().err
+        assert f"needs root: sudo {install_place.program()} {command}" in capsys.readouterr().err
 
 
 def test_given_a_command_that_fails_then_it_is_said_which_and_what_it_said(
@@ -216,7 +217,109 @@ def test_given_a_path_then_it_is_known_what_hides_it(path: str, why: str) -> Non
 
 def test_given_an_installation_that_the_units_do_not_see_then_it_is_refused_with_the_way_out() -> None:
     with pytest.raises(ModelServerError, match=r"its Python is /root/x, which .*ProtectHome=yes.*/opt/modelserver"):
-        check_seen([("/usr/bin/x", "a"), ("/root/x", "its Python")], install.ELSEWHERE)
+        check_seen([("/usr/bin/x", "a"), ("/root/x", "its Python")], install_place.ELSEWHERE)
+
+
+def test_given_several_paths_that_the_units_do_not_see_then_one_error_names_all_and_what_works() -> None:
+    with pytest.raises(ConfigError) as caught:
+        check_seen([("/root/x", "its Python"), ("/tmp/y", "its package")], install_place.ELSEWHERE)
+    (problem,) = caught.value.problems
+    assert problem.message == (
+        "its Python is /root/x, its package is /tmp/y, which the hardened units do not see "
+        "(ProtectHome=yes and PrivateTmp=yes)"
+    )
+    # with whichever python3 comes first it may be the same again
+    assert "sudo /usr/bin/python3 -m venv --clear /opt/modelserver" in problem.fix
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/deployment.md"])
+def test_given_the_documentation_then_it_names_the_same_way_as_the_advice(page: str) -> None:
+    text = (Path(__file__).parents[3] / page).read_text(encoding="utf-8")
+    way = "sudo /usr/bin/python3 -m venv --clear /opt/modelserver"
+    assert way in install_place.ELSEWHERE
+    assert way in text
+    assert "-m venv" not in text.replace(way, "").replace("python3 -m venv .venv", "")
+
+
+def test_given_an_installation_then_everything_that_is_wrong_with_it_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    python = tmp_path / "bin" / "python"
+    python.parent.mkdir()
+    python.write_text("")
+    python.parent.chmod(0o700)
+    monkeypatch.setattr(install_place.sys, "executable", str(python))
+    monkeypatch.setattr(install_place.sys, "base_prefix", "/home/me/python")
+    monkeypatch.setattr(install_place.install_files, "HIDDEN", {"/home": "ProtectHome"})
+    monkeypatch.setattr(install_place, "files", lambda name: tmp_path)
+    with pytest.raises(ConfigError) as caught:
+        install_place.check_installation()
+    said = "\n".join(problem.message for problem in caught.value.problems)
+    assert "its Python's library is /home/me/python, which the hardened units do not see" in said
+    assert f"there is no {tmp_path}/bin/modelserver" in said
+    assert f"its Python is {python}, and the service's user may not read " in said
+    assert {problem.file for problem in caught.value.problems} == {"this installation"}
+
+
+def test_given_several_problems_then_all_are_told_and_nothing_is_done(
+    run: Callable[..., Said], vehicle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(install, "check_installation", lambda: check_seen([("/root/x", "its Python")], "go"))
+    good = vehicle.read_text()
+    vehicle.write_text(good.replace("Raptor:CG", "Raptor:GC"))
+    words = ("install", "--vehicle", str(vehicle), "--dry-run", "--drivers", "none,gsp,imu")
+    code, out, err = run(*words)
+    assert (code, out) == (1, "")
+    for said in (
+        "this installation: error: its Python is /root/x",
+        "body Raptor has no frame 'GC'",
+        "--drivers: error: none stands beside other names in 'none,gsp,imu', and means no driver at all",
+        "fix:     --drivers none, or only the names: --drivers gsp,imu",
+        "the vehicle file has no driver 'gsp'; did you mean gps?",
+    ):
+        assert said in err
+    # what needs a vehicle file that is well: further ones
+    vehicle.write_text(good.replace("geometry: geometry.yaml", "geometry: ../other.yaml"))
+    (vehicle.parent / "geometry.yaml").rename(vehicle.parent.parent / "other.yaml")
+    code, _, err = run(*words, "--serial", "gsp=x", "--serial", "imu=a b")
+    assert code == 1
+    for said in (
+        "names '../other.yaml', outside its folder",
+        "--serial: error: it names 'gsp', which is no driver on a serial port here; did you mean gps?",
+        "--serial: error: 'a b' is no name below /dev/serial/by-id/",
+        "its Python is /root/x",
+    ):
+        assert said in err
+    assert tree(tmp_path / "root") == {"etc": None}
+
+
+def test_given_a_vehicle_file_that_is_not_there_or_no_yaml_then_the_other_problems_are_told_too(
+    run: Callable[..., Said], vehicle: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(install, "check_installation", lambda: check_seen([("/root/x", "its Python")], "go"))
+    vehicle.write_text("[")
+    for file in (vehicle, vehicle.parent / "none.yaml"):
+        code, _, err = run("install", "--vehicle", str(file), "--dry-run")
+        assert code == 1
+        assert f"{file}" in err
+        assert "its Python is /root/x" in err
+
+
+def test_given_another_root_then_paths_are_told_within_it(
+    run: Callable[..., Said], vehicle: Path, tmp_path: Path
+) -> None:
+    root = tmp_path / "root"
+    code, _, err = run("uninstall")
+    assert f"nothing to take back: {root}/etc/modelserver/installed.json" in err
+    run("install", "--vehicle", str(vehicle))
+    code, out, _ = run("uninstall", "--dry-run")
+    assert code == 0
+    assert f"what the service kept is still in {root}/var/lib/modelserver" in out
+    told = [line.split()[1].rstrip(":") for line in out.splitlines() if line.startswith(("remove", "leave"))]
+    assert told
+    assert all(path.startswith(f"{root}/etc") for path in told)
+    (root / "etc/modelserver/installed.json").write_text("{")
+    assert f"{root}/etc/modelserver/installed.json, which holds" in run("uninstall")[2]
 
 
 def test_given_an_installation_that_others_may_not_read_then_it_is_known_what_is_closed(tmp_path: Path) -> None:
@@ -225,9 +328,9 @@ def test_given_an_installation_that_others_may_not_read_then_it_is_known_what_is
     for part in (tmp_path, *tmp_path.parents):
         if "/pytest-of-" in str(part):  # the tests' own
             part.chmod(0o755)
-    assert install.closed_to_others(str(folder / "bin")) == ""
+    assert install_place.closed_to_others(str(folder / "bin")) == ""
     folder.chmod(0o700)
-    assert install.closed_to_others(str(folder / "bin")) == str(folder)
+    assert install_place.closed_to_others(str(folder / "bin")) == str(folder)
 
 
 @pytest.mark.parametrize(
@@ -249,7 +352,8 @@ def test_given_a_bus_then_it_has_a_group_on_loopback_where_it_stays_on_the_machi
 
 
 @pytest.mark.parametrize(
-    ("wanted", "expected"), [("all", ("gps", "imu")), ("none", ()), ("imu", ("imu",)), ("imu, gps", ("imu", "gps"))]
+    ("wanted", "expected"),
+    [("all", ("gps", "imu")), ("none", ()), ("imu", ("imu",)), ("imu, gps,imu", ("imu", "gps")), ("", ("gps", "imu"))],
 )
 def test_given_names_of_drivers_then_they_are_taken(wanted: str, expected: tuple[str, ...]) -> None:
     assert check_drivers(wanted, ["gps", "imu"]) == expected
@@ -263,6 +367,9 @@ def test_given_names_of_drivers_then_they_are_taken(wanted: str, expected: tuple
         ("all", ["gps/1"], "cannot be the name of a unit"),
         ("all", ["-gps"], "cannot be the name of a unit"),
         ("all", ["gps%n"], "cannot be the name of a unit"),
+        ("none,gps", ["gps", "imu"], "none stands beside other names in 'none,gps', and means no driver at all"),
+        ("imu,all", ["gps", "imu"], "all stands beside other names in 'imu,all', and means every driver"),
+        ("none,all", ["gps"], "fix: --drivers none, or only the names"),
     ],
 )
 def test_given_a_driver_that_cannot_be_then_it_is_said_why(wanted: str, known: list[str], said: str) -> None:

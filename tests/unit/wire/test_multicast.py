@@ -1,0 +1,34 @@
+"""The multicast group of a bus, out of whatever stands in its URL; it goes into commands that root runs."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from modelserver.wire.channels import DEFAULT_URL
+from modelserver.wire.multicast import GROUP, group_of, route
+
+
+@pytest.mark.parametrize(
+    ("url", "group"),
+    [
+        (DEFAULT_URL, GROUP),
+        ("udpm://239.1.2.3:7667?ttl=1", "239.1.2.3"),
+        ("udpm://224.0.0.9", "224.0.0.9"),
+        ("udpm://", GROUP),
+        ("udpm://192.168.1.1:7667", GROUP),
+        ("udpm://[::1", GROUP),
+        ("", GROUP),
+    ],
+)
+def test_given_a_bus_then_its_group_is_known(url: str, group: str) -> None:
+    assert group_of(url) == group
+
+
+@given(st.text() | st.text().map("udpm://{}:7667".format))
+def test_given_any_text_then_the_route_is_of_a_multicast_group(url: str) -> None:
+    command = route(group_of(url), "lo")
+    assert re.fullmatch(r"ip route replace 2[23][0-9](\.[0-9]{1,3}){3}/32 dev lo", command, re.ASCII)
