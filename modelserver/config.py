@@ -15,7 +15,8 @@ from typing import Any, ClassVar, Literal
 from pydantic import ConfigDict
 
 from modelserver import config_reader
-from modelserver.errors import ConfigError, Problem, shown
+from modelserver.errors import ConfigError, Problem, Severity, Source, shown
+from modelserver.file_kinds import FileKind, file_kind
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.magnetometer import MagnetometerCalibration
 from modelserver.localization.raw.settings import RawSettings
@@ -466,9 +467,40 @@ def with_lines(problems: Iterable[Problem], path: str) -> list[Problem]:
     ]
 
 
+NOT_ONE = "not a vehicle file"
+"""What is said last of a file of another kind."""
+
+_BEGIN = "start with: vehicle, geometry, base_frame; docs/vehicle-file.md has an example"
+_MODEL = "query, bodies and frames take it with --model"
+_INSTEAD: dict[FileKind, str] = {
+    FileKind.EMPTY: _BEGIN,
+    FileKind.COMMENTS: _BEGIN,
+    FileKind.GEOMETRY: f"give the vehicle file, which names it (geometry: {{name}}); {_MODEL}",
+    FileKind.URDF: f"give the vehicle file, which names it (geometry: {{name}}); {_MODEL}",
+    FileKind.XML: f"give the vehicle file, which is YAML; if this is a geometry file, {_MODEL}",
+    FileKind.LOG: "give the vehicle file; a log is played by modelserver replay",
+    FileKind.BINARY: "give the vehicle file, which is YAML",
+}
+"""What to give instead of a file that is no vehicle file."""
+
+
 def _bytes(path: Path) -> bytes:
+    """Return what a vehicle file holds. Raises ConfigError for a directory and what is a file of another kind."""
+    if path.is_dir():
+        there = next((each for each in ("vehicle.yaml", "vehicle.yml") if (path / each).is_file()), "")
+        fix = f"give {path / there}" if there else "give the vehicle file itself"
+        raise _no_vehicle_file(path, f"this is a directory, {NOT_ONE}", fix)
     with path.open("rb") as file:
-        return file.read(config_reader.MAX_BYTES + 1)
+        raw = file.read(config_reader.MAX_BYTES + 1)
+    kind = file_kind(raw)
+    if kind in _INSTEAD:
+        what = kind.value if kind.is_nothing else f"{kind.value}, {NOT_ONE}"
+        raise _no_vehicle_file(path, what, _INSTEAD[kind].format(name=path.name))
+    return raw
+
+
+def _no_vehicle_file(path: Path, what: str, fix: str) -> ConfigError:
+    return ConfigError([Problem(Severity.ERROR, what, Source(str(path)), fix)])
 
 
 def _with_paths(config: VehicleConfig, path: Path) -> VehicleConfig:

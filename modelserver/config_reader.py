@@ -90,17 +90,22 @@ def _composed(raw: bytes, name: str, schema: type) -> tuple[_Reader, Any]:
     if len(raw) > MAX_BYTES:
         raise _one(name, 0, f"the file is larger than {MAX_BYTES >> 20} MiB", "is this the vehicle file?")
     try:
+        if not raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+            raw.decode()
         _check_shape(raw, name)
         node = yaml.compose(raw, Loader=yaml.CSafeLoader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         what = getattr(error, "problem", None) or str(error).splitlines()[0]
         raise _one(name, mark.line + 1 if mark else 0, f"not YAML: {what}", "check indentation and quotes") from None
-    except UnicodeDecodeError:
-        raise _one(name, 0, "not text in UTF-8", "is this the vehicle file?") from None
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        what = f"not text in UTF-8: byte 0x{raw[error.start]:02x} in this line"
+        raise _one(name, line, what, "save it as UTF-8; is this the vehicle file?") from None
     if not isinstance(node, yaml.MappingNode):
         required = [each.name for each in dataclasses.fields(schema) if _is_required(each)]
-        raise _one(name, 1, "the file is empty or no mapping", f"start with: {', '.join(required)}")
+        what = "the file is empty" if node is None else "the file is no mapping (key: value, one a line)"
+        raise _one(name, 1, what, f"start with: {', '.join(required)}")
     reader = _Reader(name, schema)
     return reader, reader.value(node, ())
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from support_samples import GEOMETRY, VEHICLE, drive, write_vehicle
 from support_signing import ALLOWED, KEY, envelope, write_test_key
@@ -50,6 +50,7 @@ class Kept:
         run: str = "one",
         facts: dict[str, Any] | None = None,
         ring: Callable[..., Ring] = Ring,
+        second_writer: Literal["", "ignore", "use"] = "",
     ):
         path = write_vehicle(folder, vehicle, geometry)
         write_test_key(folder)
@@ -68,7 +69,13 @@ class Kept:
             self.bus,
             self.clock,
             self.vehicle.core(self.clock.now()),
-            LoopSettings(20_000_000, self.vehicle.sensor_channels(), queued_requests=4, requests_per_pass=2),
+            LoopSettings(
+                20_000_000,
+                self.vehicle.sensor_channels(),
+                queued_requests=4,
+                requests_per_pass=2,
+                second_writer=second_writer,
+            ),
             Hooks(
                 on_load=lambda wish, state: self.vehicle.reloaded(wish, state, str(path)),
                 snapshot=self.vehicle.snapshot,

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import PurePath
 
 from modelserver.errors import Source, shown
+from modelserver.file_kinds import FileKind, file_kind, geometry_named
 from modelserver.formats import bot_param
 from modelserver.formats.saved import Saved
 from modelserver.geometry.builder import ModelBuilder
@@ -25,6 +26,14 @@ _ELSEWHERE = {
     "sdf": "this looks like SDF, which is not read",
     "config_group": "this is Miro's compile-time parameter file; the run-time file holds the geometry",
 }
+
+
+_INSTEAD = {
+    FileKind.VEHICLE: "a vehicle file goes with -c; here give the geometry file that it names",
+    FileKind.LOG: "give a geometry file; modelserver query --log and modelserver replay take logs",
+    FileKind.COMMENTS: "see docs/geometry-files.md for an example to begin with",
+}
+"""What to give instead of a file that is no geometry file."""
 
 
 def form_of_path(path: str | os.PathLike[str]) -> str:
@@ -50,6 +59,10 @@ def read(
     text = content.removeprefix(b"\xef\xbb\xbf").lstrip()
     if not text:
         builder.error("the file is empty", Source(file), "see docs/geometry-files.md for an example to begin with")
+    elif (kind := file_kind(text)) in _INSTEAD:
+        named = geometry_named(text) if kind is FileKind.VEHICLE else ""
+        what = kind.value if kind.is_nothing else f"{kind.value}, not a geometry file"
+        builder.error(what, Source(file), _INSTEAD[kind] + (f", {shown(named, 100)}" if named else ""))
     else:
         with _collector_paused():
             if text.startswith(b"<") or PurePath(file).suffix.lower() in _XML_ENDINGS:

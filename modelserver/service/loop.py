@@ -41,6 +41,7 @@ from modelserver.service.log import RateLimited, plain, plain_lines
 from modelserver.service.requests.desk import DeskLimits
 from modelserver.service.requests.reception import Reception
 from modelserver.service.snapshots import SnapshotWriter
+from modelserver.service.unused import Unused
 from modelserver.service.watch import Watch
 from modelserver.wire.codec import encode
 from modelserver.wire.journal import Kind
@@ -54,9 +55,6 @@ SENSORS_PER_PASS = 100
 
 NO_NETWORK = frozenset({errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENODEV, errno.ENOBUFS})
 """What sending fails with while the network is away: no error of the service's own."""
-
-MOST_NOTED = 512
-"""Bytes that the journal keeps of a message that is not used: a stranger's are not to push out what is."""
 
 FLOOD_PAUSE_S = 0.002
 """How long requests wait for the next pass while too many come, at most, seconds."""
@@ -117,7 +115,8 @@ class Loop:
         self._odom, self._health = f"{prefix}POSE_ODOM", f"{prefix}MODELSERVER_HEALTH"
         self._model, self._held = f"{prefix}MODEL_SNAPSHOT", f"{prefix}JOINTS_HELD"
         self._decisions, self._state = f"{prefix}LOCALIZATION_DECISIONS", f"{prefix}LOCALIZATION_STATE"
-        self._watch = Watch(self.step, self._log, settings.second_writer, settings.shared)
+        self._unused = Unused(self.step, self._journal)
+        self._watch = Watch(self.step, self._unused.count, self._log, settings.second_writer, settings.shared)
         self._hear(settings.sensors)
         limits = DeskLimits(settings.queued_requests, settings.client_hz, settings.request_share)
         self._reception = Reception(self, bus, clock, self._log, prefix, limits, settings.requests_per_pass, hooks.gate)
@@ -176,10 +175,12 @@ class Loop:
             # what it says holds for the deadline, at which it is published; how late that was the next tick tells
             now, late_ns = Instant(due, now.utime + ahead // 1000), self._late_ns
         self._watch.look(now)
+        reports = now.monotonic_ns >= self.state.health_due_ns
+        self._unused.tell(now, reports)
         self._hold_ns = due
         try:
             # gauges are read where they will be told
-            gauges = self._gauges(self._reception.waiting) if now.monotonic_ns >= self.state.health_due_ns else None
+            gauges = self._gauges(self._reception.waiting) if reports else None
             self.step(Tick(late_ns * 1e-9, missed, self._reception.taken_answered(), gauges), now)
             self._on_tick(self.state)
         except Exception as error:
@@ -242,7 +243,7 @@ class Loop:
                         channel, writer, event.header, now
                     )
                 if ignored:
-                    self.note(Kind.IGNORED, channel, data, now)
+                    self._unused.note(Kind.IGNORED, channel, data, now)
                 else:
                     self.step(event, now, (channel, data))
             except Exception as error:
@@ -255,7 +256,7 @@ class Loop:
         if self._gate is None:
             self.obey(Commanded(wish), now)
             return
-        self.step(Rejected(channel, "unsigned"), now)
+        self._unused.count(channel, "unsigned", now)
         self._told.add((channel, "unsigned"))
         self._log.warning(
             f"{channel}:unsigned",
@@ -268,8 +269,8 @@ class Loop:
         now = self._clock.now()
         if isinstance(error, WireError):
             if data:
-                self.note(Kind.UNREAD, channel, data, now)
-            self.step(Rejected(channel, error.reason), now)
+                self._unused.note(Kind.UNREAD, channel, data, now)
+            self._unused.count(channel, error.reason, now)
             self._told.add((channel, error.reason))
             self._log.warning(f"{channel}:{error.reason}", "rejected a message on %s: %s", channel, error)
         elif isinstance(error, OSError) and error.errno in NO_NETWORK:
@@ -289,8 +290,11 @@ class Loop:
             self.send(outputs)
 
     def note(self, kind: Kind, channel: str, data: bytes, now: Instant) -> None:
-        """Have the journal note a message with which something else is done than handing it to the core."""
-        self._journal.note(kind, (channel, data[:MOST_NOTED]), now)
+        """Have the journal note a request with which something else is done than handing it to the core.
+
+        All of it: what was said to it is to be said again.
+        """
+        self._journal.note(kind, (channel, data), now)
 
     def publish(self, channel: str, data: bytes) -> None:
         """Send a message to everyone: the only place where anything is said."""

@@ -8,7 +8,7 @@ from typing import Final
 from modelserver.core import Instant
 from modelserver.core.writers import RIVAL_NS, Writer
 from modelserver.errors import shown
-from modelserver.messages import Event, Noticed, Rejected, SensorHeader
+from modelserver.messages import Event, Noticed, SensorHeader
 from modelserver.service.log import RateLimited
 
 MAX_WRITERS: Final = 256
@@ -21,11 +21,20 @@ AGO_S: Final = 5.0
 class Watch:
     """Watches the sensors' channels. `shared` names those where several sources speak: each is watched by itself.
 
-    `rule`: see `modelserver.service.loop.LoopSettings.second_writer`.
+    `step` hands the core an event, `count` has it count a sample by channel and reason. `rule`: see
+    `modelserver.service.loop.LoopSettings.second_writer`.
     """
 
-    def __init__(self, step: Callable[[Event, Instant], None], log: RateLimited, rule: str, shared: frozenset[str]):
+    def __init__(
+        self,
+        step: Callable[[Event, Instant], None],
+        count: Callable[[str, str, Instant], None],
+        log: RateLimited,
+        rule: str,
+        shared: frozenset[str],
+    ):
         self._step = step
+        self._count = count
         self._log = log
         self._watches, self._ignore = bool(rule), rule == "ignore"
         self._shared = shared
@@ -52,7 +61,7 @@ class Watch:
 
     def told(self, channel: str, writer: Writer, header: SensorHeader, now: Instant) -> bool:
         """Count a second writer's sample, and tell of it; return whether it is not to be used."""
-        self._step(Rejected(channel, "second_writer"), now)
+        self._count(channel, "second_writer", now)
         if channel not in self._told:
             self._told[channel] = writer
             text = self._text(channel, writer, (now.utime - header.utime) * 1e-6)

@@ -10,6 +10,7 @@ import lcm
 from modelserver.errors import BusError
 from modelserver.wire.channels import DEFAULT_URL
 from modelserver.wire.multicast import group_of, route
+from modelserver.wire.urls import url_problem
 
 RECEIVE_BUFFER_BYTES = 4 * 1024 * 1024
 """Kernel buffer asked for: the default loses an eighth of 20,000 messages a second (measured)."""
@@ -25,15 +26,27 @@ def resolve_url(url: str = "") -> str:
 
 def open_lcm(url: str) -> lcm.LCM:
     """Return an LCM instance. Raises BusError that says what to look at."""
+    wrong = url_problem(url)
+    if wrong:
+        raise BusError(f"cannot join the bus at {url}: {wrong}")
     try:
         return lcm.LCM(url)
     except (OSError, RuntimeError) as error:
+        other = _OTHERS.get(url.partition("://")[0])
+        if other is not None:
+            raise BusError(f"cannot join the bus at {url}: {error}. {other}") from None
         raise BusError(
             f"cannot join the bus at {url}: {error}. Is the address right (udpm://239.255.76.67:7667?ttl=0), and has "
             f"the machine a route for multicast? On one machine: sudo ip link set lo up multicast on && sudo "
             f"{route(group_of(url))} (modelserver doctor says what is missing)"
         ) from None
 
+
+_OTHERS: Final = {
+    "file": "Is there a log of that name, that may be read? To play one onto the bus: modelserver replay LOG",
+    "tcpq": f"Does LCM's TCP service run there (java lcm.lcm.TCPService)? Without one, write {DEFAULT_URL}",
+}
+"""What to look at where joining by another provider than multicast fails."""
 
 _INTERRUPTED: Final = ("lcm_handle_timeout() returned -1",)
 """What `LCM.handle_timeout` raises OSError with, without an errno, when a signal interrupted it."""

@@ -10,7 +10,9 @@ import lcm
 import pytest
 from support_lcm import reserved_url
 
-from modelserver.wire.provider import take_message
+from modelserver.errors import BusError
+from modelserver.wire.provider import open_lcm, take_message
+from modelserver.wire.urls import url_problem
 
 WAIT_MS = 1000
 
@@ -59,3 +61,59 @@ def test_given_a_handler_that_raises_then_its_error_comes_out(bus: lcm.LCM) -> N
     bus.publish("A", b"disk")
     with pytest.raises(OSError, match="disk"):
         take_message(bus, WAIT_MS)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "nonsense",
+        "nonsense://",
+        "UDPM://239.255.76.67:7667",
+        "udpm:239.255.76.67:7667",
+        "udpm://nonsense",
+        "udpm://:7667",
+        "udpm://10.0.0.1:7667",
+        "udpm://239.255.76.300:7667",
+        "udpm://239.255.76.67:",
+        "udpm://239.255.76.67:port",
+        "udpm://239.255.76.67:99999",
+        "udpm://239.255.76.67:-5",
+        "mpudpm://10.0.0.1:7667",
+        "mpudpm://239.255.76.67:99999",
+        "file://",
+    ],
+)
+def test_given_a_url_that_liblcm_refuses_then_what_is_wrong_with_it_is_told_without_advice_on_routes(url: str) -> None:
+    with pytest.raises(RuntimeError):
+        lcm.LCM(url)
+    with pytest.raises(BusError, match="cannot join the bus at ") as raised:
+        open_lcm(url)
+    assert "route" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [("file:///none/of/that/name", "Is there a log of that name"), ("tcpq://127.0.0.1:1", "TCP service")],
+)
+def test_given_another_provider_that_fails_then_it_is_told_what_to_look_at_there(url: str, words: str) -> None:
+    assert not url_problem(url)
+    with pytest.raises(BusError, match=words) as raised:
+        open_lcm(url)
+    assert "route" not in str(raised.value)
+
+
+def test_given_two_users_of_memq_then_neither_hears_the_other() -> None:
+    one, other, heard = lcm.LCM("memq://"), lcm.LCM("memq://"), []
+    other.subscribe("A", lambda _, data: heard.append(data))
+    one.publish("A", b"data")
+    assert not take_message(other)
+    assert not heard
+    assert "reaches nobody" in url_problem("memq://")
+
+
+@pytest.mark.parametrize("ttl", ["0", "00", "0&recv_buf_size=100000", "0&other=1"])
+def test_given_a_url_that_liblcm_takes_as_it_is_meant_then_it_is_not_refused(ttl: str) -> None:
+    with reserved_url() as url:
+        other = url.replace("ttl=0", f"ttl={ttl}")
+        assert not url_problem(other)
+        assert open_lcm(other)

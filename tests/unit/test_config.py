@@ -23,6 +23,7 @@ from modelserver.config import (
     RestartConfig,
     VehicleConfig,
     load_config,
+    load_partly,
     parse_config,
 )
 from modelserver.config_reader import MAX_BYTES
@@ -387,7 +388,7 @@ def test_given_two_sensors_on_one_channel_then_it_is_refused(other: str) -> None
         (b"\ta: 1\n", "not YAML"),
         (b"a: [1\nb: 2\n", "not YAML"),
         (b"a: \x00\n", "not YAML"),
-        (b"a: \xff\xfe\n", "not YAML"),
+        (b"a: 1\nb: \xff\xfe\n", "not text in UTF-8: byte 0xff in this line"),
         (b"\x7fELF\x02\x01\x01" + bytes(200), "not YAML"),
         (b"<?xml version='1.0'?><a/>", "no mapping|not YAML"),
         (b"? [a, b]\n: c\n", "a key is a name"),
@@ -403,6 +404,54 @@ def test_given_two_sensors_on_one_channel_then_it_is_refused(other: str) -> None
 )
 def test_given_bytes_that_are_no_vehicle_file_then_one_clear_problem(text: bytes, message: str) -> None:
     assert re.search(message, problem(text, "").message)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message", "fix"),
+    [
+        (
+            "geometry.yaml",
+            b"bodies:\n  Cart: {}\n",
+            "this is a geometry file, not a vehicle file",
+            "geometry: geometry.yaml",
+        ),
+        ("g.yaml", b"modelserver: geometry/1\nname: x\n", "this is a geometry file, not", "take it with --model"),
+        (
+            "r.urdf",
+            b"<?xml version='1.0'?>\n<robot name='r'/>",
+            "this is a URDF, a form of geometry file",
+            "geometry: r.urdf",
+        ),
+        ("m.xml", b"<config><section/></config>", "this is XML, not a vehicle file", "take it with --model"),
+        ("drive.lcm", b"\xed\xa1\xda\x01" + bytes(40), "this is an LCM event log, not", "modelserver replay"),
+        ("photo.png", b"\x89PNG\r\n\x1a\n\0\0\0", "this is no text, not a vehicle file", "which is YAML"),
+        ("empty.yaml", b"", "the file is empty", "start with: vehicle, geometry, base_frame"),
+        ("notes.yaml", b"# vehicle: x\n\n  # y\n", "nothing in the file but comments", "start with: vehicle"),
+    ],
+)
+def test_given_a_file_of_another_kind_then_one_error_says_what_it_is_and_where_it_goes(
+    tmp_path: Path, name: str, content: bytes, message: str, fix: str
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    for reader in (load_config, load_partly):
+        with pytest.raises(ConfigError) as raised:
+            reader(path)
+        (found,) = raised.value.problems
+        assert found.message.startswith(message) or message in found.message
+        assert fix in found.fix
+        assert found.file == str(path)
+
+
+def test_given_a_directory_then_the_vehicle_file_in_it_is_named(tmp_path: Path) -> None:
+    def fix() -> str:
+        with pytest.raises(ConfigError, match="this is a directory, not a vehicle file") as raised:
+            load_config(tmp_path)
+        return raised.value.problems[0].fix
+
+    assert fix() == "give the vehicle file itself"
+    (tmp_path / "vehicle.yaml").touch()
+    assert fix() == f"give {tmp_path / 'vehicle.yaml'}"
 
 
 def test_given_aliases_of_aliases_then_they_are_refused_before_they_are_written_out() -> None:
@@ -431,8 +480,6 @@ def test_given_damage_anywhere_then_nothing_but_config_error_is_raised() -> None
 def test_given_a_file_that_is_not_there_then_it_is_an_os_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         load_config(tmp_path / "none.yaml")
-    with pytest.raises(IsADirectoryError):
-        load_config(tmp_path)
 
 
 def test_given_the_cart_of_these_tests_then_it_loads(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ POSES = VALUES | {"messages", "geodesy", "earth", "magnetism", "history"}
 CORE = GEOMETRY | POSES | {"joints", "joint_reading", "joint_track", "joint_vector", "localization", "platform"}
 WIRE = VALUES | {"messages", "wire", "mslcm"}
 SIGNING = {"keys", "signing"}
-SERVICE = CORE | WIRE | {"core", "config", "formats", "reload", "snapshot"} | SIGNING
+SERVICE = CORE | WIRE | {"core", "config", "file_kinds", "formats", "reload", "snapshot"} | SIGNING
 
 MAY_IMPORT: dict[str, set[str]] = {
     "version": set(),
@@ -34,7 +34,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "joint_track": VALUES | {"messages", "joint_reading"},
     "joint_vector": GEOMETRY | {"joint_reading", "joint_track"},
     "joints": GEOMETRY | {"messages", "joint_reading", "joint_track"},
-    "formats": GEOMETRY,
+    "file_kinds": set(),
+    "formats": GEOMETRY | {"file_kinds"},
     "localization": GEOMETRY | POSES,
     "platform": CORE,
     "answers": CORE,
@@ -42,7 +43,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "snapshot": GEOMETRY | {"formats"},
     "core": CORE | {"answers", "reload"},
     "simulation": GEOMETRY | {"messages", "geodesy", "earth"},
-    "config": GEOMETRY | {"messages", "localization", "config_reader"},
+    "config": GEOMETRY | {"messages", "localization", "config_reader", "file_kinds"},
     "config_reader": {"errors"},
     "wire": WIRE,
     "service": SERVICE,
@@ -72,6 +73,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 
 PURE = {
     "errors",
+    "file_kinds",
     "spatial",
     "geometry",
     "geodesy",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Protocol
 
 import typer
 
-from modelserver.errors import ModelServerError
+from modelserver.errors import ModelServerError, UnknownFrameError, nearest_names, shown
 from modelserver.geometry import names
 from modelserver.messages import NO_FLAGS, Explanation, MotionAnswer, Policy, PoseAnswer, Quality
 from mstools.options import parse_variables
@@ -32,6 +32,15 @@ TimeoutOption = Annotated[
     typer.Option("--timeout", metavar="SECONDS", min=0.01, max=3600.0, help="How long one try waits for the daemon."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
+
+
+def _check_worlds(*frames: str) -> None:
+    """Raise UnknownFrameError for a frame of the service's own bodies that there is not."""
+    known = (names.WORLD_UTM, names.WORLD_ENU, names.ODOM)
+    for frame in frames:
+        if frame.partition(":")[0] in names.RESERVED_BODIES and frame not in known:
+            text = f"{shown(frame, 80)} is no frame; there are {', '.join(known)}"
+            raise UnknownFrameError(text, nearest_names(frame, known, 1))
 
 
 class Answers(Protocol):
@@ -82,6 +91,7 @@ class FileAnswers:
         """Return where one frame is in another; time plays no part, and joints stand where they rest."""
         asked = {frame.partition(":")[0] for frame in (frame_of_interest, frame_of_reference)}
         if not asked.isdisjoint(names.RESERVED_BODIES):
+            _check_worlds(frame_of_interest, frame_of_reference)
             raise ModelServerError("a geometry file does not know where the vehicle is in the world; ask the daemon")
         rests = bool(self._model.route(frame_of_interest, frame_of_reference).legs)
         return PoseAnswer(

@@ -143,7 +143,9 @@ def magnetometer(
     from --place; otherwise it is left open, and the filter cannot tell a disturbed field by its strength. The settings
     that follow are proposed, nothing is changed.
 
-    Example: modelserver calibrate magnetometer turned.lcm --plot circle.html -o magnetometer.yaml
+    \b
+    Example:
+      modelserver calibrate magnetometer turned.lcm --plot circle.html -o magnetometer.yaml
     """
     _check_paths(begin, end, log, (plot, output), force)
     if as_json and output == "-":

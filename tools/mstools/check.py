@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections import Counter
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from modelserver.errors import ConfigError, GeometryError, Problem, Severity, Source
+from modelserver.file_kinds import LOOKED_AT, FileKind, file_kind
 from modelserver.formats import check_file
 from modelserver.geometry.model import Model
 from mstools.check_drivers import drivers_problems
@@ -70,8 +70,7 @@ def is_vehicle_file(file: str) -> bool:
     if not os.path.isfile(file):
         return False
     with open(file, "rb") as stream:
-        head = stream.read(1 << 16)
-    return all(re.search(rb"^%b\s*:" % key, head, re.MULTILINE) for key in (b"vehicle", b"base_frame"))
+        return file_kind(stream.read(LOOKED_AT)) is FileKind.VEHICLE
 
 
 def checked_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tuple[Problem, ...]]:

@@ -34,9 +34,10 @@ def command(
 ) -> None:
     """Write a geometry file in another form; what that form cannot hold is said on standard error.
 
-    Example: modelserver convert K11Frames.xml k11.yaml --set MRN=K11
-
-    Example: modelserver convert husky.urdf husky.yaml
+    \b
+    Examples:
+      modelserver convert K11Frames.xml k11.yaml --set MRN=K11
+      modelserver convert husky.urdf husky.yaml
     """
     form = _form(form, target)
     values = parse_variables(variables)

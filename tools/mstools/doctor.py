@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from modelserver.errors import ConfigError, nearest_names
+from modelserver.errors import BusError, ConfigError, nearest_names
 from mstools.asking import JsonOption, PrefixOption, UrlOption
 from mstools.output import counted, safe
 
@@ -78,6 +78,7 @@ def check_there(config: Path) -> None:
 
 def examine(config: Path | None, url: str, prefix: str) -> tuple[Finding, ...]:
     """Return all that is found. Takes two seconds, most of it waiting for who answers."""
+    from modelserver.config import NOT_ONE
     from modelserver.service.probing.clock import clock_findings
     from modelserver.service.probing.findings import Finding, Grade
     from modelserver.service.probing.listening import hears_itself, who_answers
@@ -87,6 +88,7 @@ def examine(config: Path | None, url: str, prefix: str) -> tuple[Finding, ...]:
     from modelserver.version import __version__
     from modelserver.wire.channels import REPLY_PREFIX
     from modelserver.wire.provider import resolve_url
+    from modelserver.wire.urls import url_problem
     from mstools.doctor_vehicle import read_vehicle, vehicle_findings, versions
 
     vehicle: VehicleConfig | None = None
@@ -101,20 +103,31 @@ def examine(config: Path | None, url: str, prefix: str) -> tuple[Finding, ...]:
             command = f"{'sudo chmod a+r' if os.path.exists(config) else 'sudo namei -l'} {shlex.quote(str(config))}"
             found.append(Finding(Grade.ERROR, "vehicle file", seen, "the service does not start without it", command))
         except ConfigError as error:
-            seen = f"{safe(str(config))} is wrong: {safe(str(error.problems[0].message))}"
+            first = error.problems[0]
+            seen, why = f"{safe(str(config))} is wrong: {safe(first.message)}", "the service does not start with it"
             command = f"modelserver check {shlex.quote(str(config))}"
-            found.append(Finding(Grade.ERROR, "vehicle file", seen, "the service does not start with it", command))
+            if first.message.endswith(NOT_ONE):
+                why, command = safe(f"{why}; {first.fix}"), ""  # check might find it to be a good geometry
+            found.append(Finding(Grade.ERROR, "vehicle file", seen, why, command))
     if vehicle is not None:
         url, prefix = url or vehicle.lcm.url, prefix or vehicle.lcm.channel_prefix
         reply_prefix = vehicle.lcm.reply_prefix
     provider = resolve_url(url)
     watch = ClockWatch()
-    facts = bus_facts(provider, hears_itself)
-    found.append(Finding(Grade.OK, "bus", safe(provider)))
-    found += bus_findings(facts)
-    if facts.address is None or facts.heard:
-        found += server_findings(who_answers(provider, prefix, reply_prefix), prefix, __version__)
-    found += clock_findings(watch.facts(), facts.address is not None and facts.address.ttl > 0)
+    wrong, leaves = url_problem(provider), False
+    if wrong:
+        found.append(Finding(Grade.ERROR, "bus", f"{provider}: {wrong}", "LCM cannot be joined there"))
+    else:
+        facts = bus_facts(provider, hears_itself)
+        found.append(Finding(Grade.OK, "bus", safe(provider)))
+        found += bus_findings(facts)
+        if facts.address is None or facts.heard:
+            try:
+                found += server_findings(who_answers(provider, prefix, reply_prefix), prefix, __version__)
+            except BusError as error:
+                found.append(Finding(Grade.ERROR, "bus", str(error), "nothing is heard or said"))
+        leaves = facts.address is not None and facts.address.ttl > 0
+    found += clock_findings(watch.facts(), leaves)
     if config is not None and vehicle is not None:
         found += vehicle_findings(vehicle, config)
     return tuple(found)

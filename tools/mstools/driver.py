@@ -63,15 +63,12 @@ def command(
     device has been away. How it goes is on DRIVER_HEALTH once a second, and on stderr when it changes. What drivers
     there are stands in the vehicle file, under `drivers`.
 
+    \b
     Examples:
-
-    modelserver driver --list
-
-    modelserver driver gps -c config/raptor/vehicle.yaml
-
-    modelserver driver imu -c vehicle.yaml --record-raw imu.raw
-
-    modelserver driver imu -c vehicle.yaml --hard-iron --seconds 90
+      modelserver driver --list
+      modelserver driver gps -c config/raptor/vehicle.yaml
+      modelserver driver imu -c vehicle.yaml --record-raw imu.raw
+      modelserver driver imu -c vehicle.yaml --hard-iron --seconds 90
     """
     from modelserver.service.supervision.notify import Notifier
     from mstools.refusal import Start

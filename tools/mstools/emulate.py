@@ -74,13 +74,11 @@ def command(
 
     Prints the line to put into the vehicle file, and speaks until SIGTERM, Ctrl-C or --seconds.
 
+    \b
     Examples:
-
-    modelserver emulate gps -c config/raptor/vehicle.yaml --pty --link /tmp/gps
-
-    modelserver emulate imu -c vehicle.yaml --tcp 4001 --fault stall@10:2 --fault corrupt@15:3
-
-    modelserver emulate wheels -c vehicle.yaml --can vcan0 --from drive.lcm
+      modelserver emulate gps -c config/raptor/vehicle.yaml --pty --link /tmp/gps
+      modelserver emulate imu -c vehicle.yaml --tcp 4001 --fault stall@10:2 --fault corrupt@15:3
+      modelserver emulate wheels -c vehicle.yaml --can vcan0 --from drive.lcm
     """
     from msdrivers.faults import parse_fault
 

@@ -67,11 +67,10 @@ def command(
     ids and the kernel's limit for receive buffers, and has all of it start with the machine. A file that was edited
     stays as it is, and is told. Do it again after an upgrade. `modelserver uninstall` takes it back.
 
+    \b
     Examples:
-
-    modelserver install --vehicle vehicle.yaml --dry-run
-
-    sudo /opt/modelserver/bin/modelserver install --vehicle vehicle.yaml --drivers gps,imu
+      modelserver install --vehicle vehicle.yaml --dry-run
+      sudo /opt/modelserver/bin/modelserver install --vehicle vehicle.yaml --drivers gps,imu
     """
     root = root.resolve()
     if not dry_run:

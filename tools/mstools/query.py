@@ -78,7 +78,9 @@ def command(
     --explain tells what the answer rests on: each frame, constraint and joint on the way, how it was come by, how old
     it is, who told it, and its share of what is unsure. --motion tells how the one frame moves in the other.
 
-    Example: modelserver query Digiclops:ImagePlane FrontNoddingSICK:Origin --model config/raptor/geometry.xml
+    \b
+    Example:
+      modelserver query Digiclops:ImagePlane FrontNoddingSICK:Origin --model config/raptor/geometry.xml
     """
     if expressed_in and not motion:
         raise typer.BadParameter(

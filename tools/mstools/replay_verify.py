@@ -27,7 +27,8 @@ def verified(journal: Path, as_json: bool) -> None:
     # as the daemon does: the sums of the linear algebra come in another order with more threads
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from modelserver.service.journal.verify import files_of, verify
+    from modelserver.service.journal.files import files_of
+    from modelserver.service.journal.verify import verify
 
     files = files_of(journal)
     with progress(f"verifying {journal.name}", sum(path.stat().st_size for path in files)) as show:

@@ -53,13 +53,11 @@ def command(
     rate, jitter, size and age; bad counts damaged messages. Up and down choose a channel, enter shows the fields of its
     last message, q ends. Where the output is no terminal, the table is printed once.
 
+    \b
     Examples:
-
-    modelserver spy
-
-    modelserver spy --terminal --channel POSE
-
-    modelserver spy --once --channel MODELSERVER_HEALTH
+      modelserver spy
+      modelserver spy --terminal --channel POSE
+      modelserver spy --once --channel MODELSERVER_HEALTH
     """
     if build_only:
         typer.echo(str(types_jar()))

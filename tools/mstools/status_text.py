@@ -10,14 +10,28 @@ from enum import IntEnum, IntFlag
 from typing import Any, Final
 
 from modelserver.core import DEGRADED, RUNNING, STARTING
-from modelserver.messages import ChannelHealth, DriverHealth, DriverPhase, Health
-from mstools.output import safe
+from modelserver.messages import (
+    ChannelHealth,
+    DriverHealth,
+    DriverPhase,
+    Health,
+    Invalid,
+    LocalizationHealth,
+    Phase,
+)
+from mstools.output import counted, safe
 from mstools.table import table
 
 STATES: Final = {STARTING: "STARTING", RUNNING: "RUNNING", DEGRADED: "DEGRADED"}
 
 MAX_ROWS: Final = 40
 """Rows of a table that are shown; a stranger may make up as many sources as the daemon tells apart."""
+
+SENSOR: Final = "sensor:"
+"""What the names of sensors' sources begin with in a report."""
+
+FRESH_S: Final = 1.0
+"""A source without a rate that spoke in the last second was first heard after rates were last worked out."""
 
 
 def is_well(health: Health) -> bool:
@@ -59,33 +73,81 @@ def _body(health: Health) -> str:
     else:
         reasons = health.invalid_reasons.explain()
         rows.append(("pose", f"NOT VALID: {reasons}" if health.invalid_reasons else "valid"))
-        bounds = f"within {number(said.horizontal_bound, 2)} m, heading {degrees(said.heading_bound)} deg"
+        bounds = _bounds(said)
         if math.isfinite(said.seconds_to_limit):
             bounds += f"; {duration(said.seconds_to_limit)} to a limit if nothing more arrives"
         rows.append(("", bounds))
-        phase = "no filter" if said.phase is None else said.phase.name.lower()
-        stands = "standing" if said.standing else "moving"
-        fix = "no fix used yet" if math.isnan(said.fix_age) else f"last fix used {duration(said.fix_age)} ago"
-        rows.append(("filter", f"mode {said.mode.name.lower()}, {phase}, {stands}; {fix}"))
+        rows.append(("filter", f"mode {said.mode.name.lower()}{_motion(health)}; {_fix(said.fix_age)}"))
         origin = f"origin {health.origin_id & (1 << 64) - 1:016x}" if health.origin_id else "no origin yet"
-        rows.append(("", f"epoch {health.pose_epoch}, {origin}, {health.poses_published} poses published"))
+        rows.append(("", f"epoch {health.pose_epoch}, {origin}, {counted(health.poses_published, 'pose')} published"))
     rows.append(("geometry", f"revision {health.model_revision}"))
     late = (health.tick_lateness_p50, health.tick_lateness_p90, health.tick_lateness_p99, health.tick_lateness_max)
     rows.append(
         ("loop", f"late by {' / '.join(number(each * 1e3, 2) for each in late)} ms (p50, p90, p99, most); "
-         f"{health.ticks_missed} ticks missed, {health.handler_errors} errors of its own")
+         f"{counted(health.ticks_missed, 'tick')} missed, {counted(health.handler_errors, 'error')} of its own")
     )  # fmt: skip
-    cpu = "not known" if math.isnan(health.cpu_share) else f"{health.cpu_share:.0%} of a processor"
+    cpu = "processor time not known yet" if math.isnan(health.cpu_share) else f"{health.cpu_share:.0%} of a processor"
     memory = f"{health.memory / 1e6:.0f} MB" if health.memory else "memory not known"
+    waits = "waits" if health.requests_parked == 1 else "wait"
     rows.append(("process", f"{cpu}, {memory}"))
     rows.append(
         (
             "requests",
-            f"{health.requests_answered} answered, {health.requests_parked} wait for data, "
+            f"{health.requests_answered} answered, {health.requests_parked} {waits} for data, "
             f"{health.requests_queued} in the queue",
         )
     )
     return "\n".join(f"{name:<9} {safe(text)}".rstrip() for name, text in rows)
+
+
+def _bounds(said: LocalizationHealth) -> str:
+    """Return the protection bounds in words, as far as they are known."""
+    within = f"within {number(said.horizontal_bound, 2)} m" if math.isfinite(said.horizontal_bound) else ""
+    heading = f"heading {degrees(said.heading_bound)} deg" if math.isfinite(said.heading_bound) else ""
+    if not within and not heading:
+        return "no bound is known"
+    return f"{within or 'position without a bound'}, {heading or 'heading without a bound'}"
+
+
+def is_current(health: Health) -> bool:
+    """Return whether phase and motion are those of now: not where what the localization knows them from is silent."""
+    heard = [each for each in health.channels if each.channel.startswith(SENSOR) and each.count]
+    return Invalid.STALE_IMU not in health.invalid_reasons and any(not each.silent for each in heard)
+
+
+def _motion(health: Health) -> str:
+    """Return in words how far localization has come and whether the vehicle moves, as far as that is known."""
+    said = health.localization
+    phase = "" if said.phase is None else said.phase.name.lower()
+    filtered = f", {phase}" if phase else ", no filter"
+    if not any(each.channel.startswith(SENSOR) and each.count for each in health.channels):
+        return f"{filtered}: no sensor was heard yet"
+    # while it levels it knows of standing alone
+    moves = "standing" if said.standing else "" if said.phase is Phase.LEVELLING else "moving"
+    if is_current(health):
+        return f"{filtered}, {moves}" if moves else filtered
+    was = " and ".join(filter(None, (phase, moves)))
+    when = (
+        "at the last inertial sample" if Invalid.STALE_IMU in health.invalid_reasons else "when the sensors fell silent"
+    )
+    return f"{'' if phase else filtered}; {was} {when}"
+
+
+def _fix(age_s: float) -> str:
+    if math.isnan(age_s):
+        return "no fix used yet"
+    if age_s < 0.0:
+        return f"last fix used has a stamp {duration(-age_s)} ahead of the clock"
+    return f"last fix used {duration(age_s)} ago"
+
+
+def _rate(each: ChannelHealth) -> str:
+    """Return a source's rate; - for one that was first heard in the period that is not over."""
+    return "-" if _is_fresh(each) else number(each.rate_hz, 1)
+
+
+def _is_fresh(each: ChannelHealth) -> bool:
+    return bool(each.count) and not each.silent and each.rate_hz == 0.0 and each.age < FRESH_S
 
 
 def _channels(channels: Iterable[ChannelHealth]) -> str:
@@ -93,7 +155,7 @@ def _channels(channels: Iterable[ChannelHealth]) -> str:
         (
             each.channel,
             str(each.count),
-            number(each.rate_hz, 1),
+            _rate(each),
             age(each.age),
             number(each.delay_max * 1e3, 1),
             "never heard" if not each.count else "SILENT" if each.silent else "",
@@ -132,15 +194,17 @@ def line(health: Health) -> str:
     said = health.localization
     parts = [clock(health.utime), STATES.get(health.state, str(health.state))]
     if said.mode is not None:
-        within = f"within {number(said.horizontal_bound, 2)} m {degrees(said.heading_bound)} deg"
-        parts.append(f"pose not valid: {health.invalid_reasons.explain()}" if health.invalid_reasons else within)
-    parts += [
-        f"{each.channel} {'never heard' if not each.count else 'SILENT' if each.silent else f'{each.rate_hz:.1f} Hz'}"
-        for each in health.channels[:MAX_ROWS]
-    ]
+        parts.append(f"pose not valid: {health.invalid_reasons.explain()}" if health.invalid_reasons else _bounds(said))
+    parts += [f"{each.channel} {_heard(each)}" for each in health.channels[:MAX_ROWS]]
     parts.append(f"late p99 {health.tick_lateness_p99 * 1e3:.2f} ms")
     parts += [f"{name}: {text}" for name, text in health.notices]
     return safe("; ".join(parts))
+
+
+def _heard(each: ChannelHealth) -> str:
+    if not each.count:
+        return "never heard"
+    return "SILENT" if each.silent else "heard" if _is_fresh(each) else f"{each.rate_hz:.1f} Hz"
 
 
 def as_data(health: Health, drivers: Iterable[DriverHealth] = ()) -> dict[str, Any]:
@@ -153,7 +217,7 @@ def as_data(health: Health, drivers: Iterable[DriverHealth] = ()) -> dict[str, A
     data["state"] = STATES.get(health.state, health.state)
     data["well"] = is_well(health)
     data["invalid_text"] = health.invalid_reasons.explain()
-    data["localization"] = fields_of(health.localization)
+    data["localization"] = fields_of(health.localization) | {"current": is_current(health)}
     data["channels"] = [fields_of(each) for each in health.channels]
     data["rejected"] = [{"channel": a, "reason": b, "count": c} for a, b, c in health.rejected]
     data["notices"] = dict(health.notices)

@@ -21,7 +21,7 @@ from modelserver.errors import RecordingError, WireError
 from modelserver.messages import GetHistory, GetTransformations
 from modelserver.service.journal import build as journal_build
 from modelserver.service.journal.rerun import Rerun, Said
-from modelserver.service.journal.ring import SEGMENT_NAME, segments
+from modelserver.service.journal.ring import SEGMENT_NAME
 from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode
 from modelserver.wire.journal import FORMAT, Broken, End, Head, Kind, Record, State, read
@@ -96,16 +96,6 @@ class _Group:
     record: Record
     now: list[Said]
     was: list[Record] = field(default_factory=list)
-
-
-def files_of(journal: Path) -> list[Path]:
-    """Return the segments of a journal: of a directory, or the one file. Raises RecordingError, OSError."""
-    if not journal.is_dir():
-        return [journal]
-    found = segments(journal)
-    if not found:
-        raise RecordingError(f"{journal}: holds no segment of a journal (journal-*.lcm)")
-    return found
 
 
 def verify(files: Sequence[Path], show: Callable[[int], object] = lambda done: None) -> Verified:

@@ -305,7 +305,7 @@ def test_every_problem_is_reported_at_once():
     [
         (b"", "the file is empty"),
         (b"\xef\xbb\xbf \n\t\n", "the file is empty"),
-        (b"# only a comment\n", "top level is a single value"),
+        (b"# only a comment\n", "nothing in the file but comments"),
         (b"just words", "top level is a single value"),
         (b"- a\n- b\n", "top level is a list"),
         (b"name: x\n", "there are no bodies"),

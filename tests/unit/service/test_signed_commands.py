@@ -191,6 +191,8 @@ def test_given_any_cut_or_more_bytes_then_it_is_counted() -> None:
     good = encode(envelope(RELOAD, START))
     for data in [good[:n] for n in range(len(good))] + [good + b"\0"]:
         assert rig.says(data) == []
+    rig.clock.advance(1.0)  # of many the core is told once a second
+    rig.loop.turn()
     assert (rig.obeyed, sum(rig.rejected.values())) == (0, len(good) + 1)
     assert {why for _, why in rig.rejected} <= {"fingerprint", "truncated", "malformed", "load"}
 

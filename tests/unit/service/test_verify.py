@@ -31,8 +31,10 @@ from modelserver.messages import (
     SwitchMode,
     TimeQuery,
 )
-from modelserver.service.journal.verify import Verified, files_of, verify
+from modelserver.service.journal.files import files_of
+from modelserver.service.journal.verify import Verified, verify
 from modelserver.wire.codec import encode
+from modelserver.wire.eventlog import written
 from modelserver.wire.journal import Record, batch_written, read
 
 S = 1_000_000
@@ -368,10 +370,42 @@ def test_given_another_build_then_it_is_told_what_is_other(tmp_path: Path) -> No
     assert "numpy was 0.1" in found.other[0]
 
 
-def test_given_no_journal_then_that_is_said(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="holds no segment"):
-        files_of(tmp_path)
-    other = tmp_path / "other.lcm"
-    shutil.copy(__file__, other)
-    found = verify([other])
-    assert not found.proved
+def test_given_what_is_no_journal_then_it_is_said_what_it_is_and_what_to_do(tmp_path: Path) -> None:
+    def refused(path: Path, words: str) -> None:
+        with pytest.raises(RecordingError) as raised:
+            files_of(path)
+        assert words in str(raised.value)
+        assert str(raised.value).startswith(f"{path}: ")
+
+    refused(tmp_path, "the folder is empty")
+    empty = tmp_path / "empty.lcm"
+    empty.touch()
+    refused(empty, "the file is empty, so there is nothing to verify")
+    refused(
+        tmp_path, "holds no segment of a journal (journal-*.lcm); its LCM logs are played by modelserver replay LOG"
+    )
+    text = tmp_path / "README.md"
+    shutil.copy(__file__, text)
+    refused(text, "is no journal, and no LCM log either")
+    log = tmp_path / "drive.lcm"
+    log.write_bytes(b"".join(written(n, START, b"IMU", encode(imu(START))) for n in range(3)))
+    refused(log, "is an LCM log, but no journal of a modelserver, so it does not say what is to be reproduced")
+    refused(log, f"modelserver replay {log} (without --verify) plays it")
+    kept = tmp_path / "journal-rover"
+    kept.mkdir()
+    (kept / "journal-00000000.lcm").touch()
+    refused(tmp_path, f"did you mean {kept}?")
+    assert files_of(kept) == [kept / "journal-00000000.lcm"]
+
+
+def test_given_a_segment_whose_head_is_damaged_or_cut_off_then_it_is_still_one(tmp_path: Path) -> None:
+    kept = Kept(tmp_path, SMALL)
+    kept.drive(0.5)
+    (path,) = kept.finish()
+    data = path.read_bytes()
+    other = tmp_path / "copy.lcm"
+    other.write_bytes(b"\0" * 100 + data[100:])
+    assert files_of(other) == [other]
+    path.write_bytes(data[:20])
+    assert files_of(path) == [path]
+    assert not verify([path]).proved

@@ -54,16 +54,16 @@ class Rig:
         return taken
 
 
-@pytest.mark.parametrize(("rule", "used"), [("ignore", 60), ("use", 70), ("", 70)])
+@pytest.mark.parametrize(("rule", "used"), [("ignore", 57), ("use", 64), ("", 64)])
 def test_given_another_name_on_the_channel_then_the_first_keeps_it(
     rule: str, used: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     rig = Rig(rule)
     rig.speak(50)
-    rig.speak(10, other="intruder")
+    rig.speak(7, other="intruder")
     assert rig.taken == used
     counted = rig.loop.state.rejected.get(("IMU", "second_writer"), 0)
-    assert counted == (10 if rule else 0)
+    assert counted == (7 if rule else 0)
     if not rule:
         assert rig.loop.state.notices == {}
         return

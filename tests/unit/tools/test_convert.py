@@ -120,4 +120,4 @@ def test_a_folder_that_is_missing_or_a_target_that_is_a_folder_is_one_line(conve
 def test_help_has_an_example(convert):
     code, out, _ = convert("--help")
     assert code == 0
-    assert "Example: modelserver convert" in out
+    assert "Examples:\n    modelserver convert" in out

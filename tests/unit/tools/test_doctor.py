@@ -80,6 +80,15 @@ def test_given_two_daemons_then_it_is_an_error(run: Run) -> None:
     assert "$ kill 2" in out
 
 
+@pytest.mark.parametrize("url", ["udpm://nonsense", "udpm://10.0.0.1:7667", "udpm://239.255.76.67", "x://"])
+def test_given_a_wrong_url_then_that_is_the_error_and_nothing_is_said_of_routes(run: Run, url: str) -> None:
+    code, out, _ = run("--url", url)
+    assert code == 3
+    assert f"error    bus       {url}" in out
+    assert "route" not in out
+    assert "sudo" not in out
+
+
 def test_given_json_then_scripts_get_every_finding(run: Run) -> None:
     code, out, _ = run("--json", facts=BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), False))
     data = json.loads(out)
@@ -105,6 +114,17 @@ def test_given_a_vehicle_file_that_is_wrong_then_it_is_an_error_that_check_expla
     assert code == 3
     assert f"$ modelserver check {path}" in out
     assert "own message" in out
+
+
+def test_given_a_geometry_for_the_vehicle_file_then_it_says_so_and_does_not_send_to_check(
+    run: Run, tmp_path: Path
+) -> None:
+    path = write_vehicle(tmp_path).parent / "geometry.yaml"
+    code, out, _ = run("-c", path)
+    assert code == 3
+    assert f"{path} is wrong: this is a geometry file, not a vehicle file" in out
+    assert "give the vehicle file, which names it" in out
+    assert "modelserver check" not in out
 
 
 def test_given_no_such_vehicle_file_then_it_says_so(run: Run, tmp_path: Path) -> None:

@@ -193,6 +193,32 @@ def test_given_a_file_that_is_wrong_then_its_problems_are_told(run: Command, tmp
     assert "Digiclops:ImagePlane" in err
 
 
+def test_given_a_world_frame_that_there_is_not_then_those_that_there_are_are_told(run: Command, annex: Path) -> None:
+    code, _, err = run("query", "World:UTN", "Digiclops:ImagePlane", "--model", annex)
+    assert code == 1
+    assert "'World:UTN' is no frame; there are World:UTM, World:ENU, Odom:Origin. Nearest: World:UTM" in err
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"vehicle: cart\ngeometry: cart.xml\nbase_frame: Cart:Base\n", "this is a vehicle file, not a geometry file"),
+        (b"\xed\xa1\xda\x01" + bytes(40), "this is an LCM event log, not a geometry file"),
+        (b"# bodies:\n", "there is nothing in the file but comments"),
+    ],
+)
+def test_given_a_file_of_another_kind_for_a_model_then_one_error_says_what_it_is(
+    run: Command, tmp_path: Path, content: bytes, words: str
+) -> None:
+    path = tmp_path / "file.yaml"
+    path.write_bytes(content)
+    code, out, err = run("bodies", "--model", path)
+    assert (code, out) == (1, "")
+    assert words in err
+    assert err.count("error:") == 1
+    assert ("give the geometry file that it names, 'cart.xml'" in err) == (b"cart.xml" in content)
+
+
 def test_given_no_daemon_then_one_line_says_so_and_exit_is_1(run: Command, lcm_url: str) -> None:
     for command in (("query", *PAIR), ("bodies",), ("frames", "Digiclops")):
         code, out, err = run(*command, "--url", lcm_url, "--timeout", "0.02")

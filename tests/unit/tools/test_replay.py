@@ -14,6 +14,7 @@ from typing import Any
 
 import lcm
 import pytest
+from support_lcm import reserved_url
 from support_recordings import EASTING, HEIGHT, HUSKY, LATENCY, NORTHING, SPEED, START, drive, write_log
 from support_samples import Scripted
 from support_tuning import in_raw_mode
@@ -430,7 +431,8 @@ def test_given_an_interrupt_when_played_then_it_ends_with_the_count(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(playback.Player, "play", interrupted)
-    code, words, _ = run(driven, "--url", "memq://")
+    with reserved_url() as url:
+        code, words, _ = run(driven, "--url", url)
     assert code == 130
     assert "3 messages sent" in words
 

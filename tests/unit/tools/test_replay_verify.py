@@ -114,7 +114,13 @@ def test_given_options_of_another_use_then_the_usage_is_wrong(run: Run, folder: 
 
 
 def test_given_what_is_no_journal_then_that_is_said(run: Run, tmp_path: Path) -> None:
-    assert run("--verify", tmp_path)[0] == 1
+    code, out, err = run("--verify", tmp_path)
+    assert (code, out) == (1, "")
+    assert "the folder is empty" in err
+    (tmp_path / "README.md").write_text("# Not a journal\n")
+    code, out, err = run("--verify", tmp_path / "README.md")
+    assert (code, out) == (1, "")
+    assert "README.md: is no journal, and no LCM log either" in err
     assert "No such file" in run("--verify", tmp_path / "gone.lcm")[2]
     (tmp_path / "journal-00000000.lcm").write_bytes(b"nonsense")
     code, out, err = run("--verify", tmp_path)

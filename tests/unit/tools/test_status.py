@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -15,7 +16,16 @@ from hypothesis import strategies as st
 from support_wire import EXAMPLES
 
 from modelserver.core import DEGRADED, RUNNING, STARTING
-from modelserver.messages import ChannelHealth, DriverHealth, DriverPhase, Health, Invalid, LocalizationHealth
+from modelserver.messages import (
+    ChannelHealth,
+    DriverHealth,
+    DriverPhase,
+    Health,
+    Invalid,
+    LocalizationHealth,
+    Mode,
+    Phase,
+)
 from modelserver.wire.codec import encode
 from mstools import status
 from mstools.status_text import MAX_ROWS, as_data, clock, duration, is_well, line, report
@@ -39,7 +49,7 @@ def test_given_a_report_then_all_of_it_is_told() -> None:
         "revision ab12",
         "late by 0.10 / 0.50 / 1.00 / 2.00 ms",
         "12% of a processor, 150 MB",
-        "12 answered, 1 wait for data, 3 in the queue",
+        "12 answered, 1 waits for data, 3 in the queue",
         "journal: the disk is full",
         "never heard",
         "streaming",
@@ -60,7 +70,87 @@ def test_given_a_report_in_which_little_is_known_then_no_number_is_made_up() -> 
     text = report(BARE)
     assert "the vehicle file names no sensor to localize by" in text
     assert "nan" not in text
-    assert "not known, memory not known" in text
+    assert "processor time not known yet, memory not known" in text
+
+
+IMU = ChannelHealth("sensor:imu", 500, 50.0, 0.01)
+GPS = ChannelHealth("sensor:gps", 100, 10.0, 0.05)
+UNHEARD = (
+    ChannelHealth("GPS", 0, 0.0, math.nan, math.nan, True),
+    ChannelHealth("IMU", 0, 0.0, math.nan, math.nan, True),
+)
+QUIET = tuple(replace(each, rate_hz=0.0, age=9.0, silent=True) for each in (GPS, IMU))
+LEVELLING = LocalizationHealth(Mode.FULL, Phase.LEVELLING)
+DRIVING = LocalizationHealth(Mode.FULL, Phase.ALIGNED, False, 1.5, 0.05, 12.0, 0.3)
+STALE = Invalid.STALE_IMU | Invalid.BOUND_EXCEEDED
+
+
+@pytest.mark.parametrize(
+    ("said", "channels", "reasons", "filter_line", "bounds"),
+    [
+        (LEVELLING, UNHEARD, Invalid.NO_IMU,
+         "mode full, levelling: no sensor was heard yet; no fix used yet", "no bound is known"),
+        (LEVELLING, (UNHEARD[0], IMU), Invalid.NO_FIX,
+         "mode full, levelling; no fix used yet", "no bound is known"),
+        (replace(LEVELLING, standing=True), (GPS, IMU), Invalid.NO_FIX,
+         "mode full, levelling, standing; no fix used yet", "no bound is known"),
+        (replace(LEVELLING, phase=Phase.UNALIGNED), (GPS, IMU), Invalid.NOT_MOVED_YET,
+         "mode full, unaligned, moving; no fix used yet", "no bound is known"),
+        (DRIVING, (GPS, IMU), Invalid(0),
+         "mode full, aligned, moving; last fix used 300 ms ago", "within 1.50 m, heading 2.9 deg; 12.0 s to a limit"),
+        (DRIVING, (GPS, QUIET[1]), STALE,
+         "mode full; aligned and moving at the last inertial sample; last fix used 300 ms ago", "within 1.50 m"),
+        (replace(DRIVING, mode=Mode.NO_IMU), QUIET, Invalid.STALE_GPS,
+         "mode no_imu; aligned and moving when the sensors fell silent; last fix", "within"),
+        (replace(DRIVING, mode=Mode.RAW, phase=None), (GPS, IMU), Invalid(0),
+         "mode raw, no filter, moving; last fix", "within"),
+        (replace(DRIVING, mode=Mode.RAW, phase=None), QUIET, STALE,
+         "mode raw, no filter; moving at the last inertial sample; last fix", "within"),
+        (replace(LEVELLING, mode=Mode.RAW, phase=None), UNHEARD, Invalid.NO_IMU,
+         "mode raw, no filter: no sensor was heard yet; no fix", "no bound"),
+        (DRIVING, UNHEARD, Invalid.NO_IMU,
+         "mode full, aligned: no sensor was heard yet; last fix used 300 ms ago", "within"),
+        (replace(DRIVING, heading_bound=math.nan), (GPS, IMU), Invalid(0),
+         "mode full", "within 1.50 m, heading without a bound"),
+        (replace(DRIVING, horizontal_bound=math.inf), (GPS, IMU), Invalid(0),
+         "mode full", "position without a bound, heading 2.9 deg"),
+        (replace(DRIVING, fix_age=-3600.0), (GPS, IMU), Invalid(0),
+         "last fix used has a stamp 1 h 00 min ahead of the clock", "within"),
+    ],
+)  # fmt: skip
+def test_given_a_state_then_what_was_known_is_not_told_as_if_it_were_so_now(
+    said: LocalizationHealth,
+    channels: tuple[ChannelHealth, ...],
+    reasons: Invalid,
+    filter_line: str,
+    bounds: str,
+) -> None:
+    health = replace(WELL, localization=said, channels=channels, invalid_reasons=reasons)
+    text = report(health)
+    assert filter_line in text
+    assert f"\n          {bounds}" in text
+    assert not re.search(r"\b(within|heading) -", text + line(health))
+    moving = "moving;" in filter_line or "standing;" in filter_line
+    current = as_data(health)["localization"]["current"]
+    assert current == (
+        "heard yet" not in filter_line and "silent" not in filter_line and "last inert" not in filter_line
+    )
+    assert current or not moving
+
+
+def test_given_one_of_a_thing_then_the_words_are_of_one() -> None:
+    one = replace(WELL, ticks_missed=1, handler_errors=1, poses_published=1, requests_parked=1)
+    for words in ("1 tick missed, 1 error of its own", "1 pose published", "1 waits for data"):
+        assert words in report(one)
+    several = replace(WELL, ticks_missed=3, handler_errors=0, poses_published=2, requests_parked=2)
+    for words in ("3 ticks missed, 0 errors of its own", "2 poses published", "2 wait for data"):
+        assert words in report(several)
+
+
+def test_given_a_source_that_was_just_heard_then_its_rate_is_not_0() -> None:
+    fresh = replace(WELL, channels=(ChannelHealth("sensor:imu", 3, 0.0, 0.02),))
+    assert "sensor:imu heard" in line(fresh)
+    assert "0.0" not in next(each for each in report(fresh).splitlines() if "sensor:imu" in each)
 
 
 def test_given_a_silent_sensor_then_it_stands_out() -> None:

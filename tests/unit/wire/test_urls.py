@@ -1,0 +1,80 @@
+"""LCM URLs that lead nowhere: told apart, each with what to write."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from modelserver.wire.channels import DEFAULT_URL
+from modelserver.wire.provider import resolve_url
+from modelserver.wire.urls import EXAMPLE, url_problem
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("nonsense", "it has no scheme; write it like udpm://239.255.76.67:7667?ttl=0"),
+        ("239.255.76.67:7667", "it has no scheme"),
+        ("nonsense://", "'nonsense' is no scheme of LCM's; there are udpm://, mpudpm://, tcpq://, file://"),
+        ("udp://239.255.76.67:7667", "did you mean udpm://?"),
+        ("UDPM://239.255.76.67:7667", "did you mean udpm://?"),
+        ("memq://", "memq:// reaches nobody"),
+        ("file://", "it names no log"),
+        ("udpm://nonsense", "'nonsense' is no IPv4 address; write one between 224.0.0.0 and 239.255.255.255"),
+        ("udpm://localhost:7667", "'localhost' is no IPv4 address"),
+        ("udpm://ff02::1:7667", "'ff02' is no IPv4 address"),
+        ("udpm://:7667", "the address before the port is missing"),
+        ("udpm://10.0.0.1:7667", "'10.0.0.1' is no multicast address"),
+        ("udpm://127.0.0.1:7667?ttl=0", "'127.0.0.1' is no multicast address"),
+        ("udpm://240.0.0.1:7667", "'240.0.0.1' is no multicast address"),
+        ("mpudpm://10.0.0.1:7667", "such as mpudpm://239.255.76.67:7667?ttl=0"),
+        ("udpm://239.255.76.67", "the port is missing; write udpm://239.255.76.67:7667"),
+        ("udpm://239.255.76.67?ttl=0", "the port is missing"),
+        ("udpm://239.255.76.67:", "the port is a number from 1 to 65535, got ''"),
+        ("udpm://239.255.76.67:0", "the port is a number from 1 to 65535, got '0'"),
+        ("udpm://239.255.76.67:-5", "the port is a number from 1 to 65535, got '-5'"),
+        ("udpm://239.255.76.67:99999?ttl=0", "got '99999'"),
+        ("udpm://239.255.76.67:port", "got 'port'"),
+        ("udpm://239.255.76.67:7667?ttl=one", "ttl is a whole number from 0 to 255, got 'one'"),
+        ("udpm://239.255.76.67:7667?ttl=", "got ''"),
+        ("udpm://239.255.76.67:7667?ttl", "got ''"),
+        ("udpm://239.255.76.67:7667?ttl=300", "got '300'"),
+        ("udpm://239.255.76.67:7667?recv_buf_size=1&ttl=-1", "got '-1'"),
+        ("udpm://?ttl=1.5", "got '1.5'"),
+    ],
+)
+def test_given_a_url_that_leads_nowhere_then_it_is_told_what_is_wrong_and_what_to_write(url: str, words: str) -> None:
+    assert words in url_problem(url)
+    # as it is when a buffer was added to it, too
+    assert words in url_problem(resolve_url(url))
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        DEFAULT_URL,
+        EXAMPLE,
+        "udpm://",
+        "udpm://?ttl=1",
+        "udpm://239.255.76.67:7667",
+        "udpm://224.0.0.1:1?ttl=255&recv_buf_size=5",
+        "udpm://239.255.76.67:0x1E13",
+        "mpudpm://",
+        "mpudpm://239.255.76.67",
+        "mpudpm://239.255.76.67:0?ttl=0",
+        "tcpq://",
+        "tcpq://127.0.0.1:7700",
+        "tcpq://nonsense",
+        "file:///drive.lcm",
+        "file:///drive.lcm?mode=w",
+    ],
+)
+def test_given_a_url_that_liblcm_takes_then_nothing_is_wrong_with_it(url: str) -> None:
+    assert url_problem(url) == ""
+
+
+@given(st.one_of(st.text(), st.text().map("udpm://{}".format), st.text().map("udpm://239.255.76.67:{}".format)))
+def test_given_any_text_then_an_answer_is_one_line(url: str) -> None:
+    text = url_problem(url)
+    assert text.isprintable() or not text
