@@ -232,7 +232,7 @@ def test_given_a_bus_that_cannot_be_joined_then_the_error_says_what_to_look_at(
 
     monkeypatch.setattr("modelserver.wire.provider.lcm.LCM", refused)
     url = "udpm://239.1.2.3:7667?ttl=0"
-    with pytest.raises(BusError, match="sudo ip route replace 239.1.2.3/32 dev lo") as caught:
+    with pytest.raises(BusError, match=r"sudo ip route replace 239\.1\.2\.3/32 dev lo") as caught:
         LcmBus(url)
     assert url in str(caught.value)
     assert "no way out" in str(caught.value)

@@ -33,6 +33,7 @@ from modelserver.messages import (
     WheelsSample,
     YawSource,
 )
+from modelserver.simulation import Event
 from modelserver.simulation.scenario import START_UTIME
 
 wild = st.floats(allow_nan=True, allow_infinity=True, width=64)
@@ -135,13 +136,18 @@ def test_given_any_samples_when_taken_then_nothing_is_raised_and_numbers_are_fin
         check(localizer.estimate(at))
 
 
+@lru_cache
+def half_a_minute() -> list[GpsSample | ImuSample]:
+    return Sensors().events(Drive(30.0, speed=constant(2.0), yaw_rate=constant(0.2)))
+
+
 @settings(max_examples=15, phases=PHASES)
 @given(samples=st.lists(st.one_of(gps, imu), max_size=20))
 def test_given_any_samples_when_good_ones_follow_then_the_pose_is_valid_again(samples):
     localizer = RawLocalizer.start(MOUNTS, None, ORIGIN)
     for sample in samples:
         localizer, _ = localizer.take(sample)
-    for sample in Sensors().events(Drive(30.0, speed=constant(2.0), yaw_rate=constant(0.2))):
+    for sample in half_a_minute():
         localizer, _ = localizer.take(sample)
     assert localizer.estimate(localizer.utime).invalid == Invalid(0)
 
@@ -212,6 +218,11 @@ def test_given_any_samples_when_the_filter_takes_them_then_it_neither_raises_nor
         check(localizer.estimate(at))
 
 
+@lru_cache
+def forty_seconds() -> list[Event]:
+    return support_cart.drive(40.0, imu_hz=20.0)[1]
+
+
 @settings(max_examples=6, phases=PHASES, deadline=None)
 @given(
     samples=st.lists(st.one_of(gps, imu, further.filter(lambda each: not isinstance(each, SwitchMode))), max_size=20)
@@ -220,6 +231,6 @@ def test_given_any_samples_when_good_ones_follow_then_the_filters_pose_is_valid_
     localizer = support_cart.localizer()
     for sample in samples:
         localizer, _ = localizer.take(sample)
-    for sample in support_cart.drive(40.0, imu_hz=20.0)[1]:
+    for sample in forty_seconds():
         localizer, _ = localizer.take(sample)
     assert localizer.estimate(localizer.utime).invalid == Invalid(0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import random
 import shutil
 import signal
 import socket
@@ -164,14 +165,28 @@ class Bench:
                 yield process
 
 
+@contextmanager
+def reserved_port() -> Iterator[int]:
+    """Yield a port that no other test listens on: who has an even one holds the odd one above it.
+
+    They lie below those of `reserved_url`, and below those that the kernel hands out by itself.
+    """
+    for port in random.SystemRandom().sample(range(12_000, 20_000, 2), 100):
+        with socket.socket() as holder, socket.socket() as probe:
+            try:
+                holder.bind(("127.0.0.1", port + 1))
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            probe.close()
+            yield port
+            return
+    raise RuntimeError("no free port")
+
+
 @pytest.fixture
 def bench(tmp_path: Path) -> Iterator[Bench]:
-    with ExitStack() as stack:
-        url = stack.enter_context(reserved_url())
-        holder = stack.enter_context(socket.socket())
-        holder.bind(("127.0.0.1", 0))
-        port = holder.getsockname()[1]
-        holder.close()
+    with reserved_url() as url, reserved_port() as port:
         yield Bench(tmp_path, url, port)
 
 
@@ -270,6 +285,8 @@ def test_given_a_raw_recording_when_played_then_the_same_is_measured_without_the
         bench.wait(lambda: len(bench.samples) >= 4, "samples")
         driver.send_signal(signal.SIGTERM)
         assert driver.wait(PATIENCE_S) == 0
+    # what it said before it ended has been heard when its last report has
+    bench.wait(lambda: bool(bench.reports) and bench.reports[-1].text == "ended", "the last report")
     first = list(bench.samples)
     bench.samples.clear()
     with bench.driver("gps", "--play-raw", str(raw)) as driver:
