@@ -15,6 +15,7 @@ from modelserver.file_kinds import LOOKED_AT, FileKind, file_kind
 from modelserver.formats import check_file
 from modelserver.geometry.model import Model
 from mstools.check_drivers import drivers_problems
+from mstools.missing import nearest_path
 from mstools.options import Variables, parse_variables
 from mstools.output import counted, print_problem, safe, size_of
 
@@ -62,7 +63,9 @@ def _checked(file: str, variables: dict[str, str], strict: bool) -> tuple[Model 
         return check_file(file, variables, strict=strict)
     except OSError as error:
         message = f"the file cannot be read: {error.strerror or error}"
-        return None, (Problem(Severity.ERROR, message, Source(file), "look at the path and its permissions"),)
+        near = nearest_path(file) if isinstance(error, FileNotFoundError) else ""
+        fix = f"did you mean {near}?" if near else "look at the path and its permissions"
+        return None, (Problem(Severity.ERROR, message, Source(file), fix),)
 
 
 def is_vehicle_file(file: str) -> bool:

@@ -15,6 +15,7 @@ import typer
 
 from modelserver.errors import ConfigError, GeometryError, ModelServerError, QueryError, nearest_names, shown
 from modelserver.version import __version__
+from mstools.missing import meant
 from mstools.output import print_problem, safe
 
 COMMANDS = {
@@ -92,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _fail(str(error))
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
-        _fail(f"{place}{error.strerror or error}")
+        _fail(f"{place}{error.strerror or error}{meant(error)}")
     except KeyboardInterrupt:
         sys.exit(130)
 

@@ -6,14 +6,14 @@ import json
 import os
 import shlex
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from modelserver.errors import BusError, ConfigError, nearest_names
+from modelserver.errors import BusError, ConfigError
 from mstools.asking import JsonOption, PrefixOption, UrlOption
+from mstools.missing import nearest_path
 from mstools.output import counted, safe
 
 if TYPE_CHECKING:
@@ -65,10 +65,8 @@ def check_there(config: Path) -> None:
         wrong = f"{config} is a folder; name the vehicle file in it" if os.path.isdir(config) else ""
         os.stat(config)
     except (FileNotFoundError, NotADirectoryError):
-        near: tuple[str, ...] = ()
-        with suppress(OSError):
-            near = nearest_names(config.name, os.listdir(config.parent), 1)
-        offer = f"; did you mean {config.parent / near[0]}?" if near else ""
+        near = nearest_path(config)
+        offer = f"; did you mean {near}?" if near else ""
         wrong = f"there is no vehicle file {config}{offer}"
     except OSError:
         return
