@@ -8,7 +8,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -256,7 +256,7 @@ def _pool(processes: int, parts: int) -> Iterator[Callable[[Sequence[Job]], list
         return
     pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"), initializer=_ignore_interrupts)
     try:
-        yield lambda jobs: list(pool.map(_run, jobs))
+        yield lambda jobs: [future.result() for future in _submitted(pool, jobs)]
     except BaseException:
         # what runs takes seconds and is of no use any more; the pool forgets its workers when it shuts down
         workers = list((getattr(pool, "_processes", None) or {}).values())
@@ -267,6 +267,22 @@ def _pool(processes: int, parts: int) -> Iterator[Callable[[Sequence[Job]], list
             each.join()
         raise
     pool.shutdown()
+
+
+def _submitted(pool: ProcessPoolExecutor, jobs: Sequence[Job]) -> list[Future[Outcome | None]]:
+    """Return what will come of jobs. Ctrl-C counts once all are handed over.
+
+    Handing over starts workers: one that is cut off half-way is running, and the pool does not know it.
+    """
+    came: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    try:
+        futures = [pool.submit(_run, job) for job in jobs]
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        raise KeyboardInterrupt
+    return futures
 
 
 def _ignore_interrupts() -> None:
