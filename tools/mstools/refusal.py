@@ -33,24 +33,21 @@ class Start:
         Without a service manager its errors go their way. With one they are printed at once, and it is told the first;
         then the start ends as it would have, but not before a file has changed or the wait is over.
         """
+        if not self._notifier.is_heard:
+            yield
+            return
         try:
             yield
         except (ConfigError, GeometryError) as error:
-            if not self._notifier.is_heard:
-                raise
             self._refuse(error.problems, 1)
         except OSError as error:
-            if not self._notifier.is_heard or error.filename is None or Path(error.filename) != self._config:
+            if error.filename is None or Path(error.filename) != self._config:
                 raise
             why = f"the vehicle file cannot be read: {error.strerror}"
             self._refuse([_problem(why, self._config)], 1)
         except typer.BadParameter as error:
-            if not self._notifier.is_heard:
-                raise
             self._refuse([_problem(error.message, self._config)], error.exit_code)
         except ModelServerError as error:
-            if not self._notifier.is_heard:
-                raise
             self._refuse([_problem(str(error), self._config)], 1)
 
     def _refuse(self, problems: Iterable[Problem], code: int) -> NoReturn:
