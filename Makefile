@@ -5,6 +5,8 @@
 
 PYTHON ?= python3
 VENV   ?= .venv
+# Which tests `make test` runs; empty: all of them.
+TESTS  ?=
 BIN    := $(VENV)/bin
 # A changed pyproject.toml installs again; a failed install leaves no stamp behind.
 RUN_STAMP := $(VENV)/.installed-run
@@ -34,7 +36,7 @@ demo: $(RUN_STAMP)
 	$(BIN)/modelserver demo
 
 test: $(DEV_STAMP)
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto $(TESTS)
 
 check: $(DEV_STAMP)
 	$(BIN)/ruff format --check .

@@ -151,7 +151,9 @@ def test_a_frozen_unit_repeats_itself_under_new_stamps(simulate):
     samples = list(simulate(imu_model=replace(ImuModel(), frozen_from=3.0)).events(6.0))
     sound = list(simulate(imu_model=ImuModel()).events(6.0))
     assert [sample.header for sample in samples] == [sample.header for sample in sound]
-    assert samples[:300] == [replace(each, temperature_celsius=samples[0].temperature_celsius) for each in sound[:300]]
+    # compared as text: since Python 3.13 a dataclass that holds a nan is not equal to itself
+    steady = [replace(each, temperature_celsius=samples[0].temperature_celsius) for each in sound[:300]]
+    assert list(map(repr, samples[:300])) == list(map(repr, steady))
     assert {sample.specific_force for sample in samples[299:]} == {sound[299].specific_force}
     assert samples[-1].orientation == sound[299].orientation
 
