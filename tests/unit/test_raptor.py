@@ -184,10 +184,11 @@ def test_frames_stand_where_their_names_say(raptor):
 
 def test_what_the_report_does_not_give_is_marked(raptor):
     """A pose that is not the identity is the report's, or says that it is estimated."""
-    given = {"FrontNoddingSICK", "BackNoddingSICK", "Digiclops"}
+    sick = {"AxleCenterFreeEnd", "BottomPlateCorner"}
+    given = {"FrontNoddingSICK": sick, "BackNoddingSICK": sick, "Digiclops": {"ImagePlane"}}
     for body in raptor.bodies:
         for frame in body:
-            if (body.name not in given or frame.name == "NoddingAxis") and frame.pose != type(frame.pose).identity():
+            if frame.name not in given.get(body.name, ()) and frame.pose != type(frame.pose).identity():
                 assert frame.description.startswith("ESTIMATE: "), f"{body.name}:{frame.name}"
     for constraint in raptor.constraints:
         if constraint.name not in ("FrontNoddingSICKFixed", "DigiclopsFixed"):
@@ -221,9 +222,41 @@ def test_both_files_say_the_same():
         assert mine.joint == FIXED
         np.testing.assert_allclose(mine.pose.matrix, theirs.at_rest.matrix, rtol=0, atol=1e-12)
     assert [each.name for each in yaml.constraints if each.joint.moves] == [
+        "FLEALateral",
         "FrontNoddingSICKAxis",
         "BackNoddingSICKAxis",
     ]
+
+
+# --- the cameras (report 6.3, 6.4) --------------------------------------------------------------------------
+
+
+def test_the_digiclops_has_the_four_measurement_points_of_the_report_and_its_lenses_form_an_L(raptor):
+    assert raptor.frame("Digiclops:Pivot").pose == Pose.identity()
+    R_OI = raptor.frame("Digiclops:ImagePlane").pose.rotation
+    right = raptor.frame("Digiclops:RightLens").pose
+    assert right == raptor.frame("Digiclops:ImagePlane").pose
+    for name, baseline in (("LeftLens", (0.0, 0.1, 0.0)), ("TopLens", (0.0, 0.0, 0.1))):
+        lens = raptor.frame(f"Digiclops:{name}").pose
+        np.testing.assert_allclose(R_OI.T @ (lens.position - right.position), baseline, atol=1e-5)
+        np.testing.assert_allclose(lens.rotation, R_OI, atol=1e-12)
+
+
+def test_given_a_positive_angle_when_the_flea_is_turned_then_it_looks_left_about_the_normal_of_its_rail():
+    raptor = load_model(RAPTOR / "geometry.yaml")
+    joint = raptor.joints["FLEALateral"].joint
+    assert joint.type is JointType.REVOLUTE
+    np.testing.assert_allclose(np.degrees((*joint.lower, *joint.upper, *joint.rest)), (-90, 90, 0), atol=1e-12)
+    assert joint.sigma is not None
+    route = raptor.route("FLEA:Lens", "Raptor:CabFrontRailRight")
+    ahead = route.pose(((0.0,),))
+    assert ahead == raptor.get_transformation("FLEA:Lens", "Raptor:CabFrontRailRight").pose
+    c, s = np.cos(np.radians(30.0)), np.sin(np.radians(30.0))
+    turned = route.pose(((np.radians(30.0),),))
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(turned.rotation, R @ ahead.rotation, atol=1e-12)
+    np.testing.assert_allclose(turned.position, (0.03 + 0.05 * c, 0.05 * s, 0.06), atol=1e-12)
+    assert (turned.rotation @ (1.0, 0.0, 0.0))[1] > 0.0
 
 
 # --- what nods ----------------------------------------------------------------------------------------------
