@@ -1,5 +1,6 @@
 """The vehicle's geometry: bodies, frames, constraints, and the graph they make. Pure."""
 
+from modelserver.geometry.adjacency import Neighbor
 from modelserver.geometry.builder import BodyBuilder, ModelBuilder
 from modelserver.geometry.joint import Joint, JointType, Mimic
 from modelserver.geometry.model import Model, Search
@@ -17,6 +18,7 @@ __all__ = [
     "Mimic",
     "Model",
     "ModelBuilder",
+    "Neighbor",
     "Search",
     "Shape",
     "ShapeKind",

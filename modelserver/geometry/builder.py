@@ -16,7 +16,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from modelserver.errors import GeometryError, Problem, Severity, Source
+from modelserver.errors import GeometryError, NotConnectedError, Problem, Severity, Source, shown
+from modelserver.geometry.adjacency import full_name
 from modelserver.geometry.joint import FIXED, Joint
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
@@ -48,7 +49,7 @@ class BodyBuilder:
         source: Source = NOWHERE,
     ) -> BodyBuilder:
         """Add a frame at `pose` in body coordinates; return this body, to go on."""
-        self.frames.append((BodyFrame(name, pose or Pose.identity(), description, sigma), source))
+        self.frames.append((BodyFrame(name, pose or Pose.identity(), description, sigma, self.name), source))
         return self
 
 
@@ -67,6 +68,15 @@ class ModelBuilder:
         """Constraints whose joint a file states in a way that could not be read; they are added as fixed."""
         self._bodies: list[BodyBuilder] = []
         self._constraints: list[tuple[Constraint, Source]] = []
+
+    @classmethod
+    def from_model(cls, model: Model, strict: bool = False) -> ModelBuilder:
+        """Return a builder that holds what a model holds, to change it: models are immutable."""
+        builder = cls(model.name, model.description, strict)
+        for body in model.bodies:
+            builder.add(body)
+        builder._constraints = [(constraint, NOWHERE) for constraint in model.constraints]
+        return builder
 
     @property
     def is_empty(self) -> bool:
@@ -111,6 +121,24 @@ class ModelBuilder:
         constraint = Constraint(name, from_, to, pose or Pose.identity(), description, sigma, joint)
         self._constraints.append((constraint, source))
         return self
+
+    def unconstrain(self, frame: str | BodyFrame, constraint: str = "") -> tuple[str, ...]:
+        """Remove the constraints at a frame, or the one of that name; return the names of those removed.
+
+        `build` then applies the rules again: bodies that no constraint joins to the root any more are orphans, reported
+        in the model's `problems`, and removed with `repair`; a joint that follows a removed one is an error. Raises
+        NotConnectedError where the frame has no such constraint, UnknownFrameError for a frame value on no body.
+        """
+        name = full_name(frame)
+        removed = tuple(
+            each.name
+            for each, _ in self._constraints
+            if name in (each.from_, each.to) and constraint in ("", each.name)
+        )
+        if not removed:
+            raise NotConnectedError(f"frame {name} has no constraint" + (f" {shown(constraint)}" if constraint else ""))
+        self._constraints = [item for item in self._constraints if item[0].name not in removed]
+        return removed
 
     def problem(
         self,

@@ -20,7 +20,8 @@ from modelserver.errors import (
     nearest_names,
     shown,
 )
-from modelserver.geometry import names
+from modelserver.geometry import adjacency, names
+from modelserver.geometry.adjacency import Neighbor
 from modelserver.geometry.drives import drives
 from modelserver.geometry.joint import Coordinates, Joint
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
@@ -148,6 +149,47 @@ class Model:
         """Return the frame of a full name. Raises UnknownBodyError or UnknownFrameError with the nearest names."""
         body, frame = self._split(name)
         return body.frame(frame.name)
+
+    def constraints_of(self, frame: str | BodyFrame) -> tuple[Constraint, ...]:
+        """Return the constraints at a frame, in the order of the file; see `neighbors` for what it raises."""
+        return tuple([each.constraint for each in self.neighbors(frame)])
+
+    def neighbors(self, frame: str | BodyFrame) -> tuple[Neighbor, ...]:
+        """Return the frames at the other ends of a frame's constraints, with the sense in which each is crossed.
+
+        `frame` is a full name, `Body:Frame`, or a frame of this model. Raises UnknownBodyError or UnknownFrameError with
+        the nearest names.
+        """
+        name = adjacency.full_name(frame)
+        self.frame(name)
+        return tuple([Neighbor(self.frame(each.leaves), each) for each in self._topology.crossings(name)])
+
+    def next(self, frame: str | BodyFrame, constraint: str = "") -> Neighbor:
+        """Cross a frame's constraint to the partner frame (the report's nextBodyFrame).
+
+        `constraint` names the one to cross where the frame has several. Raises as `neighbors`, and NotConnectedError
+        where the frame has no such constraint, MalformedRequestError where it has several and none is named.
+        """
+        return adjacency.select_one(adjacency.full_name(frame), self.neighbors(frame), constraint)
+
+    def verify(self, frame: str | BodyFrame) -> tuple[Problem, ...]:
+        """Return what is wrong at a frame, nothing where all is well (the report's verifyConstraint).
+
+        A frame value that differs from the model's is an error, an orphaned body a warning, several constraints a note:
+        a strict model allows one. Raises as `neighbors`.
+        """
+        found = self.neighbors(frame)
+        name = adjacency.full_name(frame)
+        is_other = not isinstance(frame, str) and self.frame(name) != frame
+        is_orphan = names.split(name)[0] not in self.assemblies[0]
+        return adjacency.find_problems(name, found, is_other, is_orphan, self.root.name)
+
+    def is_static(self, frame_of_interest: str, frame_of_reference: str) -> bool:
+        """Return whether no joint lies between two frames: the report's pose type, static or dynamic.
+
+        Raises as `route`.
+        """
+        return not self.route(frame_of_interest, frame_of_reference).legs
 
     def get_body_list(self) -> list[str]:
         """Return the names of the bodies, root first."""

@@ -46,13 +46,20 @@ class Sigma:
 class BodyFrame:
     """A frame of interest on a body: `pose` is its place in body coordinates (the report's A_ij).
 
-    The body's own coordinates are its origin; a frame named Origin usually stands there.
+    The body's own coordinates are its origin; a frame named Origin usually stands there. `body` is the name of the
+    body that the frame is on, set by `Body`, and no part of the frame's value: the same frame on two bodies is equal.
     """
 
     name: str
     pose: Pose = field(default_factory=Pose.identity)
     description: str = ""
     sigma: Sigma | None = None
+    body: str = field(default="", compare=False)
+
+    @property
+    def full_name(self) -> str:
+        """The name by which a model knows the frame, `Body:Frame`; the plain name while it is on no body."""
+        return names.joined(self.body, self.name) if self.body else self.name
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +70,7 @@ class Body:
     back, and takes no part in relations between frames. `inertia` is the 6x6 spatial inertia in body
     coordinates, rows of 6 (the report's InertiaMatrix), or None; `modelserver.geometry.inertia` says how it is made.
     `visuals` and `collisions` are what it looks like and what it occupies, kept for others. Copying a body is
-    `renamed`: values are shared. Raises ValueError for two frames of one name, or an inertia that is not 6x6 and
+    `renamed`: values are shared, and each frame knows the copy as its body. Raises ValueError for two frames of one name, or an inertia that is not 6x6 and
     finite.
     """
 
@@ -77,6 +84,9 @@ class Body:
     _by_name: dict[str, BodyFrame] = field(init=False, repr=False, compare=False, hash=False)
 
     def __post_init__(self) -> None:
+        if any(frame.body != self.name for frame in self.frames):
+            mine = [frame if frame.body == self.name else replace(frame, body=self.name) for frame in self.frames]
+            object.__setattr__(self, "frames", tuple(mine))
         by_name: dict[str, BodyFrame] = {}
         for frame in self.frames:
             if frame.name in by_name:
@@ -111,9 +121,11 @@ class Body:
             )
         return found
 
-    def has_frame(self, name: str) -> bool:
-        """Return whether the body has a frame of that name."""
-        return name in self._by_name
+    def has_frame(self, frame: str | BodyFrame) -> bool:
+        """Return whether the body has a frame of that name, or exactly that frame (the report's verifyBodyFrame)."""
+        if isinstance(frame, str):
+            return frame in self._by_name
+        return frame.body == self.name and self._by_name.get(frame.name) == frame
 
     def with_frame(self, frame: BodyFrame) -> Body:
         """Return this body with one frame more. Raises ValueError for a name that is taken."""
@@ -147,6 +159,11 @@ class Constraint:
     description: str = ""
     sigma: Sigma | None = None
     joint: Joint = FIXED
+
+    @property
+    def is_static(self) -> bool:
+        """Whether the two frames keep their place to each other; the report's pose type, static or dynamic."""
+        return not self.joint.moves
 
     @property
     def at_rest(self) -> Pose:

@@ -94,6 +94,10 @@ class Topology:
                     queue.append(entered)
                     yield body, crossing
 
+    def crossings(self, frame: str) -> tuple[Crossing, ...]:
+        """Return the constraints at a frame, given by its full name, each in the sense that leads away from it."""
+        return tuple(self._at.get(frame, ()))
+
     def loop_closures(self) -> tuple[LoopClosure, ...]:
         """Return the constraints that are left over when each body is reached by a shortest path."""
         closures = []

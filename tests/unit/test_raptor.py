@@ -250,7 +250,7 @@ def test_given_a_positive_angle_when_the_flea_is_turned_then_it_looks_left_about
     assert joint.sigma is not None
     route = raptor.route("FLEA:Lens", "Raptor:CabFrontRailRight")
     ahead = route.pose(((0.0,),))
-    assert ahead == raptor.get_transformation("FLEA:Lens", "Raptor:CabFrontRailRight").pose
+    assert ahead.is_close(raptor.get_transformation("FLEA:Lens", "Raptor:CabFrontRailRight").pose)
     c, s = np.cos(np.radians(30.0)), np.sin(np.radians(30.0))
     turned = route.pose(((np.radians(30.0),),))
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
