@@ -325,20 +325,20 @@ class Platform:
         """
         return self._ask(ReloadModel(self._header(), dry_run), ReloadReply)
 
-    def set_state_vector(self, pose: Transformation) -> None:
+    def set_state_vector(self, pose: Transformation) -> Acknowledgement:
         """Tell localization where the vehicle is, through a 7-vector: the base frame in World:UTM.
 
         `pose` is as `get_state_vector` returns it: of the base frame, at its `utime` (0: now), from the origin that its
         `origin_id` names (0: the service's own), as sure as its covariance says (None: 1 m and 5 degrees). It is
-        weighed like a measurement of source "operator"; LOCALIZATION_DECISIONS tells what became of it. Sent once:
-        where NoServerError is raised it may have been taken all the same. Raises ForbiddenError, KeyFileError,
-        RejectedError.
+        weighed like a measurement of source "operator"; LOCALIZATION_DECISIONS tells what became of it, with the
+        `header.utime` of the returned reply where `utime` is 0. Sent once: where NoServerError is raised it may have been
+        taken all the same. Raises ForbiddenError, KeyFileError, RejectedError.
         """
-        self._ask(commands.pose_to_set(self._header(), pose, as_vector=True), Acknowledgement)
+        return self._ask(commands.pose_to_set(self._header(), pose, as_vector=True), Acknowledgement)
 
-    def set_h_transform(self, pose: Transformation) -> None:
+    def set_h_transform(self, pose: Transformation) -> Acknowledgement:
         """Do what `set_state_vector` does, through a homogeneous transform."""
-        self._ask(commands.pose_to_set(self._header(), pose, as_vector=False), Acknowledgement)
+        return self._ask(commands.pose_to_set(self._header(), pose, as_vector=False), Acknowledgement)
 
     def _header(self) -> RequestHeader:
         return RequestHeader(self._ids.getrandbits(63), self.reply_channel)

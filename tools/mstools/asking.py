@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Protocol
 
@@ -14,6 +16,8 @@ from mstools.options import parse_variables
 from mstools.output import print_problem
 
 if TYPE_CHECKING:
+    import lcm
+
     from mstools.log_answers import LogAnswers
 
 ModelOption = Annotated[
@@ -41,6 +45,19 @@ def _check_worlds(*frames: str) -> None:
         if frame.partition(":")[0] in names.RESERVED_BODIES and frame not in known:
             text = f"{shown(frame, 80)} is no frame; there are {', '.join(known)}"
             raise UnknownFrameError(text, nearest_names(frame, known, 1))
+
+
+def handle_until(bus: lcm.LCM, seconds: float, is_done: Callable[[], bool]) -> bool:
+    """Handle messages of the bus until `is_done`, for so many seconds at most; return whether it is done."""
+    from modelserver.wire.provider import take_message
+
+    deadline = time.monotonic() + seconds
+    while not is_done():
+        left = deadline - time.monotonic()
+        if left <= 0.0:
+            return False
+        take_message(bus, int(left * 1e3) + 1)
+    return True
 
 
 class Answers(Protocol):

@@ -22,9 +22,9 @@ from modelserver.errors import (
 )
 from modelserver.keys import ENVIRONMENT
 from modelserver.messages import Health, Mode, NavigationState, PublishDecisions, SensorHeader, SwitchMode
-from modelserver.wire.provider import open_lcm, resolve_url, take_message
+from modelserver.wire.provider import open_lcm, resolve_url
 from modelserver.wire.signed import SIGNED
-from mstools.asking import KeyOption, UrlOption
+from mstools.asking import KeyOption, UrlOption, handle_until
 
 if TYPE_CHECKING:
     import lcm
@@ -135,13 +135,7 @@ class Ear:
 
     def listen(self, seconds: float, until: Callable[[], bool]) -> bool:
         """Listen until something is so, for so long at most; return whether it is."""
-        deadline = time.monotonic() + seconds
-        while not until():
-            left = deadline - time.monotonic()
-            if left <= 0.0:
-                return False
-            take_message(self._bus, int(left * 1e3) + 1)
-        return True
+        return handle_until(self._bus, seconds, until)
 
     def is_silent(self, state_hz: float) -> bool:
         """Return whether the last three reports of the state are missing: raw mode has none."""
