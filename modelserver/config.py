@@ -16,7 +16,7 @@ from pydantic import ConfigDict
 
 from modelserver import config_reader
 from modelserver.errors import ConfigError, Problem, Severity, Source, shown
-from modelserver.file_kinds import FileKind, file_kind
+from modelserver.file_kinds import FileKind, conversion_command, file_kind
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.magnetometer import MagnetometerCalibration
 from modelserver.localization.raw.settings import RawSettings
@@ -442,7 +442,7 @@ def load_partly(path: str | Path) -> tuple[VehicleConfig | None, tuple[Problem, 
     Raises ConfigError for what is no YAML mapping, OSError where it cannot be read.
     """
     path = Path(path)
-    config, problems = config_reader.read_partly(_bytes(path), str(path), VehicleConfig)
+    config, problems = parse_partly(_bytes(path), str(path))
     return None if config is None else _with_paths(config, path), problems
 
 
@@ -477,6 +477,7 @@ _INSTEAD: dict[FileKind, str] = {
     FileKind.COMMENTS: _BEGIN,
     FileKind.GEOMETRY: f"give the vehicle file, which names it (geometry: {{name}}); {_MODEL}",
     FileKind.URDF: f"give the vehicle file, which names it (geometry: {{name}}); {_MODEL}",
+    FileKind.MIRO_PROCESS: "convert it to a vehicle file: {command}",
     FileKind.XML: f"give the vehicle file, which is YAML; if this is a geometry file, {_MODEL}",
     FileKind.LOG: "give the vehicle file; a log is played by modelserver replay",
     FileKind.BINARY: "give the vehicle file, which is YAML",
@@ -495,7 +496,8 @@ def _bytes(path: Path) -> bytes:
     kind = file_kind(raw)
     if kind in _INSTEAD:
         what = kind.value if kind.is_nothing else f"{kind.value}, {NOT_ONE}"
-        raise _no_vehicle_file(path, what, _INSTEAD[kind].format(name=path.name))
+        command = conversion_command(str(path)) if kind is FileKind.MIRO_PROCESS else ""
+        raise _no_vehicle_file(path, what, _INSTEAD[kind].format(name=path.name, command=command))
     return raw
 
 
@@ -523,6 +525,11 @@ def _with_paths(config: VehicleConfig, path: Path) -> VehicleConfig:
 def config_lines(path: str | Path) -> dict[tuple[str | int, ...], int]:
     """Return the line of each key of a vehicle file. Raises ConfigError, OSError."""
     return config_reader.lines(_bytes(Path(path)), str(path), VehicleConfig)
+
+
+def parse_partly(raw: bytes, name: str = "") -> tuple[VehicleConfig | None, tuple[Problem, ...]]:
+    """Check the bytes of a vehicle file called `name`; as `load_partly`, with the paths as they stand there."""
+    return config_reader.read_partly(raw, name, VehicleConfig)
 
 
 def parse_config(raw: bytes, name: str = "") -> VehicleConfig:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from enum import Enum
 from typing import Final
 
@@ -18,6 +19,7 @@ class FileKind(Enum):
     VEHICLE = "this is a vehicle file"
     GEOMETRY = "this is a geometry file"
     URDF = "this is a URDF, a form of geometry file"
+    MIRO_PROCESS = "this is a Miro process configuration"
     XML = "this is XML"
     LOG = "this is an LCM event log"
     BINARY = "this is no text"
@@ -46,6 +48,11 @@ _VEHICLE: Final = frozenset(
 _OWN: Final = frozenset((b"vehicle", b"base_frame"))
 _GEOMETRY: Final = frozenset((b"bodies", b"constraints", b"templates"))
 _FORM: Final = re.compile(rb"^modelserver[ \t]*:[ \t]*[\"']?geometry/", re.MULTILINE)
+_PROCESS: Final = (b"<config", b"<section", b"<parameter")
+_IN_GEOMETRY: Final = re.compile(
+    rb"BodyName|ConstraintName|FrameName|HTransform|FrameRpyParameters|FrameList|<config_group\b|<!ENTITY"
+)
+"""What Miro's geometry files and its compile-time files hold, and a process configuration does not; nor entities."""
 _URDF: Final = re.compile(rb"<(\w+:)?robot[\s>]")
 _NAMED: Final = re.compile(rb"^geometry[ \t]*:[ \t]*[\"']?([^\s\"'#]+)", re.MULTILINE)
 
@@ -69,6 +76,8 @@ def file_kind(content: bytes) -> FileKind:
     if b"\0" in head[:4096] and not head.startswith(_BOMS):
         return FileKind.BINARY
     if text.startswith(b"<"):
+        if all(tag in head for tag in _PROCESS) and not _IN_GEOMETRY.search(head):
+            return FileKind.MIRO_PROCESS
         return FileKind.URDF if _URDF.search(text) else FileKind.XML
     keys = frozenset(_KEY.findall(head))
     if keys >= _OWN:
@@ -80,6 +89,12 @@ def file_kind(content: bytes) -> FileKind:
     if len(content) <= LOOKED_AT and all(line.lstrip().startswith(b"#") for line in text.splitlines() if line.strip()):
         return FileKind.COMMENTS
     return FileKind.OTHER
+
+
+def conversion_command(path: str) -> str:
+    """Return the command that converts the Miro process configuration at a path to a vehicle file beside it."""
+    stem = path[:-4] if path.lower().endswith(".xml") else path
+    return shlex.join(["modelserver", "convert", path, f"{stem}.yaml"])
 
 
 def geometry_named(content: bytes) -> str:

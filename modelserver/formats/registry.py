@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import PurePath
 
 from modelserver.errors import Source, shown
-from modelserver.file_kinds import FileKind, file_kind, geometry_named
+from modelserver.file_kinds import FileKind, conversion_command, file_kind, geometry_named
 from modelserver.formats import bot_param
 from modelserver.formats.saved import Saved
 from modelserver.geometry.builder import ModelBuilder
@@ -32,6 +32,7 @@ _INSTEAD = {
     FileKind.VEHICLE: "a vehicle file goes with -c; here give the geometry file that it names",
     FileKind.LOG: "give a geometry file; modelserver query --log and modelserver replay take logs",
     FileKind.COMMENTS: "see docs/geometry-files.md for an example to begin with",
+    FileKind.MIRO_PROCESS: "convert it to a vehicle file, which names the geometry file: {command}",
 }
 """What to give instead of a file that is no geometry file."""
 
@@ -62,7 +63,8 @@ def read(
     elif (kind := file_kind(text)) in _INSTEAD:
         named = geometry_named(text) if kind is FileKind.VEHICLE else ""
         what = kind.value if kind.is_nothing else f"{kind.value}, not a geometry file"
-        builder.error(what, Source(file), _INSTEAD[kind] + (f", {shown(named, 100)}" if named else ""))
+        fix = _INSTEAD[kind].replace("{command}", conversion_command(file or "FILE.xml"))
+        builder.error(what, Source(file), fix + (f", {shown(named, 100)}" if named else ""))
     else:
         with _collector_paused():
             if text.startswith(b"<") or PurePath(file).suffix.lower() in _XML_ENDINGS:

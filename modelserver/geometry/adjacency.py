@@ -1,4 +1,4 @@
-"""Adjacency: the constraints at a frame, the frames at their other ends, and what is wrong at a frame (report 4.3, 4.4).
+"""Adjacency: constraints at a frame, the frames at their other ends, and what is wrong at a frame (report 4.3, 4.4).
 
 The report's BodyFrame holds a pointer to its constraint. Frames are values here, so the model answers instead: a frame
 knows the name of its body, and the model knows which constraints name it.

@@ -157,8 +157,8 @@ class Model:
     def neighbors(self, frame: str | BodyFrame) -> tuple[Neighbor, ...]:
         """Return the frames at the other ends of a frame's constraints, with the sense in which each is crossed.
 
-        `frame` is a full name, `Body:Frame`, or a frame of this model. Raises UnknownBodyError or UnknownFrameError with
-        the nearest names.
+        `frame` is a full name, `Body:Frame`, or a frame of this model. Raises UnknownBodyError or UnknownFrameError
+        with the nearest names.
         """
         name = adjacency.full_name(frame)
         self.frame(name)

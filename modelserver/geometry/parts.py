@@ -70,8 +70,8 @@ class Body:
     back, and takes no part in relations between frames. `inertia` is the 6x6 spatial inertia in body
     coordinates, rows of 6 (the report's InertiaMatrix), or None; `modelserver.geometry.inertia` says how it is made.
     `visuals` and `collisions` are what it looks like and what it occupies, kept for others. Copying a body is
-    `renamed`: values are shared, and each frame knows the copy as its body. Raises ValueError for two frames of one name, or an inertia that is not 6x6 and
-    finite.
+    `renamed`: values are shared, and each frame knows the copy as its body. Raises ValueError for two frames of one
+    name, or an inertia that is not 6x6 and finite.
     """
 
     name: str

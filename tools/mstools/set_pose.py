@@ -1,4 +1,4 @@
-"""`modelserver set-pose`: sets the pose of the vehicle in the running daemon, and reports what localization did with it."""
+"""`modelserver set-pose`: sets the pose of the vehicle in the running daemon, and reports the decision on it."""
 
 from __future__ import annotations
 
@@ -138,9 +138,7 @@ def command(
     pose = to_pose(target, geodesy, before.transformation.pose)
     base = before.transformation.frame_of_interest
     request = Transformation(base, names.WORLD_UTM, pose, covariance, origin_id=before.origin.origin_id)
-    with Platform(
-        url, channel_prefix=prefix, timeout=timeout, retries=0, name=PROGRAM, key_file=key or ""
-    ) as platform:
+    with Platform(url, channel_prefix=prefix, timeout=timeout, retries=0, name=PROGRAM, key_file=key or "") as platform:
         try:
             accepted = platform.set_state_vector(request)
         except (ForbiddenError, RejectedError) as error:
@@ -179,7 +177,7 @@ def parse_target(
     rpy: Triple | None,
     quaternion: Quaternion | None,
 ) -> Target:
-    """Return the pose that the options state. Raises typer.BadParameter, a usage error, where they state none or two."""
+    """Return the pose that the options state. Raises typer.BadParameter where they state none, two or no numbers."""
     positions = {"--utm": utm, "--xyz": xyz, "--latlon": latlon}
     orientations = {"--yaw": yaw, "--heading": heading, "--rpy": rpy, "--quaternion": quaternion}
     for what, options in (("position", positions), ("orientation", orientations)):
@@ -207,7 +205,7 @@ def parse_target(
 
 
 def to_covariance(sigma: float, sigma_deg: float) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return the covariance (6, 6) of a pose with the same sigma in meters for each coordinate, in degrees about each axis.
+    """Return the covariance (6, 6) of a pose with one sigma (m) for the coordinates and one (deg) about the axes.
 
     Raises typer.BadParameter for one that is not above 0.
     """
@@ -323,7 +321,9 @@ def describe(result: Result) -> str:
     elif result.has_decisions:
         lines.append("decision: accepted for localization; no decision on it was received")
     else:
-        lines.append("decision: accepted for localization; LOCALIZATION_DECISIONS is silent (publish.decisions: false?)")
+        lines.append(
+            "decision: accepted for localization; LOCALIZATION_DECISIONS is silent (publish.decisions: false?)"
+        )
     if result.after is not None:
         now = result.after.transformation
         state = "valid" if now.valid else f"not valid: {Invalid(now.invalid_reasons).explain()}"

@@ -168,7 +168,10 @@ def test_given_an_unconstrained_frame_then_what_hung_on_it_is_an_orphan_that_ans
     assert builder.unconstrain(model.frame("Left:Mount")) == ("LeftFixed",)
     left = builder.build()
     assert [str(each.severity) for each in left.problems] == ["warning", "warning"]
-    assert [each.message.split(":")[0] for each in left.problems] == ["body Left is an orphan", "body Lamp is an orphan"]
+    assert [each.message.split(":")[0] for each in left.problems] == [
+        "body Left is an orphan",
+        "body Lamp is an orphan",
+    ]
     assert left.neighbors("Left:Mount") == ()
     with pytest.raises(NotConnectedError):
         left.get_transformation("Left:Lens", "Cart:Origin")

@@ -101,7 +101,9 @@ def test_given_a_slip_of_usage_then_it_is_named_before_the_bus_is_joined(
 def test_given_nobody_then_one_line_says_what_to_look_at(capsys: pytest.CaptureFixture[str]) -> None:
     with reserved_url() as url:
         with pytest.raises(SystemExit) as ended:
-            main(["set-pose", "--xyz", "0", "0", "0", "--yaw", "0", "--url", url, "--prefix", "V1_", "--timeout", "0.05"])
+            main(
+                ["set-pose", "--xyz", "0", "0", "0", "--yaw", "0", "--url", url, "--prefix", "V1_", "--timeout", "0.05"]
+            )
         assert ended.value.code == 1
         out, err = capsys.readouterr()
         assert out == ""
