@@ -22,7 +22,7 @@ COMMANDS = {
     "demo": "Run the whole service on simulated sensors and watch it answer.",
     "run": "Run the service for a vehicle file.",
     "check": "Say everything that is wrong with a geometry or vehicle file.",
-    "convert": "Write a geometry file in another form.",
+    "convert": "Write a geometry file in another form, Miro's process configuration as vehicle file.",
     "query": "Where is one frame in another?",
     "bodies": "List the bodies.",
     "frames": "List the frames of a body.",

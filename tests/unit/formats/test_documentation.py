@@ -47,3 +47,10 @@ def test_the_example_of_libbot2s_frames_is_clean_and_has_degrees():
     assert model.problems == ()
     assert list(model.joints) == ["body"]
     assert model.get_transformation("laser:Origin", "body:Origin").rpy[1] == math.radians(90)
+
+
+def test_given_the_example_of_walking_a_model_then_all_that_it_asserts_is_so(monkeypatch):
+    monkeypatch.chdir(DOCUMENT.parents[1])
+    code = DOCUMENT.read_text(encoding="utf-8").split("```python\n")[2].split("```")[0]
+    assert code.count("assert ") >= 7
+    exec(compile(code, str(DOCUMENT), "exec"), {})
