@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
@@ -65,6 +65,9 @@ SWITCHES: Final[Mapping[str, tuple[str, str]]] = {
 }
 """Names whose value is true or false, and the vehicle file's values for these."""
 
+OWN_SECTION: Final = "modelserver"
+"""Sections whose name holds this are ModelServer's own; where there is one, others count by section and name only."""
+
 SHORTEST_NAME: Final = 6
 """Letters that a name needs to be matched without its section: `Type` or `Mode` alone may be anybody's."""
 
@@ -113,8 +116,9 @@ def convert_process(file: str, target: str, variables: Mapping[str, str] | None 
     root = xml_document.parse(content, builder, file)
     if root is None:
         raise GeometryError(builder.problems)
-    matching = _Matching(file)
-    for setting in read_settings(root, file):
+    settings = list(read_settings(root, file))
+    matching = _Matching(file, settings)
+    for setting in settings:
         matching.add(setting)
     geometry = _find_geometry(matching, file)
     model, problems = check_file(geometry, variables)
@@ -156,8 +160,9 @@ def _settings(element: Element, path: tuple[str, ...]) -> Iterator[Setting]:
 class _Matching:
     """The keys of the vehicle file that were found so far: value and origin of each, and what found no place."""
 
-    def __init__(self, file: str):
+    def __init__(self, file: str, settings: Iterable[Setting]):
         self.file = file
+        self.own = {each.path[0] for each in settings if OWN_SECTION in _plain(each.path[0])}
         self.values: dict[Key, Any] = {}
         self.sources: dict[Key, Setting] = {}
         self.notes: dict[Key, str] = {}
@@ -246,9 +251,12 @@ class _Matching:
     def _keys_of(self, setting: Setting) -> list[Key]:
         """Return the keys that a parameter's name fits, by as much of its path as fits."""
         words = [_plain(each) for each in setting.path]
-        if words[-1] in SYNONYMS:
-            return [SYNONYMS[words[-1]]]
-        for count in range(len(words), 0, -1):
+        # the file is common to all processes: a rate in another one's section is that one's
+        is_own = not self.own or setting.path[0] in self.own
+        synonym = SYNONYMS.get(words[-1])
+        if synonym is not None and (is_own or len(synonym) == 1):
+            return [synonym]
+        for count in range(len(words), 0 if is_own else 1, -1):
             name = "".join(words[-count:])
             found = [key for key in self._types if any(name == "".join(map(_plain, key[n:])) for n in range(len(key)))]
             whole = [key for key in found if name == "".join(map(_plain, key))]

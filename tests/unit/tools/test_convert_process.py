@@ -191,6 +191,32 @@ def test_each_line_says_where_it_comes_from_and_what_is_left_is_listed_with_a_wa
     assert (config.publish.rate_hz, config.base_frame, config.vehicle) == (20.0, "Raptor:CG", "Raptor")
 
 
+def test_given_sections_of_other_processes_then_their_parameters_are_not_taken_for_modelservers(
+    folder: Path, run: Run
+) -> None:
+    (folder / "process.xml").write_text(
+        """<config>
+  <section name="Sokkia"><parameter name="RateHz" value="4"/><parameter name="StationaryTime" value="9"/></section>
+  <section name="Common"><parameter name="GeometryFile" value="geometry.xml"/></section>
+  <section name="ModelServer"><parameter name="RateHz" value="10"/></section>
+  <section name="Gps">
+    <parameter name="Channel" value="GPS"/><parameter name="Frame" value="GPSAntenna:PhaseCentre"/>
+  </section>
+</config>
+"""
+    )
+    code, text, err = run("convert", "process.xml", "-", "--to", "yaml")
+    assert code == 0
+    assert "  rate_hz: 10.0 # line 4: ModelServer/RateHz\n" in text
+    assert "    channel: GPS # line 6: Gps/Channel\n" in text
+    assert "recapture_time" not in text
+    assert [line for line in text.splitlines() if line.startswith("#   ")] == [
+        "#   line 2: Sokkia/RateHz = '4': no counterpart",
+        "#   line 2: Sokkia/StationaryTime = '9': no counterpart",
+    ]
+    assert err.count("warning") == 2
+
+
 def test_given_another_folder_for_the_result_then_the_geometry_file_is_named_from_there(folder: Path, run: Run) -> None:
     (folder / "out").mkdir()
     assert run("convert", "process.xml", "out/vehicle.yaml")[0] == 0
