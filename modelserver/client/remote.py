@@ -326,13 +326,13 @@ class Platform:
         return self._ask(ReloadModel(self._header(), dry_run), ReloadReply)
 
     def set_state_vector(self, pose: Transformation) -> Acknowledgement:
-        """Tell localization where the vehicle is, through a 7-vector: the base frame in World:UTM.
+        """Set the pose of the vehicle, the base frame in World:UTM, through a 7-vector.
 
         `pose` is as `get_state_vector` returns it: of the base frame, at its `utime` (0: now), from the origin that its
         `origin_id` names (0: the service's own), as sure as its covariance says (None: 1 m and 5 degrees). It is
-        weighed like a measurement of source "operator"; LOCALIZATION_DECISIONS tells what became of it, at the
+        fused like a measurement of source "operator"; LOCALIZATION_DECISIONS carries the decision on it, at the
         `header.utime` of the returned reply where `utime` is 0. Sent once: where NoServerError is raised it may have
-        been taken all the same. Raises ForbiddenError, KeyFileError, RejectedError.
+        been accepted all the same. Raises ForbiddenError, KeyFileError, RejectedError.
         """
         return self._ask(commands.pose_to_set(self._header(), pose, as_vector=True), Acknowledgement)
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
 
-from modelserver.errors import ForbiddenError, ModelServerError, NoServerError, RejectedError
+from modelserver.errors import ForbiddenError, ModelServerError, NoServerError, RejectedError, WireError
 from modelserver.geometry import names
 from modelserver.messages import Decision, Invalid, PoseAnswer, PublishDecisions, Verdict
 from modelserver.spatial import so3
@@ -278,12 +279,17 @@ class Listener:
     def _on_pose(self, _: str, data: bytes) -> None:
         from modelserver.wire.codec import decode
 
-        self.pose = decode("pose_transform_t", data)
+        # a message of another type is a stranger's, or another version's: the next one may be good
+        with suppress(WireError):
+            self.pose = decode("pose_transform_t", data)
 
     def _on_decisions(self, _: str, data: bytes) -> None:
         from modelserver.wire.codec import decode
 
-        published: PublishDecisions = decode("decisions_t", data)
+        try:
+            published: PublishDecisions = decode("decisions_t", data)
+        except WireError:
+            return
         self.has_decisions = True
         for each in published.decisions:
             if each.source == OPERATOR and each.kind == "absolute_pose":

@@ -100,9 +100,9 @@ def test_given_a_process_configuration_then_it_is_refused_with_a_command_whose_r
 ) -> None:
     code, out, err = run(*arguments)
     assert code == 1
-    told = out + err
-    assert "this is a Miro process configuration" in told
-    (line,) = [each for each in told.splitlines() if "modelserver convert" in each]
+    printed = out + err
+    assert "this is a Miro process configuration" in printed
+    (line,) = [each for each in printed.splitlines() if "modelserver convert" in each]
     program, *command = shlex.split(line[line.index("modelserver convert") :])
     assert program == "modelserver"
     code, out, err = run(*command)
@@ -139,7 +139,7 @@ def test_given_a_path_with_a_space_then_the_command_is_quoted(folder: Path, run:
             "<config><section><parameter><parameter name='BodyName' value='A'/></parameter></section></config>",
             FileKind.XML,
         ),
-        # a geometry whose names are mistyped is told so by its reader
+        # a geometry whose names are mistyped is left to its reader, which reports them
         ("<config><section><parameter><parameter name='FrameName'/></parameter></section></config>", FileKind.XML),
         ("<config><section><config_group/><parameter/></section></config>", FileKind.XML),
     ],

@@ -6,16 +6,18 @@ from __future__ import annotations
 import json
 import math
 
+import lcm
 import numpy as np
 import pytest
 from support_lcm import reserved_url
 from support_samples import GEODESY, ORIGIN
 
 from modelserver.errors import ModelServerError
-from modelserver.messages import Decision, PoseAnswer, Verdict
+from modelserver.messages import Decision, PoseAnswer, PublishDecisions, Verdict
 from modelserver.spatial import Pose, Transformation
+from modelserver.wire.codec import encode
 from mstools.cli import main
-from mstools.set_pose import Result, Target, as_data, describe, to_covariance, to_pose
+from mstools.set_pose import Listener, Result, Target, as_data, describe, to_covariance, to_pose
 
 CURRENT = Pose.from_rpy((100.0, 50.0, 5.0), 0.1, -0.2, 1.0)
 UTM = (ORIGIN.easting + 30.0, ORIGIN.northing + 40.0, ORIGIN.height + 2.0)
@@ -109,6 +111,23 @@ def test_given_nobody_then_one_line_says_what_to_look_at(capsys: pytest.CaptureF
         assert out == ""
         assert "no V1_POSE within 0.05 s" in err
         assert len(err.splitlines()) == 1
+
+
+def test_given_messages_of_another_type_then_they_are_passed_over() -> None:
+    decisions = encode(PublishDecisions(9, (USED, USED._replace(utime=6, source="vo"))))
+    with reserved_url() as url:
+        bus, listener = lcm.LCM(url), Listener(lcm.LCM(url), "V1_")
+        for channel, data in (
+            ("V1_POSE", b"none"),
+            ("V1_POSE", decisions),
+            ("V1_LOCALIZATION_DECISIONS", b"none"),
+            ("V1_LOCALIZATION_DECISIONS", decisions),
+            ("V1_POSE", encode(PoseAnswer(Transformation("Cart:Base", "World:UTM", Pose())))),
+        ):
+            bus.publish(channel, data)
+        assert listener.wait(30.0, lambda: listener.pose is not None)
+    assert listener.decision(5) == USED
+    assert listener.decision(6) is None
 
 
 # --- the report ----------------------------------------------------------------------------------------------------
