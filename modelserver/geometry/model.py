@@ -62,6 +62,7 @@ class Model:
     `bodies`, `constraints`, `problems` are tuples in the order of the file; the first body is the root.
     `joints` are the constraints that move, by name; `drives` says for each of them which coordinates place it.
     `revision` is a hash of everything in the model that can change an answer or a list. Immutable.
+    Raises ValueError for two bodies or two constraints of one name, which `ModelBuilder` reports with their places.
     """
 
     __slots__ = (
@@ -97,6 +98,8 @@ class Model:
         self.description = description
         self.problems = problems
         self.revision = _revision(bodies, constraints)
+        _check_unique("body", [body.name for body in bodies])
+        _check_unique("constraint", [each.name for each in constraints])
         self._bodies = {body.name: body for body in bodies}
         self._topology = Topology(bodies, constraints)
         # An OrderedDict drops its oldest in constant time; a dict walks over all that was dropped before.
@@ -360,6 +363,13 @@ class Model:
             f"<Model {self.name or 'unnamed'}: {len(self.bodies)} bodies, {frames} frames, "
             f"{len(self.constraints)} constraints, revision {self.revision}>"
         )
+
+
+def _check_unique(what: str, given: list[str]) -> None:
+    """Raise ValueError for a name that is given twice (report 4.2, 4.4)."""
+    if len(set(given)) < len(given):
+        twice = next(name for name in given if given.count(name) > 1)
+        raise ValueError(f"the {what} name {shown(twice)} is given twice; names are unique in a model")
 
 
 def _revision(bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> str:

@@ -212,3 +212,14 @@ def test_given_a_joint_that_others_follow_when_it_is_removed_then_the_build_says
     changed.unconstrain("Arm:Origin")
     with pytest.raises(GeometryError, match="Shades"):
         changed.build()
+
+
+# --- unique names --------------------------------------------------------------------------------------------------
+
+
+def test_given_two_bodies_or_constraints_of_one_name_then_no_model_is_made_of_them() -> None:
+    model = cart()
+    with pytest.raises(ValueError, match="body name 'Left' is given twice"):
+        Model((*model.bodies, model.body("Left")), model.constraints)
+    with pytest.raises(ValueError, match="constraint name 'LampFixed' is given twice"):
+        Model(model.bodies, (*model.constraints, model.constraints[-1]))
