@@ -6,11 +6,10 @@ import hashlib
 import json
 import math
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import astuple
 from enum import StrEnum
 from functools import partial
-from typing import NamedTuple
 
 from modelserver.errors import (
     NotConnectedError,
@@ -23,6 +22,7 @@ from modelserver.errors import (
 from modelserver.geometry import adjacency, names
 from modelserver.geometry.adjacency import Neighbor
 from modelserver.geometry.drives import drives
+from modelserver.geometry.frame_tree import FrameTree, Node
 from modelserver.geometry.joint import Coordinates, Joint
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
 from modelserver.geometry.route import Edge, Route, edges_along
@@ -33,11 +33,11 @@ from modelserver.spatial.so3 import Array
 from modelserver.spatial.transformation import Transformation
 
 CACHE_SIZE = 16384
-"""Static answers kept, about 1 kB each. When full the oldest goes: a vehicle asks for few pairs, again and again."""
+"""Static answers kept for programs that ask in their own process, about 1 kB each. When full the oldest goes."""
 
 
 ROUTES_KEPT = 1024
-"""Ways kept: with all that is folded for its covariance a long one takes 40 kB."""
+"""Routes kept for the same: one that was never asked for is assembled of the frame tree in some 10 us."""
 
 
 class Search(StrEnum):
@@ -45,15 +45,6 @@ class Search(StrEnum):
 
     BREADTH_FIRST = "breadth_first"
     DEPTH_FIRST = "depth_first"
-
-
-class _Place(NamedTuple):
-    """Where a frame stands in its assembly; `X_RF` is its pose in the assembly's first body."""
-
-    assembly: int
-    body: Body
-    frame: BodyFrame
-    X_RF: Pose
 
 
 class Model:
@@ -68,12 +59,11 @@ class Model:
     __slots__ = (
         "_answers",
         "_bodies",
-        "_from_root",
         "_in_loops",
         "_looped",
-        "_places",
         "_routes",
         "_topology",
+        "_tree",
         "bodies",
         "constraints",
         "description",
@@ -107,24 +97,12 @@ class Model:
         self._routes: OrderedDict[tuple[str, str], Route] = OrderedDict()
         self.joints = {each.name: each for each in constraints if each.joint.moves}
         self.drives = drives(self.joints.values())
-        self._places: dict[str, _Place] = {}
-        self._from_root = self._place_bodies()
+        self._tree = FrameTree(self._bodies, self._topology, lambda name: self.drives[name].leader)
         closures = self._topology.loop_closures()
-        self._looped = frozenset(self._from_root[closing.bodies[0]][0] for closing in closures)
+        assembly_of = {body: number for number, bodies in enumerate(self.assemblies) for body in bodies}
+        self._looped = frozenset(assembly_of[closing.bodies[0]] for closing in closures)
         # going round by each closing constraint passes every constraint that there is another way around
         self._in_loops = frozenset(each.constraint.name for closing in closures for each in closing.path)
-
-    def _place_bodies(self) -> dict[str, tuple[int, Pose]]:
-        """Return for each body its assembly's number and the pose of its origin in that assembly's first body."""
-        placed: dict[str, tuple[int, Pose]] = {}
-        for number, assembly in enumerate(self._topology.assemblies):
-            placed[assembly[0]] = (number, Pose.identity())
-            for body, crossing in self._topology.spread(assembly[0]):
-                placed[names.split(crossing.leaves)[0]] = (
-                    number,
-                    placed[body][1] @ self._topology.step(crossing),
-                )
-        return placed
 
     @property
     def root(self) -> Body:
@@ -220,13 +198,25 @@ class Model:
         """
         found = self._routes.get((frame_of_interest, frame_of_reference))
         if found is None:
-            path = self.find_path(frame_of_interest, frame_of_reference)
-            in_loop = any(crossing.constraint.name in self._in_loops for crossing in path)
-            found = Route(self.edges(path, frame_of_interest, frame_of_reference), in_loop)
+            interest, reference = self._ends(frame_of_interest, frame_of_reference)
+            if interest.assembly in self._looped:
+                path = self.find_path(frame_of_interest, frame_of_reference)
+                in_loop = any(crossing.constraint.name in self._in_loops for crossing in path)
+                found = Route(self.edges(path, frame_of_interest, frame_of_reference), in_loop)
+            else:
+                found = self._tree.route(interest, reference)
             if len(self._routes) >= ROUTES_KEPT:
                 self._routes.popitem(last=False)
             self._routes[frame_of_interest, frame_of_reference] = found
         return found
+
+    def is_rigid(self, frame_of_interest: str, frame_of_reference: str) -> bool:
+        """Return whether two frames are rigidly joined, and there is but one path between them.
+
+        Raises UnknownBodyError, UnknownFrameError or NotConnectedError.
+        """
+        interest, reference = self._ends(frame_of_interest, frame_of_reference)
+        return interest.group is reference.group and interest.assembly not in self._looped
 
     def edges(self, path: Iterable[Crossing], frame_of_interest: str, frame_of_reference: str) -> list[Edge]:
         """Return the edges of a path of `find_path`: frames of bodies, constraints, and joints that move.
@@ -297,48 +287,44 @@ class Model:
             )
         return found, found.frame(frame_name)
 
+    def _ends(self, frame_of_interest: str, frame_of_reference: str) -> tuple[Node, Node]:
+        """Return the nodes of two frames of one assembly. Raises as `route`."""
+        nodes = self._tree.nodes
+        try:
+            reference, interest = nodes[frame_of_reference], nodes[frame_of_interest]
+        except KeyError:
+            # says what is wrong with the first of them, which is not there
+            self._split(frame_of_reference)
+            self._split(frame_of_interest)
+            raise
+        if interest.assembly != reference.assembly:
+            raise self._not_connected(interest.body, reference.body)
+        return interest, reference
+
     def _answer(self, frame_of_interest: str, frame_of_reference: str) -> Transformation:
         """Work out a pair that was not asked for before, and keep it."""
-        reference = self._places.get(frame_of_reference) or self._place(frame_of_reference)
-        interest = self._places.get(frame_of_interest) or self._place(frame_of_interest)
-        if reference is interest:
-            pose = Pose.identity()
-        elif reference.body is interest.body:
-            pose = reference.frame.pose.inverse() @ interest.frame.pose
-        elif reference.assembly != interest.assembly:
-            raise self._not_connected(interest.body.name, reference.body.name)
-        elif reference.assembly in self._looped:
-            path = self.find_path(frame_of_interest, frame_of_reference)
-            pose = self.along(path, frame_of_interest, frame_of_reference).pose
+        interest, reference = self._ends(frame_of_interest, frame_of_reference)
+        covariance: Callable[[], Array | None]
+        if interest.group is reference.group and (interest.assembly not in self._looped):
+            # a frame in itself is so exactly
+            pose = Pose.identity() if interest is reference else reference.X_NG @ interest.X_GN
+            covariance = partial(self._tree.rigid_covariance, interest, reference)
         else:
-            pose = reference.X_RF.inverse() @ interest.X_RF
-        answer = Transformation(
-            frame_of_interest,
-            frame_of_reference,
-            pose,
-            partial(self._path_covariance, frame_of_interest, frame_of_reference),
-            model_revision=self.revision,
-        )
+            route = self.route(frame_of_interest, frame_of_reference)
+            pose = route.pose(route.rest)
+            covariance = partial(self._covariance_at_rest, route)
+        answer = Transformation(frame_of_interest, frame_of_reference, pose, covariance, model_revision=self.revision)
         if len(self._answers) >= CACHE_SIZE:
             self._answers.popitem(last=False)
         self._answers[frame_of_interest, frame_of_reference] = answer
         return answer
 
-    def _place(self, name: str) -> _Place:
-        """Work out where a frame stands when it is first asked for, and keep it: one for each frame at most."""
-        body, frame = self._split(name)
-        assembly, X_RB = self._from_root[body.name]
-        place = _Place(assembly, body, frame, X_RB @ frame.pose)
-        self._places[name] = place
-        return place
-
-    def _path_covariance(self, frame_of_interest: str, frame_of_reference: str) -> Array | None:
-        path = self.find_path(frame_of_interest, frame_of_reference)
-        return self.along(path, frame_of_interest, frame_of_reference).covariance
+    def _covariance_at_rest(self, route: Route) -> Array | None:
+        return route.covariance(route.rest, [self._stated_sigma(leg.name) for leg in route.legs])
 
     def _not_connected(self, body_I: str, body_R: str) -> NotConnectedError:
         def assembly(body: str) -> str:
-            mates = self._topology.assemblies[self._from_root[body][0]]
+            mates = next(each for each in self._topology.assemblies if body in each)
             return ", ".join(mates[:6]) + (", ..." if len(mates) > 6 else "")
 
         return NotConnectedError(

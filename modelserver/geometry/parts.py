@@ -37,6 +37,11 @@ class Sigma:
             object.__setattr__(self, what, values)
 
     @property
+    def is_zero(self) -> bool:
+        """Whether it states that there is no error at all."""
+        return not any(self.position) and not any(self.rotation)
+
+    @property
     def covariance(self) -> Array:
         """The diagonal covariance (6, 6)."""
         return covariance.from_sigmas(self.position, self.rotation)

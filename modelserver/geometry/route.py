@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from enum import StrEnum
-from typing import NamedTuple
+from functools import partial
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from modelserver.geometry.joint import ROUNDING, Coordinates, Joint, JointType
 from modelserver.geometry.parts import BodyFrame, Sigma
-from modelserver.geometry.sureness import Place, Sureness
+from modelserver.geometry.path_covariance import PathCovariance, Place
 from modelserver.geometry.topology import Crossing
 from modelserver.spatial import so3
 from modelserver.spatial.chain import Link
@@ -53,12 +54,16 @@ class Edge(NamedTuple):
     leader: str = ""
 
     @property
+    def is_unstated(self) -> bool:
+        """Whether a fixed edge states no sigma; two frames that are one by definition are so exactly."""
+        return self.sigma is None and self.pose != _IDENTITY
+
+    @property
     def survey_factor(self) -> Array | None:
         """The factor (6, n) of a fixed edge's covariance; None where a pose that is none states no sigma."""
         if self.sigma is not None:
             return np.diag((*self.sigma.position, *self.sigma.rotation))
-        # two frames that are one by definition are so exactly
-        return _EXACT if self.pose == _IDENTITY else None
+        return None if self.is_unstated else _EXACT
 
 
 class Leg(NamedTuple):
@@ -73,6 +78,12 @@ class Leg(NamedTuple):
     turning: tuple[Quaternion, Quaternion] | None = None
     """Of a revolute joint the products of `before` with 1 and with its axis; cos and sin of half its angle mix them."""
 
+    @classmethod
+    def of(cls, before: Pose, edge: Edge) -> Leg:
+        """Return the leg of the edge of a joint that moves."""
+        assert edge.joint is not None
+        return cls(before, edge.name, edge.joint, edge.forward, _span(edge.joint), _turning(before, edge))
+
 
 class Route:
     """The way from `frame_of_reference` to `frame_of_interest`; see the module. Immutable by habit: nothing here sets.
@@ -81,22 +92,62 @@ class Route:
     there is another way, and this is the shortest.
     """
 
-    __slots__ = ("_sureness", "closes_loop", "edges", "last", "legs")
+    __slots__ = ("_bases", "_covariance", "_edges", "closes_loop", "last", "legs")
+
+    legs: tuple[Leg, ...]
+    last: Pose
+    closes_loop: bool
+    _bases: Sequence[Pose | None]
+    _edges: tuple[Edge, ...] | Callable[[], tuple[Edge, ...]]
+    _covariance: PathCovariance | Callable[[], PathCovariance]
 
     def __init__(self, edges: Sequence[Edge], closes_loop: bool = False):
-        self.edges = tuple(edges)
-        self.closes_loop = closes_loop
-        self._sureness: Sureness | None = None
+        """Fold the edges of any path."""
         legs: list[Leg] = []
         pose = Pose.identity()
-        for edge in self.edges:
+        for edge in edges:
             if edge.joint is not None:
-                legs.append(Leg(pose, edge.name, edge.joint, edge.forward, _span(edge.joint), _turning(pose, edge)))
+                legs.append(Leg.of(pose, edge))
                 pose = Pose.identity()
             else:
                 pose = pose @ (edge.pose if edge.forward else edge.pose.inverse())
+        self.closes_loop = closes_loop
         self.legs = tuple(legs)
         self.last = pose
+        self._edges = tuple(edges)
+        self._bases = (None,) * (len(legs) + 1)
+        self._covariance = partial(PathCovariance.along, self._edges)
+
+    @classmethod
+    def assemble(
+        cls,
+        legs: Sequence[Leg],
+        last: Pose,
+        bases: Sequence[Pose | None],
+        edges: Callable[[], tuple[Edge, ...]],
+        covariance: Callable[[], PathCovariance],
+    ) -> Self:
+        """Return the route of what is known of it already.
+
+        `bases` holds for each rigid segment the pose of its base in its first frame, None for the identity; `edges` and
+        `covariance` make what few ask for, when it is first asked for.
+        """
+        self = cls.__new__(cls)
+        self.closes_loop = False
+        self.legs = tuple(legs)
+        self.last = last
+        self._bases = bases
+        self._edges = edges
+        self._covariance = covariance
+        return self
+
+    @property
+    def edges(self) -> tuple[Edge, ...]:
+        """The edges from the frame of reference to the frame of interest."""
+        found = self._edges
+        if not isinstance(found, tuple):
+            found = self._edges = found()
+        return found
 
     @property
     def rest(self) -> tuple[Coordinates, ...]:
@@ -159,12 +210,21 @@ class Route:
 
         `sigmas` as in `links`; `places` spares working them out again.
         """
-        sureness = self._sureness
-        if sureness is None:
-            sureness = self._sureness = Sureness(self.edges)
-        if any(math.isnan(each) for leg in sigmas for each in leg) or not (unstated_is_exact or sureness.stated):
+        path = self._covariance
+        if not isinstance(path, PathCovariance):
+            path = self._covariance = path()
+        if any(math.isnan(each) for leg in sigmas for each in leg) or not (unstated_is_exact or path.is_stated):
             return None
-        return sureness.covariance(self.places(positions) if places is None else places, positions, sigmas)
+        if places is None:
+            places = self.places(positions)
+        bases: list[Place] = []
+        for place, X_LB in zip(places, self._bases, strict=False):
+            if X_LB is not None:
+                (px, py, pz), q = place
+                x, y, z = so3.rotate(q, X_LB._p)
+                place = ((px + x, py + y, pz + z), so3.multiply(q, X_LB._q))
+            bases.append(place)
+        return path.at(bases, places[-1][0], positions, sigmas)
 
     def links(self, positions: Sequence[Coordinates], sigmas: Sequence[Coordinates], stamp: int = 0) -> list[Link]:
         """Return the chain of the route, link by link, with what each is unsure of.

@@ -109,16 +109,18 @@ class PlatformView:
 
     def _within(self, frame_of_interest: str, frame_of_reference: str, time: TimeQuery, now: int) -> PoseAnswer:
         """Return a relation within the vehicle."""
-        if not (self.model.joints or self.model.has_loops):
-            return self._static(frame_of_interest, frame_of_reference)
+        model = self.model
         try:
-            route = self.model.route(frame_of_interest, frame_of_reference)
+            if model.is_rigid(frame_of_interest, frame_of_reference):
+                # it does not change with time, so it has no stamp
+                return PoseAnswer(model.get_transformation(frame_of_interest, frame_of_reference))
+            route = model.route(frame_of_interest, frame_of_reference)
         except QueryError:
             check_not_reserved(frame_of_interest)
             check_not_reserved(frame_of_reference)
             raise
         if not route.legs:
-            fixed = self._static(frame_of_interest, frame_of_reference)
+            fixed = PoseAnswer(model.get_transformation(frame_of_interest, frame_of_reference))
             return fixed._replace(quality=Quality.LOOP) if route.closes_loop else fixed
         utime, mounted = self.place(route, time, now)
         places = route.places(mounted.positions)
@@ -264,15 +266,6 @@ class PlatformView:
         route = self.route_from_vehicle(self.base_frame)
         pose, covariance = self._in_world(self.base_frame, world, estimate, route, NOTHING)
         return self._answer(self.base_frame, world, pose, covariance, estimate)
-
-    def _static(self, frame_of_interest: str, frame_of_reference: str) -> PoseAnswer:
-        """Return a relation within the vehicle: it does not change with time, so it has no stamp."""
-        try:
-            return PoseAnswer(self.model.get_transformation(frame_of_interest, frame_of_reference))
-        except QueryError:
-            check_not_reserved(frame_of_interest)
-            check_not_reserved(frame_of_reference)
-            raise
 
     def _in_world(
         self, frame: str, world: str, estimate: Estimate, route: Route, mounted: Placed, back: bool = False

@@ -65,19 +65,18 @@ class Transformation:
         origin_id: int = 0,
         model_revision: str = "",
     ):
-        """Take the values; `covariance` may be a function that works it out when it is first looked at."""
+        """Take the values; `covariance` may be a function that works out a new array when it is first looked at."""
         if covariance is not None and not callable(covariance):
             covariance = _kept(covariance)
-        put = object.__setattr__
-        put(self, "frame_of_interest", frame_of_interest)
-        put(self, "frame_of_reference", frame_of_reference)
-        put(self, "pose", pose)
-        put(self, "_covariance", covariance)
-        put(self, "utime", utime)
-        put(self, "invalid_reasons", invalid_reasons)
-        put(self, "pose_epoch", pose_epoch)
-        put(self, "origin_id", origin_id)
-        put(self, "model_revision", model_revision)
+        _put_interest(self, frame_of_interest)
+        _put_reference(self, frame_of_reference)
+        _put_pose(self, pose)
+        _put_covariance(self, covariance)
+        _put_utime(self, utime)
+        _put_invalid(self, invalid_reasons)
+        _put_epoch(self, pose_epoch)
+        _put_origin(self, origin_id)
+        _put_revision(self, model_revision)
 
     @property
     def covariance(self) -> Array | None:
@@ -86,8 +85,9 @@ class Transformation:
         if callable(found):
             found = found()
             if found is not None:
-                found = _kept(found)
-            object.__setattr__(self, "_covariance", found)
+                # the function made it for us alone, so it need not be copied
+                found.flags.writeable = False
+            _put_covariance(self, found)
         return found
 
     @property
@@ -249,3 +249,15 @@ class Transformation:
     def __str__(self) -> str:
         invalid = "" if self.valid else f" (invalid: reasons {self.invalid_reasons:#x})"
         return f"{self.frame_of_interest} in {self.frame_of_reference}: {self.pose}{invalid}"
+
+
+# Setting a slot by its descriptor passes by the guard above, at half the cost of object.__setattr__.
+_put_interest = Transformation.__dict__["frame_of_interest"].__set__
+_put_reference = Transformation.__dict__["frame_of_reference"].__set__
+_put_pose = Transformation.__dict__["pose"].__set__
+_put_covariance = Transformation.__dict__["_covariance"].__set__
+_put_utime = Transformation.__dict__["utime"].__set__
+_put_invalid = Transformation.__dict__["invalid_reasons"].__set__
+_put_epoch = Transformation.__dict__["pose_epoch"].__set__
+_put_origin = Transformation.__dict__["origin_id"].__set__
+_put_revision = Transformation.__dict__["model_revision"].__set__

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from typing import Any, Final
+from functools import partial
+from typing import Final
 
 import numpy as np
 
@@ -20,10 +21,16 @@ from mslcm.pose_transform_t import pose_transform_t
 from mslcm.pose_vector_t import pose_vector_t
 
 _UTIME = struct.Struct(">q")
-# covariance, initial_utm, zone, north, origin id, epoch, valid, reasons, flags, bounds and seconds
-_COMMON = "36d3dbbqibiiddd"
-_TRANSFORM = struct.Struct(f">16d{_COMMON}")
-_VECTOR = struct.Struct(f">7d{_COMMON}")
+_MATRIX = struct.Struct(">16d")
+_STATE_VECTOR = struct.Struct(">7d")
+# the same, and the first number of the covariance behind it: nan where there is none
+_TRANSFORM = struct.Struct(">17d")
+_VECTOR = struct.Struct(">8d")
+_COVARIANCE: Final = 36 * 8
+"""Bytes."""
+# initial_utm, zone, north, origin id, epoch, valid, reasons, flags, bounds and seconds
+_REST = struct.Struct(">3dbbqibiiddd")
+_NAN_COVARIANCE: Final = struct.pack(">36d", *fields.NAN36)
 
 _TRANSFORM_FINGERPRINT: Final[bytes] = pose_transform_t._get_packed_fingerprint()
 _VECTOR_FINGERPRINT: Final[bytes] = pose_vector_t._get_packed_fingerprint()
@@ -59,97 +66,114 @@ def read_vector(data: bytes) -> PoseAnswer:
 
 def transform_body(answer: PoseAnswer) -> bytes:
     """Return the bytes of a pose_transform_t without its fingerprint."""
-    a, b, c, d = answer.transformation.pose.matrix_rows()
-    return _body(_TRANSFORM, a + b + c + d, answer)
+    pose = answer.transformation.pose
+    (a, b, c), (d, e, f), (g, h, i) = so3.matrix_rows(pose._q)
+    x, y, z = pose._p
+    return _body(_MATRIX.pack(a, b, c, x, d, e, f, y, g, h, i, z, 0.0, 0.0, 0.0, 1.0), answer)
 
 
 def vector_body(answer: PoseAnswer) -> bytes:
     """Return the bytes of a pose_vector_t without its fingerprint."""
     pose = answer.transformation.pose
-    return _body(_VECTOR, pose.xyz + pose.wxyz, answer)
+    return _body(_STATE_VECTOR.pack(*pose._p, *pose._q), answer)
 
 
 def read_transform_body(data: bytes, at: int) -> tuple[PoseAnswer, int]:
     """Return the pose that begins at `at`, and where it ends. Raises WireError, struct.error."""
-    head, values, revision, end = _fields(_TRANSFORM, data, at)
-    a, b, c, x, d, e, f, y, g, h, i, z, *last = values[:16]
-    if last != [0.0, 0.0, 0.0, 1.0]:
+    utime, interest, reference, at = _head(data, at)
+    a, b, c, x, d, e, f, y, g, h, i, z, zero_a, zero_b, zero_c, one, first = _TRANSFORM.unpack_from(data, at)
+    if zero_a or zero_b or zero_c or one != 1.0:
+        last = [zero_a, zero_b, zero_c, one]
         raise WireError("malformed", f"the last row of a homogeneous transform is 0 0 0 1, got {last}")
-    return _answer(head, _pose((x, y, z), ((a, b, c), (d, e, f), (g, h, i))), values[16:], revision), end
+    pose = _pose((x, y, z), ((a, b, c), (d, e, f), (g, h, i)))
+    return _answer(data, at + _MATRIX.size, utime, interest, reference, pose, first)
 
 
 def read_vector_body(data: bytes, at: int) -> tuple[PoseAnswer, int]:
     """Return the pose that begins at `at`, and where it ends. Raises WireError, struct.error."""
-    head, values, revision, end = _fields(_VECTOR, data, at)
-    q = values[3:7]
+    utime, interest, reference, at = _head(data, at)
+    x, y, z, *q, first = _VECTOR.unpack_from(data, at)
     if not abs(sum(value * value for value in q) - 1.0) <= TOLERANCE:
-        raise WireError("malformed", f"{q} is no unit quaternion")
+        raise WireError("malformed", f"{tuple(q)} is no unit quaternion")
     try:
-        pose = Pose(values[:3], q)
+        pose = Pose((x, y, z), q)
     except ValueError as error:
         raise WireError("malformed", str(error)) from None
-    return _answer(head, pose, values[7:], revision), end
+    return _answer(data, at + _STATE_VECTOR.size, utime, interest, reference, pose, first)
 
 
 def check_no_transform(data: bytes, at: int) -> None:
     """Check that what begins at `at` is a whole pose_transform_t, whatever it says. Raises WireError, struct.error."""
     if data[at:] != NO_TRANSFORM:
-        check_end(data, _fields(_TRANSFORM, data, at)[3])
+        check_end(data, _end(data, at, _MATRIX.size))
 
 
 def check_no_vector(data: bytes, at: int) -> None:
     """Check that what begins at `at` is a whole pose_vector_t, whatever it says. Raises WireError, struct.error."""
     if data[at:] != NO_VECTOR:
-        check_end(data, _fields(_VECTOR, data, at)[3])
+        check_end(data, _end(data, at, _STATE_VECTOR.size))
 
 
-def _body(layout: struct.Struct, pose: tuple[float, ...], answer: PoseAnswer) -> bytes:
-    transformation = answer.transformation
+def _body(pose: bytes, answer: PoseAnswer) -> bytes:
+    transformation, origin, quality, horizontal_bound, heading_bound, seconds_to_limit = answer
     covariance = transformation.covariance
-    origin = answer.origin
-    return b"%b%b%b%b%b" % (
+    invalid = transformation.invalid_reasons
+    easting, northing, height = fields.NAN3 if origin is None else origin.initial_utm
+    return b"%b%b%b%b%b%b%b" % (
         _UTIME.pack(transformation.utime),
         text(transformation.frame_of_interest),
         text(transformation.frame_of_reference),
-        layout.pack(
-            *pose,
-            *(fields.NAN36 if covariance is None else covariance.ravel().tolist()),
-            *(fields.NAN3 if origin is None else origin.initial_utm),
+        pose,
+        _NAN_COVARIANCE if covariance is None else covariance.astype(">f8").tobytes(),
+        _REST.pack(
+            easting,
+            northing,
+            height,
             0 if origin is None else origin.zone,
             origin is not None and origin.north,
             transformation.origin_id,
             transformation.pose_epoch,
-            not transformation.invalid_reasons,
-            transformation.invalid_reasons,
-            answer.quality,
-            answer.horizontal_bound,
-            answer.heading_bound,
-            answer.seconds_to_limit,
+            not invalid,
+            invalid,
+            quality,
+            horizontal_bound,
+            heading_bound,
+            seconds_to_limit,
         ),
         text(transformation.model_revision),
     )
 
 
-def _fields(layout: struct.Struct, data: bytes, at: int) -> tuple[tuple[int, str, str], tuple[Any, ...], str, int]:
-    """Return time and names, the numbers, the model revision, and where the pose ends."""
+def _head(data: bytes, at: int) -> tuple[int, str, str, int]:
+    """Return time and names that a pose begins with, and where they end."""
     (utime,) = _UTIME.unpack_from(data, at)
     interest, at = read_text(data, at + 8)
     reference, at = read_text(data, at)
-    values = layout.unpack_from(data, at)
-    revision, end = read_text(data, at + layout.size)
-    return (utime, interest, reference), values, revision, end
+    return utime, interest, reference, at
 
 
-def _answer(head: tuple[int, str, str], pose: Pose, values: tuple[Any, ...], revision: str) -> PoseAnswer:
-    """Return the answer of what both pose types have in common; `values` begin with the covariance."""
-    utime, interest, reference = head
-    easting, northing, height, zone, north, origin_id, epoch, _, invalid, quality = values[36:46]
+def _end(data: bytes, at: int, size: int) -> int:
+    """Return where a pose ends whose numbers before the covariance are of that size. Raises WireError, struct.error."""
+    at = _head(data, at)[3] + size + _COVARIANCE
+    _REST.unpack_from(data, at)
+    return read_text(data, at + _REST.size)[1]
+
+
+def _answer(
+    data: bytes, at: int, utime: int, interest: str, reference: str, pose: Pose, first: float
+) -> tuple[PoseAnswer, int]:
+    """Return the answer of what both pose types have in common, from the covariance at `at`, and where it ends."""
+    rest = at + _COVARIANCE
+    easting, northing, height, zone, north, origin_id, epoch, _, invalid, quality, *bounds = _REST.unpack_from(
+        data, rest
+    )
+    revision, end = read_text(data, rest + _REST.size)
     return PoseAnswer(
         Transformation(
             interest,
             reference,
             pose,
-            None if values[0] != values[0] else lambda: _square(values[:36]),
+            None if first != first else partial(_covariance, data, at),
             utime,
             invalid,
             epoch,
@@ -158,12 +182,12 @@ def _answer(head: tuple[int, str, str], pose: Pose, values: tuple[Any, ...], rev
         ),
         None if easting != easting else Origin(easting, northing, height, zone, bool(north), origin_id),
         Quality(quality) if quality else NO_FLAGS,
-        *values[46:],
-    )
+        *bounds,
+    ), end
 
 
-def _square(numbers: tuple[float, ...]) -> Array:
-    return np.array(numbers, dtype=float).reshape(6, 6)
+def _covariance(data: bytes, at: int) -> Array:
+    return np.frombuffer(data, ">f8", 36, at).astype(float).reshape(6, 6)
 
 
 def _pose(p: so3.Vector3, rows: tuple[so3.Vector3, so3.Vector3, so3.Vector3]) -> Pose:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import struct
-from functools import lru_cache
 from typing import Final
 
 from modelserver.errors import Status
 from modelserver.messages import (
     GetTransformation,
     HistoryReply,
-    PoseAnswer,
     ReplyHeader,
     RequestHeader,
     StateVectorReply,
@@ -26,14 +24,6 @@ from mslcm.get_transformation_request_t import get_transformation_request_t
 _REQUEST_ID = struct.Struct(">q")
 _TIME = struct.Struct(">qbi")
 _REPLY_HEAD = struct.Struct(">qqh")
-
-
-_STAMPED: Final = 24
-"""Where a reply goes on behind fingerprint, id and stamp."""
-
-_READ: Final[dict[bytes, PoseAnswer]] = {}
-_KEPT: Final = 1024
-"""Replies that hold for good, lately read: their bytes from `_STAMPED` on, and the answer; see `known_answer`."""
 
 _PLAIN: Final = text("") + LENGTH.pack(0)
 _PLAIN_AT: Final = 8 + _REPLY_HEAD.size
@@ -55,42 +45,19 @@ def write_question(
     request_id: int, channel: str, interest: str, reference: str, at: int, policy: int, wait_ms: int
 ) -> bytes:
     """Return the bytes of a get_transformation_request_t, without the values that it is made of."""
-    short = len(interest) + len(reference) <= _KEPT_BYTES
-    names = (_kept_texts if short else _texts)(channel, interest, reference)
-    return b"%b%b%b%b" % (_REQUEST, _REQUEST_ID.pack(request_id), names, _TIME.pack(at, policy, wait_ms))
-
-
-def _texts(channel: str, interest: str, reference: str) -> bytes:
-    """Return the three texts of a request."""
-    return text(channel) + text(interest) + text(reference)
-
-
-_kept_texts = lru_cache(maxsize=1024)(_texts)
+    head = (_REQUEST, _REQUEST_ID.pack(request_id), text(channel), text(interest), text(reference))
+    return b"%b%b%b%b%b%b" % (*head, _TIME.pack(at, policy, wait_ms))
 
 
 def read_request(data: bytes) -> GetTransformation:
     """Return the request in the bytes of a get_transformation_request_t. Raises WireError, struct.error."""
     (request_id,) = _REQUEST_ID.unpack_from(data, 8)
-    names = data[16 : -_TIME.size]
-    channel, interest, reference = _kept_names(names) if len(names) <= _KEPT_BYTES else _read_names(names)
-    time = fields.time_query(*_TIME.unpack_from(data, len(data) - _TIME.size))
-    return GetTransformation(RequestHeader(request_id, channel), interest, reference, time)
-
-
-def _read_names(data: bytes) -> tuple[str, str, str]:
-    """Return the three texts that fill `data`. Raises WireError, struct.error."""
-    channel, at = read_text(data, 0)
+    channel, at = read_text(data, 16)
     interest, at = read_text(data, at)
     reference, at = read_text(data, at)
-    check_end(data, at)
-    return channel, interest, reference
-
-
-_kept_names = lru_cache(maxsize=4096)(_read_names)
-"""The same, kept: clients ask the same question over and over."""
-
-_KEPT_BYTES: Final = 512
-"""Longer names are read anew: kept ones of 60 kB, sent by a stranger, would fill the memory."""
+    time = fields.time_query(*_TIME.unpack_from(data, at))
+    check_end(data, at + _TIME.size)
+    return GetTransformation(RequestHeader(request_id, channel), interest, reference, time)
 
 
 def write_transform_reply(reply: TransformReply) -> bytes:
@@ -107,16 +74,7 @@ def read_transform_reply(data: bytes) -> TransformReply:
         return TransformReply(header)
     answer, end = poses.read_transform_body(data, at)
     check_end(data, end)
-    if not answer.transformation.utime and answer.origin is None:
-        if len(_READ) >= _KEPT:
-            _READ.clear()
-        _READ[data[_STAMPED:]] = answer
     return TransformReply(header, answer)
-
-
-def known_answer(data: bytes) -> PoseAnswer | None:
-    """Return the answer in the bytes of a get_transformation_reply_t that was read before but for id and stamp."""
-    return _READ.get(data[_STAMPED:]) if data[:8] == _TRANSFORM_REPLY else None
 
 
 def write_state_vector_reply(reply: StateVectorReply) -> bytes:

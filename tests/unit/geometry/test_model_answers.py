@@ -126,7 +126,7 @@ def test_a_failed_question_is_not_kept():
         with pytest.raises((UnknownBodyError, UnknownFrameError)):
             model.get_transformation(name, "A:a")
     assert len(model._answers) == 0
-    assert len(model._places) <= 1
+    assert set(model._tree.nodes) == set(all_frames(model))
 
 
 def test_not_connected_names_both_assemblies_shortly():
@@ -151,7 +151,7 @@ def test_cache_is_bounded_and_answers_do_not_change_when_the_oldest_go(monkeypat
         again = model.get_transformation(a, b)
         assert again == answer
     assert len(model._answers) == 10
-    assert len(model._places) == len(frames)
+    assert len(model._tree.nodes) == len(frames)
     # the newest are those that stay
     assert list(model._answers) == list(first)[-10:]
     a, b = frames[0], frames[1]

@@ -1,0 +1,111 @@
+"""What a query costs in-process on both sides, for each pair of the Raptor's frames when it is first seen.
+
+All pairs of frames in random order, on a model that was just loaded: decoding the request, `core.step`, encoding the
+reply with its covariance, and decoding the reply in the client, each by itself. Once with joints that were never
+reported, once with both nodding axes moving at 50 Hz. The floor is to pack and unpack the same bytes with `struct`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+import statistics
+import struct
+import time
+from collections.abc import Sequence
+from typing import Final
+
+from benchmarks.support import RAPTOR, verdict
+from modelserver import core
+from modelserver.client.remote import opened_pose
+from modelserver.core import CoreSettings, CoreState, Instant
+from modelserver.formats import load_model
+from modelserver.messages import JointSample, JointsSample, SensorHeader
+from modelserver.wire.codec import decode, encode
+from modelserver.wire.queries import write_question
+
+START_UTIME: Final = 1_700_000_000_000_000
+STEP_US, SAMPLES = 20_000, 100
+BASE_FRAME: Final = "Raptor:CG"
+RUNS: Final = 7
+SERVER: Final = ("decode", "step", "encode")
+CLIENT: Final = ("ask", "read reply")
+BOUND_US: Final = 60.0
+
+_REQUEST, _REPLY = "get_transformation_request_t", "get_transformation_reply_t"
+_NUMBERS: Final = struct.Struct(">3q55d")
+"""About the numbers of a request and its reply: ids, times, pose, covariance, bounds."""
+
+
+def loaded(moving: bool) -> tuple[CoreState, list[str], Instant]:
+    """Return the core with a model that was just loaded, the full names of all frames, and the time after the samples.
+
+    With `moving` both nodding axes have been reported at 50 Hz.
+    """
+    model = load_model(RAPTOR / "geometry.yaml")
+    state = core.start(CoreSettings(BASE_FRAME), model, None, Instant(0, START_UTIME))
+    now = Instant(0, START_UTIME)
+    for sample in range(SAMPLES if moving else 0):
+        utime = START_UTIME + sample * STEP_US
+        now = Instant(sample * STEP_US * 1000, utime)
+        angle = 0.3 * math.sin(0.05 * sample)
+        joints = tuple(JointSample(name, angle, 0.0004, 0.1, 0.01) for name in model.joints)
+        state, _ = core.step(state, JointsSample(SensorHeader(utime, "axes"), joints), now)
+    names = [f"{body.name}:{frame.name}" for body in model.bodies for frame in body]
+    return state, names, now
+
+
+def measured(moving: bool, seed: int) -> dict[str, list[float]]:
+    """Return the seconds that each part of each query took, every pair once and in random order."""
+    state, names, now = loaded(moving)
+    pairs = list(itertools.product(names, repeat=2))
+    random.Random(seed).shuffle(pairs)
+    times: dict[str, list[float]] = {part: [] for part in (*SERVER, *CLIENT, "floor")}
+    clock = time.perf_counter
+    numbers = tuple([0] * 3 + [0.5] * 55)
+    for number, (interest, reference) in enumerate(pairs):
+        begin = clock()
+        question = write_question(number, "REPLY_BENCHMARK", interest, reference, 0, 0, 0)
+        asked = clock()
+        request = decode(_REQUEST, question)
+        decoded = clock()
+        state, outputs = core.step(state, request, now)
+        stepped = clock()
+        reply = encode(outputs[0].reply)
+        encoded = clock()
+        opened_pose(reply)
+        opened = clock()
+        _NUMBERS.unpack(_NUMBERS.pack(*numbers))
+        end = clock()
+        spent = (decoded - asked, stepped - decoded, encoded - stepped, asked - begin, opened - encoded, end - opened)
+        for part, seconds in zip(times, spent, strict=True):
+            times[part].append(seconds)
+    return times
+
+
+def quantile(values: Sequence[float], share: float) -> float:
+    """Return the value below which a share of the values lies."""
+    return sorted(values)[min(int(share * len(values)), len(values) - 1)]
+
+
+def main() -> int:
+    holds = True
+    for moving in (False, True):
+        measured(moving, 0)  # warm up: the interpreter specializes what runs often
+        runs = [measured(moving, seed) for seed in range(1, RUNS + 1)]
+        print(f"  joints {'moving at 50 Hz' if moving else 'never reported'}; median of {RUNS} runs, us:")
+        print(f"    {'':12} {'p50':>7} {'p99':>7}")
+        for part in (*SERVER, *CLIENT, "floor"):
+            p50, p99 = (statistics.median(quantile(run[part], share) for run in runs) * 1e6 for share in (0.5, 0.99))
+            print(f"    {part:12} {p50:7.1f} {p99:7.1f}")
+        sums = [[sum(each) for each in zip(*(run[part] for part in SERVER), strict=True)] for run in runs]
+        p50, p99 = (statistics.median(quantile(each, share) for each in sums) * 1e6 for share in (0.5, 0.99))
+        ratio = statistics.median(
+            statistics.median(each) / statistics.median(run["floor"]) for each, run in zip(sums, runs, strict=True)
+        )
+        print(f"    {'server':12} {p50:7.1f} {p99:7.1f}")
+        holds &= verdict("decode, lookup, covariance and encode together, p50", p50, BOUND_US, "us")
+        holds &= verdict("the same, p99", p99, 2 * BOUND_US, "us")
+        holds &= verdict("the same as a ratio to the floor, p50", ratio, 30.0, "x")
+    return 0 if holds else 1

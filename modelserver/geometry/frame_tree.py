@@ -1,0 +1,225 @@
+"""Frame tree: every frame and every edge of a model as a node under its assembly's root, so that any pair is quick.
+
+Theory of operation. The bodies of an assembly are spread from its first one (`Topology.spread`). A body's origin, each
+of its frames that is not there by definition, and each far end of a constraint or joint are nodes; the edge of a node
+leads down to it from its parent. Nodes with no moving joint between them form a group, and each knows its pose in the
+group's root node. The path between two frames climbs from both to the lowest common ancestor. What two frames of one
+group are to each other is one product of two poses that are kept, its covariance the blocks of the edges between them
+(`path_covariance`), whose base is the group's root. A path through joints has a segment for each group that it passes.
+
+All is made once for a model: memory and time are linear in its frames, and nothing is kept for pairs. In an assembly
+with a loop, shortest paths form no tree; the model searches them there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Final
+
+import numpy as np
+
+from modelserver.geometry import names
+from modelserver.geometry.parts import Body
+from modelserver.geometry.path_covariance import (
+    Crossing,
+    FixedEdge,
+    JointMotion,
+    PathCovariance,
+    motion_factors,
+    transport_columns,
+)
+from modelserver.geometry.route import Edge, EdgeKind, Leg, Route
+from modelserver.geometry.topology import Crossing as ConstraintCrossing
+from modelserver.geometry.topology import Topology
+from modelserver.spatial import so3
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.so3 import Array
+
+_EXACT: Final = -1
+_UNSTATED: Final = -2
+"""In place of the number of a block: the edge is exact, or states no sigma."""
+
+
+@dataclass(slots=True, eq=False, repr=False)
+class Node:
+    """A frame, or the far end of an edge. Immutable by habit: only the tree sets, while it is made.
+
+    `edge` leads down to it from `parent`, `back` is the same passed upward; a root's parent is the root itself. `X_GN`
+    is its pose in the root `group` of its group, `X_NG` the inverse. `block` numbers the edge's motion factors.
+    `motion` is that of a moving joint's edge.
+    """
+
+    assembly: int
+    body: str
+    X_GN: Pose
+    block: int = _EXACT
+    depth: int = 0
+    edge: Edge | None = None
+    back: Edge | None = None
+    motion: JointMotion | None = None
+    parent: Node = field(init=False)
+    group: Node = field(init=False)
+    X_NG: Pose = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.parent = self.group = self
+        self.X_NG = self.X_GN.inverse()
+
+
+class FrameTree:
+    """The nodes of a model's frames by full name, in `nodes`; see the module."""
+
+    __slots__ = ("_blocks", "_fixed", "_leader", "nodes")
+
+    def __init__(self, bodies: Mapping[str, Body], topology: Topology, leader: Callable[[str], str]):
+        """Spread every assembly; `leader` gives the joint that places a joint, itself where it follows none."""
+        self._leader = leader
+        self._fixed: list[FixedEdge] = []
+        self.nodes: dict[str, Node] = {}
+        for number, assembly in enumerate(topology.assemblies):
+            root = assembly[0]
+            self._add_frames(bodies[root], Node(number, root, Pose.identity()))
+            for _, crossing in topology.spread(root):
+                body = bodies[names.split(crossing.leaves)[0]]
+                self._add_frames(body, self._cross(crossing, body), crossing.leaves)
+        self._blocks = motion_factors(self._fixed)
+
+    def _add_frames(self, body: Body, entered: Node, by: str = "") -> None:
+        """Add the frames of a body that is entered at its origin, or by the frame of that full name."""
+        origin = entered
+        if by:
+            frame = body.frame(names.split(by)[1])
+            if frame.pose != _IDENTITY or frame.sigma is not None:
+                origin = self._add(entered, Edge(EdgeKind.FRAME, by, False, frame.pose, frame.sigma), body.name)
+        for frame in body:
+            full = names.joined(body.name, frame.name)
+            if full == by:
+                self.nodes[full] = entered
+            elif frame.pose == _IDENTITY and frame.sigma is None:
+                # a frame that is at the origin by definition is the origin
+                self.nodes[full] = origin
+            else:
+                edge = Edge(EdgeKind.FRAME, full, True, frame.pose, frame.sigma)
+                self.nodes[full] = self._add(origin, edge, body.name)
+
+    def _cross(self, crossing: ConstraintCrossing, body: Body) -> Node:
+        """Add the edges of a constraint, and of its joint where that moves; return the node in the body entered."""
+        each, forward = crossing.constraint, crossing.forward
+        edges = [Edge(EdgeKind.CONSTRAINT, each.name, forward, each.pose, each.sigma)]
+        if each.joint.moves:
+            leader = "" if each.joint.mimic is None else self._leader(each.name)
+            joint = Edge(EdgeKind.JOINT, each.name, forward, _IDENTITY, joint=each.joint, leader=leader)
+            edges.insert(1 if forward else 0, joint)
+        node = self.nodes[crossing.enters]
+        for edge in edges:
+            node = self._add(node, edge, body.name)
+        return node
+
+    def _add(self, parent: Node, edge: Edge, body: str) -> Node:
+        back = edge._replace(forward=not edge.forward)
+        common = {"depth": parent.depth + 1, "edge": edge, "back": back}
+        if edge.joint is not None:
+            motion = JointMotion.at(edge.joint, parent.X_GN if edge.forward else _IDENTITY)
+            node = Node(parent.assembly, body, _IDENTITY, motion=motion, **common)
+            node.parent = parent
+            return node
+        X_GN = parent.X_GN @ (edge.pose if edge.forward else edge.pose.inverse())
+        block = _UNSTATED if edge.is_unstated else _EXACT
+        if edge.sigma is not None and not edge.sigma.is_zero:
+            block = len(self._fixed)
+            X_F, X_T = (parent.X_GN, X_GN) if edge.forward else (X_GN, parent.X_GN)
+            self._fixed.append(FixedEdge(X_F.wxyz, X_T.xyz, edge.sigma))
+        node = Node(parent.assembly, body, X_GN, block=block, **common)
+        node.parent, node.group = parent, parent.group
+        return node
+
+    @staticmethod
+    def path(interest: Node, reference: Node) -> tuple[list[Node], list[Node]]:
+        """Return the nodes whose edges are passed upward from the reference, then downward to the interest."""
+        up: list[Node] = []
+        down: list[Node] = []
+        while reference is not interest:
+            if reference.depth >= interest.depth:
+                up.append(reference)
+                reference = reference.parent
+            else:
+                down.append(interest)
+                interest = interest.parent
+        down.reverse()
+        return up, down
+
+    def rigid_covariance(self, interest: Node, reference: Node) -> Array | None:
+        """Return the covariance (6, 6) of one frame in another of the same group; None where an edge states none."""
+        X_RG, p_I = reference.X_NG, interest.X_GN._p
+        blocks: list[int] = []
+        # the path, without keeping it
+        while reference is not interest:
+            if reference.depth >= interest.depth:
+                block = reference.block
+                reference = reference.parent
+            else:
+                block = interest.block
+                interest = interest.parent
+            if block >= 0:
+                blocks.append(block)
+            elif block == _UNSTATED:
+                return None
+        if not blocks:
+            return np.zeros((6, 6))
+        q = X_RG._q
+        transport = np.array(transport_columns(q, so3.rotate(q, p_I))).reshape(6, 6)
+        rows = self._blocks.take(blocks, axis=0).reshape(-1, 6) @ transport
+        return np.asarray(rows.T @ rows)
+
+    def route(self, interest: Node, reference: Node) -> Route:
+        """Return the route from one frame to another of the same assembly."""
+        up, down = self.path(interest, reference)
+        legs: list[Leg] = []
+        bases: list[Pose | None] = [reference.X_NG]
+        # pose from the frame behind the last joint, or from the reference, to its group's root
+        X_LG = reference.X_NG
+        for node in up:
+            if node.motion is not None:
+                # a joint is the edge of its group's root
+                legs.append(Leg.of(X_LG, node.back))
+                X_LG = node.parent.X_NG
+                bases.append(X_LG)
+        for node in down:
+            if node.motion is not None:
+                legs.append(Leg.of(X_LG @ node.parent.X_GN, node.edge))
+                X_LG = _IDENTITY
+                bases.append(None)
+        return Route.assemble(
+            legs, X_LG @ interest.X_GN, bases, partial(_edges, up, down), partial(self._path_covariance, up, down)
+        )
+
+    def _path_covariance(self, up: Sequence[Node], down: Sequence[Node]) -> PathCovariance:
+        blocks: list[int] = []
+        segments: list[int] = []
+        crossings: list[Crossing] = []
+        is_stated = True
+        number = 0
+        for nodes, is_upward in ((up, True), (down, False)):
+            for node in nodes:
+                edge = node.back if is_upward else node.edge
+                assert edge is not None
+                if node.motion is not None:
+                    segment = number if edge.forward else number + 1
+                    sign = 1.0 if edge.forward else -1.0
+                    crossings.append(Crossing(node.motion, segment, sign, edge.leader or edge.name))
+                    number += 1
+                elif node.block >= 0:
+                    blocks.append(node.block)
+                    segments.append(number)
+                elif node.block == _UNSTATED:
+                    is_stated = False
+        return PathCovariance(self._blocks.take(blocks, axis=0), segments, crossings, is_stated)
+
+
+def _edges(up: Sequence[Node], down: Sequence[Node]) -> tuple[Edge, ...]:
+    return tuple([edge for edge in (*[each.back for each in up], *[each.edge for each in down]) if edge is not None])
+
+
+_IDENTITY: Final = Pose.identity()
