@@ -71,12 +71,13 @@ class Node:
 class FrameTree:
     """The nodes of a model's frames by full name, in `nodes`; see the module."""
 
-    __slots__ = ("_blocks", "_fixed", "_leader", "nodes")
+    __slots__ = ("_blocks", "_fixed", "_joints", "_leader", "nodes")
 
     def __init__(self, bodies: Mapping[str, Body], topology: Topology, leader: Callable[[str], str]):
         """Spread every assembly; `leader` gives the joint that places a joint, itself where it follows none."""
         self._leader = leader
         self._fixed: list[FixedEdge] = []
+        self._joints: list[Node] = []
         self.nodes: dict[str, Node] = {}
         for number, assembly in enumerate(topology.assemblies):
             root = assembly[0]
@@ -84,7 +85,11 @@ class FrameTree:
             for _, crossing in topology.spread(root):
                 body = bodies[names.split(crossing.leaves)[0]]
                 self._add_frames(body, self._cross(crossing, body), crossing.leaves)
-        self._blocks = motion_factors(self._fixed)
+        self._blocks = np.concatenate(
+            (motion_factors(self._fixed), *[each.motion.block[None] for each in self._joints if each.motion])
+        )
+        for number, node in enumerate(self._joints):
+            node.block = len(self._fixed) + number
 
     def _add_frames(self, body: Body, entered: Node, by: str = "") -> None:
         """Add the frames of a body that is entered at its origin, or by the frame of that full name."""
@@ -119,10 +124,11 @@ class FrameTree:
 
     def _add(self, parent: Node, edge: Edge, body: str) -> Node:
         back = edge._replace(forward=not edge.forward)
-        common = {"depth": parent.depth + 1, "edge": edge, "back": back}
+        depth = parent.depth + 1
         if edge.joint is not None:
             motion = JointMotion.at(edge.joint, parent.X_GN if edge.forward else _IDENTITY)
-            node = Node(parent.assembly, body, _IDENTITY, motion=motion, **common)
+            node = Node(parent.assembly, body, _IDENTITY, -1, depth, edge, back, motion)
+            self._joints.append(node)
             node.parent = parent
             return node
         X_GN = parent.X_GN @ (edge.pose if edge.forward else edge.pose.inverse())
@@ -131,7 +137,7 @@ class FrameTree:
             block = len(self._fixed)
             X_F, X_T = (parent.X_GN, X_GN) if edge.forward else (X_GN, parent.X_GN)
             self._fixed.append(FixedEdge(X_F.wxyz, X_T.xyz, edge.sigma))
-        node = Node(parent.assembly, body, X_GN, block=block, **common)
+        node = Node(parent.assembly, body, X_GN, block, depth, edge, back)
         node.parent, node.group = parent, parent.group
         return node
 
@@ -178,44 +184,48 @@ class FrameTree:
         up, down = self.path(interest, reference)
         legs: list[Leg] = []
         bases: list[Pose | None] = [reference.X_NG]
-        # pose from the frame behind the last joint, or from the reference, to its group's root
+        # the group's root in the frame behind the last joint, or in the reference
         X_LG = reference.X_NG
         for node in up:
-            if node.motion is not None:
-                # a joint is the edge of its group's root
+            if node.motion is not None and node.back is not None:
+                # the near frame of a joint passed upward is its group's root
                 legs.append(Leg.of(X_LG, node.back))
                 X_LG = node.parent.X_NG
                 bases.append(X_LG)
         for node in down:
-            if node.motion is not None:
-                legs.append(Leg.of(X_LG @ node.parent.X_GN, node.edge))
+            if node.motion is not None and node.edge is not None:
+                # the far frame of one passed downward is the next group's root
+                X_GN = node.parent.X_GN
+                legs.append(Leg.of(X_GN if X_LG is _IDENTITY else X_LG @ X_GN, node.edge))
                 X_LG = _IDENTITY
                 bases.append(None)
-        return Route.assemble(
-            legs, X_LG @ interest.X_GN, bases, partial(_edges, up, down), partial(self._path_covariance, up, down)
-        )
+        last = interest.X_GN if X_LG is _IDENTITY else X_LG @ interest.X_GN
+        return Route.assemble(legs, last, bases, partial(_edges, up, down), partial(self._covariance, up, down))
 
-    def _path_covariance(self, up: Sequence[Node], down: Sequence[Node]) -> PathCovariance:
-        blocks: list[int] = []
+    def _covariance(self, up: Sequence[Node], down: Sequence[Node]) -> PathCovariance:
+        fixed: list[int] = []
+        joints: list[int] = []
         segments: list[int] = []
         crossings: list[Crossing] = []
         is_stated = True
         number = 0
         for nodes, is_upward in ((up, True), (down, False)):
             for node in nodes:
-                edge = node.back if is_upward else node.edge
-                assert edge is not None
+                block = node.block
                 if node.motion is not None:
-                    segment = number if edge.forward else number + 1
-                    sign = 1.0 if edge.forward else -1.0
-                    crossings.append(Crossing(node.motion, segment, sign, edge.leader or edge.name))
+                    edge = node.back if is_upward else node.edge
+                    assert edge is not None
+                    # the motion is written in the segment that F is in: the one before the joint, or behind it
+                    at, sign = (number, 1.0) if edge.forward else (number + 1, -1.0)
+                    crossings.append(Crossing(node.motion, at, sign, edge.leader or edge.name))
+                    joints.append(block)
                     number += 1
-                elif node.block >= 0:
-                    blocks.append(node.block)
+                elif block >= 0:
+                    fixed.append(block)
                     segments.append(number)
-                elif node.block == _UNSTATED:
+                elif block == _UNSTATED:
                     is_stated = False
-        return PathCovariance(self._blocks.take(blocks, axis=0), segments, crossings, is_stated)
+        return PathCovariance(self._blocks.take(fixed + joints, axis=0), segments, crossings, is_stated)
 
 
 def _edges(up: Sequence[Node], down: Sequence[Node]) -> tuple[Edge, ...]:

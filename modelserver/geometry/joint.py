@@ -98,11 +98,16 @@ class Joint:
     default: Coordinates = ()
     sigma: Coordinates = ()
     mimic: Mimic | None = None
+    count: int = field(init=False, repr=False, compare=False, hash=False)
+    """How many coordinates it has."""
+    span: tuple[float, float] | None = field(init=False, repr=False, compare=False, hash=False)
+    """Of a joint with one coordinate its limits, widened by rounding."""
     _plane: tuple[Vector3, Vector3] = field(init=False, repr=False, compare=False, hash=False)
 
     def __post_init__(self) -> None:
         put = object.__setattr__
         put(self, "type", JointType(self.type))
+        put(self, "count", len(SUFFIXES[self.type]))
         put(self, "axis", _unit(self.axis) if self.type in AXIAL else (0.0, 0.0, 1.0))
         put(self, "_plane", _plane(self.axis))
         count = self.count
@@ -128,6 +133,9 @@ class Joint:
             # no limit is written in one way, so that equal joints are equal
             if all(value == none for value in getattr(self, what)):
                 put(self, what, ())
+        low = self.lower[0] - ROUNDING if self.lower else -math.inf
+        high = self.upper[0] + ROUNDING if self.upper else math.inf
+        put(self, "span", (low, high) if count == 1 else None)
         if not all(map(math.isfinite, self.default)):
             raise ValueError(f"a default is finite, got {_listed(self.default)}")
         # where a leader takes its followers is a matter for the builder, which can name both
@@ -137,11 +145,6 @@ class Joint:
             raise ValueError(
                 f"only a joint with one coordinate can follow another; a {self.type} one has {count or 'none'}"
             )
-
-    @property
-    def count(self) -> int:
-        """How many coordinates it has."""
-        return len(SUFFIXES[self.type])
 
     @property
     def moves(self) -> bool:

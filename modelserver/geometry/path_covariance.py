@@ -23,9 +23,9 @@ before they are squared.
 
 from __future__ import annotations
 
-import math
+import struct
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 Place = tuple[Vector3, Quaternion]
 """Position and orientation of a frame, as plain floats."""
 
+_NUMBERS: Final = struct.Struct("36d")
+
 
 class FixedEdge(NamedTuple):
     """A fixed edge in its segment: `orientation` of F and `position` of T in the base, and the survey's sigmas."""
@@ -53,12 +55,12 @@ class FixedEdge(NamedTuple):
 class JointMotion(NamedTuple):
     """How a joint moves the segment behind it: `transport` (6, 6) takes a motion at F, along its axes, to the base.
 
-    `rows` (1, 6) is that of a joint with one coordinate, the same at every position; None for any other joint.
+    `block` (6, 6) is that of `at_position`, at any position where the joint has one coordinate.
     """
 
     joint: Joint
     transport: Array
-    rows: Array | None
+    block: Array
 
     @classmethod
     def at(cls, joint: Joint, X_BF: Pose) -> JointMotion:
@@ -67,14 +69,16 @@ class JointMotion(NamedTuple):
         transport = np.zeros((6, 6))
         transport[:3, :3] = transport[3:, 3:] = R
         transport[:3, 3:] = so3.skew(X_BF.xyz) @ R
-        found = cls(joint, transport, None)
-        return found._replace(rows=found.at_position((0.0,))) if joint.count == 1 else found
+        found = cls(joint, transport, transport)
+        return found._replace(block=found.at_position((0.0,) * joint.count))
 
     def at_position(self, position: Coordinates) -> Array:
-        """Return the motions (n, 6) in the base that a unit of each coordinate makes."""
+        """Return a block (6, 6): row i is the motion (v, w) in the base that a unit of coordinate i makes, else 0."""
         J = self.joint.jacobian(position)
         J[:3] += so3.skew(self.joint.motion(position).xyz) @ J[3:]
-        return np.asarray((self.transport @ J).T)
+        block = np.zeros((6, 6))
+        block[: self.joint.count] = (self.transport @ J).T
+        return block
 
 
 class Crossing(NamedTuple):
@@ -92,28 +96,30 @@ class Crossing(NamedTuple):
 class PathCovariance:
     """Covariance of the far end of a path, for any position of its joints; see the module.
 
-    `blocks` (k, 6, 6) are those of `motion_factors` for the fixed edges, `segments` the number of the segment that each
-    is in; `is_stated` is false where an edge states no sigma, and counts as exact here.
+    `blocks` (k + m, 6, 6) are those of `motion_factors` for the k fixed edges, each in the segment whose number is in
+    `segments`, and those of the m joints, the `crossings`. `is_stated` is false where an edge states no sigma, and
+    counts as exact here.
     """
 
-    __slots__ = ("_blocks", "_crossings", "_rows", "_segments", "_shared", "is_stated")
+    __slots__ = ("_blocks", "_constant", "_crossings", "_segments", "_shared", "is_stated")
 
     def __init__(
         self, blocks: Array, segments: Sequence[int], crossings: Sequence[Crossing] = (), is_stated: bool = True
     ):
         self.is_stated = is_stated
-        self._crossings = crossings
         self._blocks = blocks
+        self._crossings = crossings
+        self._segments = np.array([*segments, *[each.segment for each in crossings]], dtype=np.intp)
+        self._constant = True
         self._shared: Array | None = None
-        self._rows: Array | None = None
-        coordinates = [(each.source, number) for each in crossings for number in range(each.motion.joint.count)]
-        distinct = sorted(set(coordinates))
-        if len(distinct) < len(coordinates):
-            self._shared = np.array([[float(mine == each) for mine in coordinates] for each in distinct])
-        if all(each.motion.rows is not None for each in crossings):
-            self._rows = np.array([each.motion.rows for each in crossings])
-        joints = [each.segment for each in crossings for _ in range(each.motion.joint.count)]
-        self._segments = np.array([*segments, *joints], dtype=np.intp)
+        for each in crossings:
+            self._constant &= each.motion.joint.count == 1
+        if len(crossings) > 1:
+            sources = [each.source for each in crossings]
+            distinct = sorted(set(sources))
+            if len(distinct) < len(sources):
+                same = np.array([[float(mine == each) for mine in sources] for each in distinct])
+                self._shared = np.kron(same, np.eye(6))
 
     @classmethod
     def along(cls, edges: Sequence[Edge]) -> PathCovariance:
@@ -140,7 +146,8 @@ class PathCovariance:
             elif edge.is_unstated:
                 is_stated = False
             pose = behind
-        return cls(motion_factors(fixed), segments, crossings, is_stated)
+        blocks = np.concatenate((motion_factors(fixed), *[each.motion.block[None] for each in crossings]))
+        return cls(blocks, segments, crossings, is_stated)
 
     def at(
         self, bases: Sequence[Place], far: Vector3, positions: Sequence[Coordinates], sigmas: Sequence[Coordinates]
@@ -150,32 +157,29 @@ class PathCovariance:
         Parameters: `bases` are the places of the segments' bases in the frame of reference, `far` the position of the
         far end there; `positions` and `sigmas` those of the joints' coordinates, nan counts as exact.
         """
-        transports = np.array(
-            [transport_columns(q, (far[0] - p[0], far[1] - p[1], far[2] - p[2])) for p, q in bases]
-        ).reshape(-1, 6, 6)
-        count = len(self._blocks)
-        if len(transports) == 1:
-            rows = self._blocks.reshape(-1, 6) @ transports[0]
+        x, y, z = far
+        # half the cost of np.array of nested tuples
+        numbers = [_NUMBERS.pack(*transport_columns(q, (x - p[0], y - p[1], z - p[2]))) for p, q in bases]
+        transports = np.frombuffer(b"".join(numbers)).reshape(-1, 6, 6)
+        blocks = self._blocks
+        if len(numbers) == 1:
+            rows = blocks.reshape(-1, 6) @ transports[0]
             return np.asarray(rows.T @ rows)
-        each = transports.take(self._segments, axis=0)
-        rows = (self._blocks @ each[:count]).reshape(-1, 6)
-        total = rows.T @ rows
-        if self._crossings:
-            motions = self._rows
-            if motions is None:
-                motions = np.concatenate(
-                    [each.motion.at_position(where) for each, where in zip(self._crossings, positions, strict=True)]
-                ).reshape(-1, 1, 6)
-            scales = [
-                0.0 if math.isnan(sigma) else crossing.sign * sigma
-                for crossing, leg in zip(self._crossings, sigmas, strict=True)
-                for sigma in leg
-            ]
-            moved = (motions @ each[count:])[:, 0] * np.array(scales)[:, None]
-            if self._shared is not None:
-                moved = self._shared @ moved
-            total += moved.T @ moved
-        return np.asarray(total)
+        fixed = len(blocks) - len(self._crossings)
+        if not self._constant:
+            moved = [each.motion.at_position(where) for each, where in zip(self._crossings, positions, strict=True)]
+            blocks = np.concatenate((blocks[:fixed], moved))
+        # here, not in the blocks: the sigmas are those of the readings
+        scales = []
+        for crossing, leg in zip(self._crossings, sigmas, strict=True):
+            sign = crossing.sign
+            scale = [0.0 if sigma != sigma else sign * sigma for sigma in leg]
+            scales += scale + [0.0] * (6 - len(scale))
+        rows = (blocks @ transports.take(self._segments, axis=0)).reshape(-1, 6)
+        rows[6 * fixed :] *= np.array(scales)[:, None]
+        if self._shared is not None:
+            rows = np.concatenate((rows[: 6 * fixed], self._shared @ rows[6 * fixed :]))
+        return np.asarray(rows.T @ rows)
 
 
 def motion_factors(edges: Sequence[FixedEdge]) -> Array:

@@ -14,7 +14,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from modelserver.geometry.joint import ROUNDING, Coordinates, Joint, JointType
+from modelserver.geometry.joint import Coordinates, Joint, JointType
 from modelserver.geometry.parts import BodyFrame, Sigma
 from modelserver.geometry.path_covariance import PathCovariance, Place
 from modelserver.geometry.topology import Crossing
@@ -82,7 +82,7 @@ class Leg(NamedTuple):
     def of(cls, before: Pose, edge: Edge) -> Leg:
         """Return the leg of the edge of a joint that moves."""
         assert edge.joint is not None
-        return cls(before, edge.name, edge.joint, edge.forward, _span(edge.joint), _turning(before, edge))
+        return cls(before, edge.name, edge.joint, edge.forward, edge.joint.span, _turning(before, edge))
 
 
 class Route:
@@ -213,8 +213,13 @@ class Route:
         path = self._covariance
         if not isinstance(path, PathCovariance):
             path = self._covariance = path()
-        if any(math.isnan(each) for leg in sigmas for each in leg) or not (unstated_is_exact or path.is_stated):
+        if not (unstated_is_exact or path.is_stated):
             return None
+        # loops, not any(): this is asked for each lookup
+        for leg in sigmas:
+            for sigma in leg:
+                if sigma != sigma:
+                    return None
         if places is None:
             places = self.places(positions)
         bases: list[Place] = []
@@ -279,13 +284,6 @@ def edges_along(
         inside, name = frame(crossing.leaves), crossing.leaves
     within(frame(frame_of_interest), frame_of_interest)
     return edges
-
-
-def _span(joint: Joint) -> tuple[float, float] | None:
-    if joint.count != 1:
-        return None
-    low = joint.lower[0] - ROUNDING if joint.lower else -math.inf
-    return low, joint.upper[0] + ROUNDING if joint.upper else math.inf
 
 
 def _turning(before: Pose, edge: Edge) -> tuple[Quaternion, Quaternion] | None:

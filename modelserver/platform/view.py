@@ -131,8 +131,8 @@ class PlatformView:
                 route.end(places),
                 lambda: route.covariance(mounted.positions, mounted.sigmas, places=places),
                 utime,
-                # flags cost more to put together than the pose: mostly there are none
-                int(self.doubt & Invalid.CLOCK_STEPPED | mounted.invalid) if self.doubt or mounted.invalid else 0,
+                # as numbers: flags cost more to put together than the pose
+                self.doubt.value & _CLOCK_STEPPED | mounted.invalid.value,
                 model_revision=self.model.revision,
             ),
             quality=mounted.quality | Quality.LOOP if route.closes_loop else mounted.quality,
@@ -351,6 +351,7 @@ class PlatformView:
 
 
 _ZERO = np.zeros((6, 6))
+_CLOCK_STEPPED: Final = Invalid.CLOCK_STEPPED.value
 ODOM_INVALID = Invalid.NO_IMU | Invalid.STALE_IMU | Invalid.CLOCK_STEPPED | Invalid.TILTED
 """What speaks against a pose in Odom: it needs no fix and no origin."""
 
