@@ -4,7 +4,7 @@ Theory of operation. The bodies of an assembly are spread from its first one (`T
 of its frames that is not there by definition, and each far end of a constraint or joint are nodes; the edge of a node
 leads down to it from its parent. Nodes with no moving joint between them form a group, and each knows its pose in the
 group's root node. The path between two frames climbs from both to the lowest common ancestor. What two frames of one
-group are to each other is one product of two poses that are kept, its covariance the blocks of the edges between them
+group are to each other is one product of two poses that are kept, its covariance the sum over the edges between them
 (`path_covariance`), whose base is the group's root. A path through joints has a segment for each group that it passes.
 
 All is made once for a model: memory and time are linear in its frames, and nothing is kept for pairs. In an assembly
@@ -18,28 +18,22 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
-import numpy as np
-
 from modelserver.geometry import names
 from modelserver.geometry.parts import Body
 from modelserver.geometry.path_covariance import (
     Crossing,
-    FixedEdge,
+    EdgeCovariance,
     JointMotion,
     PathCovariance,
-    motion_factors,
-    transport_columns,
+    edge_covariance,
+    expand,
+    rotate_axes,
+    sum_at,
 )
 from modelserver.geometry.route import Edge, EdgeKind, Leg, Route
 from modelserver.geometry.topology import Crossing as ConstraintCrossing
 from modelserver.geometry.topology import Topology
-from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
-from modelserver.spatial.so3 import Array
-
-_EXACT: Final = -1
-_UNSTATED: Final = -2
-"""In place of the number of a block: the edge is exact, or states no sigma."""
 
 
 @dataclass(slots=True, eq=False, repr=False)
@@ -47,17 +41,18 @@ class Node:
     """A frame, or the far end of an edge. Immutable by habit: only the tree sets, while it is made.
 
     `edge` leads down to it from `parent`, `back` is the same passed upward; a root's parent is the root itself. `X_GN`
-    is its pose in the root `group` of its group, `X_NG` the inverse. `block` numbers the edge's motion factors.
-    `motion` is that of a moving joint's edge.
+    is its pose in the root `group` of its group, `X_NG` the inverse. `covariance` is that of a fixed edge, None where
+    it is exact or, as `is_unstated` says, states none; `motion` is that of the edge of a moving joint.
     """
 
     assembly: int
     body: str
     X_GN: Pose
-    block: int = _EXACT
     depth: int = 0
     edge: Edge | None = None
     back: Edge | None = None
+    covariance: EdgeCovariance | None = None
+    is_unstated: bool = False
     motion: JointMotion | None = None
     parent: Node = field(init=False)
     group: Node = field(init=False)
@@ -71,13 +66,11 @@ class Node:
 class FrameTree:
     """The nodes of a model's frames by full name, in `nodes`; see the module."""
 
-    __slots__ = ("_blocks", "_fixed", "_joints", "_leader", "nodes")
+    __slots__ = ("_leader", "nodes")
 
     def __init__(self, bodies: Mapping[str, Body], topology: Topology, leader: Callable[[str], str]):
         """Spread every assembly; `leader` gives the joint that places a joint, itself where it follows none."""
         self._leader = leader
-        self._fixed: list[FixedEdge] = []
-        self._joints: list[Node] = []
         self.nodes: dict[str, Node] = {}
         for number, assembly in enumerate(topology.assemblies):
             root = assembly[0]
@@ -85,11 +78,6 @@ class FrameTree:
             for _, crossing in topology.spread(root):
                 body = bodies[names.split(crossing.leaves)[0]]
                 self._add_frames(body, self._cross(crossing, body), crossing.leaves)
-        self._blocks = np.concatenate(
-            (motion_factors(self._fixed), *[each.motion.block[None] for each in self._joints if each.motion])
-        )
-        for number, node in enumerate(self._joints):
-            node.block = len(self._fixed) + number
 
     def _add_frames(self, body: Body, entered: Node, by: str = "") -> None:
         """Add the frames of a body that is entered at its origin, or by the frame of that full name."""
@@ -127,17 +115,15 @@ class FrameTree:
         depth = parent.depth + 1
         if edge.joint is not None:
             motion = JointMotion.at(edge.joint, parent.X_GN if edge.forward else _IDENTITY)
-            node = Node(parent.assembly, body, _IDENTITY, -1, depth, edge, back, motion)
-            self._joints.append(node)
+            node = Node(parent.assembly, body, _IDENTITY, depth, edge, back, motion=motion)
             node.parent = parent
             return node
         X_GN = parent.X_GN @ (edge.pose if edge.forward else edge.pose.inverse())
-        block = _UNSTATED if edge.is_unstated else _EXACT
+        covariance = None
         if edge.sigma is not None and not edge.sigma.is_zero:
-            block = len(self._fixed)
             X_F, X_T = (parent.X_GN, X_GN) if edge.forward else (X_GN, parent.X_GN)
-            self._fixed.append(FixedEdge(X_F.wxyz, X_T.xyz, edge.sigma))
-        node = Node(parent.assembly, body, X_GN, block, depth, edge, back)
+            covariance = edge_covariance(X_F.wxyz, X_T.xyz, edge.sigma)
+        node = Node(parent.assembly, body, X_GN, depth, edge, back, covariance, edge.is_unstated)
         node.parent, node.group = parent, parent.group
         return node
 
@@ -156,32 +142,27 @@ class FrameTree:
         down.reverse()
         return up, down
 
-    def rigid_covariance(self, interest: Node, reference: Node) -> Array | None:
-        """Return the covariance (6, 6) of one frame in another of the same group; None where an edge states none."""
-        X_RG, p_I = reference.X_NG, interest.X_GN._p
-        blocks: list[int] = []
+    @staticmethod
+    def rigid_covariance(interest: Node, reference: Node) -> tuple[float, ...] | None:
+        """Return the covariance, 36 numbers, of a frame in another of its group; None where an edge states none."""
+        q, far = reference.X_NG._q, interest.X_GN._p
+        edges: list[EdgeCovariance] = []
         # the path, without keeping it
         while reference is not interest:
             if reference.depth >= interest.depth:
-                block = reference.block
-                reference = reference.parent
+                node, reference = reference, reference.parent
             else:
-                block = interest.block
-                interest = interest.parent
-            if block >= 0:
-                blocks.append(block)
-            elif block == _UNSTATED:
+                node, interest = interest, interest.parent
+            if node.covariance is not None:
+                edges.append(node.covariance)
+            elif node.is_unstated:
                 return None
-        if not blocks:
-            return np.zeros((6, 6))
-        q = X_RG._q
-        transport = np.array(transport_columns(q, so3.rotate(q, p_I))).reshape(6, 6)
-        rows = self._blocks.take(blocks, axis=0).reshape(-1, 6) @ transport
-        return np.asarray(rows.T @ rows)
+        return expand(rotate_axes(sum_at(edges, far), q))
 
-    def route(self, interest: Node, reference: Node) -> Route:
+    @classmethod
+    def route(cls, interest: Node, reference: Node) -> Route:
         """Return the route from one frame to another of the same assembly."""
-        up, down = self.path(interest, reference)
+        up, down = cls.path(interest, reference)
         legs: list[Leg] = []
         bases: list[Pose | None] = [reference.X_NG]
         # the group's root in the frame behind the last joint, or in the reference
@@ -200,32 +181,28 @@ class FrameTree:
                 X_LG = _IDENTITY
                 bases.append(None)
         last = interest.X_GN if X_LG is _IDENTITY else X_LG @ interest.X_GN
-        return Route.assemble(legs, last, bases, partial(_edges, up, down), partial(self._covariance, up, down))
+        return Route.assemble(legs, last, bases, partial(_edges, up, down), partial(_covariance, up, down))
 
-    def _covariance(self, up: Sequence[Node], down: Sequence[Node]) -> PathCovariance:
-        fixed: list[int] = []
-        joints: list[int] = []
-        segments: list[int] = []
-        crossings: list[Crossing] = []
-        is_stated = True
-        number = 0
-        for nodes, is_upward in ((up, True), (down, False)):
-            for node in nodes:
-                block = node.block
-                if node.motion is not None:
-                    edge = node.back if is_upward else node.edge
-                    assert edge is not None
-                    # the motion is written in the segment that F is in: the one before the joint, or behind it
-                    at, sign = (number, 1.0) if edge.forward else (number + 1, -1.0)
-                    crossings.append(Crossing(node.motion, at, sign, edge.leader or edge.name))
-                    joints.append(block)
-                    number += 1
-                elif block >= 0:
-                    fixed.append(block)
-                    segments.append(number)
-                elif block == _UNSTATED:
-                    is_stated = False
-        return PathCovariance(self._blocks.take(fixed + joints, axis=0), segments, crossings, is_stated)
+
+def _covariance(up: Sequence[Node], down: Sequence[Node]) -> PathCovariance:
+    segments: list[list[EdgeCovariance]] = [[]]
+    crossings: list[Crossing] = []
+    is_stated = True
+    for nodes, is_upward in ((up, True), (down, False)):
+        for node in nodes:
+            if node.covariance is not None:
+                segments[-1].append(node.covariance)
+            elif node.is_unstated:
+                is_stated = False
+            elif node.motion is not None:
+                edge = node.back if is_upward else node.edge
+                assert edge is not None
+                number = len(crossings)
+                # the motion is written in the segment that F is in: the one before the joint, or behind it
+                at, sign = (number, 1.0) if edge.forward else (number + 1, -1.0)
+                crossings.append(Crossing(node.motion, at, sign, edge.leader or edge.name))
+                segments.append([])
+    return PathCovariance(segments, crossings, is_stated)
 
 
 def _edges(up: Sequence[Node], down: Sequence[Node]) -> tuple[Edge, ...]:

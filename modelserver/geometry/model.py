@@ -29,7 +29,6 @@ from modelserver.geometry.route import Edge, Route, edges_along
 from modelserver.geometry.topology import Crossing, Topology
 from modelserver.spatial import chain
 from modelserver.spatial.pose import Pose
-from modelserver.spatial.so3 import Array
 from modelserver.spatial.transformation import Transformation
 
 CACHE_SIZE = 16384
@@ -304,7 +303,7 @@ class Model:
     def _answer(self, frame_of_interest: str, frame_of_reference: str) -> Transformation:
         """Work out a pair that was not asked for before, and keep it."""
         interest, reference = self._ends(frame_of_interest, frame_of_reference)
-        covariance: Callable[[], Array | None]
+        covariance: Callable[[], tuple[float, ...] | None]
         if interest.group is reference.group and (interest.assembly not in self._looped):
             # a frame in itself is so exactly
             pose = Pose.identity() if interest is reference else reference.X_NG @ interest.X_GN
@@ -319,7 +318,7 @@ class Model:
         self._answers[frame_of_interest, frame_of_reference] = answer
         return answer
 
-    def _covariance_at_rest(self, route: Route) -> Array | None:
+    def _covariance_at_rest(self, route: Route) -> tuple[float, ...] | None:
         return route.covariance(route.rest, [self._stated_sigma(leg.name) for leg in route.legs])
 
     def _not_connected(self, body_I: str, body_R: str) -> NotConnectedError:

@@ -1,31 +1,32 @@
 """Covariance of a path: how the uncertainty of surveys and joints adds up at its far end.
 
 Theory of operation. A path consists of rigid segments with a joint between each and the next. A perturbation (dp,
-dtheta) of an edge X_FT, along the axes of F, is a small motion of everything behind it. Written as the velocity at the
-origin of the segment's base frame and the angular velocity, along the base's axes, it is
+dtheta) of an edge X_FT, along the axes of F, is a small motion of everything behind it: at the far end N of the path
 
-    v = R_F dp + p_T x (R_F dtheta),   w = R_F dtheta
+    v = R_F dp + (R_F dtheta) x (p_N - p_T),   w = R_F dtheta
 
-with R_F the orientation of F in the base and p_T the position of T in it. Each fixed edge keeps this motion for its six
-standard deviations as a block of six rows (v, w): `motion_factors`. At the far end N of the path, and along the axes of
-the frame of reference, a motion of the base B is
+with R_F the orientation of F and p_T the position of T in the base frame of the segment. Each fixed edge keeps p_T,
+P = R_F diag(sigma_p^2) R_F' and W = R_F diag(sigma_r^2) R_F' in the base: `EdgeCovariance`. With r = p_N - p_T, its
+share is
 
-    v_N = R_B v + (R_B w) x (p_N - p_B),   w_N = R_B w
+    cov(v) = P + [r]x W [r]x',   cov(v, w) = -[r]x W,   cov(w) = W
 
-so the covariance is the sum of the squares of all rows, transported (the same as `spatial.chain.covariance`, which
-carries every edge by itself). The rows are summed before they are squared, never covariances of a common ancestor
-subtracted: a long lever from the base to the edge cancels linearly, as it does in the poses, and not squared.
+These are summed over the edges of a segment, then turned to the axes of the frame of reference. Every edge has its own
+lever, so nothing of a common ancestor is subtracted and no long lever to a distant base cancels after it was squared.
+The result is that of `spatial.chain.covariance`, which carries every edge by itself from frame to frame.
 
 A joint's motion is written in the segment that contains its F frame, the frame that the motion starts from. The sign of
 an edge that is passed backward matters only where two joints share an error (one follows the other): those are added
 before they are squared.
+
+All of it is plain floats. A service sleeps between two requests and runs with cold caches, where a call of numpy on 6x6
+costs 5 to 8 us, and a hundred multiplications in Python 2 us (measured).
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -38,47 +39,45 @@ if TYPE_CHECKING:
     from modelserver.geometry.parts import Sigma
     from modelserver.geometry.route import Edge
 
-Place = tuple[Vector3, Quaternion]
+Place: TypeAlias = tuple[Vector3, Quaternion]
 """Position and orientation of a frame, as plain floats."""
 
-_NUMBERS: Final = struct.Struct("36d")
+EdgeCovariance: TypeAlias = tuple[Vector3, tuple[float, ...], tuple[float, ...]]
+"""p_T (3), and the upper triangles (6) of P and W, of a fixed edge in the base of its segment."""
 
-
-class FixedEdge(NamedTuple):
-    """A fixed edge in its segment: `orientation` of F and `position` of T in the base, and the survey's sigmas."""
-
-    orientation: Quaternion
-    position: Vector3
-    sigma: Sigma
+Twists: TypeAlias = list[tuple[Vector3, Vector3]]
+"""Small motions (v, w)."""
 
 
 class JointMotion(NamedTuple):
-    """How a joint moves the segment behind it: `transport` (6, 6) takes a motion at F, along its axes, to the base.
+    """How a joint moves the segment behind it; `X_BF` is the pose of its F frame in the base of its segment.
 
-    `block` (6, 6) is that of `at_position`, at any position where the joint has one coordinate.
+    `twists` are those of a joint with one coordinate, the same at every position.
     """
 
     joint: Joint
-    transport: Array
-    block: Array
+    X_BF: Pose
+    twists: Twists
 
     @classmethod
     def at(cls, joint: Joint, X_BF: Pose) -> JointMotion:
-        """Return the motion of a joint whose F frame is at a pose in the base of its segment."""
-        R = np.array(so3.matrix_rows(X_BF.wxyz))
-        transport = np.zeros((6, 6))
-        transport[:3, :3] = transport[3:, 3:] = R
-        transport[:3, 3:] = so3.skew(X_BF.xyz) @ R
-        found = cls(joint, transport, transport)
-        return found._replace(block=found.at_position((0.0,) * joint.count))
+        """Return the motion of a joint at a pose."""
+        found = cls(joint, X_BF, [])
+        return found._replace(twists=found.at_position((0.0,) * joint.count))
 
-    def at_position(self, position: Coordinates) -> Array:
-        """Return a block (6, 6): row i is the motion (v, w) in the base that a unit of coordinate i makes, else 0."""
+    def at_position(self, position: Coordinates) -> Twists:
+        """Return for each coordinate the motion that a unit of it makes, at the base's origin and along its axes."""
         J = self.joint.jacobian(position)
-        J[:3] += so3.skew(self.joint.motion(position).xyz) @ J[3:]
-        block = np.zeros((6, 6))
-        block[: self.joint.count] = (self.transport @ J).T
-        return block
+        x, y, z = self.X_BF.xyz
+        mx, my, mz = so3.rotate(self.X_BF.wxyz, self.joint.motion(position).xyz)
+        twists = []
+        for column in J.T.tolist():
+            v = so3.rotate(self.X_BF.wxyz, (column[0], column[1], column[2]))
+            w = so3.rotate(self.X_BF.wxyz, (column[3], column[4], column[5]))
+            # the Jacobian is that of the place where the joint has moved to
+            a, b, c = so3.cross((x + mx, y + my, z + mz), w)
+            twists.append(((v[0] + a, v[1] + b, v[2] + c), w))
+        return twists
 
 
 class Crossing(NamedTuple):
@@ -96,117 +95,192 @@ class Crossing(NamedTuple):
 class PathCovariance:
     """Covariance of the far end of a path, for any position of its joints; see the module.
 
-    `blocks` (k + m, 6, 6) are those of `motion_factors` for the k fixed edges, each in the segment whose number is in
-    `segments`, and those of the m joints, the `crossings`. `is_stated` is false where an edge states no sigma, and
-    counts as exact here.
+    `segments` holds the fixed edges of each rigid segment, `crossings` the joints between them. `is_stated` is false
+    where an edge states no sigma, and counts as exact here.
     """
 
-    __slots__ = ("_blocks", "_constant", "_crossings", "_segments", "_shared", "is_stated")
+    __slots__ = ("_crossings", "_segments", "is_stated")
 
     def __init__(
-        self, blocks: Array, segments: Sequence[int], crossings: Sequence[Crossing] = (), is_stated: bool = True
+        self,
+        segments: Sequence[Sequence[EdgeCovariance]],
+        crossings: Sequence[Crossing] = (),
+        is_stated: bool = True,
     ):
         self.is_stated = is_stated
-        self._blocks = blocks
+        self._segments = segments
         self._crossings = crossings
-        self._segments = np.array([*segments, *[each.segment for each in crossings]], dtype=np.intp)
-        self._constant = True
-        self._shared: Array | None = None
-        for each in crossings:
-            self._constant &= each.motion.joint.count == 1
-        if len(crossings) > 1:
-            sources = [each.source for each in crossings]
-            distinct = sorted(set(sources))
-            if len(distinct) < len(sources):
-                same = np.array([[float(mine == each) for mine in sources] for each in distinct])
-                self._shared = np.kron(same, np.eye(6))
 
     @classmethod
     def along(cls, edges: Sequence[Edge]) -> PathCovariance:
         """Return that of a path given by its edges; each segment's base is its first frame."""
-        fixed: list[FixedEdge] = []
-        segments: list[int] = []
+        segments: list[list[EdgeCovariance]] = [[]]
         crossings: list[Crossing] = []
         is_stated = True
-        number = 0
         pose = Pose.identity()
         for edge in edges:
-            behind = pose if edge.joint is not None else pose @ (edge.pose if edge.forward else edge.pose.inverse())
             if edge.joint is not None:
-                segment = number if edge.forward else number + 1
+                number = len(crossings)
                 # the frame that the motion starts from is the last of this segment, or the first of the next
                 motion = JointMotion.at(edge.joint, pose if edge.forward else Pose.identity())
-                crossings.append(Crossing(motion, segment, 1.0 if edge.forward else -1.0, edge.leader or edge.name))
-                number += 1
-                behind = Pose.identity()
-            elif edge.sigma is not None:
+                at, sign = (number, 1.0) if edge.forward else (number + 1, -1.0)
+                crossings.append(Crossing(motion, at, sign, edge.leader or edge.name))
+                segments.append([])
+                pose = Pose.identity()
+                continue
+            behind = pose @ (edge.pose if edge.forward else edge.pose.inverse())
+            if edge.sigma is not None:
                 X_F, X_T = (pose, behind) if edge.forward else (behind, pose)
-                fixed.append(FixedEdge(X_F.wxyz, X_T.xyz, edge.sigma))
-                segments.append(number)
-            elif edge.is_unstated:
-                is_stated = False
+                segments[-1].append(edge_covariance(X_F.wxyz, X_T.xyz, edge.sigma))
+            is_stated &= not edge.is_unstated
             pose = behind
-        blocks = np.concatenate((motion_factors(fixed), *[each.motion.block[None] for each in crossings]))
-        return cls(blocks, segments, crossings, is_stated)
+        return cls(segments, crossings, is_stated)
 
     def at(
         self, bases: Sequence[Place], far: Vector3, positions: Sequence[Coordinates], sigmas: Sequence[Coordinates]
-    ) -> Array:
-        """Return the covariance (6, 6) of the far end, along the axes of the frame of reference.
+    ) -> tuple[float, ...]:
+        """Return the covariance of the far end along the axes of the frame of reference: 36 numbers, row by row.
 
         Parameters: `bases` are the places of the segments' bases in the frame of reference, `far` the position of the
         far end there; `positions` and `sigmas` those of the joints' coordinates, nan counts as exact.
         """
-        x, y, z = far
-        # half the cost of np.array of nested tuples
-        numbers = [_NUMBERS.pack(*transport_columns(q, (x - p[0], y - p[1], z - p[2]))) for p, q in bases]
-        transports = np.frombuffer(b"".join(numbers)).reshape(-1, 6, 6)
-        blocks = self._blocks
-        if len(numbers) == 1:
-            rows = blocks.reshape(-1, 6) @ transports[0]
-            return np.asarray(rows.T @ rows)
-        fixed = len(blocks) - len(self._crossings)
-        if not self._constant:
-            moved = [each.motion.at_position(where) for each, where in zip(self._crossings, positions, strict=True)]
-            blocks = np.concatenate((blocks[:fixed], moved))
-        # here, not in the blocks: the sigmas are those of the readings
-        scales = []
-        for crossing, leg in zip(self._crossings, sigmas, strict=True):
-            sign = crossing.sign
-            scale = [0.0 if sigma != sigma else sign * sigma for sigma in leg]
-            scales += scale + [0.0] * (6 - len(scale))
-        rows = (blocks @ transports.take(self._segments, axis=0)).reshape(-1, 6)
-        rows[6 * fixed :] *= np.array(scales)[:, None]
-        if self._shared is not None:
-            rows = np.concatenate((rows[: 6 * fixed], self._shared @ rows[6 * fixed :]))
-        return np.asarray(rows.T @ rows)
+        total: tuple[float, ...] = _ZERO
+        for edges, ((x, y, z), q) in zip(self._segments, bases, strict=True):
+            if edges:
+                # the far end in the base
+                p_N = so3.rotate(so3.conjugate(q), (far[0] - x, far[1] - y, far[2] - z))
+                share = rotate_axes(sum_at(edges, p_N), q)
+                total = share if total is _ZERO else tuple([a + b for a, b in zip(total, share, strict=True)])
+        shares: dict[tuple[str, int], tuple[float, ...]] = {}
+        for crossing, position, sigma in zip(self._crossings, positions, sigmas, strict=True):
+            motion = crossing.motion
+            (x, y, z), q = bases[crossing.segment]
+            r = (far[0] - x, far[1] - y, far[2] - z)
+            twists = motion.twists if motion.joint.count == 1 else motion.at_position(position)
+            for number, (v, w) in enumerate(twists):
+                s = sigma[number] * crossing.sign
+                if s != s:
+                    continue
+                # at the far end, along the axes of the reference
+                vx, vy, vz = so3.rotate(q, v)
+                w = so3.rotate(q, w)
+                a, b, c = so3.cross(w, r)
+                share = (s * (vx + a), s * (vy + b), s * (vz + c), s * w[0], s * w[1], s * w[2])
+                key = (crossing.source, number)
+                known = shares.get(key)
+                shares[key] = share if known is None else tuple([a + b for a, b in zip(known, share, strict=True)])
+        for a, b, c, d, e, f in shares.values():
+            vxx, vxy, vxz, vyy, vyz, vzz, cxx, cxy, cxz, cyx, cyy, cyz, czx, czy, czz, wxx, wxy, wxz, wyy, wyz, wzz = (
+                total
+            )
+            # fmt: off
+            total = (
+                vxx + a * a, vxy + a * b, vxz + a * c, vyy + b * b, vyz + b * c, vzz + c * c,
+                cxx + a * d, cxy + a * e, cxz + a * f,
+                cyx + b * d, cyy + b * e, cyz + b * f,
+                czx + c * d, czy + c * e, czz + c * f,
+                wxx + d * d, wxy + d * e, wxz + d * f, wyy + e * e, wyz + e * f, wzz + f * f,
+            )
+            # fmt: on
+        return expand(total)
 
 
-def motion_factors(edges: Sequence[FixedEdge]) -> Array:
-    """Return for each edge its block (6, 6): row i is the motion (v, w) that standard deviation i makes in the base."""
-    blocks = np.zeros((len(edges), 6, 6))
-    if edges:
-        # (n, 3, 3), axes of F as rows
-        axes = np.array([so3.matrix_rows(each.orientation) for each in edges]).transpose(0, 2, 1)
-        p_T = np.array([each.position for each in edges])
-        turns = axes * np.array([each.sigma.rotation for each in edges])[:, :, None]
-        blocks[:, :3, :3] = axes * np.array([each.sigma.position for each in edges])[:, :, None]
-        blocks[:, 3:, :3] = np.cross(p_T[:, None], turns)
-        blocks[:, 3:, 3:] = turns
-    return blocks
+def edge_covariance(q_F: Quaternion, p_T: Vector3, sigma: Sigma) -> EdgeCovariance:
+    """Return what a fixed edge keeps: orientation of F and position of T are those in the base of its segment."""
+    R = np.array(so3.matrix_rows(q_F))
+    upper = np.triu_indices(3)
+    P, W = ((R * np.square(each)) @ R.T for each in (sigma.position, sigma.rotation))
+    return p_T, tuple(P[upper].tolist()), tuple(W[upper].tolist())
 
 
-def transport_columns(q: Quaternion, r: Vector3) -> tuple[float, ...]:
-    """Return the 36 numbers of the transposed [[R, -[r]x R], [0, R]]: takes rows (v, w) to the far end `r` from B."""
+def sum_at(edges: Sequence[EdgeCovariance], far: Vector3) -> tuple[float, ...]:
+    """Return the sum of the edges' shares at a point of their base, along its axes: 21 numbers.
+
+    They are the upper triangle of cov(v), all of cov(v, w) row by row, and the upper triangle of cov(w).
+    """
+    px, py, pz = far
+    vxx = vxy = vxz = vyy = vyz = vzz = 0.0
+    cxx = cxy = cxz = cyx = cyy = cyz = czx = czy = czz = 0.0
+    wxx = wxy = wxz = wyy = wyz = wzz = 0.0
+    for (x, y, z), (Pxx, Pxy, Pxz, Pyy, Pyz, Pzz), (a, b, c, d, e, f) in edges:
+        x, y, z = px - x, py - y, pz - z
+        # [r]x W
+        sxx, sxy, sxz = y * c - z * b, y * e - z * d, y * f - z * e
+        syx, syy, syz = z * a - x * c, z * b - x * e, z * c - x * f
+        szx, szy, szz = x * b - y * a, x * d - y * b, x * e - y * c
+        vxx += Pxx + y * sxz - z * sxy
+        vxy += Pxy + z * sxx - x * sxz
+        vxz += Pxz + x * sxy - y * sxx
+        vyy += Pyy + z * syx - x * syz
+        vyz += Pyz + x * syy - y * syx
+        vzz += Pzz + x * szy - y * szx
+        cxx -= sxx
+        cxy -= sxy
+        cxz -= sxz
+        cyx -= syx
+        cyy -= syy
+        cyz -= syz
+        czx -= szx
+        czy -= szy
+        czz -= szz
+        wxx += a
+        wxy += b
+        wxz += c
+        wyy += d
+        wyz += e
+        wzz += f
+    return (
+        vxx, vxy, vxz, vyy, vyz, vzz, cxx, cxy, cxz, cyx, cyy, cyz, czx, czy, czz, wxx, wxy, wxz, wyy, wyz, wzz
+    )  # fmt: skip
+
+
+def rotate_axes(numbers: tuple[float, ...], q: Quaternion) -> tuple[float, ...]:
+    """Return the 21 numbers of `sum_at` along other axes: R cov R' for each block, R(q) from the old to the new."""
+    if q == so3.IDENTITY:
+        return numbers
     (a, b, c), (d, e, f), (g, h, i) = so3.matrix_rows(q)
-    x, y, z = r
+    vxx, vxy, vxz, vyy, vyz, vzz, cxx, cxy, cxz, cyx, cyy, cyz, czx, czy, czz, wxx, wxy, wxz, wyy, wyz, wzz = numbers
+    # R times each block
+    v0, v1, v2 = a * vxx + b * vxy + c * vxz, a * vxy + b * vyy + c * vyz, a * vxz + b * vyz + c * vzz
+    v3, v4, v5 = d * vxx + e * vxy + f * vxz, d * vxy + e * vyy + f * vyz, d * vxz + e * vyz + f * vzz
+    v6, v7, v8 = g * vxx + h * vxy + i * vxz, g * vxy + h * vyy + i * vyz, g * vxz + h * vyz + i * vzz
+    c0, c1, c2 = a * cxx + b * cyx + c * czx, a * cxy + b * cyy + c * czy, a * cxz + b * cyz + c * czz
+    c3, c4, c5 = d * cxx + e * cyx + f * czx, d * cxy + e * cyy + f * czy, d * cxz + e * cyz + f * czz
+    c6, c7, c8 = g * cxx + h * cyx + i * czx, g * cxy + h * cyy + i * czy, g * cxz + h * cyz + i * czz
+    w0, w1, w2 = a * wxx + b * wxy + c * wxz, a * wxy + b * wyy + c * wyz, a * wxz + b * wyz + c * wzz
+    w3, w4, w5 = d * wxx + e * wxy + f * wxz, d * wxy + e * wyy + f * wyz, d * wxz + e * wyz + f * wzz
+    w6, w7, w8 = g * wxx + h * wxy + i * wxz, g * wxy + h * wyy + i * wyz, g * wxz + h * wyz + i * wzz
     # fmt: off
     return (
-        a, d, g, 0.0, 0.0, 0.0,
-        b, e, h, 0.0, 0.0, 0.0,
-        c, f, i, 0.0, 0.0, 0.0,
-        z * d - y * g, x * g - z * a, y * a - x * d, a, d, g,
-        z * e - y * h, x * h - z * b, y * b - x * e, b, e, h,
-        z * f - y * i, x * i - z * c, y * c - x * f, c, f, i,
+        v0 * a + v1 * b + v2 * c, v0 * d + v1 * e + v2 * f, v0 * g + v1 * h + v2 * i,
+        v3 * d + v4 * e + v5 * f, v3 * g + v4 * h + v5 * i, v6 * g + v7 * h + v8 * i,
+        c0 * a + c1 * b + c2 * c, c0 * d + c1 * e + c2 * f, c0 * g + c1 * h + c2 * i,
+        c3 * a + c4 * b + c5 * c, c3 * d + c4 * e + c5 * f, c3 * g + c4 * h + c5 * i,
+        c6 * a + c7 * b + c8 * c, c6 * d + c7 * e + c8 * f, c6 * g + c7 * h + c8 * i,
+        w0 * a + w1 * b + w2 * c, w0 * d + w1 * e + w2 * f, w0 * g + w1 * h + w2 * i,
+        w3 * d + w4 * e + w5 * f, w3 * g + w4 * h + w5 * i, w6 * g + w7 * h + w8 * i,
     )
     # fmt: on
+
+
+def expand(numbers: tuple[float, ...]) -> tuple[float, ...]:
+    """Return all 36 numbers of the covariance whose 21 `sum_at` gives."""
+    vxx, vxy, vxz, vyy, vyz, vzz, cxx, cxy, cxz, cyx, cyy, cyz, czx, czy, czz, wxx, wxy, wxz, wyy, wyz, wzz = numbers
+    # fmt: off
+    return (
+        vxx, vxy, vxz, cxx, cxy, cxz,
+        vxy, vyy, vyz, cyx, cyy, cyz,
+        vxz, vyz, vzz, czx, czy, czz,
+        cxx, cyx, czx, wxx, wxy, wxz,
+        cxy, cyy, czy, wxy, wyy, wyz,
+        cxz, cyz, czz, wxz, wyz, wzz,
+    )
+    # fmt: on
+
+
+def as_array(numbers: tuple[float, ...]) -> Array:
+    """Return 36 numbers as a matrix (6, 6)."""
+    return np.array(numbers).reshape(6, 6)
+
+
+_ZERO: Final = (0.0,) * 21

@@ -203,8 +203,8 @@ class Route:
         sigmas: Sequence[Coordinates],
         unstated_is_exact: bool = False,
         places: Sequence[Place] | None = None,
-    ) -> Array | None:
-        """Return the covariance (6, 6) of `pose`, that of `links`; None where a part states none.
+    ) -> tuple[float, ...] | None:
+        """Return the covariance of `pose`, that of `links`: 36 numbers, row by row; None where a part states none.
 
         With `unstated_is_exact` a survey that states none counts as exact; a joint never does.
 

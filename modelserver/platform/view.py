@@ -26,6 +26,7 @@ from modelserver.errors import (
 )
 from modelserver.geometry import names
 from modelserver.geometry.model import Model
+from modelserver.geometry.path_covariance import as_array
 from modelserver.geometry.route import Route
 from modelserver.history import History, at_time
 from modelserver.joints import NO_JOINTS, Joints, JointTrack
@@ -392,7 +393,8 @@ def _mount_covariance(route: Route, mounted: Placed) -> Array | None:
     A mount without stated sigmas counts as exact here: the vehicle's own error is far larger. A joint of which nobody
     told how sure it is does not: a long arm on it may be anywhere.
     """
-    return route.covariance(mounted.positions, mounted.sigmas, unstated_is_exact=True)
+    found = route.covariance(mounted.positions, mounted.sigmas, unstated_is_exact=True)
+    return None if found is None else as_array(found)
 
 
 def _fixed_covariance(fixed: Transformation, route: Route) -> Array | None:

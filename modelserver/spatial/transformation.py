@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 
@@ -10,6 +11,8 @@ from modelserver.errors import FrameMismatchError
 from modelserver.spatial import covariance as cov
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array
+
+Numbers: TypeAlias = tuple[float, ...]
 
 
 def _kept(covariance: Array) -> Array:
@@ -51,21 +54,24 @@ class Transformation:
     pose_epoch: int
     origin_id: int
     model_revision: str
-    _covariance: Array | Callable[[], Array | None] | None
+    _covariance: Array | Numbers | Callable[[], Array | Numbers | None] | None
 
     def __init__(
         self,
         frame_of_interest: str,
         frame_of_reference: str,
         pose: Pose,
-        covariance: Array | Callable[[], Array | None] | None = None,
+        covariance: Array | Callable[[], Array | Numbers | None] | None = None,
         utime: int = 0,
         invalid_reasons: int = 0,
         pose_epoch: int = 0,
         origin_id: int = 0,
         model_revision: str = "",
     ):
-        """Take the values; `covariance` may be a function that works out a new array when it is first looked at."""
+        """Take the values; `covariance` may be a function that works it out when it is first looked at.
+
+        Such a function returns an array (6, 6), or 36 plain floats row by row.
+        """
         if covariance is not None and not callable(covariance):
             covariance = _kept(covariance)
         _put_interest(self, frame_of_interest)
@@ -82,13 +88,23 @@ class Transformation:
     def covariance(self) -> Array | None:
         """The covariance (6, 6): x, y, z, about x, about y, about z, along the axes of the reference."""
         found = self._covariance
+        if found is None or isinstance(found, np.ndarray):
+            return found
         if callable(found):
             found = found()
-            if found is not None:
-                # the function made it for us alone, so it need not be copied
-                found.flags.writeable = False
-            _put_covariance(self, found)
+        if found is not None:
+            found = _kept(np.array(found).reshape(6, 6) if isinstance(found, tuple) else found)
+        _put_covariance(self, found)
         return found
+
+    @property
+    def covariance_numbers(self) -> Numbers | None:
+        """The 36 numbers of `covariance`, row by row, as plain floats: no array is made where they come as such."""
+        found = self._covariance
+        if callable(found):
+            found = found()
+            _put_covariance(self, _kept(found) if isinstance(found, np.ndarray) else found)
+        return tuple(found.ravel().tolist()) if isinstance(found, np.ndarray) else found
 
     @property
     def valid(self) -> bool:
@@ -129,11 +145,12 @@ class Transformation:
         """Return the same with more reasons against it."""
         if not reasons & ~self.invalid_reasons:
             return self
+        covariance = self._covariance
         return Transformation(
             self.frame_of_interest,
             self.frame_of_reference,
             self.pose,
-            self._covariance,
+            self.covariance if isinstance(covariance, tuple) else covariance,
             self.utime,
             self.invalid_reasons | reasons,
             self.pose_epoch,

@@ -6,13 +6,10 @@ import struct
 from functools import partial
 from typing import Final
 
-import numpy as np
-
 from modelserver.errors import WireError
 from modelserver.messages import NO_FLAGS, Origin, PoseAnswer, Quality
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
-from modelserver.spatial.so3 import Array
 from modelserver.spatial.transformation import Transformation
 from modelserver.wire import fields
 from modelserver.wire.fields import FAR, TOLERANCE
@@ -26,11 +23,10 @@ _STATE_VECTOR = struct.Struct(">7d")
 # the same, and the first number of the covariance behind it: nan where there is none
 _TRANSFORM = struct.Struct(">17d")
 _VECTOR = struct.Struct(">8d")
-_COVARIANCE: Final = 36 * 8
-"""Bytes."""
 # initial_utm, zone, north, origin id, epoch, valid, reasons, flags, bounds and seconds
 _REST = struct.Struct(">3dbbqibiiddd")
-_NAN_COVARIANCE: Final = struct.pack(">36d", *fields.NAN36)
+_NUMBERS = struct.Struct(">36d")
+_NAN_COVARIANCE: Final = _NUMBERS.pack(*fields.NAN36)
 
 _TRANSFORM_FINGERPRINT: Final[bytes] = pose_transform_t._get_packed_fingerprint()
 _VECTOR_FINGERPRINT: Final[bytes] = pose_vector_t._get_packed_fingerprint()
@@ -116,7 +112,7 @@ def check_no_vector(data: bytes, at: int) -> None:
 
 def _body(pose: bytes, answer: PoseAnswer) -> bytes:
     transformation, origin, quality, horizontal_bound, heading_bound, seconds_to_limit = answer
-    covariance = transformation.covariance
+    covariance = transformation.covariance_numbers
     invalid = transformation.invalid_reasons
     easting, northing, height = fields.NAN3 if origin is None else origin.initial_utm
     return b"%b%b%b%b%b%b%b" % (
@@ -124,7 +120,7 @@ def _body(pose: bytes, answer: PoseAnswer) -> bytes:
         text(transformation.frame_of_interest),
         text(transformation.frame_of_reference),
         pose,
-        _NAN_COVARIANCE if covariance is None else covariance.astype(">f8").tobytes(),
+        _NAN_COVARIANCE if covariance is None else _NUMBERS.pack(*covariance),
         _REST.pack(
             easting,
             northing,
@@ -154,7 +150,7 @@ def _head(data: bytes, at: int) -> tuple[int, str, str, int]:
 
 def _end(data: bytes, at: int, size: int) -> int:
     """Return where a pose ends whose numbers before the covariance are of that size. Raises WireError, struct.error."""
-    at = _head(data, at)[3] + size + _COVARIANCE
+    at = _head(data, at)[3] + size + _NUMBERS.size
     _REST.unpack_from(data, at)
     return read_text(data, at + _REST.size)[1]
 
@@ -163,7 +159,7 @@ def _answer(
     data: bytes, at: int, utime: int, interest: str, reference: str, pose: Pose, first: float
 ) -> tuple[PoseAnswer, int]:
     """Return the answer of what both pose types have in common, from the covariance at `at`, and where it ends."""
-    rest = at + _COVARIANCE
+    rest = at + _NUMBERS.size
     easting, northing, height, zone, north, origin_id, epoch, _, invalid, quality, *bounds = _REST.unpack_from(
         data, rest
     )
@@ -186,8 +182,8 @@ def _answer(
     ), end
 
 
-def _covariance(data: bytes, at: int) -> Array:
-    return np.frombuffer(data, ">f8", 36, at).astype(float).reshape(6, 6)
+def _covariance(data: bytes, at: int) -> tuple[float, ...]:
+    return _NUMBERS.unpack_from(data, at)
 
 
 def _pose(p: so3.Vector3, rows: tuple[so3.Vector3, so3.Vector3, so3.Vector3]) -> Pose:
