@@ -74,7 +74,7 @@ def measured(moving: bool, seed: int) -> dict[str, list[float]]:
         stepped = clock()
         reply = encode(outputs[0].reply)
         encoded = clock()
-        opened_pose(reply)
+        opened_pose(reply, interest, reference)
         opened = clock()
         _NUMBERS.unpack(_NUMBERS.pack(*numbers))
         end = clock()

@@ -60,7 +60,7 @@ from modelserver.wire.channels import REPLY_PREFIX, literal
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.many import MAX_PAIRS
 from modelserver.wire.provider import open_lcm, resolve_url, take_message
-from modelserver.wire.queries import write_question
+from modelserver.wire.queries import read_answer, write_question
 
 R = TypeVar(
     "R",
@@ -192,14 +192,14 @@ class Platform:
         wait_ms: int = 0,
     ) -> PoseAnswer:
         """Return what `get_transformation` does, with the origin, the bounds and the flags beside it."""
-        # by hand, not through `_ask`: this is what is asked all the time
+        # by hand, not through `_ask`: this is what is asked all the time, and often what was asked before
         names = (self.reply_channel, frame_of_interest, frame_of_reference)
         try:
             request = write_question(self._ids.getrandbits(63), *names, at, policy, wait_ms)
         except _UNWRITABLE as error:
             raise _unwritable(error, at) from error
         reply = self._exchange(self._channels[GetTransformation], request, self.timeout + wait_ms * 1e-3)
-        return opened_pose(reply)
+        return opened_pose(reply, frame_of_interest, frame_of_reference)
 
     def get_body_list(self) -> list[str]:
         """Return the names of the bodies, root first. Raises NoServerError."""
@@ -427,9 +427,14 @@ def _opened(data: bytes, kind: type[R]) -> R:
     return reply
 
 
-def opened_pose(data: bytes) -> PoseAnswer:
-    """Return the answer in the bytes of a reply to GetTransformation. Raises as `Platform.get_pose`."""
-    return _found(_opened(data, TransformReply).answer)
+def opened_pose(data: bytes, frame_of_interest: str, frame_of_reference: str) -> PoseAnswer:
+    """Return the answer in the reply to a GetTransformation. Raises as `Platform.get_pose`."""
+    try:
+        answer = read_answer(data, frame_of_interest, frame_of_reference)
+    except struct.error:
+        # cut short: `decode` says so
+        answer = None
+    return answer or _found(_opened(data, TransformReply).answer)
 
 
 def _instants(at: Sequence[int] | npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

@@ -209,13 +209,16 @@ class Model:
             self._routes[frame_of_interest, frame_of_reference] = found
         return found
 
-    def is_rigid(self, frame_of_interest: str, frame_of_reference: str) -> bool:
-        """Return whether two frames are rigidly joined, and there is but one path between them.
+    def rigid_transformation(self, frame_of_interest: str, frame_of_reference: str) -> Transformation | None:
+        """Return what `get_transformation` does, or None where a joint is between the two or a loop around them.
 
         Raises UnknownBodyError, UnknownFrameError or NotConnectedError.
         """
         interest, reference = self._ends(frame_of_interest, frame_of_reference)
-        return interest.group is reference.group and interest.assembly not in self._looped
+        if interest.group is not reference.group or interest.assembly in self._looped:
+            return None
+        known = self._answers.get((frame_of_interest, frame_of_reference))
+        return known or self._rigid(frame_of_interest, frame_of_reference, interest, reference)
 
     def edges(self, path: Iterable[Crossing], frame_of_interest: str, frame_of_reference: str) -> list[Edge]:
         """Return the edges of a path of `find_path`: frames of bodies, constraints, and joints that move.
@@ -303,15 +306,27 @@ class Model:
     def _answer(self, frame_of_interest: str, frame_of_reference: str) -> Transformation:
         """Work out a pair that was not asked for before, and keep it."""
         interest, reference = self._ends(frame_of_interest, frame_of_reference)
-        covariance: Callable[[], tuple[float, ...] | None]
-        if interest.group is reference.group and (interest.assembly not in self._looped):
-            # a frame in itself is so exactly
-            pose = Pose.identity() if interest is reference else reference.X_NG @ interest.X_GN
-            covariance = partial(self._tree.rigid_covariance, interest, reference)
-        else:
-            route = self.route(frame_of_interest, frame_of_reference)
-            pose = route.pose(route.rest)
-            covariance = partial(self._covariance_at_rest, route)
+        if interest.group is reference.group and interest.assembly not in self._looped:
+            return self._rigid(frame_of_interest, frame_of_reference, interest, reference)
+        route = self.route(frame_of_interest, frame_of_reference)
+        covariance = partial(self._covariance_at_rest, route)
+        return self._kept(frame_of_interest, frame_of_reference, route.pose(route.rest), covariance)
+
+    def _rigid(
+        self, frame_of_interest: str, frame_of_reference: str, interest: Node, reference: Node
+    ) -> Transformation:
+        # a frame in itself is so exactly
+        pose = Pose.identity() if interest is reference else reference.X_NG @ interest.X_GN
+        covariance = partial(FrameTree.rigid_covariance, interest, reference)
+        return self._kept(frame_of_interest, frame_of_reference, pose, covariance)
+
+    def _kept(
+        self,
+        frame_of_interest: str,
+        frame_of_reference: str,
+        pose: Pose,
+        covariance: Callable[[], tuple[float, ...] | None],
+    ) -> Transformation:
         answer = Transformation(frame_of_interest, frame_of_reference, pose, covariance, model_revision=self.revision)
         if len(self._answers) >= CACHE_SIZE:
             self._answers.popitem(last=False)

@@ -112,9 +112,10 @@ class PlatformView:
         """Return a relation within the vehicle."""
         model = self.model
         try:
-            if model.is_rigid(frame_of_interest, frame_of_reference):
+            rigid = model.rigid_transformation(frame_of_interest, frame_of_reference)
+            if rigid is not None:
                 # it does not change with time, so it has no stamp
-                return PoseAnswer(model.get_transformation(frame_of_interest, frame_of_reference))
+                return PoseAnswer(rigid)
             route = model.route(frame_of_interest, frame_of_reference)
         except QueryError:
             check_not_reserved(frame_of_interest)

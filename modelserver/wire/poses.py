@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 from modelserver.errors import WireError
 from modelserver.messages import NO_FLAGS, Origin, PoseAnswer, Quality
@@ -20,12 +20,12 @@ from mslcm.pose_vector_t import pose_vector_t
 _UTIME = struct.Struct(">q")
 _MATRIX = struct.Struct(">16d")
 _STATE_VECTOR = struct.Struct(">7d")
-# the same, and the first number of the covariance behind it: nan where there is none
-_TRANSFORM = struct.Struct(">17d")
-_VECTOR = struct.Struct(">8d")
+_NUMBERS = struct.Struct(">36d")
 # initial_utm, zone, north, origin id, epoch, valid, reasons, flags, bounds and seconds
 _REST = struct.Struct(">3dbbqibiiddd")
-_NUMBERS = struct.Struct(">36d")
+# all of these in one: of the covariance only the first number, nan where there is none
+_TRANSFORM = struct.Struct(">16dd280x3dbbqibiiddd")
+_VECTOR = struct.Struct(">7dd280x3dbbqibiiddd")
 _NAN_COVARIANCE: Final = _NUMBERS.pack(*fields.NAN36)
 
 _TRANSFORM_FINGERPRINT: Final[bytes] = pose_transform_t._get_packed_fingerprint()
@@ -77,25 +77,45 @@ def vector_body(answer: PoseAnswer) -> bytes:
 def read_transform_body(data: bytes, at: int) -> tuple[PoseAnswer, int]:
     """Return the pose that begins at `at`, and where it ends. Raises WireError, struct.error."""
     utime, interest, reference, at = _head(data, at)
-    a, b, c, x, d, e, f, y, g, h, i, z, zero_a, zero_b, zero_c, one, first = _TRANSFORM.unpack_from(data, at)
+    return read_transform_numbers(data, at, utime, interest, reference)
+
+
+def read_transform_numbers(data: bytes, at: int, utime: int, interest: str, reference: str) -> tuple[PoseAnswer, int]:
+    """Return the pose whose time and names end at `at`, and where it ends. Raises WireError, struct.error."""
+    a, b, c, x, d, e, f, y, g, h, i, z, zero_a, zero_b, zero_c, one, *rest = _TRANSFORM.unpack_from(data, at)
     if zero_a or zero_b or zero_c or one != 1.0:
         last = [zero_a, zero_b, zero_c, one]
         raise WireError("malformed", f"the last row of a homogeneous transform is 0 0 0 1, got {last}")
-    pose = _pose((x, y, z), ((a, b, c), (d, e, f), (g, h, i)))
-    return _answer(data, at + _MATRIX.size, utime, interest, reference, pose, first)
+    # rows of length 1 and at right angles, right-handed, and all of it finite: a nan fails every comparison
+    if not (
+        abs(a * a + b * b + c * c - 1.0) <= TOLERANCE
+        and abs(d * d + e * e + f * f - 1.0) <= TOLERANCE
+        and abs(g * g + h * h + i * i - 1.0) <= TOLERANCE
+        and abs(a * d + b * e + c * f) <= TOLERANCE
+        and abs(a * g + b * h + c * i) <= TOLERANCE
+        and abs(d * g + e * h + f * i) <= TOLERANCE
+        and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0
+        and abs(x) < FAR
+        and abs(y) < FAR
+        and abs(z) < FAR
+    ):
+        raise WireError("malformed", f"{((a, b, c), (d, e, f), (g, h, i))} with {(x, y, z)} is no rigid transform")
+    pose = Pose._of((x, y, z), so3.from_rows(((a, b, c), (d, e, f), (g, h, i))))
+    return _answer(data, at + _MATRIX.size, utime, interest, reference, pose, rest)
 
 
 def read_vector_body(data: bytes, at: int) -> tuple[PoseAnswer, int]:
     """Return the pose that begins at `at`, and where it ends. Raises WireError, struct.error."""
     utime, interest, reference, at = _head(data, at)
-    x, y, z, *q, first = _VECTOR.unpack_from(data, at)
+    x, y, z, *rest = _VECTOR.unpack_from(data, at)
+    q, rest = rest[:4], rest[4:]
     if not abs(sum(value * value for value in q) - 1.0) <= TOLERANCE:
         raise WireError("malformed", f"{tuple(q)} is no unit quaternion")
     try:
         pose = Pose((x, y, z), q)
     except ValueError as error:
         raise WireError("malformed", str(error)) from None
-    return _answer(data, at + _STATE_VECTOR.size, utime, interest, reference, pose, first)
+    return _answer(data, at + _STATE_VECTOR.size, utime, interest, reference, pose, rest)
 
 
 def check_no_transform(data: bytes, at: int) -> None:
@@ -156,52 +176,19 @@ def _end(data: bytes, at: int, size: int) -> int:
 
 
 def _answer(
-    data: bytes, at: int, utime: int, interest: str, reference: str, pose: Pose, first: float
+    data: bytes, at: int, utime: int, interest: str, reference: str, pose: Pose, rest: list[Any]
 ) -> tuple[PoseAnswer, int]:
-    """Return the answer of what both pose types have in common, from the covariance at `at`, and where it ends."""
-    rest = at + _NUMBERS.size
-    easting, northing, height, zone, north, origin_id, epoch, _, invalid, quality, *bounds = _REST.unpack_from(
-        data, rest
-    )
-    revision, end = read_text(data, rest + _REST.size)
-    return PoseAnswer(
-        Transformation(
-            interest,
-            reference,
-            pose,
-            None if first != first else partial(_covariance, data, at),
-            utime,
-            invalid,
-            epoch,
-            origin_id,
-            revision,
-        ),
-        None if easting != easting else Origin(easting, northing, height, zone, bool(north), origin_id),
-        Quality(quality) if quality else NO_FLAGS,
-        *bounds,
-    ), end
+    """Return the answer of what both pose types have in common, whose covariance is at `at`, and where it ends.
+
+    `rest` are the numbers from the covariance's first one on.
+    """
+    first, easting, northing, height, zone, north, origin_id, epoch, _, invalid, quality, *bounds = rest
+    revision, end = read_text(data, at + _NUMBERS.size + _REST.size)
+    covariance = None if first != first else partial(_covariance, data, at)
+    transformation = Transformation(interest, reference, pose, covariance, utime, invalid, epoch, origin_id, revision)
+    origin = None if easting != easting else Origin(easting, northing, height, zone, bool(north), origin_id)
+    return PoseAnswer(transformation, origin, Quality(quality) if quality else NO_FLAGS, *bounds), end
 
 
 def _covariance(data: bytes, at: int) -> tuple[float, ...]:
     return _NUMBERS.unpack_from(data, at)
-
-
-def _pose(p: so3.Vector3, rows: tuple[so3.Vector3, so3.Vector3, so3.Vector3]) -> Pose:
-    """Return the pose of a position and the rows of a rotation. Raises WireError where they are none."""
-    (a, b, c), (d, e, f), (g, h, i) = rows
-    x, y, z = p
-    # rows of length 1 and at right angles, right-handed, and all of it finite: a nan fails every comparison
-    if not (
-        abs(a * a + b * b + c * c - 1.0) <= TOLERANCE
-        and abs(d * d + e * e + f * f - 1.0) <= TOLERANCE
-        and abs(g * g + h * h + i * i - 1.0) <= TOLERANCE
-        and abs(a * d + b * e + c * f) <= TOLERANCE
-        and abs(a * g + b * h + c * i) <= TOLERANCE
-        and abs(d * g + e * h + f * i) <= TOLERANCE
-        and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0
-        and abs(x) < FAR
-        and abs(y) < FAR
-        and abs(z) < FAR
-    ):
-        raise WireError("malformed", f"{rows} with {p} is no rigid transform")
-    return Pose._of(p, so3.from_rows(rows))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import struct
+from collections import OrderedDict
 from typing import Final
 
 from modelserver.errors import Status
 from modelserver.messages import (
     GetTransformation,
     HistoryReply,
+    PoseAnswer,
     ReplyHeader,
     RequestHeader,
     StateVectorReply,
@@ -23,10 +25,22 @@ from mslcm.get_transformation_request_t import get_transformation_request_t
 
 _REQUEST_ID = struct.Struct(">q")
 _TIME = struct.Struct(">qbi")
+_UTIME = struct.Struct(">q")
 _REPLY_HEAD = struct.Struct(">qqh")
+
+_STAMPED: Final = 24
+"""Where a reply goes on behind fingerprint, id and stamp."""
+
+_KNOWN: Final[OrderedDict[bytes, PoseAnswer]] = OrderedDict()
+_MOST_KNOWN: Final = 4096
+"""Replies that hold for good, lately read, by their bytes from `_STAMPED` on: 2 kB each, the oldest goes when full.
+
+A program that asks for more pairs reads each reply again, as it does a pair that it sees first; see `read_answer`.
+"""
 
 _PLAIN: Final = text("") + LENGTH.pack(0)
 _PLAIN_AT: Final = 8 + _REPLY_HEAD.size
+_PLAIN_OK: Final = b"\0\0" + _PLAIN
 """No message and no nearest names: what a reply says that has an answer, and where it says so."""
 
 _REQUEST: Final[bytes] = get_transformation_request_t._get_packed_fingerprint()
@@ -75,6 +89,33 @@ def read_transform_reply(data: bytes) -> TransformReply:
     answer, end = poses.read_transform_body(data, at)
     check_end(data, end)
     return TransformReply(header, answer)
+
+
+def read_answer(data: bytes, interest: str, reference: str) -> PoseAnswer | None:
+    """Return the answer of a get_transformation_reply_t to a question for these two frames; None: see the whole reply.
+
+    What was asked need not be read again, only compared. A reply with a message or an error, or with other frames, is
+    one for `read_transform_reply`. Raises WireError, struct.error.
+    """
+    if data[:8] != _TRANSFORM_REPLY or data[_STAMPED : _STAMPED + len(_PLAIN_OK)] != _PLAIN_OK:
+        return None
+    known = _KNOWN.get(data[_STAMPED:])
+    if known is not None:
+        return known
+    (length,) = LENGTH.unpack_from(data, _STAMPED + len(_PLAIN_OK))
+    # the revision of the header stands in the pose too, and is read there
+    at = _STAMPED + len(_PLAIN_OK) + LENGTH.size + length
+    names = text(interest) + text(reference)
+    if not data.startswith(names, at + 8):
+        return None
+    (utime,) = _UTIME.unpack_from(data, at)
+    answer, end = poses.read_transform_numbers(data, at + 8 + len(names), utime, interest, reference)
+    check_end(data, end)
+    if not utime and answer.origin is None:
+        if len(_KNOWN) >= _MOST_KNOWN:
+            _KNOWN.popitem(last=False)
+        _KNOWN[data[_STAMPED:]] = answer
+    return answer
 
 
 def write_state_vector_reply(reply: StateVectorReply) -> bytes:
