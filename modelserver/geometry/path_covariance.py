@@ -26,6 +26,7 @@ costs 5 to 8 us, and a hundred multiplications in Python 2 us (measured).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import add
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -99,7 +100,7 @@ class PathCovariance:
     where an edge states no sigma, and counts as exact here.
     """
 
-    __slots__ = ("_crossings", "_segments", "is_stated")
+    __slots__ = ("_joints", "_segments", "_shared", "is_stated")
 
     def __init__(
         self,
@@ -109,7 +110,12 @@ class PathCovariance:
     ):
         self.is_stated = is_stated
         self._segments = segments
-        self._crossings = crossings
+        # the joints of each segment with their numbers on the path
+        self._joints: list[list[tuple[int, Crossing]]] = [[] for _ in segments]
+        for number, each in enumerate(crossings):
+            self._joints[each.segment].append((number, each))
+        sources = [each.source for each in crossings]
+        self._shared = {source for source in sources if sources.count(source) > 1}
 
     @classmethod
     def along(cls, edges: Sequence[Edge]) -> PathCovariance:
@@ -144,44 +150,35 @@ class PathCovariance:
         Parameters: `bases` are the places of the segments' bases in the frame of reference, `far` the position of the
         far end there; `positions` and `sigmas` those of the joints' coordinates, nan counts as exact.
         """
-        total: tuple[float, ...] = _ZERO
-        for edges, ((x, y, z), q) in zip(self._segments, bases, strict=True):
-            if edges:
-                # the far end in the base
-                p_N = so3.rotate(so3.conjugate(q), (far[0] - x, far[1] - y, far[2] - z))
-                share = rotate_axes(sum_at(edges, p_N), q)
-                total = share if total is _ZERO else tuple([a + b for a, b in zip(total, share, strict=True)])
-        shares: dict[tuple[str, int], tuple[float, ...]] = {}
-        for crossing, position, sigma in zip(self._crossings, positions, sigmas, strict=True):
-            motion = crossing.motion
-            (x, y, z), q = bases[crossing.segment]
-            r = (far[0] - x, far[1] - y, far[2] - z)
-            twists = motion.twists if motion.joint.count == 1 else motion.at_position(position)
-            for number, (v, w) in enumerate(twists):
-                s = sigma[number] * crossing.sign
-                if s != s:
-                    continue
-                # at the far end, along the axes of the reference
-                vx, vy, vz = so3.rotate(q, v)
-                w = so3.rotate(q, w)
-                a, b, c = so3.cross(w, r)
-                share = (s * (vx + a), s * (vy + b), s * (vz + c), s * w[0], s * w[1], s * w[2])
-                key = (crossing.source, number)
-                known = shares.get(key)
-                shares[key] = share if known is None else tuple([a + b for a, b in zip(known, share, strict=True)])
-        for a, b, c, d, e, f in shares.values():
-            vxx, vxy, vxz, vyy, vyz, vzz, cxx, cxy, cxz, cyx, cyy, cyz, czx, czy, czz, wxx, wxy, wxz, wyy, wyz, wzz = (
-                total
-            )
-            # fmt: off
-            total = (
-                vxx + a * a, vxy + a * b, vxz + a * c, vyy + b * b, vyz + b * c, vzz + c * c,
-                cxx + a * d, cxy + a * e, cxz + a * f,
-                cyx + b * d, cyy + b * e, cyz + b * f,
-                czx + c * d, czy + c * e, czz + c * f,
-                wxx + d * d, wxy + d * e, wxz + d * f, wyy + e * e, wyz + e * f, wzz + f * f,
-            )
-            # fmt: on
+        total = _ZERO
+        shared: dict[tuple[str, int], tuple[float, ...]] = {}
+        for edges, joints, ((x, y, z), q) in zip(self._segments, self._joints, bases, strict=True):
+            if not edges and not joints:
+                continue
+            # the far end in the base
+            p_N = so3.rotate(so3.conjugate(q), (far[0] - x, far[1] - y, far[2] - z))
+            numbers = sum_at(edges, p_N) if edges else _ZERO
+            for index, crossing in joints:
+                motion, sign, source = crossing.motion, crossing.sign, crossing.source
+                twists = motion.twists if motion.joint.count == 1 else motion.at_position(positions[index])
+                for coordinate, ((vx, vy, vz), w) in enumerate(twists):
+                    s = sigmas[index][coordinate] * sign
+                    if s != s:
+                        continue
+                    wx, wy, wz = w
+                    a, b, c = so3.cross(w, p_N)
+                    v, w = (s * (vx + a), s * (vy + b), s * (vz + c)), (s * wx, s * wy, s * wz)
+                    if source not in self._shared:
+                        numbers = add_square(numbers, (*v, *w))
+                        continue
+                    # along the axes of the reference, where it meets the others of its source
+                    twist = (*so3.rotate(q, v), *so3.rotate(q, w))
+                    known = shared.get((source, coordinate))
+                    shared[source, coordinate] = twist if known is None else tuple(map(add, known, twist))
+            numbers = rotate_axes(numbers, q)
+            total = numbers if total is _ZERO else tuple(map(add, total, numbers))
+        for twist in shared.values():
+            total = add_square(total, twist)
         return expand(total)
 
 
@@ -263,6 +260,21 @@ def rotate_axes(numbers: tuple[float, ...], q: Quaternion) -> tuple[float, ...]:
     # fmt: on
 
 
+def add_square(numbers: tuple[float, ...], twist: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the 21 numbers with those of the small motion (v, w) that one standard deviation makes added."""
+    a, b, c, d, e, f = twist
+    vxx, vxy, vxz, vyy, vyz, vzz, cxx, cxy, cxz, cyx, cyy, cyz, czx, czy, czz, wxx, wxy, wxz, wyy, wyz, wzz = numbers
+    # fmt: off
+    return (
+        vxx + a * a, vxy + a * b, vxz + a * c, vyy + b * b, vyz + b * c, vzz + c * c,
+        cxx + a * d, cxy + a * e, cxz + a * f,
+        cyx + b * d, cyy + b * e, cyz + b * f,
+        czx + c * d, czy + c * e, czz + c * f,
+        wxx + d * d, wxy + d * e, wxz + d * f, wyy + e * e, wyz + e * f, wzz + f * f,
+    )
+    # fmt: on
+
+
 def expand(numbers: tuple[float, ...]) -> tuple[float, ...]:
     """Return all 36 numbers of the covariance whose 21 `sum_at` gives."""
     vxx, vxy, vxz, vyy, vyz, vzz, cxx, cxy, cxz, cyx, cyy, cyz, czx, czy, czz, wxx, wxy, wxz, wyy, wyz, wzz = numbers
@@ -283,4 +295,4 @@ def as_array(numbers: tuple[float, ...]) -> Array:
     return np.array(numbers).reshape(6, 6)
 
 
-_ZERO: Final = (0.0,) * 21
+_ZERO: Final[tuple[float, ...]] = (0.0,) * 21

@@ -163,15 +163,20 @@ class Route:
         q = so3.IDENTITY
         places: list[Place] = [((px, py, pz), q)]
         for leg, position in zip(self.legs, positions, strict=True):
-            x, y, z = so3.rotate(q, leg.before._p)
-            px, py, pz = px + x, py + y, pz + z
             turning = leg.turning
+            if q is so3.IDENTITY:
+                # the first leg begins in the frame of reference itself
+                px, py, pz = leg.before._p
+            else:
+                x, y, z = so3.rotate(q, leg.before._p)
+                px, py, pz = px + x, py + y, pz + z
             if turning is not None:
                 # most joints there are: before and turn are one product, a (cos) + b (sin)
                 half = 0.5 * position[0]
                 c, s = math.cos(half), math.sin(half)
                 (aw, ax, ay, az), (bw, bx, by, bz) = turning
-                q = so3.multiply(q, (aw * c + bw * s, ax * c + bx * s, ay * c + by * s, az * c + bz * s))
+                turn = (aw * c + bw * s, ax * c + bx * s, ay * c + by * s, az * c + bz * s)
+                q = turn if q is so3.IDENTITY else so3.multiply(q, turn)
             else:
                 q = so3.multiply(q, leg.before._q)
                 moved = leg.joint.motion(position)
@@ -226,6 +231,10 @@ class Route:
         for place, X_LB in zip(places, self._bases, strict=False):
             if X_LB is not None:
                 (px, py, pz), q = place
+                if q is so3.IDENTITY:
+                    # the first segment begins in the frame of reference itself
+                    bases.append((X_LB._p, X_LB._q))
+                    continue
                 x, y, z = so3.rotate(q, X_LB._p)
                 place = ((px + x, py + y, pz + z), so3.multiply(q, X_LB._q))
             bases.append(place)
