@@ -33,6 +33,7 @@ from modelserver.geometry.path_covariance import (
 from modelserver.geometry.route import Edge, EdgeKind, Leg, Route
 from modelserver.geometry.topology import Crossing as ConstraintCrossing
 from modelserver.geometry.topology import Topology
+from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
 
 
@@ -157,7 +158,7 @@ class FrameTree:
                 edges.append(node.covariance)
             elif node.is_unstated:
                 return None
-        return expand(rotate_axes(sum_at(edges, far), q))
+        return expand(rotate_axes(sum_at(edges, far), so3.matrix_rows(q)))
 
     @classmethod
     def route(cls, interest: Node, reference: Node) -> Route:

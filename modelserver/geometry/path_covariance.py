@@ -43,8 +43,11 @@ if TYPE_CHECKING:
 Place: TypeAlias = tuple[Vector3, Quaternion]
 """Position and orientation of a frame, as plain floats."""
 
-EdgeCovariance: TypeAlias = tuple[Vector3, tuple[float, ...], tuple[float, ...]]
-"""p_T (3), and the upper triangles (6) of P and W, of a fixed edge in the base of its segment."""
+EdgeCovariance: TypeAlias = tuple[Vector3, tuple[float, ...], float | tuple[float, ...]]
+"""p_T (3), and the upper triangles (6) of P and W, of a fixed edge in the base of its segment.
+
+W is one variance where it is the same about all axes, as most surveys state it: half the work.
+"""
 
 Twists: TypeAlias = list[tuple[Vector3, Vector3]]
 """Small motions (v, w)."""
@@ -155,8 +158,11 @@ class PathCovariance:
         for edges, joints, ((x, y, z), q) in zip(self._segments, self._joints, bases, strict=True):
             if not edges and not joints:
                 continue
+            x, y, z = far[0] - x, far[1] - y, far[2] - z
+            R = so3.matrix_rows(q)
+            (a, b, c), (d, e, f), (g, h, i) = R
             # the far end in the base
-            p_N = so3.rotate(so3.conjugate(q), (far[0] - x, far[1] - y, far[2] - z))
+            p_N = (a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z)
             numbers = sum_at(edges, p_N) if edges else _ZERO
             for index, crossing in joints:
                 motion, sign, source = crossing.motion, crossing.sign, crossing.source
@@ -175,10 +181,10 @@ class PathCovariance:
                     twist = (*so3.rotate(q, v), *so3.rotate(q, w))
                     known = shared.get((source, coordinate))
                     shared[source, coordinate] = twist if known is None else tuple(map(add, known, twist))
-            numbers = rotate_axes(numbers, q)
+            numbers = rotate_axes(numbers, R)
             total = numbers if total is _ZERO else tuple(map(add, total, numbers))
-        for twist in shared.values():
-            total = add_square(total, twist)
+        for sum_of_source in shared.values():
+            total = add_square(total, sum_of_source)
         return expand(total)
 
 
@@ -187,7 +193,9 @@ def edge_covariance(q_F: Quaternion, p_T: Vector3, sigma: Sigma) -> EdgeCovarian
     R = np.array(so3.matrix_rows(q_F))
     upper = np.triu_indices(3)
     P, W = ((R * np.square(each)) @ R.T for each in (sigma.position, sigma.rotation))
-    return p_T, tuple(P[upper].tolist()), tuple(W[upper].tolist())
+    about_x, about_y, about_z = sigma.rotation
+    same = about_x == about_y == about_z
+    return p_T, tuple(P[upper].tolist()), about_x * about_x if same else tuple(W[upper].tolist())
 
 
 def sum_at(edges: Sequence[EdgeCovariance], far: Vector3) -> tuple[float, ...]:
@@ -199,8 +207,27 @@ def sum_at(edges: Sequence[EdgeCovariance], far: Vector3) -> tuple[float, ...]:
     vxx = vxy = vxz = vyy = vyz = vzz = 0.0
     cxx = cxy = cxz = cyx = cyy = cyz = czx = czy = czz = 0.0
     wxx = wxy = wxz = wyy = wyz = wzz = 0.0
-    for (x, y, z), (Pxx, Pxy, Pxz, Pyy, Pyz, Pzz), (a, b, c, d, e, f) in edges:
+    for (x, y, z), (Pxx, Pxy, Pxz, Pyy, Pyz, Pzz), W in edges:
         x, y, z = px - x, py - y, pz - z
+        if not isinstance(W, tuple):
+            xW, yW, zW = x * W, y * W, z * W
+            vxx += Pxx + y * yW + z * zW
+            vxy += Pxy - x * yW
+            vxz += Pxz - x * zW
+            vyy += Pyy + x * xW + z * zW
+            vyz += Pyz - y * zW
+            vzz += Pzz + x * xW + y * yW
+            cxy += zW
+            cxz -= yW
+            cyx -= zW
+            cyz += xW
+            czx += yW
+            czy -= xW
+            wxx += W
+            wyy += W
+            wzz += W
+            continue
+        a, b, c, d, e, f = W
         # [r]x W
         sxx, sxy, sxz = y * c - z * b, y * e - z * d, y * f - z * e
         syx, syy, syz = z * a - x * c, z * b - x * e, z * c - x * f
@@ -231,11 +258,9 @@ def sum_at(edges: Sequence[EdgeCovariance], far: Vector3) -> tuple[float, ...]:
     )  # fmt: skip
 
 
-def rotate_axes(numbers: tuple[float, ...], q: Quaternion) -> tuple[float, ...]:
-    """Return the 21 numbers of `sum_at` along other axes: R cov R' for each block, R(q) from the old to the new."""
-    if q == so3.IDENTITY:
-        return numbers
-    (a, b, c), (d, e, f), (g, h, i) = so3.matrix_rows(q)
+def rotate_axes(numbers: tuple[float, ...], R: tuple[Vector3, Vector3, Vector3]) -> tuple[float, ...]:
+    """Return the 21 numbers of `sum_at` along other axes: R cov R' for each block, R from the old to the new."""
+    (a, b, c), (d, e, f), (g, h, i) = R
     vxx, vxy, vxz, vyy, vyz, vzz, cxx, cxy, cxz, cyx, cyy, cyz, czx, czy, czz, wxx, wxy, wxz, wyy, wyz, wzz = numbers
     # R times each block
     v0, v1, v2 = a * vxx + b * vxy + c * vxz, a * vxy + b * vyy + c * vyz, a * vxz + b * vyz + c * vzz

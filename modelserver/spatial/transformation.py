@@ -92,8 +92,11 @@ class Transformation:
             return found
         if callable(found):
             found = found()
-        if found is not None:
-            found = _kept(np.array(found).reshape(6, 6) if isinstance(found, tuple) else found)
+        if isinstance(found, tuple):
+            found = np.array(found).reshape(6, 6)
+            found.flags.writeable = False
+        elif found is not None:
+            found = _kept(found)
         _put_covariance(self, found)
         return found
 

@@ -77,7 +77,9 @@ def random_tree(rng, lever, moves):
         return Pose([rng.uniform(-lever, lever) for _ in range(3)], [rng.gauss(0, 1) for _ in range(4)])
 
     def sigma():
-        return Sigma([10 ** rng.uniform(-5, -1)] * 3, [10 ** rng.uniform(-5, -1), 0.0, 10 ** rng.uniform(-5, -1)])
+        about = [10 ** rng.uniform(-5, -1) for _ in range(3)]
+        same = [about[0]] * 3
+        return Sigma([10 ** rng.uniform(-5, -1), 0.0, 1e-3], rng.choice((about, same)))
 
     builder = ModelBuilder("tree")
     for body in range(10):
