@@ -13,7 +13,7 @@ from typing import Any, Final
 from modelserver.core.commands import OPERATOR, SET_COVARIANCE, commanded, model_loaded, unsigned
 from modelserver.core.keeping import START, kept, start_told
 from modelserver.core.requests import denied, fail, refuse, requested, turn_back
-from modelserver.core.samples import AHEAD_LIMIT_S, FUTURE_LIMIT_S, FUTURE_SAMPLES, mode_wished, sample_taken
+from modelserver.core.samples import AHEAD_LIMIT_S, FUTURE_LIMIT_S, mode_wished, sample_taken
 from modelserver.core.state import (
     DEGRADED,
     MAX_COUNTERS,
@@ -102,7 +102,6 @@ __all__ = [
     "AHEAD_LIMIT_S",
     "DEGRADED",
     "FUTURE_LIMIT_S",
-    "FUTURE_SAMPLES",
     "LATENESS_KEPT",
     "MAX_COUNTERS",
     "OPERATOR",

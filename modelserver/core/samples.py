@@ -33,9 +33,6 @@ AHEAD_LIMIT_S: Final = 0.25
 """The same for a sample, which nobody can have taken before it is: clocks that are kept together differ by less, and a
 fix that is taken for one of a quarter of a second later is off by what the vehicle drives in that."""
 
-FUTURE_SAMPLES: Final = 3
-"""So many of them in a row are no strays: the host's clock was set back, and no pose is valid until one fits."""
-
 
 def sample_taken(state: CoreState, sample: Sample, now: Instant) -> Step:
     """Take a sensor's sample."""
@@ -43,19 +40,28 @@ def sample_taken(state: CoreState, sample: Sample, now: Instant) -> Step:
     state = traffic_noted(state, source, sample.header.host_utime, now)
     if state.unheard:
         state = heard(state, sample)
+    state = check_host_clock(state, now)
     if sample.header.utime > now.utime + AHEAD_LIMIT_S * 1e6:
-        state = counted(state._replace(futures=state.futures + 1), source, "future")
-        if state.futures >= FUTURE_SAMPLES:
-            # one clock was set: what is held is of another time than what is asked for now
-            state = state._replace(view=replace(state.view, doubt=Invalid.CLOCK_STEPPED))
-        return state, ()
-    if state.futures:
-        state = state._replace(futures=0, view=replace(state.view, doubt=VALID))
+        # it speaks for its own source alone: anyone can stamp as it likes
+        return counted(state, source, "future"), ()
     if isinstance(sample, JointsSample):
         return joints_told(state, sample, now)
     if state.localizer is None:
         return state, ()
     return localized(state, state.localizer, sample, now)
+
+
+def check_host_clock(state: CoreState, now: Instant) -> CoreState:
+    """Return the state after a look at the host's clocks.
+
+    Where the time of day was set back, the pose that is held is of another time than what is asked for now: it is
+    invalid until localization has used a sample of the new time.
+    """
+    set_back = state.host_clock.is_set_back(now)
+    state = state._replace(host_clock=state.host_clock.next(now, set_back))
+    if set_back and state.localizer is not None:
+        state = state._replace(view=replace(state.view, doubt=Invalid.CLOCK_STEPPED))
+    return state
 
 
 def joints_told(state: CoreState, sample: JointsSample, now: Instant) -> Step:
@@ -116,7 +122,11 @@ def localized(state: CoreState, before: Localizer, sample: Sample | SwitchMode, 
     if known and not history.holds_enough(utime):
         history = history.extended(localizer.deferred(utime))
     view = state.view
-    view = PlatformView(view.model, view.base_frame, localizer, history, view.rolling_frame, view.doubt, view.joints)
+    doubt = view.doubt
+    if doubt and known and not refused and utime <= now.utime + AHEAD_LIMIT_S * 1e6:
+        # what is held is of the time that the host has now
+        doubt = VALID
+    view = PlatformView(view.model, view.base_frame, localizer, history, view.rolling_frame, doubt, view.joints)
     state = state._replace(view=view)
     if known:
         # a part may be refused of a sample that moves time on all the same

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, Literal, NamedTuple, TypeAlias
 
+from modelserver.core.host_clock import HostClock
 from modelserver.errors import NotConnectedError
 from modelserver.geometry.model import Model
 from modelserver.history import History
@@ -163,7 +164,7 @@ class CoreState(NamedTuple):
     ticks_missed: int = 0
     handler_errors: int = 0
     run_state: int = STARTING
-    futures: int = 0
+    host_clock: HostClock = HostClock()
     snapshot_due_ns: int = 0
     notices: Mapping[str, str] = MappingProxyType({})
     keep_due_ns: int = 0
@@ -198,7 +199,10 @@ def start(settings: CoreSettings, model: Model, localizer: Localizer | None, now
     view = PlatformView(model, settings.base_frame, localizer, history, settings.rolling_frame, joints=joints)
     check_bolted(model, view.base_frame, view.rolling_frame)
     due = now.monotonic_ns
-    return CoreState(settings, view, due, health_due_ns=due, snapshot_due_ns=due, unheard=settings.sensors)
+    clock = HostClock.at(now)
+    return CoreState(
+        settings, view, due, health_due_ns=due, snapshot_due_ns=due, unheard=settings.sensors, host_clock=clock
+    )
 
 
 def check_bolted(model: Model, base_frame: str, rolling_frame: str) -> None:

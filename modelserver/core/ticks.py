@@ -7,7 +7,7 @@ from typing import Final
 from modelserver.core import health
 from modelserver.core.keeping import keep_if_due
 from modelserver.core.requests import answer_parked
-from modelserver.core.samples import published
+from modelserver.core.samples import check_host_clock, published
 from modelserver.core.state import CoreState, Instant, Step
 from modelserver.messages import Output, PublishNavigation, PublishSnapshot, Tick
 
@@ -18,6 +18,7 @@ def ticked(state: CoreState, tick: Tick, now: Instant) -> Step:
     """Do what is due by the clock."""
     outputs: list[Output] = []
     settings, before = state.settings, state.ticks
+    state = check_host_clock(state, now)
     state = state._replace(
         lateness=(*state.lateness[-LATENESS_KEPT + 1 :], tick.late),
         ticks=state.ticks + 1 + tick.missed,

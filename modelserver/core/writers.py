@@ -16,7 +16,7 @@ intervals, and towards another name for `SILENCE_NS`.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 from modelserver.messages import SensorHeader
 
@@ -39,8 +39,20 @@ QUIET_INTERVALS: Final = 5
 STRAYS: Final = 2
 """So often numbers may be off the row while the row goes on, within `SILENCE_NS`; more are another writer's."""
 
+LOST_FACTOR: Final = 8
+"""Times the messages that are usual in a span may be lost in it; numbers that are farther ahead are off the row."""
+
 MUTE: Final = 3
 """After so many samples with one number a source is known not to count."""
+
+
+class Mark(NamedTuple):
+    """The fields of a sample's header that its publisher is recognized by; they can be read without decoding it."""
+
+    utime: int
+    source: str
+    seq: int
+
 
 _MASK: Final = NEAR - 1
 _NEVER: Final = -1 << 64
@@ -61,12 +73,12 @@ class Writer:
         """Name of the second writer that was heard last, empty for none yet."""
         self.rival_ns = 0
         """When that was, monotonic nanoseconds."""
-        self._heard: list[SensorHeader] = []
+        self._heard: list[SensorHeader | Mark] = []
         self._last = self._last_ns = self._interval_ns = self._off_ns = self._same = self._strays = 0
         self._counts = self._went_on = False
         self._begin(_NOBODY, -SILENCE_NS - 1)
 
-    def is_second(self, header: SensorHeader, now_ns: int) -> bool:
+    def is_second(self, header: SensorHeader | Mark, now_ns: int) -> bool:
         """Return whether a sample is a second writer's."""
         seq = header.seq
         ahead = seq - self._last
@@ -77,6 +89,9 @@ class Writer:
                 return False
             return self._is_rival(header.source, now_ns)
         if 0 < ahead <= FAR and self._same < MUTE:
+            if ahead > NEAR and ahead * self._interval_ns > LOST_FACTOR * passed:
+                # more numbers than can have been lost in that time
+                return self._off_the_row(header, now_ns)
             self._counts = True
         elif -NEAR < ahead <= 0 and self._counts:
             known = self._heard[seq & _MASK]
@@ -97,7 +112,7 @@ class Writer:
         self._heard[seq & _MASK] = header
         return False
 
-    def _off_the_row(self, header: SensorHeader, now_ns: int) -> bool:
+    def _off_the_row(self, header: SensorHeader | Mark, now_ns: int) -> bool:
         """Return whether a number off the row is of a second writer, beside whom the row goes on."""
         if now_ns - self._last_ns > max(QUIET_NS, QUIET_INTERVALS * self._interval_ns):
             # whoever spoke before was started anew
@@ -105,8 +120,10 @@ class Writer:
             return False
         if now_ns - self._off_ns > SILENCE_NS:
             self._strays = 0
+        # one that comes sooner than any driver's next, started again or not, is an extra one
+        early = 2 * (now_ns - max(self._last_ns, self._off_ns)) < self._interval_ns
         self._off_ns = now_ns
-        if self._went_on:
+        if self._went_on or early:
             self._strays += 1
             self._went_on = False
         return self._strays > STRAYS and self._is_rival(header.source, now_ns)
@@ -115,7 +132,7 @@ class Writer:
         self.rival, self.rival_ns = source, now_ns
         return True
 
-    def _begin(self, header: SensorHeader, now_ns: int) -> None:
+    def _begin(self, header: SensorHeader | Mark, now_ns: int) -> None:
         self.source, self._last, self._last_ns = header.source, header.seq, now_ns
         self._counts, self._same, self._strays, self._went_on = False, 0, 0, True
         self._interval_ns = self._off_ns = 0

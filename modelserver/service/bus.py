@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import select
 import time
 from collections.abc import Callable
@@ -24,8 +25,11 @@ class Inbox(Protocol):
         """Hand every message of exactly `channel` to `handler`."""
         ...
 
-    def drain(self, limit: int) -> int:
-        """Hand over what has come, at most `limit` messages, without waiting; return how many."""
+    def drain(self, limit: int, seconds: float = math.inf) -> int:
+        """Hand over what has come, at most `limit` messages and for so many seconds, without waiting; return how many.
+
+        The message that is being handled when the time is up is the last.
+        """
         ...
 
 
@@ -67,14 +71,20 @@ class LcmInbox:
         # than the loop can refuse must not fill the memory
         subscription.set_queue_capacity(UNREAD)
 
-    def drain(self, limit: int) -> int:
-        """Hand over what has come, at most `limit` messages, without waiting; return how many."""
+    def drain(self, limit: int, seconds: float = math.inf) -> int:
+        """Hand over what has come, at most `limit` messages and for so many seconds, without waiting; return how many.
+
+        The message that is being handled when the time is up is the last.
+        """
         if not self.may_have:
             self.may_have = True
             return 0
+        end = time.monotonic() + seconds
         for count in range(limit):
             if not take_message(self.lcm):
                 return count
+            if time.monotonic() >= end:
+                return count + 1
         return limit
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 from modelserver.service.bus import Handler
@@ -11,7 +12,8 @@ from modelserver.service.clock import FakeClock
 class FakeInbox:
     """One queue of a `FakeBus`."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: FakeClock) -> None:
+        self._clock = clock
         self._handlers: dict[str, list[Handler]] = {}
         self._queue: deque[tuple[str, bytes]] = deque()
 
@@ -24,10 +26,11 @@ class FakeInbox:
         if channel in self._handlers:
             self._queue.append((channel, data))
 
-    def drain(self, limit: int) -> int:
-        """Hand over what has come, at most `limit` messages; return how many."""
+    def drain(self, limit: int, seconds: float = math.inf) -> int:
+        """Hand over what has come, at most `limit` messages and for so many seconds; return how many."""
         count = 0
-        while self._queue and count < limit:
+        end_ns = self._clock.monotonic_ns() + seconds * 1e9
+        while self._queue and count < limit and (not count or self._clock.monotonic_ns() < end_ns):
             channel, data = self._queue.popleft()
             count += 1
             for handler in self._handlers[channel]:
@@ -45,8 +48,8 @@ class FakeBus:
 
     def __init__(self, clock: FakeClock):
         self._clock = clock
-        self.sensors = FakeInbox()
-        self.requests = FakeInbox()
+        self.sensors = FakeInbox(clock)
+        self.requests = FakeInbox(clock)
         self.published: list[tuple[str, bytes]] = []
 
     def publish(self, channel: str, data: bytes) -> None:

@@ -35,15 +35,15 @@ from modelserver.reload import ModelLoaded
 from modelserver.service.ahead import Lead
 from modelserver.service.bus import Bus
 from modelserver.service.clock import Clock
-from modelserver.service.heard import Heard
+from modelserver.service.heard import Heard, peek
 from modelserver.service.hooks import Hooks
 from modelserver.service.log import RateLimited, plain, plain_lines
 from modelserver.service.requests.desk import DeskLimits
 from modelserver.service.requests.reception import Reception
 from modelserver.service.snapshots import SnapshotWriter
 from modelserver.service.unused import Unused
-from modelserver.service.watch import Watch
-from modelserver.wire.codec import encode
+from modelserver.service.watch import SECOND, Watch
+from modelserver.wire.codec import encode, fingerprint_of
 from modelserver.wire.journal import Kind
 from modelserver.wire.navigation import MAX_DECISIONS
 
@@ -51,6 +51,11 @@ log = logging.getLogger(__name__)
 
 SENSORS_PER_PASS = 100
 """Samples taken before the clock is looked at again: a flood of samples must not stop the ticks."""
+
+SENSORS_NS = 2_000_000
+SENSORS_LEAST_NS = 500_000
+"""Nanoseconds that samples may take of a pass: up to the next tick and no more than the first, but at least the second,
+so that late ticks do not keep samples waiting."""
 
 
 NO_NETWORK = frozenset({errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENODEV, errno.ENOBUFS})
@@ -149,7 +154,7 @@ class Loop:
         if self._reloading:
             self._reloading = False
             self.send((LoadModel(),))
-        busy = self._bus.sensors.drain(SENSORS_PER_PASS) == SENSORS_PER_PASS
+        busy = self._drain_sensors()
         self._tick_if_due()
         begin_ns = self._due_ns - self._lead.ns
         self._reception.serve(begin_ns)
@@ -160,6 +165,14 @@ class Loop:
                 self._bus.wait(min(seconds, FLOOD_PAUSE_S), requests=False)
             else:
                 self._bus.wait(seconds)
+
+    def _drain_sensors(self) -> bool:
+        """Handle the samples that have come, up to the next tick; return whether more may wait."""
+        now_ns = self._clock.monotonic_ns()
+        until_tick = self._due_ns - self._lead.ns - now_ns
+        most_ns = min(SENSORS_NS, max(SENSORS_LEAST_NS, until_tick))
+        count = self._bus.sensors.drain(SENSORS_PER_PASS, most_ns * 1e-9)
+        return count == SENSORS_PER_PASS or (count > 0 and self._clock.monotonic_ns() - now_ns >= most_ns)
 
     def _tick_if_due(self) -> None:
         now = self._clock.now()
@@ -229,21 +242,26 @@ class Loop:
 
     def _sensor_handler(self, own: str, heard: Heard) -> Callable[[str, bytes], None]:
         writer = self._watch.writer(own)
+        watched, fingerprint = heard.has_publisher, fingerprint_of(heard.type_name)
 
         def handle(channel: str, data: bytes) -> None:
             try:
-                event, now = heard.read(data), self._clock.now()
+                now = self._clock.now()
+                # what is ignored is recognized before it is decoded: a flood of it must cost little
+                mark = peek(data, fingerprint) if watched else None
+                if mark is not None:
+                    if writer is None:
+                        ignored = self._watch.refuses(channel, mark, now)
+                    else:
+                        ignored = writer.is_second(mark, now.monotonic_ns) and self._watch.told(
+                            channel, writer, mark, now
+                        )
+                    if ignored:
+                        self._unused.drop(Kind.IGNORED, channel, SECOND, data, now)
+                        return
+                event = heard.read(data)
                 if isinstance(event, SwitchMode):
                     self._wished(channel, event, now)
-                    return
-                if writer is None:
-                    ignored = self._watch.refuses(channel, event.header, now)
-                else:
-                    ignored = writer.is_second(event.header, now.monotonic_ns) and self._watch.told(
-                        channel, writer, event.header, now
-                    )
-                if ignored:
-                    self._unused.note(Kind.IGNORED, channel, data, now)
                 else:
                     self.step(event, now, (channel, data))
             except Exception as error:

@@ -8,7 +8,7 @@ report of health, instead of with each.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Final, Protocol
 
 from modelserver.core import Instant
@@ -38,15 +38,17 @@ class Budget:
 
     def __init__(self, a_second: int = A_SECOND):
         self._a_second = a_second
-        self._begun: dict[str, tuple[int, int]] = {}
+        self._begun: dict[Hashable, tuple[int, int]] = {}
 
-    def grants(self, name: str, now_ns: int) -> bool:
+    def grants(self, name: Hashable, now_ns: int) -> bool:
         """Return whether there is something left for a name at an instant (monotonic, ns), and take it."""
         begin, used = self._begun.get(name, (now_ns, 0))
         if now_ns - begin >= SECOND_NS:
             begin, used = now_ns, 0
+        if used >= self._a_second:
+            return False
         self._begun[name] = (begin, used + 1)
-        return used < self._a_second
+        return True
 
 
 class Unused:
@@ -69,11 +71,20 @@ class Unused:
 
     def count(self, channel: str, reason: str, now: Instant) -> None:
         """Have the core count a message: now, or where many come, with `tell`."""
-        key = (channel, reason)
-        if self._singly.grants(f"{channel} {reason}", now.monotonic_ns):
-            self._step(Rejected(channel, reason), now)
-        else:
-            self._waiting[key] = self._waiting.get(key, 0) + 1
+        self._count((channel, reason), now)
+
+    def drop(self, kind: Kind, channel: str, reason: str, data: bytes, now: Instant) -> None:
+        """Count a message and note it, within the budgets; beyond them this costs a microsecond."""
+        if self._count((channel, reason), now):
+            self.note(kind, channel, data, now)
+
+    def _count(self, key: tuple[str, str], now: Instant) -> bool:
+        """Count a message; return whether the core was handed it singly."""
+        if self._singly.grants(key, now.monotonic_ns):
+            self._step(Rejected(*key), now)
+            return True
+        self._waiting[key] = self._waiting.get(key, 0) + 1
+        return False
 
     def tell(self, now: Instant, at_once: bool = False) -> None:
         """Have the core count what waits for that, where it has waited for a second, or `at_once`."""

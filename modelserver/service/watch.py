@@ -6,13 +6,16 @@ from collections.abc import Callable
 from typing import Final
 
 from modelserver.core import Instant
-from modelserver.core.writers import RIVAL_NS, Writer
+from modelserver.core.writers import RIVAL_NS, Mark, Writer
 from modelserver.errors import shown
-from modelserver.messages import Event, Noticed, SensorHeader
+from modelserver.messages import Event, Noticed
 from modelserver.service.log import RateLimited
 
 MAX_WRITERS: Final = 256
 """Sources that are watched on shared channels; a vehicle has a dozen, and strangers make up the rest."""
+
+SECOND: Final = "second_writer"
+"""The reason under which a second writer's samples are counted."""
 
 AGO_S: Final = 5.0
 """A second writer whose stamps lie this far in the past plays a recording."""
@@ -21,7 +24,8 @@ AGO_S: Final = 5.0
 class Watch:
     """Watches the sensors' channels. `shared` names those where several sources speak: each is watched by itself.
 
-    `step` hands the core an event, `count` has it count a sample by channel and reason. `rule`: see
+    `step` hands the core an event, `count` has it count a sample that is used by channel and reason; whoever ignores
+    one counts it. `rule`: see
     `modelserver.service.loop.LoopSettings.second_writer`.
     """
 
@@ -47,24 +51,25 @@ class Watch:
             return None
         return Writer()
 
-    def refuses(self, channel: str, header: SensorHeader, now: Instant) -> bool:
+    def refuses(self, channel: str, mark: Mark, now: Instant) -> bool:
         """Return whether a sample on a channel of several sources is a second writer's, and not to be used."""
         if not self._watches:
             return False
-        key = (channel, header.source)
+        key = (channel, mark.source)
         writer = self._writers.get(key)
         if writer is None:
             if len(self._writers) >= MAX_WRITERS:
                 return False
             writer = self._writers[key] = Writer()
-        return writer.is_second(header, now.monotonic_ns) and self.told(channel, writer, header, now)
+        return writer.is_second(mark, now.monotonic_ns) and self.told(channel, writer, mark, now)
 
-    def told(self, channel: str, writer: Writer, header: SensorHeader, now: Instant) -> bool:
-        """Count a second writer's sample, and tell of it; return whether it is not to be used."""
-        self._count(channel, "second_writer", now)
+    def told(self, channel: str, writer: Writer, mark: Mark, now: Instant) -> bool:
+        """Take notice of a second writer's sample; return whether it is not to be used."""
+        if not self._ignore:
+            self._count(channel, SECOND, now)
         if channel not in self._told:
             self._told[channel] = writer
-            text = self._text(channel, writer, (now.utime - header.utime) * 1e-6)
+            text = self._text(channel, writer, (now.utime - mark.utime) * 1e-6)
             self._step(Noticed(f"channel {channel}", text), now)
             self._log.warning(f"{channel}:second_writer", "%s", text)
         return self._ignore

@@ -191,6 +191,11 @@ def type_names() -> tuple[str, ...]:
     return tuple(_BY_TYPE_NAME)
 
 
+def fingerprint_of(type_name: str) -> bytes:
+    """Return the eight bytes that a message of a wire type begins with."""
+    return _BY_TYPE_NAME[type_name].fingerprint
+
+
 def decode(type_name: str, data: bytes) -> Any:
     """Return the value in `data`, which should hold a message of the wire type `type_name`.
 

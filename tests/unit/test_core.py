@@ -474,9 +474,9 @@ def test_given_a_wish_for_a_mode_then_the_localizer_hears_it_and_it_counts_as_tr
 def test_given_wishes_from_the_future_then_they_are_counted_and_no_pose_is_doubted_for_them() -> None:
     run = Run()
     run.samples(0)
-    for _ in range(core.FUTURE_SAMPLES + 1):
+    for _ in range(4):
         assert run.feed(SwitchMode(SensorHeader(START + 10 * S, "console"), Mode.RAW)) == ()
-    assert run.rejected == {("command:console", "future"): core.FUTURE_SAMPLES + 1}
+    assert run.rejected == {("command:console", "future"): 4}
     (pose,) = of_kind(run.feed(Tick(), 0.1), PublishPose)
     assert pose.world.transformation.valid
     assert run.state.localizer == replace(Scripted(), newest=START, taken=1)
@@ -760,10 +760,10 @@ def test_given_a_host_clock_that_was_set_back_then_no_pose_is_valid_until_a_samp
     run = Run()
     run.samples(0.0, 0.1, 0.2)
     run.feed(Tick(), 0.25)
-    for n in range(core.FUTURE_SAMPLES):
+    for n in range(3):
         # the sensors' stamps go on; the host's clock was set back by 10 s
         run.feed(imu(START + round((0.3 + n / 10) * S)), -9.7 + n / 10)
-    assert run.rejected["sensor:imu", "future"] == core.FUTURE_SAMPLES
+    assert run.rejected["sensor:imu", "future"] == 3
     (pose,) = of_kind(run.feed(Tick(), -9.0), PublishPose)
     assert Invalid(pose.world.transformation.invalid_reasons) & Invalid.CLOCK_STEPPED
     assert not pose.odom.transformation.valid
@@ -774,9 +774,42 @@ def test_given_a_host_clock_that_was_set_back_then_no_pose_is_valid_until_a_samp
     assert pose.world.transformation.valid
 
 
-def test_given_one_stray_sample_of_the_future_then_poses_stay_valid() -> None:
+@pytest.mark.parametrize("count", [1, 100])
+def test_given_samples_of_the_future_then_they_are_rejected_and_poses_stay_valid(count: int) -> None:
     run = Run()
     run.samples(0.0, 0.1)
-    run.feed(imu(START + 100 * S), 0.15)
+    for _ in range(count):
+        run.feed(imu(START + 100 * S), 0.15)
+    assert run.rejected == {("sensor:imu", "future"): count}
     (pose,) = of_kind(run.feed(Tick(), 0.2), PublishPose)
     assert pose.world.transformation.valid
+
+
+def test_given_the_time_of_day_set_back_then_poses_are_invalid_at_the_next_tick_until_a_sample_of_the_new_time() -> (
+    None
+):
+    run = Run()
+
+    def tick(since: float, utime: float) -> PublishPose:
+        now = Instant(now_at(START).monotonic_ns + round(since * 1e9), START + round(utime * S))
+        run.state, outputs = step(run.state, Tick(), now)
+        (pose,) = of_kind(outputs, PublishPose)
+        return pose
+
+    run.samples(0.0, 0.1)
+    assert tick(0.12, 0.12).world.transformation.valid
+    # preempted between reading the one clock and the other: no step
+    assert tick(0.14, 0.44).world.transformation.valid
+    assert tick(0.16, 0.16).world.transformation.valid
+    # set ahead: what is held is older than it was, which is told by its age
+    assert tick(0.18, 0.68).world.transformation.valid
+    assert tick(0.20, 0.70).world.transformation.valid
+    assert tick(0.22, 0.22).world.transformation.invalid_reasons == Invalid.CLOCK_STEPPED
+    # joints say nothing of the vehicle's time
+    joints = JointsSample(SensorHeader(START + round(0.23 * S), "arm"), ())
+    run.state, _ = step(run.state, joints, Instant(now_at(START).monotonic_ns + 230_000_000, START + round(0.23 * S)))
+    assert tick(0.24, 0.24).world.transformation.invalid_reasons == Invalid.CLOCK_STEPPED
+    run.state, _ = step(
+        run.state, imu(START + 250_000), Instant(now_at(START).monotonic_ns + 250_000_000, START + 250_000)
+    )
+    assert tick(0.26, 0.26).world.transformation.valid

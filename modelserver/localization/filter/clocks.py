@@ -5,15 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from enum import Enum
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from modelserver.localization.filter.settings import FilterSettings
 
 MOST_SOURCES = 256
 """Sources that are told apart: more names than that come from a flood."""
 
+RECENT = 8
+"""Good stamps of a source that are remembered, to tell a clock that was set back from one stamp that was ahead."""
+
 MOST_AHEAD = 100
 """Counts that a sequence is taken to go on by: more is one that began anew from 0."""
+
+REPLAY_RATE = 2_000.0
+REPLAY_BURST = 4_000.0
+"""Items a second, and at once, that delayed samples of one source may have fused again. A camera at 30 Hz with 0.2 s of
+latency needs 900 beside 150 samples a second of others; whoever stamps back without end is refused what is more."""
 
 INERTIAL_RANK = 2
 """The rank of an inertial unit: nothing leads before it."""
@@ -32,29 +40,49 @@ class Verdict(Enum):
     STEPPED_BACK = "stepped_back"
 
 
+SourceKey: TypeAlias = tuple[str, str]
+"""The kind of a sample and the name of its source: a range whose source takes an inertial unit's name is not it."""
+
+
 class Source(NamedTuple):
-    """The stamps of one source: the newest good one with its sequence number, and a run of odd ones."""
+    """The stamps of one source: the newest good one with its sequence number, and a run of odd ones.
+
+    `recent` are the last good stamps, the oldest first. The stamps of a clock that was set back cover ground that these
+    covered already; those that follow one stamp that was ahead do not, and are as good as those before it. `replays`
+    is how many items this source may still have fused again, as of the lead's instant `replays_utime`.
+    """
 
     newest: int
     seq: int
     odd: int = 0
     odd_utime: int = 0
     odd_since: int = 0
+    recent: tuple[int, ...] = ()
+    replays: float = REPLAY_BURST
+    replays_utime: int = 0
+
+    def has_covered(self, utime: int) -> bool:
+        """Return whether good stamps lie between the last odd one and `utime`, as far back as they are known."""
+        recent = self.recent
+        return not recent or utime <= recent[0] or any(self.odd_utime < each <= utime for each in recent)
 
 
 class Clocks(NamedTuple):
-    """The stamps of all sources. `lead` is the one that time goes by: of those heard the one with the highest rank.
+    """The stamps of all sources, each judged by itself.
 
-    A clock that was set is told from a sample that is odd by a run of `clock_samples` of one source, ascending. Only
-    the lead can set time back; another may set it forward while the lead is silent.
+    `lead` is the source that time goes by: of those received the one with the highest rank. A clock that was set is
+    distinguished from a sample that is odd by a run of `clock_samples` of one source, ascending. Only the lead can set
+    time back; another may set it forward while the lead is silent.
     """
 
     newest: int = 0
     rank: int = -1
     lead_utime: int = 0
-    sources: Mapping[str, Source] = MappingProxyType({})
+    sources: Mapping[SourceKey, Source] = MappingProxyType({})
 
-    def take(self, name: str, rank: int, utime: int, seq: int, settings: FilterSettings) -> tuple[Clocks, Verdict]:
+    def take(
+        self, name: SourceKey, rank: int, utime: int, seq: int, settings: FilterSettings
+    ) -> tuple[Clocks, Verdict]:
         """Return the clocks with one stamp more, and what to do with its sample."""
         source = self.sources.get(name)
         if source is None:
@@ -67,9 +95,9 @@ class Clocks(NamedTuple):
                 return self._with(name, source), Verdict.FUTURE
         elif source.newest and utime < source.newest and (ahead < -horizon or 0 < seq - source.seq < MOST_AHEAD):
             # its own stamps go back: those of one that merely comes late do not, or its sequence goes back too
-            source = _odd(source, utime, 0)
+            source = _odd(source, utime, 0, is_back=True)
             if source.odd >= settings.clock_samples and rank >= self.rank:
-                return Clocks(utime, rank, utime, MappingProxyType({name: Source(utime, seq)})), Verdict.STEPPED_BACK
+                return _set_back(name, rank, utime, seq), Verdict.STEPPED_BACK
             # within the horizon it is used as long as it may be chance: what counts must not hang on the arrival
             return self._with(name, source), Verdict.ORDER if ahead < -horizon else Verdict.GOOD
         elif self.newest and ahead < -horizon:
@@ -78,11 +106,17 @@ class Clocks(NamedTuple):
             # heard for the first time: it may be the stamps before that are wrong, and they would keep it out for ever
             source = _odd(source, utime, self.lead_utime)
             if source.odd >= settings.clock_samples:
-                return Clocks(utime, rank, utime, MappingProxyType({name: Source(utime, seq)})), Verdict.STEPPED_BACK
+                return _set_back(name, rank, utime, seq), Verdict.STEPPED_BACK
             return self._with(name, source), Verdict.LATE
         if utime < source.newest:
             return self, Verdict.GOOD
-        source = Source(utime, seq)
+        source = Source(
+            utime,
+            seq,
+            recent=(*source.recent[1 - RECENT :], utime),
+            replays=source.replays,
+            replays_utime=source.replays_utime,
+        )
         leads = rank >= self.rank
         return (
             Clocks(
@@ -94,6 +128,16 @@ class Clocks(NamedTuple):
             Verdict.GOOD,
         )
 
+    def with_replay(self, name: SourceKey, items: int) -> Clocks | None:
+        """Return the clocks after a source has had so many items fused again; None where that is more than it may."""
+        source = self.sources.get(name)
+        if source is None:
+            return self
+        # by the lead's time, which the source cannot stamp
+        passed = max(0, self.lead_utime - source.replays_utime) * 1e-6
+        left = min(REPLAY_BURST, source.replays + REPLAY_RATE * passed) - items
+        return None if left < 0.0 else self._with(name, source._replace(replays=left, replays_utime=self.lead_utime))
+
     def complete_to(self) -> int:
         """Return the instant up to which measurements can be fused for good, as far as the inertial unit goes.
 
@@ -104,17 +148,28 @@ class Clocks(NamedTuple):
             return self.lead_utime
         return self.newest
 
-    def _full(self, name: str) -> bool:
+    def _full(self, name: SourceKey) -> bool:
         """Return whether there is no room for a source that is not known yet."""
         return name not in self.sources and len(self.sources) >= MOST_SOURCES
 
-    def _with(self, name: str, source: Source) -> Clocks:
+    def _with(self, name: SourceKey, source: Source) -> Clocks:
         if self._full(name):
             return self
         return self._replace(sources=MappingProxyType({**self.sources, name: source}))
 
 
-def _odd(source: Source, utime: int, lead: int) -> Source:
-    """Return a source with an odd stamp more: those that follow each other make a run, unless the lead spoke."""
+def _set_back(name: SourceKey, rank: int, utime: int, seq: int) -> Clocks:
+    """Return the clocks after the lead was set back to `utime`."""
+    return Clocks(utime, rank, utime, MappingProxyType({name: Source(utime, seq, recent=(utime,))}))
+
+
+def _odd(source: Source, utime: int, lead: int, is_back: bool = False) -> Source:
+    """Return a source with an odd stamp more: those that follow each other make a run, unless the lead spoke.
+
+    A stamp behind the newest (`is_back`) lengthens the run only where good stamps have covered the ground before.
+    """
     follows = source.odd > 0 and 0 < utime - source.odd_utime <= 10_000_000 and source.odd_since == lead
-    return source._replace(odd=source.odd + 1 if follows else 1, odd_utime=utime, odd_since=lead)
+    count = source.odd + 1 if follows else 1
+    if follows and is_back and not source.has_covered(utime):
+        count -= 1
+    return source._replace(odd=count, odd_utime=utime, odd_since=lead)

@@ -113,7 +113,8 @@ class FilterLocalizer:
         if not found:
             return self, ()
         settings = setup.settings
-        known, verdict = self.clocks.take(header.source, _rank(sample), found[0].utime, header.seq, settings)
+        name, rank = (type(sample).__name__, header.source), _rank(sample)
+        known, verdict = self.clocks.take(name, rank, found[0].utime, header.seq, settings)
         if verdict is clocks.Verdict.STEPPED_BACK:
             self = self._begun_anew(found[0].utime)
         elif verdict is not clocks.Verdict.GOOD:
@@ -137,6 +138,12 @@ class FilterLocalizer:
                 notes.append(_refused(out, "duplicate"))
         if timeline is self.timeline:
             return replace(self, clocks=known), tuple(notes)
+        again = self.timeline.fused - timeline.fused
+        if again > 0 and rank < clocks.INERTIAL_RANK:
+            afforded = known.with_replay(name, again)
+            if afforded is None:
+                return replace(self, clocks=known), (_refused(found[0], "load"),)
+            known = afforded
         # an order is obeyed at once, and what was measured waits only for inertial samples that will be used
         waits = motion.inertial(setup, self.mode) and not isinstance(sample, SwitchMode)
         limit = known.complete_to() if waits else known.newest

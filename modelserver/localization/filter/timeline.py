@@ -90,7 +90,8 @@ class Timeline(NamedTuple):
                 other = self.entries[n].item
                 if other.utime != item.utime or other.source != item.source:
                     break
-                if other.part == item.part:
+                # a range of the same source name is no inertial sample
+                if other.part == item.part and type(other.sample) is type(item.sample):
                     return n
         return None
 
