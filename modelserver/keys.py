@@ -34,7 +34,7 @@ _MAKE = "modelserver key new FILE makes one"
 
 
 def read_keys(path: str | Path) -> tuple[Key, ...]:
-    """Return the keys of a file, in its order. Raises KeyFileError, also where others may read it.
+    """Return the keys of a file, in its order. Raises KeyFileError, also where others may read or replace it.
 
     Where systemd hands a file of that name over (LoadCredential), that one is read.
     """
@@ -49,13 +49,75 @@ def read_keys(path: str | Path) -> tuple[Key, ...]:
     except OSError as error:
         raise KeyFileError(f"the key file {shown(str(path), LONGEST_PATH)} cannot be read: {error.strerror}") from None
     # what systemd hands over lies in a directory that nobody else may enter
-    if handed is None and stat.S_ISREG(status.st_mode) and status.st_mode & (stat.S_IRWXO | stat.S_IWGRP):
-        mode = stat.S_IMODE(status.st_mode)
-        raise KeyFileError(
-            f"the key file {shown(str(path), LONGEST_PATH)} is open to others (mode {mode:04o}), so its keys are "
-            "secret no more: chmod 600 it, and make a new key if others use this machine"
-        )
+    if handed is None and stat.S_ISREG(status.st_mode):
+        if status.st_mode & (stat.S_IRWXO | stat.S_IWGRP):
+            mode = stat.S_IMODE(status.st_mode)
+            raise KeyFileError(
+                f"the key file {shown(str(path), LONGEST_PATH)} is open to others (mode {mode:04o}), so its keys are "
+                "secret no more: chmod 600 it, and make a new key if others use this machine"
+            )
+        if not _is_trusted(status.st_uid):
+            raise KeyFileError(
+                f"the key file {shown(str(path), LONGEST_PATH)} is owned by user {status.st_uid}, who can replace it; "
+                f"it was expected to be root's or that of user {os.geteuid()}, who reads it: chown it, and make a new "
+                "key if others use this machine"
+            )
+        _check_folders(path)
     return _parsed(raw, str(path))
+
+
+def shared_folder(path: str | Path) -> str:
+    """Return a folder on the way to a file that its group may write, empty where there is none.
+
+    Whoever is in the group can put another file in the place of this one. Raises OSError.
+    """
+    for folder in _folders(Path(path)):
+        mode = folder.stat().st_mode
+        if mode & stat.S_IWGRP and not mode & stat.S_ISVTX:
+            return str(folder)
+    return ""
+
+
+def _folders(path: Path) -> list[Path]:
+    """Return the folders on the way to a file, as it is named and where links lead; the outermost first."""
+    named = Path(os.path.abspath(path))
+    return list(dict.fromkeys([*reversed(named.parents), *reversed(named.resolve().parents)]))
+
+
+def _check_folders(path: Path) -> None:
+    """Raise KeyFileError where another user can put another file in the place of one."""
+    for folder in _folders(path):
+        try:
+            status = folder.stat()
+        except OSError:
+            continue  # whoever cannot look at it cannot judge it either
+        where = f"the key file {shown(str(path), LONGEST_PATH)} is reached by the folder {folder}"
+        # in a folder with the sticky bit, such as /tmp, files can be replaced by their owners alone
+        if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
+            mode = stat.S_IMODE(status.st_mode)
+            raise KeyFileError(f"{where}, which everyone may write (mode {mode:04o}): chmod o-w it, or use another one")
+        if not _is_trusted(status.st_uid):
+            raise KeyFileError(
+                f"{where}, which is owned by user {status.st_uid}: it was expected to be root's or that of user "
+                f"{os.geteuid()}, who reads the key; use a folder of either, e.g. /etc/modelserver"
+            )
+
+
+def _is_trusted(owner: int) -> bool:
+    """Return whether a file of this owner can be replaced by nobody but root and the user of this process."""
+    return owner in (0, os.geteuid()) or (owner == _UNMAPPED and _has_own_users())
+
+
+_UNMAPPED: Final = 65534
+"""The owner that a file of the host's root has in a user namespace, as systemd makes one (PrivateUsers=yes)."""
+
+
+def _has_own_users() -> bool:
+    """Return whether this process is in a user namespace of its own, where the host's root has no number."""
+    try:
+        return Path("/proc/self/uid_map").read_text(encoding="ascii").split() != ["0", "0", "4294967295"]
+    except OSError:
+        return False
 
 
 def _credential(name: str) -> Path | None:
@@ -102,7 +164,11 @@ def new_key(name: str = "") -> Key:
 
 
 def write_key(path: str | Path, key: Key) -> None:
-    """Write a key file that nobody else may read. Raises KeyFileError where it exists, or cannot be written."""
+    """Write a key file that nobody else may read.
+
+    Raises KeyFileError where it exists, cannot be written, or another user could replace it.
+    """
+    _check_folders(Path(path))
     about = "# signs commands to a modelserver; keep it secret, and make another one for each vehicle"
     try:
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)

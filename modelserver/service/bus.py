@@ -12,8 +12,48 @@ from modelserver.service.membership import RENEW_S, Membership
 from modelserver.wire.channels import literal
 from modelserver.wire.provider import open_lcm, resolve_url, take_message
 
-UNREAD: Final = 50_000
-"""Messages of a channel that LCM holds until they are taken; at 10,000 a second that is five seconds' worth."""
+MOST_UNREAD: Final = 50_000
+LEAST_UNREAD: Final = 16
+"""Messages of a channel that LCM holds until they are taken, at most; and where they are long, at least."""
+
+SENSOR_BYTES: Final = 4 << 20
+REQUEST_BYTES: Final = 1 << 20
+"""Bytes of the messages of one channel that LCM holds: 20,000 samples of wheels, 4,000 requests.
+
+LCM counts messages, which may have 64 kB and more each, and what it has allocated for them once it keeps. So the number
+of messages is set by how long they are.
+"""
+
+HEAD_BYTES: Final = 128
+"""What LCM keeps for a message beside its data, about: a record with pointers and the name of its channel."""
+
+
+class QueueLimit:
+    """How many messages of a channel LCM may hold, by how long they have been lately: `limit_bytes` in all."""
+
+    __slots__ = ("_limit_bytes", "_mean", "capacity")
+
+    def __init__(self, limit_bytes: int):
+        self._limit_bytes = limit_bytes
+        self._mean = 256.0
+        self.capacity = self._wanted()
+
+    def changes(self, length: int) -> bool:
+        """Take the length of a message into account; return whether `capacity` is another one now."""
+        # long ones count at once, since many more may follow; short ones are believed slowly
+        off = length - self._mean
+        if -0.1 * self._mean < off < 0.1 * self._mean:
+            return False
+        self._mean += off * (0.125 if off > 0.0 else 0.015625)
+        wanted = self._wanted()
+        if 0.8 * self.capacity <= wanted <= 1.25 * self.capacity:
+            return False
+        self.capacity = wanted
+        return True
+
+    def _wanted(self) -> int:
+        return max(LEAST_UNREAD, min(MOST_UNREAD, int(self._limit_bytes / (self._mean + HEAD_BYTES))))
+
 
 Handler: TypeAlias = Callable[[str, bytes], None]
 
@@ -58,7 +98,8 @@ class Bus(Protocol):
 class LcmInbox:
     """An inbox on an LCM instance of its own."""
 
-    def __init__(self, url: str):
+    def __init__(self, url: str, queue_bytes: int):
+        self._queue_bytes = queue_bytes
         self.lcm = open_lcm(url)
         self.fileno = self.lcm.fileno()
         self.may_have = True
@@ -66,10 +107,17 @@ class LcmInbox:
 
     def subscribe(self, channel: str, handler: Handler) -> None:
         """Hand every message of exactly `channel` to `handler`."""
-        subscription = self.lcm.subscribe(literal(channel), handler)
+        limit = QueueLimit(self._queue_bytes)
+
+        def handle(name: str, data: bytes) -> None:
+            if limit.changes(len(data)):
+                subscription.set_queue_capacity(limit.capacity)
+            handler(name, data)
+
+        subscription = self.lcm.subscribe(literal(channel), handle)
         # LCM drops silently what comes beyond it, so the loop refuses and counts long before; a flood that is faster
         # than the loop can refuse must not fill the memory
-        subscription.set_queue_capacity(UNREAD)
+        subscription.set_queue_capacity(limit.capacity)
 
     def drain(self, limit: int, seconds: float = math.inf) -> int:
         """Hand over what has come, at most `limit` messages and for so many seconds, without waiting; return how many.
@@ -93,8 +141,8 @@ class LcmBus:
 
     def __init__(self, url: str = ""):
         self.url = resolve_url(url)
-        self.sensors: LcmInbox = LcmInbox(self.url)
-        self.requests: LcmInbox = LcmInbox(self.url)
+        self.sensors: LcmInbox = LcmInbox(self.url, SENSOR_BYTES)
+        self.requests: LcmInbox = LcmInbox(self.url, REQUEST_BYTES)
         self._poll = select.poll()
         for inbox in (self.sensors, self.requests):
             self._poll.register(inbox.fileno, select.POLLIN)

@@ -236,3 +236,45 @@ def test_given_a_bus_that_cannot_be_joined_then_the_error_says_what_to_look_at(
         LcmBus(url)
     assert url in str(caught.value)
     assert "no way out" in str(caught.value)
+
+
+# --- bytes that wait ------------------------------------------------------------------------------------------
+
+
+@given(st.lists(st.tuples(st.integers(0, 1 << 24), st.integers(1, 300)), max_size=8), st.integers(0, 1 << 24))
+def test_given_messages_of_any_lengths_then_those_that_may_wait_fit_into_the_bytes_there_are(
+    before: list[tuple[int, int]], length: int
+) -> None:
+    limit = QueueLimit(SENSOR_BYTES)
+    for each, count in before:
+        for _ in range(count):
+            limit.changes(each)
+    for _ in range(60):
+        limit.changes(length)
+    assert LEAST_UNREAD <= limit.capacity <= MOST_UNREAD
+    assert limit.capacity * length <= 1.5 * SENSOR_BYTES or limit.capacity == LEAST_UNREAD
+
+
+def test_given_short_messages_again_then_as_many_may_wait_as_before_the_long_ones() -> None:
+    limit = QueueLimit(SENSOR_BYTES)
+    for length in (160, 64_000, 160):
+        for _ in range(1000):
+            limit.changes(length)
+    assert limit.capacity * (160 + HEAD_BYTES) >= 0.75 * SENSOR_BYTES
+
+
+def test_given_long_messages_that_nobody_takes_then_few_of_them_are_held(rig: Rig) -> None:
+    taken: list[int] = []
+    rig.bus.sensors.subscribe("GPS", lambda channel, data: taken.append(len(data)))
+    long, most = bytes(60_000), SENSOR_BYTES // 60_000
+    publisher = lcm.LCM(rig.bus.url)
+    for _ in range(40):
+        publisher.publish("GPS", long)
+        rig.until(lambda: True)
+    taken.clear()
+    for _ in range(4 * most):
+        publisher.publish("GPS", long)
+        time.sleep(0.0005)
+    while rig.bus.sensors.drain(1000):
+        pass
+    assert most // 4 < len(taken) <= 1.5 * most

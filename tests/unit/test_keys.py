@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import stat
 from pathlib import Path
 
 import pytest
 
 from modelserver.errors import KeyFileError
-from modelserver.keys import KEY_BYTES, new_key, read_keys, write_key
+from modelserver.keys import KEY_BYTES, new_key, read_keys, shared_folder, write_key
 from mstools.cli import main
 
 HEX = "00112233445566778899aabbccddeeff"
@@ -108,3 +109,58 @@ def test_given_no_file_then_it_says_what_makes_one(tmp_path: Path) -> None:
         read_keys(tmp_path)
     with pytest.raises(KeyFileError, match="cannot be written"):
         write_key(tmp_path / "none" / "a.key", new_key())
+
+
+# --- who can put another file in its place ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("by", ["name", "link"])
+def test_given_a_key_in_a_folder_that_everyone_may_write_then_it_is_not_read_nor_made(tmp_path: Path, by: str) -> None:
+    folder = tmp_path / "open"
+    folder.mkdir()
+    path = written(folder, f"a {HEX}")
+    if by == "link":
+        path = tmp_path / "link.key"
+        path.symlink_to(folder / "some.key")
+    assert read_keys(path)[0].name == "a"
+    folder.chmod(0o777)
+    with pytest.raises(KeyFileError, match=r"open, which everyone may write \(mode 0777\): chmod o-w it"):
+        read_keys(path)
+    with pytest.raises(KeyFileError, match="everyone may write"):
+        write_key(folder / "new.key", new_key())
+    assert not (folder / "new.key").exists()
+    # files in one with the sticky bit are their owners'
+    folder.chmod(0o1777)
+    assert read_keys(path)[0].name == "a"
+
+
+def test_given_a_key_or_a_folder_of_another_user_then_it_is_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = written(tmp_path, f"a {HEX}")
+    stranger = os.geteuid() + 12345
+    if os.geteuid() == 0:
+        os.chown(path, stranger, -1)
+        with pytest.raises(KeyFileError, match=f"owned by user {stranger}, who can replace it"):
+            read_keys(path)
+        os.chown(path, 0, -1)
+        os.chown(tmp_path, stranger, -1)
+        with pytest.raises(KeyFileError, match=f"reached by the folder .*owned by user {stranger}"):
+            read_keys(path)
+        os.chown(tmp_path, 0, -1)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: stranger)
+        with pytest.raises(KeyFileError, match="who can replace it"):
+            read_keys(path)
+        monkeypatch.undo()
+    assert read_keys(path)[0].name == "a"
+
+
+def test_given_a_folder_that_a_group_may_write_then_it_is_named(tmp_path: Path) -> None:
+    folder = tmp_path / "team"
+    folder.mkdir(mode=0o755)
+    path = written(folder, f"a {HEX}")
+    assert shared_folder(path) == ""
+    folder.chmod(0o775)
+    assert shared_folder(path) == str(folder)
+    assert read_keys(path)[0].name == "a"

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from modelserver.errors import KeyFileError
-from modelserver.keys import read_keys
+from modelserver.keys import read_keys, shared_folder
 from modelserver.service.journal.place import bound, journal_directory
 from modelserver.service.journal.ring import LOCK_NAME, segments
 from modelserver.service.keeping.origin import state_directory
@@ -139,6 +139,12 @@ def key_findings(vehicle: VehicleConfig, unit: bool = False) -> Iterator[Finding
         command = f"sudo modelserver install  # writes LoadCredential={os.path.basename(quoted)}:{quoted}"
         yield Finding(Grade.ERROR, subject, seen, why, command)
         return
+    shared = "" if handed else shared_folder(path)
+    if shared:
+        seen = f"{path} is reached by {shared}, which a group may write"
+        danger = "who is in the group can put another key in its place, and command the vehicle with that"
+        yield Finding(Grade.WARNING, subject, seen, danger, f"sudo chmod g-w {shlex.quote(shared)}")
+        return
     yield Finding(Grade.OK, subject, f"{path} may be read by this user alone or its group, {counted(len(keys), 'key')}")
 
 
@@ -158,6 +164,12 @@ def _key_command(path: str) -> str:
         return f"sudo chmod 600 {quoted}"
     if not os.access(path, os.R_OK):
         return f"sudo chown {os.geteuid()} {quoted}"
+    if status.st_uid not in (0, os.geteuid()):
+        return f"sudo chown root {quoted}"
+    for folder in Path(path).absolute().parents:
+        mode = folder.stat().st_mode
+        if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
+            return f"sudo chmod o-w {shlex.quote(str(folder))}"
     return f"sudo mv {quoted} {quoted}.aside && {make}"
 
 

@@ -157,18 +157,24 @@ def _plan(
     from modelserver.wire.channels import DEFAULT_URL
     from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
 
-    group = install_files.loopback_group(made.config.lcm.url or DEFAULT_URL)
+    url = made.config.lcm.url or DEFAULT_URL
+    group = install_files.loopback_group(url)
     ip = facts.programs.get("ip", "/usr/sbin/ip")
     rules, notes = install_files.rules(made.serial_of(names), serial, facts)
     writes = [
         *copied,
-        *install_files.units(templates(), program(), group, ip, drivers=bool(names)),
+        *install_files.units(templates(), program(), url, ip, bool(names), made.hosts_of(names)),
         *install_files.realtime(facts),
         *install_files.credential(installed_key(made)),
         *rules,
         *install_files.limits(RECEIVE_BUFFER_BYTES, facts),
     ]
     units = (*((LOOPBACK,) if group else ()), SERVICE, *(f"modelserver-driver@{name}.service" for name in names))
+    if set(install_files.NETWORK) & set(install_files.bus_addresses(url)):
+        notes.append(
+            "the units speak with this machine and with private networks alone (IPAddressAllow); where the vehicle's "
+            "own is another: sudo systemctl edit modelserver, and there [Service] IPAddressAllow=NETWORK"
+        )
     if made.config.state_directory:
         notes.append("the vehicle file sets state_directory; without it the state goes where the unit may write")
     if made.config.journal.directory:
@@ -204,6 +210,19 @@ class Made:
             raise ConfigError(errors)
         config = load_config(vehicle)
         return cls(vehicle, config, read_drivers(config.drivers, Place(str(vehicle)))[0])
+
+    def hosts_of(self, names: Iterable[str]) -> list[str]:
+        """Return the hosts of those of the named drivers whose devices are on the network."""
+        from msdrivers.line_settings import MULTICAST, split_address, split_group
+
+        found = []
+        for name in names:
+            line = self.drivers[name].line
+            if address := getattr(line, "address", ""):
+                found.append(split_address(address)[0])
+            elif getattr(line, "interface", "") == MULTICAST:
+                found.append(split_group(getattr(line, "channel", ""))[0])
+        return found
 
     def serial_of(self, names: Iterable[str]) -> list[install_files.SerialDriver]:
         """Return those of the named drivers that are on serial ports."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
+from ipaddress import ip_address
 from typing import Final, NoReturn
 from urllib.parse import parse_qs, urlsplit
 
@@ -115,15 +116,73 @@ def loopback_group(url: str) -> str:
     return group_of(url)
 
 
-def units(templates: Mapping[str, str], program: str, group: str, ip: str, drivers: bool) -> list[Write]:
-    """Return the units with what is this installation's in them. `program` is the path of its command."""
+LOCAL: Final = "localhost"
+NETWORK: Final = ("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "169.254.0.0/16")
+"""The networks that a vehicle's own is one of (RFC 1918, RFC 3927): a bus with a ttl has its other machines there."""
+
+ANYWHERE: Final = "any"
+
+
+def bus_addresses(url: str) -> tuple[str, ...]:
+    """Return the addresses that a bus at `url` is of, as IPAddressAllow of systemd takes them."""
+    parts = urlsplit(url)
+    if parts.scheme == "file":
+        return (LOCAL,)
+    if parts.scheme == "tcpq":
+        return (LOCAL, *host_addresses([parts.hostname or LOCAL]))
+    if parts.scheme != "udpm" or not group_of(url):
+        return (ANYWHERE,)
+    return (LOCAL, group_of(url), *(() if loopback_group(url) else NETWORK))
+
+
+def host_addresses(hosts: Iterable[str]) -> tuple[str, ...]:
+    """Return the addresses of hosts, in their order; any for a name, which may be another's tomorrow."""
+    found = []
+    for host in hosts:
+        if host == LOCAL:
+            continue
+        try:
+            found.append(str(ip_address(host)))
+        except ValueError:
+            found.append(ANYWHERE)
+    return tuple(found)
+
+
+def allowed(addresses: Iterable[str]) -> str:
+    """Return addresses as a unit has them: each once, or any alone."""
+    found = tuple(dict.fromkeys(addresses))
+    return ANYWHERE if ANYWHERE in found else " ".join(found)
+
+
+def units(
+    templates: Mapping[str, str],
+    program: str,
+    url: str,
+    ip: str,
+    drivers: bool,
+    hosts: Iterable[str] = (),
+) -> list[Write]:
+    """Return the units with what is this installation's in them.
+
+    `program` is the path of its command, `url` that of the bus; `hosts` are those of the drivers' devices.
+    """
     check_program(program)
+    group, bus = loopback_group(url), bus_addresses(url)
+    places = {
+        "@MODELSERVER@": program,
+        "@GROUP@": group,
+        "@IP@": ip,
+        "@ADDRESSES@": allowed(bus),
+        "@DEVICES@": allowed((*bus, *host_addresses(hosts))),
+    }
     wanted = {SERVICE: "the service"}
     wanted |= {DRIVER: "one driver, by its name"} if drivers else {}
     wanted |= {LOOPBACK: "multicast on the loopback interface"} if group else {}
     writes = []
     for name, what in wanted.items():
-        text = templates[name].replace("@MODELSERVER@", program).replace("@GROUP@", group).replace("@IP@", ip)
+        text = templates[name]
+        for place, value in places.items():
+            text = text.replace(place, value)
         summary = "\n".join(line for line in text.splitlines() if line.startswith("ExecStart="))
         writes.append(Write(f"{UNITS}/{name}", text.encode(), what, summary))
     return writes

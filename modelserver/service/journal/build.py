@@ -45,9 +45,15 @@ def facts() -> Mapping[str, str]:
 
 
 def differences(then: Mapping[str, Any]) -> list[str]:
-    """Return in words what is other here than in the facts of a journal: any of it may change the last bits."""
+    """Return in words what is other here than in the facts of a journal: any of it may change the last bits.
+
+    A processor that is not known is no other one: a unit that sees of /proc its processes alone cannot name it.
+    """
     now = facts()
-    return [f"{words} was {then.get(key)}, is {now[key]}" for key, words in TOLD.items() if then.get(key) != now[key]]
+    other = [key for key in TOLD if then.get(key) != now[key]]
+    if not (then.get("processor") and now["processor"]):
+        other = [key for key in other if key != "processor"]
+    return [f"{TOLD[key]} was {then.get(key)}, is {now[key]}" for key in other]
 
 
 def _source() -> str:

@@ -19,6 +19,7 @@ from modelserver.service.log import plain
 log = logging.getLogger(__name__)
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+BOOT_ID_VARIABLE = "MODELSERVER_BOOT_ID"
 
 CLOCKS_AGREE = 2.0
 """Seconds by which the time of day may have gone less far than the monotonic clock: a clock that is steered."""
@@ -28,11 +29,15 @@ CLOSING_S = 1.0
 
 
 def boot_id() -> str:
-    """Return the name of this boot of the machine, empty where it has none."""
+    """Return the name of this boot of the machine, empty where it has none.
+
+    A unit that does not see /proc/sys (ProcSubset=pid) is given it in its environment, which writes it without hyphens.
+    """
     try:
-        return BOOT_ID.read_text(encoding="ascii").strip()[:64]
+        found = BOOT_ID.read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError):
-        return ""
+        found = os.environ.get(BOOT_ID_VARIABLE, "")
+    return found.strip().replace("-", "")[:64]
 
 
 def held_words(error: HeldError, directory: Path) -> str:

@@ -385,10 +385,47 @@ def test_given_a_path_that_a_unit_would_take_for_something_else_then_it_is_refus
         units(TEMPLATES, program, "", "/sbin/ip", drivers=False)
 
 
+@pytest.mark.parametrize(
+    ("url", "hosts", "service", "driver"),
+    [
+        ("udpm://239.1.2.3:7667?ttl=0", (), "localhost 239.1.2.3", "localhost 239.1.2.3"),
+        (
+            "udpm://239.1.2.3:7667?ttl=1&recv_buf_size=9",
+            ("192.168.1.10", "2001:db8::1", "192.168.1.10", "localhost"),
+            "localhost 239.1.2.3 10.0.0.0/8 172.16.0.0/12 192.168.0.0/16 169.254.0.0/16",
+            "localhost 239.1.2.3 10.0.0.0/8 172.16.0.0/12 192.168.0.0/16 169.254.0.0/16 192.168.1.10 2001:db8::1",
+        ),
+        ("udpm://239.1.2.3:7667", ("moxa.local",), "localhost 239.1.2.3", "any"),
+        ("tcpq://10.0.0.7:7700", (), "localhost 10.0.0.7", "localhost 10.0.0.7"),
+        ("mpudpm://239.1.2.3:7667", (), "any", "any"),
+    ],
+)
+def test_given_a_bus_and_devices_then_the_units_speak_with_those_alone(
+    url: str, hosts: tuple[str, ...], service: str, driver: str
+) -> None:
+    texts = {each.path: each.content.decode() for each in units(TEMPLATES, "/x", url, "/sbin/ip", True, hosts)}
+    for name, addresses in (("modelserver.service", service), ("modelserver-driver@.service", driver)):
+        text = texts[f"/etc/systemd/system/{name}"]
+        assert f"\nIPAddressDeny=any\nIPAddressAllow={addresses}\n" in text
+        assert not re.search("@[A-Z]+@", text)
+
+
+@pytest.mark.parametrize("name", sorted(TEMPLATES))
+def test_given_a_unit_then_it_is_bounded_and_hardened_as_the_others(name: str) -> None:
+    settings = dict(line.split("=", 1) for line in TEMPLATES[name].splitlines() if "=" in line and line[0] != "#")
+    for key in ("MemoryMax", "TasksMax", "IPAddressDeny"):
+        assert settings[key]
+    for key in ("ProtectKernelLogs", "ProtectClock", "ProtectHostname", "PrivateMounts", "RestrictRealtime"):
+        assert settings[key] == "yes"
+    assert settings["ProcSubset"] == "pid"
+    assert settings["SystemCallFilter"] == "~@privileged @resources"
+
+
 def test_given_a_bus_that_leaves_the_machine_and_no_drivers_then_there_is_the_service_alone() -> None:
-    assert [each.path for each in units(TEMPLATES, "/opt/x/modelserver", "", "/sbin/ip", drivers=False)] == [
-        "/etc/systemd/system/modelserver.service"
-    ]
+    assert [
+        each.path
+        for each in units(TEMPLATES, "/opt/x/modelserver", "udpm://239.1.2.3:7667?ttl=1", "/sbin/ip", drivers=False)
+    ] == ["/etc/systemd/system/modelserver.service"]
 
 
 BY_ID = {"usb-FTDI_A1-if00-port0": "/dev/ttyUSB0"}
