@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from typing import Final
 
@@ -67,8 +68,8 @@ def check_host_clock(state: CoreState, now: Instant) -> CoreState:
 def joints_told(state: CoreState, sample: JointsSample, now: Instant) -> Step:
     """Return what follows from positions of joints."""
     joints, refused = state.view.joints.taken(sample, now.utime)
-    for why in refused:
-        state = counted(state, f"sensor:{sample.header.source}", why)
+    for why, count in Counter(refused).items():
+        state = counted(state, f"sensor:{sample.header.source}", why, count)
     if joints is state.view.joints:
         return state, ()
     state = state._replace(view=replace(state.view, joints=joints))

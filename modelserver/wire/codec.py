@@ -80,7 +80,12 @@ class _Codec(NamedTuple):
 def _generated(wire: Any, value: type, read: Callable[[Any], Any], write: Callable[[Any], Any]) -> _Codec:
     """Return the codec of a type that goes through the generated class."""
 
+    # what is shorter than a message of empty names and arrays is recognized without decoding it
+    least = len(wire().encode())
+
     def read_bytes(data: bytes) -> Any:
+        if len(data) < least:
+            raise WireError("truncated", f"{len(data)} bytes are no whole {wire.__name__}: the end is cut")
         # The generated decoder takes a text cut short for a shorter one. With one byte more at the end it reads
         # into that byte instead, so that a message is whole exactly when the decoder stops where the data end.
         stream = BytesIO(data + b"\0")

@@ -21,6 +21,7 @@ from modelserver.joints import (
     ABSURD,
     AHEAD_S,
     LONGEST_GAP_S,
+    MOST_EXPLAINED,
     MOST_READINGS,
     PREDICTION_LIMIT_S,
     How,
@@ -512,3 +513,15 @@ def test_given_a_stamp_older_than_what_is_held_then_also_the_first_is_refused_an
     )
     assert not joints.tracks
     assert why in refused[0]
+
+
+def test_given_a_thousand_unknown_joints_in_one_message_then_the_nearest_name_of_a_few_is_searched(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    searched: list[str] = []
+    monkeypatch.setattr("modelserver.joints.nearest_names", lambda name, known: searched.append(name) or [])
+    unknown = [JointSample(f"x{n}", 0.1) for n in range(1024)]
+    _, refused = Joints(constraints(), 60.0).taken(sample(1.0, *unknown), at(1.0))
+    assert len(refused) == 1024
+    assert len(searched) == MOST_EXPLAINED
+    assert refused[-1] == "unknown joint"

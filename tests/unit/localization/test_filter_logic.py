@@ -53,7 +53,7 @@ def judged(known: Clocks, *stamps: tuple[str, int, float, int]) -> tuple[Clocks,
     """Take stamps (source, rank, seconds since T0, sequence number)."""
     words = []
     for name, rank, seconds, seq in stamps:
-        known, verdict = known.take(name, rank, T0 + round(seconds * 1e6), seq, SETTINGS)
+        known, verdict = known.take(("sample", name), rank, T0 + round(seconds * 1e6), seq, SETTINGS)
         words.append(verdict.value)
     return known, words
 
@@ -94,6 +94,23 @@ def test_given_the_lead_set_back_then_time_steps_when_a_run_of_samples_agrees():
     assert words == ["order"] * 6
 
 
+def test_given_a_stamp_ahead_when_the_lead_goes_on_as_before_then_time_does_not_step_back():
+    """One forged stamp that is 0.2 s ahead: the true ones after it seem to have gone back."""
+    _, words = judged(running(), ("imu", 2, 10.18, 501), *[("imu", 2, 9.98 + n * 0.02, 501 + n) for n in range(1, 20)])
+    assert set(words) == {"good"}
+    # a clock that was set back by as much covers ground that was covered before
+    _, words = judged(running(), *[("imu", 2, 9.78 + n * 0.02, 501 + n) for n in range(4)])
+    assert words[2] == "stepped_back"
+
+
+def test_given_another_kind_of_sample_by_the_leads_name_then_its_stamps_are_its_own():
+    known = running()
+    for n in range(10):
+        known, _ = known.take(("range", "imu"), 0, T0 + 10_180_000 + n, 501 + n, SETTINGS)
+        known, verdict = known.take(("sample", "imu"), 2, T0 + 10_000_000 + n * 10_000, 501 + n, SETTINGS)
+        assert verdict is Verdict.GOOD
+
+
 def test_given_another_source_set_back_then_time_does_not_step():
     _, words = judged(running(), *[("gps", 0, 2.0 + n * 0.2, 3 + n) for n in range(10)])
     assert words == ["order"] * 10
@@ -118,7 +135,7 @@ def test_given_a_flood_of_names_then_memory_is_bounded_and_the_known_sources_are
     assert len(known.sources) == clocks.MOST_SOURCES
     known, words = judged(known, *[("imu", 2, 10.0 + n * 0.02, 501 + n) for n in range(300)])
     assert set(words) == {"good"}
-    assert known.sources["imu"].newest == T0 + 15_980_000
+    assert known.sources["sample", "imu"].newest == T0 + 15_980_000
     _, words = judged(known, *[("imu", 2, 8.0 + n * 0.02, 801 + n) for n in range(3)])
     assert words[-1] == Verdict.STEPPED_BACK.value
 
