@@ -91,7 +91,7 @@ class Joints:
             return self, ("future",)
         if sample.header.utime < now - self._seconds * 1e6:
             return self, ("stamped in seconds or milliseconds" if sample.header.utime < LEAST_UTIME else "late",)
-        refused = []
+        refused: list[str] = []
         seen: set[str] = set()
         tracks: dict[str, JointTrack] | None = None
         newest = now + AHEAD_S * 1e6

@@ -264,7 +264,7 @@ def test_given_messages_of_any_lengths_then_those_that_may_wait_fit_into_the_byt
     for _ in range(60):
         limit.changes(length)
     assert LEAST_UNREAD <= limit.capacity <= MOST_UNREAD
-    assert limit.capacity * length <= 2 * SENSOR_BYTES or limit.capacity == LEAST_UNREAD
+    assert limit.capacity * length <= 2 * SENSOR_BYTES or limit.capacity <= 1.25 * LEAST_UNREAD
 
 
 def test_given_short_messages_again_then_as_many_may_wait_as_before_the_long_ones() -> None:

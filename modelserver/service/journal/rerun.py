@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container, Mapping
 
 from modelserver import core
@@ -44,7 +45,7 @@ class _Nowhere:
     def subscribe(self, channel: str, handler: Handler) -> None:
         """Do nothing."""
 
-    def drain(self, limit: int) -> int:
+    def drain(self, limit: int, seconds: float = math.inf) -> int:
         """Return that nothing has come."""
         return 0
 
