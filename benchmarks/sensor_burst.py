@@ -50,7 +50,8 @@ def ignored() -> bool:
             ear.late.clear()
             cpu, begin, sent = flood.cpu_seconds(served.pid), time.monotonic(), 0
             bus = lcm.LCM(url)
-            data = encode(ImuSample(SensorHeader(time.time_ns() // 1000, "other", 5), (0.1, 0.0, 0.0), (0.0, 0.0, 9.8)))
+            header = SensorHeader(time.time_ns() // 1000, "other", 5)
+            data = encode(ImuSample(header, (0.1, 0.0, 0.0), (0.0, 0.0, 9.8)))
             while (now := time.monotonic()) < begin + IGNORED_S:
                 while sent < (now - begin) * IGNORED_HZ:
                     bus.publish("IMU", data)
