@@ -3,7 +3,8 @@
 The whole loop, codec and core, on a bus and a clock within the process: sensors at modest rates, poses, a question now
 and then, and everything that is refused. An hour of traffic unless told otherwise:
 `python -m benchmarks.memory_day HOURS`. Memory is compared from a quarter of the way on, when history and every table
-are full. liblcm remembers each channel name that it has ever heard, whoever speaks on it: how much a name takes is
+are full. Then damaged messages, sent to a daemon as fast as one program can: what a million takes after the first
+quarter. liblcm remembers each channel name that it has ever heard, whoever speaks on it: how much a name takes is
 measured on a real bus.
 """
 
@@ -12,18 +13,35 @@ from __future__ import annotations
 import gc
 import logging
 import os
+import random
 import sys
 import time
 from pathlib import Path
 
 import lcm
 
-from benchmarks.support import RAPTOR, free_url, verdict
+from benchmarks.support import RAPTOR, free_url, process, verdict
+from modelserver.client.remote import Platform
 from modelserver.config import load_config
-from modelserver.messages import GetTransformation, GpsSample, ImuSample, RequestHeader, WheelsSample
+from modelserver.errors import NoServerError
+from modelserver.messages import (
+    FixType,
+    GetStateVector,
+    GetTransformation,
+    GpsSample,
+    ImuSample,
+    JointSample,
+    JointsSample,
+    RequestHeader,
+    SensorHeader,
+    TimeQuery,
+    WheelSample,
+    WheelsSample,
+)
 from modelserver.service.clock import FakeClock
 from modelserver.service.daemon import load_vehicle
 from modelserver.service.fake_bus import FakeBus
+from modelserver.service.gauges import resident_bytes
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.simulation import GpsModel, ImuModel, Timing, WheelsModel
 from modelserver.wire.codec import encode
@@ -34,6 +52,9 @@ START = 1_700_000_000_000_000
 IMU_HZ, WHEELS_HZ, GPS_HZ, ODD_EVERY = 20.0, 5.0, 1.0, 50
 CHANNELS = {GpsSample: "GPS", ImuSample: "IMU", WheelsSample: "WHEELS"}
 NAMES = 100_000
+DAMAGED = 1_000_000
+SPARE_MB = 30.0
+"""What a million damaged messages may take more, megabytes: the queues of liblcm fill by chance, and stay as large."""
 SPARE_KB = 1024
 """What an hour may take more: pages that the allocator has begun; a leak of a byte a message takes 90 kB."""
 
@@ -89,6 +110,45 @@ def day(hours: float) -> tuple[int, float, int]:
     return count, (held[-1] - held[0]) / (0.75 * hours), max(held) - held[0]
 
 
+def damaged_mb(count: int) -> tuple[float, float]:
+    """Send a daemon damaged samples and requests; return what it held after a quarter of them and at the end, MB."""
+    chance = random.Random(11)
+    header, utime = SensorHeader(1, "imu"), time.time_ns() // 1000
+    whole = {
+        "IMU": encode(ImuSample(header, (0.0, 0.0, 0.0), (0.0, 0.0, 9.8))),
+        "GPS": encode(GpsSample(header, FixType.FIX_3D, 50.27, -111.1, 700.0)),
+        "WHEELS": encode(WheelsSample(header, (WheelSample("front_left", speed=1.0),) * 4)),
+        "JOINTS": encode(JointsSample(header, (JointSample("Nod", 0.1),))),
+        "PLATFORM_GET_TRANSFORMATION": encode(GetTransformation(RequestHeader(1, "REPLY_X"), "A:B", "World:UTM")),
+        "PLATFORM_GET_STATE_VECTOR": encode(GetStateVector(RequestHeader(1, "REPLY_X"), TimeQuery(utime))),
+    }
+    pool = []
+    for _ in range(2000):
+        channel, data = chance.choice(list(whole.items()))
+        cut = bytearray(data[: chance.randrange(8, len(data) + 1)] + chance.randbytes(chance.choice((0, 0, 30, 3000))))
+        for _ in range(chance.randrange(4)):
+            cut[chance.randrange(8, len(cut)) if len(cut) > 8 else 0] = chance.randrange(256)
+        pool.append((channel, bytes(cut)))
+    url = resolve_url(free_url())
+    run = ("-c", "from mstools.cli import main; main()", "run", "-c", str(RAPTOR / "vehicle.yaml"))
+    with process(*run, "--log-level", "error", url=url) as served, Platform(url, timeout=0.5) as platform:
+        deadline = time.monotonic() + 20.0
+        while True:
+            try:
+                platform.get_body_list()
+                break
+            except NoServerError:
+                if time.monotonic() > deadline:
+                    raise
+        bus, quarter = lcm.LCM(url), 0.0
+        for number in range(count):
+            bus.publish(*pool[number % len(pool)])
+            if number == count // 4:
+                quarter = resident_bytes(Path(f"/proc/{served.pid}/statm")) / 1e6
+        time.sleep(2.0)
+        return quarter, resident_bytes(Path(f"/proc/{served.pid}/statm")) / 1e6
+
+
 def name_bytes() -> float:
     """Return how many bytes liblcm keeps for each channel name that it hears and nobody has asked for."""
     url = resolve_url(free_url())
@@ -114,7 +174,11 @@ def main(hours: float = 1.0) -> int:
     begin = time.monotonic()
     count, growth, most = day(hours)
     print(f"  {hours:g} h of traffic, {count} samples, in {time.monotonic() - begin:.0f} s; at most {most} kB more")
-    return 0 if verdict("growth an hour", growth, SPARE_KB, "kB") else 1
+    quarter, end = damaged_mb(DAMAGED)
+    print(f"  {DAMAGED} damaged messages: {quarter:.0f} MB after a quarter of them, {end:.0f} MB at the end")
+    holds = verdict("growth an hour", growth, SPARE_KB, "kB")
+    holds &= verdict("growth a million damaged messages", (end - quarter) / (0.75e-6 * DAMAGED), SPARE_MB, "MB")
+    return 0 if holds else 1
 
 
 if __name__ == "__main__":

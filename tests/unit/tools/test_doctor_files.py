@@ -244,6 +244,19 @@ def test_given_a_key_that_is_open_to_others_then_the_command_closes_it(tmp_path:
     assert "is open to others" in found.seen
 
 
+def test_given_a_key_in_a_folder_that_others_may_write_then_the_command_closes_the_folder(tmp_path: Path) -> None:
+    write_test_key(tmp_path)
+    config = configured(tmp_path, ALLOWED)
+    tmp_path.chmod(0o777)
+    found = key(config)
+    assert (found.grade, found.command) == (Grade.ERROR, f"sudo chmod o-w {tmp_path}")
+    tmp_path.chmod(0o770)
+    found = key(config)
+    assert (found.grade, found.command) == (Grade.WARNING, f"sudo chmod g-w {tmp_path}")
+    tmp_path.chmod(0o700)
+    assert key(config).grade is Grade.OK
+
+
 @pytest.mark.parametrize("content", ["", "name\n", "name zz\n", "a 00\n", "# nothing\n"])
 def test_given_a_file_that_holds_no_key_then_another_is_made_beside_it(tmp_path: Path, content: str) -> None:
     path = write_test_key(tmp_path)
