@@ -20,10 +20,9 @@ from pathlib import Path
 
 import lcm
 
-from benchmarks.support import RAPTOR, free_url, process, verdict
+from benchmarks.support import RAPTOR, free_url, process, until_answered, verdict
 from modelserver.client.remote import Platform
 from modelserver.config import load_config
-from modelserver.errors import NoServerError
 from modelserver.messages import (
     FixType,
     GetStateVector,
@@ -132,14 +131,7 @@ def damaged_mb(count: int) -> tuple[float, float]:
     url = resolve_url(free_url())
     run = ("-c", "from mstools.cli import main; main()", "run", "-c", str(RAPTOR / "vehicle.yaml"))
     with process(*run, "--log-level", "error", url=url) as served, Platform(url, timeout=0.5) as platform:
-        deadline = time.monotonic() + 20.0
-        while True:
-            try:
-                platform.get_body_list()
-                break
-            except NoServerError:
-                if time.monotonic() > deadline:
-                    raise
+        until_answered(platform)
         bus, quarter = lcm.LCM(url), 0.0
         for number in range(count):
             bus.publish(*pool[number % len(pool)])

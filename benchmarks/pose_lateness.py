@@ -23,7 +23,7 @@ from pathlib import Path
 
 import lcm
 
-from benchmarks.support import RAPTOR, free_url, process, verdict
+from benchmarks.support import RAPTOR, free_url, process, until_answered, verdict
 from modelserver.client.remote import Platform
 from modelserver.config import load_config
 from modelserver.errors import NoServerError, QueryError
@@ -176,14 +176,7 @@ def main(seconds: float = SECONDS) -> int:
         served, bare = Path(folder) / "served.json", Path(folder) / "bare.json"
         with process("-m", MODULE, "daemon", str(config), str(served), url=url) as server:
             with Platform(url) as platform:
-                deadline = time.monotonic() + 30.0
-                while True:
-                    try:
-                        platform.get_body_list()
-                        break
-                    except NoServerError:
-                        if time.monotonic() > deadline:
-                            raise
+                until_answered(platform)
             lasting = seconds + SETTLING + 10.0
             with (
                 process("-m", MODULE, "feeder", f"{lasting:g}", url=url),

@@ -66,15 +66,20 @@ def daemon(url: str, config: Path) -> Iterator[Platform]:
     """Run the daemon and return a client that it has answered."""
     run = "from mstools.cli import main; main()"
     with process("-c", run, "run", "-c", str(config), "--log-level", "error", url=url), Platform(url) as platform:
-        deadline = time.monotonic() + 20.0
-        while True:
-            try:
-                platform.get_body_list()
-                break
-            except NoServerError:
-                if time.monotonic() > deadline:
-                    raise
+        until_answered(platform)
         yield platform
+
+
+def until_answered(platform: Platform) -> None:
+    """Return when the daemon has answered. Raises NoServerError where it has not within 20 s."""
+    deadline = time.monotonic() + 20.0
+    while True:
+        try:
+            platform.get_body_list()
+            return
+        except NoServerError:
+            if time.monotonic() > deadline:
+                raise
 
 
 def interleaved(rounds: int, calls: int, actions: Mapping[str, Callable[[], object]]) -> dict[str, list[float]]:
