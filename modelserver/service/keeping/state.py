@@ -7,6 +7,7 @@ import logging
 import os
 import threading
 from pathlib import Path
+from uuid import UUID
 
 from modelserver.core import Instant
 from modelserver.messages import Kept, Recalled
@@ -34,10 +35,13 @@ def boot_id() -> str:
     A unit that does not see /proc/sys (ProcSubset=pid) is given it in its environment, which writes it without hyphens.
     """
     try:
-        found = BOOT_ID.read_text(encoding="ascii")
+        return BOOT_ID.read_text(encoding="ascii").strip()[:64]
     except (OSError, UnicodeDecodeError):
-        found = os.environ.get(BOOT_ID_VARIABLE, "")
-    return found.strip().replace("-", "")[:64]
+        pass
+    try:
+        return str(UUID(os.environ.get(BOOT_ID_VARIABLE, "")))
+    except ValueError:
+        return ""
 
 
 def held_words(error: HeldError, directory: Path) -> str:

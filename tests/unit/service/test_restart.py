@@ -258,3 +258,17 @@ def test_given_a_new_name_then_the_directory_is_on_the_disk_too(
 
 def test_given_this_machine_then_its_boot_has_a_name_or_none() -> None:
     assert len(boot_id()) in (0, 36)
+
+
+def test_given_a_unit_that_does_not_see_the_boots_name_then_its_environment_has_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As systemd's specifier %b writes it, without hyphens; the same name as a service outside of the unit reads."""
+    monkeypatch.setattr("modelserver.service.keeping.state.BOOT_ID", tmp_path / "hidden")
+    for given, found in (
+        ("143ed63e8a1544ff9db3048c46529278", "143ed63e-8a15-44ff-9db3-048c46529278"),
+        ("", ""),
+        ("no name", ""),
+    ):
+        monkeypatch.setenv("MODELSERVER_BOOT_ID", given)
+        assert boot_id() == found
