@@ -265,10 +265,10 @@ def test_given_a_unit_that_does_not_see_the_boots_name_then_its_environment_has_
 ) -> None:
     """As systemd's specifier %b writes it, without hyphens; the same name as a service outside of the unit reads."""
     monkeypatch.setattr("modelserver.service.keeping.state.BOOT_ID", tmp_path / "hidden")
-    for given, found in (
+    for named, found in (
         ("143ed63e8a1544ff9db3048c46529278", "143ed63e-8a15-44ff-9db3-048c46529278"),
         ("", ""),
         ("no name", ""),
     ):
-        monkeypatch.setenv("MODELSERVER_BOOT_ID", given)
+        monkeypatch.setenv("MODELSERVER_BOOT_ID", named)
         assert boot_id() == found
