@@ -136,11 +136,48 @@ class GpsConfig(SensorConfig):
 
 
 @dataclass(frozen=True, slots=True)
+class SteeringConfig:
+    """Where the angle of wheels that steer comes from, where they do not measure it themselves.
+
+    channel: where the vehicle controller's status (vehicle_status_t) comes. wheels: names of the wheels in `frames` that
+        steer by its steering_angle.
+    geometry: ackermann, the angle is that of one equivalent wheel in the middle of the axle, and each wheel points along
+        its own circle; parallel, all point along the angle itself.
+    sigma: standard deviation of the angle, radians: play of the gear, and how far geometry is kept.
+    limit: an angle beyond it to either side is damage and is not used, radians.
+    max_age: an older angle is not used, seconds. Without one the wheels measure the speed of their contact points alone.
+    latency: seconds by which the stamps are later than the measurement; subtracted from each stamp.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    wheels: tuple[str, ...]
+    channel: str = "VEHICLE_STATUS"
+    geometry: Literal["ackermann", "parallel"] = "ackermann"
+    sigma: float = 0.035
+    limit: float = 0.7
+    max_age: float = 0.2
+    latency: float = 0.0
+
+    def __post_init__(self) -> None:
+        problems = _channel_problems(self.channel) + _latency_problems(self.latency)
+        if not self.wheels:
+            problems.append("wheels names the wheels that steer, e.g. [front_left, front_right]; got none")
+        problems += [
+            f"{name} is between {low:g} and {high:g}, got {getattr(self, name):g}"
+            for name, low, high in (("sigma", 1e-4, 0.5), ("limit", 0.05, 1.5), ("max_age", 0.01, 10.0))
+            if not low <= getattr(self, name) <= high
+        ]
+        _refuse(problems)
+
+
+@dataclass(frozen=True, slots=True)
 class WheelsConfig:
     """The wheels: the channel they are heard on, and for each wheel's name the frame of its contact point.
 
-    kinematics: how the vehicle turns. skid_steer: its sides roll at different speeds and wheels are dragged sideways;
-        differential: two driven wheels and castors; ackermann: the wheels that steer roll where they point.
+    kinematics: how the vehicle turns. skid_steer: its sides roll at different speeds and wheels are dragged sideways, so
+        only the mean of all is used; differential and ackermann: each wheel rolls where it points, straight ahead or as
+        it is steered. A wheel whose steering angle nothing measures rolls where its contact point goes.
+    steering: where the angle of wheels that steer comes from, where they do not measure it themselves.
     latency: seconds by which the stamps are later than the measurement; subtracted from each stamp.
     """
 
@@ -148,6 +185,7 @@ class WheelsConfig:
     channel: str = "WHEELS"
     frames: dict[str, str] = field(default_factory=dict)
     kinematics: Literal["skid_steer", "differential", "ackermann"] = "differential"
+    steering: SteeringConfig | None = None
     latency: float = 0.0
 
     def __post_init__(self) -> None:
@@ -206,12 +244,16 @@ class SensorsConfig:
         for name in self.aiding:
             if not (0 < len(name) <= MAX_NAME and name.isprintable()):
                 raise ValueError(f"aiding names sources with 1 to {MAX_NAME} printable characters, got {shown(name)}")
-        channels = [
-            each.channel for each in (self.gps, self.imu, self.wheels, self.joints, *self.aiding.values()) if each
-        ]
+        sensors = (self.gps, self.imu, self.wheels, self.steering, self.joints, *self.aiding.values())
+        channels = [each.channel for each in sensors if each]
         twice = {channel for channel in channels if channels.count(channel) > 1}
         if twice:
             raise ValueError(f"each sensor has a channel of its own; {shown(min(twice))} is given twice")
+
+    @property
+    def steering(self) -> SteeringConfig | None:
+        """Where the steering angle comes from; None where nothing measures it beside the wheels."""
+        return self.wheels.steering if self.wheels is not None else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from modelserver.messages import DeviceSample, DriverHealth
+from modelserver.messages import Sample, DriverHealth
 from modelserver.wire.codec import encode
 from msdrivers.registry import CHANNELS
 
@@ -20,7 +20,7 @@ class Publisher:
     channels: Mapping[type, str]
     prefix: str = ""
 
-    def sample(self, sample: DeviceSample) -> None:
+    def sample(self, sample: Sample) -> None:
         """Send a sample."""
         kind = type(sample)
         self.send(f"{self.prefix}{self.channels.get(kind) or CHANNELS[kind]}", encode(sample))

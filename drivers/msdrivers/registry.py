@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from modelserver.errors import ConfigError, Problem, Severity, Source, nearest_names, shown
-from modelserver.messages import DeviceSample, GpsSample, ImuSample, JointsSample, VehicleStatusSample, WheelsSample
+from modelserver.messages import Sample, GpsSample, ImuSample, JointsSample, VehicleStatusSample, WheelsSample
 from msdrivers.faults import FAULTS, Fault
 from msdrivers.line_settings import CanSettings, LineSettings, ModbusSettings, SerialSettings, TcpSettings
 from msdrivers.station import Station
@@ -19,7 +19,7 @@ from msdrivers.station import Station
 if TYPE_CHECKING:
     from msdrivers.protocol.can.database import CanDatabase
 
-CHANNELS: Mapping[type[DeviceSample], str] = {
+CHANNELS: Mapping[type[Sample], str] = {
     GpsSample: "GPS",
     ImuSample: "IMU",
     WheelsSample: "WHEELS",
@@ -69,7 +69,7 @@ class Kind:
 
     name: str
     about: str
-    sample: type[DeviceSample]
+    sample: type[Sample]
     lines: tuple[type[LineSettings], ...]
     load: Callable[[], Made]
     emulate: Callable[[Emulation], Station[Any]]

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from modelserver.messages import DeviceSample, DriverHealth, DriverPhase, VehicleCommand
+from modelserver.messages import Sample, DriverHealth, DriverPhase, VehicleCommand
 from msdrivers.device_clock import DeviceClock
 from msdrivers.links import Link, LinkError, PlayedOutError
 from msdrivers.links.guarded import GuardedLink
@@ -69,7 +69,7 @@ class Runner(Generic[U]):
         link: Link[U],
         settings: RunnerSettings,
         clock: Time,
-        publish: Callable[[DeviceSample], object] = lambda sample: None,
+        publish: Callable[[Sample], object] = lambda sample: None,
         report: Callable[[DriverHealth], object] = lambda health: None,
         rng: random.Random | None = None,
     ):

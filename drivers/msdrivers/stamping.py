@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from modelserver.messages import NAN, DeviceSample
+from modelserver.messages import NAN, Sample
 from msdrivers.device_clock import DeviceClock
 from msdrivers.station import Measured, Now
 
@@ -27,7 +27,7 @@ class Stamper:
         """Host's clock minus the device's at the last stamp, seconds; nan before the first."""
         return self.clock.offset + self._ahead_us * 1e-6
 
-    def stamp(self, measured: Measured, now: Now) -> DeviceSample:
+    def stamp(self, measured: Measured, now: Now) -> Sample:
         """Return the sample with utime and utime_sigma in its header, from the device's time where it has one."""
         header = measured.sample.header
         if header.device_utime:

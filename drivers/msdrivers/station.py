@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
 
-from modelserver.messages import DeviceSample, VehicleCommand
+from modelserver.messages import Sample, VehicleCommand
 
 
 class Now(NamedTuple):
@@ -54,7 +54,7 @@ class Measured:
     device's time goes in steps so long, seconds.
     """
 
-    sample: DeviceSample
+    sample: Sample
     delay: float = 0.0
     delay_sigma: float = 0.0
     tick: float = 1e-6

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import reduce
 from operator import xor
 
-from modelserver.messages import NAN, DeviceSample, SensorHeader, WheelSample, WheelsSample
+from modelserver.messages import NAN, Sample, SensorHeader, WheelSample, WheelsSample
 from msdrivers.faulty import FaultyStation
 from msdrivers.line_settings import SerialSettings, TcpSettings
 from msdrivers.links.fake import FakeLink, FakeTime
@@ -142,7 +142,7 @@ KIND = Kind(
 )
 
 if __name__ == "__main__":
-    time, published = FakeTime(), list[DeviceSample]()
+    time, published = FakeTime(), list[Sample]()
     coming = [(1.1, line(1.23)), (1.2, line(1.24).replace(b"4", b"5", 1)), (1.3, line(1.25))]
     how = RunnerSettings("radar", "speed")
     runner = Runner(SpeedDriver(SpeedSettings("radar")), FakeLink(time, coming), how, time, published.append)

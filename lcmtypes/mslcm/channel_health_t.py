@@ -10,11 +10,11 @@ import struct
 class channel_health_t(object):
     """ Traffic of one source that the daemon hears, or of a sensor of the vehicle file that it never heard. """
 
-    __slots__ = ["channel", "count", "rate_hz", "age", "delay_max", "silent"]
+    __slots__ = ["channel", "count", "rate_hz", "age", "delay_max", "silent", "measured", "used"]
 
-    __typenames__ = ["string", "int64_t", "double", "double", "double", "boolean"]
+    __typenames__ = ["string", "int64_t", "double", "double", "double", "boolean", "int64_t", "int64_t"]
 
-    __dimensions__ = [None, None, None, None, None, None]
+    __dimensions__ = [None, None, None, None, None, None, None, None]
 
     def __init__(self):
         self.channel = ""
@@ -55,6 +55,19 @@ class channel_health_t(object):
         LCM Type: boolean
         """
 
+        self.measured = 0
+        """
+        Measurements of its samples that localization decided on since the start; a sample may hold several, and wheels
+        are looked at every localization.filter.wheel_period. 0 for an inertial unit, which propagates.
+        LCM Type: int64_t
+        """
+
+        self.used = 0
+        """
+        How many of these were used.
+        LCM Type: int64_t
+        """
+
 
     def encode(self):
         buf = BytesIO()
@@ -67,7 +80,7 @@ class channel_health_t(object):
         buf.write(struct.pack('>I', len(__channel_encoded)+1))
         buf.write(__channel_encoded)
         buf.write(b"\0")
-        buf.write(struct.pack(">qdddb", self.count, self.rate_hz, self.age, self.delay_max, self.silent))
+        buf.write(struct.pack(">qdddbqq", self.count, self.rate_hz, self.age, self.delay_max, self.silent, self.measured, self.used))
 
     @staticmethod
     def decode(data: bytes):
@@ -86,12 +99,13 @@ class channel_health_t(object):
         self.channel = buf.read(__channel_len)[:-1].decode('utf-8', 'replace')
         self.count, self.rate_hz, self.age, self.delay_max = struct.unpack(">qddd", buf.read(32))
         self.silent = bool(struct.unpack('b', buf.read(1))[0])
+        self.measured, self.used = struct.unpack(">qq", buf.read(16))
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if channel_health_t in parents: return 0
-        tmphash = (0x31d844d729f511a9) & 0xffffffffffffffff
+        tmphash = (0x76a23989f649dc4c) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -25,7 +25,9 @@ class wheels_t(object):
     FORWARD = 1
     """ The wheel turns forward. """
     UNKNOWN = 2
-    """ The encoder does not tell. """
+    """ The encoder does not measure it; travel and speed have a sign all the same. """
+    UNSIGNED = 3
+    """ Nothing measures it: travel counts up and speed is a magnitude, whichever way the wheel turns. """
 
     def __init__(self):
         self.header = mslcm.sensor_header_t()
@@ -48,7 +50,8 @@ class wheels_t(object):
 
         self.travel = []
         """
-        Way rolled since the source started, metres along the ground, forward positive; going back subtracts.
+        Way rolled since the source started, metres along the ground, forward positive; going back subtracts (UNSIGNED:
+        adds).
         LCM Type: double[num_wheels]
         """
 
@@ -72,14 +75,14 @@ class wheels_t(object):
 
         self.direction = []
         """
-        Direction of rotation as the encoder tells it: one of BACKWARD, STOPPED, FORWARD, UNKNOWN.
+        Direction of rotation as the encoder measures it: one of BACKWARD, STOPPED, FORWARD, UNKNOWN, UNSIGNED.
         LCM Type: int8_t[num_wheels]
         """
 
         self.steering = []
         """
         Steering angle of the wheel about the vehicle's up axis, radians, to the left positive; 0 = not steered,
-        nan = steered but not measured.
+        nan = steered, and not measured by the wheel.
         LCM Type: double[num_wheels]
         """
 

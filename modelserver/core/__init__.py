@@ -59,6 +59,7 @@ from modelserver.messages import (
     SetStateVector,
     SwitchMode,
     Tick,
+    VehicleStatusSample,
     WheelsSample,
 )
 from modelserver.reload import ModelLoaded
@@ -73,6 +74,7 @@ _HANDLERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], Step]]] = {
     GpsSample: sample_taken,
     ImuSample: sample_taken,
     WheelsSample: sample_taken,
+    VehicleStatusSample: sample_taken,
     JointsSample: sample_taken,
     AbsolutePoseSample: sample_taken,
     RelativePoseSample: sample_taken,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from modelserver.core.state import CHANGE_PERIOD_NS, CoreState, Instant, Outputs, Signs, Traffic, silent_after
@@ -21,6 +21,10 @@ from modelserver.version import __version__
 
 JUDGED_FROM = 3
 """Messages of a source from which on it can fall silent: of fewer nobody knows how often they come."""
+
+
+DROPPED_FROM = 20
+"""Measurements of a source dropped in a row from which on that is a notice: 8 s of wheels, 2 s of a receiver."""
 
 
 def told(state: CoreState, gauges: Gauges | None, now: Instant) -> tuple[CoreState, Outputs]:
@@ -58,13 +62,32 @@ def signs(state: CoreState, now: Instant) -> Signs:
     """Return what a report goes out for at once when it changes."""
     silent = tuple([name for name, traffic in state.traffic.items() if _is_silent(name, traffic, now)])
     return Signs(
-        state.run_state, state.pose_invalid, state.model.revision, silent, tuple(_unheard(state)), state.notices
+        state.run_state,
+        state.pose_invalid,
+        state.model.revision,
+        silent,
+        tuple(_unheard(state)),
+        state.notices,
+        tuple([(name, reason) for name, reason, _ in _unused(state, now)]),
     )
 
 
 def _unheard(state: CoreState) -> list[str]:
     """Return the channels of the sensors that were never heard; joints are no sensor of a geometry without any."""
     return [each.channel for each in state.unheard if each.kind is not JointsSample or state.model.joints]
+
+
+def _unused(state: CoreState, now: Instant) -> Iterator[tuple[str, str, str]]:
+    """Yield the sensors that cannot be used: subject of a notice, a word why, and the text."""
+    if state.localizer is not None:
+        for finding in state.localizer.summary(now.utime).findings:
+            if not finding.is_choice:
+                fix = f"; {finding.fix}" if finding.fix else ""
+                yield f"sensors.{finding.sensor} ({finding.reason})", finding.reason, f"{finding.text}{fix}"
+    for name, traffic in state.traffic.items():
+        if traffic.dropped >= DROPPED_FROM and not _is_silent(name, traffic, now):
+            counts = f"{traffic.count} received, {traffic.used} of {traffic.measured} measurements used"
+            yield name, traffic.reason, f"{counts}; the last {traffic.dropped} were dropped: {traffic.reason}"
 
 
 def _is_silent(name: str, traffic: Traffic, now: Instant) -> bool:
@@ -114,7 +137,7 @@ def _report(state: CoreState, now: Instant) -> Health:
         tick_lateness_max=percentile(late, 1.0),
         channels=tuple(sorted(channels, key=lambda each: each.channel)),
         rejected=tuple((channel, reason, count) for (channel, reason), count in sorted(state.rejected.items())),
-        notices=tuple(sorted(state.notices.items())),
+        notices=tuple(sorted({**state.notices, **{name: text for name, _, text in _unused(state, now)}}.items())),
         host=gauges.host,
         pid=gauges.pid,
         requests_queued=gauges.queued,
@@ -146,4 +169,4 @@ def _localization(state: CoreState, estimate: Estimate | None, now: Instant) -> 
 
 def _channel_health(name: str, traffic: Traffic, now: Instant) -> ChannelHealth:
     age = (now.monotonic_ns - traffic.last_ns) * 1e-9
-    return ChannelHealth(name, traffic.count, traffic.rate, age, traffic.told_delay, _is_silent(name, traffic, now))
+    return ChannelHealth(name, traffic.count, traffic.rate, age, traffic.told_delay, _is_silent(name, traffic, now), traffic.measured, traffic.used)

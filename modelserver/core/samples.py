@@ -8,7 +8,18 @@ from typing import Final
 
 from modelserver.core.keeping import KEPT, start_told
 from modelserver.core.requests import answer_parked
-from modelserver.core.state import DEGRADED, RUNNING, STARTING, CoreState, Instant, Step, counted, heard, traffic_noted
+from modelserver.core.state import (
+    DEGRADED,
+    RUNNING,
+    STARTING,
+    CoreState,
+    Instant,
+    Step,
+    counted,
+    decided,
+    heard,
+    traffic_noted,
+)
 from modelserver.geometry import names
 from modelserver.localization.interface import Localizer
 from modelserver.messages import (
@@ -105,6 +116,7 @@ def localized(state: CoreState, before: Localizer, sample: Sample | SwitchMode, 
             outputs.append(note)
         else:
             decisions.append(note)
+            state = decided(state, note)
             if note.kind == KEPT:
                 state, said = start_told(state, note, now)
                 outputs.extend(said)

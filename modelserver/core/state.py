@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, Literal, NamedTuple, TypeAlias
 
@@ -15,6 +15,7 @@ from modelserver.joints import Joints
 from modelserver.localization.interface import Localizer
 from modelserver.messages import (
     NAN,
+    Decision,
     Gauges,
     GetExplanation,
     GetHTransform,
@@ -25,6 +26,7 @@ from modelserver.messages import (
     Output,
     Rejected,
     Sample,
+    Verdict,
 )
 from modelserver.platform import PlatformView
 
@@ -39,6 +41,9 @@ SILENT_LEAST_S: Final = 1.0
 
 INTERVAL_GAIN: Final = 0.1
 """By how much each interval counts for the usual one."""
+
+UNCOUNTED: Final = frozenset(("inertial", "steering", "imu_tilt", "imu_yaw", "magnetometer"))
+"""Kinds of measurements that are not counted as used or dropped: not each one is decided on."""
 
 CHANGE_PERIOD_NS: Final = 100_000_000
 """Nanoseconds between two looks for what a health report goes out for at once: changes to and fro cannot flood."""
@@ -106,6 +111,9 @@ class Expected(NamedTuple):
 class Traffic:
     """Messages of one source: how many, the last one's arrival, and how many there were at the last whole report.
 
+    `measured` counts the measurements of its samples that localization decided on, `used` those that it used, `dropped`
+    those dropped in a row since, and `reason` is the last one's.
+
     `interval` is the usual time between two, seconds; 0 = not known yet. `delay` is the greatest from the host's
     receipt to handling since the last whole report, seconds. `rate` and `told_delay` are what that report said.
     """
@@ -117,10 +125,17 @@ class Traffic:
     delay: float = NAN
     rate: float = 0.0
     told_delay: float = NAN
+    measured: int = 0
+    used: int = 0
+    dropped: int = 0
+    reason: str = ""
 
 
 class Signs(NamedTuple):
-    """What a report goes out for at once when it changes. `silent` names sources, `unheard` channels."""
+    """What a report goes out for at once when it changes. `silent` names sources, `unheard` channels.
+
+    `unused` are sensors that cannot be used, each with a word why.
+    """
 
     run_state: int = STARTING
     invalid: int = 0
@@ -128,6 +143,7 @@ class Signs(NamedTuple):
     silent: tuple[str, ...] = ()
     unheard: tuple[str, ...] = ()
     notices: Mapping[str, str] = MappingProxyType({})
+    unused: tuple[tuple[str, str], ...] = ()
 
 
 class Watch(NamedTuple):
@@ -257,7 +273,39 @@ def traffic_noted(state: CoreState, source: str, host_utime: int, now: Instant) 
         took = (now.utime - host_utime) * 1e-6
         # a nan fails the comparison
         delay = delay if delay >= took else took
-    updated = Traffic(known.count + 1, now.monotonic_ns, known.reported, interval, delay, known.rate, known.told_delay)
+    updated = Traffic(
+        known.count + 1,
+        now.monotonic_ns,
+        known.reported,
+        interval,
+        delay,
+        known.rate,
+        known.told_delay,
+        known.measured,
+        known.used,
+        known.dropped,
+        known.reason,
+    )
+    return state._replace(traffic={**state.traffic, source: updated})
+
+
+def decided(state: CoreState, decision: Decision) -> CoreState:
+    """Return the state with a decision of localization counted for its source.
+
+    An inertial unit's measurements are not counted: of those that are used for propagation nothing is reported.
+    """
+    source = f"sensor:{decision.source}"
+    known = state.traffic.get(source)
+    if known is None or decision.kind in UNCOUNTED:
+        return state
+    dropped = decision.verdict is Verdict.REJECTED
+    updated = replace(
+        known,
+        measured=known.measured + 1,
+        used=known.used + (decision.verdict in (Verdict.USED, Verdict.TOOK_UP)),
+        dropped=known.dropped + 1 if dropped else 0,
+        reason=decision.reason if dropped else "",
+    )
     return state._replace(traffic={**state.traffic, source: updated})
 
 

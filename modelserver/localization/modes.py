@@ -111,7 +111,10 @@ class ModeLocalizer:
 
     def summary(self, utime: int) -> LocalizerSummary:
         """Return what the localizer at work is about."""
-        return self.active.summary(utime)
+        found = self.active.summary(utime)
+        if isinstance(self.active, RawLocalizer):
+            found = found._replace(findings=self.makings.setup.findings[Mode.RAW])
+        return found
 
     def _continued(self, estimate: Estimate) -> Estimate:
         if not self.epochs:

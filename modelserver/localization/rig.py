@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
@@ -14,13 +15,55 @@ from modelserver.spatial.so3 import Vector3
 
 Kinematics: TypeAlias = Literal["skid_steer", "differential", "ackermann"]
 
+SteeringGeometry: TypeAlias = Literal["ackermann", "parallel"]
+
+
+@dataclass(frozen=True, slots=True)
+class SteeringSignal:
+    """The steering angle of an axle as the vehicle controller measures it (VEHICLE_STATUS.steering_angle).
+
+    `wheels` are the wheels that steer by it. `geometry`: `ackermann`, the angle is that of one equivalent wheel in the
+    middle of the axle and each wheel points along its own circle; `parallel`, all wheels point along the angle itself.
+    `sigma` and `limit` in radians: beyond the limit an angle is damage. `max_age` in seconds: an older one is not used.
+    """
+
+    wheels: tuple[str, ...]
+    geometry: SteeringGeometry = "ackermann"
+    sigma: float = 0.035
+    limit: float = 0.7
+    max_age: float = 0.2
+
+    def wheel_angles(self, angle: float, contacts: Mapping[str, Vector3]) -> dict[str, float]:
+        """Return each wheel's angle, rad, from the contact points in the rolling frame, m.
+
+        The curvature of the rolling frame's path is tan(angle) / wheelbase; a wheel at (x, y) rolls along the circle
+        about (0, 1 / curvature), at atan2(curvature x, 1 - curvature y).
+        """
+        known = [name for name in self.wheels if name in contacts]
+        if self.geometry == "parallel" or not known:
+            return dict.fromkeys(known, angle)
+        wheelbase = self.wheelbase(contacts)
+        if not wheelbase:
+            return {}
+        curvature = math.tan(angle) / wheelbase
+        return {
+            name: math.atan2(curvature * contacts[name][0], 1.0 - curvature * contacts[name][1]) for name in known
+        }
+
+    def wheelbase(self, contacts: Mapping[str, Vector3]) -> float:
+        """Return how far the steered axle is ahead of the rolling frame, m; 0 where it is not known."""
+        ahead = [contacts[name][0] for name in self.wheels if name in contacts]
+        return sum(ahead) / len(ahead) if ahead else 0.0
+
 
 @dataclass(frozen=True)
 class Rig:
     """The vehicle's frames as the filter needs them. The body's axes are those of `rolling_frame`.
 
     `rolling_frame` moves along its own x axis; `imu_frame`, `gps_frame` and `second_antenna_frame` are full names,
-    empty where there is none; `wheel_frames` has the frame of each wheel's contact point by the wheel's name.
+    empty where there is none; `wheel_frames` has the frame of each wheel's contact point by the wheel's name. `steering` is
+    the steering angle that the vehicle controller measures, where the vehicle file names one; `has_wheels` is whether it
+    names wheels at all, with frames or without.
     Raises QueryError for a frame that the model does not have or join to the rolling frame.
     """
 
@@ -32,6 +75,8 @@ class Rig:
     wheel_frames: Mapping[str, str] = field(default_factory=dict)
     kinematics: Kinematics = "differential"
     magnetometer: MagnetometerCalibration = field(default_factory=MagnetometerCalibration)
+    steering: SteeringSignal | None = None
+    has_wheels: bool = False
 
     def __post_init__(self) -> None:
         imu = self.pose(self.imu_frame).xyz if self.imu_frame else (0.0, 0.0, 0.0)

@@ -43,11 +43,12 @@ from modelserver.messages.flags import (
     OrientationReference,
     Policy,
     Quality,
+    VehicleMode,
     YawSource,
 )
 from modelserver.messages.health import ChannelHealth, Gauges, Health, LocalizationHealth
 from modelserver.messages.kept import Kept, KeptPose, Recalled
-from modelserver.messages.navigation import LocalizerSummary, Mode, NavigationState, Phase
+from modelserver.messages.navigation import LocalizerSummary, Mode, NavigationState, Phase, SensorFinding
 from modelserver.messages.replies import (
     Acknowledgement,
     EdgeReport,
@@ -97,11 +98,12 @@ from modelserver.messages.samples import (
     RelativePoseSample,
     Sample,
     SensorHeader,
+    VehicleStatusSample,
     WheelSample,
     WheelsSample,
 )
 from modelserver.messages.signed import MAC_BYTES, MAX_PAYLOAD, Envelope
-from modelserver.messages.vehicle import DeviceSample, VehicleCommand, VehicleMode, VehicleStatusSample
+from modelserver.messages.vehicle import VehicleCommand
 
 __all__ = [
     "CHANNEL_OF",
@@ -119,7 +121,6 @@ __all__ = [
     "Commanded",
     "Decision",
     "Denied",
-    "DeviceSample",
     "Direction",
     "DriverHealth",
     "DriverPhase",
@@ -187,6 +188,7 @@ __all__ = [
     "RequestHeader",
     "Sample",
     "SendReply",
+    "SensorFinding",
     "SensorHeader",
     "SetHTransform",
     "SetStateVector",

@@ -43,6 +43,17 @@ class Direction(IntEnum):
     STOPPED = 0
     FORWARD = 1
     UNKNOWN = 2
+    UNSIGNED = 3
+
+
+class VehicleMode(IntEnum):
+    """Who drives; the numbers are those of the wire, MODE_UNKNOWN and so on."""
+
+    UNKNOWN = 0
+    MANUAL = 1
+    AUTONOMOUS = 2
+    EMERGENCY_STOP = 3
+    FAULT = 4
 
 
 class Policy(IntEnum):

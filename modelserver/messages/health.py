@@ -33,6 +33,8 @@ class ChannelHealth:
     age: float
     delay_max: float = NAN
     silent: bool = False
+    measured: int = 0
+    used: int = 0
 
 
 @dataclass(frozen=True, slots=True)

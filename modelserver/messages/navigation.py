@@ -37,13 +37,33 @@ class Phase(IntEnum):
     """Known in the world."""
 
 
+class SensorFinding(NamedTuple):
+    """Why a configured sensor cannot be used, in whole or in part.
+
+    `element` is the key of the vehicle file that it is about, `reason` a word for programs, `text` what is wrong and what
+    follows, `fix` what to do. `sensor` is the sensor's key under `sensors`. `is_choice`: the vehicle file asks for it,
+    e.g. by its mode.
+    """
+
+    sensor: str
+    reason: str
+    element: str
+    text: str
+    fix: str = ""
+    is_choice: bool = False
+
+
 class LocalizerSummary(NamedTuple):
-    """What a localizer is about: `phase` is None where no filter is at work, `fix_utime` 0 before a fix was used."""
+    """The state of a localizer in short: `phase` is None in raw mode, `fix_utime` 0 before a fix was used.
+
+    `findings` are the configured sensors that cannot be used now, and why.
+    """
 
     mode: Mode
     phase: Phase | None = None
     standing: bool = False
     fix_utime: int = 0
+    findings: tuple[SensorFinding, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from modelserver.messages.flags import NAN, Direction, FixType, OrientationReference, YawSource
+from modelserver.messages.flags import NAN, Direction, FixType, OrientationReference, VehicleMode, YawSource
 from modelserver.spatial.so3 import Quaternion, Vector3
 
 Matrix3: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
@@ -153,6 +153,27 @@ class RangeSample:
     sigma: float = NAN
 
 
+@dataclass(frozen=True, slots=True)
+class VehicleStatusSample:
+    """What the vehicle controller says of itself; see vehicle_status_t."""
+
+    header: SensorHeader
+    mode: VehicleMode = VehicleMode.UNKNOWN
+    forward_speed: float = NAN
+    steering_angle: float = NAN
+    supply_voltage: float = NAN
+    engine_speed: float = NAN
+    fault_bits: int = 0
+    commands_refused: int = 0
+
+
 Sample: TypeAlias = (
-    GpsSample | ImuSample | WheelsSample | JointsSample | AbsolutePoseSample | RelativePoseSample | RangeSample
+    GpsSample
+    | ImuSample
+    | WheelsSample
+    | VehicleStatusSample
+    | JointsSample
+    | AbsolutePoseSample
+    | RelativePoseSample
+    | RangeSample
 )

@@ -13,7 +13,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from modelserver import core
-from modelserver.config import MAKE_KEY, GpsConfig, JointsConfig, SensorConfig, VehicleConfig, WheelsConfig, with_lines
+from modelserver.config import (
+    MAKE_KEY,
+    GpsConfig,
+    JointsConfig,
+    SensorConfig,
+    SteeringConfig,
+    VehicleConfig,
+    WheelsConfig,
+    with_lines,
+)
 from modelserver.core import CoreSettings, CoreState, Expected, Instant
 from modelserver.errors import ConfigError, GeometryError, KeyFileError, Problem, QueryError, Severity, Source, shown
 from modelserver.formats import load_model
@@ -21,7 +30,8 @@ from modelserver.geodesy import GeodesyError, make_origin
 from modelserver.geometry import Model
 from modelserver.keys import read_keys
 from modelserver.localization.mounts import Mounts
-from modelserver.localization.rig import Rig
+from modelserver.localization.findings import find_unusable
+from modelserver.localization.rig import Rig, SteeringSignal
 from modelserver.messages import (
     AbsolutePoseSample,
     GpsSample,
@@ -35,7 +45,9 @@ from modelserver.messages import (
     Recalled,
     RelativePoseSample,
     Sample,
+    SensorFinding,
     SwitchMode,
+    VehicleStatusSample,
     WheelsSample,
 )
 from modelserver.reload import ModelLoaded
@@ -138,6 +150,10 @@ class Vehicle:
 
         return Makings(Setup(self.rig, self.config.localization.filter), self.config.localization.raw, self.mounts)
 
+    def unusable(self) -> tuple[SensorFinding, ...]:
+        """Return the configured sensors that localization cannot use in the mode it starts in, and why."""
+        return () if self.rig is None else find_unusable(self.rig, self.config.localization.first_mode)
+
     def gate(self, started_ns: int, file: str = "") -> Gate:
         """Return what opens signed commands. Raises ConfigError where the key file cannot be used."""
         config = self.config
@@ -206,10 +222,13 @@ class Vehicle:
     def expected(self) -> tuple[Expected, ...]:
         """Return the sensors that the vehicle file names, with the channels they are to be heard on."""
         prefix, sensors = self.config.lcm.channel_prefix, self.config.sensors
-        named: list[tuple[GpsConfig | SensorConfig | WheelsConfig | JointsConfig | None, type[Sample]]] = [
+        named: list[
+            tuple[GpsConfig | SensorConfig | WheelsConfig | SteeringConfig | JointsConfig | None, type[Sample]]
+        ] = [
             (sensors.gps, GpsSample),
             (sensors.imu, ImuSample),
             (sensors.wheels, WheelsSample),
+            (sensors.steering, VehicleStatusSample),
             (sensors.joints, JointsSample),
         ]
         return (
@@ -235,6 +254,7 @@ class Vehicle:
                 (sensors.gps, "gps_t"),
                 (sensors.imu, "imu_t"),
                 (sensors.wheels, "wheels_t"),
+                (sensors.steering, "vehicle_status_t"),
                 (sensors.joints if model.joints else None, "joints_t"),
                 *((each, f"{each.type}_t") for each in sensors.aiding.values()),
             )
@@ -317,7 +337,16 @@ def _rig(config: VehicleConfig, model: Model) -> Rig | None:
         wheels.frames if wheels is not None else {},
         wheels.kinematics if wheels is not None else "differential",
         config.localization.magnetometer,
+        _steering_signal(wheels),
+        wheels is not None,
     )
+
+
+def _steering_signal(wheels: WheelsConfig | None) -> SteeringSignal | None:
+    if wheels is None or wheels.steering is None:
+        return None
+    steering = wheels.steering
+    return SteeringSignal(steering.wheels, steering.geometry, steering.sigma, steering.limit, steering.max_age)
 
 
 def _channel_problems(config: VehicleConfig, file: str) -> list[Problem]:
@@ -330,6 +359,7 @@ def _channel_problems(config: VehicleConfig, file: str) -> list[Problem]:
             ("gps", sensors.gps),
             ("imu", sensors.imu),
             ("wheels", sensors.wheels),
+            ("wheels.steering", sensors.steering),
             ("joints", sensors.joints),
             *((f"aiding.{name}", each) for name, each in sensors.aiding.items()),
         )

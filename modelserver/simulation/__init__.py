@@ -32,7 +32,7 @@ from modelserver.simulation.stamps import Timing
 from modelserver.simulation.terrain import Terrain, Wave
 from modelserver.simulation.trajectory import Drive, Motion, Phase, Trajectory
 from modelserver.simulation.triad import TriadModel
-from modelserver.simulation.wheels import WheelsModel
+from modelserver.simulation.wheels import StatusModel, WheelsModel
 
 __all__ = [
     "AbsolutePoseModel",
@@ -49,6 +49,7 @@ __all__ = [
     "Ride",
     "SideSlip",
     "Simulation",
+    "StatusModel",
     "Terrain",
     "Timing",
     "Trajectory",

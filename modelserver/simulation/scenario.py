@@ -15,6 +15,7 @@ from modelserver.messages import (
     Origin,
     RangeSample,
     RelativePoseSample,
+    VehicleStatusSample,
     WheelsSample,
 )
 from modelserver.simulation import aiding, gps, imu, rigid, wheels
@@ -25,14 +26,22 @@ from modelserver.simulation.ride import ride
 from modelserver.simulation.side_slip import SideSlip
 from modelserver.simulation.terrain import Terrain
 from modelserver.simulation.trajectory import Drive, Trajectory
-from modelserver.simulation.wheels import WheelsModel
+from modelserver.simulation.wheels import StatusModel, WheelsModel
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Vector3, conjugate, rotate
 
 START_UTIME = 1_750_000_000_000_000
 """When a simulation starts unless told otherwise: a whole second in June 2025."""
 
-Event = GpsSample | ImuSample | WheelsSample | AbsolutePoseSample | RelativePoseSample | RangeSample
+Event = (
+    GpsSample
+    | ImuSample
+    | WheelsSample
+    | VehicleStatusSample
+    | AbsolutePoseSample
+    | RelativePoseSample
+    | RangeSample
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +92,7 @@ class Simulation:
         gps_model: GpsModel | None = None,
         imu_model: ImuModel | None = None,
         wheels_model: WheelsModel | None = None,
+        status_model: StatusModel | None = None,
         terrain: Terrain | None = None,
         side_slip: SideSlip | None = None,
         second_gps_frame: str | None = None,
@@ -98,6 +108,8 @@ class Simulation:
 
         `second_gps_frame` is that of a second antenna. `pose_frame` is seen from outside, `odometry_frame` sees its
         own way, `range_frame` hears the `beacons`, places in World:ENU by name.
+
+        `status_model` is that of a vehicle controller; without it there is none.
 
         `wheel_frames` has the frame of each wheel's contact point by the wheel's name. `origin` is that of the
         world frames and of the drive's east and north. Raises UnknownBodyError, UnknownFrameError or
@@ -122,6 +134,8 @@ class Simulation:
         if wheel_frames:
             contacts = {name: mounted(frame).xyz for name, frame in wheel_frames.items()}
             sensors.append(wheels.turns(wheels_model or WheelsModel(), drive, contacts, start_utime, seed, "wheels"))
+        if status_model is not None:
+            sensors.append(wheels.statuses(status_model, drive, start_utime, seed, "vehicle"))
         if gps_frame is not None:
             second = mounted(second_gps_frame).xyz if second_gps_frame is not None else None
             sensors.append(gps.fixes(gps_model or GpsModel(), drive, mounted(gps_frame), *common, "gps", second))

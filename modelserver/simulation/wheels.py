@@ -1,4 +1,4 @@
-"""Wheel encoders: way rolled, speed and direction of each wheel at its contact point."""
+"""Wheel encoders: way rolled, speed and direction of each wheel at its contact point; and the vehicle controller."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from modelserver.messages import WheelsSample
+from modelserver.messages import VehicleMode, VehicleStatusSample, WheelsSample
 from modelserver.simulation.encoder import Encoder, EncoderModel
 from modelserver.simulation.noise import Noise
 from modelserver.simulation.stamps import Timing, headers
@@ -139,6 +139,33 @@ class _Rolling:
                 ways[name] = along - model.track_factor * contact[1] * turned + contact[2] * pitched
         self.before, self.t_before = motion, t
         return motion, ways
+
+
+@dataclass(frozen=True, slots=True)
+class StatusModel:
+    """What the vehicle controller measures. `wheelbase`: meters from the rolling frame ahead to the steered axle.
+
+    angle_sigma: standard deviation of the steering angle's noise, radians. angle_error: what it is off by, radians.
+    """
+
+    wheelbase: float
+    timing: Timing = Timing(20.0, latency=0.01, jitter=0.002)
+    angle_sigma: float = 0.002
+    angle_error: float = 0.0
+
+
+def statuses(
+    model: StatusModel, drive: Drive, start_utime: int, seed: int, source: str
+) -> Iterator[VehicleStatusSample]:
+    """Yield the controller's samples, for ever: forward speed, and the steering angle of the equivalent front wheel."""
+    noise = Noise(seed, f"status/{source}")
+    stamps = headers(
+        model.timing, start_utime, start_utime - 1_000_000, source, Noise(seed, f"status/{source}/arrival")
+    )
+    for header in stamps:
+        motion = drive.at((header.utime - start_utime) * 1e-6)
+        angle = math.atan(motion.curvature * model.wheelbase) + model.angle_error + noise.normal(model.angle_sigma)
+        yield VehicleStatusSample(header, VehicleMode.AUTONOMOUS, motion.speed, angle)
 
 
 def _rates(motion: Motion) -> Vector3:

@@ -35,7 +35,7 @@ _PLAIN = (
 
 _LOCALIZATION = ("standing", "horizontal_bound", "heading_bound", "seconds_to_limit", "fix_age")
 
-_CHANNEL = ("channel", "count", "rate_hz", "age", "delay_max", "silent")
+_CHANNEL = ("channel", "count", "rate_hz", "age", "delay_max", "silent", "measured", "used")
 
 NONE = -1
 """On the wire: no mode, no phase."""

@@ -21,6 +21,7 @@ from mstools.output import counted, print_problem, safe, size_of
 
 if TYPE_CHECKING:
     from modelserver.config import VehicleConfig
+    from modelserver.service.daemon import Vehicle
 
 
 def command(
@@ -93,7 +94,7 @@ def checked_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tupl
         vehicle = load_vehicle(config, file, strict)
         vehicle.gate(0, file)
         model = vehicle.model
-        more = model.problems
+        more = (*model.problems, *with_lines(_unusable(vehicle, file), file))
     except (ConfigError, GeometryError) as error:
         more = error.problems
     more += drivers_problems(config, file, model)
@@ -112,15 +113,14 @@ def _worth_knowing(config: VehicleConfig, file: str) -> Iterator[Problem]:
     if sensors.gps is None and sensors.imu is None and sensors.wheels is None:
         words = "no sensors: there will never be a pose"
         yield Problem(Severity.NOTE, words, Source(file, element="sensors"), "see docs/vehicle-file.md")
-    wheels = sensors.wheels
-    if wheels is not None and not wheels.frames:
-        words = "frames names no wheels, so nothing of them is used"
-        fix = "write frames: {NAME: BODY:FRAME} with the names that the driver gives"
-        yield Problem(Severity.WARNING, words, Source(file, element="sensors.wheels.frames"), fix)
-    elif wheels is not None and wheels.kinematics == "ackermann" and len(wheels.frames) == 1:
-        words = "ackermann with a single wheel: the wheels tell no turn"
-        fix = "name the wheels of the other side and axle too"
-        yield Problem(Severity.WARNING, words, Source(file, element="sensors.wheels.frames"), fix)
+
+
+def _unusable(vehicle: Vehicle, file: str) -> Iterator[Problem]:
+    """Yield the sensors that localization cannot use; those that the vehicle file leaves out on purpose as notes."""
+    for found in vehicle.unusable():
+        severity = Severity.NOTE if found.is_choice else Severity.WARNING
+        text = f"sensors.{found.sensor}: {found.text}" if found.is_choice else found.text
+        yield Problem(severity, text, Source(file, element=found.element), found.fix)
 
 
 def _is_unclean(problems: tuple[Problem, ...]) -> bool:

@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from modelserver.errors import NoServerError, QueryError
-from modelserver.messages import DriverHealth, DriverPhase, Invalid, PoseAnswer
+from modelserver.messages import DriverHealth, DriverPhase, Health, Invalid, PoseAnswer
 from modelserver.spatial.pose import Pose
 from modelserver.wire.provider import open_lcm, resolve_url, take_message
 from mstools.demo_children import MODELSERVER, Children, DemoError
@@ -131,6 +131,8 @@ def show(lines: Lines, seconds: float, children: Children) -> None:
                 "Run it again with --verbose; a busy machine may need --seconds 20"
             )
         say(f"   {received} poses in {seconds:g} s, {len(valid)} of them valid")
+        for text in usage(ear.service):
+            say(f"   {text}")
 
         say("\n5. Where was the camera in the world a second ago?")
         at = valid[-1].transformation.utime - 1_000_000
@@ -151,8 +153,24 @@ def show(lines: Lines, seconds: float, children: Children) -> None:
     say(f"\nDone. Next: modelserver run -c {vehicle_file()}, and in another shell: modelserver bodies")
 
 
+def usage(service: Health | None) -> list[str]:
+    """Return for each sensor how many of its measurements localization used, and what it says of unusable ones.
+
+    Raises DemoError where wheels were measured and none was used: the Raptor's front wheels steer, and must be used.
+    """
+    if service is None:
+        raise DemoError("no health report came on MODELSERVER_HEALTH; run the demo with --verbose")
+    counts = [
+        (each.channel.removeprefix("sensor:"), each.used, each.measured) for each in service.channels if each.measured
+    ]
+    notices = [f"{subject}: {text}" for subject, text in service.notices if subject.startswith("sensor")]
+    if any(name == "wheels" and not used for name, used, _ in counts):
+        raise DemoError(f"no measurement of the wheels was used: {'; '.join(notices) or 'see --verbose'}")
+    return [f"{name}: {used} of {measured} measurements used" for name, used, measured in counts] + notices
+
+
 class Ear:
-    """Hears the poses, and how each driver is."""
+    """Receives the poses, and the health reports of the service and the drivers."""
 
     def __init__(self, url: str, prefix: str):
         from modelserver.wire.channels import literal
@@ -161,15 +179,21 @@ class Ear:
         self.poses: list[PoseAnswer] = []
         self.health: dict[str, DriverHealth] = {}
         """The last report of each driver by its name."""
+        self.service: Health | None = None
+        """The last report of the service."""
         self.bus = open_lcm(resolve_url(url))
 
         def report(_: str, data: bytes) -> None:
             health: DriverHealth = decode("driver_health_t", data)
             self.health[health.source] = health
 
+        def service(_: str, data: bytes) -> None:
+            self.service = decode("health_t", data)
+
         for channel, hear in (
             ("POSE", lambda _, data: self.poses.append(decode("pose_transform_t", data))),
             ("DRIVER_HEALTH", report),
+            ("MODELSERVER_HEALTH", service),
         ):
             self.bus.subscribe(literal(f"{prefix}{channel}"), hear).set_queue_capacity(0)
 

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from modelserver.config import VehicleConfig
 from modelserver.formats import load_model
 from modelserver.geodesy import origin_at
-from modelserver.messages import DeviceSample, GpsSample, ImuSample, WheelsSample
-from modelserver.simulation import GpsModel, ImuModel, Simulation, Trajectory, WheelsModel, figures
+from modelserver.geometry import Model
+from modelserver.messages import GpsSample, ImuSample, Sample, VehicleStatusSample, WheelsSample
+from modelserver.simulation import GpsModel, ImuModel, Simulation, StatusModel, Timing, Trajectory, WheelsModel, figures
 from modelserver.simulation.trajectory import Phase
 
 SUFFIELD = (50.27, -111.18, 700.0)
@@ -17,6 +18,12 @@ SUFFIELD = (50.27, -111.18, 700.0)
 
 STAND_SECONDS = 3.0
 """Levelling takes two seconds at rest, and a moment until rest is seen."""
+
+WHEELS_HZ = 100.0
+"""How often wheels and the vehicle controller measure."""
+
+TYPICAL_WHEELBASE = 1.5
+"""Meters; for a vehicle whose file does not name the wheels that steer."""
 
 LAP_SECONDS = 25.0
 """An eight takes a little longer."""
@@ -28,15 +35,19 @@ def simulation(
     seconds: float,
     scenario: str = "eight",
     seed: int = 1,
-    sensors: Sequence[type[DeviceSample]] = (),
+    sensors: Sequence[type[Sample]] = (),
     gps_model: GpsModel | None = None,
     imu_model: ImuModel | None = None,
     wheels_model: WheelsModel | None = None,
 ) -> Simulation:
-    """Return a drive of the vehicle for `seconds` or more, and what those of its sensors say that give `sensors`."""
+    """Return a drive of the vehicle for `seconds` or more, and what those of its sensors measure that give `sensors`."""
     gps, imu, wheels = config.sensors.gps, config.sensors.imu, config.sensors.wheels
+    model = load_model(config.geometry, variables=config.variables)
+    status = None
+    if VehicleStatusSample in sensors:
+        status = StatusModel(_wheelbase(config, model), wheels_model.timing if wheels_model else Timing(WHEELS_HZ))
     return Simulation(
-        load_model(config.geometry, variables=config.variables),
+        model,
         config.base_frame,
         Trajectory(_phases(scenario, seconds, seed), yaw=0.5),
         origin_at(*SUFFIELD),
@@ -49,7 +60,19 @@ def simulation(
         gps_model=gps_model,
         imu_model=imu_model,
         wheels_model=wheels_model,
+        status_model=status,
     )
+
+
+def _wheelbase(config: VehicleConfig, model: Model) -> float:
+    """Return how far ahead of the rolling frame the steered axle is, m; `TYPICAL_WHEELBASE` where none is named."""
+    wheels = config.sensors.wheels
+    if wheels is None or wheels.steering is None:
+        return TYPICAL_WHEELBASE
+    rolling = config.rolling_frame or config.base_frame
+    steered = [wheels.frames[name] for name in wheels.steering.wheels if name in wheels.frames]
+    ahead = [model.get_transformation(frame, rolling).pose.xyz[0] for frame in steered]
+    return sum(ahead) / len(ahead) if ahead else TYPICAL_WHEELBASE
 
 
 def _phases(scenario: str, seconds: float, seed: int) -> tuple[Phase, ...]:

@@ -15,7 +15,7 @@ from mstools.driver import channels_of
 
 if TYPE_CHECKING:
     from modelserver.config import VehicleConfig
-    from modelserver.messages import DeviceSample
+    from modelserver.messages import Sample
     from modelserver.spatial.so3 import Vector3
     from msdrivers.settings import DriverSettings
 
@@ -29,8 +29,6 @@ LEAD_US = 200_000
 
 GPS_HZ = 4.0
 """Where the driver's settings say nothing of a rate."""
-
-WHEELS_HZ = 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +46,7 @@ class Wanted:
     own_field: Vector3
 
 
-def samples_of(vehicle: VehicleConfig, settings: DriverSettings, wanted: Wanted) -> Iterator[DeviceSample]:
+def samples_of(vehicle: VehicleConfig, settings: DriverSettings, wanted: Wanted) -> Iterator[Sample]:
     """Return what the emulator of a driver's device measures; its end is told in the log.
 
     Raises ModelServerError where that is nothing: a log without the channel, a drive that was over before now.
@@ -81,13 +79,13 @@ def samples_of(vehicle: VehicleConfig, settings: DriverSettings, wanted: Wanted)
     return told_end(samples, settings.name, what)
 
 
-def told_end(samples: Iterator[DeviceSample], name: str, what: str) -> Iterator[DeviceSample]:
+def told_end(samples: Iterator[Sample], name: str, what: str) -> Iterator[Sample]:
     """Yield samples, and say so when there are no more: the emulator speaks on, but measures nothing."""
     yield from samples
     log.warning("%s: %s is over, nothing more is measured", name, what)
 
 
-def logged(file: Path, vehicle: VehicleConfig, settings: DriverSettings, start_utime: int) -> Iterator[DeviceSample]:
+def logged(file: Path, vehicle: VehicleConfig, settings: DriverSettings, start_utime: int) -> Iterator[Sample]:
     """Yield the samples of a driver's channel in a log, their stamps moved so that the first is at `start_utime`.
 
     Raises ModelServerError where the log has none of that channel.
@@ -105,7 +103,7 @@ def logged(file: Path, vehicle: VehicleConfig, settings: DriverSettings, start_u
         for event in events:
             if event.channel != channel:
                 continue
-            sample: DeviceSample = decode(type_name, event.data)
+            sample: Sample = decode(type_name, event.data)
             header = sample.header
             shift = start_utime - header.utime if shift is None else shift
             host = header.host_utime + shift if header.host_utime else 0
@@ -122,23 +120,23 @@ def simulated(
     scenario: str,
     seed: int,
     own_field: Vector3 = (0.0, 0.0, 0.0),
-) -> Iterator[DeviceSample]:
+) -> Iterator[Sample]:
     """Return what the sensor of a driver measures on a simulated drive that begins at `start_utime`.
 
     `own_field`: what the vehicle adds to the earth's magnetic field, tesla along the sensor's axes. A receiver measures
-    at the rate of its driver's settings, wheels at 100 Hz. A vehicle controller has the speed of the wheels. Raises
-    ModelServerError for a sensor that has no place.
+    at the rate of its driver's settings, wheels and the vehicle controller at 100 Hz. The wheels steer that the vehicle
+    file or the driver's settings say steer. Raises ModelServerError for a sensor that has no place.
     """
     from modelserver.messages import GpsSample, ImuSample, VehicleStatusSample, WheelsSample
     from modelserver.simulation import GpsModel, ImuModel, MagnetometerModel, Timing, WheelsModel
-    from mstools.demo_drive import simulation
+    from mstools.demo_drive import WHEELS_HZ, simulation
 
     sensors = vehicle.sensors
     needed = {
         GpsSample: (GpsSample, "gps", sensors.gps),
         ImuSample: (ImuSample, "imu", sensors.imu),
         WheelsSample: (WheelsSample, "wheels", sensors.wheels),
-        VehicleStatusSample: (WheelsSample, "wheels", sensors.wheels),
+        VehicleStatusSample: (VehicleStatusSample, "wheels", sensors.wheels),
     }
     if settings.kind.sample not in needed:
         # it does as it is commanded
@@ -146,6 +144,9 @@ def simulated(
     kind, name, sensor = needed[settings.kind.sample]
     if sensor is None:
         raise ModelServerError(f"the vehicle file says nothing of sensors.{name}: where is the sensor?")
+    steered = sensors.steering.wheels if sensors.steering is not None else ()
+    mapped = getattr(settings.station, "wheels", {})
+    wheels = [name for name, wheel in mapped.items() if wheel.steers or wheel.steering is not None]
     run = simulation(
         vehicle,
         start_utime,
@@ -155,6 +156,6 @@ def simulated(
         (kind,),
         gps_model=GpsModel(Timing(getattr(settings.station, "rate_hz", GPS_HZ))),
         imu_model=ImuModel(magnetometer=MagnetometerModel(hard_iron=own_field)),
-        wheels_model=WheelsModel(Timing(WHEELS_HZ)),
+        wheels_model=WheelsModel(Timing(WHEELS_HZ), steered=frozenset((*steered, *wheels))),
     )
     return (sample for sample in run.events(seconds) if isinstance(sample, kind))

@@ -158,11 +158,12 @@ def _channels(channels: Iterable[ChannelHealth]) -> str:
             _rate(each),
             age(each.age),
             number(each.delay_max * 1e3, 1),
+            f"{each.used}/{each.measured}" if each.measured else "",
             "never heard" if not each.count else "SILENT" if each.silent else "",
         )
         for each in channels
     ]
-    return _table(("source", "count", "Hz", "age", "delay ms", ""), rows, numbers=(1, 2, 3, 4))
+    return _table(("source", "count", "Hz", "age", "delay ms", "used", ""), rows, numbers=(1, 2, 3, 4, 5))
 
 
 def _drivers(drivers: Iterable[DriverHealth], missing: Iterable[str]) -> str:

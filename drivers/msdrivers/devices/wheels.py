@@ -157,7 +157,7 @@ class WheelsDriver:
         travel = travel_sigma = speed_sigma = NAN
         raw = instant.raw(wheel.count)
         if raw is not None and wheel.map.count is not None:
-            sign = None if direction is Direction.UNKNOWN else int(direction)
+            sign = _SIGNS.get(direction)
             odometer = self._odometers[wheel.name]
             self._odometers[wheel.name], travel, reason = odometer.taken(raw, instant.monotonic_ns, sign)
             if reason:
@@ -197,4 +197,10 @@ _DOUBTS = {
 
 
 def _says_nothing(wheel: WheelSample) -> bool:
-    return wheel.travel != wheel.travel and wheel.speed != wheel.speed and wheel.direction is Direction.UNKNOWN
+    return wheel.travel != wheel.travel and wheel.speed != wheel.speed and wheel.direction not in _TURNS
+
+
+_TURNS = frozenset((Direction.BACKWARD, Direction.STOPPED, Direction.FORWARD))
+
+_SIGNS = {**{turn: int(turn) for turn in _TURNS}, Direction.UNSIGNED: 1}
+"""What a counter that counts up only is multiplied by."""

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from modelserver.messages import VehicleMode, VehicleStatusSample, WheelsSample
+from modelserver.messages import VehicleMode, VehicleStatusSample
 from msdrivers.emulate.can_line import CanFault, CanLine, said
 from msdrivers.protocol.can.database import CanDatabase, FrameError
 from msdrivers.protocol.can.frame import CanFrame
@@ -41,7 +41,7 @@ class VehicleUnit:
 
 
 class VehicleEmulator:
-    """A `Station` of CAN frames. With samples its speed is what they tell at their stamps, not what is commanded."""
+    """A `Station` of CAN frames. With samples speed, steering and mode are theirs, not what is commanded."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class VehicleEmulator:
         status: StatusMap | None,
         command: CommandMap | None = None,
         unit: VehicleUnit | None = None,
-        samples: Iterable[WheelsSample | VehicleStatusSample] = (),
+        samples: Iterable[VehicleStatusSample] = (),
         faults: Iterable[CanFault] = (),
     ):
         """Take DBC and mapping as the driver has them, the vehicle, what measures it, and the faults.
@@ -133,19 +133,16 @@ class VehicleEmulator:
         """Leave."""
         return []
 
-    def _at(self, sample: WheelsSample | VehicleStatusSample) -> int:
+    def _at(self, sample: VehicleStatusSample) -> int:
         assert self._begun is not None
         return self._begun[0] + (sample.header.utime - self._begun[1]) * 1000
 
-    def _follow(self, sample: WheelsSample | VehicleStatusSample) -> None:
-        if isinstance(sample, VehicleStatusSample):
-            self.mode = sample.mode
-            speeds, self.steering = [sample.forward_speed], sample.steering_angle
-        else:
-            speeds = [wheel.speed for wheel in sample.wheels]
-        known = [speed for speed in speeds if math.isfinite(speed)]
-        if known:
-            self.speed = sum(known) / len(known)
+    def _follow(self, sample: VehicleStatusSample) -> None:
+        self.mode = sample.mode
+        if math.isfinite(sample.forward_speed):
+            self.speed = sample.forward_speed
+        if math.isfinite(sample.steering_angle):
+            self.steering = sample.steering_angle
 
     def _take(self, command: BoundCommand, raw: dict[str, float], at_ns: int) -> None:
         self._move(at_ns)
@@ -181,11 +178,12 @@ class VehicleEmulator:
         self._moved_ns = at_ns
 
     def _go(self, seconds: float, speed: float, steering: float) -> None:
+        if self._measured:
+            return
         unit = self.unit
-        if not self._measured:
-            slows = abs(speed) < abs(self.speed) or speed * self.speed < 0.0
-            step = (unit.braking if slows else unit.acceleration) * seconds
-            self.speed += min(max(speed - self.speed, -step), step)
+        slows = abs(speed) < abs(self.speed) or speed * self.speed < 0.0
+        step = (unit.braking if slows else unit.acceleration) * seconds
+        self.speed += min(max(speed - self.speed, -step), step)
         step = unit.steering_rate * seconds
         self.steering += min(max(steering - self.steering, -step), step)
 

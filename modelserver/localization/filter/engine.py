@@ -5,18 +5,27 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TypeAlias
 
 from modelserver.geodesy import Geodesy
 from modelserver.localization.filter import fixes, fixing, inertial, motion, rolling, updates
 from modelserver.localization.filter.handling import begun_anew, begun_level, counts, measured, scene_of
-from modelserver.localization.filter.items import INERTIAL, NOTHING, Fused, Item, took_up
+from modelserver.localization.filter.items import INERTIAL, NOTHING, STEERING, Fused, Item, refused, took_up
 from modelserver.localization.filter.measurements.aiding import AbsolutePose
 from modelserver.localization.filter.resuming import gone_on
 from modelserver.localization.filter.setup import Setup
-from modelserver.localization.filter.state import FilterState, Resuming
-from modelserver.messages import AbsolutePoseSample, Decision, Mode, Phase, Recalled, SwitchMode
+from modelserver.localization.filter.state import FilterState, Resuming, Steering
+from modelserver.messages import (
+    AbsolutePoseSample,
+    Decision,
+    Mode,
+    Phase,
+    Recalled,
+    SwitchMode,
+    VehicleStatusSample,
+)
 
 
 def first(setup: Setup, mode: Mode, geodesy: Geodesy | None, recalled: Recalled | None = None) -> FilterState:
@@ -63,6 +72,19 @@ def _mode(setup: Setup, state: FilterState, item: Item) -> Fused:
     return state._replace(mode=sample.mode), (took_up(item, f"mode {sample.mode.name.lower()}"),)
 
 
+def _steering(setup: Setup, state: FilterState, item: Item) -> Fused:
+    """Return the state with the vehicle controller's steering angle; an angle out of range is dropped."""
+    sample, signal = item.sample, setup.rig.steering
+    assert isinstance(sample, VehicleStatusSample)
+    assert signal is not None
+    angle = sample.steering_angle
+    if not math.isfinite(angle):
+        return state, (refused(item, "nan"),)
+    if abs(angle) > signal.limit:
+        return state, (refused(item, "range"),)
+    return state._replace(steering=Steering(item.utime, angle)), NOTHING
+
+
 def _latched(setup: Setup, state: FilterState, utime: int) -> Fused:
     """Return the state with the decisions in force whose time has come: nothing can change them any more."""
     decisions = NOTHING
@@ -90,6 +112,7 @@ _HANDLERS: dict[str, Handler] = {
     INERTIAL: inertial.sample,
     "mode": _mode,
     "wheel_speed": rolling.sample,
+    STEERING: _steering,
     "gps_position": fixing.fix,
     "gps_height": fixing.height,
     "gps_velocity": fixing.velocity,

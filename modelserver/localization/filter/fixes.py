@@ -13,7 +13,7 @@ import numpy as np
 
 from modelserver.geodesy import GeodesyError, LocalFrame, ecef_from_geodetic, geodetic_from_ecef, origin_at
 from modelserver.localization import gate
-from modelserver.localization.filter import alignment, lateness, placing, updates
+from modelserver.localization.filter import alignment, lateness, motion, placing, updates
 from modelserver.localization.filter.alignment import Fit, Passed, Turn, horizontal
 from modelserver.localization.filter.measurements.aiding import AbsolutePose
 from modelserver.localization.filter.measurements.base import Compared, Scene, wrapped
@@ -95,6 +95,8 @@ def passed(setup: Setup, state: FilterState, nav: Nav, fix: GoodFix, kind: FixTy
         math.sqrt(0.5 * (white_e + white_n)),
         math.sqrt(0.5 * (lingering_e**2 + lingering_n**2)),
         shares(fix.up_variance, kind, setup.settings)[1],
+        state.swept + horizontal(so3.rotate(nav.attitude, lever)),
+        state.phase is Phase.ALIGNED or speed_known(setup, state, nav),
     )
     return state._replace(site=site, earth=earth), newest
 
@@ -129,15 +131,37 @@ def sought(setup: Setup, state: FilterState, newest: Passed) -> tuple[FilterStat
     state = state._replace(passed=stretch, fixed=newest)
     rate_sigma = math.sqrt(nav.covariance[11, 11])
     known = speed_known(setup, state, nav)
-    fit = alignment.fitted(stretch, settings, by_unit=not known, rate_sigma=rate_sigma)
+    ways = alignment.measured(stretch) if known else stretch
+    fit = alignment.fitted(ways, settings, by_unit=not known, rate_sigma=rate_sigma)
+    state = state._replace(undirected=False)
     if fit is None or fit.turn.sigma > settings.align_sigma or not alignment.agrees(fit, newest):
         return state, None
     if known and not 0.6 < fit.factor < 1.6:
         # not the way that was driven: fixes that wander, or wheels that spin
         return state, None
-    if not known and fit.factor < settings.align_speed:
-        return state, None
+    if not known:
+        if fit.factor < settings.align_speed:
+            return state, None
+        travel = direction(setup, state, nav.yaw + fit.turn.angle, fit.factor)
+        if not travel:
+            return state._replace(undirected=True), None
+        if travel < 0:
+            fit = alignment.fitted(stretch, settings, by_unit=True, rate_sigma=rate_sigma, travel=-1.0)
     return state, fit
+
+
+def direction(setup: Setup, state: FilterState, heading: float, speed: float) -> int:
+    """Return 1 for a vehicle of unknown velocity that drives forward, -1 for backward, 0 where nothing tells.
+
+    `heading` (rad, N once it is turned) and `speed` (m/s) are those of driving forward along the fixes. Backward the
+    heading would be the opposite one; a wrong choice would be believed for long, so none is made without evidence.
+    """
+    if speed > setup.settings.reverse_speed:
+        return 1
+    nav = state.nav
+    if nav is None or not motion.inertial(setup, state.mode):
+        return 0
+    return alignment.direction_of_travel(state.passed, heading - nav.yaw, setup.settings)
 
 
 def aligned(setup: Setup, state: FilterState, fit: Fit, *, by_unit: bool) -> FilterState:
@@ -146,7 +170,7 @@ def aligned(setup: Setup, state: FilterState, fit: Fit, *, by_unit: bool) -> Fil
     assert nav is not None
     assert newest is not None
     if by_unit:
-        nav = placing.at_speed(nav, fit.factor, fit.factor_sigma)
+        nav = placing.at_speed(nav, fit.travel * fit.factor, fit.factor_sigma)
     return into_world(setup, state, nav, fit.turn, newest)
 
 
@@ -163,7 +187,7 @@ def into_world(setup: Setup, state: FilterState, nav: Nav, turn: Turn, newest: P
     else:
         way = horizontal(nav.point_velocity(lever)) * (nav.utime - newest.utime) * 1e-6
     moved = way * cmath.rect(1.0, turn.angle)
-    nav = lateness.doubted(nav, lateness.told(state.passed), setup.layout)
+    nav = lateness.doubted(nav, lateness.told(alignment.measured(state.passed)), setup.layout)
     nav = placing.placed(placing.turned(nav, turn, setup.layout), newest, moved, lever, setup.layout)
     site = state.site
     assert site is not None
@@ -178,13 +202,14 @@ def into_world(setup: Setup, state: FilterState, nav: Nav, turn: Turn, newest: P
         refused_count=0,
         fix_utime=nav.utime,
         stepped=False,
+        undirected=False,
     )
 
 
 def by_velocity(setup: Setup, state: FilterState, sample: GpsSample, utime: int) -> tuple[Turn, float] | None:
     """Return the turn by the receiver's velocity, and the speed (nan: known already); None where it does not tell.
 
-    Where the speed is not known the vehicle is taken to drive forward, and slower than twice `align_speed` not at all.
+    Where the speed is not known it is signed by the direction of travel; slower than twice `align_speed` nothing is told.
     """
     settings, nav, newest = setup.settings, state.nav, state.fixed
     assert nav is not None
@@ -205,7 +230,10 @@ def by_velocity(setup: Setup, state: FilterState, sample: GpsSample, utime: int)
         return Turn(wrapped(cmath.phase(z) - cmath.phase(v)), sigma, nav.turn_rate[2]), math.nan
     if size < 2.0 * settings.align_speed:
         return None
-    return Turn(wrapped(cmath.phase(z) - nav.yaw), sigma, nav.turn_rate[2]), size
+    travel = direction(setup, state, cmath.phase(z), size)
+    if not travel:
+        return None
+    return Turn(wrapped(cmath.phase(travel * z) - nav.yaw), sigma, nav.turn_rate[2]), travel * size
 
 
 # --- jumps --------------------------------------------------------------------------------------------------

@@ -39,7 +39,26 @@ def scene_of(setup: Setup, state: FilterState, age: float = math.inf, before: An
     """Return what a measurement is compared with, `age` seconds after the sample `before` of its source."""
     assert state.nav is not None
     site = state.site if state.phase is Phase.ALIGNED else None
-    return Scene(state.nav, setup.layout, setup.settings, setup.rig, site, state.geodesy, state.standing, age, before)
+    return Scene(
+        state.nav,
+        setup.layout,
+        setup.settings,
+        setup.rig,
+        site,
+        state.geodesy,
+        state.standing,
+        age,
+        before,
+        steering_angle(setup, state),
+    )
+
+
+def steering_angle(setup: Setup, state: FilterState) -> float:
+    """Return the steering angle that the vehicle controller measures now, rad; nan where none is fresh."""
+    signal, nav = setup.rig.steering, state.nav
+    if signal is None or nav is None or (nav.utime - state.steering.utime) * 1e-6 > signal.max_age:
+        return math.nan
+    return state.steering.angle
 
 
 def counts(mode: Mode, item: Item) -> bool:

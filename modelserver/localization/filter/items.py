@@ -8,15 +8,16 @@ from modelserver.localization.filter import updates
 from modelserver.localization.filter.measurements import Measurement
 from modelserver.localization.filter.setup import Setup
 from modelserver.localization.filter.state import FilterState
-from modelserver.messages import Decision, ImuSample, Sample, SwitchMode, Verdict
+from modelserver.messages import Decision, ImuSample, Sample, SwitchMode, VehicleStatusSample, Verdict
 
-INERTIAL = "inertial"
+INERTIAL, STEERING = "inertial", "steering"
 
 
 class Item(NamedTuple):
     """One measurement of a sample, at its instant. Items are fused in the order of their first four fields.
 
-    `measurement` is None for the inertial part of an inertial sample, and for an order to switch the mode.
+    `measurement` is None for the inertial part of an inertial sample, for the steering angle of a vehicle status, and for
+    an order to switch the mode.
     """
 
     utime: int
@@ -46,6 +47,8 @@ def items(setup: Setup, sample: Sample | SwitchMode) -> list[Item]:
     if isinstance(sample, (ImuSample, SwitchMode)):
         kind = INERTIAL if isinstance(sample, ImuSample) else "mode"
         found.append(Item(header.utime, header.source, header.seq, 0, kind, None, sample))
+    if isinstance(sample, VehicleStatusSample) and setup.rig.steering is not None:
+        found.append(Item(header.utime, header.source, header.seq, 0, STEERING, None, sample))
     for part, measurement in enumerate(setup.measurements.get(type(sample), ()), start=1):
         instant = measurement.instant(sample)
         if instant is not None:

@@ -22,7 +22,7 @@ KEPT = "kept"
 def named(setup: Setup) -> str:
     """Return a word that stands for all that a kept state rests on: equal where it may be gone on from."""
     rig = setup.rig
-    words = repr((rig.places(), rig.kinematics, setup.layout.names))
+    words = repr((rig.places(), rig.kinematics, rig.steering, setup.layout.names))
     return hashlib.sha256(words.encode()).hexdigest()[:16]
 
 

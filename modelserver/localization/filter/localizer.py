@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -27,7 +28,9 @@ from modelserver.messages import (
     Origin,
     OriginLatched,
     Recalled,
+    Phase,
     Sample,
+    SensorFinding,
     SwitchMode,
     Verdict,
     WheelsSample,
@@ -39,6 +42,10 @@ ODOM_LEAST_US = 15_000
 ODOM_KEPT_US = 2_000_000
 ODOM_STEP_US = 20_000
 """How far back poses in Odom are kept, and how close together, microseconds."""
+
+
+STEERING_STALE = 1.0
+"""Seconds without a usable steering angle after which that is reported; wheels do without it at once."""
 
 
 class Deferred(NamedTuple):
@@ -237,7 +244,33 @@ class FilterLocalizer:
     def summary(self, utime: int) -> LocalizerSummary:
         """Return mode and phase, whether the vehicle stands, and when a fix was last used."""
         head = self.head
-        return LocalizerSummary(head.mode, head.phase, head.standing, head.fix_utime)
+        return LocalizerSummary(head.mode, head.phase, head.standing, head.fix_utime, self._findings())
+
+    def _findings(self) -> tuple[SensorFinding, ...]:
+        """Return the configured sensors that cannot be used now: by their configuration, or by what they measure."""
+        setup, head = self.setup, self.head
+        found = setup.findings[head.mode]
+        if head.phase is Phase.LEVELLING and head.tilt:
+            if math.isinf(head.tilt):
+                text = "its specific force at rest is no gravity: are its units m/s2, are its axes in order?"
+            else:
+                off = math.degrees(head.tilt)
+                text = f"gravity is {off:.0f} deg off the geometry's up: the mount is wrong, or the vehicle lies on its side"
+            fix = "modelserver calibrate imu LOG -c FILE says which mount fits"
+            found += (SensorFinding("imu", "gravity", "sensors.imu.frame", text, fix),)
+        signal, nav = setup.rig.steering, head.nav
+        if signal is not None and nav is not None and head.mode is not Mode.NO_WHEELS:
+            if (nav.utime - head.steering.utime) * 1e-6 > max(signal.max_age, STEERING_STALE):
+                text = "no fresh steering angle: the steered wheels are used by the speed of their contact points alone"
+                fix = "start the driver of the vehicle controller, and see that it measures steering_angle"
+                found += (SensorFinding("wheels", "steering", "sensors.wheels.steering", text, fix),)
+        if head.undirected:
+            text = (
+                "the course is known, and not whether the vehicle drives forward or backward along it: heading waits "
+                "until it brakes, turns or stops, or wheels measure it"
+            )
+            found += (SensorFinding("gps", "direction", "sensors.gps", text),)
+        return found
 
 
 def _rank(sample: Sample | SwitchMode) -> int:

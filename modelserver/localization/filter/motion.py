@@ -123,10 +123,20 @@ def _at_rest(state: FilterState, nav: Nav) -> Vector3:
 
 
 def _moved(state: FilterState, nav: Nav) -> FilterState:
-    """Return the state at a new navigation state; before heading is known the way at speed 1 is drawn with it."""
+    """Return the state at a new navigation state; before heading is known the way at speed 1 is drawn with it.
+
+    So is what the accelerations alone lead to: propagation is all that changes the velocity here.
+    """
     before = state.nav
     if state.phase is Phase.UNALIGNED and before is not None and nav.utime > before.utime:
         step = (nav.utime - before.utime) * 1e-6
         middle = 0.5 * (cmath.rect(1.0, before.yaw) + cmath.rect(1.0, nav.yaw))
-        return state._replace(nav=nav, unit=state.unit + step * middle)
+        (ax, ay, _), (bx, by, _) = before.velocity, nav.velocity
+        change = complex(bx - ax, by - ay)
+        return state._replace(
+            nav=nav,
+            unit=state.unit + step * middle,
+            gained=state.gained + change,
+            swept=state.swept + step * (state.gained + 0.5 * change),
+        )
     return state._replace(nav=nav)

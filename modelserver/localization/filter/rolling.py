@@ -70,7 +70,7 @@ def sample(setup: Setup, state: FilterState, item: Item) -> Fused:
                 scene, compared = scene._replace(nav=rolling), again
         nav, decision = updates.used(scene.nav, compared, settings, item.utime, item.source, item.seq, item.kind)
         gyro = motion.inertial(setup, state.mode) and (item.utime - state.imu_utime) * 1e-6 <= settings.rate_hold
-        rate = 0.0 if gyro else turn_rate(sample, before, measurement, settings)
+        rate = 0.0 if gyro else turn_rate(sample, before, measurement, settings, scene.steering)
         state = state._replace(nav=nav, wheels_source=item.source)
         if decision.verdict is Verdict.USED:
             state = state._replace(wheels_utime=item.utime, wheels_rate=rate)

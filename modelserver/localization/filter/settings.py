@@ -73,6 +73,9 @@ class FilterSettings(FixSettings):
     """Sigma of the angle between the way that the wheels roll and the geometry's x axis, rad: surveying a mount."""
     wheel_yaw_walk: float = 1e-5
     """Random walk of that angle, rad/sqrt(s): load shifts it."""
+    steering_sigma: float = 0.3
+    """Sigma of the angle of a wheel that steers where nothing measures it, rad: half of the 35 degrees that road vehicles
+    steer at most (turning circle of 10 m, wheelbase of 2.7 m)."""
     slip_share: float = 0.01
     """Slip of a driven wheel on firm ground, share of speed (M. Mitschke, Dynamik der Kraftfahrzeuge: 1 to 2 %)."""
     slip_acceleration: float = 0.01
@@ -165,6 +168,10 @@ class FilterSettings(FixSettings):
     """Longest stretch of fixes that heading is found from, seconds."""
     align_speed: float = 1.0
     """Least speed at which the receiver's velocity tells heading, m/s."""
+    reverse_speed: float = 6.0
+    """Speed from which on the vehicle is known to drive forward, m/s, where neither wheels nor accelerations tell: a
+    road vehicle's reverse gear is as short as its first and ends at about 20 km/h. For a vehicle that drives as fast
+    either way set it to `maximum_speed`."""
 
     # --- losing and finding fixes ---
 

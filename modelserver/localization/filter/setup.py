@@ -10,7 +10,9 @@ from modelserver.localization.filter.measurements.gps import gps_states
 from modelserver.localization.filter.measurements.wheels import WheelSpeed, wheel_states
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.filter.strapdown import Noise
+from modelserver.localization.findings import find_unusable
 from modelserver.localization.rig import Rig
+from modelserver.messages import Mode
 from modelserver.spatial import so3
 
 ROCKING = 1e-5
@@ -21,7 +23,7 @@ class Setup:
     """A vehicle for the filter. Immutable.
 
     `measurements` has what is made of each type of sample, in the order in which those of one sample are fused. The
-    layout holds the error states that these need.
+    layout holds the error states that these need. `findings` has, by mode, the configured sensors that cannot be used.
     """
 
     def __init__(self, rig: Rig, settings: FilterSettings | None = None, kinds: Iterable[type[Measurement]] = ()):
@@ -51,6 +53,7 @@ class Setup:
         self.coasting = Noise(s.gap_rate_sigma**2, s.gap_acceleration**2, *biases, by_gyros=False)
         # numbers that someone filled a gap with go from the one end to the other: a third of what could be
         self.guessing = Noise((s.gap_rate_sigma / 3.0) ** 2, s.gap_acceleration**2, *biases)
+        self.findings = {mode: find_unusable(rig, mode) for mode in Mode}
         self.rolling = Noise(s.wheel_rate_sigma**2 * s.slip_time, s.gap_acceleration**2, *biases, by_gyros=False)
 
     @property

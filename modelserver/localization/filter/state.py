@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -72,6 +73,13 @@ class Pending(NamedTuple):
     take_up: bool = False
 
 
+class Steering(NamedTuple):
+    """The steering angle (rad) that the vehicle controller measured last, at `utime`; nan where it measures none."""
+
+    utime: int = 0
+    angle: float = math.nan
+
+
 class Resuming(NamedTuple):
     """What an earlier run kept, while it waits for evidence.
 
@@ -120,7 +128,10 @@ class FilterState(NamedTuple):
     `conflict_utime` when a fix from beyond its gate was last used. `biases` are the gyros' with their sigma, kept
     where the rest begins anew. `tilt` is how far gravity is off the geometry's up at start-up, where that is too
     far; infinite where what is felt is no gravity. `resuming` is what an earlier run kept, until it is used or not;
-    `proving` what a resumed heading is held against, until it is right or not.
+    `proving` what a resumed heading is held against, until it is right or not. `steering` is the vehicle controller's
+    steering angle. Before heading is known, `gained` (m/s) and `swept` (m) are the first and the second integral of the
+    inertial unit's horizontal acceleration along N, and `undirected` is whether heading lacks only the direction of
+    travel: forward or backward.
     """
 
     nav: Nav | None = None
@@ -168,6 +179,10 @@ class FilterState(NamedTuple):
     stepped: bool = False
     resuming: Resuming | None = None
     proving: Proving | None = None
+    steering: Steering = Steering()
+    gained: complex = 0j
+    swept: complex = 0j
+    undirected: bool = False
 
     def on_wheels(self, utime: int) -> bool:
         """Return whether wheels tell how fast the vehicle goes at an instant."""

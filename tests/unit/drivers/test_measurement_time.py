@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 import pytest
 from support_gx1 import START_UTIME, turning
 
-from modelserver.messages import DeviceSample, FixType, GpsSample, ImuSample, SensorHeader
+from modelserver.messages import Sample, FixType, GpsSample, ImuSample, SensorHeader
 from msdrivers.devices.gps import GpsDriver, GpsSettings
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
 from msdrivers.emulate.gps import GpsEmulator, GpsUnit
@@ -65,9 +65,9 @@ class DelayedLine:
                 self._coming.append((max(at, self._coming[-1][0] if self._coming else 0), output.unit))
 
 
-def driven(driver: Station[bytes], device: Station[bytes], seed: int, seconds: float) -> list[DeviceSample]:
+def driven(driver: Station[bytes], device: Station[bytes], seed: int, seconds: float) -> list[Sample]:
     time = FakeTime(START_UTIME)
-    samples: list[DeviceSample] = []
+    samples: list[Sample] = []
     line = DelayedLine(device, time, seed)
     runner = Runner(driver, line, RunnerSettings("some", "device"), time, samples.append, rng=random.Random(seed))
     end = time.monotonic_ns + round(seconds * 1e9)

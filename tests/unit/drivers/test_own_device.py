@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modelserver.messages import DeviceSample, DriverPhase, SensorHeader, WheelSample, WheelsSample
+from modelserver.messages import Sample, DriverPhase, SensorHeader, WheelSample, WheelsSample
 from msdrivers.faults import Fault
 from msdrivers.links.fake import FakeLink, FakeTime
 from msdrivers.protocol.framing import Scanner
@@ -50,8 +50,8 @@ def _said(unit: Any) -> list[tuple[float, bytes]]:
     return coming
 
 
-def _driven(coming: list[tuple[float, bytes]], seconds: float) -> tuple[Runner[bytes], list[DeviceSample], FakeTime]:
-    time, published = FakeTime(START_US), list[DeviceSample]()
+def _driven(coming: list[tuple[float, bytes]], seconds: float) -> tuple[Runner[bytes], list[Sample], FakeTime]:
+    time, published = FakeTime(START_US), list[Sample]()
     driver = OWN["SpeedDriver"](OWN["SpeedSettings"]("radar"))
     runner = Runner(driver, FakeLink(time, coming), RunnerSettings("radar", "speed"), time, published.append)
     while time.monotonic_ns < round((1.0 + seconds) * 1e9):
@@ -59,7 +59,7 @@ def _driven(coming: list[tuple[float, bytes]], seconds: float) -> tuple[Runner[b
     return runner, published, time
 
 
-def _speeds(samples: list[DeviceSample]) -> list[float]:
+def _speeds(samples: list[Sample]) -> list[float]:
     return [each.wheels[0].speed for each in samples if isinstance(each, WheelsSample)]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from modelserver.messages import (
-    DeviceSample,
+    Sample,
     DriverHealth,
     DriverPhase,
     FixType,
@@ -24,7 +24,7 @@ from msdrivers.registry import CHANNELS
 
 HEADER = SensorHeader(1_700_000_000_000_000, "some", 7, 1_700_000_000_000_100, utime_sigma=0.001)
 
-SAMPLES: list[tuple[DeviceSample, str]] = [
+SAMPLES: list[tuple[Sample, str]] = [
     (GpsSample(HEADER, FixType.FIX_3D, 50.0, -111.0), "gps_t"),
     (ImuSample(HEADER), "imu_t"),
     (WheelsSample(HEADER, (WheelSample("left", 1.0, 0.1, 0.5, 0.1),)), "wheels_t"),
@@ -35,7 +35,7 @@ SAMPLES: list[tuple[DeviceSample, str]] = [
 
 @pytest.mark.parametrize(("sample", "type_name"), SAMPLES)
 def test_given_no_channel_then_a_sample_goes_out_whole_on_the_customary_one(
-    sample: DeviceSample, type_name: str
+    sample: Sample, type_name: str
 ) -> None:
     sent: list[tuple[str, bytes]] = []
     Publisher(lambda channel, data: sent.append((channel, data)), {}).sample(sample)

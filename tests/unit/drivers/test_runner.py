@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from modelserver.messages import DeviceSample, DriverHealth, DriverPhase, ImuSample, SensorHeader, VehicleCommand
+from modelserver.messages import Sample, DriverHealth, DriverPhase, ImuSample, SensorHeader, VehicleCommand
 from msdrivers.links import LinkError, PlayedOutError
 from msdrivers.links.fake import FakeLink, FakeTime
 from msdrivers.runner import Runner, RunnerSettings
@@ -75,7 +75,7 @@ class Bench:
         self.echo = echo or Echo()
         count = round(seconds / PERIOD_S)
         self.link: FakeLink[bytes] = FakeLink(self.time, [((n + 1) * PERIOD_S, b"x") for n in range(count)])
-        self.samples: list[DeviceSample] = []
+        self.samples: list[Sample] = []
         self.reports: list[DriverHealth] = []
         self.runner = Runner(
             self.echo,
@@ -233,7 +233,7 @@ def test_given_a_bug_in_a_station_then_it_is_counted_told_and_the_driver_goes_on
 def test_given_a_bus_that_fails_then_the_driver_goes_on() -> None:
     bench = Bench(1.0)
 
-    def fails(sample: DeviceSample) -> None:
+    def fails(sample: Sample) -> None:
         raise OSError("network is unreachable")
 
     bench.runner._publish = fails

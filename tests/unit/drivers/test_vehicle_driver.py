@@ -16,12 +16,11 @@ from support_vehicle_bus import (
     Wire,
     at,
     raptor_dbc,
-    rolling,
     vehicle_settings,
 )
 
 from modelserver.errors import ConfigError
-from modelserver.messages import VehicleCommand, VehicleMode, VehicleStatusSample
+from modelserver.messages import SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
 from msdrivers.devices.vehicle import VehicleDriver
 from msdrivers.devices.vehicle_settings import LimitsMap, VehicleSettings
 from msdrivers.emulate.can_line import CanFault
@@ -131,12 +130,21 @@ def test_given_a_mode_that_changes_then_it_is_told_with_what_it_means() -> None:
     assert "emergency stop: commands have no effect until it is released" in wire.texts()
 
 
-def test_given_wheels_that_measure_the_vehicle_then_the_status_tells_their_speed() -> None:
-    emulator = VehicleEmulator(DATABASE, RAPTOR_STATUS, samples=rolling(10.0, lambda t: -0.1 * t))
-    wire = Wire(VehicleDriver(vehicle_settings(command=None), DATABASE), emulator).run(10.0)
+def test_given_a_vehicle_that_is_driven_then_the_status_has_its_speed_and_its_steering_angle() -> None:
+    driven = (
+        VehicleStatusSample(
+            SensorHeader(START_UTIME + n * 10_000), VehicleMode.MANUAL, -0.001 * n, 0.4 * math.sin(0.02 * n)
+        )
+        for n in range(1000)
+    )
+    emulator = VehicleEmulator(DATABASE, RAPTOR_STATUS, samples=driven)
+    wire = Wire(VehicleDriver(vehicle_settings(command=None), DATABASE), emulator).run(9.9)
+    assert len(statuses(wire)) > 190
     for sample in statuses(wire):
         t = (sample.header.utime - START_UTIME) * 1e-6
+        assert sample.mode is VehicleMode.MANUAL
         assert sample.forward_speed == pytest.approx(-0.1 * t, abs=0.003)
+        assert sample.steering_angle == pytest.approx(0.4 * math.sin(2.0 * t), abs=0.01)
 
 
 # --- commands --------------------------------------------------------------------------------------------------

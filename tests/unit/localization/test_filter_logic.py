@@ -554,9 +554,7 @@ def test_given_travel_then_it_tells_the_mean_speed_and_without_it_the_speed_coun
     kind = wheel_speed("differential", "RL", "RR")
     assert kind.by_travel(now, before)
     assert not kind.by_travel(now, None)
-    strange = said(
-        0.4, WheelSample("RL", speed=1.0, steering=math.nan), WheelSample("XX", speed=1.0), WheelSample("RR")
-    )
+    strange = said(0.4, WheelSample("XX", speed=1.0), WheelSample("RR"))
     assert rolling(strange, None, contacts, SETTINGS) == []
 
 

@@ -62,7 +62,7 @@ class CountMap:
     wrap: int = 0
     """The counter goes from wrap - 1 to 0; 0: as many as its bits hold."""
     up_only: bool = False
-    """The encoder counts up whichever way the wheel turns; the way's sign comes from the direction signal."""
+    """The encoder counts up whichever way the wheel turns; the sign comes from the direction signal, or is not known."""
 
     def __post_init__(self) -> None:
         check_signal(self.signal)
@@ -82,7 +82,8 @@ class SpeedMap:
     scale: float = 1.0
     """m/s for each unit of the signal: 0.2778 for km/h, the wheel's radius for rad/s."""
     is_magnitude: bool = False
-    """The signal has no sign, as from a frequency-to-voltage divider; the sign comes from the direction signal."""
+    """The signal has no sign, as from a frequency-to-voltage divider; it comes from the direction signal, or is not
+    known."""
     sigma: float = 0.0
     """Standard deviation, m/s; 0: not known."""
 
@@ -135,16 +136,24 @@ class WheelMap:
     def __post_init__(self) -> None:
         if self.count is None and self.speed is None:
             raise ValueError("count or speed is needed: of a wheel of which neither is told nothing can be said")
-        signed_by = [
-            key
-            for key, needed in (
-                ("count.up_only", self.count is not None and self.count.up_only),
-                ("speed.is_magnitude", self.speed is not None and self.speed.is_magnitude),
-            )
-            if needed
-        ]
-        if signed_by and self.direction is None:
-            raise ValueError(f"direction is needed with {' and '.join(signed_by)}: the sign comes from it")
+        signs = self._signs()
+        if self.direction is None and len(set(signs.values())) > 1:
+            without = next(key for key, has_sign in signs.items() if not has_sign)
+            raise ValueError(f"direction is needed with {without}: the other signal of the wheel has a sign")
+
+    def _signs(self) -> dict[str, bool]:
+        """Return for each mapped signal, by its key, whether it has a sign of its own."""
+        signs = {}
+        if self.count is not None:
+            signs["count.up_only"] = not self.count.up_only
+        if self.speed is not None:
+            signs["speed.is_magnitude"] = not self.speed.is_magnitude
+        return signs
+
+    @property
+    def is_unsigned(self) -> bool:
+        """Whether nothing says which way the wheel turns."""
+        return self.direction is None and not any(self._signs().values())
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,6 +37,8 @@ class BoundWheel:
 
     def turning(self, instant: Instant) -> Direction:
         """Return which way the wheel turns, as the encoder tells."""
+        if self.map.is_unsigned:
+            return Direction.UNSIGNED
         raw = instant.raw(self.direction)
         if raw is None or self.map.direction is None:
             return Direction.UNKNOWN
@@ -48,13 +50,15 @@ class BoundWheel:
         return numbers.get(int(raw), Direction.UNKNOWN) if raw == raw and abs(raw) < 1e18 else Direction.UNKNOWN
 
     def speed_of(self, instant: Instant, direction: Direction) -> float:
-        """Return the speed, m/s, forward positive; nan where it is not said or its sign is not known."""
+        """Return the speed, m/s, forward positive (UNSIGNED: its size); nan where it or its sign did not come."""
         physical = instant.physical(self.speed)
         if physical is None or self.map.speed is None:
             return NAN
         speed = physical * self.map.speed.scale
         if not self.map.speed.is_magnitude or speed == 0.0:
             return speed
+        if direction is Direction.UNSIGNED:
+            return abs(speed)
         return {Direction.FORWARD: speed, Direction.BACKWARD: -speed}.get(direction, NAN)
 
     def steering_of(self, instant: Instant) -> float:

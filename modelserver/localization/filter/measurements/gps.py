@@ -15,6 +15,7 @@ from modelserver.localization.filter.measurements.base import Compared, Scene, a
 from modelserver.localization.filter.nav import jacobian_of_point, jacobian_of_point_velocity
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.filter.strapdown import STANDARD_GRAVITY
+from modelserver.localization.findings import LEAST_BASELINE
 from modelserver.localization.gate import GoodFix
 from modelserver.localization.rig import Rig
 from modelserver.messages import FixType, GpsSample
@@ -227,7 +228,7 @@ class GpsBaseline:
             return None
         first, second = rig.lever(rig.gps_frame), rig.lever(rig.second_antenna_frame)
         baseline = (second[0] - first[0], second[1] - first[1], second[2] - first[2])
-        return cls(baseline) if math.hypot(baseline[0], baseline[1]) > 0.01 else None
+        return cls(baseline) if math.hypot(baseline[0], baseline[1]) > LEAST_BASELINE else None
 
     def instant(self, sample: GpsSample) -> int | None:
         """Return the fix's stamp; None where it tells no baseline."""

@@ -1,9 +1,39 @@
-"""What wheels measure: the speed of each contact point along the way it rolls."""
+"""Wheel speeds: each wheel measures the speed of its contact point along the direction in which it rolls.
+
+Measurement. With v the velocity of the rolling frame, w the turn rate and c the contact point (body axes; x and y span
+the ground plane), the contact point moves with u = v + w x c. A wheel at the steering angle a measures
+
+    z = (1 + s) d(a) . u + noise,   d(a) = (cos(a + m), sin(a + m)),
+
+s the scale error and m the mounting yaw of the wheels (states of the filter). H follows from du/d(v, attitude, bias).
+
+Steering angle. It is 0 for a wheel that does not steer, or measured: by the wheel's own encoder, or by the vehicle
+controller for the whole axle (`SteeringSignal`). A wheel that steers and whose angle nobody measures rolls where its
+contact point goes, so it measures |u| with the sign of its encoder. |u| has no derivative at u = 0, and the direction
+of u is noise there; so the angle is estimated from both that are known of it, as a weighted mean of
+
+    the prior m +- steering_sigma   and   the course of u, atan2(u_y, u_x) +- sqrt(V), V = var(u across) / |u|^2.
+
+With the weight k = steering_sigma^2 / (steering_sigma^2 + V) the measurement is |u| where the course is known (k = 1),
+and a wheel that points ahead with an uncertain angle where it is not (k = 0), with a continuous transition. What is left
+of the angle's variance P = k V acts through u across the wheel, to the second order: (u_across)^2 P + 3/4 (|u| P)^2.
+
+Sign. An encoder without a direction (`Direction.UNSIGNED`) measures |z|. Its sign is that of the predicted speed where
+that is certain to three sigmas; otherwise the sample is not used.
+
+Slip acts as for every wheel: a share of speed, larger under acceleration. Of a skid-steered vehicle, whose wheels slide
+in every turn, the mean of all wheels is one measurement; a wheel that steers has no place there.
+
+Limits: one steering angle for the time between two samples; a wheel beyond 3 steering_sigma needs a measured angle.
+Read top-down: `rolling` -> `WheelSpeed.compare` -> `_steer` -> `standing_wheels`, `turn_rate`.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -12,9 +42,9 @@ from modelserver.localization.filter.layout import ErrorState
 from modelserver.localization.filter.measurements.base import INSTANT, Compared, Scene, register
 from modelserver.localization.filter.nav import jacobian_of_body_velocity
 from modelserver.localization.filter.settings import FilterSettings
-from modelserver.localization.rig import Rig
-from modelserver.messages import WheelsSample
-from modelserver.spatial.so3 import Vector3, cross
+from modelserver.localization.rig import Rig, SteeringSignal
+from modelserver.messages import Direction, WheelsSample
+from modelserver.spatial.so3 import Array, Vector3, cross
 
 SCALE, YAW = "wheel_scale", "wheel_yaw"
 """How much too far all wheels tell, and by how much the way they roll is turned to the left of the geometry's x."""
@@ -24,6 +54,14 @@ EASED = 4.0
 
 LONGEST = 1.0
 """Seconds between two samples over which travel still tells a speed."""
+
+SIGN_KNOWN = 3.0
+"""Sigmas by which a predicted speed must differ from 0 to give an unsigned measurement its sign."""
+
+TURN_STEPS = 6
+"""Iterations for the directions of steered wheels: at full lock each reduces the error to a fifth."""
+
+NO_ANGLES: Mapping[str, float] = MappingProxyType({})
 
 
 def wheel_states(settings: FilterSettings) -> tuple[ErrorState, ...]:
@@ -35,9 +73,10 @@ def wheel_states(settings: FilterSettings) -> tuple[ErrorState, ...]:
 
 
 class Rolling(NamedTuple):
-    """One wheel between two samples: mean speed (m/s) and its variance, steering (rad), contact point (body axes, m).
+    """One wheel between two samples: mean speed (m/s) and its variance, steering angle (rad), contact point (body, m).
 
-    `mean`: of the whole time between, from travel; else of the instant.
+    `mean`: of the whole time between, from travel; else of the instant. `steering` is nan where nobody measures it,
+    `steering_sigma` its standard deviation where the vehicle controller does. `unsigned`: `speed` is a magnitude.
     """
 
     speed: float
@@ -45,28 +84,59 @@ class Rolling(NamedTuple):
     steering: float
     contact: Vector3
     mean: bool
+    steering_sigma: float = 0.0
+    unsigned: bool = False
 
 
 def rolling(
-    sample: WheelsSample, before: WheelsSample | None, contacts: dict[str, Vector3], settings: FilterSettings
+    sample: WheelsSample,
+    before: WheelsSample | None,
+    contacts: Mapping[str, Vector3],
+    settings: FilterSettings,
+    angles: Mapping[str, float] = NO_ANGLES,
+    angle_sigma: float = 0.0,
 ) -> list[Rolling]:
-    """Return what each known wheel of a sample tells: from its travel since the sample before, else from its speed."""
+    """Return what each known wheel of a sample measures: from its travel since `before`, else from its speed.
+
+    `angles` are the steering angles (rad) that the vehicle controller measures, to `angle_sigma`, by the wheel's name:
+    for wheels that steer and do not measure it themselves.
+    """
     dt = 0.0 if before is None else (sample.header.utime - before.header.utime) * 1e-6
     earlier = {wheel.name: wheel for wheel in before.wheels} if before is not None and 0.0 < dt <= LONGEST else {}
     found = []
     for wheel in sample.wheels:
         contact = contacts.get(wheel.name)
-        if contact is None or not math.isfinite(wheel.steering):
+        if contact is None:
             continue
+        steering, steering_sigma = wheel.steering, 0.0
+        if not math.isfinite(steering) and wheel.name in angles:
+            steering, steering_sigma = angles[wheel.name], angle_sigma
+        unsigned = wheel.direction is Direction.UNSIGNED
         last = earlier.get(wheel.name)
         way = wheel.travel - last.travel if last is not None else math.nan
         if math.isfinite(way):
             sigma = wheel.travel_sigma if 0.0 < wheel.travel_sigma < 10.0 else settings.wheel_sigma * 0.5
-            found.append(Rolling(way / dt, 2.0 * (sigma / dt) ** 2, wheel.steering, contact, True))
+            speed, variance, mean = way / dt, 2.0 * (sigma / dt) ** 2, True
         elif math.isfinite(wheel.speed):
             sigma = wheel.speed_sigma if 0.0 < wheel.speed_sigma < 10.0 else settings.wheel_sigma
-            found.append(Rolling(wheel.speed, sigma * sigma, wheel.steering, contact, False))
+            speed, variance, mean = wheel.speed, sigma * sigma, False
+        else:
+            continue
+        speed = abs(speed) if unsigned else speed
+        found.append(Rolling(speed, variance, steering, contact, mean, steering_sigma, unsigned))
     return found
+
+
+class Steered(NamedTuple):
+    """The direction of a wheel: its angle (rad), how much of the course's change it follows, and its variance (rad2).
+
+    `follow` is the weight k of the module's theory, `course_gradient` d(course)/du (rad per m/s).
+    """
+
+    angle: float
+    follow: float
+    variance: float
+    course_gradient: tuple[float, float]
 
 
 @register
@@ -84,6 +154,7 @@ class WheelSpeed:
     skid: bool
     half_track: float
     imu: Vector3
+    steering: SteeringSignal | None = None
 
     @classmethod
     def of(cls, rig: Rig, settings: FilterSettings) -> Self | None:
@@ -92,7 +163,7 @@ class WheelSpeed:
             return None
         contacts = {name: rig.pose(frame).xyz for name, frame in rig.wheel_frames.items()}
         half = max(abs(contact[1]) for contact in contacts.values())
-        return cls(contacts, rig.kinematics == "skid_steer", half, rig.imu)
+        return cls(contacts, rig.kinematics == "skid_steer", half, rig.imu, rig.steering)
 
     def instant(self, sample: WheelsSample) -> int | None:
         """Return the sample's stamp."""
@@ -101,16 +172,32 @@ class WheelSpeed:
     def compare(self, scene: Scene, sample: WheelsSample) -> Compared | str:
         """Compare the mean speeds since the sample before with the mean motion since then, or speeds of the instant."""
         settings = scene.settings
-        wheels = rolling(sample, scene.before, self.contacts, settings)
+        wheels = self.rolling(sample, scene.before, settings, scene.steering)
         if not wheels:
-            known = any(wheel.name in self.contacts for wheel in sample.wheels)
-            return ("nan" if known else "names") if sample.wheels else "empty"
+            known = [wheel for wheel in sample.wheels if wheel.name in self.contacts]
+            if not known:
+                return "names" if sample.wheels else "empty"
+            measured = any(math.isfinite(wheel.speed) or math.isfinite(wheel.travel) for wheel in known)
+            return "steering" if self.skid and measured else "nan"
         top = settings.maximum_speed
         if not all(abs(wheel.speed) <= top for wheel in wheels):
             return "range"
         if self.skid:
             wheels = [_mean(wheels)]
         return self._compared(scene, wheels)
+
+    def rolling(
+        self, sample: WheelsSample, before: WheelsSample | None, settings: FilterSettings, steering: float = math.nan
+    ) -> list[Rolling]:
+        """Return what each wheel measures that can be used; `steering` is the controller's steering angle, rad.
+
+        On a skid-steered vehicle a wheel that steers by an unknown angle cannot be averaged with the others.
+        """
+        angles, sigma = NO_ANGLES, 0.0
+        if self.steering is not None and math.isfinite(steering):
+            angles, sigma = self.steering.wheel_angles(steering, self.contacts), self.steering.sigma
+        found = rolling(sample, before, self.contacts, settings, angles, sigma)
+        return [each for each in found if math.isfinite(each.steering)] if self.skid else found
 
     def by_travel(self, sample: WheelsSample, before: WheelsSample | None) -> bool:
         """Return whether a wheel tells the way since a sample before."""
@@ -138,21 +225,33 @@ class WheelSpeed:
             else:
                 swing = cross(rate, wheel.contact)
                 v = (now[0] + swing[0], now[1] + swing[1], now[2] + swing[2])
-            c, s = math.cos(wheel.steering + yaw), math.sin(wheel.steering + yaw)
-            along = c * v[0] + s * v[1]
-            row = scale * (c * body[0] + s * body[1])
-            # an error of the gyro's bias changes w x c by c x error: d . (c x error) = (d x c) . error
-            x, y, z = wheel.contact
-            row[9:12] += (scale * s * z, -scale * c * z, scale * (c * y - s * x))
+            steered = _steer(wheel, v, yaw, body, nav.covariance, settings)
+            c, s = math.cos(steered.angle), math.sin(steered.angle)
+            along, across = c * v[0] + s * v[1], c * v[1] - s * v[0]
+            # d(along)/du: the angle follows the course of u, and so turns what is across into what is along
+            gx, gy = steered.course_gradient
+            rx, ry = c + steered.follow * across * gx, s + steered.follow * across * gy
+            row = scale * _row(rx, ry, wheel.contact, body)
             row[layout.index(SCALE)] = along
-            row[layout.index(YAW)] = scale * (c * v[1] - s * v[0])
-            residuals.append(wheel.speed - scale * along)
-            rows.append(row)
+            row[layout.index(YAW)] = scale * (1.0 - steered.follow) * across
             variance = wheel.variance
             if not wheel.mean:
                 # the rate of the instant has the gyro's noise, which a longer way averages
+                x, y, _ = wheel.contact
                 variance += ((c * y - s * x) * settings.gyro_noise) ** 2 / INSTANT
+            fast = max(math.hypot(v[0], v[1]), abs(wheel.speed))
+            variance += (across * across + 0.75 * fast * fast * steered.variance) * steered.variance
+            speed = wheel.speed
+            if wheel.unsigned:
+                certain = along * along > SIGN_KNOWN**2 * float(row @ nav.covariance @ row)
+                if not certain and speed > settings.standing_speed:
+                    continue
+                speed = math.copysign(speed, along) if certain else 0.0
+            residuals.append(speed - scale * along)
+            rows.append(row)
             noises.append(variance + self._slip(nav.force, along, rate[2], settings) * _lasting(dt, settings))
+        if not rows:
+            return "direction"
         return Compared(np.array(residuals), np.array(rows), np.diag(noises), separable=True, eased=EASED)
 
     def _slip(self, force: Vector3, speed: float, turn: float, settings: FilterSettings) -> float:
@@ -166,6 +265,40 @@ class WheelSpeed:
 def _lasting(dt: float, settings: FilterSettings) -> float:
     """Return by how much a noise that lasts must be widened where samples `dt` seconds apart count as independent."""
     return max(settings.slip_time / dt, 1.0) if 0.0 < dt < settings.slip_time else 1.0
+
+
+def _row(rx: float, ry: float, contact: Vector3, body: Array) -> Array:
+    """Return the Jacobian (n) of rx u_x + ry u_y, u the velocity of a contact point; `body` that of the body's."""
+    row: Array = rx * body[0] + ry * body[1]
+    # an error of the gyro's bias changes w x c by c x error: r . (c x error) = (r x c) . error
+    x, y, z = contact
+    row[9:12] += (ry * z, -rx * z, rx * y - ry * x)
+    return row
+
+
+def _steer(
+    wheel: Rolling, u: Vector3, yaw: float, body: Array, covariance: Array, settings: FilterSettings
+) -> Steered:
+    """Return the direction of a wheel whose contact point moves with `u` (body axes, m/s); see the module's theory."""
+    if math.isfinite(wheel.steering):
+        return Steered(wheel.steering + yaw, 0.0, wheel.steering_sigma**2, (0.0, 0.0))
+    prior = settings.steering_sigma**2
+    square = u[0] * u[0] + u[1] * u[1]
+    if square < 1e-12:
+        return Steered(yaw, 0.0, prior, (0.0, 0.0))
+    # a wheel does not turn round: rolling backward it points away from the course
+    ahead = math.copysign(1.0, u[0])
+    course = math.atan2(ahead * u[1], ahead * u[0])
+    size = math.sqrt(square)
+    row = _row(-u[1] / size, u[0] / size, wheel.contact, body)
+    variance = max(float(row @ covariance @ row), 0.0) / square
+    follow = prior / (prior + variance)
+    most = 3.0 * settings.steering_sigma
+    turned = course - yaw
+    # no wheel steers farther than its stop: the angle follows the course no longer
+    gradient = (-u[1] / square, u[0] / square) if abs(turned) <= most else (0.0, 0.0)
+    angle = yaw + follow * min(max(turned, -most), most)
+    return Steered(angle, follow, follow * variance, gradient)
 
 
 def _mean(wheels: list[Rolling]) -> Rolling:
@@ -185,9 +318,9 @@ def _mean(wheels: list[Rolling]) -> Rolling:
 
 
 def standing_wheels(
-    sample: WheelsSample, before: WheelsSample | None, contacts: dict[str, Vector3], settings: FilterSettings
+    sample: WheelsSample, before: WheelsSample | None, contacts: Mapping[str, Vector3], settings: FilterSettings
 ) -> bool | None:
-    """Return whether the wheels stand; None where they do not tell."""
+    """Return whether the wheels are stationary; None where they do not measure it. Steering does not matter here."""
     wheels = rolling(sample, before, contacts, settings)
     if not wheels:
         return None
@@ -195,21 +328,37 @@ def standing_wheels(
 
 
 def turn_rate(
-    sample: WheelsSample, before: WheelsSample | None, measurement: WheelSpeed, settings: FilterSettings
+    sample: WheelsSample,
+    before: WheelsSample | None,
+    measurement: WheelSpeed,
+    settings: FilterSettings,
+    steering: float = math.nan,
 ) -> float:
-    """Return the turn rate that the wheels tell, rad/s; 0 where they do not.
+    """Return the turn rate that the wheels measure, rad/s; 0 where they do not. `steering`: as in `rolling`.
 
-    Each wheel rolls at d . (v + w x c): two unknowns, forward speed and turn rate, by least squares. A skid-steered
-    vehicle's wheels slide: it turns by less than its sides' difference says, how much less nobody knows.
+    Each wheel rolls at d . (v + w x c): two unknowns, forward speed and turn rate, by least squares. The direction of a
+    wheel whose angle is not measured follows from the two, so it is found by iteration from straight ahead. A
+    skid-steered vehicle's wheels slide: it turns by less than its sides' difference says, by an unknown share.
     """
-    wheels = rolling(sample, before, measurement.contacts, settings)
+    wheels = [each for each in measurement.rolling(sample, before, settings, steering) if not each.unsigned]
     if len(wheels) < 2:
         return 0.0
-    rows = []
-    for wheel in wheels:
-        c, s = math.cos(wheel.steering), math.sin(wheel.steering)
-        x, y, _ = wheel.contact
-        rows.append((c, s * x - c * y))
-    A = np.array(rows)
-    found, _, rank, _ = np.linalg.lstsq(A, np.array([wheel.speed for wheel in wheels]), rcond=1e-6)
-    return float(found[1]) if rank == 2 and abs(found[1]) < 10.0 else 0.0
+    speeds = np.array([wheel.speed for wheel in wheels])
+    angles = [wheel.steering if math.isfinite(wheel.steering) else 0.0 for wheel in wheels]
+    free = [n for n, wheel in enumerate(wheels) if not math.isfinite(wheel.steering)]
+    most = 3.0 * settings.steering_sigma
+    for _ in range(TURN_STEPS if free else 1):
+        A = np.array(
+            [
+                (math.cos(a), math.sin(a) * wheel.contact[0] - math.cos(a) * wheel.contact[1])
+                for a, wheel in zip(angles, wheels, strict=True)
+            ]
+        )
+        (v, w), _, rank, _ = np.linalg.lstsq(A, speeds, rcond=1e-6)
+        if rank < 2:
+            return 0.0
+        for n in free:
+            x, y, _ = wheels[n].contact
+            ahead = math.copysign(1.0, v - w * y)
+            angles[n] = min(max(math.atan2(ahead * w * x, ahead * (v - w * y)), -most), most)
+    return float(w) if abs(w) < 10.0 else 0.0

@@ -1,0 +1,98 @@
+"""Findings: which configured sensors localization cannot use, and why. Pure: from the vehicle's frames and the mode.
+
+`find_unusable` looks at what does not change while the filter runs; `modelserver check` reports it before a start. What
+only the running filter knows (an inertial unit that measures no gravity, a steering angle that is not fresh) comes with
+`LocalizerSummary.findings`, together with these.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from modelserver.localization.rig import Rig
+from modelserver.messages import Mode, SensorFinding
+
+LEAST_WHEELBASE = 0.1
+"""Meters between the rolling frame and a steered axle below which a steering angle tells no curvature."""
+
+LEAST_BASELINE = 0.01
+"""Meters between two antennas, horizontally, below which they tell no heading."""
+
+_EXCLUDED: dict[str, tuple[Mode, ...]] = {
+    "gps": (Mode.NO_GPS, Mode.DEAD_RECKONING),
+    "imu": (Mode.NO_IMU,),
+    "wheels": (Mode.NO_WHEELS, Mode.RAW),
+}
+"""By sensor: the modes that do not use it."""
+
+
+def find_unusable(rig: Rig, mode: Mode) -> tuple[SensorFinding, ...]:
+    """Return the configured sensors, or parts of their configuration, that a mode of localization cannot use."""
+    return (*_excluded(rig, mode), *_wheels(rig), *_steering(rig), *_antennas(rig), *_heading(rig))
+
+
+def _excluded(rig: Rig, mode: Mode) -> Iterator[SensorFinding]:
+    configured = {"gps": bool(rig.gps_frame), "imu": bool(rig.imu_frame), "wheels": bool(rig.wheel_frames)}
+    for sensor, modes in _EXCLUDED.items():
+        if configured[sensor] and mode in modes:
+            yield SensorFinding(
+                sensor,
+                "mode",
+                "localization.mode",
+                f"mode {mode.name.lower()} does not use it",
+                "switch to mode full where it should be used",
+                is_choice=True,
+            )
+
+
+def _wheels(rig: Rig) -> Iterator[SensorFinding]:
+    frames = "sensors.wheels.frames"
+    if rig.has_wheels and not rig.wheel_frames:
+        text = "frames names no wheels, so nothing of them is used"
+        yield SensorFinding(
+            "wheels", "frames", frames, text, "write frames: {NAME: BODY:FRAME} with the names that the driver gives"
+        )
+    elif rig.kinematics == "ackermann" and len(rig.wheel_frames) == 1:
+        text = "ackermann with a single wheel: the wheels tell no turn"
+        yield SensorFinding("wheels", "single", frames, text, "name the wheels of the other side and axle too")
+
+
+def _steering(rig: Rig) -> Iterator[SensorFinding]:
+    signal, element = rig.steering, "sensors.wheels.steering"
+    if signal is None:
+        return
+    if rig.kinematics == "skid_steer":
+        text = "a skid-steered vehicle has no wheels that steer: the steering angle is not used"
+        yield SensorFinding("wheels", "kinematics", element, text, "write kinematics: ackermann, or remove steering")
+        return
+    unknown = [name for name in signal.wheels if name not in rig.wheel_frames]
+    if unknown:
+        known = ", ".join(rig.wheel_frames) or "none"
+        text = f"frames has no wheel {', '.join(unknown)}: the steering angle is not used for it (known: {known})"
+        yield SensorFinding("wheels", "names", f"{element}.wheels", text, "write the names that frames has")
+    contacts = {name: rig.pose(frame).xyz for name, frame in rig.wheel_frames.items()}
+    steered = [name for name in signal.wheels if name in contacts]
+    if signal.geometry == "ackermann" and steered and abs(signal.wheelbase(contacts)) < LEAST_WHEELBASE:
+        text = (
+            f"the steered wheels stand {signal.wheelbase(contacts):.2f} m ahead of the rolling frame, so an angle tells "
+            "no curvature and is not used"
+        )
+        fix = "name the middle of the axle that does not steer as rolling_frame, or write geometry: parallel"
+        yield SensorFinding("wheels", "wheelbase", element, text, fix)
+
+
+def _antennas(rig: Rig) -> Iterator[SensorFinding]:
+    if not (rig.gps_frame and rig.second_antenna_frame):
+        return
+    a, b = rig.pose(rig.gps_frame).xyz, rig.pose(rig.second_antenna_frame).xyz
+    if math.hypot(b[0] - a[0], b[1] - a[1]) <= LEAST_BASELINE:
+        text = f"{rig.second_antenna_frame} stands above {rig.gps_frame}: the two antennas tell no heading"
+        fix = "name the frame of the other antenna's phase center"
+        yield SensorFinding("gps", "baseline", "sensors.gps.second_frame", text, fix)
+
+
+def _heading(rig: Rig) -> Iterator[SensorFinding]:
+    if rig.gps_frame and not (rig.imu_frame or rig.wheel_frames or rig.second_antenna_frame):
+        text = "no IMU, no wheels and no second antenna: heading is known above localization.filter.reverse_speed alone"
+        yield SensorFinding("gps", "alone", "sensors.gps", text, "name an IMU or wheels")
