@@ -169,4 +169,13 @@ def _localization(state: CoreState, estimate: Estimate | None, now: Instant) -> 
 
 def _channel_health(name: str, traffic: Traffic, now: Instant) -> ChannelHealth:
     age = (now.monotonic_ns - traffic.last_ns) * 1e-9
-    return ChannelHealth(name, traffic.count, traffic.rate, age, traffic.told_delay, _is_silent(name, traffic, now), traffic.measured, traffic.used)
+    return ChannelHealth(
+        name,
+        traffic.count,
+        traffic.rate,
+        age,
+        traffic.told_delay,
+        _is_silent(name, traffic, now),
+        traffic.measured,
+        traffic.used,
+    )

@@ -46,9 +46,7 @@ class SteeringSignal:
         if not wheelbase:
             return {}
         curvature = math.tan(angle) / wheelbase
-        return {
-            name: math.atan2(curvature * contacts[name][0], 1.0 - curvature * contacts[name][1]) for name in known
-        }
+        return {name: math.atan2(curvature * contacts[name][0], 1.0 - curvature * contacts[name][1]) for name in known}
 
     def wheelbase(self, contacts: Mapping[str, Vector3]) -> float:
         """Return how far the steered axle is ahead of the rolling frame, m; 0 where it is not known."""

@@ -34,13 +34,7 @@ START_UTIME = 1_750_000_000_000_000
 """When a simulation starts unless told otherwise: a whole second in June 2025."""
 
 Event = (
-    GpsSample
-    | ImuSample
-    | WheelsSample
-    | VehicleStatusSample
-    | AbsolutePoseSample
-    | RelativePoseSample
-    | RangeSample
+    GpsSample | ImuSample | WheelsSample | VehicleStatusSample | AbsolutePoseSample | RelativePoseSample | RangeSample
 )
 
 

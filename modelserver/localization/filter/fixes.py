@@ -33,6 +33,9 @@ FRESH = 1.5
 ANCHORED = 10.0
 """Seconds for which another source that tells the place keeps the pose from going with the fixes."""
 
+COURSE_KNOWN = 0.05
+"""Sigma of the course in N, rad, from which on the receiver's course tells how N is turned: about that of a course."""
+
 CONFLICT_FADES = 20.0
 """Seconds after a fix from beyond its gate for which the bound allows for it in full."""
 
@@ -226,6 +229,10 @@ def by_velocity(setup: Setup, state: FilterState, sample: GpsSample, utime: int)
     if speed_known(setup, state, nav):
         v = horizontal(nav.point_velocity(setup.rig.lever(setup.rig.gps_frame)))
         if not 0.6 * size < abs(v) < 1.6 * size:
+            return None
+        across = np.array((-v.imag, v.real)) / abs(v)
+        if across @ nav.covariance[3:5, 3:5] @ across > (COURSE_KNOWN * abs(v)) ** 2:
+            # wheels have told how fast it goes, and nothing yet that it does not slide
             return None
         return Turn(wrapped(cmath.phase(z) - cmath.phase(v)), sigma, nav.turn_rate[2]), math.nan
     if size < 2.0 * settings.align_speed:

@@ -59,10 +59,12 @@ def sample(setup: Setup, state: FilterState, item: Item) -> Fused:
     scene = scene_of(setup, state, age, before)
     compared = measurement.compare(scene, sample)
     decisions = NOTHING
+    begins = False
     if isinstance(compared, str):
         decisions = (refused(item, compared),) if compared else NOTHING
     else:
-        if _speed_unknown(scene.nav):
+        begins = _speed_unknown(scene.nav)
+        if begins:
             # the way wheels err is a share of speed: compared at the speed that they tell, not at 0
             rolling = updates.moving(scene.nav, compared, setup.rig.base, min(age, settings.wheel_period))
             again = measurement.compare(scene._replace(nav=rolling), sample)
@@ -88,7 +90,8 @@ def sample(setup: Setup, state: FilterState, item: Item) -> Fused:
             decisions += (decision,)
         if not state.standing or rested >= REST_PERIOD:
             state = state._replace(rested_utime=item.utime)
-    if not state.standing and (item.utime - state.rolled_utime) * 1e-6 >= 0.5 * CONSTRAINT_PERIOD:
+    # the first wheels that tell a speed leave the sideways speed to what is known of rolling vehicles
+    if not state.standing and (begins or (item.utime - state.rolled_utime) * 1e-6 >= 0.5 * CONSTRAINT_PERIOD):
         state, more = rolled(setup, state, item.utime)
         decisions += more
     return state, decisions

@@ -34,9 +34,7 @@ SAMPLES: list[tuple[Sample, str]] = [
 
 
 @pytest.mark.parametrize(("sample", "type_name"), SAMPLES)
-def test_given_no_channel_then_a_sample_goes_out_whole_on_the_customary_one(
-    sample: Sample, type_name: str
-) -> None:
+def test_given_no_channel_then_a_sample_goes_out_whole_on_the_customary_one(sample: Sample, type_name: str) -> None:
     sent: list[tuple[str, bytes]] = []
     Publisher(lambda channel, data: sent.append((channel, data)), {}).sample(sample)
     ((channel, data),) = sent

@@ -276,9 +276,7 @@ def _row(rx: float, ry: float, contact: Vector3, body: Array) -> Array:
     return row
 
 
-def _steer(
-    wheel: Rolling, u: Vector3, yaw: float, body: Array, covariance: Array, settings: FilterSettings
-) -> Steered:
+def _steer(wheel: Rolling, u: Vector3, yaw: float, body: Array, covariance: Array, settings: FilterSettings) -> Steered:
     """Return the direction of a wheel whose contact point moves with `u` (body axes, m/s); see the module's theory."""
     if math.isfinite(wheel.steering):
         return Steered(wheel.steering + yaw, 0.0, wheel.steering_sigma**2, (0.0, 0.0))
