@@ -139,13 +139,13 @@ class GpsConfig(SensorConfig):
 class SteeringConfig:
     """Where the angle of wheels that steer comes from, where they do not measure it themselves.
 
-    channel: where the vehicle controller's status (vehicle_status_t) comes. wheels: names of the wheels in `frames` that
-        steer by its steering_angle.
-    geometry: ackermann, the angle is that of one equivalent wheel in the middle of the axle, and each wheel points along
-        its own circle; parallel, all point along the angle itself.
+    channel: where the vehicle controller's status (vehicle_status_t) comes. wheels: names of the wheels in `frames`
+        that steer by its steering_angle.
+    geometry: ackermann, the angle is that of one equivalent wheel in the middle of the axle, and each wheel points
+        along its own circle; parallel, all point along the angle itself.
     sigma: standard deviation of the angle, radians: play of the gear, and how far geometry is kept.
     limit: an angle beyond it to either side is damage and is not used, radians.
-    max_age: an older angle is not used, seconds. Without one the wheels measure the speed of their contact points alone.
+    max_age: an older angle is not used, seconds. Without one wheels measure the speed of their contact points alone.
     latency: seconds by which the stamps are later than the measurement; subtracted from each stamp.
     """
 
@@ -174,9 +174,9 @@ class SteeringConfig:
 class WheelsConfig:
     """The wheels: the channel they are heard on, and for each wheel's name the frame of its contact point.
 
-    kinematics: how the vehicle turns. skid_steer: its sides roll at different speeds and wheels are dragged sideways, so
-        only the mean of all is used; differential and ackermann: each wheel rolls where it points, straight ahead or as
-        it is steered. A wheel whose steering angle nothing measures rolls where its contact point goes.
+    kinematics: how the vehicle turns. skid_steer: its sides roll at different speeds and wheels are dragged sideways,
+        so only the mean of all is used; differential and ackermann: each wheel rolls where it points, straight ahead or
+        as it is steered. A wheel whose steering angle nothing measures rolls where its contact point goes.
     steering: where the angle of wheels that steer comes from, where they do not measure it themselves.
     latency: seconds by which the stamps are later than the measurement; subtracted from each stamp.
     """

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from modelserver.messages import Sample, DriverHealth
+from modelserver.messages import DriverHealth, Sample
 from modelserver.wire.codec import encode
 from msdrivers.registry import CHANNELS
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from modelserver.errors import ConfigError, Problem, Severity, Source, nearest_names, shown
-from modelserver.messages import Sample, GpsSample, ImuSample, JointsSample, VehicleStatusSample, WheelsSample
+from modelserver.messages import GpsSample, ImuSample, JointsSample, Sample, VehicleStatusSample, WheelsSample
 from msdrivers.faults import FAULTS, Fault
 from msdrivers.line_settings import CanSettings, LineSettings, ModbusSettings, SerialSettings, TcpSettings
 from msdrivers.station import Station

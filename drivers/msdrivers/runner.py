@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from modelserver.messages import Sample, DriverHealth, DriverPhase, VehicleCommand
+from modelserver.messages import DriverHealth, DriverPhase, Sample, VehicleCommand
 from msdrivers.device_clock import DeviceClock
 from msdrivers.links import Link, LinkError, PlayedOutError
 from msdrivers.links.guarded import GuardedLink

@@ -10,11 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from modelserver.localization.rig import Rig
+from modelserver.localization.rig import LEAST_WHEELBASE, Rig
 from modelserver.messages import Mode, SensorFinding
-
-LEAST_WHEELBASE = 0.1
-"""Meters between the rolling frame and a steered axle below which a steering angle tells no curvature."""
 
 LEAST_BASELINE = 0.01
 """Meters between two antennas, horizontally, below which they tell no heading."""
@@ -75,8 +72,8 @@ def _steering(rig: Rig) -> Iterator[SensorFinding]:
     steered = [name for name in signal.wheels if name in contacts]
     if signal.geometry == "ackermann" and steered and abs(signal.wheelbase(contacts)) < LEAST_WHEELBASE:
         text = (
-            f"the steered wheels stand {signal.wheelbase(contacts):.2f} m ahead of the rolling frame, so an angle tells "
-            "no curvature and is not used"
+            f"the steered wheels are {signal.wheelbase(contacts):.2f} m ahead of the rolling frame: an angle tells no "
+            "curvature and is not used"
         )
         fix = "name the middle of the axle that does not steer as rolling_frame, or write geometry: parallel"
         yield SensorFinding("wheels", "wheelbase", element, text, fix)

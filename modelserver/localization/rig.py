@@ -15,6 +15,9 @@ from modelserver.spatial.so3 import Vector3
 
 Kinematics: TypeAlias = Literal["skid_steer", "differential", "ackermann"]
 
+LEAST_WHEELBASE = 0.1
+"""Meters between the rolling frame and a steered axle below which a steering angle tells no curvature."""
+
 SteeringGeometry: TypeAlias = Literal["ackermann", "parallel"]
 
 
@@ -43,7 +46,7 @@ class SteeringSignal:
         if self.geometry == "parallel" or not known:
             return dict.fromkeys(known, angle)
         wheelbase = self.wheelbase(contacts)
-        if not wheelbase:
+        if abs(wheelbase) < LEAST_WHEELBASE:
             return {}
         curvature = math.tan(angle) / wheelbase
         return {name: math.atan2(curvature * contacts[name][0], 1.0 - curvature * contacts[name][1]) for name in known}
@@ -59,9 +62,9 @@ class Rig:
     """The vehicle's frames as the filter needs them. The body's axes are those of `rolling_frame`.
 
     `rolling_frame` moves along its own x axis; `imu_frame`, `gps_frame` and `second_antenna_frame` are full names,
-    empty where there is none; `wheel_frames` has the frame of each wheel's contact point by the wheel's name. `steering` is
-    the steering angle that the vehicle controller measures, where the vehicle file names one; `has_wheels` is whether it
-    names wheels at all, with frames or without.
+    empty where there is none; `wheel_frames` has the frame of each wheel's contact point by the wheel's name.
+    `steering` is the steering angle that the vehicle controller measures, where the vehicle file names one;
+    `has_wheels` is whether it names wheels at all, with frames or without.
     Raises QueryError for a frame that the model does not have or join to the rolling frame.
     """
 

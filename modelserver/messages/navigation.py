@@ -40,9 +40,9 @@ class Phase(IntEnum):
 class SensorFinding(NamedTuple):
     """Why a configured sensor cannot be used, in whole or in part.
 
-    `element` is the key of the vehicle file that it is about, `reason` a word for programs, `text` what is wrong and what
-    follows, `fix` what to do. `sensor` is the sensor's key under `sensors`. `is_choice`: the vehicle file asks for it,
-    e.g. by its mode.
+    `element` is the key of the vehicle file that it is about, `reason` a word for programs, `text` what is wrong and
+    what follows, `fix` what to do. `sensor` is the sensor's key under `sensors`. `is_choice`: the vehicle file asks for
+    it, e.g. by its mode.
     """
 
     sensor: str

@@ -29,8 +29,8 @@ from modelserver.formats import load_model
 from modelserver.geodesy import GeodesyError, make_origin
 from modelserver.geometry import Model
 from modelserver.keys import read_keys
-from modelserver.localization.mounts import Mounts
 from modelserver.localization.findings import find_unusable
+from modelserver.localization.mounts import Mounts
 from modelserver.localization.rig import Rig, SteeringSignal
 from modelserver.messages import (
     AbsolutePoseSample,

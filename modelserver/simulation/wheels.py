@@ -149,7 +149,7 @@ class StatusModel:
     """
 
     wheelbase: float
-    timing: Timing = Timing(20.0, latency=0.01, jitter=0.002)
+    timing: Timing = _TIMING
     angle_sigma: float = 0.002
     angle_error: float = 0.0
 

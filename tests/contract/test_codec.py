@@ -140,7 +140,7 @@ def _message(type_name: str, **fields: Any) -> bytes:
         ("gps_t", {"header__source": "s" * 65}),
         ("imu_t", {"orientation_reference": 3}),
         ("imu_t", {"yaw_source": -1}),
-        ("wheels_t", {"direction": [3, 0]}),
+        ("wheels_t", {"direction": [4, 0]}),
         ("absolute_pose_t", {"orientation": [1.0, 0.0, 0.0, 0.1]}),
         ("absolute_pose_t", {"position": [0.0, 0.0, float("inf")]}),
         ("absolute_pose_t", {"covariance": [1.0] * 35 + [float("nan")]}),

@@ -19,6 +19,7 @@ from modelserver.core import CoreState, Expected, step
 from modelserver.core.health import percentile
 from modelserver.core.state import CHANGE_PERIOD_NS, SILENT_LEAST_S
 from modelserver.messages import (
+    Decision,
     Event,
     Gauges,
     GpsSample,
@@ -26,14 +27,17 @@ from modelserver.messages import (
     ImuSample,
     Invalid,
     JointsSample,
+    LocalizerSummary,
     Mode,
     Noticed,
     Phase,
     PublishHealth,
     RangeSample,
+    SensorFinding,
     SensorHeader,
     SwitchMode,
     Tick,
+    Verdict,
 )
 from modelserver.reload import ModelLoaded
 from modelserver.wire.codec import encode
@@ -257,3 +261,62 @@ def test_given_a_report_for_a_change_then_rates_are_those_of_the_last_whole_peri
     change = next(health for at, health in by_time.items() if 1.3 < at < 1.5)
     assert change.channels[0].rate_hz == pytest.approx(100.0, abs=2.0)
     assert change.channels[0].count > by_time[1.0].channels[0].count
+
+
+# --- sensors that cannot be used ---
+
+
+class Unusable(Scripted):
+    """A localizer with a finding, and decisions on its samples that a test sets."""
+
+    findings: tuple[SensorFinding, ...] = ()
+    verdicts: tuple[Decision, ...] = ()
+
+    def summary(self, utime: int) -> LocalizerSummary:
+        return super().summary(utime)._replace(findings=type(self).findings)
+
+    def take(self, sample: Any) -> tuple[Any, tuple[Any, ...]]:
+        taken, notes = super().take(sample)
+        return taken, notes + tuple(each for each in type(self).verdicts if each.source == sample.header.source)
+
+
+@pytest.fixture
+def unusable() -> Iterable[type[Unusable]]:
+    yield Unusable
+    Unusable.findings = Unusable.verdicts = ()
+
+
+def verdict(source: str, verdict: Verdict, reason: str = "", kind: str = "wheel_speed") -> Decision:
+    return Decision(START, source, 0, kind, verdict, reason)
+
+
+def test_given_a_sensor_that_cannot_be_used_then_a_report_goes_out_at_once_with_why_until_it_can(unusable) -> None:
+    run = Run(unusable())
+    run.until(1.5)
+    before = len(run.reports)
+    choice = SensorFinding("gps", "mode", "localization.mode", "mode no_gps does not use it", is_choice=True)
+    unusable.findings = (SensorFinding("wheels", "steering", "sensors.wheels.steering", "no angle", "start it"), choice)
+    run.until(1.8)
+    assert len(run.reports) == before + 1
+    assert dict(run.reports[-1][1].notices) == {"sensors.wheels (steering)": "no angle; start it"}
+    unusable.findings = ()
+    run.until(2.5)
+    assert run.reports[-1][1].notices == ()
+
+
+def test_given_measurements_that_are_dropped_then_it_is_told_how_many_were_used_of_how_many(unusable) -> None:
+    run = Run(unusable())
+    unusable.verdicts = (verdict("gps", Verdict.REJECTED, "names"), verdict("gps", Verdict.REJECTED, "gate", "imu_yaw"))
+    run.until(1.05, [(0.04 * n + 0.01, gps(START + 40_000 * n)) for n in range(19)])
+    (channel,) = run.reports[-1][1].channels
+    assert (channel.measured, channel.used) == (19, 0)
+    assert run.reports[-1][1].notices == ()
+    run.until(1.4, [(1.2, gps(START + S))])
+    ((subject, text),) = run.reports[-1][1].notices
+    assert subject == "sensor:gps"
+    assert text == "20 received, 0 of 20 measurements used; the last 20 were dropped: names"
+    unusable.verdicts = (verdict("gps", Verdict.USED), verdict("gps", Verdict.MONITORED, "at_rest"))
+    run.until(3.05, [(2.5, gps(START + 5 * S // 2))])
+    assert run.reports[-1][1].notices == ()
+    (channel,) = run.reports[-1][1].channels
+    assert (channel.measured, channel.used) == (22, 1)

@@ -40,7 +40,7 @@ def simulation(
     imu_model: ImuModel | None = None,
     wheels_model: WheelsModel | None = None,
 ) -> Simulation:
-    """Return a drive of the vehicle for `seconds` or more, and what those of its sensors measure that give `sensors`."""
+    """Return a drive of the vehicle for `seconds` or more, and what those of its sensors in `sensors` measure."""
     gps, imu, wheels = config.sensors.gps, config.sensors.imu, config.sensors.wheels
     model = load_model(config.geometry, variables=config.variables)
     status = None

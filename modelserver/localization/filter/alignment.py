@@ -3,8 +3,8 @@
 With u_i where the way says the antenna was, and p_i where the fixes say (both horizontal, as complex numbers),
 p_i = p_0 + c u_i. The straight-line fit c = sum conj(u_i - mean u) (p_i - mean p) / sum |u_i - mean u|^2 turns the
 way by arg c; |c| should be 1. Wheels know backward from forward, so a vehicle that starts in reverse is right. Where
-nothing measures the speed, u is the path at speed 1 and |c| the speed: then the course is known, and the heading but for the
-direction of travel, which `direction_of_travel` finds.
+nothing measures the speed, u is the path at speed 1 and |c| the speed: then the course is known, and the heading but
+for the direction of travel, which `direction_of_travel` finds.
 
 Fixes that are late by t tell p(u - t u'), which turns the way too little, by t Im sum conj(u_i - mean u) u'_i over
 sum |u_i - mean u|^2: in a circle by as much as the vehicle turns in that time.

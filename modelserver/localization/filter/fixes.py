@@ -212,7 +212,7 @@ def into_world(setup: Setup, state: FilterState, nav: Nav, turn: Turn, newest: P
 def by_velocity(setup: Setup, state: FilterState, sample: GpsSample, utime: int) -> tuple[Turn, float] | None:
     """Return the turn by the receiver's velocity, and the speed (nan: known already); None where it does not tell.
 
-    Where the speed is not known it is signed by the direction of travel; slower than twice `align_speed` nothing is told.
+    Where the speed is not known it is signed by the direction of travel; below twice `align_speed` nothing is returned.
     """
     settings, nav, newest = setup.settings, state.nav, state.fixed
     assert nav is not None

@@ -16,8 +16,8 @@ INERTIAL, STEERING = "inertial", "steering"
 class Item(NamedTuple):
     """One measurement of a sample, at its instant. Items are fused in the order of their first four fields.
 
-    `measurement` is None for the inertial part of an inertial sample, for the steering angle of a vehicle status, and for
-    an order to switch the mode.
+    `measurement` is None for the inertial part of an inertial sample, for the steering angle of a vehicle status, and
+    for an order to switch the mode.
     """
 
     utime: int

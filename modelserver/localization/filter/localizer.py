@@ -27,8 +27,8 @@ from modelserver.messages import (
     NavigationState,
     Origin,
     OriginLatched,
-    Recalled,
     Phase,
+    Recalled,
     Sample,
     SensorFinding,
     SwitchMode,
@@ -255,12 +255,13 @@ class FilterLocalizer:
                 text = "its specific force at rest is no gravity: are its units m/s2, are its axes in order?"
             else:
                 off = math.degrees(head.tilt)
-                text = f"gravity is {off:.0f} deg off the geometry's up: the mount is wrong, or the vehicle lies on its side"
+                text = f"gravity is {off:.0f} deg off the geometry's up: a wrong mount, or a vehicle on its side"
             fix = "modelserver calibrate imu LOG -c FILE says which mount fits"
             found += (SensorFinding("imu", "gravity", "sensors.imu.frame", text, fix),)
         signal, nav = setup.rig.steering, head.nav
         if signal is not None and nav is not None and head.mode is not Mode.NO_WHEELS:
-            if (nav.utime - head.steering.utime) * 1e-6 > max(signal.max_age, STEERING_STALE):
+            age = (nav.utime - head.steering.utime) * 1e-6
+            if age > max(signal.max_age, STEERING_STALE):
                 text = "no fresh steering angle: the steered wheels are used by the speed of their contact points alone"
                 fix = "start the driver of the vehicle controller, and see that it measures steering_angle"
                 found += (SensorFinding("wheels", "steering", "sensors.wheels.steering", text, fix),)

@@ -74,8 +74,8 @@ class FilterSettings(FixSettings):
     wheel_yaw_walk: float = 1e-5
     """Random walk of that angle, rad/sqrt(s): load shifts it."""
     steering_sigma: float = 0.3
-    """Sigma of the angle of a wheel that steers where nothing measures it, rad: half of the 35 degrees that road vehicles
-    steer at most (turning circle of 10 m, wheelbase of 2.7 m)."""
+    """Sigma of the angle of a wheel that steers where nothing measures it, rad: half of the 35 degrees that road
+    vehicles steer at most (turning circle of 10 m, wheelbase of 2.7 m)."""
     slip_share: float = 0.01
     """Slip of a driven wheel on firm ground, share of speed (M. Mitschke, Dynamik der Kraftfahrzeuge: 1 to 2 %)."""
     slip_acceleration: float = 0.01

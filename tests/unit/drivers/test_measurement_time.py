@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 import pytest
 from support_gx1 import START_UTIME, turning
 
-from modelserver.messages import Sample, FixType, GpsSample, ImuSample, SensorHeader
+from modelserver.messages import FixType, GpsSample, ImuSample, Sample, SensorHeader
 from msdrivers.devices.gps import GpsDriver, GpsSettings
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
 from msdrivers.emulate.gps import GpsEmulator, GpsUnit

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modelserver.messages import Sample, DriverPhase, SensorHeader, WheelSample, WheelsSample
+from modelserver.messages import DriverPhase, Sample, SensorHeader, WheelSample, WheelsSample
 from msdrivers.faults import Fault
 from msdrivers.links.fake import FakeLink, FakeTime
 from msdrivers.protocol.framing import Scanner

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 
 from modelserver.messages import (
-    Sample,
     DriverHealth,
     DriverPhase,
     FixType,
     GpsSample,
     ImuSample,
     JointsSample,
+    Sample,
     SensorHeader,
     VehicleMode,
     VehicleStatusSample,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from modelserver.messages import Sample, DriverHealth, DriverPhase, ImuSample, SensorHeader, VehicleCommand
+from modelserver.messages import DriverHealth, DriverPhase, ImuSample, Sample, SensorHeader, VehicleCommand
 from msdrivers.links import LinkError, PlayedOutError
 from msdrivers.links.fake import FakeLink, FakeTime
 from msdrivers.runner import Runner, RunnerSettings

@@ -246,6 +246,20 @@ def test_given_pulses_without_sign_then_the_direction_gives_it() -> None:
     assert wheels_of(wire)[-1].wheels[0].steering == 0.0
 
 
+def test_given_pulses_and_speeds_without_sign_or_direction_then_they_are_published_as_sizes() -> None:
+    count = CountMap("WheelCounts.FrontLeftCount", METRES_PER_COUNT, wrap=1000, up_only=True)
+    size = SpeedMap("WheelSpeeds.FrontLeftSpeed", is_magnitude=True)
+    settings = wheels_settings(wheels={"front_left": WheelMap(count, size, steers=True)})
+    wire = wired(20.0, swing, settings=settings).run(21.0)
+    wheels = [each.wheels[0] for each in wheels_of(wire)]
+    assert {each.direction for each in wheels} == {Direction.UNSIGNED}
+    assert all(b.travel >= a.travel for a, b in itertools.pairwise(wheels))
+    assert min(each.speed for each in wheels) >= 0.0
+    assert max(each.speed for each in wheels) > 2.5
+    rolled = sum(abs(swing(0.001 * n)) for n in range(20_000)) * 0.001
+    assert wheels[-1].travel == pytest.approx(rolled, abs=0.5)
+
+
 def test_given_the_line_opened_anew_then_half_an_instant_from_before_is_not_joined() -> None:
     database = raptor_dbc()
     driver = WheelsDriver(wheels_settings(), database)

@@ -12,14 +12,15 @@ from functools import lru_cache
 from pathlib import Path
 
 import pytest
-from tests.support_filter import GPS_TIMING, IMU_TIMING, ORIGIN, WHEELS_TIMING, Run, Transform, drive, untouched
-from tests.support_restart import longest_wrong
 
 from modelserver.config import load_config
 from modelserver.localization.filter.localizer import FilterLocalizer
-from modelserver.messages import Direction, Verdict, VehicleStatusSample, WheelSample, WheelsSample
+from modelserver.messages import Direction, VehicleStatusSample, Verdict, WheelSample, WheelsSample
 from modelserver.service.daemon import Vehicle, load_vehicle
 from modelserver.simulation import Event, GpsModel, ImuModel, Phase, Simulation, StatusModel, Trajectory, WheelsModel
+from modelserver.simulation.scenario import START_UTIME
+from tests.support_filter import GPS_TIMING, IMU_TIMING, ORIGIN, WHEELS_TIMING, Run, Transform, drive, untouched
+from tests.support_restart import longest_wrong
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor" / "vehicle.yaml"
 AT_ONCE = Phase(1e-3, -2.0)
@@ -147,15 +148,13 @@ def test_given_a_raptor_that_drives_then_a_lost_and_a_wrong_steering_angle_cost_
 
     def angles(events: Iterable[Event]) -> Iterable[Event]:
         for event in events:
-            t = (event.header.utime - events_start) * 1e-6
+            t = (event.header.utime - START_UTIME) * 1e-6
             if isinstance(event, VehicleStatusSample):
                 if 10.0 < t < 14.0:
                     continue
                 if t > 18.0:
                     event = replace(event, steering_angle=1.2)
             yield event
-
-    from modelserver.simulation.scenario import START_UTIME as events_start
 
     run = raptor_drive(phases, 28.0, transform=angles)
     used, measured = wheels_used(run)

@@ -1,15 +1,14 @@
-"""Wheels that steer: by the speed of their contact point, by the vehicle controller's angle, and without a direction."""
+"""Wheels that steer: by their contact point's speed, by the vehicle controller's angle, and without a direction."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
-from tests.support_cart import BASE, IMU, WHEELS, model, some_nav
-from tests.support_restart import TO_A_STOP, lose
 
 from modelserver.localization.filter.engine import fused
 from modelserver.localization.filter.items import items
@@ -36,7 +35,9 @@ from modelserver.simulation import Phase
 from modelserver.simulation.scenario import START_UTIME
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import cross
+from tests.support_cart import BASE, IMU, WHEELS, model, some_nav
 from tests.support_filter import ORIGIN, drive, simulation
+from tests.support_restart import TO_A_STOP, lose
 
 SETTINGS = FilterSettings()
 FRONT = ("FL", "FR")
@@ -96,7 +97,7 @@ def by_differences(setup: Setup, nav: Nav, measured: WheelsSample, steering: flo
     return np.array(columns).T
 
 
-# --- the measurement ----------------------------------------------------------------------------------------------
+# --- the measurement ---
 
 
 @pytest.mark.parametrize("speed", [3.0, -3.0, 0.8, -0.8])
@@ -128,7 +129,7 @@ def test_given_any_speed_through_zero_then_residual_and_jacobian_stay_finite_and
         assert np.isfinite(found.noise).all()
         assert np.abs(found.residual).max() < 0.02
         rows.append(found.jacobian)
-    assert max(np.abs(a - b).max() for a, b in zip(rows, rows[1:], strict=False)) < 0.05
+    assert max(np.abs(a - b).max() for a, b in pairwise(rows)) < 0.05
 
 
 def test_given_an_unknown_course_then_the_noise_covers_the_whole_range_of_the_steering():
@@ -165,7 +166,7 @@ def test_given_a_skid_steered_vehicle_then_a_wheel_by_an_unknown_angle_is_droppe
 
 
 def test_given_wheels_that_steer_then_they_tell_whether_the_vehicle_is_stationary():
-    contacts = {name: (1.2, 0.0, 0.0) for name in FRONT}
+    contacts = dict.fromkeys(FRONT, (1.2, 0.0, 0.0))
     assert standing_wheels(sample({"FL": 0.0, "FR": 0.01}), None, contacts, SETTINGS) is True
     assert standing_wheels(sample({"FL": 0.0, "FR": 0.3}), None, contacts, SETTINGS) is False
     sizes = sample({"FL": 0.3, "FR": 0.3}, direction=Direction.UNSIGNED)
@@ -186,7 +187,7 @@ def test_given_two_wheels_without_angles_then_they_tell_the_turn_rate(speed, cur
     assert found == pytest.approx(speed * curvature, abs=0.01)
 
 
-# --- the controller's steering angle --------------------------------------------------------------------------------
+# --- the controller's steering angle ---
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, -0.5])
@@ -245,7 +246,7 @@ def test_given_an_angle_when_it_ages_then_the_wheels_go_back_to_the_speed_of_the
     assert math.isnan(steering_angle(setup, state))
 
 
-# --- what cannot be used ---------------------------------------------------------------------------------------------
+# --- what cannot be used ---
 
 
 def test_given_configurations_that_cannot_be_used_then_each_is_found_with_its_key():
@@ -267,7 +268,7 @@ def test_given_configurations_that_cannot_be_used_then_each_is_found_with_its_ke
     assert all(each.text and each.fix for each in find_unusable(rear, Mode.FULL))
 
 
-# --- warm start --------------------------------------------------------------------------------------------------------
+# --- warm start ---
 
 
 @lru_cache(maxsize=1)

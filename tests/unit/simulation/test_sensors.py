@@ -12,12 +12,21 @@ import pytest
 from modelserver import earth
 from modelserver.geodesy import Geodesy, LocalFrame, origin_at
 from modelserver.geometry import Model, ModelBuilder
-from modelserver.messages import Direction, FixType, GpsSample, ImuSample, OrientationReference, WheelsSample
+from modelserver.messages import (
+    Direction,
+    FixType,
+    GpsSample,
+    ImuSample,
+    OrientationReference,
+    VehicleStatusSample,
+    WheelsSample,
+)
 from modelserver.simulation import (
     GpsModel,
     ImuModel,
     Phase,
     Simulation,
+    StatusModel,
     Trajectory,
     WheelsModel,
     figure_eight,
@@ -264,6 +273,29 @@ def test_the_difference_of_the_wheels_travel_is_the_turn_times_the_track():
         assert rolled["rear_right"] - rolled["rear_left"] == pytest.approx(turned * TRACK, abs=1e-9)
         # wheels that do not steer roll the forward part of their way, at the front as at the rear
         assert rolled["front_left"] == pytest.approx(rolled["rear_left"], abs=1e-9)
+
+
+def test_the_vehicle_controller_measures_the_speed_and_the_angle_of_the_equivalent_front_wheel():
+    """The steered wheels' own angles lie on both sides of it, by Ackermann's geometry."""
+    steered = frozenset(("front_left", "front_right"))
+    run = simulation(
+        gps_frame=None,
+        imu_frame=None,
+        wheels_model=WheelsModel.noise_free(steered=steered),
+        status_model=StatusModel(BASE, Timing(20.0), angle_sigma=0.0),
+    )
+    events = list(run.events(40.0))
+    wheels = {each.header.utime: each.wheels for each in events if isinstance(each, WheelsSample)}
+    statuses = [each for each in events if isinstance(each, VehicleStatusSample)]
+    assert len(statuses) == len(wheels) == 800
+    for status in statuses:
+        left, right = (math.tan(each.steering) for each in wheels[status.header.utime] if each.name in steered)
+        equivalent = math.tan(status.steering_angle)
+        if abs(equivalent) > 0.05:
+            assert 1.0 / equivalent == pytest.approx(0.5 * (1.0 / left + 1.0 / right))
+        assert min(left, right) - 1e-9 <= equivalent <= max(left, right) + 1e-9
+    assert min(each.forward_speed for each in statuses) < -1.0
+    assert max(abs(each.steering_angle) for each in statuses) > 0.2
 
 
 def test_unsteered_and_steered_wheels_follow_the_way_of_their_contact_points():

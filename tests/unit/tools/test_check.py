@@ -227,6 +227,10 @@ def test_one_wheel_of_a_steered_vehicle_and_wheels_without_names_are_warned_of(c
     for wheels, words in (
         ("{kinematics: ackermann, frames: {left: Cart:Mast}}", "ackermann with a single wheel"),
         ("{kinematics: differential}", "frames names no wheels"),
+        (
+            "{kinematics: skid_steer, frames: {left: Cart:Mast}, steering: {wheels: [left]}}",
+            "a skid-steered vehicle has no wheels that steer",
+        ),
     ):
         code, out, _ = check(**{"vehicle.yaml": f"{VEHICLE}sensors:\n  wheels: {wheels}\n"})
         assert code == 1

@@ -62,7 +62,7 @@ class CountMap:
     wrap: int = 0
     """The counter goes from wrap - 1 to 0; 0: as many as its bits hold."""
     up_only: bool = False
-    """The encoder counts up whichever way the wheel turns; the sign comes from the direction signal, or is not known."""
+    """The encoder counts up whichever way the wheel turns; the sign is the direction signal's, or not known."""
 
     def __post_init__(self) -> None:
         check_signal(self.signal)

@@ -41,8 +41,8 @@ class Scene(NamedTuple):
     `nav` is the state at the measurement's instant, its covariance caught up. `site` is the tangent plane that N is
     east, north and up of; None before the filter is aligned, when N has no place in the world. `geodesy` is that of the
     origin, None before it is known. `age` is the time since the last measurement of the same kind from the same source
-    that was compared, seconds (infinite: none was); `before` is the sample it came from. `steering` is the steering angle
-    that the vehicle controller measures, rad; nan where there is none that is fresh.
+    that was compared, seconds (infinite: none was); `before` is the sample it came from. `steering` is the steering
+    angle that the vehicle controller measures, rad; nan where there is none that is fresh.
     """
 
     nav: Nav

@@ -15,8 +15,8 @@ of u is noise there; so the angle is estimated from both that are known of it, a
     the prior m +- steering_sigma   and   the course of u, atan2(u_y, u_x) +- sqrt(V), V = var(u across) / |u|^2.
 
 With the weight k = steering_sigma^2 / (steering_sigma^2 + V) the measurement is |u| where the course is known (k = 1),
-and a wheel that points ahead with an uncertain angle where it is not (k = 0), with a continuous transition. What is left
-of the angle's variance P = k V acts through u across the wheel, to the second order: (u_across)^2 P + 3/4 (|u| P)^2.
+and a wheel that points ahead by an uncertain angle where it is not (k = 0), with a continuous transition. The angle's
+remaining variance P = k V acts through u across the wheel, to the second order: (u_across)^2 P + 3/4 (|u| P)^2.
 
 Sign. An encoder without a direction (`Direction.UNSIGNED`) measures |z|. Its sign is that of the predicted speed where
 that is certain to three sigmas; otherwise the sample is not used.
@@ -204,7 +204,7 @@ class WheelSpeed:
         earlier = {wheel.name: wheel.travel for wheel in before.wheels} if before is not None else {}
         return any(math.isfinite(wheel.travel - earlier.get(wheel.name, math.nan)) for wheel in sample.wheels)
 
-    def _compared(self, scene: Scene, wheels: list[Rolling]) -> Compared:
+    def _compared(self, scene: Scene, wheels: list[Rolling]) -> Compared | str:
         nav, layout, settings = scene.nav, scene.layout, scene.settings
         dt = scene.age
         scale, yaw = 1.0 + scene.extra(SCALE), scene.extra(YAW)
