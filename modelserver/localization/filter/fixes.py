@@ -232,7 +232,7 @@ def by_velocity(setup: Setup, state: FilterState, sample: GpsSample, utime: int)
             return None
         across = np.array((-v.imag, v.real)) / abs(v)
         if across @ nav.covariance[3:5, 3:5] @ across > (COURSE_KNOWN * abs(v)) ** 2:
-            # wheels have told how fast it goes, and nothing yet that it does not slide
+            # wheels have measured how fast it goes, and nothing yet that it does not slide
             return None
         return Turn(wrapped(cmath.phase(z) - cmath.phase(v)), sigma, nav.turn_rate[2]), math.nan
     if size < 2.0 * settings.align_speed:

@@ -28,9 +28,7 @@ def test_given_a_report_then_the_demo_and_the_status_say_how_many_measurements_w
 def test_given_wheels_that_were_never_used_then_the_demo_fails_and_says_why() -> None:
     notice = ("sensor:wheels", "1230 received, 0 of 217 measurements used; the last 217 were dropped: nan")
     health = replace(WELL, channels=(replace(WHEELS, used=0),), notices=(notice,))
-    with pytest.raises(
-        DemoError, match="no measurement of the wheels was used: sensor:wheels: 1230 received"
-    ):
+    with pytest.raises(DemoError, match="no measurement of the wheels was used: sensor:wheels: 1230 received"):
         usage(health)
     with pytest.raises(DemoError, match="no health report"):
         usage(None)
