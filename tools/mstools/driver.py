@@ -178,11 +178,16 @@ def warn_of_names(vehicle: VehicleConfig, settings: DriverSettings) -> None:
 
 def channels_of(vehicle: VehicleConfig, settings: DriverSettings) -> dict[type, str]:
     """Return on which channels a driver's samples go out: the driver's own, else those that the service hears."""
-    from modelserver.messages import GpsSample, ImuSample, WheelsSample
+    from modelserver.messages import GpsSample, ImuSample, VehicleStatusSample, WheelsSample
 
     sensors = vehicle.sensors
-    heard = ((GpsSample, sensors.gps), (ImuSample, sensors.imu), (WheelsSample, sensors.wheels))
-    channels: dict[type, str] = {kind: sensor.channel for kind, sensor in heard if sensor is not None}
+    subscribed = (
+        (GpsSample, sensors.gps),
+        (ImuSample, sensors.imu),
+        (WheelsSample, sensors.wheels),
+        (VehicleStatusSample, sensors.steering),
+    )
+    channels: dict[type, str] = {kind: sensor.channel for kind, sensor in subscribed if sensor is not None}
     if settings.channel:
         channels[settings.kind.sample] = settings.channel
     return channels
