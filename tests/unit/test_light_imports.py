@@ -80,6 +80,11 @@ def test_check_loads_nothing_heavy(cart):
     assert (loaded, run.returncode) == ([], 0), run.stderr
 
 
+def test_the_service_and_its_filter_load_pyproj_alone_of_what_is_heavy():
+    loaded, run = heavy_after("import modelserver.service.daemon, modelserver.localization.filter.localizer")
+    assert (loaded, run.returncode) == (["pyproj"], 0), run.stderr
+
+
 def test_the_watch_sees_what_is_heavy():
     loaded, _ = heavy_after("import scipy")
     assert loaded == ["scipy"]

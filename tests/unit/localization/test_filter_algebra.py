@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from filterpy.kalman import KalmanFilter
 from scipy import stats
 from support_cart import rig, some_nav
 
@@ -88,6 +89,24 @@ def test_given_any_numbers_when_predicted_then_it_is_what_the_formula_says():
     kept = P.copy()
     assert kalman.predicted(P, F, Q) == pytest.approx(F @ P @ F.T + Q)
     assert (kept == P).all()
+
+
+@pytest.mark.parametrize("m", [1, 2, 3, 6])
+@pytest.mark.parametrize("seed", range(5))
+def test_given_any_numbers_then_filterpy_computes_the_same_to_the_bit(seed, m):
+    rng = np.random.default_rng(seed)
+    n = 20
+    P, F, Q = spread(rng, n), rng.normal(size=(n, n)), spread(rng, n)
+    H, R, residual = rng.normal(size=(m, n)), spread(rng, m), rng.normal(size=m)
+    oracle = KalmanFilter(dim_x=n, dim_z=m)
+    oracle.x, oracle.P = np.zeros(n), P
+    oracle.predict(F=F, Q=Q)
+    predicted = kalman.predicted(P, F, Q)
+    assert predicted.tolist() == oracle.P.tolist()
+    oracle.update(residual, R=R, H=H)
+    error, after = kalman.corrected(predicted, residual, H, R)
+    assert error.tolist() == oracle.x.tolist()
+    assert after.tolist() == (0.5 * (oracle.P + oracle.P.T)).tolist()
 
 
 def test_given_calls_of_one_size_between_then_nothing_is_carried_from_one_to_the_other():
