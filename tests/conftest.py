@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 
-import pytest
-from hypothesis import settings
-from support_lcm import reserved_url
+# Modules are compiled once, also where the environment forbids it: each worker and each of the hundreds of processes
+# that tests start would compile the whole package again, which doubles the time until a daemon serves. Before the
+# imports, for pytest compiles what it rewrites when it is imported.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+from collections.abc import Iterator  # noqa: E402
+from pathlib import Path  # noqa: E402
+
+import pytest  # noqa: E402
+from hypothesis import settings  # noqa: E402
+from support_lcm import reserved_url  # noqa: E402
 
 # The same examples on every run and every machine; a loaded machine must not fail a test by its slowness.
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=50)
 settings.load_profile("repeatable")
-
-# Modules are compiled once, also where the environment forbids it: each worker and each of the hundreds of processes
-# that tests start would compile the whole package again, which doubles the time until a daemon serves.
-sys.dont_write_bytecode = False
-os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
 @pytest.fixture(scope="session")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import cache
 
 from modelserver.localization.filter.localizer import FilterLocalizer
 from modelserver.localization.filter.setup import Setup
@@ -23,11 +26,26 @@ DRIVES_OFF = (Phase(2.0, 2.0, 0.0), Phase(20.0, 2.0, 0.1), Phase(2.0, 0.0))
 
 def first_run(after: Sequence[Phase] = (), seed: int = 1, seconds: float = FIRST) -> tuple[Run, Kept]:
     """The run that is broken off, and what it kept."""
+    run, kept = _first_run(tuple(after), seed, seconds)
+    return replace(run, simulation=_fork(run.simulation)), kept
+
+
+@cache
+def _first_run(after: tuple[Phase, ...], seed: int, seconds: float) -> tuple[Run, Kept]:
+    """Simulate a first run once for all tests of it; nobody may draw from its simulation but through `_fork`."""
     sim = simulation((*TO_A_STOP, *after, Phase(200.0)), seed=seed)
+    (sim._arrivals,) = itertools.tee(sim._arrivals, 1)
     run = drive(sim, seconds)
     kept = run.localizer.kept()
     assert kept is not None
     return run, kept
+
+
+def _fork(sim: Simulation) -> Simulation:
+    """Return a simulation that continues like `sim`, which stays where it is."""
+    fork = copy.copy(sim)
+    fork._arrivals = copy.copy(sim._arrivals)
+    return fork
 
 
 def second_run(

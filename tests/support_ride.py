@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from modelserver import core
 from modelserver.config import load_config
 from modelserver.core import CoreState, Instant
 from modelserver.messages import GpsSample, ImuSample, Invalid, PoseAnswer, PublishPose, Tick, WheelsSample
-from modelserver.service.daemon import load_vehicle
+from modelserver.service.daemon import Vehicle, load_vehicle
 from modelserver.simulation import Event, Simulation
 from modelserver.spatial.pose import Pose
 from mstools.demo_drive import simulation
@@ -28,6 +29,12 @@ LONGEST_LIE_S = 1.0
 Transform = Callable[[Iterable[Event]], Iterable[Event]]
 
 
+@cache
+def raptor() -> Vehicle:
+    """Load the Raptor once for all drives of it."""
+    return load_vehicle(load_config(RAPTOR / "vehicle.yaml"))
+
+
 @dataclass
 class Ride:
     """A drive: stands for three seconds, then drives eights at 3 m/s. Its truth, and what its sensors say."""
@@ -35,10 +42,11 @@ class Ride:
     start_utime: int
     seconds: float
     simulation: Simulation
+    _truths: dict[int, Pose] = field(default_factory=dict)
 
     @classmethod
     def at(cls, start_utime: int, seconds: float, scenario: str = "eight", **models: Any) -> Ride:
-        config = load_config(RAPTOR / "vehicle.yaml")
+        config = raptor().config
         return cls(start_utime, seconds, simulation(config, start_utime, seconds, scenario, sensors=SENSORS, **models))
 
     def events(self, transform: Transform = lambda events: events) -> list[Event]:
@@ -47,9 +55,11 @@ class Ride:
 
     def truth(self, utime: int) -> Pose:
         """Where the base frame is in World:UTM: easting, northing and height themselves, not relative to an origin."""
-        true = self.simulation.truth(utime).utm
-        origin = self.simulation.geodesy.origin.initial_utm
-        return true.__class__(tuple(a + b for a, b in zip(true.xyz, origin, strict=True)), true.wxyz)
+        if utime not in self._truths:
+            true = self.simulation.truth(utime).utm
+            origin = self.simulation.geodesy.origin.initial_utm
+            self._truths[utime] = Pose(tuple(a + b for a, b in zip(true.xyz, origin, strict=True)), true.wxyz)
+        return self._truths[utime]
 
 
 @dataclass(frozen=True)
@@ -119,7 +129,6 @@ def told_to_core(ride: Ride, events: Iterable[Event], clock_step: tuple[float, f
 
     `clock_step`: at so many seconds the time of day is set so many seconds ahead; the samples' stamps are as given.
     """
-    vehicle = load_vehicle(load_config(RAPTOR / "vehicle.yaml"))
     begin = ride.start_utime
 
     def now(arrival: int) -> Instant:
@@ -128,7 +137,7 @@ def told_to_core(ride: Ride, events: Iterable[Event], clock_step: tuple[float, f
             1_000_000_000 + since * 1000, arrival + (round(clock_step[1] * 1e6) if since >= clock_step[0] * 1e6 else 0)
         )
 
-    run = CoreRun(ride, vehicle.core(now(begin)))
+    run = CoreRun(ride, raptor().core(now(begin)))
     due = begin
     for event in events:
         while event.header.host_utime >= due:
