@@ -1,7 +1,8 @@
 # Two commands on a fresh machine with python3, python3-venv and make:
 #   make demo     makes its own environment, installs, runs the demo
 #   make test     the same for the tests
-# and: make check (format, lint, types), make bench (ratio benchmarks), make clean.
+# and: make test-quick (the tests that need neither processes nor long drives, for the inner loop: under a minute),
+#      make check (format, lint, types), make bench (ratio benchmarks), make clean.
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -12,10 +13,10 @@ BIN    := $(VENV)/bin
 RUN_STAMP := $(VENV)/.installed-run
 DEV_STAMP := $(VENV)/.installed-dev
 
-.PHONY: demo test check format bench types clean help
+.PHONY: demo test test-quick check format bench types clean help
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | head -4
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -5
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -37,6 +38,9 @@ demo: $(RUN_STAMP)
 
 test: $(DEV_STAMP)
 	$(BIN)/python -m pytest -n auto $(TESTS)
+
+test-quick: $(DEV_STAMP)
+	$(BIN)/python -m pytest -n "$$(nproc)" -m "not slow" tests/unit tests/contract tests/property
 
 check: $(DEV_STAMP)
 	$(BIN)/ruff format --check .

@@ -12,6 +12,7 @@ sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 from collections.abc import Iterator  # noqa: E402
+from itertools import zip_longest  # noqa: E402
 from pathlib import Path  # noqa: E402
 
 import pytest  # noqa: E402
@@ -21,6 +22,37 @@ from support_lcm import reserved_url  # noqa: E402
 # The same examples on every run and every machine; a loaded machine must not fail a test by its slowness.
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=50)
 settings.load_profile("repeatable")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """Run more workers than processors: half of the scenario tests' time is real time that has to pass."""
+    return len(os.sched_getaffinity(0)) + 2
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Order the files, which are what workers take (`--dist loadfile`): those that last go first.
+
+    Scenario files, which mostly wait, alternate with files that compute, so that neither kind runs all at once.
+    """
+    files: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.path, []).append(item)
+    slow = {path: sum(each.get_closest_marker("slow") is not None for each in found) for path, found in files.items()}
+    waiting = sorted((path for path in files if path.parent.name == "scenario"), key=_rank)
+    computing = sorted((path for path, count in slow.items() if count and path not in waiting), key=lambda p: -slow[p])
+    mixed = [path for pair in zip_longest(waiting, computing) for path in pair if path is not None]
+    rest = [path for path in files if path not in mixed]
+    items[:] = [item for path in (*mixed, *rest) for item in files[path]]
+
+
+LONGEST = ("drivers", "service", "systemd", "demo", "faults_strangers", "faults_machine", "monitoring", "mirror")
+"""Scenario files that take longest, the longest first."""
+
+
+def _rank(path: Path) -> int:
+    name = path.stem.removeprefix("test_")
+    return LONGEST.index(name) if name in LONGEST else len(LONGEST)
 
 
 @pytest.fixture(scope="session")

@@ -133,12 +133,13 @@ class Trial:
             self._bus.publish(channel, data)
 
     def feed(self, events: Iterable[Event] | None = None) -> None:
-        """Tell of the drive from now on, in real time: what is past already at once."""
-        stream = list(self.ride.events() if events is None else events)
-        before = [each for each in stream if each.header.host_utime < time.time_ns() // 1000]
-        for event in before:
+        """Publish the drive in real time from now on: what is past already at once."""
+        stream = iter(self.ride.stream() if events is None else events)
+        for event in stream:
+            if event.header.host_utime >= time.time_ns() // 1000:
+                self.spawn(self._feed, itertools.chain([event], stream))
+                return
             self.tell(event)
-        self.spawn(self._feed, stream[len(before) :])
 
     def tell_all(self, events: Sequence[Event], portion: int = 1000) -> None:
         """Tell of a whole drive as fast as the daemon takes it, and return when it has taken it all."""
@@ -253,7 +254,7 @@ class Trial:
         self._threads.append(thread)
         thread.start()
 
-    def _feed(self, stream: Sequence[Event]) -> None:
+    def _feed(self, stream: Iterable[Event]) -> None:
         # the pace is the monotonic clock's: the time of day may be stepped
         ahead = time.time_ns() // 1000 - time.monotonic_ns() // 1000
         for event in stream:
@@ -289,7 +290,7 @@ class Trial:
 def trial(
     url: str,
     folder: Path,
-    seconds: float = 40.0,
+    seconds: float = PAST_S + 4.0 * PATIENCE_S,
     past: float = PAST_S,
     feeding: bool = True,
     command: Sequence[str] = MODELSERVER,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -43,6 +44,8 @@ class Ride:
     seconds: float
     simulation: Simulation
     _truths: dict[int, Pose] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    """Held while the simulation works: one thread may stream its events and another ask for its truth."""
 
     @classmethod
     def at(cls, start_utime: int, seconds: float, scenario: str = "eight", **models: Any) -> Ride:
@@ -51,12 +54,23 @@ class Ride:
 
     def events(self, transform: Transform = lambda events: events) -> list[Event]:
         """What arrives during the drive, in the order of arrival (host_utime)."""
-        return list(transform(self.simulation.events(self.seconds)))
+        return list(self.stream(transform))
+
+    def stream(self, transform: Transform = lambda events: events) -> Iterator[Event]:
+        """The same, each simulated when it is asked for."""
+        events = iter(transform(self.simulation.events(self.seconds)))
+        while True:
+            with self._lock:
+                event = next(events, None)
+            if event is None:
+                return
+            yield event
 
     def truth(self, utime: int) -> Pose:
         """Where the base frame is in World:UTM: easting, northing and height themselves, not relative to an origin."""
         if utime not in self._truths:
-            true = self.simulation.truth(utime).utm
+            with self._lock:
+                true = self.simulation.truth(utime).utm
             origin = self.simulation.geodesy.origin.initial_utm
             self._truths[utime] = Pose(tuple(a + b for a, b in zip(true.xyz, origin, strict=True)), true.wxyz)
         return self._truths[utime]

@@ -75,6 +75,7 @@ def test_given_every_other_type_when_decoded_then_the_fingerprint_is_refused(typ
             assert caught.value.reason == "fingerprint"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("type_name", "value"), CASES)
 def test_given_any_bit_flipped_when_decoded_then_nothing_but_wire_error_is_raised(type_name: str, value: Any) -> None:
     data = encode(value, type_name)
@@ -85,6 +86,7 @@ def test_given_any_bit_flipped_when_decoded_then_nothing_but_wire_error_is_raise
             _decode_any(type_name, bytes(damaged))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("type_name", "value"), CASES)
 def test_given_a_huge_count_anywhere_when_decoded_then_little_memory_is_used(type_name: str, value: Any) -> None:
     data = encode(value, type_name)

@@ -9,6 +9,8 @@ from support_urdf import BOT_FRAMES, URDF
 from modelserver.errors import GeometryError, Severity
 from modelserver.formats import parse_model, save_model
 
+pytestmark = pytest.mark.slow
+
 TREE = tree(tree_frame("$MRN"), tree_frame("Mast", "$MRN", X="1.5", Yaw="90"), tree_frame("Camera", "Mast", Roll="-3"))
 JOINTS = YAML.replace(
     "xyz: [0, 0, 0.1]", "joint: {type: revolute, axis: [0, 1, 0], limits_deg: [-9, 9], mimic: Lift}"

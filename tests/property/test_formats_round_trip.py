@@ -3,6 +3,7 @@
 from itertools import product
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support_formats import assert_same_transforms, models, read
@@ -12,6 +13,8 @@ from modelserver.formats import save_model
 from modelserver.formats.frame_tree_text import instance_names
 from modelserver.formats.yaml_text import degrees_of
 from modelserver.spatial import Pose
+
+pytestmark = pytest.mark.slow
 
 
 def folded(text):

@@ -66,6 +66,7 @@ def test_given_readings_in_any_order_and_twice_then_the_same_is_held(some, rando
     assert told(shuffled) == told(some)
 
 
+@pytest.mark.slow
 @given(readings, st.randoms(use_true_random=False))
 def test_given_more_than_may_be_held_then_the_newest_are_held_in_any_order(some, random) -> None:
     shuffled = random.sample(some, len(some))

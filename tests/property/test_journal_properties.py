@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -41,6 +42,7 @@ def test_given_any_records_then_they_come_back(batches: list[list[Record]]) -> N
     assert back(data) == [each for batch in batches for each in batch]
 
 
+@pytest.mark.slow
 @given(BATCHES)
 def test_given_a_cut_at_every_byte_then_the_batches_before_it_come_back(batches: list[list[Record]]) -> None:
     written = [batch_written(number, batch) for number, batch in enumerate(batches)]

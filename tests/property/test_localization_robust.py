@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from functools import lru_cache
 
+import pytest
 import support_cart
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
@@ -35,6 +36,8 @@ from modelserver.messages import (
 )
 from modelserver.simulation import Event
 from modelserver.simulation.scenario import START_UTIME
+
+pytestmark = pytest.mark.slow
 
 wild = st.floats(allow_nan=True, allow_infinity=True, width=64)
 number = st.one_of(wild, st.floats(-1e3, 1e3), st.sampled_from((0.0, -0.0, 1.0, math.nan, math.inf, 1e308, 5e-324)))

@@ -27,6 +27,7 @@ def product_of(route, positions):
     return product
 
 
+@pytest.mark.slow
 @given(models(), st.data())
 @settings(max_examples=60)
 def test_given_joints_anywhere_then_a_routes_pose_is_the_product_of_its_edges(model, data):
@@ -79,6 +80,7 @@ def test_given_a_chain_then_its_covariance_is_that_of_composing_and_inverting_st
     assert chain.product(some).is_close(X, 1e-12, 1e-12)
 
 
+@pytest.mark.slow
 @given(st.lists(links, min_size=1, max_size=6))
 def test_given_links_that_share_a_source_then_each_sources_share_is_what_moving_it_does(some):
     some = [link._replace(source=number % 3) for number, link in enumerate(some)]
@@ -116,6 +118,7 @@ def test_given_a_covariance_of_any_rank_then_its_factor_squares_to_it(rank):
 # --- joints in chains -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(models(), st.data())
 @settings(max_examples=40)
 def test_given_joints_that_err_then_a_routes_covariance_is_what_moving_each_does(model, data):

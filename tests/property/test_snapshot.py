@@ -21,6 +21,7 @@ def snapshot(model: Model) -> Snapshot:
     return Snapshot("rover", model, "A:B", "C:D", 12.5, "ARM_JOINTS", 1500)
 
 
+@pytest.mark.slow
 @given(models())
 @settings(max_examples=40, deadline=None)
 def test_given_any_model_then_its_snapshot_is_of_the_same_revision(model: Model) -> None:

@@ -4,6 +4,7 @@ import io
 from itertools import product
 
 import numpy as np
+import pytest
 import yourdfpy
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,6 +15,8 @@ from modelserver.formats import save_model
 from modelserver.formats.urdf_text import link_names
 from modelserver.geometry import ModelBuilder
 from modelserver.spatial import Pose
+
+pytestmark = pytest.mark.slow
 
 
 def assert_same_places(model, again, place, values):

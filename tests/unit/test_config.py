@@ -273,6 +273,7 @@ def test_given_a_key_twice_then_both_lines_are_told(text: str, element: str, lin
 # --- what is wrong with a value -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "element", "message"),
     [
@@ -466,6 +467,7 @@ def test_given_a_python_tag_then_nothing_is_built_from_it(tmp_path: Path) -> Non
     assert not trace.exists()
 
 
+@pytest.mark.slow
 def test_given_damage_anywhere_then_nothing_but_config_error_is_raised() -> None:
     rng = random.Random(3)
     whole = (ROOT / "config" / "raptor" / "vehicle.yaml").read_bytes()

@@ -160,6 +160,7 @@ def test_shown_is_quoted_escaped_and_cut():
     assert shown("x" * 100) == f"'{'x' * 80}'... (100 characters)"
 
 
+@pytest.mark.slow
 def test_a_file_in_which_everything_is_wrong_gives_each_problem_a_short_message():
     builder = star(4_000)
     for number in range(2_000):
@@ -169,6 +170,7 @@ def test_a_file_in_which_everything_is_wrong_gives_each_problem_a_short_message(
     assert max(len(str(problem)) for problem in problems) < 800
 
 
+@pytest.mark.slow
 def test_ten_thousand_orphans_are_sorted_out():
     builder = ModelBuilder()
     for number in range(5_000):

@@ -13,6 +13,8 @@ from support_ride import LONGEST_LIE_S, CoreRun, Ride, told_to_core
 from modelserver.messages import GpsSample
 from modelserver.simulation import Event, GpsModel
 
+pytestmark = pytest.mark.slow
+
 START = 1_700_000_000_000_000
 SECONDS = 36.0
 ENOUGH = 24.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import graphlib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -148,7 +149,11 @@ def imported(tree: ast.AST, module: str, is_package: bool) -> list[tuple[int, st
                 base = ".".join([*above, base] if base else above)
             # `from modelserver import core` imports the module core; names of deeper modules stay in their package
             found += [(node.lineno, f"{base}.{alias.name}") for alias in node.names]
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module") and node.args:
+        elif (
+            isinstance(node, ast.Call)
+            and node.args
+            and getattr(node.func, "attr", getattr(node.func, "id", "")).endswith("import_module")
+        ):
             first = node.args[0]
             if isinstance(first, ast.Constant) and isinstance(first.value, str):
                 found.append((node.lineno, first.value))
@@ -203,10 +208,15 @@ def impure(tree: ast.AST, module: str, is_package: bool) -> list[tuple[int, str]
     return wrong
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), str(path))
+
+
 def findings(rule) -> list[str]:
     report = []
     for path in sources():
-        tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
+        tree = parsed(path)
         report += [
             f"{path.relative_to(ROOT)}:{line}: {message}"
             for line, message in rule(tree, module_of(path), path.name == "__init__.py")

@@ -69,6 +69,7 @@ print(*answer.position)
     assert (loaded, run.returncode, run.stdout.split()) == ([], 0, ["0.1", "0.0", "1.0"]), run.stderr
 
 
+@pytest.mark.slow
 def test_query_with_a_file_loads_nothing_heavy(cart):
     loaded, run = heavy_after(COMMAND, "query", "Camera:Lens", "Cart:Origin", "--model", cart)
     assert (loaded, run.returncode) == ([], 0), run.stderr

@@ -159,6 +159,7 @@ def test_given_bounds_then_they_stand_beside_the_base_frame_in_the_world_alone()
 # --- covariance ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", [UTM, ODOM])
 @pytest.mark.parametrize("inverse", [False, True])
 def test_given_a_mounted_frame_then_its_covariance_agrees_with_monte_carlo(world: str, inverse: bool) -> None:

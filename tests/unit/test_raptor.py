@@ -89,6 +89,7 @@ def from_origins(plain):
 # --- all pairs ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_pair_of_frames_agrees_between_both_searches_the_answer_and_a_numpy_product(raptor, plain, from_origins):
     frames, _ = plain
     names = [f"{body.name}:{frame.name}" for body in raptor.bodies for frame in body]

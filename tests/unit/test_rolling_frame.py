@@ -69,6 +69,7 @@ def errors_in_turns(rolling_frame: str) -> tuple[float, float]:
     return worst_yaw, worst_place
 
 
+@pytest.mark.slow
 def test_given_the_axle_as_rolling_frame_then_pose_is_right_in_turns_where_the_cg_slides() -> None:
     yaw, place = errors_in_turns(AXLE)
     assert yaw < 2.5

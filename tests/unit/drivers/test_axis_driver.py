@@ -338,6 +338,7 @@ def test_given_registers_of_another_scale_then_angles_out_of_range_are_told() ->
     assert any("although the axis answers" in getattr(each, "text", "") for each in driver.woken(now))
 
 
+@pytest.mark.slow
 def test_given_random_replies_then_nothing_is_raised_and_memory_stays_flat() -> None:
     rng = random.Random(5)
     driver = AxisDriver(axis_settings())

@@ -78,6 +78,7 @@ def test_given_delays_to_20_ms_and_drift_to_100_ppm_then_the_instant_is_right_to
     assert quantile(errors, 0.95) < 2e-3 + (tick * 1e-6 if tick > 1.0 else 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "delay",
     [
@@ -221,6 +222,7 @@ def small(rng: random.Random) -> float:
     return rng.expovariate(1 / 1000.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("longer_us", [3_000, 8_000, 30_000])
 @pytest.mark.parametrize("is_way", [True, False], ids=["way", "clock"])
 def test_given_a_way_that_becomes_longer_or_a_clock_set_back_then_sigma_covers_either(

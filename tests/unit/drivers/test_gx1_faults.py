@@ -273,6 +273,7 @@ def test_given_an_emulator_woken_before_it_is_opened_then_it_says_nothing():
     assert device.due() is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late_s", [0.3, 0.55, 0.7, 0.95, 1.05, 1.2, 1.4])
 def test_given_replies_that_are_late_then_no_gain_is_taken_for_another(late_s: float):
     line = line_with()

@@ -99,6 +99,7 @@ def test_given_a_line_that_is_right_by_its_checksum_alone_then_it_is_refused(sai
     assert scanner.counts["rejected.content"] == 1
 
 
+@pytest.mark.slow
 def test_given_the_program_of_the_page_and_a_mistyped_key_then_it_says_so_with_its_line(tmp_path: Path) -> None:
     (code,) = re.findall(
         r"```python\n(.*?)```", (ROOT / "docs" / "own-device.md").read_text(encoding="utf-8"), re.DOTALL

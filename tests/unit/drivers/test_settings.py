@@ -335,6 +335,7 @@ VALUES = st.recursive(
 KEYS = sorted({field for kind in KINDS.values() for field in kind.load().settings.__dataclass_fields__})
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(
     st.sampled_from(sorted(KINDS)),

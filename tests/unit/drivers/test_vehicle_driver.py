@@ -327,6 +327,7 @@ def test_given_a_flood_of_refused_commands_then_little_is_told() -> None:
     assert driver.counts["rejected.expired"] == 1000
 
 
+@pytest.mark.slow
 def test_given_random_frames_and_commands_then_nothing_is_raised_and_memory_stays_flat() -> None:
     rng = random.Random(3)
     driver = VehicleDriver(vehicle_settings(), DATABASE)

@@ -281,6 +281,7 @@ def test_given_a_wheels_driver_then_it_never_sends() -> None:
     assert wire.host.leaving(at(2.0)) == []
 
 
+@pytest.mark.slow
 def test_given_random_frames_then_nothing_is_raised_and_memory_stays_flat() -> None:
     rng = random.Random(7)
     driver = WheelsDriver(wheels_settings(), raptor_dbc())
@@ -351,6 +352,7 @@ def test_given_a_direction_that_the_mapping_does_not_have_then_it_is_unknown() -
     assert math.isnan(measured.sample.wheels[0].speed)
 
 
+@pytest.mark.slow
 def test_given_a_simulated_raptor_that_turns_and_backs_up_then_its_wheels_come_over_the_bus() -> None:
     settings = wheels_settings()
     drive = Trajectory(figure_eight(speed=3.0, radius=6.0, stand=2.0, stop=1.0, reverse=3.0))

@@ -158,6 +158,7 @@ def test_bodies_beside_a_frame_tree_are_read_as_well():
     assert model.problems == ()
 
 
+@pytest.mark.slow
 def test_a_chain_of_thousands_of_frames_needs_no_recursion():
     frames = [tree_frame("F0"), *(tree_frame(f"F{n}", f"F{n - 1}", X="1") for n in range(1, 3000))]
     model = read(tree(*frames))

@@ -142,6 +142,7 @@ def big_urdf():
     return f'<robot name="big">{"".join(links)}<link name="L5000"/>{"".join(joints)}</robot>'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", [big_yaml, big_miro, big_urdf])
 def test_ten_thousand_frames_load(tmp_path, text):
     path = tmp_path / "big"

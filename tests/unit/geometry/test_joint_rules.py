@@ -156,6 +156,7 @@ def test_given_joints_that_follow_at_random_then_a_model_or_the_faults_come_of_i
         assert follows is None or repaired.drives[follows.joint].leader == drive.leader
 
 
+@pytest.mark.slow
 def test_given_thousands_that_follow_each_other_then_the_last_follows_the_first():
     joints = {f"J{n}": slide(Mimic(f"J{n + 1}")) for n in range(2_999)} | {"J2999": slide(default=(0.5,))}
     model = comb(**joints).build()
@@ -163,6 +164,7 @@ def test_given_thousands_that_follow_each_other_then_the_last_follows_the_first(
     assert place(model, "j0") == 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("last", [slide(Mimic("Nobody")), slide(Mimic("J2999")), slide(Mimic("J2998")), Joint()])
 @pytest.mark.parametrize("backwards", [False, True])
 def test_given_thousands_that_follow_one_that_cannot_then_it_alone_is_reported(last, backwards):

@@ -229,6 +229,7 @@ def test_inertia_is_six_by_six(rows):
         Body("A", (), inertia=rows)
 
 
+@pytest.mark.slow
 def test_a_chain_of_two_thousand_bodies():
     model = chain(2000).build()
     assert model.problems == ()
@@ -251,6 +252,7 @@ def test_a_chain_of_two_thousand_bodies():
     assert answer.pose.is_close(expected, 1e-9, 1e-9)
 
 
+@pytest.mark.slow
 def test_a_ring_of_two_thousand_bodies_is_one_loop_and_the_message_stays_short():
     builder = chain(2000)
     builder.constraint("Last", "B1999:Out", "B0:In")

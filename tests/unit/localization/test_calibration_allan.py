@@ -79,6 +79,7 @@ def test_given_too_little_or_no_numbers_when_worked_out_then_refused(values: lis
 # --- figures ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_given_simulated_noise_when_read_then_white_noise_and_walk_are_found_within_their_errors() -> None:
     pulls: dict[str, list[float]] = {"white": [], "walk": []}
     for seed in range(20):
@@ -105,12 +106,14 @@ def test_given_a_minute_when_read_then_white_noise_alone_and_the_rest_is_bounded
         assert all("stand for 10 minutes or more" in each for each in found.missing)
 
 
+@pytest.mark.slow
 def test_given_twenty_minutes_when_read_then_the_limit_of_the_walk_holds() -> None:
     limits = [figures(1200.0, seed).walk_limit for seed in range(20)]
     assert min(limits) > WALK
     assert sorted(limits)[10] < 4.0 * WALK
 
 
+@pytest.mark.slow
 def test_given_flicker_when_read_then_the_floor_gives_the_instability() -> None:
     # flicker, 1/f: walks that forget, one for each factor of 4 in time, all equally strong
     told = []
@@ -131,6 +134,7 @@ def test_given_flicker_when_read_then_the_floor_gives_the_instability() -> None:
     assert float(np.mean(told)) == pytest.approx(0.9, abs=0.2)
 
 
+@pytest.mark.slow
 def test_given_a_warming_unit_when_read_then_a_ramp_is_not_called_a_walk() -> None:
     for seed in range(5):
         found = figures(3600.0, seed, walk=0.0, ramp=3e-6)

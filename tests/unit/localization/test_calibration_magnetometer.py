@@ -166,6 +166,7 @@ def test_given_no_gravity_when_fitted_then_up_is_asked_for(up: tuple[float, floa
 # --- a unit that is turned about all of its axes ------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reach", [1.0, 0.5, 0.35])
 def test_given_all_directions_when_fitted_then_hard_and_soft_iron_are_found(reach: float) -> None:
     found = fit_all_axes(on_sphere(reach), STRENGTH, HORIZONTAL)
@@ -176,6 +177,7 @@ def test_given_all_directions_when_fitted_then_hard_and_soft_iron_are_found(reac
     assert found.coverage.spread == pytest.approx(0.96 * reach, abs=0.03)
 
 
+@pytest.mark.slow
 def test_given_no_strength_when_fitted_then_the_mean_radius() -> None:
     found = fit_all_axes(on_sphere())
     assert found.strength == pytest.approx(STRENGTH * float(np.linalg.det(SOFT_ALL)) ** (1.0 / 3.0), rel=1e-3)
@@ -183,6 +185,7 @@ def test_given_no_strength_when_fitted_then_the_mean_radius() -> None:
     assert math.isnan(found.heading_rms)
 
 
+@pytest.mark.slow
 def test_given_strays_when_fitted_on_all_axes_then_they_count_for_nothing() -> None:
     felt = on_sphere(seed=7)
     felt[::10] *= np.random.default_rng(1).uniform(0.3, 2.0, (300, 1))
@@ -191,6 +194,7 @@ def test_given_strays_when_fitted_on_all_axes_then_they_count_for_nothing() -> N
     assert found.strays > 250
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reach", [0.25, 0.1])
 def test_given_little_roll_and_pitch_when_fitted_on_all_axes_then_it_says_how_little(reach: float) -> None:
     with pytest.raises(CalibrationError, match=r"reach over \d+% of the sphere's height.*level mode"):

@@ -28,6 +28,8 @@ from tests.support_restart import (
     words,
 )
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_given_a_kill_while_standing_then_the_pose_is_valid_at_once_and_within_its_bounds(seed):

@@ -19,6 +19,8 @@ from modelserver.simulation.scenario import START_UTIME
 from modelserver.spatial import so3
 from tests.support_filter import IMU, ORIGIN, PLAIN_GPS, RIG, RTK_LIKE, WHEELS_TIMING, drive, simulation
 
+pytestmark = pytest.mark.slow
+
 EIGHT = figure_eight(speed=2.5, radius=8.0, stand=4.0, laps=2)
 
 

@@ -28,6 +28,8 @@ from modelserver.simulation.scenario import START_UTIME
 from modelserver.spatial.pose import Pose
 from tests.support_filter import IMU, ORIGIN, RIG, WHEELS_TIMING, Run, drive, rig, simulation
 
+pytestmark = pytest.mark.slow
+
 EIGHT = figure_eight(speed=2.5, radius=8.0, stand=4.0, laps=2)
 FIELD = magnetic_field(50.27, -111.18, 700.0, START_UTIME)
 ODD = (math.nan, math.inf, -math.inf)

@@ -21,6 +21,8 @@ from modelserver.simulation import (
 )
 from tests.support_filter import GPS_TIMING, PLAIN_GPS, RTK_LIKE, drive, rms, simulation
 
+pytestmark = pytest.mark.slow
+
 EIGHT = figure_eight(speed=3.0, radius=8.0, stand=4.0, laps=3)
 BEACONS = {"a": (40.0, 40.0, 3.0), "b": (-40.0, 40.0, 3.0), "c": (-40.0, -40.0, 3.0), "d": (40.0, -40.0, 3.0)}
 FOREVER = 1e9

@@ -20,6 +20,8 @@ from modelserver.simulation import city, figure_eight
 from modelserver.simulation.scenario import START_UTIME
 from tests.support_filter import ORIGIN, RIG, drive, simulation
 
+pytestmark = pytest.mark.slow
+
 WORLDLY = (Mode.FULL, Mode.RAW, Mode.NO_IMU, Mode.NO_WHEELS)
 EYELESS = (Mode.NO_GPS, Mode.DEAD_RECKONING)
 

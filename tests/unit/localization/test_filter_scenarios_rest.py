@@ -21,6 +21,8 @@ from modelserver.simulation import (
 )
 from tests.support_filter import IMU, PLAIN_GPS, drive, rig, simulation
 
+pytestmark = pytest.mark.slow
+
 SLOW_IMU = replace(IMU, timing=Timing(12.5))
 SLOW_WHEELS = WheelsModel(Timing(2.5))
 WANDERING = GpsModel(Timing(1.0), lingering_sigma=1.0, white_sigma=0.15, time_constant=60.0)

@@ -31,6 +31,7 @@ def earth_here() -> Earth:
 # --- the nominal state --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_given_a_drive_on_hills_when_integrated_for_a_minute_then_the_place_is_right_within_millimetres(monkeypatch):
     # the simulator's vertical is that of the origin everywhere
     monkeypatch.setattr(strapdown, "EARTH_RADIUS", 1e15)
@@ -142,6 +143,7 @@ def test_given_states_that_fade_when_caught_up_then_they_do_so_exactly_and_keep_
     assert strapdown.caught_up(after, SETUP.driving, SETUP.layout) is after
 
 
+@pytest.mark.slow
 def test_given_two_hundred_noisy_runs_then_their_spread_is_what_the_covariance_says():
     rng = np.random.default_rng(5)
     dt, steps, runs = 0.05, 160, 200

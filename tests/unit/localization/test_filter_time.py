@@ -70,6 +70,7 @@ def in_order() -> FilterLocalizer:
 # --- one state, whatever the order --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @settings(max_examples=20, phases=(Step.explicit, Step.reuse, Step.generate), deadline=None)
 @given(st.randoms(use_true_random=False), st.integers(0, 12))
 def test_given_any_order_of_arrival_within_the_horizon_then_the_state_is_the_same_to_the_bit(rng, twice):
@@ -267,6 +268,7 @@ def moding(mode: Mode = Mode.FULL) -> ModeLocalizer:
     return ModeLocalizer.start(Makings(Setup(rig()), RawSettings(), MOUNTS), mode, ORIGIN)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [Mode.FULL, Mode.RAW])
 def test_given_switches_between_filter_and_raw_mode_then_odom_goes_on_and_epochs_count(first):
     found, seen = moding(first), []

@@ -69,6 +69,7 @@ def rms(values):
     return math.sqrt(sum(v * v for v in values) / len(values))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("velocity_sigma", [0.1, None])
 @pytest.mark.parametrize("reference", list(OrientationReference))
 def test_figure_eight_is_followed_within_the_noise(velocity_sigma, reference):
@@ -84,6 +85,7 @@ def test_figure_eight_is_followed_within_the_noise(velocity_sigma, reference):
     assert sum(each[2] > each[4].heading_bound for each in found) <= 0.005 * len(found)
 
 
+@pytest.mark.slow
 def test_position_is_exact_with_exact_sensors_whatever_the_lever_arms():
     drive = figure_eight()
     sensors = Sensors(
@@ -115,6 +117,7 @@ def test_pose_is_invalid_until_the_vehicle_moves_and_valid_after():
     assert 10.0 < first_valid < 12.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("velocity_sigma", [0.1, None])
 def test_standing_ten_minutes_keeps_heading_and_captures_the_bias(velocity_sigma):
     drive = Drive(680.0, speed=stepwise((0.0, 1.5), (60.0, 0.0)), yaw_rate=stepwise((10.0, 0.1), (50.0, 0.0)))
@@ -134,6 +137,7 @@ def test_standing_ten_minutes_keeps_heading_and_captures_the_bias(velocity_sigma
     assert localizer.motion.speed == 0.0
 
 
+@pytest.mark.slow
 def test_standing_longer_than_the_gyro_holds_is_said():
     settings = RawSettings(gyro_noise=0.02)
     drive = Drive(200.0, speed=stepwise((0.0, 1.5), (30.0, 0.0)))
@@ -145,6 +149,7 @@ def test_standing_longer_than_the_gyro_holds_is_said():
     assert Invalid.STATIONARY_HEADING in seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("velocity_sigma", [0.1, None])
 def test_driving_backwards_is_no_heading_jump(velocity_sigma):
     drive = Drive(

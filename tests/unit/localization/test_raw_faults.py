@@ -53,6 +53,7 @@ def worst(rows, which, after=0.0):
     return max((row[which] for row in rows if row[1].invalid == 0 and row[0] > after), default=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [-0.6, -0.95, -3.0])
 def test_a_clock_step_of_any_size_in_a_turn_loses_no_turn(step):
     drive = Drive(50.0, speed=stepwise((3.0, 2.0)), yaw_rate=stepwise((15.0, 0.6)))
@@ -90,6 +91,7 @@ def test_a_pose_asked_from_a_clock_that_is_behind_is_not_valid():
         assert Invalid.CLOCK_STEPPED in localizer.estimate(localizer.utime - round(back * 1e6)).invalid
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("velocity_sigma", [0.03, 0.1, None])
 @pytest.mark.parametrize(("speed", "rate"), [(0.1, 0.008), (0.1, 0.013), (0.25, 0.013)])
 def test_creeping_in_a_curve_is_not_standing(velocity_sigma, speed, rate):
@@ -152,6 +154,7 @@ def test_no_height_at_all_is_said_by_the_sigma():
     assert math.sqrt(localizer.estimate(localizer.utime).covariance[14]) > 4000.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag", [0.3, 0.45])
 def test_inertial_samples_behind_the_fixes_still_turn_the_vehicle(lag):
     drive = Drive(40.0, speed=stepwise((3.0, 2.0)), yaw_rate=lambda t: 0.4 * math.sin(t / 2))

@@ -21,6 +21,8 @@ from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array
 from modelserver.spatial.transformation import Transformation
 
+pytestmark = pytest.mark.slow
+
 COUNT = 20_000
 AT, LATER = 1.2, 1.9
 FINGER = "Finger:Tip"

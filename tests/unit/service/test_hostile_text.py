@@ -118,6 +118,7 @@ def assert_clean(caplog: pytest.LogCaptureFixture) -> None:
         assert all(line.startswith("    ") and line.isprintable() for line in rest), rest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hostile", HOSTILE, ids=range(len(HOSTILE)))
 def test_given_hostile_text_in_any_field_on_any_channel_then_the_log_is_clean_and_the_loop_goes_on(
     hostile: bytes, caplog: pytest.LogCaptureFixture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

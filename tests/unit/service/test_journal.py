@@ -80,6 +80,7 @@ def test_given_no_journal_then_nothing_is_asked_for_and_nothing_told(tmp_path: P
 # --- bounds ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_given_more_than_may_be_kept_then_the_oldest_segments_go(tmp_path: Path) -> None:
     kept = Kept(tmp_path, SMALL, segment_bytes=120_000, most_bytes=500_000)
     most = 0
@@ -156,6 +157,7 @@ def test_given_a_directory_that_cannot_be_made_then_the_service_says_so_and_trie
     assert [each.levelname for each in caplog.records if each.name == journal_writer.log.name] == ["WARNING", "INFO"]
 
 
+@pytest.mark.slow
 def test_given_a_disk_that_is_full_then_the_oldest_segment_makes_room_and_the_service_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -169,6 +169,7 @@ def test_given_a_signature_that_is_wrong_then_nobody_is_told_anything() -> None:
     assert rig.obeyed == 0
 
 
+@pytest.mark.slow
 def test_given_one_bit_flipped_anywhere_then_it_is_not_obeyed_and_only_counted() -> None:
     rig = Rig()
     good = encode(envelope(RELOAD, START))

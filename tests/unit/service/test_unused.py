@@ -29,6 +29,7 @@ def records(kept: Kept) -> list[Record]:
     return [each for path in kept.segments for each in read(path.read_bytes()) if isinstance(each, Record)]
 
 
+@pytest.mark.slow
 def test_given_a_flood_of_rubbish_then_the_journal_grows_by_little_and_is_reproduced(tmp_path: Path) -> None:
     sizes = []
     for rubbish in (0, FLOOD // 50):

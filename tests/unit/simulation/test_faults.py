@@ -32,6 +32,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS.values(), ids=list(FAULTS))
 def test_the_seed_decides_and_the_samples_given_stay_as_they_were(events, fault):
     before = list(map(repr, events))
@@ -108,6 +109,7 @@ def numbers(value) -> list[float]:
     return [value] if isinstance(value, float) else []
 
 
+@pytest.mark.slow
 def test_one_number_of_a_share_of_the_samples_is_none(events):
     holed = list(faults.not_a_number(events, 1, 0.25))
     hit = 0

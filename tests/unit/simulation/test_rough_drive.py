@@ -15,6 +15,7 @@ from modelserver.spatial import so3
 SLIDING = SideSlip(cornering=0.02, wander_sigma=0.1)
 
 
+@pytest.mark.slow
 def test_integrating_the_inertial_unit_gives_the_drive_back(simulate, hills, car, origin):
     """Strapdown navigation by Runge-Kutta from the first instant on; see test_sensors for the source."""
     rate = 400.0
@@ -81,6 +82,7 @@ def test_fixes_are_the_antenna_itself(simulate, hills, car, origin):
         assert apart == pytest.approx(0.0, abs=2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slip", [None, SLIDING])
 def test_wheels_roll_what_their_contact_points_move_ahead(simulate, hills, car, slip):
     """A steered wheel moves along itself where nothing slides; the others see nothing of what is across."""

@@ -106,6 +106,7 @@ def vectors(run, seconds, name):
     return np.array([getattr(sample, name) for sample in run.events(seconds)])
 
 
+@pytest.mark.slow
 def test_scale_and_misalignment_are_one_matrix_of_the_size_said(simulate):
     model = replace(QUIET, accelerometer=TriadModel(scale_sigma=0.01, misalignment_sigma=0.003))
     true = vectors(simulate(imu_model=QUIET), 20.0, "specific_force")
@@ -122,6 +123,7 @@ def test_scale_and_misalignment_are_one_matrix_of_the_size_said(simulate):
     np.testing.assert_allclose(sigma[~np.eye(3, dtype=bool)], 0.003, rtol=0.45)
 
 
+@pytest.mark.slow
 def test_a_bias_that_is_unstable_stays_within_its_size_and_one_that_walks_does_not(simulate):
     timing = Timing(10.0)
     unstable = replace(QUIET, timing=timing, gyro=TriadModel(instability=1e-3, instability_time=5.0))
@@ -164,6 +166,7 @@ def test_an_outage_leaves_the_other_samples_as_they_were(simulate):
     assert list(map(repr, holed)) == [repr(each) for each in sound if not 200 <= each.header.seq < 400]
 
 
+@pytest.mark.slow
 def test_the_magnetometer_feels_the_earth_the_vehicle_and_the_roadside(simulate, car):
     field, pull = (3e-6, 17e-6, -51e-6), (5e-6, -2e-6, 1e-6)
     soft = ((1.1, 0.02, 0.0), (0.01, 0.9, 0.03), (0.0, -0.02, 1.05))
@@ -187,6 +190,7 @@ def test_the_magnetometer_feels_the_earth_the_vehicle_and_the_roadside(simulate,
     assert next(simulate(imu_model=ImuModel()).events(1.0)).magnetic_field is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("source", "expected"), [(YawSource.TRUE, 0.1), (YawSource.MAGNETIC, 0.1 + math.atan2(3.0, 17.0))]
 )

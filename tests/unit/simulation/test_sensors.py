@@ -82,6 +82,7 @@ def of(kind, samples):
 # --- the inertial unit --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_integrating_the_inertial_unit_gives_the_drive_back():
     """Strapdown navigation by Runge-Kutta from the first instant on; nothing but the samples and the start.
 
@@ -212,6 +213,7 @@ def test_fixes_without_noise_are_the_antenna_itself():
             assert fix.course == pytest.approx(math.atan2(fix.velocity[1], fix.velocity[0]))
 
 
+@pytest.mark.slow
 def test_the_error_of_fixes_lingers_and_is_as_large_as_stated():
     run = simulation(Trajectory([Phase(1.0)]), imu_frame=None, wheel_frames=None, gps_model=GpsModel(time_constant=5.0))
     geodesy = Geodesy(ORIGIN)

@@ -139,6 +139,7 @@ def test_given_a_key_file_whose_name_a_unit_would_take_for_something_else_then_i
         credential("/etc/my keys/%n")
 
 
+@pytest.mark.slow
 def test_given_an_edited_vehicle_file_then_it_stays_and_counts(
     run: Callable[..., Said], vehicle: Path, tmp_path: Path
 ) -> None:

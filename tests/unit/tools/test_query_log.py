@@ -50,6 +50,7 @@ def said(out: str) -> Pose:
     return Pose(answer["position"], answer["quaternion"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [0.0, 0.5, 1.005, 3.99])
 @pytest.mark.parametrize("pair", [(BASE, UTM), (SCAN, UTM), (SCAN, BASE), (BASE, ODOM)])
 def test_given_a_time_in_the_log_then_the_answer_is_the_truth_of_then(

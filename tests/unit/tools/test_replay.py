@@ -62,6 +62,7 @@ def rows(path: Path) -> list[list[float]]:
 # --- offline ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_given_a_drive_when_replayed_then_the_antenna_is_where_it_was(driven: Path, tmp_path: Path, run: Run) -> None:
     out = tmp_path / "poses.csv"
     code, words, err = run(driven, "-c", HUSKY, "--poses", out, "--frame", "Antenna:PhaseCentre", "--rate", 10)
@@ -81,6 +82,7 @@ def test_given_a_drive_when_replayed_then_the_antenna_is_where_it_was(driven: Pa
     assert math.hypot(x, y) < 0.01
 
 
+@pytest.mark.slow
 def test_given_no_frame_when_replayed_then_it_is_the_base_frame(driven: Path, tmp_path: Path, run: Run) -> None:
     for name, options in (("base.csv", ()), ("antenna.csv", ("--frame", "Antenna:PhaseCentre"))):
         assert run(driven, "-c", HUSKY, "--poses", tmp_path / name, *options)[0] == 0
@@ -89,12 +91,14 @@ def test_given_no_frame_when_replayed_then_it_is_the_base_frame(driven: Path, tm
     assert antenna[3] - base[3] == pytest.approx(0.2231, abs=0.01)
 
 
+@pytest.mark.slow
 def test_given_the_same_log_when_replayed_twice_then_the_same_bytes(driven: Path, tmp_path: Path, run: Run) -> None:
     for name in ("one.csv", "two.csv"):
         assert run(driven, "-c", HUSKY, "--poses", tmp_path / name)[0] == 0
     assert (tmp_path / "one.csv").read_bytes() == (tmp_path / "two.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_given_times_when_replayed_then_a_row_for_each_whatever_comes_after(
     driven: Path, tmp_path: Path, run: Run
 ) -> None:
@@ -109,6 +113,7 @@ def test_given_times_when_replayed_then_a_row_for_each_whatever_comes_after(
     assert (tmp_path / "whole.csv").read_bytes() == (tmp_path / "short.csv").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("factor", "words"),
     [(1e-6, "these look like seconds"), (1e3, "these look like nanoseconds"), (2.0, "the log lasts")],
@@ -124,6 +129,7 @@ def test_given_times_that_lie_outside_the_log_then_that_is_told(
     assert words in err
 
 
+@pytest.mark.slow
 def test_given_poses_that_are_not_valid_then_the_summary_says_how_many_and_why(
     driven: Path, tmp_path: Path, run: Run
 ) -> None:
@@ -248,6 +254,7 @@ def test_given_a_ledger_on_standard_output_then_only_that_goes_there(driven: Pat
     assert "times real time" in err
 
 
+@pytest.mark.slow
 def test_given_raw_mode_then_the_ledger_is_empty_and_the_poses_are_the_same(
     driven: Path, tmp_path: Path, run: Run
 ) -> None:
@@ -272,6 +279,7 @@ def test_given_a_ledger_over_a_file_that_is_needed_then_it_is_refused(driven: Pa
 # --- bad input ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_given_a_log_that_breaks_off_when_replayed_then_the_rest_counts_and_it_is_told(
     driven: Path, tmp_path: Path, run: Run
 ) -> None:
@@ -283,6 +291,7 @@ def test_given_a_log_that_breaks_off_when_replayed_then_the_rest_counts_and_it_i
     assert len(rows(tmp_path / "p.csv")) > 1900
 
 
+@pytest.mark.slow
 def test_given_damage_within_when_replayed_then_what_is_good_is_used_and_the_exit_code_tells(
     driven: Path, tmp_path: Path, run: Run
 ) -> None:

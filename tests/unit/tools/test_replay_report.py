@@ -62,6 +62,7 @@ def eight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return simulated(folder, seconds=25.0, wheels_model=wheels)
 
 
+@pytest.mark.slow
 def test_given_a_drive_when_reported_then_the_page_is_whole_and_the_swapped_wheel_is_named(
     eight: tuple[Path, Path], tmp_path: Path, run: Run
 ) -> None:
@@ -77,6 +78,7 @@ def test_given_a_drive_when_reported_then_the_page_is_whole_and_the_swapped_whee
     assert "phase aligned" in page
 
 
+@pytest.mark.slow
 def test_given_a_report_beside_poses_and_decisions_then_these_are_as_without_it(
     eight: tuple[Path, Path], tmp_path: Path, run: Run
 ) -> None:

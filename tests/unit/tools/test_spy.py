@@ -49,6 +49,7 @@ def _failure(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return capsys.readouterr().err
 
 
+@pytest.mark.slow
 @needs_javac
 def test_given_an_empty_cache_when_built_then_the_jar_holds_every_type_and_is_kept(cache: Path) -> None:
     jar = spy.types_jar()
@@ -62,6 +63,7 @@ def test_given_an_empty_cache_when_built_then_the_jar_holds_every_type_and_is_ke
     assert jar.stat().st_mtime_ns == built
 
 
+@pytest.mark.slow
 @needs_javac
 def test_given_build_only_when_run_as_a_command_then_the_path_alone_is_printed(cache: Path) -> None:
     done = subprocess.run([*MODELSERVER, "spy", "--build-only"], capture_output=True, text=True, timeout=120)
@@ -180,6 +182,7 @@ def test_given_a_window_and_options_of_the_terminal_then_it_is_wrong_usage(capsy
     assert _run("--window", "--once") == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "default", "expected"),
     [

@@ -118,6 +118,7 @@ def noisy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return simulated(tmp_path_factory.mktemp("noisy"), seconds=30.0, gps_model=receiver)
 
 
+@pytest.mark.slow
 def test_given_fixes_that_scatter_more_than_is_set_when_tuned_then_more_is_taken_for_new(
     noisy: tuple[Path, Path], tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -134,6 +135,7 @@ def test_given_fixes_that_scatter_more_than_is_set_when_tuned_then_more_is_taken
     assert config.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_given_the_same_drive_when_tuned_twice_then_the_same_is_told(
     noisy: tuple[Path, Path], run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -211,6 +213,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_given_ctrl_c_while_workers_run_then_all_end_at_once_with_130(tmp_path: Path) -> None:
     # a worker that reads a pipe which nobody writes never ends by itself
     config = tmp_path / "vehicle.yaml"
