@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import random
 import re
@@ -14,6 +16,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import lcm
+import pytest
+
+from mstools.cli import main
 
 PATIENCE_S = 30.0
 """How long a test waits for what must come; only a failing one waits so long."""
@@ -86,6 +91,27 @@ def started(arguments: Sequence[str | Path], url: str, **options: object) -> Ite
 
 MODELSERVER = (sys.executable, "-c", "from mstools.cli import main; main()")
 """The `modelserver` command of the environment that runs the tests."""
+
+
+def invoke(url: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run a `modelserver` command on the bus at `url` within this process, where a process is not what is tested.
+
+    That saves the imports, half a second of processor time each.
+    """
+    out, err = io.StringIO(), io.StringIO()
+    words = list(map(str, arguments))
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        patch.setenv("LCM_DEFAULT_URL", url)
+        patch.delenv("DISPLAY", raising=False)
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+    code = ended.value.code or 0
+    assert isinstance(code, int), code
+    return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from typing import Any
 
 import lcm
 import pytest
-from support_lcm import MODELSERVER, PATIENCE_S, reserved_url, started, wait_until
+from support_lcm import MODELSERVER, PATIENCE_S, invoke, reserved_url, started, wait_until
 
 from modelserver.messages import DriverHealth, DriverPhase, FixType, GpsSample, SensorHeader, VehicleCommand
 from modelserver.wire.codec import decode, encode
@@ -414,19 +414,19 @@ def run(bench: Bench, *arguments: str | Path) -> subprocess.CompletedProcess[str
 
 
 def test_given_mistyped_names_then_the_nearest_is_told(bench: Bench) -> None:
-    wrong = run(bench, "driver", "gsp", "-c", bench.vehicle)
+    wrong = invoke(bench.url, "driver", "gsp", "-c", bench.vehicle)
     assert wrong.returncode == 2
     assert "did you mean gps?" in wrong.stderr
-    fault = run(bench, "emulate", "gps", "-c", bench.vehicle, "--pty", "--fault", "stal@1")
+    fault = invoke(bench.url, "emulate", "gps", "-c", bench.vehicle, "--pty", "--fault", "stal@1")
     assert fault.returncode == 2
     assert "did you mean stall?" in fault.stderr
-    axes = run(bench, "driver", "imu", "-c", bench.vehicle, "--all-axes")
+    axes = invoke(bench.url, "driver", "imu", "-c", bench.vehicle, "--all-axes")
     assert axes.returncode == 2
     assert "--hard-iron" in axes.stderr
     text = bench.vehicle.read_text().replace("bauds: [38400]", "buads: [38400]")
     bench.vehicle.write_text(text)
     for command in (("driver", "gps", "-c"), ("check",)):
-        slip = run(bench, *command, bench.vehicle)
+        slip = invoke(bench.url, *command, bench.vehicle)
         assert slip.returncode == 1
         said = slip.stderr + slip.stdout
         assert "unknown key 'buads'" in said
@@ -434,13 +434,13 @@ def test_given_mistyped_names_then_the_nearest_is_told(bench: Bench) -> None:
 
 
 def test_given_list_then_ports_and_drivers_are_shown(bench: Bench) -> None:
-    shown = run(bench, "driver", "--list", "-c", bench.vehicle)
+    shown = invoke(bench.url, "driver", "--list", "-c", bench.vehicle)
     assert shown.returncode == 0, shown.stderr
     assert "novatel: NovAtel OEM4" in shown.stdout
 
 
 def test_given_a_port_in_use_then_the_emulator_says_so(bench: Bench) -> None:
     with bench.device("nmea"):
-        second = run(bench, "emulate", "nmea", "-c", bench.vehicle, "--tcp", str(bench.port))
+        second = invoke(bench.url, "emulate", "nmea", "-c", bench.vehicle, "--tcp", str(bench.port))
     assert second.returncode == 1
     assert f"port {bench.port} is in use" in second.stderr

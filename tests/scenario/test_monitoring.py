@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 from conftest import BRISK, Daemon
-from support_lcm import MODELSERVER, PATIENCE_S, started
+from support_lcm import MODELSERVER, PATIENCE_S, invoke, started
 from support_samples import VEHICLE, write_vehicle
 
 from modelserver.messages import Invalid
@@ -30,7 +30,7 @@ NO_SENSORS = "".join(
 
 
 def ran(url: str, *arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
-    """Run a subcommand on a bus until it ends."""
+    """Run a subcommand on a bus as a process of its own until it ends."""
     environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"} | {"LCM_DEFAULT_URL": url}
     return subprocess.run(
         [*MODELSERVER, *map(str, arguments)],
@@ -78,27 +78,27 @@ def test_given_a_daemon_without_a_pose_then_status_tells_why_and_exits_3(start_d
     assert done.returncode == 3, done.stderr
     for words in ("cart: STARTING", "NOT VALID: no usable GPS fix yet", "never heard", f"process {daemon.process.pid}"):
         assert words in done.stdout
-    data = json.loads(ran(daemon.url, "status", "--json").stdout)
+    data = json.loads(invoke(daemon.url, "status", "--json").stdout)
     assert (data["state"], data["well"], data["pid"]) == ("STARTING", False, daemon.process.pid)
 
 
 def test_given_a_vehicle_without_sensors_then_it_is_well_and_status_exits_0(start_daemon: StartDaemon) -> None:
-    done = ran(start_daemon(NO_SENSORS).url, "status")
+    done = invoke(start_daemon(NO_SENSORS).url, "status")
     assert done.returncode == 0, done.stderr
     assert "names no sensor to localize by" in done.stdout
 
 
 def test_given_the_wrong_prefix_then_status_offers_the_one_that_is_heard(start_daemon: StartDaemon) -> None:
     daemon = start_daemon(BRISK + "lcm: {channel_prefix: RAPTOR_}\n", prefix="RAPTOR_")
-    done = ran(daemon.url, "status", "--prefix", "RAPTR_", "--timeout", "0.5")
+    done = invoke(daemon.url, "status", "--prefix", "RAPTR_", "--timeout", "0.5")
     assert (done.returncode, done.stdout) == (1, "")
     assert "Did you mean --prefix 'RAPTOR_'?" in done.stderr
     # and the vehicle file knows it
-    assert ran(daemon.url, "status", "-c", daemon.folder / "vehicle.yaml").returncode == 3
+    assert invoke(daemon.url, "status", "-c", daemon.folder / "vehicle.yaml").returncode == 3
 
 
 def test_given_an_empty_bus_then_status_says_what_to_look_at_and_exits_1(lcm_url: str) -> None:
-    done = ran(lcm_url, "status", "--timeout", "0.2")
+    done = invoke(lcm_url, "status", "--timeout", "0.2")
     assert (done.returncode, done.stdout) == (1, "")
     assert "modelserver doctor looks at the bus" in done.stderr
     assert lcm_url in done.stderr
@@ -122,7 +122,7 @@ def test_given_watch_into_a_pipe_then_there_is_a_line_for_each_report_until_it_i
 
 def test_given_no_screen_then_spy_prints_every_channel_once_and_the_fields_of_one(start_daemon: StartDaemon) -> None:
     daemon = start_daemon()
-    done = ran(daemon.url, "spy", "--seconds", "1", "--channel", "MODELSERVER_HEALTH")
+    done = invoke(daemon.url, "spy", "--seconds", "1", "--channel", "MODELSERVER_HEALTH")
     assert done.returncode == 0, done.stderr
     rows = {row[0]: row for row in map(str.split, done.stdout.splitlines()) if row}
     assert {"POSE", "POSE_VECTOR", "POSE_ODOM", "MODELSERVER_HEALTH"} <= rows.keys()
@@ -133,7 +133,7 @@ def test_given_no_screen_then_spy_prints_every_channel_once_and_the_fields_of_on
 
 
 def test_given_a_mistyped_channel_then_spy_offers_the_nearest_that_is_heard(start_daemon: StartDaemon) -> None:
-    done = ran(start_daemon().url, "spy", "--seconds", "1", "--channel", "POSE_ODON")
+    done = invoke(start_daemon().url, "spy", "--seconds", "1", "--channel", "POSE_ODON")
     assert done.returncode == 1
     assert "nothing came on 'POSE_ODON'; nearest: 'POSE_ODOM'" in done.stderr
 
@@ -263,7 +263,7 @@ def test_given_two_daemons_on_one_bus_then_each_notices_the_other_until_it_is_go
 
     assert noticed(first.process.pid, second.process.pid)
     assert noticed(second.process.pid, first.process.pid)
-    done = ran(first.url, "doctor")
+    done = invoke(first.url, "doctor")
     assert done.returncode == 3
     assert "2 answer at once" in done.stdout
     assert all(f"process {pid} on" in done.stdout for pid in pids)

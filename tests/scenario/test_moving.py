@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import signal
-import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import BRISK, Daemon
-from support_lcm import MODELSERVER, Listener, wait_until
+from support_lcm import Listener, invoke, wait_until
 from support_samples import GEOMETRY, write_vehicle
 
 import modelserver as ms
@@ -61,10 +59,7 @@ def logged(daemon: Daemon, words: str) -> str:
 
 
 def run_tool(daemon: Daemon, *arguments: str) -> tuple[int, str, str]:
-    done = subprocess.run(
-        [*map(str, MODELSERVER), *arguments, "--url", daemon.url],
-        capture_output=True, text=True, timeout=60, env=os.environ | {"PYTHONIOENCODING": "utf-8"},
-    )  # fmt: skip
+    done = invoke("", *arguments, "--url", daemon.url)
     assert "Traceback" not in done.stderr
     return done.returncode, done.stdout, done.stderr
 
