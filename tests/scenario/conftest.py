@@ -17,6 +17,7 @@ from support_samples import GEOMETRY, VEHICLE, drive, write_vehicle
 from support_signing import ALLOWED, write_test_key
 
 from modelserver.client.remote import Platform
+from modelserver.errors import TooNewError
 from modelserver.messages import Health
 from modelserver.signing import AHEAD_S
 from modelserver.wire.codec import decode, encode
@@ -55,9 +56,17 @@ class Daemon:
         for sample in drive(seconds, begin):
             self.publish("GPS" if type(sample).__name__ == "GpsSample" else "IMU", encode(sample))
             self.last_utime = sample.header.utime
+        deadline = time.monotonic() + PATIENCE_S
         with Platform(self.url, name="feeder", timeout=PATIENCE_S, retries=0) as platform:
-            platform.get_state_vector(at=self.last_utime, wait_ms=2000)
-        return self.last_utime
+            while True:
+                try:
+                    platform.get_state_vector(at=self.last_utime, wait_ms=2000)
+                except TooNewError:
+                    # the server waits for so long and no longer; a busy machine may need more
+                    if time.monotonic() > deadline:
+                        raise
+                else:
+                    return self.last_utime
 
     def health(self, enough: Callable[[Health], bool] = lambda health: True) -> Health:
         """Return the first health report from now on that is as wanted."""

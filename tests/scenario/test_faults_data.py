@@ -78,13 +78,19 @@ def test_given_an_inertial_unit_that_fails_then_the_pose_is_not_valid(
         assert fault.counted <= run.rejected.keys(), run.rejected
 
 
-def test_given_a_receiver_whose_clock_goes_1_s_ahead_then_its_fixes_are_refused_and_the_pose_stays_right(
+AHEAD_S = 10.0
+"""By how much the receiver's clock goes ahead: by more than messages may come late on a busy machine, where a stamp
+that is 1 s ahead is of the past when it arrives. The core is given 1 s, in tests/unit/test_faults_core.py.
+"""
+
+
+def test_given_a_receiver_whose_clock_goes_ahead_then_its_fixes_are_refused_and_the_pose_stays_right(
     lcm_url: str, tmp_path: Path
 ) -> None:
     with trial(lcm_url, tmp_path, feeding=False) as run:
         begin = time.time_ns() // 1000 - round((FROM_S + 0.5) * 1e6)
         run.ride = Ride.at(begin, LONG_ENOUGH)
-        run.feed(run.ride.stream(lambda events: clock_off(1.0)(events, begin)))
+        run.feed(run.ride.stream(lambda events: clock_off(AHEAD_S)(events, begin)))
         run.until_health(lambda health: ("sensor:gps", "future") in {each[:2] for each in health.rejected}, "a refusal")
         since = time.monotonic()
         run.until(lambda: run.valid_since(since + 0.5), "a valid pose")
