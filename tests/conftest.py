@@ -38,15 +38,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     files: dict[Path, list[pytest.Item]] = {}
     for item in items:
         files.setdefault(item.path, []).append(item)
-    slow = {path: sum(each.get_closest_marker("slow") is not None for each in found) for path, found in files.items()}
+    slow = {path: sum(map(_is_slow, found)) / len(found) for path, found in files.items()}
     waiting = sorted((path for path in files if path.parent.name == "scenario"), key=_rank)
-    computing = sorted((path for path, count in slow.items() if count and path not in waiting), key=lambda p: -slow[p])
+    computing = sorted((path for path, share in slow.items() if share and path not in waiting), key=lambda p: -slow[p])
     mixed = [path for pair in zip_longest(waiting, computing) for path in pair if path is not None]
     rest = [path for path in files if path not in mixed]
     items[:] = [item for path in (*mixed, *rest) for item in files[path]]
 
 
-LONGEST = ("drivers", "service", "systemd", "demo", "faults_strangers", "faults_machine", "monitoring", "mirror")
+def _is_slow(item: pytest.Item) -> bool:
+    return item.get_closest_marker("slow") is not None or item.path.parent.name == "realdata"
+
+
+LONGEST = ("drivers", "service", "monitoring", "systemd", "demo", "faults_data", "faults_processes", "faults_drivers")
 """Scenario files that take longest, the longest first."""
 
 
