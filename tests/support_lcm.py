@@ -20,7 +20,7 @@ import pytest
 
 from mstools.cli import main
 
-PATIENCE_S = 30.0
+PATIENCE_S = 60.0
 """How long a test waits for what must come; only a failing one waits so long."""
 
 

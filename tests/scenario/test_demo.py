@@ -82,7 +82,7 @@ def all_started(process: subprocess.Popen[str]) -> tuple[str, dict[str, int]]:
 def test_given_nothing_else_when_the_demo_runs_then_it_shows_a_valid_pose_and_ends_by_itself():
     process = start("--seconds", "8")
     try:
-        out, err = process.communicate(timeout=90)
+        out, err = process.communicate(timeout=2 * PATIENCE_S)
     finally:
         process.kill()
     assert process.returncode == 0, err
@@ -104,7 +104,7 @@ def test_given_a_running_demo_when_it_is_told_to_end_then_its_children_end_too(n
     try:
         vehicle, _ = all_started(process)
         process.send_signal(number)
-        process.communicate(timeout=20)
+        process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
     assert process.returncode == code
@@ -116,7 +116,7 @@ def test_given_a_running_demo_when_one_of_its_processes_dies_then_it_says_which_
     try:
         vehicle, running = all_started(process)
         os.kill(running["driver imu"], signal.SIGKILL)
-        _, err = process.communicate(timeout=20)
+        _, err = process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
     assert process.returncode == 1
@@ -136,7 +136,7 @@ def test_given_a_running_demo_when_it_is_killed_then_nothing_is_left_running():
                 stack.callback(os.close, end)
                 ends.register(end, select.POLLIN)
             process.kill()
-            process.communicate(timeout=20)
+            process.communicate(timeout=PATIENCE_S)
             deadline = time.monotonic() + PATIENCE_S
             for _ in running:
                 ((ended, _),) = ends.poll(max(0.0, deadline - time.monotonic()) * 1e3)[:1] or pytest.fail(
