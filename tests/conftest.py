@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 
@@ -48,6 +49,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def _is_slow(item: pytest.Item) -> bool:
     return item.get_closest_marker("slow") is not None or item.path.parent.name == "realdata"
+
+
+def pytest_collection_finish() -> None:
+    """Keep the garbage collector from walking through what was collected, each time again."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000, 50, 50)
 
 
 LONGEST = ("drivers", "service", "monitoring", "systemd", "demo", "faults_data", "faults_processes", "faults_drivers")

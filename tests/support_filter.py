@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -90,6 +91,21 @@ def simulation(phases: Sequence[Phase], on: Rig = RIG, *, yaw: float = 0.7, seed
     return Simulation(on.model, "Car:Base", Trajectory(phases, yaw=yaw), ORIGIN, seed=seed, **arguments)
 
 
+class SharedDrive:
+    """A simulated drive whose samples and truth are computed once for all tests that localize along it."""
+
+    def __init__(self, simulation: Simulation, seconds: float):
+        self.start_utime = simulation.start_utime
+        self.truth = cache(simulation.truth)
+        self._seconds = seconds
+        self._events = tuple(simulation.events(seconds))
+
+    def events(self, seconds: float) -> Iterator[Event]:
+        """Return the samples of the whole drive, in the order of arrival."""
+        assert seconds == self._seconds
+        return iter(self._events)
+
+
 @dataclass
 class Row:
     """An estimate beside the truth: seconds since the start, errors east, north (m) and of heading (rad)."""
@@ -114,7 +130,7 @@ class Row:
 class Run:
     """What a drive showed: rows, the ledger, and the localizer at the end."""
 
-    simulation: Simulation
+    simulation: Simulation | SharedDrive
     localizer: Any
     rows: list[Row] = field(default_factory=list)
     ledger: list[Decision] = field(default_factory=list)
@@ -152,7 +168,7 @@ class Run:
         return steps
 
 
-def row(run: Simulation, estimate: Estimate) -> Row:
+def row(run: Simulation | SharedDrive, estimate: Estimate) -> Row:
     true = run.truth(estimate.utime)
     east = north = heading = math.nan
     if estimate.enu is not None:
@@ -168,7 +184,7 @@ def untouched(events: Iterable[Event]) -> Iterable[Event]:
 
 
 def drive(
-    run: Simulation,
+    run: Simulation | SharedDrive,
     seconds: float,
     *,
     settings: FilterSettings | None = None,

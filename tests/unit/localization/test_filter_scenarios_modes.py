@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise, permutations
 
 import numpy as np
@@ -18,12 +19,18 @@ from modelserver.localization.raw.settings import RawSettings
 from modelserver.messages import AbsolutePoseSample, Invalid, Mode, SensorHeader, SwitchMode, Verdict
 from modelserver.simulation import city, figure_eight
 from modelserver.simulation.scenario import START_UTIME
-from tests.support_filter import ORIGIN, RIG, drive, simulation
+from tests.support_filter import ORIGIN, RIG, SharedDrive, drive, simulation
 
 pytestmark = pytest.mark.slow
 
 WORLDLY = (Mode.FULL, Mode.RAW, Mode.NO_IMU, Mode.NO_WHEELS)
 EYELESS = (Mode.NO_GPS, Mode.DEAD_RECKONING)
+
+
+@cache
+def town() -> SharedDrive:
+    """Drive through a town for 80 s."""
+    return SharedDrive(simulation(city(5, 80.0, speed=5.0)), 80.0)
 
 
 def _localizer(mode: Mode = Mode.FULL) -> ModeLocalizer:
@@ -37,7 +44,7 @@ def _switch(t: float, number: int, mode: Mode) -> tuple[float, SwitchMode]:
 
 @pytest.mark.parametrize("mode", WORLDLY, ids=lambda mode: mode.name.lower())
 def test_given_a_mode_with_fixes_when_driven_through_a_town_then_the_pose_is_valid_and_right(mode):
-    found = drive(simulation(city(5, 80.0, speed=5.0)), 80.0, localizer=_localizer(mode), every=0.02)
+    found = drive(town(), 80.0, localizer=_localizer(mode), every=0.02)
 
     known = found.between(30.0)
     assert np.mean([row.valid for row in known]) > 0.95
@@ -48,7 +55,7 @@ def test_given_a_mode_with_fixes_when_driven_through_a_town_then_the_pose_is_val
 
 @pytest.mark.parametrize("mode", EYELESS, ids=lambda mode: mode.name.lower())
 def test_given_a_mode_without_fixes_when_driven_through_a_town_then_odom_alone_is_good(mode):
-    found = drive(simulation(city(5, 80.0, speed=5.0)), 80.0, localizer=_localizer(mode), every=0.02)
+    found = drive(town(), 80.0, localizer=_localizer(mode), every=0.02)
 
     first, last = found.at(8.0), found.last
     true = [found.simulation.truth(row.estimate.utime).enu for row in (first, last)]
