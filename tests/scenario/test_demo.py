@@ -31,6 +31,13 @@ def start(*arguments: str) -> subprocess.Popen[str]:
     )
 
 
+def close(process: subprocess.Popen[str]) -> None:
+    """End the demo if it runs; leave no pipe open, of which a later test would be warned."""
+    process.kill()
+    with process:
+        pass
+
+
 def vehicle_in(text: str) -> str:
     found = re.search(r" -c (\S+)", text)
     assert found, text
@@ -84,7 +91,7 @@ def test_given_nothing_else_when_the_demo_runs_then_it_shows_a_valid_pose_and_en
     try:
         out, err = process.communicate(timeout=2 * PATIENCE_S)
     finally:
-        process.kill()
+        close(process)
     assert process.returncode == 0, err
     assert re.search(r"all 5 devices are alive: gps \d\.\d Hz, imu \d+\.\d Hz, wheels \d+\.\d Hz, raptor", out)
     assert "Raptor, FrontNoddingSICK, BackNoddingSICK, Digiclops" in out
@@ -106,7 +113,7 @@ def test_given_a_running_demo_when_it_is_told_to_end_then_its_children_end_too(n
         process.send_signal(number)
         process.communicate(timeout=PATIENCE_S)
     finally:
-        process.kill()
+        close(process)
     assert process.returncode == code
     assert still_running(vehicle) == {}
 
@@ -118,7 +125,7 @@ def test_given_a_running_demo_when_one_of_its_processes_dies_then_it_says_which_
         os.kill(running["driver imu"], signal.SIGKILL)
         _, err = process.communicate(timeout=PATIENCE_S)
     finally:
-        process.kill()
+        close(process)
     assert process.returncode == 1
     assert "the driver imu was ended by SIGKILL. It said:" in err
     assert "imu: closed:" in err  # from before its device was there
@@ -144,7 +151,7 @@ def test_given_a_running_demo_when_it_is_killed_then_nothing_is_left_running():
                 )
                 ends.unregister(ended)
     finally:
-        process.kill()
+        close(process)
     assert still_running(vehicle) == {}
     # a killed demo cannot take its folder away
     shutil.rmtree(Path(vehicle).parent)
