@@ -36,7 +36,7 @@ MOST = 64
 """Fixes kept: of a longer stretch every second one goes."""
 
 DIRECTION_SPANS = (6.0, 10.0, 15.0)
-"""Seconds of fixes that the direction of travel is estimated from: longer ones let gyro biases bend more than a cubic."""
+"""Seconds of fixes to estimate the direction of travel from: over longer ones gyro biases bend more than a cubic."""
 
 DIRECTION_FIXES = 12
 """Fixes that such a stretch has at least: five unknowns, and what tells whether they explain the rest."""

@@ -1,21 +1,31 @@
-"""Linear algebra of the error-state Kalman filter (Groves 2013, 3.2).
+"""Linear algebra of the error-state Kalman filter (Groves 2013, 3.2): filterpy's KalmanFilter holds the error state.
 
-Equations: prediction P <- F P F' + Q; update S = H P H' + R, K = P H' S^-1, error = K residual and, in Joseph's form,
-P <- (I - K H) P (I - K H)' + K R K', which stays symmetric and positive definite under rounding and for any gain. The
-error state is zero before each update, for its estimate is injected into the nominal state. The functions are pure.
-
-It is written with numpy alone: filterpy computes the same, to the bit, but imports scipy.stats, which took two thirds of
-the time that a service needs to start. filterpy and scipy are the oracles of the tests.
+filterpy's object is a workspace: each call sets all that it reads, so no state passes from one call to the next and
+the functions are pure. x is one-dimensional, H, R, F, Q are two-dimensional and given always: its defaults broadcast
+silently. The error state is zero before each update, for what was estimated has been put into the nominal state.
 """
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any, Final
 
 import numpy as np
 
+from modelserver.filterpy_import import import_kalman_filter
 from modelserver.spatial.so3 import Array
+
+KalmanFilter: Final = import_kalman_filter()
+
+
+@lru_cache(maxsize=64)
+def _workspace(n: int, m: int) -> tuple[Any, Array]:
+    workspace = KalmanFilter(dim_x=n, dim_z=m)
+    zero = np.zeros(n)
+    zero.flags.writeable = False
+    workspace.x = zero
+    return workspace, zero
 
 
 def chi_square_survival(value: float, dof: int) -> float:
@@ -31,7 +41,7 @@ def chi_square_survival(value: float, dof: int) -> float:
 
 @lru_cache(maxsize=256)
 def gate_limit(dof: int, risk: float) -> float:
-    """Return the value that a chi-square statistic of `dof` degrees of freedom exceeds with probability `risk`, in (0, 1)."""
+    """Return the value that a chi-square statistic exceeds with probability `risk`, in (0, 1); `dof`: its freedoms."""
     low, high = 0.0, 1.0
     while chi_square_survival(high, dof) > risk:
         low, high = high, 2.0 * high
@@ -42,7 +52,12 @@ def gate_limit(dof: int, risk: float) -> float:
 
 def predicted(P: Array, F: Array, Q: Array) -> Array:
     """Return F P F' + Q, all (n, n)."""
-    return np.asarray(F @ P @ F.T + Q)
+    workspace, zero = _workspace(len(P), 1)
+    workspace.x = zero
+    workspace.P = P
+    workspace.predict(F=F, Q=Q)
+    found: Array = workspace.P
+    return found
 
 
 def innovation(P: Array, H: Array, R: Array) -> Array:
@@ -69,8 +84,11 @@ def corrected(P: Array, residual: Array, H: Array, R: Array) -> tuple[Array, Arr
     n, m = len(P), len(residual)
     assert H.shape == (m, n), (H.shape, m, n)
     assert R.shape == (m, m), R.shape
-    PHt = P @ H.T
-    K = PHt @ np.linalg.inv(H @ PHt + R)
-    rest = np.eye(n) - K @ H
-    after = rest @ P @ rest.T + K @ R @ K.T
-    return K @ residual, 0.5 * (after + after.T)
+    workspace, zero = _workspace(n, m)
+    workspace.x = zero
+    workspace.P = P
+    workspace.update(residual, R=R, H=H)
+    error: Array = workspace.x
+    after: Array = workspace.P
+    workspace.x = zero
+    return error, 0.5 * (after + after.T)

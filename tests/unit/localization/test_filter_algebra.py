@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from filterpy.kalman import KalmanFilter
 from scipy import stats
 from support_cart import rig, some_nav
 
+from modelserver.filterpy_import import import_kalman_filter
 from modelserver.localization.filter import bounds, kalman, updates
 from modelserver.localization.filter.layout import STRAPDOWN, ErrorState, Layout
 from modelserver.localization.filter.measurements import Compared
@@ -89,6 +92,14 @@ def test_given_any_numbers_when_predicted_then_it_is_what_the_formula_says():
     kept = P.copy()
     assert kalman.predicted(P, F, Q) == pytest.approx(F @ P @ F.T + Q)
     assert (kept == P).all()
+
+
+def test_given_the_filter_is_loaded_then_all_of_filterpy_can_be_imported_and_its_class_is_the_same_code():
+    assert "filterpy.stats" in sys.modules
+    assert sys.modules["filterpy.stats"].logpdf is not None
+    assert inspect.getsource(kalman.KalmanFilter) == inspect.getsource(KalmanFilter)
+    assert import_kalman_filter() is not KalmanFilter
+    assert sys.modules["filterpy.kalman"].KalmanFilter is KalmanFilter
 
 
 @pytest.mark.parametrize("m", [1, 2, 3, 6])
