@@ -113,7 +113,8 @@ def main() -> int:
         chunks = Chunks()
         for _ in range(STATES):
             chunks.begin()
-            size = len(journal_state.written((config, journal_state.apart(with_it.loop.state)), chunks))
+            run = journal_state.Run(config, journal_state.detach(with_it.loop.state))
+            size = len(journal_state.encode_run(run, chunks))
             chunks()
         write.finish()
     told = f"longest hold of the interpreter for a state of {size >> 10} KiB, median"

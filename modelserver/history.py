@@ -44,9 +44,15 @@ class History:
 
     __slots__ = ("_end", "_estimates", "_horizon", "_start", "_times")
 
+    _times: array[int]
+    _estimates: list[Estimate | Later]
+    _start: int
+    _end: int
+    _horizon: int
+
     def __init__(self, seconds: float):
-        self._times: array[int] = array("q")
-        self._estimates: list[Estimate | Later] = []
+        self._times = array("q")
+        self._estimates = []
         self._start = 0
         self._end = 0
         self._horizon = round(seconds * 1e6)

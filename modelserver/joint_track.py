@@ -73,11 +73,20 @@ class JointTrack:
 
     __slots__ = ("_blocks", "_count", "_end", "_firsts", "_horizon", "_start", "_turns", "source")
 
+    _blocks: tuple[_Block, ...]
+    _firsts: tuple[int, ...]
+    _start: int
+    _end: int
+    _count: int
+    _horizon: int
+    _turns: bool
+    source: str
+
     def __init__(self, seconds: float, turns: bool = False):
         """Hold so many seconds; `turns`: an angle without limits, whose readings may begin anew at a full turn."""
         self._turns = turns
-        self._blocks: tuple[_Block, ...] = ()
-        self._firsts: tuple[int, ...] = ()
+        self._blocks = ()
+        self._firsts = ()
         self._start = 0
         """Of the first block: what lies before is forgotten."""
         self._end = 0

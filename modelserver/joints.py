@@ -58,8 +58,12 @@ class Joints:
 
     __slots__ = ("_coordinates", "_seconds", "tracks")
 
+    _coordinates: Mapping[str, Coordinate]
+    _seconds: float
+    tracks: Mapping[str, JointTrack]
+
     def __init__(self, constraints: Iterable[Constraint], seconds: float):
-        self._coordinates: Mapping[str, Coordinate] = MappingProxyType(
+        self._coordinates = MappingProxyType(
             {
                 name: Coordinate(name, constraint.joint, number)
                 for constraint in constraints
@@ -68,7 +72,7 @@ class Joints:
             }
         )
         self._seconds = seconds
-        self.tracks: Mapping[str, JointTrack] = MappingProxyType({})
+        self.tracks = MappingProxyType({})
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ NamedTuple is made at a third of the cost.
 
 from modelserver.messages.decisions import Decision, Verdict
 from modelserver.messages.driver_health import DriverHealth, DriverPhase
-from modelserver.messages.estimates import Estimate, Origin, VehicleMotion
+from modelserver.messages.estimates import Estimate, MotionCovariance, Origin, VehicleMotion
 from modelserver.messages.events import (
     Commanded,
     Denied,

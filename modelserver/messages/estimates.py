@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from modelserver.messages.flags import NAN, NO_FLAGS, VALID, Invalid, Quality
 from modelserver.spatial.pose import Pose
@@ -31,6 +30,17 @@ class Origin:
         return (self.easting, self.northing, self.height)
 
 
+class MotionCovariance(Protocol):
+    """Works out the covariance of a motion when it is called: 36 numbers of velocity and rate, row-major.
+
+    What a journal keeps of it are its fields, so it is a declared value, not a function.
+    """
+
+    def __call__(self) -> tuple[float, ...]:
+        """Return the numbers: the same each time."""
+        ...
+
+
 class VehicleMotion(NamedTuple):
     """How the vehicle moves relative to the ground, along the axes of the frame that an estimate is of.
 
@@ -43,7 +53,7 @@ class VehicleMotion(NamedTuple):
     rate: Vector3
     acceleration: Vector3 = (NAN, NAN, NAN)
     felt_at: Vector3 = (0.0, 0.0, 0.0)
-    covariance: Callable[[], tuple[float, ...]] | None = None
+    covariance: MotionCovariance | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

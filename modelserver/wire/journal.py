@@ -31,7 +31,7 @@ CHANNEL: Final = "MODELSERVER_JOURNAL"
 MAGIC: Final = b"MSjrnl1\n"
 """Stands where a message's fingerprint does."""
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 
 
 class Part(IntEnum):
@@ -50,8 +50,7 @@ class Kind(IntEnum):
     SAID: a message that was published. SAMPLE: one that a sensor's channel brought, or a wish about the mode.
     REQUEST: one that the core answered; REMEMBERED: answered without it, from memory; REFUSED: for want of time;
     MALFORMED, FAILED: turned back. UNREAD: bytes that are no message of their channel. IGNORED: a sample that is not
-    used, as that of a second writer. EVENT: something of the
-    service's own, as JSON; PICKLED: the same for what JSON cannot hold.
+    used, as that of a second writer. EVENT: something of the service's own, encoded by the schema of the segment.
     """
 
     SAID = 0
@@ -64,7 +63,6 @@ class Kind(IntEnum):
     UNREAD = 7
     IGNORED = 8
     EVENT = 9
-    PICKLED = 10
 
 
 class Record(NamedTuple):
@@ -99,7 +97,7 @@ class File:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What the service knew when the segment began, pickled."""
+    """What the service knew when the segment began, encoded with the description of its types."""
 
     data: bytes
 

@@ -30,7 +30,8 @@ class Setup:
         """Take the vehicle; `kinds` are the measurements to use, by default all that are registered."""
         self.rig = rig
         self.settings = settings = settings or FilterSettings()
-        made = [kind.of(rig, settings) for kind in (tuple(kinds) or REGISTRY.values())]
+        self.kinds = tuple(kinds) or tuple(REGISTRY.values())
+        made = [kind.of(rig, settings) for kind in self.kinds]
         present = [each for each in made if each is not None]
         self.wheels = next((each for each in present if isinstance(each, WheelSpeed)), None)
         extras = [*gps_states(settings)] if rig.gps_frame else [gps_states(settings)[0]]

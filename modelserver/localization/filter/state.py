@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from modelserver.geodesy import Geodesy, LocalFrame
 from modelserver.localization.filter.alignment import Passed
@@ -13,7 +13,7 @@ from modelserver.localization.filter.nav import Nav
 from modelserver.localization.filter.stillness import Stillness
 from modelserver.localization.filter.strapdown import Earth
 from modelserver.localization.origin import Capture
-from modelserver.messages import Mode, Origin, Phase, Recalled
+from modelserver.messages import Mode, Origin, Phase, Recalled, Sample
 from modelserver.spatial.so3 import Vector3
 
 LINE = 3e-4
@@ -27,7 +27,7 @@ class Last(NamedTuple):
     """The last measurement of a kind from a source that was compared: its instant, and its sample."""
 
     utime: int
-    sample: Any
+    sample: Sample
 
 
 class Said(NamedTuple):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache, partial
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -99,7 +100,7 @@ def vehicle_motion(setup: Setup, state: FilterState, nav: Nav) -> VehicleMotion:
     """Return how the vehicle moves: the filter's velocity and turn rate, and the force felt with gravity taken off."""
     base = setup.rig.base
     lever = (-base[0], -base[1], -base[2])
-    covariance = partial(_twist_covariance, setup, nav)
+    covariance = TwistCovariance(setup, nav)
     if state.standing:
         return VehicleMotion(ZERO, ZERO, ZERO, lever, covariance)
     acceleration = (NAN, NAN, NAN)
@@ -108,6 +109,17 @@ def vehicle_motion(setup: Setup, state: FilterState, nav: Nav) -> VehicleMotion:
         (fx, fy, fz), (bx, by, bz), (ux, uy, uz) = nav.force, nav.accelerometer_bias, nav.up
         acceleration = (fx - bx - g * ux, fy - by - g * uy, fz - bz - g * uz)
     return VehicleMotion(nav.body_velocity(base), nav.turn_rate, acceleration, lever, covariance)
+
+
+class TwistCovariance(NamedTuple):
+    """The covariance of a motion, worked out when it is called."""
+
+    setup: Setup
+    nav: Nav
+
+    def __call__(self) -> tuple[float, ...]:
+        """Return the 36 numbers of velocity and turn rate of the rolling frame along its own axes, row-major."""
+        return _twist_covariance(self.setup, self.nav)
 
 
 def _twist_covariance(setup: Setup, nav: Nav) -> tuple[float, ...]:

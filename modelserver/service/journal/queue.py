@@ -122,7 +122,7 @@ class JournalQueue:
         self.wants_state = False
         self._last = now
         lost, self.lost = self.lost, 0
-        self._entries.append(Entry(Kind.PICKLED, now, "", b"", Beginning(state, lost)))
+        self._entries.append(Entry(Kind.EVENT, now, "", b"", Beginning(state, lost)))
         self._open, self._begun = True, 1
 
     def step(self, event: object, now: Instant, heard: Heard | None = None) -> None:

@@ -6,8 +6,7 @@ import math
 from collections.abc import Container, Mapping
 
 from modelserver import core
-from modelserver.config import VehicleConfig
-from modelserver.core import CoreState, Instant
+from modelserver.core import Instant
 from modelserver.errors import RecordingError, WireError
 from modelserver.messages import (
     Output,
@@ -23,7 +22,6 @@ from modelserver.service.bus import Handler
 from modelserver.service.daemon import Vehicle
 from modelserver.service.heard import Heard
 from modelserver.service.hooks import Hooks
-from modelserver.service.journal import events as journal_events
 from modelserver.service.journal import state as journal_state
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.service.requests.reception import request_kind
@@ -94,7 +92,7 @@ class Rerun(Loop):
 
     def __init__(self, state: bytes):
         """Go on from the state that a segment begins with. Raises RecordingError."""
-        config, known = _begun(journal_state.read(state))
+        config, known = journal_state.decode_run(state)
         self.config = config
         self._ear, self._standing = _Ear(), _Standing()
         vehicle = Vehicle(config, known.model, None)
@@ -113,8 +111,8 @@ class Rerun(Loop):
         """Do again what a record tells of; return what is said to it. Raises RecordingError where it makes no sense."""
         self._ear.said = []
         now = self._standing.instant = Instant(record.monotonic_ns, record.utime)
-        if record.kind in (Kind.EVENT, Kind.PICKLED):
-            self._taken(journal_events.read(record.kind, record.data), now)
+        if record.kind is Kind.EVENT:
+            self._taken(journal_state.decode_event(record.data), now)
         elif record.kind is Kind.SAMPLE:
             heard = self._heard.get(record.channel)
             if heard is None:
@@ -161,9 +159,3 @@ class Rerun(Loop):
     def failed(self, channel: str, error: Exception, data: bytes = b"") -> None:
         """Do nothing: that it failed then too stands in the journal as the next record."""
 
-
-def _begun(value: object) -> tuple[VehicleConfig, CoreState]:
-    match value:
-        case (VehicleConfig() as config, CoreState() as state):
-            return config, state
-    raise RecordingError("the state in the journal is none")

@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from modelserver.errors import RecordingError, WireError
-from modelserver.messages import GetHistory, GetTransformations
+from modelserver.messages import GetHistory, GetTransformations, Noticed, Rejected
 from modelserver.service.journal import build as journal_build
+from modelserver.service.journal import state as journal_state
 from modelserver.service.journal.rerun import Rerun, Said
 from modelserver.service.journal.ring import SEGMENT_NAME
 from modelserver.wire.channels import BY_NAME
@@ -264,7 +265,12 @@ class _Verifier:
     @staticmethod
     def _is_refusal(record: Record) -> bool:
         """Return whether it may stand between two things that are said at once: one could not be sent, or kept."""
-        return record.kind is Kind.EVENT and record.data.startswith((b'["Rejected"', b'["Noticed"'))
+        if record.kind is not Kind.EVENT:
+            return False
+        try:
+            return isinstance(journal_state.decode_event(record.data), (Rejected, Noticed))
+        except RecordingError:
+            return False
 
     def _compare(self) -> None:
         group, self._group = self._group, None

@@ -15,10 +15,10 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+from modelserver.config import VehicleConfig
 from modelserver.core import Instant
 from modelserver.messages import CHANNEL_OF
 from modelserver.service.clock import Clock
-from modelserver.service.journal import events as journal_events
 from modelserver.service.journal import state as journal_state
 from modelserver.service.journal.queue import Beginning, Entry, JournalQueue
 from modelserver.service.journal.ring import Ring, Segment
@@ -66,7 +66,7 @@ class Origins:
 
     facts: Mapping[str, Any]
     files: Iterable[tuple[str, bytes]]
-    config: Any
+    config: VehicleConfig
 
 
 def pause() -> None:
@@ -174,7 +174,7 @@ class JournalWriter:
     def _record(self, entry: Entry) -> Record:
         kind, data = entry.kind, entry.data
         if kind is Kind.EVENT:
-            kind, data = journal_events.written(entry.event, self._pause)
+            data = journal_state.encode_event(entry.event, self._pause)
         elif kind is Kind.REQUEST and type(entry.event) not in CHANNEL_OF:
             kind = Kind.SAMPLE
         return Record(kind, entry.now.monotonic_ns, entry.now.utime, entry.channel, data)
@@ -196,7 +196,8 @@ class JournalWriter:
         lost = self._lost + beginning.lost
         try:
             self._end()
-            state = journal_state.written((self._origins.config, journal_state.apart(beginning.state)), self._pause)
+            run = journal_state.Run(self._origins.config, journal_state.detach(beginning.state))
+            state = journal_state.encode_run(run, self._pause)
             segment = self._ring.fresh()
         except OSError:
             self._lost = lost
