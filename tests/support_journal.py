@@ -51,6 +51,7 @@ class Kept:
         facts: dict[str, Any] | None = None,
         ring: Callable[..., Ring] = Ring,
         second_writer: Literal["", "ignore", "use"] = "",
+        key: Key | None = None,
     ):
         path = write_vehicle(folder, vehicle, geometry)
         write_test_key(folder)
@@ -64,7 +65,7 @@ class Kept:
         known = {**journal_build.facts(), "run": run, **(facts or {})}
         files = [(str(path), path.read_bytes())]
         origins = Origins(known, files, self.vehicle.config)
-        self.writer = JournalWriter(self.queue, self.ring, origins, self.clock, pause=lambda: None)
+        self.writer = JournalWriter(self.queue, self.ring, origins, self.clock, pause=lambda: None, key=key)
         self.loop = Loop(
             self.bus,
             self.clock,

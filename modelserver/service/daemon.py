@@ -66,6 +66,7 @@ from modelserver.service.probing.start import probe, tell
 from modelserver.service.requests.gate import Gate
 from modelserver.service.supervision.notify import Notifier
 from modelserver.service.supervision.supervised import Supervision
+from modelserver.signing import Key
 from modelserver.snapshot import Snapshot, written
 from modelserver.version import __version__
 from modelserver.wire.channels import CHANNELS, Way
@@ -154,14 +155,19 @@ class Vehicle:
         """Return the configured sensors that localization cannot use in the mode it starts in, and why."""
         return () if self.rig is None else find_unusable(self.rig, self.config.localization.first_mode)
 
-    def gate(self, started_ns: int, file: str = "") -> Gate:
-        """Return what opens signed commands. Raises ConfigError where the key file cannot be used."""
-        config = self.config
+    def keys(self, file: str = "") -> tuple[Key, ...]:
+        """Return the vehicle's keys, none where it has no key file. Raises ConfigError where that cannot be used."""
+        path = self.config.commands.key_file
         try:
-            keys = read_keys(config.commands.key_file) if config.commands.key_file else ()
+            return read_keys(path) if path else ()
         except KeyFileError as error:
             problem = Problem(Severity.ERROR, str(error), Source(file, element="commands.key_file"))
             raise ConfigError(with_lines([problem], file)) from None
+
+    def gate(self, started_ns: int, file: str = "") -> Gate:
+        """Return what opens signed commands. Raises ConfigError where the key file cannot be used."""
+        config = self.config
+        keys = self.keys(file)
         mode_channel = config.localization.mode_channel
         return Gate(keys, config.lcm.channel_prefix, config.commands.window_s, mode_channel, started_ns)
 
@@ -474,7 +480,7 @@ def _serve(vehicle: Vehicle, store: Store, notifier: Notifier, url: str, file: s
         shared=frozenset({f"{config.lcm.channel_prefix}{config.sensors.joints.channel}"}),
     )
     supervision = Supervision(notifier, clock, lambda channel: loop.hears(channel))
-    journal = make_writer(config, file, clock, store.lock)
+    journal = make_writer(config, file, clock, store.lock, next(iter(vehicle.keys(file)), None))
     loop = Loop(
         bus,
         clock,

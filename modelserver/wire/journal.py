@@ -13,6 +13,7 @@ record before it what it was and at which instant it was handled, carries those 
 from __future__ import annotations
 
 import hashlib
+import hmac
 import json
 import struct
 import zlib
@@ -104,9 +105,20 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """The end of a segment that was closed; `intact`: whether the checksum over all of it is right."""
+    """The end of a segment that was closed.
+
+    `digest` is the SHA-256 of all bytes before it, and `intact` whether they still have it. `mac` proves, with the key,
+    who wrote that; empty for a journal without a key.
+    """
 
     intact: bool
+    digest: bytes
+    mac: bytes = b""
+
+    @property
+    def seal(self) -> bytes:
+        """What the next segment's head holds of this one."""
+        return self.mac or self.digest
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +137,11 @@ class Broken:
 Item: TypeAlias = Head | File | State | Record | End | Broken
 
 _OWN = struct.Struct(">8sBI")  # magic, part, checksum of what follows
+_DIGEST: Final = 32
+
+_TIMES: Final = 20
+"""Bytes of an event before its lengths: sync word, number, time."""
+
 _SEAL = struct.Struct(">II")  # number of the batch, count of events before the seal
 _INLINE = struct.Struct(">BqqHI")  # kind, instant, lengths of channel and data
 _HEARD = struct.Struct(">Bq")
@@ -154,9 +171,9 @@ def state_written(data: bytes, utime: int) -> bytes:
     return _own(Part.STATE, utime, data)
 
 
-def end_written(digest: bytes, utime: int) -> bytes:
-    """Return the end of a segment; `digest` is the SHA-256 of all bytes before."""
-    return _own(Part.END, utime, digest)
+def end_written(digest: bytes, utime: int, mac: bytes = b"") -> bytes:
+    """Return the end of a segment; `digest` is the SHA-256 of all bytes before, `mac` see `End`."""
+    return _own(Part.END, utime, digest + mac)
 
 
 def batch_written(number: int, records: Iterable[Record]) -> bytes:
@@ -218,6 +235,18 @@ def read(data: Buffer) -> Iterator[Item]:
         yield Broken(start, len(data) - start, "the segment breaks off: not sealed yet", tail=True)
 
 
+def read_end(data: Buffer) -> End | None:
+    """Return the end of a segment without reading what is before; None where it is not closed. Checks no digest."""
+    for size in (2 * _DIGEST, _DIGEST):
+        body = bytes(data[-size:])
+        event = _own(Part.END, 0, body)
+        tail = bytes(data[-len(event) :])
+        # number and time of the event may be any
+        if len(tail) == len(event) and tail[:4] == event[:4] and tail[_TIMES:] == event[_TIMES:]:
+            return End(True, body[:_DIGEST], body[_DIGEST:])
+    return None
+
+
 def _own_read(data: bytes) -> tuple[Part, int, bytes] | None:
     if len(data) < _OWN.size:
         return None
@@ -232,7 +261,10 @@ _PARTS: Final = frozenset(Part)
 
 def _part(part: Part, body: bytes, data: Buffer, begin: int) -> list[Item] | None:
     if part is Part.END:
-        return [End(hashlib.sha256(data[:begin]).digest() == body)]
+        digest, mac = body[:_DIGEST], body[_DIGEST:]
+        if len(digest) != _DIGEST or len(mac) not in (0, _DIGEST):
+            return None
+        return [End(hmac.compare_digest(hashlib.sha256(data[:begin]).digest(), digest), digest, mac)]
     if part is Part.STATE:
         return [State(body)]
     try:
@@ -240,7 +272,7 @@ def _part(part: Part, body: bytes, data: Buffer, begin: int) -> list[Item] | Non
             name, _, content = body.partition(b"\0")
             return [File(name.decode(), content)]
         facts = json.loads(body)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return [Head(facts)] if isinstance(facts, dict) else None
 

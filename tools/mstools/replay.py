@@ -72,6 +72,9 @@ def command(
         bool,
         typer.Option("--verify", help="LOG is a journal: run it again and compare all that was said, bit for bit."),
     ] = False,
+    key: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="With --verify: the vehicle's key file, to check the seals.")
+    ] = None,
     url: UrlOption = "",
     as_json: JsonOption = False,
 ) -> None:
@@ -84,7 +87,9 @@ def command(
     even or listed times, each from nothing but what had arrived before it; docs/recordings.md says exactly what that
     means. --report draws the same run: track, innovations, biases, gaps, validity, and what looks wrong.
     A log that breaks off in its last event is used up to there; for other damage the exit code is 1.
-    With --verify a service's journal is run again, and the first message that is not reproduced is named: exit code 1.
+    With --verify a service's journal is run again, and the first message that is not reproduced is named. Exit code 0:
+    all is reproduced bit for bit, and authentic by --key; 3: reproduced, but nothing proves that it is authentic; 4: the
+    same to within 1e-9 m and rad, as with another numpy; 1: it differs, or is damaged, incomplete or forged.
     Files named by --poses, --decisions and --report that exist are replaced, without --force.
 
     \b
@@ -93,17 +98,19 @@ def command(
       modelserver replay drive.lcm --speed 2
       modelserver replay drive.lcm -c config/husky/vehicle.yaml --poses poses.csv --frame Antenna:PhaseCentre --rate 10
       modelserver replay drive.lcm -c config/husky/vehicle.yaml --report drive.html
-      modelserver replay --verify /var/lib/modelserver/journal-Husky
+      modelserver replay --verify /var/lib/modelserver/journal-Husky --key /etc/modelserver/commands.key
     """
     if verify:
         if any(
             (config, poses, decisions, report, frame, rate, at_times, channel, everything, url, restamp, speed != "1")
         ):
-            raise typer.BadParameter("--verify stands alone, but for --json: all it needs is in the journal")
+            raise typer.BadParameter("--verify takes --json and --key beside it: all else that it needs is in the journal")
         from mstools.replay_verify import verified
 
-        verified(log, as_json)
+        verified(log, as_json, key)
         return
+    if key is not None:
+        raise typer.BadParameter("--key goes with --verify")
     channels = frozenset(channel or ())
     if poses or report:
         if config is None:

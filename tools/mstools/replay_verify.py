@@ -22,21 +22,26 @@ MOST_FIELDS = 12
 MOST_REMARKS = 20
 
 
-def verified(journal: Path, as_json: bool) -> None:
-    """Verify a journal and print what was found; exit code 1 where that is no proof."""
+def verified(journal: Path, as_json: bool, key: Path | None = None) -> None:
+    """Verify a journal and print what was found; the exit code is the `Result`.
+
+    `key`: the vehicle's key file; None: nothing can be proved to be genuine.
+    """
     # as the daemon does: the sums of the linear algebra come in another order with more threads
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    from modelserver.keys import read_keys
     from modelserver.service.journal.files import files_of
     from modelserver.service.journal.verify import verify
 
+    keys = () if key is None else read_keys(key)
     files = files_of(journal)
     with progress(f"verifying {journal.name}", sum(path.stat().st_size for path in files)) as show:
-        found = verify(files, show)
+        found = verify(files, show, keys, journal if journal.is_dir() else None)
     if as_json:
         typer.echo(json.dumps(_as_json(found)))
     else:
-        for line in lines(found):
+        for line in lines(found, bool(keys)):
             typer.echo(safe(line))
         for remark in found.remarks[:MOST_REMARKS]:
             typer.echo(safe(f"modelserver: {remark}"), err=True)
@@ -44,33 +49,61 @@ def verified(journal: Path, as_json: bool) -> None:
             typer.echo(f"modelserver: {len(found.remarks) - MOST_REMARKS} remarks more (--json has all)", err=True)
         if found.other:
             typer.echo(safe(f"modelserver: bits may differ: {'; '.join(found.other)}"), err=True)
-    if not found.proved:
-        raise typer.Exit(1)
+    if found.result:
+        raise typer.Exit(found.result)
 
 
-def lines(found: Verified) -> list[str]:
-    """Return what was found, in words."""
+def lines(found: Verified, keyed: bool = False) -> list[str]:
+    """Return what was found, in words; `keyed`: whether it was verified with a key."""
+    from modelserver.service.journal.comparison import TOLERANCE
+
     span = (found.last_utime - found.first_utime) * 1e-6
     where = f"{counted(found.segments, 'segment')} of {counted(found.runs, 'run')}, {found.seconds:.1f} of {span:.1f} s"
-    told = [f"{where} ({_when(found.first_utime)} to {_when(found.last_utime)}), {found.handled} records run again"]
-    said = sum(found.said.values())
-    if said:
-        told.append(f"{found.poses} poses and {said - found.poses} other messages are reproduced bit for bit:")
-        told += [f"  {name:24} {count:9}" for name, count in sorted(found.said.items())]
-    else:
-        told.append("nothing is reproduced: nothing in it was said, or it is not known what to begin from")
+    text = [f"{where} ({_when(found.first_utime)} to {_when(found.last_utime)}), {found.handled} records run again"]
+    exact, close = sum(found.said.values()), sum(found.close.values())
+    if exact:
+        text.append(f"{found.poses} poses and {exact - found.poses} other messages are reproduced bit for bit:")
+        text += [f"  {name:24} {count:9}" for name, count in sorted(found.said.items())]
+    if close:
+        text.append(f"{counted(close, 'message')} are the same to within {TOLERANCE:g} m and rad: {_largest(found)}:")
+        text += [f"  {name:24} {count:9}" for name, count in sorted(found.close.items())]
+    if not exact and not close:
+        text.append("nothing is reproduced: nothing in it was sent, or it is not known what to begin from")
     if found.skipped:
-        told.append(
+        text.append(
             f"not verified: {counted(sum(found.skipped.values()), 'message')}, for what the service knew then is not "
             "in the journal"
         )
     if found.old:
-        told.append(
+        text.append(
             f"not verified: {found.old} replies about the past, from before the first segment that is still held"
         )
     if found.difference is not None:
-        told += _difference(found.difference)
-    return told
+        text += _difference(found.difference)
+    text.append(_verdict(found, keyed))
+    return text
+
+
+def _largest(found: Verified) -> str:
+    off, (meters, radians) = found.largest, found.largest_at
+    return (
+        f"largest difference {off.meters:.2g} m{f' in {meters}' if meters else ''}, "
+        f"{off.radians:.2g} rad{f' in {radians}' if radians else ''}, {off.share:.2g} of any other number"
+    )
+
+
+def _verdict(found: Verified, keyed: bool) -> str:
+    if not found.proved:
+        return "NOT PROVED: what is wrong is named here"
+    words = "reproduced, but not all of it bit for bit" if found.close else "reproduced bit for bit"
+    if found.authentic:
+        return f"authentic: {words}, sealed with the vehicle's key"
+    if not keyed:
+        return f"{words}; not proved authentic (--key FILE checks the seals, where the vehicle has a key file)"
+    why = "segments may be missing at the end"
+    if found.unsealed:
+        why = f"{counted(found.unsealed, 'segment')} of {found.segments} not closed, or not sealed with a key"
+    return f"{words}; not proved authentic: {why}"
 
 
 def _when(utime: int) -> str:
@@ -92,44 +125,31 @@ def _difference(first: Difference) -> list[str]:
 
 
 def differing(was: bytes, now: bytes) -> list[tuple[str, str, str]]:
-    """Return the fields of two messages that differ: name, and what either says. Where one cannot be read, its length.
+    """Return the fields of two messages that differ: name, and both values. Where one cannot be read, its length.
 
     Numbers are shown with all digits that tell them apart.
     """
-    import mslcm
+    from modelserver.service.journal.comparison import changes
 
-    kinds: dict[bytes, Any] = {
-        kind._get_packed_fingerprint(): kind
-        for kind in vars(mslcm).values()
-        if isinstance(kind, type) and hasattr(kind, "_get_packed_fingerprint")
-    }
-    kind = kinds.get(was[:8])
-    if kind is None or was[:8] != now[:8]:
+    found = changes(was, now)
+    if found is None:
         return [("type or content", f"{len(was)} bytes {was[:12].hex()}", f"{len(now)} bytes {now[:12].hex()}")]
-    try:
-        fields = list(_fields("", kind.decode(was), kind.decode(now)))
-    except Exception as error:
-        return [("content", f"{len(was)} bytes", f"{len(now)} bytes that cannot be read ({error})")]
-    return fields or [("bits", "nan or zero", "another nan or zero")]
+    return [(each.name, _shown(each.was), _shown(each.now)) for each in found] or [
+        ("bits", "nan or zero", "another nan or zero")
+    ]
 
 
-def _fields(name: str, was: Any, now: Any) -> list[tuple[str, str, str]]:
-    if hasattr(was, "_get_packed_fingerprint") and type(was) is type(now):
-        found = []
-        for slot in was.__slots__:
-            found += _fields(f"{name}.{slot}" if name else slot, getattr(was, slot), getattr(now, slot))
-        return found
-    if isinstance(was, (list, tuple)) and isinstance(now, (list, tuple)):
-        if len(was) != len(now):
-            return [(name, f"{len(was)} of them", f"{len(now)} of them")]
-        return [each for n, pair in enumerate(zip(was, now, strict=True)) for each in _fields(f"{name}[{n}]", *pair)]
-    return [] if repr(was) == repr(now) else [(name, repr(was), repr(now))]
+def _shown(value: Any) -> str:
+    return f"{len(value)} of them" if isinstance(value, (list, tuple)) else repr(value)
 
 
 def _as_json(found: Verified) -> dict[str, Any]:
     first = found.difference
     return {
+        "result": found.result.name.lower(),
         "proved": found.proved,
+        "authentic": found.authentic,
+        "genuine_segments": found.genuine,
         "segments": found.segments,
         "runs": found.runs,
         "seconds": found.seconds,
@@ -137,6 +157,8 @@ def _as_json(found: Verified) -> dict[str, Any]:
         "records": found.handled,
         "poses": found.poses,
         "said": dict(sorted(found.said.items())),
+        "close": dict(sorted(found.close.items())),
+        "largest": {"meters": found.largest.meters, "radians": found.largest.radians, "share": found.largest.share},
         "skipped": sum(found.skipped.values()),
         "old_replies": found.old,
         "lost": found.lost,

@@ -16,6 +16,7 @@ from modelserver.service.journal.ring import Ring
 from modelserver.service.journal.writer import JournalWriter, Origins
 from modelserver.service.keeping.lock import Lock
 from modelserver.service.keeping.origin import safe, state_directory
+from modelserver.signing import Key
 
 log = logging.getLogger(__name__)
 
@@ -56,11 +57,12 @@ def bound(config: VehicleConfig) -> int:
 
 
 def make_writer(
-    config: VehicleConfig, file: str, clock: Clock, lock: Lock | None = None
+    config: VehicleConfig, file: str, clock: Clock, lock: Lock | None = None, key: Key | None = None
 ) -> tuple[JournalQueue, JournalWriter] | None:
     """Return the queue for the loop and the writer for it, None where no journal is kept.
 
-    `file`: the vehicle file. `lock`: that of the state directory, which counts where the journal lies within.
+    `file`: the vehicle file. `lock`: that of the state directory, which counts where the journal lies within. `key`:
+    what segments are sealed with, None: the vehicle has none.
     """
     directory = journal_directory(config)
     if directory is None:
@@ -72,4 +74,5 @@ def make_writer(
     facts = {**journal_build.facts(), "vehicle": config.vehicle, "run": secrets.token_hex(8), "pid": os.getpid()}
     files = [(str(path), path.read_bytes()) for path in (Path(file), Path(config.geometry)) if path.is_file()]
     queue = JournalQueue()
-    return queue, JournalWriter(queue, ring, Origins(facts, files, config), clock, config.journal.sync_s)
+    origins = Origins(facts, files, config)
+    return queue, JournalWriter(queue, ring, origins, clock, config.journal.sync_s, key=key)

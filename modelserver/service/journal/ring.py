@@ -28,8 +28,10 @@ class Segment:
     Every method raises OSError where the disk refuses.
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, number: int = 0):
         self.path = path
+        self.number = number
+        """In the ring."""
         self.size = 0
         self.digest = hashlib.sha256()
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
@@ -68,12 +70,19 @@ class Ring:
         self._within = within
         self._lock = Lock(directory / LOCK_NAME)
 
-    def fresh(self) -> Segment:
-        """Return a new segment, numbered behind all others, once the oldest have made room for it."""
+    def hold(self) -> None:
+        """Have the directory for this writer."""
         if self._within is not None:
             self._within.claim()
         self.directory.mkdir(parents=True, exist_ok=True)
         self._lock.hold()
+
+    def fresh(self, least: int = 0) -> Segment:
+        """Return a new segment, numbered behind all others, once the oldest have made room for it.
+
+        `least`: the smallest number that it may have; there may have been segments that are gone.
+        """
+        self.hold()
         held = segments(self.directory)
         sizes = [path.stat().st_size for path in held]
         excess = sum(sizes) + self.segment_bytes - self.most_bytes
@@ -83,8 +92,8 @@ class Ring:
             path.unlink()
             excess -= size
         match = SEGMENT_NAME.fullmatch(held[-1].name) if held else None
-        number = int(match[1]) + 1 if match else 0
-        segment = Segment(self.directory / f"journal-{number:08d}.lcm")
+        number = max(int(match[1]) + 1 if match else 0, least)
+        segment = Segment(self.directory / f"journal-{number:08d}.lcm", number)
         self._sync_directory()
         return segment
 

@@ -1,4 +1,7 @@
-"""A journal verified: every record is run again, and what is said is compared with what was said, bit for bit.
+"""A journal verified: every record is run again, and what is sent is compared with what was sent, bit for bit.
+
+Where another build or machine sums in another order, messages may be the same to within `comparison.TOLERANCE`; that is
+a result of its own. Whether the segments are whole, in order and genuine is checked by `chain`.
 
 A run is the life of one service: its segments follow each other, and each is gone on into with what is known from the
 one before. Where that is missing (the ring has dropped it, records were lost, bytes are damaged) the run is taken up
@@ -12,8 +15,9 @@ from __future__ import annotations
 
 import mmap
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from enum import IntEnum
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,13 +25,28 @@ from modelserver.errors import RecordingError, WireError
 from modelserver.messages import GetHistory, GetTransformations, Noticed, Rejected
 from modelserver.service.journal import build as journal_build
 from modelserver.service.journal import state as journal_state
+from modelserver.service.journal.chain import NEWEST_NAME, Chain, Finding, read_newest
+from modelserver.service.journal.comparison import Deviation, deviation
 from modelserver.service.journal.rerun import Rerun, Said
-from modelserver.service.journal.ring import SEGMENT_NAME
+from modelserver.signing import Key
 from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode
 from modelserver.wire.journal import FORMAT, Broken, End, Head, Kind, Record, State, read
 
 POSES: Final = ("POSE", "POSE_VECTOR", "POSE_ODOM")
+
+
+class Result(IntEnum):
+    """What a verification found; the value is the exit code of `modelserver replay --verify`."""
+
+    AUTHENTIC = 0
+    """All is reproduced bit for bit, and the key proves that it is genuine and whole."""
+    DIFFERS = 1
+    """Something is not reproduced, damaged, missing or not genuine."""
+    REPRODUCED = 3
+    """All is reproduced bit for bit; nothing proves that it is genuine."""
+    CLOSE = 4
+    """All is reproduced, some of it only to within the tolerance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +79,9 @@ class Verified:
 
     skipped: messages that were said where it is not known from what. old: see the module. difference: the first.
     seconds: how long of it was run again, of the span from first_utime to last_utime.
-    other: what is other with build or machine than it was then, in words.
+    other: what is other with build or machine than it was then, in words. close: messages that are the same to within
+    the tolerance, by channel; largest: their largest difference, with the channel. genuine: segments whose keyed seal
+    is right. unsealed: segments whose seal proves nothing. complete: whether it is known that none is missing at the end.
     """
 
     segments: int = 0
@@ -77,6 +98,13 @@ class Verified:
     remarks: list[Remark] = field(default_factory=list)
     other: list[str] = field(default_factory=list)
     difference: Difference | None = None
+    close: Counter[str] = field(default_factory=Counter)
+    largest: Deviation = Deviation()
+    largest_at: tuple[str, str] = ("", "")
+    """Channels of the largest difference of a position, and of an orientation."""
+    genuine: int = 0
+    unsealed: int = 0
+    complete: bool = False
 
     @property
     def poses(self) -> int:
@@ -85,8 +113,23 @@ class Verified:
 
     @property
     def proved(self) -> bool:
-        """Whether something was verified, all of it holds, and no bytes are damaged."""
-        return bool(self.said) and self.difference is None and not any(each.damage for each in self.remarks)
+        """Whether something was verified, all of it holds bit for bit or nearly, and no bytes are damaged or missing."""
+        said = bool(self.said) or bool(self.close)
+        return said and self.difference is None and not any(each.damage for each in self.remarks)
+
+    @property
+    def authentic(self) -> bool:
+        """Whether the key proves that all of it was written by the service, and that nothing is missing at the end."""
+        return self.proved and self.complete and 0 < self.segments == self.genuine and not self.unsealed
+
+    @property
+    def result(self) -> Result:
+        """What was found, in a word."""
+        if not self.proved:
+            return Result.DIFFERS
+        if self.close:
+            return Result.CLOSE
+        return Result.AUTHENTIC if self.authentic else Result.REPRODUCED
 
 
 @dataclass(slots=True)
@@ -99,30 +142,38 @@ class _Group:
     was: list[Record] = field(default_factory=list)
 
 
-def verify(files: Sequence[Path], show: Callable[[int], object] = lambda done: None) -> Verified:
-    """Run a journal again up to the first difference. `show` is told how many bytes are done.
+def verify(
+    files: Sequence[Path],
+    show: Callable[[int], object] = lambda done: None,
+    keys: Sequence[Key] = (),
+    directory: Path | None = None,
+) -> Verified:
+    """Run a journal again up to the first difference. `show` is called with how many bytes are done.
 
+    `keys`: the vehicle's, to prove that it is genuine. `directory`: whose segments the files are, all of them; None:
+    they are looked at by themselves.
     Raises RecordingError for a file that is no journal, OSError where one cannot be read.
     """
-    verifier = _Verifier(show)
+    verifier = _Verifier(show, keys)
     for path in files:
         verifier.segment(path)
         if verifier.found.difference is not None:
             break
     verifier.close()
+    verifier.finish(directory)
     return verifier.found
 
 
 class _Verifier:
-    def __init__(self, show: Callable[[int], object]):
+    def __init__(self, show: Callable[[int], object], keys: Sequence[Key] = ()):
         self.found = Verified()
+        self._chain = Chain(keys)
+        self._keys = keys
         self._show = show
         self._rerun: Rerun | None = None
         self._group: _Group | None = None
         self._follows: tuple[str, int] | None = None
         """Run and number of the segment that would go on from here."""
-        self._before: tuple[Path, str, int, bool] | None = None
-        """The segment before: its run, its number in that, and whether it was closed."""
         self._held_until = 0
         """When as much is known again as when a state was written, by the sensors' time."""
         self._at_ns = 0
@@ -133,6 +184,7 @@ class _Verifier:
     def segment(self, path: Path) -> None:
         """Verify a segment more."""
         self._path, self._ended, going_on = path, False, False
+        end: End | None = None
         found, before = self.found, self.found.bytes
         facts: dict[str, Any] | None = None
         with path.open("rb") as file:
@@ -155,7 +207,7 @@ class _Verifier:
                 elif isinstance(item, Broken):
                     self._broken(item)
                 elif isinstance(item, End):
-                    self._ended = True
+                    self._ended, end = True, item
                     if not item.intact:
                         self._remark("the checksum over the whole segment is wrong", damage=True)
         finally:
@@ -165,14 +217,13 @@ class _Verifier:
         if facts is None:
             if size == 0 or any(each.segment == path for each in found.remarks):
                 self._stop()
-                if self._before is not None:
-                    self._before = (path, *self._before[1:])
+                self._chain.skip(path)
                 if size == 0:
                     self._remark("is empty: the machine stopped as it was made")
                 return
             raise RecordingError(f"{path}: is no journal of a modelserver")
         found.segments += 1
-        self._before = (path, str(facts["run"]), facts["part"], self._ended)
+        self._remark_all(self._chain.end(facts, end))
         if not self._ended:
             if not any(each.segment == path for each in found.remarks):
                 self._remark("is not closed: it is being written, or process or machine were stopped")
@@ -182,13 +233,15 @@ class _Verifier:
     def _headed(self, facts: dict[str, Any]) -> bool:
         """Take note of who wrote a segment; return whether it goes on from the one before."""
         run, part, lost = str(facts.get("run")), facts.get("part"), facts.get("lost")
-        if facts.get("format") != FORMAT or not isinstance(part, int) or not isinstance(lost, int):
+        numbers = (part, lost, facts.get("number"), facts.get("run_number"))
+        if facts.get("format") != FORMAT or not all(type(each) is int for each in numbers):
             raise RecordingError(
                 f"{self._path}: is a journal of format {facts.get('format')}, this build reads {FORMAT}; "
                 "take the build that wrote it"
             )
-        if self._before is not None:
-            self._check_follows(*self._before, run, part, lost)
+        assert isinstance(part, int)
+        assert isinstance(lost, int)
+        self._remark_all(self._chain.begin(self._path, facts))
         for each in journal_build.differences(facts):
             if each not in self.found.other:
                 self.found.other.append(each)
@@ -205,24 +258,12 @@ class _Verifier:
             self._remark(f"{lost} records before it are lost: the disk refused them, or was too slow")
         return going_on
 
-    def _check_follows(self, before: Path, was: str, number: int, closed: bool, run: str, part: int, lost: int) -> None:
-        """Remark on what should stand between a segment and the one before it, or at that one's end, and does not."""
-        names = [SEGMENT_NAME.fullmatch(path.name) for path in (before, self._path)]
-        apart = 1 if None in names else int(names[1][1]) - int(names[0][1])  # type: ignore[index]
-        skipped = part - number - 1 if run == was else part
-        missing = max(apart - 1, 0 if lost else skipped)
-        if missing > 0:
-            why = f"{missing} segments before it are missing, behind {before.name}: removed, or lost"
-            self._remark(why, damage=True)
-        elif run == was and not closed and not lost:
-            self._remark(f"goes on from {before.name}, whose end was cut off after it was written", damage=True)
-
     def _begin(self, state: State, facts: dict[str, Any] | None) -> None:
         self.close()
         self._rerun, self._at_ns = None, 0
         try:
             self._rerun = rerun = Rerun(state.data)
-        except RecordingError as error:
+        except Exception as error:
             self._remark(f"cannot be run again: {error}", damage=True)
             return
         if facts is not None and facts.get("kept_s") is not None:
@@ -253,7 +294,8 @@ class _Verifier:
                 return
         try:
             said = rerun.handle(record)
-        except RecordingError as error:
+        except Exception as error:
+            # a state that was made up may hold what no service ever had
             self._remark(f"at byte {record.at}: {error}", damage=True)
             self._stop()
             return
@@ -287,6 +329,9 @@ class _Verifier:
             if was is not None and now == (was.channel, was.data):
                 found.said["replies" if was.channel.startswith(replies) else was.channel.removeprefix(prefix)] += 1
                 continue
+            if was is not None and now is not None and self._is_close(was, now):
+                found.close["replies" if was.channel.startswith(replies) else was.channel.removeprefix(prefix)] += 1
+                continue
             channel = was.channel if was is not None else now[0] if now is not None else ""
             if old and channel.startswith(replies):
                 found.old += was is not None
@@ -300,6 +345,20 @@ class _Verifier:
                 None if now is None else now[1],
             )
             return
+
+    def _is_close(self, was: Record, now: Said) -> bool:
+        """Return whether a message is the same to within the tolerance, and take note of how near it is."""
+        found = self.found
+        off = deviation(was.data, now[1]) if now[0] == was.channel else None
+        if off is None or not off.is_tolerable:
+            return False
+        meters, radians = found.largest_at
+        found.largest_at = (
+            was.channel if off.meters > found.largest.meters else meters,
+            was.channel if off.radians > found.largest.radians else radians,
+        )
+        found.largest = found.largest.largest(off)
+        return True
 
     def _asks_for_the_past(self, record: Record) -> bool:
         """Return whether a reply to a record may rest on poses that the state no longer held, when it was taken up."""
@@ -343,6 +402,28 @@ class _Verifier:
                 self._group.now = self._group.now[: len(self._group.was)]
             self._compare()
         self._group = None
+
+    def finish(self, directory: Path | None) -> None:
+        """Check that nothing is missing at the end, as far as that can be known."""
+        found = self.found
+        found.genuine, found.unsealed = self._chain.genuine, len(self._chain.unsealed)
+        found.complete = directory is None
+        if directory is None or found.difference is not None:
+            return
+        try:
+            newest = read_newest(directory, self._keys)
+        except RecordingError as error:
+            self._remark(str(error), damage=True)
+            return
+        findings = self._chain.finish(newest)
+        self._remark_all(findings)
+        found.complete = newest is not None
+        if newest is None:
+            self._remark(f"the file {NEWEST_NAME} is not there, so nobody knows whether segments after it are missing")
+
+    def _remark_all(self, findings: Iterable[Finding]) -> None:
+        for each in findings:
+            self._remark(each.text, each.damage)
 
     def _remark(self, text: str, damage: bool = False) -> None:
         self.found.remarks.append(Remark(self._path, text, damage))

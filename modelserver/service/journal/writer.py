@@ -20,12 +20,16 @@ from modelserver.core import Instant
 from modelserver.messages import CHANNEL_OF
 from modelserver.service.clock import Clock
 from modelserver.service.journal import state as journal_state
+from modelserver.service.journal.chain import NEWEST_NAME, Newest, last_link, read_newest, seal_segment
 from modelserver.service.journal.queue import Beginning, Entry, JournalQueue
 from modelserver.service.journal.ring import Ring, Segment
+from modelserver.service.keeping.origin import write_whole
 from modelserver.service.keeping.trouble import words_on
 from modelserver.service.log import plain
+from modelserver.signing import Key
 from modelserver.wire.journal import (
     FORMAT,
+    End,
     Kind,
     Record,
     batch_written,
@@ -77,7 +81,8 @@ def pause() -> None:
 class JournalWriter:
     """Writes what a queue holds into a ring. `start` runs it on a thread, `close` ends that.
 
-    `sync_s`: seconds between two times that the disk is told to hold what it was given.
+    `sync_s`: seconds between two times that the disk is told to hold what it was given. `key`: what segments are sealed
+    with; None: nobody can prove them.
     """
 
     def __init__(
@@ -88,7 +93,13 @@ class JournalWriter:
         clock: Clock,
         sync_s: float = 2.0,
         pause: Callable[[], object] = pause,
+        key: Key | None = None,
     ):
+        # compiled here, before the loop turns
+        journal_state.schema()
+        self._key = key
+        self._run_number = -1
+        self._previous = ""
         self._queue = queue
         self._ring = ring
         self._origins = origins
@@ -198,18 +209,22 @@ class JournalWriter:
             self._end()
             run = journal_state.Run(self._origins.config, journal_state.detach(beginning.state))
             state = journal_state.encode_run(run, self._pause)
-            segment = self._ring.fresh()
+            segment = self._fresh()
         except OSError:
             self._lost = lost
             raise
         facts = {"format": FORMAT, "part": self._part, "lost": lost, "utime": now.utime, **self._origins.facts}
         facts["kept_s"] = journal_state.KEPT_S if len(beginning.state.history) else None
+        facts["key"] = "" if self._key is None else self._key.name
+        facts |= {"number": segment.number, "run_number": self._run_number, "previous": self._previous}
+        self._previous = ""
         self._segment, self._batch = segment, 0
         try:
             segment.append(head_written(facts, now.utime))
             for name, data in self._origins.files:
                 segment.append(file_written(name, data[:LARGEST_FILE], now.utime))
             segment.append(state_written(state, now.utime))
+            self._write_newest(segment.number)
         except OSError:
             self._lost = lost
             raise
@@ -227,10 +242,28 @@ class JournalWriter:
         segment, self._segment = self._segment, None
         if segment is not None:
             try:
-                segment.append(end_written(segment.digest.digest(), self._clock.utime()))
+                end = End(True, segment.digest.digest(), seal_segment(self._key, segment.digest.digest()))
+                segment.append(end_written(end.digest, self._clock.utime(), end.mac))
                 segment.sync()
+                self._previous = end.seal.hex()
+                self._write_newest(segment.number)
             finally:
                 segment.close()
+
+    def _fresh(self) -> Segment:
+        """Return a new segment, which follows from what the directory holds."""
+        ring = self._ring
+        ring.hold()
+        newest = read_newest(ring.directory, () if self._key is None else (self._key,), checks=False)
+        if self._run_number < 0:
+            before = last_link(ring.directory)
+            self._previous = before.seal
+            self._run_number = max(before.run, -1 if newest is None else newest.run) + 1
+        return ring.fresh(0 if newest is None else newest.number + 1)
+
+    def _write_newest(self, number: int) -> None:
+        newest = Newest(self._run_number, number, self._previous)
+        write_whole(self._ring.directory / NEWEST_NAME, newest.encode(self._key))
 
     def _fail(self, error: OSError) -> None:
         """Write no more until the disk is tried again; what comes meanwhile is dropped and counted."""

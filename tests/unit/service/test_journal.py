@@ -36,10 +36,10 @@ class Refusing(Ring):
 
     error: OSError | None = None
 
-    def fresh(self) -> Segment:
+    def fresh(self, least: int = 0) -> Segment:
         if self.error is not None:
             raise self.error
-        return super().fresh()
+        return super().fresh(least)
 
 
 def notices(kept: Kept) -> dict[str, str]:

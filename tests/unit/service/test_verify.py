@@ -326,7 +326,7 @@ def test_given_a_journal_that_breaks_off_anywhere_when_verified_then_what_is_sea
     kept = Kept(tmp_path)
     kept.drive(2.0)
     (path,) = kept.finish()
-    data, torn = path.read_bytes(), tmp_path / "journal-00000077.lcm"
+    data, torn = path.read_bytes(), tmp_path / "torn.lcm"
     begin = next(each.at for each in read(data) if isinstance(each, Record))
     poses = []
     for cut in range(begin, len(data), (len(data) - begin) // 40):

@@ -24,6 +24,7 @@ from modelserver.wire.journal import (
     file_written,
     head_written,
     read,
+    read_end,
     state_written,
 )
 from modelserver.wire.kinds import is_of_service
@@ -52,7 +53,8 @@ def test_given_a_segment_when_read_then_everything_comes_back_in_order() -> None
     found = list(read(segment(RECORDS[:3], RECORDS[3:])))
     assert found[:3] == [Head({"format": 1, "run": "x"}), File("a.yaml", b"a\0b"), State(b"known")]
     assert records(found) == list(RECORDS)
-    assert found[-1] == End(intact=True)
+    assert isinstance(found[-1], End)
+    assert found[-1].intact
     assert len(found) == 9
 
 
@@ -116,10 +118,19 @@ def test_given_a_record_that_was_put_between_when_read_then_the_batch_is_refused
 
 def test_given_an_end_that_does_not_fit_when_read_then_the_segment_is_not_intact() -> None:
     found = list(read(batch_written(0, RECORDS) + end_written(bytes(32), 6)))
-    assert found[-1] == End(intact=False)
+    assert found[-1] == End(intact=False, digest=bytes(32))
 
 
-@pytest.mark.parametrize("body", [b"", b"[]", b"{", b"\xff"])
+@pytest.mark.parametrize("mac", [b"", bytes(range(32))], ids=["plain", "keyed"])
+def test_given_a_segment_then_its_end_is_read_from_its_last_bytes_alone(mac: bytes) -> None:
+    data = batch_written(0, RECORDS) + end_written(bytes(31) + b"!", 6, mac)
+    assert read_end(data) == End(True, bytes(31) + b"!", mac)
+    assert read_end(data[:-1]) is None
+    assert read_end(data + b"\0") is None
+    assert read_end(b"") is None
+
+
+@pytest.mark.parametrize("body", [b"", b"[]", b"{", b"\xff", b"[" * 100_000])
 def test_given_a_head_that_is_none_when_read_then_it_is_told_as_broken(body: bytes) -> None:
     from modelserver.wire.journal import Part, _own
 
