@@ -38,6 +38,8 @@ from modelserver.service.encoding.tokens import (
 )
 
 MOST_DIMENSIONS: Final = 8
+LONGEST_DIMENSION: Final = 1 << 24
+"""Of an array: an empty one may claim any."""
 
 LARGEST_CONSTRUCTED: Final = 5_000_000
 """Values that a constructor may be given, each counted as often as it is referred to: references cost one byte."""
@@ -85,17 +87,18 @@ class Scalar:
             types.add(bool)
         self._types = frozenset(types)
 
-    def check(self, value: Any) -> None:
-        """Raise TypeError for a value that is not of the declared type."""
-        kind = type(value.item()) if isinstance(value, np.generic) else type(value)
-        if kind not in self._types or (self._values and value not in self._values):
-            raise TypeError(f"{_described(value)}, declared as {self.text}")
+    @property
+    def types(self) -> frozenset[type]:
+        """The types whose values are tokens as they are; empty where it depends on the value."""
+        return frozenset() if self._values else self._types
 
     def encode(self, value: Any, out: TokenWriter) -> None:
         """See `Node`."""
-        if out.checks:
-            self.check(value)
-        out.tokens.append(value)
+        # numpy's scalars are stored as Python's, which have the same bits
+        plain = value.item() if isinstance(value, (np.bool_, np.integer, np.float64)) else value
+        if type(plain) not in self._types or (self._values and plain not in self._values):
+            raise TypeError(f"{_described(value)}, declared as {self.text}")
+        out.tokens.append(plain)
 
     def decode(self, head: Any, source: TokenReader) -> Any:
         """See `Node`."""
@@ -177,7 +180,7 @@ class Record:
         self.parts: Callable[[Any], Sequence[Any]] = tuple
         self.build: Callable[[list[Any]], Any] = cls
         self.constructed = False
-        self._plan: tuple[tuple[str, Callable[[Any, TokenWriter], None] | None], ...] = ()
+        self._plan: tuple[tuple[str, frozenset[type], Callable[[Any, TokenWriter], None]], ...] = ()
         self._allowed: dict[int, Record] = {}
 
     def number(self, index: int) -> None:
@@ -189,7 +192,8 @@ class Record:
         """Set the fields."""
         self.names, self.nodes = tuple(names), tuple(nodes)
         self._plan = tuple(
-            (name, None if isinstance(node, Scalar) else node.encode) for name, node in zip(names, nodes, strict=True)
+            (name, node.types if isinstance(node, Scalar) else frozenset(), node.encode)
+            for name, node in zip(names, nodes, strict=True)
         )
 
     def definition(self) -> list[list[str]]:
@@ -214,11 +218,11 @@ class Record:
         append = out.tokens.append
         name = ""
         try:
-            for (name, encode), node, part in zip(self._plan, self.nodes, self.parts(value), strict=True):
-                if encode is None and not out.checks:
+            for (name, types, encode), part in zip(self._plan, self.parts(value), strict=True):
+                if type(part) in types:
                     append(part)
                 else:
-                    node.encode(part, out)
+                    encode(part, out)
         except EncodingError:
             raise
         except TypeError as error:
@@ -420,7 +424,7 @@ class TupleNode(_Shared):
     def encode_content(self, value: Any, out: TokenWriter) -> None:
         """See `_Shared`."""
         out.tokens.append(len(value))
-        if isinstance(self._element, Scalar) and not out.checks:
+        if isinstance(self._element, Scalar) and self._element.accepts(value):
             out.tokens += value
         else:
             for each in value:
@@ -447,7 +451,9 @@ class FixedTuple(_Shared):
     def __init__(self, nodes: Sequence[Node]):
         self._nodes = tuple(nodes)
         self._count = len(self._nodes)
-        self._scalars = [node for node in nodes if isinstance(node, Scalar)]
+        scalars = [node for node in nodes if isinstance(node, Scalar)]
+        alike = len(scalars) == self._count > 0 and len({node.text for node in scalars}) == 1
+        self._alike = scalars[0] if alike else None
         self.text = "(" + ", ".join(node.text for node in nodes) + ")"
 
     def encode_content(self, value: Any, out: TokenWriter) -> None:
@@ -455,7 +461,7 @@ class FixedTuple(_Shared):
         if len(value) != self._count:
             raise TypeError(f"{len(value)} values, declared as {self.text}")
         out.tokens.append(self._count)
-        if len(self._scalars) == self._count and not out.checks:
+        if self._alike is not None and self._alike.accepts(value):
             out.tokens += value
         else:
             for node, each in zip(self._nodes, value, strict=True):
@@ -466,14 +472,9 @@ class FixedTuple(_Shared):
         if head != self._count:
             raise ValueError(f"{head} values, declared as {self.text}")
         source.weight += head
-        if len(self._scalars) == self._count:
+        if self._alike is not None:
             found = source.many(head)
-            return tuple(
-                [
-                    token if node.accepts((token,)) else node.converted(token)
-                    for node, token in zip(self._scalars, found, strict=True)
-                ]
-            )
+            return tuple(found if self._alike.accepts(found) else [self._alike.converted(token) for token in found])
         return tuple([node.decode(source.take(), source) for node in self._nodes])
 
 
@@ -562,7 +563,7 @@ class NumpyArray(_Shared):
         fortran, *shape, data = source.many(head + 2)
         if type(fortran) is not bool or type(data) is not bytes or any(type(n) is not int or n < 0 for n in shape):
             raise ValueError(f"no {self.text}")
-        if prod(shape) * self._stored.itemsize != len(data) or (not data and max(shape, default=0) > 0):
+        if prod(shape) * self._stored.itemsize != len(data) or max(shape, default=0) > LONGEST_DIMENSION:
             raise ValueError(f"an array of shape {shape} with {len(data)} bytes")
         flat = np.frombuffer(data, self._stored).astype(self._dtype)
         return flat.reshape(shape, order="F" if fortran else "C")

@@ -132,12 +132,14 @@ class Schema:
 
         Raises EncodingError, which names the field, for a value that is not of its declared type.
         """
-        node = self._roots[root]
+        out = TokenWriter(pause)
         try:
-            return _encoded(node, value, TokenWriter(pause))
+            self._roots[root].encode(value, out)
         except EncodingError:
-            # again, slowly, for the name of the field
-            return _encoded(node, value, TokenWriter(pause, checks=True))
+            raise
+        except TypeError as error:
+            raise EncodingError(f"{root} is {error}") from error
+        return out.close()
 
     def decode(self, root: str, data: bytes) -> Any:
         """Return the value in what `encode` returned. Raises RecordingError for anything else."""
@@ -279,11 +281,6 @@ class Schema:
             record.parts, record.build = _getter(fields), _Construct(cls)
             record.constructed = True
         record.define(fields, [self._node(hints[each], f"{name}.{each}") for each in fields])
-
-
-def _encoded(node: Node, value: object, out: TokenWriter) -> bytes:
-    node.encode(value, out)
-    return out.close()
 
 
 def _records_of(node: Node) -> Sequence[Record]:

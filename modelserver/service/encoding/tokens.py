@@ -15,7 +15,6 @@ from itertools import islice
 from typing import Any, Final
 
 import msgspec
-import numpy as np
 
 from modelserver.errors import RecordingError
 
@@ -48,14 +47,12 @@ class TokenWriter:
     then on: values share much, and what is shared is written once and shared again when it is read.
     """
 
-    __slots__ = ("_blocks", "_kept", "_pause", "checks", "others", "records", "tokens")
+    __slots__ = ("_blocks", "_kept", "_pause", "others", "records", "tokens")
 
-    def __init__(self, pause: Callable[[], object] = lambda: None, checks: bool = False):
+    def __init__(self, pause: Callable[[], object] = lambda: None):
         self.tokens: list[Any] = []
         self.records: dict[int, int] = {}
         self.others: dict[object, dict[int, int]] = {}
-        self.checks = checks
-        """Whether each scalar is compared with its declared type: slow, to name the field that is wrong."""
         self._kept: list[object] = []
         self._blocks: list[bytes] = []
         self._pause = pause
@@ -66,12 +63,10 @@ class TokenWriter:
         self._kept.append(value)
 
     def flush(self) -> None:
-        """Close a block. Raises EncodingError for a token that is no scalar."""
+        """Close a block."""
         tokens = self.tokens
         if not tokens:
             return
-        if not SCALARS.issuperset(map(type, tokens)):
-            tokens[:] = map(_scalar, tokens)
         try:
             data = _encode(tokens)
         except (OverflowError, UnicodeEncodeError):
@@ -84,15 +79,6 @@ class TokenWriter:
         """Return all blocks."""
         self.flush()
         return b"".join(self._blocks)
-
-
-def _scalar(token: Any) -> Any:
-    """Return a token as a plain scalar: numpy's are stored as Python's, which have the same bits."""
-    if type(token) in SCALARS:
-        return token
-    if isinstance(token, (np.bool_, np.integer, np.float64)):
-        return token.item()
-    raise EncodingError(f"a {type(token).__qualname__} where a scalar is declared")
 
 
 def _fitting(token: Any) -> Any:

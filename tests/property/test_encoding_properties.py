@@ -1,0 +1,117 @@
+"""The encoding of states under hypothesis: any value comes back, and no bytes do more than raise RecordingError."""
+
+from __future__ import annotations
+
+import struct
+import tracemalloc
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support_journal import OPEN, Kept
+
+from modelserver.errors import RecordingError
+from modelserver.service.encoding.schema import Schema
+from modelserver.service.journal import state as journal_state
+
+MOST_MEMORY = 40
+"""Bytes of memory that one byte of a state may become: an object of its own, and its place in two lists."""
+
+
+class Value(NamedTuple):
+    number: float
+    numbers: tuple[float, ...]
+    named: dict[str, tuple[int, ...]]
+    text: str
+    data: bytes
+    next: Value | None = None
+
+
+SCHEMA = Schema({"value": Value})
+FLOATS = st.integers(0, (1 << 64) - 1).map(lambda bits: struct.unpack("<d", struct.pack("<Q", bits))[0])
+INTS = st.integers(-(1 << 80), 1 << 80)
+TEXTS = st.text(st.characters(), max_size=9)
+VALUES = st.recursive(
+    st.none(),
+    lambda inner: st.builds(
+        Value, FLOATS, st.lists(FLOATS, max_size=3).map(tuple), st.dictionaries(TEXTS, st.lists(INTS).map(tuple), max_size=3),
+        TEXTS, st.binary(max_size=9), inner,
+    ),
+    max_leaves=4,
+).filter(lambda value: value is not None)  # fmt: skip
+
+
+@given(VALUES)
+def test_given_any_value_then_it_is_read_back_to_the_same_bytes(value: Value) -> None:
+    data = SCHEMA.encode("value", value)
+    back = SCHEMA.decode("value", data)
+    assert repr(back) == repr(value)
+    assert SCHEMA.encode("value", back) == data
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A run of the filter as bytes."""
+    kept = Kept(Path(tmp_path_factory.mktemp("run")), OPEN)
+    kept.drive(0.4)
+    state = journal_state.detach(kept.loop.state)
+    return journal_state.encode_run(journal_state.Run(kept.vehicle.config, state))
+
+
+def read(data: bytes) -> None:
+    """Read what may be a run; only a RecordingError may come of it, and memory stays in proportion."""
+    tracemalloc.start()
+    try:
+        journal_state.decode_run(data)
+    except RecordingError:
+        pass
+    finally:
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert peak < 4_000_000 + MOST_MEMORY * len(data)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_given_bytes_of_a_run_that_were_changed_then_nothing_but_a_recording_error_comes_of_it(
+    run: bytes, data: st.DataObject
+) -> None:
+    changed = bytearray(run)
+    for _ in range(data.draw(st.integers(1, 4))):
+        changed[data.draw(st.integers(0, len(run) - 1))] = data.draw(st.integers(0, 255))
+    read(bytes(changed))
+    read(run[: data.draw(st.integers(0, len(run)))])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_given_tokens_of_a_run_that_were_changed_then_nothing_but_a_recording_error_comes_of_it(
+    run: bytes, data: st.DataObject
+) -> None:
+    (length,) = struct.unpack_from(">I", run, 40)
+    begin = 44 + length
+    (size,) = struct.unpack_from(">I", run, begin)
+    tokens = msgspec.msgpack.decode(run[begin + 4 : begin + 4 + size])
+    for _ in range(data.draw(st.integers(1, 4))):
+        new = data.draw(st.one_of(st.none(), st.booleans(), INT64, FLOATS, TEXTS, st.binary(max_size=9)))
+        tokens[data.draw(st.integers(0, len(tokens) - 1))] = new
+    block = msgspec.msgpack.encode(tokens)
+    read(run[:begin] + struct.pack(">I", len(block)) + block + run[begin + 4 + size :])
+
+
+INT64 = st.integers(-(1 << 63), (1 << 64) - 1)
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=400))
+def test_given_any_bytes_then_nothing_but_a_recording_error_comes_of_them(data: bytes) -> None:
+    read(data)
+    framed = struct.pack(">I", len(data)) + data
+    for root in ("run", "event"):
+        try:
+            journal_state.schema().decode(root, framed)
+        except RecordingError:
+            pass
