@@ -7,6 +7,7 @@ import os
 import platform
 from collections.abc import Mapping
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,6 +20,8 @@ TOLD: Final = {
     "source": "source of modelserver",
     "python": "Python",
     "numpy": "numpy",
+    "scipy": "scipy",
+    "pyproj": "pyproj",
     "libc": "C library",
     "machine": "kind of machine",
     "processor": "processor",
@@ -35,6 +38,9 @@ def facts() -> Mapping[str, str]:
         "source": _source(),
         "python": f"{platform.python_implementation()} {platform.python_version()}",
         "numpy": np.__version__,
+        # asked without loading them
+        "scipy": version("scipy"),
+        "pyproj": version("pyproj"),
         "libc": " ".join(platform.libc_ver()),
         "machine": platform.machine(),
         "processor": _processor(),
