@@ -159,6 +159,7 @@ __all__ = [
     "Matrix3",
     "Mode",
     "MotionAnswer",
+    "MotionCovariance",
     "MotionReply",
     "NameListReply",
     "NavigationState",

@@ -88,8 +88,8 @@ def command(
     means. --report draws the same run: track, innovations, biases, gaps, validity, and what looks wrong.
     A log that breaks off in its last event is used up to there; for other damage the exit code is 1.
     With --verify a service's journal is run again, and the first message that is not reproduced is named. Exit code 0:
-    all is reproduced bit for bit, and authentic by --key; 3: reproduced, but nothing proves that it is authentic; 4: the
-    same to within 1e-9 m and rad, as with another numpy; 1: it differs, or is damaged, incomplete or forged.
+    all is reproduced bit for bit, and authentic by --key; 3: reproduced, but nothing proves that it is authentic; 4:
+    the same to within 1e-9 m and rad, as with another numpy; 1: it differs, or is damaged, incomplete or forged.
     Files named by --poses, --decisions and --report that exist are replaced, without --force.
 
     \b
@@ -104,7 +104,9 @@ def command(
         if any(
             (config, poses, decisions, report, frame, rate, at_times, channel, everything, url, restamp, speed != "1")
         ):
-            raise typer.BadParameter("--verify takes --json and --key beside it: all else that it needs is in the journal")
+            raise typer.BadParameter(
+                "--verify takes --json and --key beside it: all else that it needs is in the journal"
+            )
         from mstools.replay_verify import verified
 
         verified(log, as_json, key)

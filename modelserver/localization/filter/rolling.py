@@ -19,7 +19,7 @@ from modelserver.localization.filter.measurements import constraints
 from modelserver.localization.filter.measurements.wheels import WheelSpeed, standing_wheels, turn_rate
 from modelserver.localization.filter.nav import ZERO, Nav
 from modelserver.localization.filter.setup import Setup
-from modelserver.localization.filter.state import FilterState
+from modelserver.localization.filter.state import FilterState, Last
 from modelserver.messages import Mode, Verdict, WheelsSample
 
 OTHER_SILENT = 2.0
@@ -42,10 +42,10 @@ def sample(setup: Setup, state: FilterState, item: Item) -> Fused:
         return state, (refused(item, "source"),)
     key = (item.source, item.kind)
     seen = (item.source, "seen")
-    last, newest = state.last.get(key), state.last.get(seen)
-    before = None if last is None else last.sample
+    last = state.last.get(key)
+    before, newest = _wheels_of(last), _wheels_of(state.last.get(seen))
     settings = setup.settings
-    stands = standing_wheels(sample, None if newest is None else newest.sample, measurement.contacts, settings)
+    stands = standing_wheels(sample, newest, measurement.contacts, settings)
     state = remembered(state._replace(stillness=state.stillness.rolled(item.utime, stands)), seen, item)
     if state.nav is None:
         if not motion.inertial(setup, state.mode):
@@ -100,3 +100,7 @@ def sample(setup: Setup, state: FilterState, item: Item) -> Fused:
 def _speed_unknown(nav: Nav) -> bool:
     P = nav.covariance
     return float(P[3, 3] + P[4, 4]) > UNKNOWN_SPEED**2
+
+
+def _wheels_of(last: Last | None) -> WheelsSample | None:
+    return last.sample if last is not None and isinstance(last.sample, WheelsSample) else None

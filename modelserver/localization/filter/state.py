@@ -13,7 +13,7 @@ from modelserver.localization.filter.nav import Nav
 from modelserver.localization.filter.stillness import Stillness
 from modelserver.localization.filter.strapdown import Earth
 from modelserver.localization.origin import Capture
-from modelserver.messages import Mode, Origin, Phase, Recalled, Sample
+from modelserver.messages import Mode, Origin, Phase, Recalled, Sample, SwitchMode
 from modelserver.spatial.so3 import Vector3
 
 LINE = 3e-4
@@ -27,7 +27,7 @@ class Last(NamedTuple):
     """The last measurement of a kind from a source that was compared: its instant, and its sample."""
 
     utime: int
-    sample: Sample
+    sample: Sample | SwitchMode
 
 
 class Said(NamedTuple):

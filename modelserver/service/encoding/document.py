@@ -1,6 +1,6 @@
 """A stored value as one piece of bytes that says by itself which types it is made of.
 
-    magic (8) | fingerprint of the schema (32) | length of the description (4) | description, deflated | tokens
+magic (8) | fingerprint of the schema (32) | length of the description (4) | description, deflated | tokens
 """
 
 from __future__ import annotations

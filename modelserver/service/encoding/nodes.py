@@ -218,7 +218,7 @@ class Record:
         append = out.tokens.append
         name = ""
         try:
-            for (name, types, encode), part in zip(self._plan, self.parts(value), strict=True):
+            for (name, types, encode), part in zip(self._plan, self.parts(value), strict=True):  # noqa: B007 - for the error
                 if type(part) in types:
                     append(part)
                 else:
@@ -249,7 +249,7 @@ class Record:
         values = []
         take = source.take
         try:
-            for name, node in zip(self.names, self.nodes, strict=True):
+            for name, node in zip(self.names, self.nodes, strict=True):  # noqa: B007 - for the error
                 values.append(node.decode(take(), source))
         except (ValueError, TypeError) as error:
             raise RecordingError(f"{self.text}.{name}: {error}") from error

@@ -269,7 +269,7 @@ class Schema:
             fields = sorted(slots)
             record.parts, record.build = _getter(fields), _Rebuild(cls, fields)
         else:
-            hints = _hints(cls.__init__)
+            hints = _hints(inspect.getattr_static(cls, "__init__"))
             fields = list(inspect.signature(cls).parameters)
             for each in fields:
                 found = inspect.getattr_static(cls, each, None)
@@ -315,7 +315,7 @@ class _Rebuild:
         self._cls, self._fields, self._defaults = cls, tuple(fields), tuple(defaults)
 
     def __call__(self, values: Sequence[Any]) -> Any:
-        made = object.__new__(self._cls)
+        made: object = object.__new__(self._cls)
         put = object.__setattr__
         for name, value in zip(self._fields, values, strict=True):
             put(made, name, value)

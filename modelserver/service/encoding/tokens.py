@@ -157,7 +157,7 @@ def _tokens(data: memoryview) -> Iterator[Any]:
 
 
 def _holds_array(block: memoryview) -> bool:
-    """Return whether a MessagePack array begins here that is no longer than its bytes: an element takes one at least."""
+    """Return whether a MessagePack array begins here that is no longer than its bytes: each element takes one."""
     head = block[0]
     if 0x90 <= head <= 0x9F:
         return (head & 0x0F) < len(block)

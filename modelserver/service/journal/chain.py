@@ -164,7 +164,9 @@ class Chain:
             found.append(Finding(f"is older than {before.path.name} before it: the order was changed"))
         elif number > before.number + 1:
             missing = number - before.number - 1
-            found.append(Finding(f"{missing} segments before it are missing, behind {before.path.name}: removed, or lost"))
+            found.append(
+                Finding(f"{missing} segments before it are missing, behind {before.path.name}: removed, or lost")
+            )
         elif previous and not before.seal:
             found.append(Finding(f"goes on from {before.path.name}, whose end was cut off after it was written"))
         elif previous != before.seal:

@@ -158,4 +158,3 @@ class Rerun(Loop):
 
     def failed(self, channel: str, error: Exception, data: bytes = b"") -> None:
         """Do nothing: that it failed then too stands in the journal as the next record."""
-

@@ -81,7 +81,8 @@ class Verified:
     seconds: how long of it was run again, of the span from first_utime to last_utime.
     other: what is other with build or machine than it was then, in words. close: messages that are the same to within
     the tolerance, by channel; largest: their largest difference, with the channel. genuine: segments whose keyed seal
-    is right. unsealed: segments whose seal proves nothing. complete: whether it is known that none is missing at the end.
+    is right. unsealed: segments whose seal proves nothing. complete: whether it is known that none is missing at the
+    end.
     """
 
     segments: int = 0
@@ -99,7 +100,7 @@ class Verified:
     other: list[str] = field(default_factory=list)
     difference: Difference | None = None
     close: Counter[str] = field(default_factory=Counter)
-    largest: Deviation = Deviation()
+    largest: Deviation = field(default_factory=Deviation)
     largest_at: tuple[str, str] = ("", "")
     """Channels of the largest difference of a position, and of an orientation."""
     genuine: int = 0
@@ -113,7 +114,7 @@ class Verified:
 
     @property
     def proved(self) -> bool:
-        """Whether something was verified, all of it holds bit for bit or nearly, and no bytes are damaged or missing."""
+        """Whether something was verified, all of it holds, bit for bit or nearly, and nothing is damaged or missing."""
         said = bool(self.said) or bool(self.close)
         return said and self.difference is None and not any(each.damage for each in self.remarks)
 

@@ -8,7 +8,7 @@ import math
 from typing import Any, Final
 
 from modelserver.errors import shown
-from modelserver.messages import Kept, KeptPose, Recalled
+from modelserver.messages import Kept, KeptPose
 
 VERSION: Final = 1
 
@@ -26,29 +26,6 @@ _LARGEST: Final = 1e9
 
 class KeptError(ValueError):
     """What was read is no kept state of this version; the message says why."""
-
-
-def to_bytes(recalled: Recalled) -> bytes:
-    """Return what a start recalls as bytes, e.g. for a journal. `from_bytes` gives it back to the bit."""
-    kept = recalled.kept
-    content = {
-        "age": recalled.age,
-        "why": recalled.why,
-        "pose_age": recalled.pose_age,
-        "most_age": recalled.most_age,
-        "kept": None if kept is None else _content(kept),
-    }
-    return _sealed(content)
-
-
-def from_bytes(data: bytes) -> Recalled:
-    """Return what `to_bytes` wrote. Raises KeptError."""
-    content = _opened(data)
-    kept = _field(content, "kept")
-    numbers = (_number(content, key) for key in ("age", "pose_age", "most_age"))
-    age, pose_age, most_age = numbers
-    why = _text(content, "why", MAX_BYTES)
-    return Recalled(None if kept is None else _kept(kept), age, why, pose_age, most_age)
 
 
 def kept_to_bytes(kept: Kept) -> bytes:

@@ -19,10 +19,8 @@ from modelserver.service.keeping import state as restart
 from modelserver.service.keeping.form import (
     MAX_BYTES,
     KeptError,
-    from_bytes,
     kept_from_bytes,
     kept_to_bytes,
-    to_bytes,
 )
 from modelserver.service.keeping.form import _sealed as sealed
 from modelserver.service.keeping.origin import write_whole
@@ -61,8 +59,7 @@ def test_given_any_finite_numbers_then_bytes_give_them_back_to_the_bit(gyro, pla
     pose = POSE._replace(position=place, wheels=tuple(wheels))
     kept = KEPT._replace(vehicle=vehicle, gyro_bias=gyro, pose=pose)
     assert kept_from_bytes(kept_to_bytes(kept)) == kept
-    for found in (Recalled(kept, 3.5), Recalled(None, 0.0, "why not"), Recalled(kept._replace(pose=None), 1e9)):
-        assert from_bytes(to_bytes(found)) == found
+    assert kept_from_bytes(kept_to_bytes(kept._replace(pose=None))).pose is None
 
 
 def test_given_nothing_kept_then_the_start_is_cold_and_says_so(keeper: StateKeeper) -> None:
@@ -86,9 +83,8 @@ def test_given_any_byte_changed_then_it_is_refused(at: int, change: int) -> None
 
 @given(st.binary(max_size=300))
 def test_given_any_bytes_then_nothing_but_a_refusal_comes_of_them(data: bytes) -> None:
-    for read in (kept_from_bytes, from_bytes):
-        with pytest.raises(KeptError):
-            read(data)
+    with pytest.raises(KeptError):
+        kept_from_bytes(data)
 
 
 def _content(**change: Any) -> bytes:
