@@ -10,6 +10,9 @@ import pytest
 from support_journal import SMALL, Kept
 from support_samples import gps
 
+from modelserver.keys import new_key, write_key
+from modelserver.service.journal.chain import NEWEST_NAME, Newest
+from modelserver.service.journal.verify import Result
 from modelserver.wire.codec import encode
 from modelserver.wire.journal import Record, batch_written, read
 from mstools import cli
@@ -42,7 +45,8 @@ def journal(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 @pytest.fixture
 def folder(tmp_path: Path, journal: bytes) -> Path:
-    (tmp_path / "journal-00000004.lcm").write_bytes(journal)
+    (tmp_path / "journal-00000000.lcm").write_bytes(journal)
+    (tmp_path / NEWEST_NAME).write_bytes(Newest(0, 0).encode(None))
     return tmp_path
 
 
@@ -55,10 +59,13 @@ def changed(path: Path) -> None:
     path.write_bytes(data[: records[0].at] + batch_written(0, records))
 
 
-def test_given_a_journal_when_verified_then_the_counts_are_printed_and_the_code_is_0(run: Run, folder: Path) -> None:
-    for target in (folder, folder / "journal-00000004.lcm"):
+def test_given_a_journal_when_verified_then_the_counts_are_printed_and_the_code_is_that_of_reproduced(
+    run: Run, folder: Path
+) -> None:
+    for target in (folder, folder / "journal-00000000.lcm"):
         code, out, err = run("--verify", target)
-        assert (code, err) == (0, "")
+        assert (code, err) == (Result.REPRODUCED, "")
+        assert "not proved authentic (--key FILE checks the seals" in out
         assert "1 segment of 1 run" in out
         assert "reproduced bit for bit" in out
         assert "  POSE_ODOM " in out
@@ -67,8 +74,8 @@ def test_given_a_journal_when_verified_then_the_counts_are_printed_and_the_code_
 def test_given_json_then_it_holds_all_of_it(run: Run, folder: Path) -> None:
     code, out, _ = run("--verify", folder, "--json")
     told = json.loads(out)
-    assert code == 0
-    assert told["proved"]
+    assert code == Result.REPRODUCED
+    assert (told["result"], told["proved"], told["authentic"]) == ("reproduced", True, False)
     assert told["poses"] == 3 * told["said"]["POSE"] > 200
     assert told["difference"] is None
 
@@ -76,7 +83,7 @@ def test_given_json_then_it_holds_all_of_it(run: Run, folder: Path) -> None:
 def test_given_a_pose_that_was_changed_then_it_is_named_field_by_field_and_the_code_is_1(
     run: Run, folder: Path
 ) -> None:
-    path = folder / "journal-00000004.lcm"
+    path = folder / "journal-00000000.lcm"
     changed(path)
     code, out, _ = run("--verify", folder)
     assert code == 1
@@ -88,16 +95,16 @@ def test_given_a_pose_that_was_changed_then_it_is_named_field_by_field_and_the_c
     assert len(told["difference"]["fields"]) == 1
 
 
-def test_given_a_torn_tail_then_it_is_told_and_the_code_is_0(run: Run, folder: Path) -> None:
-    path = folder / "journal-00000004.lcm"
+def test_given_a_torn_tail_then_it_is_told_and_the_code_is_that_of_reproduced(run: Run, folder: Path) -> None:
+    path = folder / "journal-00000000.lcm"
     path.write_bytes(path.read_bytes()[:-300])
     code, _, err = run("--verify", folder)
-    assert code == 0
+    assert code == Result.REPRODUCED
     assert "breaks off" in err
 
 
 def test_given_damage_then_its_place_is_told_and_the_code_is_1(run: Run, folder: Path) -> None:
-    path = folder / "journal-00000004.lcm"
+    path = folder / "journal-00000000.lcm"
     data = bytearray(path.read_bytes())
     data[-5000] ^= 1
     path.write_bytes(data)
@@ -106,11 +113,20 @@ def test_given_damage_then_its_place_is_told_and_the_code_is_1(run: Run, folder:
     assert "checksum" in err
 
 
+def test_given_a_key_and_a_journal_that_is_not_sealed_with_one_then_that_is_reported(run: Run, folder: Path) -> None:
+    write_key(folder / "k.key", new_key("rover"))
+    code, out, _ = run("--verify", folder, "--key", folder / "k.key")
+    assert code == Result.REPRODUCED
+    assert "not proved authentic: 1 segment of 1 not closed, or not sealed with a key" in out
+    code, _, err = run(folder / "journal-00000000.lcm", "--key", folder / "k.key")
+    assert (code, "--key goes with --verify" in err) == (2, True)
+
+
 @pytest.mark.parametrize("more", [["--speed", "2"], ["--poses", "x.csv"], ["--url", "x"], ["--all"]])
 def test_given_options_of_another_use_then_the_usage_is_wrong(run: Run, folder: Path, more: list[str]) -> None:
     code, _, err = run("--verify", folder, *more)
     assert code == 2
-    assert "stands alone" in err
+    assert "--verify takes --json and --key beside it" in err
 
 
 def test_given_what_is_no_journal_then_that_is_said(run: Run, tmp_path: Path) -> None:
@@ -135,4 +151,4 @@ def test_given_two_messages_then_the_fields_that_differ_are_named() -> None:
     assert differing(one, b"12345678") == [
         ("type or content", f"{len(one)} bytes {one[:12].hex()}", "8 bytes 3132333435363738")
     ]
-    assert differing(one, one[:20])[0][0] == "content"
+    assert differing(one, one[:20])[0][0] == "type or content"
