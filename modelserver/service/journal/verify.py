@@ -115,8 +115,8 @@ class Verified:
     @property
     def proved(self) -> bool:
         """Whether something was verified, all of it holds, bit for bit or nearly, and nothing is damaged or missing."""
-        said = bool(self.said) or bool(self.close)
-        return said and self.difference is None and not any(each.damage for each in self.remarks)
+        something = bool(self.said) or bool(self.close)
+        return something and self.difference is None and not any(each.damage for each in self.remarks)
 
     @property
     def authentic(self) -> bool:
