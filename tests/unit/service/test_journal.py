@@ -82,13 +82,13 @@ def test_given_no_journal_then_nothing_is_asked_for_and_nothing_told(tmp_path: P
 
 @pytest.mark.slow
 def test_given_more_than_may_be_kept_then_the_oldest_segments_go(tmp_path: Path) -> None:
-    kept = Kept(tmp_path, SMALL, segment_bytes=120_000, most_bytes=500_000)
+    kept = Kept(tmp_path, SMALL, segment_bytes=160_000, most_bytes=660_000)
     most = 0
     for _ in range(10):
         kept.drive(1.0)
         most = max(most, sum(path.stat().st_size for path in kept.segments))
     files = kept.finish()
-    assert most < 500_000
+    assert most < 660_000
     assert 2 <= len(files) < 5
     parts = [each["part"] for each in heads(files)]
     assert parts == list(range(int(str(parts[0])), int(str(parts[0])) + len(parts)))
