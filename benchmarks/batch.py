@@ -16,7 +16,7 @@ import lcm
 import numpy as np
 
 from benchmarks.support import free_url, interleaved, process, verdict
-from modelserver.answers import answer
+from modelserver.answers import DeferredAnswer
 from modelserver.client.remote import Platform
 from modelserver.errors import NoServerError
 from modelserver.geometry import names
@@ -35,6 +35,7 @@ from modelserver.messages import (
     SensorHeader,
 )
 from modelserver.platform import PlatformView
+from modelserver.platform.steps import complete
 from modelserver.spatial.pose import Pose
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.provider import resolve_url
@@ -82,8 +83,7 @@ def serve() -> None:
 
     def asked(channel: str, data: bytes) -> None:
         request = decode("get_transformations_request_t", data)
-        reply = answer(view, request, time.time_ns() // 1000)
-        for part in reply if isinstance(reply, list) else [reply]:
+        for part in complete(DeferredAnswer(view, request, time.time_ns() // 1000).work()):
             bus.publish(request.header.reply_channel, encode(part))
 
     bus.subscribe(CHANNEL_OF[GetTransformations], asked).set_queue_capacity(0)

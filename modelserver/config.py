@@ -311,10 +311,11 @@ class LimitsConfig:
 
     history_s: seconds of poses held, at most 600, for questions about the past.
     parked_requests: requests that may wait for data at once. wait_ms: the longest wait granted, milliseconds.
-    queued_requests: requests held between two passes of the loop; more are refused and counted.
-    requests_per_pass: requests answered before sensors are looked at again.
-    client_hz: requests a second that each client is sure of; more are answered while there is time.
-    request_share: how much of the time may go into requests before only those are answered that clients are sure of.
+    queued_requests: requests that may wait; more are dropped and counted.
+    requests_per_pass: requests answered before the loop looks at sensors again.
+    client_hz: requests per second that are guaranteed to each client; more are answered while there is time.
+    request_share: share of the time for requests beyond the clients' rates, while something else needs the time.
+    client_reply_bytes: bytes per second of long replies (many transformations, history) to each client.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _STRICT
@@ -325,6 +326,7 @@ class LimitsConfig:
     requests_per_pass: int = 16
     client_hz: float = 500.0
     request_share: float = 0.25
+    client_reply_bytes: float = 5_000_000.0
 
     def __post_init__(self) -> None:
         problems = []
@@ -332,6 +334,8 @@ class LimitsConfig:
             problems.append(f"client_hz is between 1 and 100000, got {self.client_hz:g}")
         if not 0.0 <= self.request_share <= 1.0:
             problems.append(f"request_share is between 0 and 1, got {self.request_share:g}")
+        if not 1e4 <= self.client_reply_bytes <= 1e9:
+            problems.append(f"client_reply_bytes is between 10000 and 1e9, got {self.client_reply_bytes:g}")
         if not 0.0 < self.history_s <= 600.0:
             problems.append(f"history_s is above 0 and at most 600, got {self.history_s:g}")
         for name, low, high in (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from modelserver.answers import answer, failure
+from modelserver.answers import DeferredAnswer, answers, failure, is_deferred
 from modelserver.core.state import CoreState, Instant, Outputs, Parked, Step, TimedRequest, counted
 from modelserver.errors import Status
 from modelserver.geometry import names
@@ -27,7 +27,7 @@ _TIMED: Final = (GetTransformation, GetStateVector, GetHTransform, GetMotion, Ge
 
 
 def requested(state: CoreState, request: Request, now: Instant) -> Step:
-    """Answer a question, or park it until the data come that it is ready to wait for."""
+    """Answer a question, have it answered in steps, or park it until the data come that it is ready to wait for."""
     if not request.header.is_answerable(state.settings.reply_prefix):
         return counted(state, CHANNEL_OF[type(request)], "reply_channel"), ()
     if isinstance(request, _TIMED) and request.time.wait_ms and _must_wait(state, request):
@@ -40,6 +40,8 @@ def requested(state: CoreState, request: Request, now: Instant) -> Step:
         return state, turned_down(state, type(request), request.header, Status.REFUSED_LOAD, why, now)
     # what `_replace` does, at a third of its cost: this is done for every request
     after = CoreState._make((*state[:-1], state.requests_answered + 1))
+    if is_deferred(request):
+        return after, (DeferredAnswer(state.view, request, now.utime),)
     return after, _replies(state, request, now)
 
 
@@ -68,11 +70,8 @@ def answer_parked(state: CoreState, now: Instant) -> tuple[CoreState, list[Outpu
 
 
 def _replies(state: CoreState, request: Request, now: Instant) -> tuple[SendReply, ...]:
-    reply = answer(state.view, request, now.utime)
     channel = request.header.reply_channel
-    if isinstance(reply, list):
-        return tuple([SendReply(channel, part) for part in reply])
-    return (SendReply(channel, reply),)
+    return tuple([SendReply(channel, reply) for reply in answers(state.view, request, now.utime)])
 
 
 def refuse(state: CoreState, request: Request, now: Instant) -> Outputs:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, Literal, NamedTuple, TypeAlias
 
+from modelserver.answers import DeferredAnswer
 from modelserver.core.host_clock import HostClock
 from modelserver.errors import NotConnectedError
 from modelserver.geometry.model import Model
@@ -205,7 +206,7 @@ class CoreState(NamedTuple):
         return self.view.history
 
 
-Outputs: TypeAlias = tuple[Output, ...]
+Outputs: TypeAlias = tuple[Output | DeferredAnswer, ...]
 Step: TypeAlias = tuple[CoreState, Outputs]
 
 

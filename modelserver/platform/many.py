@@ -12,14 +12,16 @@ from modelserver.geometry import names
 from modelserver.geometry.route import EdgeKind, Route
 from modelserver.messages import MOST_INSTANTS, Invalid, ManyPoses, Origin, Policy, Quality, TimeQuery
 from modelserver.platform.path import Step, Way, way
-from modelserver.platform.rows import Rows, Times
+from modelserver.platform.rows import STEP_ROWS, Rows, Times
 from modelserver.platform.rows_joint import joint_moved
 from modelserver.platform.rows_vehicle import differ, drifts, vehicle
+from modelserver.platform.steps import Steps, complete
 from modelserver.platform.view import PlatformView
 from modelserver.platform.worlds import WORLD_FRAMES, check_not_reserved
 from modelserver.spatial import chain, chains
 from modelserver.spatial.arrays import Poses
 from modelserver.spatial.chains import Links
+from modelserver.spatial.so3 import Array
 
 
 def many(
@@ -32,6 +34,20 @@ def many(
     with_covariance: bool = True,
     now: int = 0,
 ) -> ManyPoses:
+    """Return what `many_in_steps` does, at once."""
+    return complete(many_in_steps(view, interest, reference, utimes, reference_at, fixed, with_covariance, now))
+
+
+def many_in_steps(
+    view: PlatformView,
+    interest: str,
+    reference: str,
+    utimes: Times,
+    reference_at: int = 0,
+    fixed: str = "",
+    with_covariance: bool = True,
+    now: int = 0,
+) -> Steps[ManyPoses]:
     """Return the poses of `interest` in `reference` at each of `utimes`, interpolated.
 
     With `fixed`, those at `utimes` in the reference at `reference_at` (0: the latest), through a frame that is taken to
@@ -49,18 +65,22 @@ def many(
     rows = Rows(utimes, none, none, none, none, with_covariance)
     if fixed:
         there = way(view, fixed, reference, TimeQuery(reference_at, Policy.INTERPOLATED), now)
-        links, rows = _links(view, interest, fixed, rows)
+        links, rows = yield from _links(view, interest, fixed, rows)
+        if view.localizer is not None and len(view.history):
+            yield from view.history.resolve(rows.within(view.history.first, view.history.last).utimes)
         links, rows = _met(view, there, links, rows, fixed)
     else:
-        links, rows = _links(view, interest, reference, rows)
+        links, rows = yield from _links(view, interest, reference, rows)
         if any(link.source[0] is EdgeKind.VEHICLE for link in links):
             # a mount without stated sigmas counts as exact here: the vehicle's own error is far larger
             links = [link._replace(factor=_EXACT) if _is_unstated(link) else link for link in links]
         links = _folded(links)
+    yield
     if fixed or any(link.source[0] in (EdgeKind.VEHICLE, EdgeKind.JOINT) for link in links):
         doubt = view.doubt & Invalid.CLOCK_STEPPED if fixed else view.doubt
         rows = rows.told(int(doubt), 0)
     places = chains.places(links)
+    yield
     poses = places[-1].canonical()
     origin = None
     if {interest, reference, fixed} & {names.WORLD_UTM, names.WORLD_ENU} and len(view.history):
@@ -69,7 +89,8 @@ def many(
     # each is one row where it is the same in all
     whole = np.hstack((np.broadcast_to(poses.p, (count, 3)), np.broadcast_to(poses.q, (count, 4))))
     vectors = np.where(good, whole, math.nan)
-    covariances = chains.covariances(links, count, places) if with_covariance else None
+    yield
+    covariances = (yield from _covariances(links, count, places)) if with_covariance else None
     if covariances is not None:
         covariances = np.where(good, covariances.reshape(count, 36), math.nan)
     return ManyPoses(
@@ -87,7 +108,37 @@ def many(
     )
 
 
-def _links(view: PlatformView, interest: str, reference: str, rows: Rows) -> tuple[list[Links], Rows]:
+def _covariances(links: list[Links], count: int, places: list[Poses]) -> Steps[Array | None]:
+    """Return `chains.covariances`, some rows in each step."""
+    vary = any(len(place.p) > 1 or len(place.q) > 1 for place in places) or any(
+        link.factor is not None and link.factor.ndim == 3 for link in links
+    )
+    if count <= STEP_ROWS or not vary:
+        return chains.covariances(links, count, places)
+    parts = []
+    for start in range(0, count, STEP_ROWS):
+        some = slice(start, min(start + STEP_ROWS, count))
+        of_links = [
+            link._replace(X_FT=_rows_of(link.X_FT, some), factor=_factor_of(link.factor, some)) for link in links
+        ]
+        part = chains.covariances(of_links, some.stop - start, [_rows_of(place, some) for place in places])
+        if part is None:
+            return None
+        parts.append(part)
+        yield
+    return np.concatenate(parts)
+
+
+def _rows_of(poses: Poses, some: slice) -> Poses:
+    """Return some rows of poses; of what is the same in all rows, that."""
+    return Poses(poses.p[some] if len(poses.p) > 1 else poses.p, poses.q[some] if len(poses.q) > 1 else poses.q)
+
+
+def _factor_of(factor: Array | None, some: slice) -> Array | None:
+    return factor[some] if factor is not None and factor.ndim == 3 and len(factor) > 1 else factor
+
+
+def _links(view: PlatformView, interest: str, reference: str, rows: Rows) -> Steps[tuple[list[Links], Rows]]:
     """Return the links from one frame to another at every row's time."""
     of_world = [frame for frame in (interest, reference) if frame in WORLD_FRAMES]
     if interest == reference and of_world:
@@ -95,29 +146,29 @@ def _links(view: PlatformView, interest: str, reference: str, rows: Rows) -> tup
     if not of_world:
         for frame in (interest, reference):
             check_not_reserved(frame)
-        return _route(view, view.model.route(interest, reference), rows)
+        return (yield from _route(view, view.model.route(interest, reference), rows))
     forth: list[Links] = []
     if reference in WORLD_FRAMES:
-        link, rows = vehicle(view, reference, rows)
+        link, rows = yield from vehicle(view, reference, rows)
         forth = [link]
     if interest in WORLD_FRAMES:
-        back, rows = vehicle(view, interest, rows)
+        back, rows = yield from vehicle(view, interest, rows)
         if forth:
             # how the errors of the vehicle's two poses hang together nobody knows
             forth, back = [forth[0]._replace(factor=None)], back._replace(factor=None)
         else:
             check_not_reserved(reference)
             view.check_carried(reference)
-            mounted, rows = _route(view, view.route_from_vehicle(reference), rows)
+            mounted, rows = yield from _route(view, view.route_from_vehicle(reference), rows)
             forth = [link._replace(forward=not link.forward) for link in reversed(mounted)]
         return [*forth, back._replace(forward=False)], rows
     check_not_reserved(interest)
     view.check_carried(interest)
-    mounted, rows = _route(view, view.route_from_vehicle(interest), rows)
+    mounted, rows = yield from _route(view, view.route_from_vehicle(interest), rows)
     return [*forth, *mounted], rows
 
 
-def _route(view: PlatformView, route: Route, rows: Rows) -> tuple[list[Links], Rows]:
+def _route(view: PlatformView, route: Route, rows: Rows) -> Steps[tuple[list[Links], Rows]]:
     if route.closes_loop:
         rows = rows.told(0, int(Quality.LOOP))
     rest = route.rest
@@ -131,6 +182,7 @@ def _route(view: PlatformView, route: Route, rows: Rows) -> tuple[list[Links], R
         else:
             moving, rows = joint_moved(view, next(legs), rows)
             links.append(moving)
+            yield
     return links, rows
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,9 @@ from modelserver.messages import Estimate
 
 Times = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.int32]
+
+STEP_ROWS: Final = 250
+"""Rows of covariances that are worked out in one step."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,8 @@ from modelserver.errors import NoPoseError, Status
 from modelserver.geometry import names
 from modelserver.geometry.route import EdgeKind
 from modelserver.messages import Estimate, Origin, Quality
-from modelserver.platform.rows import Rows
+from modelserver.platform.rows import STEP_ROWS, Rows
+from modelserver.platform.steps import Steps
 from modelserver.platform.view import ODOM_INVALID, PlatformView
 from modelserver.platform.worlds import known_in
 from modelserver.spatial import arrays
@@ -30,13 +31,15 @@ _NOWHERE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 _NOTHING = (0.0,) * 36
 
 
-def vehicle(view: PlatformView, world: str, rows: Rows) -> tuple[Links, Rows]:
-    """Return the vehicle's poses in a world at every row's time. Raises NoPoseError where there is none at all."""
+def vehicle(view: PlatformView, world: str, rows: Rows) -> Steps[tuple[Links, Rows]]:
+    """Return, in steps, the vehicle's poses in a world at every row's time. Raises NoPoseError where there is none."""
     history = view.history
     if view.localizer is None or not len(history):
         raise view.no_pose()
     rows = rows.within(history.first, history.last)
+    yield from history.resolve(rows.utimes)
     held, before = history.around(rows.utimes)
+    yield
     found = [known_in(world, each) for each in held]
     known = np.array([pose is not None for pose in found])
     if not known.any():
@@ -44,6 +47,7 @@ def vehicle(view: PlatformView, world: str, rows: Rows) -> tuple[Links, Rows]:
     told = itertools.chain.from_iterable([_NOWHERE if pose is None else pose.xyz + pose.wxyz for pose in found])
     vectors = np.fromiter(told, float, 7 * len(found)).reshape(-1, 7)
     p, q = vectors[:, :3], vectors[:, 3:]
+    yield
     times = np.array([each.utime for each in held])
     epochs = np.array([each.pose_epoch for each in held], dtype=np.int32)
     after = np.minimum(before + 1, len(held) - 1)
@@ -54,6 +58,7 @@ def vehicle(view: PlatformView, world: str, rows: Rows) -> tuple[Links, Rows]:
     part = np.where(jump, 0.0, part)
     end = np.where(exact | jump, before, after)
     poses = Poses(p[before] + (p[after] - p[before]) * part[:, None], arrays.slerped(q[before], q[after], part))
+    yield
     keep = int(ODOM_INVALID) if world == names.ODOM else -1
     invalid = np.array([int(each.invalid) for each in held], dtype=np.int32) & keep
     quality = np.array([int(each.quality) for each in held], dtype=np.int32)
@@ -61,11 +66,12 @@ def vehicle(view: PlatformView, world: str, rows: Rows) -> tuple[Links, Rows]:
     status = np.where((known[before] & known[end]) | (rows.status != 0), rows.status, int(Status.NO_POSE))
     rows = replace(rows, status=status.astype(np.int32), epochs=epochs[end], around=(held, before))
     rows = rows.told(invalid[before] | invalid[end], quality[before] | quality[end] | between)
-    factor = _vehicle_factor(world, held, end) if rows.with_covariance else None
+    yield
+    factor = (yield from _vehicle_factor(world, held, end)) if rows.with_covariance else None
     return Links(poses, True, factor, (EdgeKind.VEHICLE, world), bends=True), rows
 
 
-def _vehicle_factor(world: str, held: list[Estimate], which: npt.NDArray[np.intp]) -> Array | None:
+def _vehicle_factor(world: str, held: list[Estimate], which: npt.NDArray[np.intp]) -> Steps[Array | None]:
     """Return factors (n, 6, 6) of the covariances of those estimates of `held` that `which` (n,) names."""
     used, row = np.unique(which, return_inverse=True)
     of_use = [held[index] for index in used.tolist()]
@@ -73,8 +79,13 @@ def _vehicle_factor(world: str, held: list[Estimate], which: npt.NDArray[np.intp
     unsure = np.array([each is None for each in numbers])
     if unsure.all():
         return None
-    some = itertools.chain.from_iterable(_NOTHING if each is None else each for each in numbers)
-    factors = _factors(np.fromiter(some, float, 36 * len(numbers)).reshape(-1, 6, 6))
+    stacks = []
+    for start in range(0, len(numbers), STEP_ROWS):
+        part = [_NOTHING if each is None else each for each in numbers[start : start + STEP_ROWS]]
+        flat = np.fromiter(itertools.chain.from_iterable(part), float, 36 * len(part))
+        stacks.append(_factors(flat.reshape(-1, 6, 6)))
+        yield
+    factors = np.concatenate(stacks)
     factors[unsure] = math.nan
     return np.asarray(factors[row])
 
@@ -109,7 +120,8 @@ def drifts(view: PlatformView, since: Estimate, rows: Rows) -> Array | None:
     if since.odom_covariance is None or any(each.odom_covariance is None for each in held):
         return None
     first = np.array(since.odom_covariance)[::7]
-    then = np.array([each.odom_covariance for each in held])[:, ::7][after]
+    # the diagonals alone: all of the matrices would take most of the time
+    then = np.array([each.odom_covariance[::7] for each in held if each.odom_covariance is not None])[after]
     if since.odom_walks or held[-1].odom_walks:
         sigma = np.sqrt(np.abs(then - first))
     else:

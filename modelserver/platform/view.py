@@ -44,6 +44,7 @@ from modelserver.messages import (
     TimeQuery,
 )
 from modelserver.platform.placing import NOTHING, Placed, heard, placed
+from modelserver.platform.steps import Steps, complete
 from modelserver.platform.worlds import WORLD_FRAMES, check_not_reserved, is_absolute, known_in, pose_in
 from modelserver.spatial import covariance as cov
 from modelserver.spatial.pose import Pose
@@ -187,6 +188,12 @@ class PlatformView:
         return self.transformation(self.base_frame, names.WORLD_UTM, time, now)
 
     def vehicle_history(self, start_utime: int, end_utime: int, rate_hz: float) -> tuple[PoseAnswer, ...]:
+        """Return what `vehicle_history_in_steps` does, at once."""
+        return complete(self.vehicle_history_in_steps(start_utime, end_utime, rate_hz))
+
+    def vehicle_history_in_steps(
+        self, start_utime: int, end_utime: int, rate_hz: float
+    ) -> Steps[tuple[PoseAnswer, ...]]:
         """Return the base frame's poses in World:UTM at an even rate; times not held are left out.
 
         Raises MalformedRequestError for a range that ends before it starts or a rate that is not positive,
@@ -208,6 +215,7 @@ class PlatformView:
                 estimate = self.history.at(utime)
                 if estimate.utm is not None:
                     answers.append(self.broadcast(estimate, names.WORLD_UTM))
+                yield
         return tuple(answers)
 
     def estimate(self, time: TimeQuery, now: int = 0) -> Estimate:

@@ -53,7 +53,7 @@ from modelserver.messages import (
 from modelserver.reload import ModelLoaded
 from modelserver.service.bus import LcmBus
 from modelserver.service.clock import SystemClock
-from modelserver.service.gauges import read_gauges
+from modelserver.service.gauges import read_gauges, read_run_delay
 from modelserver.service.heard import Heard
 from modelserver.service.hooks import Hooks
 from modelserver.service.journal.place import make_writer
@@ -476,6 +476,7 @@ def _serve(vehicle: Vehicle, store: Store, notifier: Notifier, url: str, file: s
         requests_per_pass=config.limits.requests_per_pass,
         client_hz=config.limits.client_hz,
         request_share=config.limits.request_share,
+        client_reply_bytes=config.limits.client_reply_bytes,
         second_writer=config.sensors.second_writer,
         shared=frozenset({f"{config.lcm.channel_prefix}{config.sensors.joints.channel}"}),
     )
@@ -494,6 +495,7 @@ def _serve(vehicle: Vehicle, store: Store, notifier: Notifier, url: str, file: s
             channels=lambda state: vehicle.sensor_channels(state.model),
             on_keep=states.keep if states is not None else lambda kept: "",
             gauges=read_gauges,
+            run_delay=read_run_delay,
             on_tick=supervision.ticked,
             gate=gate,
             journal=NoJournal() if journal is None else journal[0],

@@ -10,6 +10,7 @@ from pathlib import Path
 from modelserver.messages import Gauges
 
 STATM = Path("/proc/self/statm")
+SCHEDSTAT = Path("/proc/thread-self/schedstat")
 
 
 def read_gauges(queued: int, statm: Path = STATM) -> Gauges:
@@ -23,3 +24,11 @@ def resident_bytes(statm: Path = STATM) -> int:
         return int(statm.read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):
         return 0
+
+
+def read_run_delay(schedstat: Path = SCHEDSTAT) -> int | None:
+    """Return for how long this thread was ready to run and had no processor, nanoseconds; None where not known."""
+    try:
+        return int(schedstat.read_bytes().split()[1])
+    except (OSError, ValueError, IndexError):
+        return None

@@ -25,9 +25,10 @@ class Hooks:
     on_load: reads the geometry anew. snapshot: returns its bytes for the bus. channels: which sensors are heard once
     another is in force: joints, where it has any. on_keep: keeps a state for the next run without waiting for the
     disk, and returns what is wrong with that, empty where nothing is. gauges: reads what the health report tells of
-    the process, given how many requests wait. on_tick: called after each tick that went through. gate: opens signed
-    commands; without one none are heard, and wishes for modes count without a signature, as in a recording. journal:
-    told of everything that is handled and said.
+    the process, given how many requests wait. run_delay: reads for how long the loop's thread was ready to run and
+    had no processor, nanoseconds in all; None where nobody knows. on_tick: called after each tick that went through.
+    gate: opens signed commands; without one none are heard, and wishes for modes count without a signature, as in a
+    recording. journal: told of everything that is handled and said.
     """
 
     on_origin: Callable[[OriginLatched], None] = lambda note: None
@@ -37,6 +38,7 @@ class Hooks:
     channels: Callable[[CoreState], Mapping[str, Heard]] = lambda state: {}
     on_keep: Callable[[Kept], str] = lambda kept: ""
     gauges: Callable[[int], Gauges | None] = lambda queued: None
+    run_delay: Callable[[], int | None] = lambda: None
     on_tick: Callable[[CoreState], None] = lambda state: None
     gate: Gate | None = None
     journal: Journal = field(default_factory=NoJournal)

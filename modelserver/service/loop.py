@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from modelserver import core
-from modelserver.core import CoreState, Instant
+from modelserver.answers import DeferredAnswer
+from modelserver.core import CoreState, Instant, Outputs
 from modelserver.errors import WireError
 from modelserver.geometry import names
 from modelserver.messages import (
@@ -19,7 +20,6 @@ from modelserver.messages import (
     LoadModel,
     Noticed,
     OriginLatched,
-    Output,
     PublishDecisions,
     PublishHealth,
     PublishNavigation,
@@ -38,8 +38,8 @@ from modelserver.service.clock import Clock
 from modelserver.service.heard import Heard, peek
 from modelserver.service.hooks import Hooks
 from modelserver.service.log import RateLimited, plain, plain_lines
-from modelserver.service.requests.desk import DeskLimits
-from modelserver.service.requests.reception import Reception
+from modelserver.service.requests.handler import RequestHandler
+from modelserver.service.requests.scheduler import RequestLimits
 from modelserver.service.snapshots import SnapshotWriter
 from modelserver.service.unused import Unused
 from modelserver.service.watch import SECOND, Watch
@@ -62,7 +62,7 @@ NO_NETWORK = frozenset({errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTUNREACH, e
 """What sending fails with while the network is away: no error of the service's own."""
 
 FLOOD_PAUSE_S = 0.002
-"""How long requests wait for the next pass while too many come, at most, seconds."""
+"""How long requests wait for the next pass, at most, seconds: in a flood, and where there is no time for them."""
 
 
 _NO_HOOKS = Hooks()
@@ -73,7 +73,8 @@ class LoopSettings:
     """How the loop runs.
 
     period_ns: between ticks. sensors: for each channel that is heard, what it carries.
-    channel_prefix, queued_requests, requests_per_pass, client_hz, request_share: see `modelserver.config`.
+    channel_prefix, queued_requests, requests_per_pass, client_hz, request_share, client_reply_bytes: see
+    `modelserver.config`.
     second_writer: see `modelserver.config`; empty: nobody looks. shared: channels that several may write on.
     """
 
@@ -84,6 +85,7 @@ class LoopSettings:
     requests_per_pass: int = 16
     client_hz: float = 500.0
     request_share: float = 0.25
+    client_reply_bytes: float = 5e6
     second_writer: Literal["", "ignore", "use"] = ""
     shared: frozenset[str] = frozenset()
 
@@ -115,6 +117,7 @@ class Loop:
         self._hold_ns = 0  # the deadline that the tick's pose waits for
         self._late_ns = 0  # of the last pose that a tick published
         self._stopping = False
+        self._was_busy = False  # whether samples waited behind samples in the last pass
         prefix = settings.channel_prefix
         self._pose, self._pose_vector = f"{prefix}POSE", f"{prefix}POSE_VECTOR"
         self._odom, self._health = f"{prefix}POSE_ODOM", f"{prefix}MODELSERVER_HEALTH"
@@ -123,8 +126,12 @@ class Loop:
         self._unused = Unused(self.step, self._journal)
         self._watch = Watch(self.step, self._unused.count, self._log, settings.second_writer, settings.shared)
         self._hear(settings.sensors)
-        limits = DeskLimits(settings.queued_requests, settings.client_hz, settings.request_share)
-        self._reception = Reception(self, bus, clock, self._log, prefix, limits, settings.requests_per_pass, hooks.gate)
+        limits = RequestLimits(
+            settings.queued_requests, settings.client_hz, settings.request_share, settings.client_reply_bytes
+        )
+        self._requests = RequestHandler(
+            self, bus, clock, self._log, prefix, limits, settings.requests_per_pass, hooks.gate, hooks.run_delay
+        )
 
     def run(self) -> None:
         """Serve until `stop` is called."""
@@ -148,23 +155,29 @@ class Loop:
         self.step(Noticed(subject, text), self._clock.now())
 
     def turn(self) -> None:
-        """Make one pass: sensors, the tick when it is due, requests within their budget, then wait."""
-        if self._journal.wants_state:
+        """Make one pass: sensors, the tick when it is due, a slice of request work, then wait."""
+        requests = self._requests
+        # a deferred reply in progress rests on an older state than the one that a segment would begin with
+        if self._journal.wants_state and not requests.is_deferring:
             self._journal.begin(self.state, self._clock.now())
         if self._reloading:
             self._reloading = False
             self.send((LoadModel(),))
         busy = self._drain_sensors()
+        if busy and self._was_busy:
+            requests.contention.add_sensor_backlog(self._clock.monotonic_ns())
+        self._was_busy = busy
         self._tick_if_due()
         begin_ns = self._due_ns - self._lead.ns
-        self._reception.serve(begin_ns)
-        if not busy and not self._reception.pressing and not self._stopping:
-            seconds = max(0.0, (begin_ns - self._clock.monotonic_ns()) * 1e-9)
-            if self._reception.flooded:
-                # waking for each request of a flood would be most of the work
-                self._bus.wait(min(seconds, FLOOD_PAUSE_S), requests=False)
-            else:
-                self._bus.wait(seconds)
+        requests.serve(begin_ns, may_defer=not self._journal.wants_state)
+        if busy or self._stopping:
+            return
+        seconds = max(0.0, (begin_ns - self._clock.monotonic_ns()) * 1e-9)
+        if requests.is_flooded:
+            # waking for each request of a flood would be most of the work
+            self._bus.wait(0.0 if requests.is_ready else min(seconds, FLOOD_PAUSE_S), requests=False)
+        elif not requests.is_ready:
+            self._bus.wait(min(seconds, FLOOD_PAUSE_S) if requests.waiting else seconds)
 
     def _drain_sensors(self) -> bool:
         """Handle the samples that have come, up to the next tick; return whether more may wait."""
@@ -187,14 +200,17 @@ class Loop:
         if ahead > 0:
             # what it says holds for the deadline, at which it is published; how late that was the next tick tells
             now, late_ns = Instant(due, now.utime + ahead // 1000), self._late_ns
+        self._requests.contention.add_tick(
+            late_ns if not missed else missed * self._settings.period_ns, now.monotonic_ns
+        )
         self._watch.look(now)
         reports = now.monotonic_ns >= self.state.health_due_ns
         self._unused.tell(now, reports)
         self._hold_ns = due
         try:
             # gauges are read where they will be told
-            gauges = self._gauges(self._reception.waiting) if reports else None
-            self.step(Tick(late_ns * 1e-9, missed, self._reception.taken_answered(), gauges), now)
+            gauges = self._gauges(self._requests.waiting) if reports else None
+            self.step(Tick(late_ns * 1e-9, missed, self._requests.take_answered(), gauges), now)
             self._on_tick(self.state)
         except Exception as error:
             self._wait_for(due, ahead)
@@ -225,7 +241,7 @@ class Loop:
     @property
     def requests_waiting(self) -> int:
         """Requests that wait to be answered."""
-        return self._reception.waiting
+        return self._requests.waiting
 
     def obey(self, command: Commanded, now: Instant) -> None:
         """Have a signed command obeyed."""
@@ -323,7 +339,7 @@ class Loop:
             # what is said beside it is sent all the same
             self.failed(channel, error)
 
-    def send(self, outputs: tuple[Output, ...]) -> None:
+    def send(self, outputs: Outputs) -> None:
         """Send what the core says."""
         for output in outputs:
             try:
@@ -335,7 +351,10 @@ class Loop:
     def _send_reply(self, output: SendReply) -> None:
         encoded = encode(output.reply)
         self.publish(output.channel, encoded)
-        self._reception.learn(output, encoded)
+        self._requests.cache(output, encoded)
+
+    def _defer(self, output: DeferredAnswer) -> None:
+        self._requests.defer(output)
 
     def _send_pose(self, output: PublishPose) -> None:
         world, vector, odom = encode(output.world), encode(output.world, "pose_vector_t"), encode(output.odom)
@@ -406,6 +425,7 @@ class Loop:
 
 _SENDERS: Mapping[type, Callable[[Loop, Any], None]] = {
     SendReply: Loop._send_reply,
+    DeferredAnswer: Loop._defer,
     PublishPose: Loop._send_pose,
     PublishHealth: Loop._send_health,
     OriginLatched: Loop._send_origin,

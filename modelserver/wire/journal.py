@@ -52,6 +52,7 @@ class Kind(IntEnum):
     REQUEST: one that the core answered; REMEMBERED: answered without it, from memory; REFUSED: for want of time;
     MALFORMED, FAILED: turned back. UNREAD: bytes that are no message of their channel. IGNORED: a sample that is not
     used, as that of a second writer. EVENT: something of the service's own, encoded by the schema of the segment.
+    PORTION: the next messages of the deferred reply in progress were sent, as many as its four bytes say.
     """
 
     SAID = 0
@@ -64,6 +65,7 @@ class Kind(IntEnum):
     UNREAD = 7
     IGNORED = 8
     EVENT = 9
+    PORTION = 10
 
 
 class Record(NamedTuple):

@@ -10,7 +10,8 @@ import pytest
 from support_samples import ME, ORIGIN, START, Scripted, cart, decided, drive, gps, imu, now_at, started
 
 from modelserver import core
-from modelserver.core import MAX_COUNTERS, CoreSettings, CoreState, Instant, step
+from modelserver.answers import DeferredAnswer
+from modelserver.core import MAX_COUNTERS, CoreSettings, CoreState, Instant, Outputs, step
 from modelserver.errors import Status, UnknownBodyError, UnknownFrameError
 from modelserver.geometry import names
 from modelserver.history import STEP_US
@@ -57,6 +58,7 @@ from modelserver.messages import (
     Verdict,
     WheelsSample,
 )
+from modelserver.platform.steps import complete
 from modelserver.wire.codec import encode
 
 S = 1_000_000
@@ -87,7 +89,7 @@ class Run:
         self.state: CoreState = started(localizer, **settings)
         self.at = START
 
-    def feed(self, event: Event, at: float = 0.0) -> tuple[Output, ...]:
+    def feed(self, event: Event, at: float = 0.0) -> Outputs:
         """Handle an event `at` seconds after START."""
         self.at = START + round(at * S)
         self.state, outputs = step(self.state, event, now_at(self.at))
@@ -99,6 +101,9 @@ class Run:
 
     def ask(self, request: Any, at: float = 0.0) -> Reply:
         (output,) = self.feed(request, at)
+        if isinstance(output, DeferredAnswer):
+            (reply,) = complete(output.work())
+            output = SendReply(output.request.header.reply_channel, reply)
         assert isinstance(output, SendReply)
         assert output.channel == request.header.reply_channel
         assert output.reply.header.request_id == request.header.request_id
@@ -711,6 +716,8 @@ def bits(events: list[tuple[Event, Instant]], publish: str) -> list[bytes]:
                     said += [encode(world), encode(world, "pose_vector_t"), encode(odom)]
                 case SendReply(channel, reply):
                     said += [channel.encode(), encode(reply)]
+                case DeferredAnswer():
+                    said += [encode(reply) for reply in complete(output.work())]
                 case PublishHealth(health):
                     said.append(encode(health))
                 case PublishDecisions() as decisions:

@@ -17,7 +17,7 @@ POSES = VALUES | {"messages", "geodesy", "earth", "magnetism", "history"}
 CORE = GEOMETRY | POSES | {"joints", "joint_reading", "joint_track", "joint_vector", "localization", "platform"}
 WIRE = VALUES | {"messages", "wire", "mslcm"}
 SIGNING = {"keys", "signing"}
-SERVICE = CORE | WIRE | {"core", "config", "file_kinds", "formats", "reload", "snapshot"} | SIGNING
+SERVICE = CORE | WIRE | {"answers", "core", "config", "file_kinds", "formats", "reload", "snapshot"} | SIGNING
 
 MAY_IMPORT: dict[str, set[str]] = {
     "version": set(),

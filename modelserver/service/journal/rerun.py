@@ -6,10 +6,10 @@ import math
 from collections.abc import Container, Mapping
 
 from modelserver import core
-from modelserver.core import Instant
+from modelserver.answers import DeferredAnswer
+from modelserver.core import Instant, Outputs
 from modelserver.errors import RecordingError, WireError
 from modelserver.messages import (
-    Output,
     PublishDecisions,
     PublishHealth,
     PublishNavigation,
@@ -24,7 +24,7 @@ from modelserver.service.heard import Heard
 from modelserver.service.hooks import Hooks
 from modelserver.service.journal import state as journal_state
 from modelserver.service.loop import Loop, LoopSettings
-from modelserver.service.requests.reception import request_kind
+from modelserver.service.requests.handler import request_kind
 from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode
 from modelserver.wire.journal import Kind, Record
@@ -33,7 +33,7 @@ from modelserver.wire.requests import request_header
 Said = tuple[str, bytes]
 
 
-SAYING = (SendReply, PublishPose, PublishHealth, PublishDecisions, PublishNavigation, PublishSnapshot)
+SAYING = (SendReply, DeferredAnswer, PublishPose, PublishHealth, PublishDecisions, PublishNavigation, PublishSnapshot)
 """Outputs that are said; what comes of the others (a geometry read anew, a state kept) is a record of its own."""
 
 
@@ -118,6 +118,8 @@ class Rerun(Loop):
             if heard is None:
                 raise RecordingError(f"{record.channel} is no channel that the vehicle file names")
             self._taken(heard.read(record.data), now)
+        elif record.kind is Kind.PORTION:
+            self._requests.send_deferred(int.from_bytes(record.data, "big"))
         elif record.kind not in (Kind.UNREAD, Kind.IGNORED):
             self._asked_again(record, now)
         return self._ear.said
@@ -144,6 +146,7 @@ class Rerun(Loop):
         elif record.kind is Kind.REFUSED:
             self.send(core.refuse(self.state, request, now))
         elif record.kind is Kind.FAILED:
+            self._requests.drop_deferred()
             self.send(core.fail(self.state, request, now))
 
     def _taken(self, event: object, now: Instant) -> None:
@@ -152,7 +155,7 @@ class Rerun(Loop):
         except Exception as error:
             self.failed("", error)
 
-    def send(self, outputs: tuple[Output, ...]) -> None:
+    def send(self, outputs: Outputs) -> None:
         """Say what the core says; whatever else it wants was seen to then."""
         super().send(tuple(each for each in outputs if isinstance(each, SAYING)))
 

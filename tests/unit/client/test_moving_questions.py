@@ -13,7 +13,7 @@ import pytest
 from support_lcm import PATIENCE_S, reserved_url
 from support_moving import BASE, DEEP, ODOM, SCAN, T0, UTM, S, rover, view
 
-from modelserver.answers import answer
+from modelserver.answers import DeferredAnswer
 from modelserver.client.remote import Platform
 from modelserver.core import CoreSettings, Instant, start, step
 from modelserver.errors import LimitError, MalformedRequestError, Status, TooNewError, UnknownFrameError, WireError
@@ -31,6 +31,7 @@ from modelserver.messages import (
 from modelserver.platform.explained import explained
 from modelserver.platform.many import many
 from modelserver.platform.moving import motion
+from modelserver.platform.steps import complete
 from modelserver.wire.codec import decode, encode
 
 HELD = view(2.0)
@@ -50,6 +51,10 @@ def answering(url: str, stop: threading.Event, ready: threading.Event) -> None:
     def asked(channel: str, data: bytes) -> None:
         request: Any = decode(TYPES[channel], data)
         for each in step(state, request, Instant(0, NOW))[1]:
+            if isinstance(each, DeferredAnswer):
+                for reply in complete(each.work()):
+                    bus.publish(request.header.reply_channel, encode(reply))
+                continue
             assert isinstance(each, SendReply)
             bus.publish(each.channel, encode(each.reply))
 
@@ -141,7 +146,8 @@ def test_given_frames_that_there_are_not_then_the_error_names_the_nearest(platfo
 @pytest.mark.parametrize("pairs", [1, 3])
 def test_given_more_than_one_question_may_hold_then_the_server_says_the_limit(pairs: int) -> None:
     at = tuple(utimes(MOST_INSTANTS // pairs + 1).tolist())
-    reply: Any = answer(HELD, GetTransformations(RequestHeader(1, "REPLY_ME"), ((SCAN, UTM),) * pairs, at), NOW)
+    request = GetTransformations(RequestHeader(1, "REPLY_ME"), ((SCAN, UTM),) * pairs, at)
+    (reply,) = complete(DeferredAnswer(HELD, request, NOW).work())
     assert isinstance(reply, ManyReply)
     assert reply.header.status is LimitError.status
     assert f"at most {MOST_INSTANTS} go in one question. Ask in parts." in reply.header.message

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from support_moving import BASE, DEEP, SCAN, T0, UTM, S, view
 
-from modelserver.answers import COVARIANCES_IN_PART, POSES_IN_PART, answer
+from modelserver.answers import COVARIANCES_IN_PART, POSES_IN_PART, DeferredAnswer
 from modelserver.client.parts import Parts, stacked
 from modelserver.errors import WireError
 from modelserver.messages import GetTransformations, ManyReply, RequestHeader
 from modelserver.platform.many import many
+from modelserver.platform.steps import complete
 from modelserver.wire.codec import decode, encode
 
 PAIRS = ((SCAN, UTM), (DEEP, BASE))
@@ -24,9 +25,7 @@ AT = T0 + np.arange(700, dtype=np.int64) * 1000
 @cache
 def sent(covariance: bool = True, utime: int = T0 + S) -> tuple[bytes, ...]:
     request = GetTransformations(RequestHeader(5, "REPLY_ME"), PAIRS, tuple(AT.tolist()), with_covariance=covariance)
-    parts = answer(view(1.0), request, utime)
-    assert isinstance(parts, list)
-    return tuple(encode(part) for part in parts)
+    return tuple(encode(part) for part in complete(DeferredAnswer(view(1.0), request, utime).work()))
 
 
 def opened(data: bytes) -> ManyReply:

@@ -45,7 +45,7 @@ from modelserver.service.heard import Heard
 from modelserver.service.hooks import Hooks
 from modelserver.service.log import MAX_CAUSES, PERIOD_S, RateLimited
 from modelserver.service.loop import SENSORS_LEAST_NS, SENSORS_NS, SENSORS_PER_PASS, Loop, LoopSettings
-from modelserver.service.requests.desk import REFUSALS_TOLD
+from modelserver.service.requests.scheduler import REJECTIONS_PER_CLIENT
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.transformation import Transformation
 from modelserver.wire.channels import REQUESTS
@@ -233,7 +233,7 @@ def test_given_a_burst_of_requests_then_each_is_answered_or_counted_as_refused(c
     assert len(ok) + len(refused) == len(replies)
     assert len({each.header.request_id for each in replies}) == len(replies)
     assert (load > 0) == (count > 256)
-    assert 0 < len(refused) <= REFUSALS_TOLD or not load
+    assert 0 < len(refused) <= REJECTIONS_PER_CLIENT or not load
     assert rig.ask(GetBodyList(ME)).header.status is Status.OK
 
 

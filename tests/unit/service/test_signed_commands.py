@@ -213,7 +213,7 @@ def test_given_the_vehicles_clock_stepped_then_the_client_is_told_by_how_much(ho
 
 def test_given_a_command_of_before_the_start_then_it_is_refused() -> None:
     rig = Rig()
-    rig.loop._reception._gate._started_ns = rig.clock.monotonic_ns()  # type: ignore[union-attr]
+    rig.loop._requests._gate._started_ns = rig.clock.monotonic_ns()  # type: ignore[union-attr]
     header = rig.header(rig.signed(RELOAD))
     assert header.status is Status.FORBIDDEN
     assert "has just started" in header.message

@@ -148,6 +148,7 @@ def test_given_commands_that_are_not_obeyed_when_verified_then_what_is_said_of_t
     kept.order(ReloadModel(ME, dry_run=False), key=replace(KEY, secret=bytes(32)))
     kept.order(ReloadModel(ME, dry_run=False), key=replace(KEY, name="stranger"))
     kept.order(ReloadModel(ME, dry_run=False), late=3600.0)
+    kept.turns()  # four requests may wait
     kept.order(GetBodyList(ME))
     kept.bus.publish("MODELSERVER_SIGNED", b"none")
     kept.turns(20)

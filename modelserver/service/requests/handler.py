@@ -1,0 +1,421 @@
+"""The request handler: receives requests from the bus into per-client queues, and answers them as there is time.
+
+One pass of the server loop gives it a slice of at most a millisecond:
+
+1. Receive. What waits in liblcm's queue goes into the per-client queues, without being decoded. So fairness begins
+   at the socket: behind a queue shared by all, a flood would delay everyone.
+2. Answer queued requests in the order of the scheduler (`scheduler`).
+3. Work on the deferred reply, if one is in progress: steps of about half a millisecond, begun only where they end
+   before the next tick (`deferred`). One is worked out at a time, the others wait in their queues.
+4. Send replies to some of the requests that were dropped.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Final, Protocol
+
+from modelserver import core
+from modelserver.answers import DeferredAnswer, effort_of, is_deferred
+from modelserver.core import CoreState, Instant
+from modelserver.errors import WireError
+from modelserver.messages import (
+    CHANNEL_OF,
+    Commanded,
+    Event,
+    Noticed,
+    Output,
+    Rejected,
+    Request,
+    RequestHeader,
+    SendReply,
+    SwitchMode,
+)
+from modelserver.service.bus import Bus
+from modelserver.service.clock import Clock
+from modelserver.service.log import RateLimited, plain
+from modelserver.service.requests.contention import ContentionDetector
+from modelserver.service.requests.deferred import DeferredReply, reply_bytes
+from modelserver.service.requests.gate import Gate
+from modelserver.service.requests.scheduler import (
+    SIGNED_CLIENT,
+    DeferredRequest,
+    QueuedRequest,
+    RequestLimits,
+    RequestScheduler,
+)
+from modelserver.wire.channels import BY_NAME, REQUESTS
+from modelserver.wire.codec import decode, encode
+from modelserver.wire.journal import Kind
+from modelserver.wire.reply_cache import CACHED_TYPE, StaticReplyCache
+from modelserver.wire.requests import request_header
+from modelserver.wire.signed import SIGNED
+
+log = logging.getLogger(__name__)
+
+SLICE_NS: Final = 1_000_000
+"""How long a pass works on requests before the loop looks at sensors again; the last request is finished."""
+
+RECEIVE_BATCH: Final = 16
+"""Requests received between two looks at the clock."""
+
+RECEIVE_MOST: Final = 1024
+"""Requests received in one pass."""
+
+STEP_ROOM_NS: Final = 1_500_000
+"""A step of deferred work begins only so long before the next tick: most steps take less."""
+
+STARVED_NS: Final = 50_000_000
+"""Deferred work that has not had a step for so long gets one all the same."""
+
+REJECTIONS_PER_PASS: Final = 2
+REJECTIONS_WAITING: Final = 128
+
+SIGNED_TYPE: Final = BY_NAME[SIGNED].type_name
+
+
+class RequestContext(Protocol):
+    """Services that the request handler gets from the server loop."""
+
+    state: CoreState
+
+    def step(self, event: Event, now: Instant, heard: tuple[str, bytes] | None = None) -> None:
+        """Have the core handle an event and send its outputs; `heard` is the message that it was read from."""
+        ...
+
+    def note(self, kind: Kind, channel: str, data: bytes, now: Instant) -> None:
+        """Record in the journal a message that is not handed to the core."""
+        ...
+
+    def publish(self, channel: str, data: bytes) -> None:
+        """Publish a message."""
+        ...
+
+    def send(self, outputs: tuple[Output, ...]) -> None:
+        """Send outputs of the core."""
+        ...
+
+    def failed(self, channel: str, error: Exception, data: bytes = b"") -> None:
+        """Count and log an error while handling a message."""
+        ...
+
+    def obey(self, command: Commanded, now: Instant) -> None:
+        """Execute a signed command."""
+        ...
+
+
+class RequestHandler:
+    """Serves the request channels of one bus; `serve` makes one pass."""
+
+    def __init__(
+        self,
+        context: RequestContext,
+        bus: Bus,
+        clock: Clock,
+        log: RateLimited,
+        prefix: str,
+        limits: RequestLimits,
+        per_pass: int,
+        gate: Gate | None = None,
+        run_delay: Callable[[], int | None] = lambda: None,
+    ):
+        self._context = context
+        self._bus = bus
+        self._clock = clock
+        self._log = log
+        self._prefix = prefix
+        self._gate = gate
+        self._per_pass = per_pass
+        self._run_delay = run_delay
+        self._scheduler = RequestScheduler(limits, clock.monotonic_ns())
+        self.contention = ContentionDetector()
+        self._cache = StaticReplyCache()
+        self._answered = 0
+        self._dropped: dict[str, int] = {}
+        self._rejections: deque[QueuedRequest] = deque()
+        self._report = ""
+        self._current: QueuedRequest | None = None
+        self._deferred: DeferredReply | None = None
+        self._deferred_request: QueuedRequest | None = None
+        self._stepped_ns = 0
+        self.is_flooded = False
+        """Whether requests were dropped in the last pass."""
+        self.is_ready = False
+        """Whether there is something that can be done now."""
+        for request in REQUESTS:
+            bus.requests.subscribe(f"{prefix}{request.name}", self._receiver(request.type_name))
+        if gate is not None:
+            bus.requests.subscribe(f"{prefix}{SIGNED}", self._receiver(SIGNED_TYPE))
+
+    @property
+    def waiting(self) -> int:
+        """Requests that wait for their reply, also for one that says that they were dropped."""
+        scheduler = self._scheduler
+        return scheduler.queued + scheduler.deferred + (self._deferred is not None) + len(self._rejections)
+
+    @property
+    def is_deferring(self) -> bool:
+        """Whether a deferred reply is in progress."""
+        return self._deferred is not None
+
+    def take_answered(self) -> int:
+        """Return how many requests were answered from the cache since the last call."""
+        answered, self._answered = self._answered, 0
+        return answered
+
+    def serve(self, due_ns: int, may_defer: bool = True) -> None:
+        """Make one pass; `due_ns` is when the next tick begins. Without `may_defer` no deferred reply is begun."""
+        scheduler, clock = self._scheduler, self._clock
+        begin = clock.monotonic_ns()
+        end = min(begin + SLICE_NS, max(due_ns, begin + SLICE_NS // 4))
+        contention = self.contention
+        if contention.wants_delay(begin):
+            contention.add_delay(self._run_delay(), begin)
+        scheduler.set_contended(contention.is_contended(begin), begin)
+        unread = self._receive(begin + SLICE_NS // 2)
+        now = clock.monotonic_ns()
+        defers = self._deferred is not None or (may_defer and scheduler.deferred > 0)
+        # both sorts of work get their half where both wait
+        until = end - SLICE_NS // 2 if defers else end
+        budget = self._per_pass
+        while budget > 0:
+            request = scheduler.next(now)
+            if request is None:
+                break
+            budget -= 1
+            self._answer(request)
+            now = clock.monotonic_ns()
+            if now >= until:
+                break
+        stepped = defers and self._work_deferred(now, end, due_ns, may_defer)
+        for _ in range(min(REJECTIONS_PER_PASS, len(self._rejections))):
+            self._send_rejection(self._rejections.popleft())
+        now = clock.monotonic_ns()
+        scheduler.spend((now - begin) * 1e-9, now)
+        self.is_flooded = bool(self._dropped)
+        self.is_ready = unread or scheduler.is_ready or stepped or bool(self._rejections)
+        if self._dropped:
+            self._count_dropped()
+        report = scheduler.report(now)
+        if report is not None and report != self._report:
+            self._report = report
+            self._context.step(Noticed("requests", report), clock.now())
+
+    def cache(self, output: SendReply, encoded: bytes) -> None:
+        """Cache a reply that has just been sent, where it answers the current request and does not depend on time."""
+        current = self._current
+        if current is not None and current.type_name == CACHED_TYPE and current.client:
+            self._model_cache().add(current.data, current.client, output, encoded)
+
+    def defer(self, answer: DeferredAnswer) -> None:
+        """Take on a deferred answer; one is in progress at a time."""
+        self._deferred = DeferredReply(answer)
+        self._deferred_request = self._current
+
+    def send_deferred(self, count: int) -> None:
+        """Send the next messages of the deferred reply in progress, as a journal says."""
+        deferred = self._deferred
+        if deferred is None:
+            return
+        deferred.complete()
+        for message in deferred.take(count):
+            self._context.publish(deferred.channel, message)
+        if not deferred.portion:
+            self.drop_deferred()
+
+    def drop_deferred(self) -> None:
+        """Give up the deferred reply in progress."""
+        self._deferred = self._deferred_request = None
+
+    def _receive(self, until_ns: int) -> bool:
+        """Receive requests into their clients' queues; return whether more may wait in liblcm's queue."""
+        drain = self._bus.requests.drain
+        for _ in range(RECEIVE_MOST // RECEIVE_BATCH):
+            if drain(RECEIVE_BATCH) < RECEIVE_BATCH:
+                return False
+            if self._clock.monotonic_ns() >= until_ns:
+                return True
+        return True
+
+    def _receiver(self, type_name: str) -> Callable[[str, bytes], None]:
+        signed = type_name == SIGNED_TYPE
+        scheduler, monotonic_ns = self._scheduler, self._clock.monotonic_ns
+
+        def receive(channel: str, data: bytes) -> None:
+            now_ns = monotonic_ns()
+            name = SIGNED_CLIENT if signed else client_of(data)
+            request = QueuedRequest(name, channel, type_name, data)
+            dropped = scheduler.enqueue(scheduler.client(name, now_ns), request, now_ns)
+            if dropped is not None:
+                self._drop(dropped)
+
+        return receive
+
+    def _drop(self, request: QueuedRequest) -> None:
+        channel = request.channel
+        self._dropped[channel] = self._dropped.get(channel, 0) + 1
+        if (
+            self._scheduler.reject(request.client)
+            and request.type_name != SIGNED_TYPE
+            and len(self._rejections) < REJECTIONS_WAITING
+        ):
+            self._rejections.append(request)
+
+    def _send_rejection(self, dropped: QueuedRequest) -> None:
+        """Reply to a dropped request that the server is loaded."""
+        try:
+            request = decode(dropped.type_name, dropped.data)
+        except Exception:
+            return  # counted already: as dropped
+        now = self._clock.now()
+        self._context.note(Kind.REFUSED, dropped.channel, dropped.data, now)
+        self._context.send(core.refuse(self._context.state, request, now))
+
+    def _count_dropped(self) -> None:
+        """Have the core count the dropped requests: together, since counting each one costs more than dropping it."""
+        dropped, self._dropped = self._dropped, {}
+        now = self._clock.now()
+        for channel, count in dropped.items():
+            self._context.step(Rejected(channel, "load", count), now)
+
+    def _work_deferred(self, now_ns: int, end_ns: int, due_ns: int, may_defer: bool) -> bool:
+        """Work on the deferred reply, or begin the next one; return whether that can go on at once."""
+        scheduler, monotonic_ns = self._scheduler, self._clock.monotonic_ns
+        if self._deferred is None:
+            deferred = scheduler.next_deferred(now_ns) if may_defer and scheduler.may_exceed else None
+            if deferred is None:
+                return False
+            self._handle(deferred.queued, deferred.request)
+        while self._deferred is not None and scheduler.may_exceed:
+            now = monotonic_ns()
+            if due_ns - now < STEP_ROOM_NS and now - self._stepped_ns < STARVED_NS:
+                return False
+            if now >= end_ns and self._stepped_ns >= now_ns:
+                return True
+            self._stepped_ns = now
+            self._step_deferred(self._deferred)
+        return self._deferred is None and scheduler.deferred > 0 and may_defer
+
+    def _step_deferred(self, deferred: DeferredReply) -> None:
+        """Do one step of the deferred work, or send a portion of its messages."""
+        if not deferred.ready:
+            try:
+                deferred.step()
+            except Exception as error:
+                request = self._deferred_request
+                self.drop_deferred()
+                assert request is not None
+                self._fail(request, deferred.request, error)
+                return
+        if deferred.ready:
+            count = deferred.portion
+            # what is sent later than its request is a record of its own: a rerun of the journal sends it there
+            self._context.note(Kind.PORTION, deferred.channel, count.to_bytes(4, "big"), self._clock.now())
+            self.send_deferred(count)
+
+    def _answer(self, queued: QueuedRequest) -> None:
+        """Answer a request, also a malformed one or one whose handling fails."""
+        client, channel, type_name, data = queued
+        context = self._context
+        try:
+            if type_name == SIGNED_TYPE:
+                self._open(channel, data)
+                return
+            if type_name == CACHED_TYPE and client and self._send_cached(client, channel, data):
+                return
+            request = decode(type_name, data)
+        except Exception as error:
+            context.failed(channel, error, data)
+            header = request_header(data) if isinstance(error, WireError) and error.reason == "malformed" else None
+            kind = request_kind(type_name)
+            if header is not None and kind is not None:
+                now = self._clock.now()
+                context.note(Kind.MALFORMED, channel, data, now)
+                context.send(core.turn_back(context.state, kind, header, str(error), now))
+            return
+        effort = effort_of(request)
+        if is_deferred(request):
+            if not self._scheduler.enqueue_deferred(DeferredRequest(queued, request, reply_bytes(request), effort)):
+                self._drop(queued)
+            return
+        if effort > 1.0:
+            self._scheduler.charge(client, effort - 1.0, self._clock.monotonic_ns())
+        self._handle(queued, request)
+
+    def _handle(self, queued: QueuedRequest, request: Request) -> None:
+        """Have the core handle a request."""
+        self._current = queued
+        try:
+            self._context.step(request, self._clock.now(), (queued.channel, queued.data))
+        except Exception as error:
+            self._fail(queued, request, error)
+        self._current = None
+
+    def _send_cached(self, client: bytes, channel: str, data: bytes) -> bool:
+        """Answer a request from the cache; return whether that was possible."""
+        now = self._clock.now()
+        reply = self._model_cache().find(data, client, now.utime)
+        if reply is None:
+            return False
+        header = RequestHeader(0, client.decode("utf-8", "replace"))
+        if not header.is_answerable(self._context.state.settings.reply_prefix):
+            return False
+        self._context.note(Kind.REMEMBERED, channel, data, now)
+        self._context.publish(header.reply_channel, reply)
+        self._answered += 1
+        return True
+
+    def _model_cache(self) -> StaticReplyCache:
+        """Return the cache, emptied where its model is no longer in use."""
+        model = self._context.state.view.model
+        if not self._cache.is_of(model):
+            self._cache.reset(model, sum(len(body.frames) for body in model.bodies))
+        return self._cache
+
+    def _fail(self, queued: QueuedRequest, request: Request, error: Exception) -> None:
+        """Reply to a request whose handling failed."""
+        context, now = self._context, self._clock.now()
+        context.failed(queued.channel, error)
+        context.note(Kind.FAILED, queued.channel, queued.data, now)
+        context.send(core.fail(context.state, request, now))
+
+    def _open(self, channel: str, data: bytes) -> None:
+        """Execute the command in an envelope, or reply why not to a sender that has proved to know the key."""
+        if self._gate is None:
+            return
+        now = self._clock.now()
+        found = self._gate.opened(data, now)
+        if isinstance(found, Commanded):
+            # each one, however many: whoever signs is no stranger
+            log.info("%s, signed by %s", type(found.order).__name__, plain(found.sender))
+            try:
+                self._context.obey(found, now)
+            except Exception as error:
+                self._context.failed(channel, error)
+                if not isinstance(found.order, SwitchMode):
+                    own = f"{self._prefix}{CHANNEL_OF[type(found.order)]}"
+                    self._context.note(Kind.FAILED, own, encode(found.order), now)
+                    self._context.send(core.fail(self._context.state, found.order, now))
+            return
+        self._context.step(found, now)
+        self._log.warning(
+            f"{channel}:{found.reason}", "a signed command is refused (%s): %s", found.reason, found.why or "no detail"
+        )
+
+
+def client_of(data: bytes) -> bytes:
+    """Return the reply channel in the bytes of a request; empty where there is none that a reply could be sent to."""
+    end = 19 + int.from_bytes(data[16:20], "big")
+    # a name that begins with a control character is no client's: `SIGNED_CLIENT` is the scheduler's own
+    return data[20:end] if 20 < end <= 83 and end < len(data) and data[20] > 0x20 else b""
+
+
+def request_kind(type_name: str) -> type[Request] | None:
+    """Return the request that a wire type carries."""
+    return _REQUEST_KINDS.get(type_name)
+
+
+_REQUEST_KINDS: Mapping[str, type[Request]] = {BY_NAME[channel].type_name: kind for kind, channel in CHANNEL_OF.items()}
+"""The request of each wire type."""

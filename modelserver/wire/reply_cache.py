@@ -1,0 +1,90 @@
+"""Static replies as bytes: answers that do not depend on time, by the pair of frames.
+
+Most questions are about how the vehicle is bolted together, and their answers hold until the model changes. The bytes
+of such a reply differ only in request id and stamp, and do not depend on the client. So the pair in the bytes of a
+request leads to the rest of the reply, without decoding, core and encoding. The cache is as large as the model's
+pairs of frames, within bounds, and drops the entry that was not used for longest.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+from modelserver.errors import Status
+from modelserver.messages import Policy, SendReply, TransformReply
+from modelserver.wire.fields import MAX_UTIME
+from mslcm.get_transformation_reply_t import get_transformation_reply_t
+from mslcm.get_transformation_request_t import get_transformation_request_t
+
+CACHED_TYPE: Final = get_transformation_request_t.__name__
+"""The only type of request whose replies are cached."""
+
+LARGEST_CACHE: Final = 16_384
+"""Entries: all pairs of 128 frames, some 10 MB."""
+
+LONGEST_PAIR: Final = 512
+"""Bytes of both names; longer ones come from strangers and are not cached."""
+
+_REQUEST: Final[bytes] = get_transformation_request_t._get_packed_fingerprint()
+_REPLY: Final[bytes] = get_transformation_reply_t._get_packed_fingerprint()
+_CHANNEL: Final = 20
+"""Where the reply channel begins in a request: behind fingerprint, id and the channel's length."""
+_TIME = struct.Struct(">qbi")
+_UTIME = struct.Struct(">q")
+_STAMPED: Final = 24
+"""Where a reply goes on behind fingerprint, id and stamp."""
+_LAST_POLICY: Final = max(Policy)
+
+
+class StaticReplyCache:
+    """The static replies of one model; see the module."""
+
+    def __init__(self) -> None:
+        self._entries: dict[bytes, bytes] = {}
+        self._model: object = None
+        self._capacity = 0
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def reset(self, model: object, frames: int) -> None:
+        """Drop all entries and cache the replies of another model from now on, which has so many frames."""
+        self._entries.clear()
+        self._model = model
+        self._capacity = min(max(frames, 1) ** 2, LARGEST_CACHE)
+
+    def is_of(self, model: object) -> bool:
+        """Return whether the cache is of a model."""
+        return model is self._model
+
+    def find(self, request: bytes, client: bytes, utime: int) -> bytes | None:
+        """Return the bytes of the reply to a get_transformation_request_t; None where it is not cached.
+
+        `client` is the reply channel in the bytes of the request.
+        """
+        if request[:8] != _REQUEST:
+            return None
+        pair = request[_CHANNEL + len(client) : -_TIME.size]
+        entries = self._entries
+        rest = entries.pop(pair, None)
+        if rest is None:
+            return None
+        # back in as the newest: the first entry is the one that was not used for longest
+        entries[pair] = rest
+        at, policy, wait_ms = _TIME.unpack(request[-_TIME.size :])
+        if not (0 <= at < MAX_UTIME and 0 <= policy <= _LAST_POLICY and wait_ms >= 0):
+            return None
+        return b"%b%b%b%b" % (_REPLY, request[8:16], _UTIME.pack(utime), rest)
+
+    def add(self, request: bytes, client: bytes, reply: SendReply, encoded: bytes) -> None:
+        """Cache a reply to a request, if it does not depend on time; `encoded` are its bytes."""
+        body = reply.reply
+        if not isinstance(body, TransformReply) or body.header.status is not Status.OK or body.answer is None:
+            return
+        pair = request[_CHANNEL + len(client) : -_TIME.size]
+        if body.answer.transformation.utime or len(pair) > LONGEST_PAIR:
+            return
+        if len(self._entries) >= self._capacity:
+            self._entries.pop(next(iter(self._entries), b""), None)
+        self._entries[pair] = encoded[_STAMPED:]
