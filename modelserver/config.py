@@ -314,7 +314,7 @@ class LimitsConfig:
     queued_requests: requests that may wait; more are dropped and counted.
     requests_per_pass: requests answered before the loop looks at sensors again.
     client_hz: requests per second that are guaranteed to each client; more are answered while there is time.
-    request_share: share of the time for requests beyond the clients' rates, while something else needs the time.
+    request_share: share of the time for requests before clients get their rates alone, while others need the time.
     client_reply_bytes: bytes per second of long replies (many transformations, history) to each client.
     """
 

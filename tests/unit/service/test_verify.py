@@ -20,6 +20,7 @@ from modelserver.messages import (
     GetMotion,
     GetStateVector,
     GetTransformation,
+    GetTransformations,
     JointSample,
     JointsSample,
     LoadModel,
@@ -33,6 +34,7 @@ from modelserver.messages import (
 )
 from modelserver.service.journal.files import files_of
 from modelserver.service.journal.verify import Verified, verify
+from modelserver.service.requests.deferred import DeferredReply
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import written
 from modelserver.wire.journal import Record, batch_written, read
@@ -419,3 +421,84 @@ def test_given_a_segment_whose_head_is_damaged_or_cut_off_then_it_is_still_one(t
     path.write_bytes(data[:20])
     assert files_of(path) == [path]
     assert not verify([path]).proved
+
+
+# --- long answers -------------------------------------------------------------------------------------------
+
+
+def ask_long(kept: Kept, number: int = 1) -> None:
+    """Ask for many poses of the last two seconds: an answer that is worked out in steps."""
+    newest = kept.clock.utime() - 200_000
+    at = tuple(newest - n * 60_000 for n in range(31))
+    kept.send(GetTransformations(RequestHeader(number, "REPLY_LONG"), (("Camera:Origin", "World:UTM"),) * 20, at))
+
+
+def slow_steps(monkeypatch: pytest.MonkeyPatch, kept: Kept, seconds: float = 0.002) -> None:
+    """Have each step of a long answer take time."""
+    step = DeferredReply.step
+
+    def slow(reply: DeferredReply) -> None:
+        kept.clock.advance(seconds)
+        step(reply)
+
+    monkeypatch.setattr(DeferredReply, "step", slow)
+
+
+@pytest.mark.parametrize("segment_bytes", [1 << 20, 2_000])
+def test_given_long_answers_between_ticks_when_verified_then_each_part_is_reproduced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, segment_bytes: int
+) -> None:
+    kept = Kept(tmp_path, vehicle=SMALL, segment_bytes=segment_bytes)
+    kept.drive(6.0)
+    slow_steps(monkeypatch, kept)
+    for number in range(4):
+        ask_long(kept, number)
+        kept.send(GetHistory(ME, kept.clock.utime() - 4 * S, kept.clock.utime(), 50.0))
+        kept.drive(0.7)
+        kept.send(GetStateVector(ME))
+        kept.drive(0.3)
+    kept.turns(100)
+    assert len(kept.bus.said("REPLY_LONG")) == 4 * 20
+    # poses and other replies went out between the parts
+    channels = [channel for channel, _ in kept.bus.published]
+    first = channels.index("REPLY_LONG")
+    assert "POSE" in channels[first : first + 60]
+    if segment_bytes < 1 << 20:
+        assert len(kept.segments) > 4
+    assert proved(again(kept))
+
+
+def test_given_a_long_answer_that_is_not_finished_when_verified_then_what_was_sent_is_reproduced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = Kept(tmp_path)
+    kept.drive(6.0)
+    slow_steps(monkeypatch, kept, 0.02)
+    ask_long(kept)
+    kept.turns(10)
+    assert kept.loop.requests_waiting == 1
+    assert proved(again(kept))
+
+
+def test_given_a_long_answer_that_fails_when_verified_then_its_reply_is_reproduced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = Kept(tmp_path)
+    kept.drive(6.0)
+    steps = 0
+
+    def broken(reply: DeferredReply) -> None:
+        nonlocal steps
+        steps += 1
+        if steps == 3:
+            raise ArithmeticError("no number")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(DeferredReply, "step", broken)
+        ask_long(kept)
+        kept.turns(5)
+    assert len(kept.bus.said("REPLY_LONG")) == 1
+    ask_long(kept, 2)
+    kept.drive(0.5)
+    assert len(kept.bus.said("REPLY_LONG")) == 1 + 20
+    assert proved(again(kept))
