@@ -17,7 +17,7 @@ from pathlib import Path
 
 import lcm
 
-from benchmarks.flood import VEHICLE, GEOMETRY, POSE_HZ, Ear, p99
+from benchmarks.flood import GEOMETRY, POSE_HZ, VEHICLE, Ear, p99
 from benchmarks.support import free_url, process, verdict
 from modelserver.client.remote import Platform
 from modelserver.errors import NoPoseError, NoServerError, RefusedError

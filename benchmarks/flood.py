@@ -63,23 +63,26 @@ sensors:
 """
 
 
-def sensors() -> None:
-    """Be an inertial unit at 200 Hz, wheels at 100 Hz and a receiver at 5 Hz, on a level drive."""
+def sensors(hz: float = 200.0, wheel_names: tuple[str, ...] = ("left", "right"), up: float = 1.0) -> None:
+    """Be an inertial unit at `hz`, wheels at half of it and a receiver at 5 Hz, on a level drive.
+
+    `up` is 1 where the unit's z axis points up, -1 where it points down.
+    """
     bus = lcm.LCM(resolve_url())
     begin, shaken = time.monotonic(), random.Random(1).gauss
     for n in itertools.count():
-        time.sleep(max(0.0, begin + n / 200.0 - time.monotonic()))
+        time.sleep(max(0.0, begin + n / hz - time.monotonic()))
         utime = time.time_ns() // 1000
         rate = (shaken(0.0, 0.02), shaken(0.0, 0.02), shaken(0.0, 0.02))
-        force = (shaken(0.0, 0.3), shaken(0.0, 0.3), 9.80665 + shaken(0.0, 0.3))
+        force = (shaken(0.0, 0.3), shaken(0.0, 0.3), up * 9.80665 + shaken(0.0, 0.3))
         bus.publish("IMU", encode(ImuSample(SensorHeader(utime, "imu", n), rate, force)))
         if n % 2 == 0:
-            wheels = tuple(WheelSample(name, 2.0 * n / 200.0, speed=2.0) for name in ("left", "right"))
+            wheels = tuple(WheelSample(name, 2.0 * n / hz, speed=2.0) for name in wheel_names)
             bus.publish("WHEELS", encode(WheelsSample(SensorHeader(utime, "wheels", n // 2), wheels)))
-        if n % 40 == 0:
-            east = 2.0 * n / 200.0
+        if n % round(hz / 5.0) == 0:
+            east = 2.0 * n / hz
             fix = GpsSample(
-                SensorHeader(utime, "gps", n // 40),
+                SensorHeader(utime, "gps", n),
                 FixType.FIX_3D,
                 50.27,
                 -111.1 + east / 71_200.0,

@@ -1,16 +1,23 @@
-"""A query over LCM, reply decoded, beside a bare LCM echo of the same request and reply bytes."""
+"""A query over LCM, reply decoded, beside a bare LCM echo of as many bytes: one pair, and random pairs of all frames.
+
+Echo and query take turns call by call, so that a machine that is busy with something else slows both.
+"""
 
 from __future__ import annotations
 
 import itertools
+import random
 import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import lcm
 
+from benchmarks.flood import sensors
 from benchmarks.support import RAPTOR, daemon, free_url, interleaved, process, ratio, verdict
 from modelserver.client.remote import Platform
 from modelserver.messages import CHANNEL_OF, GetTransformation
@@ -19,6 +26,11 @@ from modelserver.wire.provider import resolve_url
 
 INTEREST, REFERENCE = "Digiclops:ImagePlane", "Raptor:CG"
 ROUNDS, CALLS = 40, 100
+REPEATS = 3
+"""How often each pair is asked again."""
+
+DRIVING_PAIRS = 1000
+WHEELS = ("front_left", "front_right")
 
 
 def echo_server(reply_file: str) -> None:
@@ -64,11 +76,10 @@ def captured(url: str, platform: Platform) -> tuple[bytes, bytes]:
     return seen[CHANNEL_OF[GetTransformation]], seen[platform.reply_channel]
 
 
-def main() -> int:
-    url = free_url()
-    times_asked = itertools.count(1_700_000_000_000_000)
-    with daemon(url, RAPTOR / "vehicle.yaml") as platform, tempfile.TemporaryDirectory() as folder:
-        request, reply = captured(url, platform)
+@contextmanager
+def echoing(url: str, request: bytes, reply: bytes) -> Iterator[EchoClient]:
+    """Run an echo server, and return a client that it has answered."""
+    with tempfile.TemporaryDirectory() as folder:
         reply_file = Path(folder) / "reply"
         reply_file.write_bytes(reply)
         with process("-m", "benchmarks.query_latency", "echo", str(reply_file), url=url):
@@ -81,20 +92,93 @@ def main() -> int:
                 except TimeoutError:
                     if time.monotonic() > deadline:
                         raise
+            yield echo
+
+
+def frames_of(platform: Platform) -> list[str]:
+    """Return all frames of the vehicle."""
+    bodies = platform.get_body_list()
+    return [f"{body}:{frame}" for body in bodies for frame in platform.get_body_frame_list(body)]
+
+
+def in_turns(platform: Platform, echo: EchoClient, pairs: Sequence[tuple[str, str]]) -> dict[str, list[float]]:
+    """Return the seconds of an echo and of a query for each pair, one after the other."""
+    times: dict[str, list[float]] = {"echo": [], "query": []}
+    for interest, reference in pairs:
+        begin = time.perf_counter()
+        echo.ask()
+        middle = time.perf_counter()
+        platform.get_transformation(interest, reference)
+        times["query"].append(time.perf_counter() - middle)
+        times["echo"].append(middle - begin)
+    return times
+
+
+def compare(what: str, times: dict[str, list[float]], p50: float, p99: float = 0.0) -> bool:
+    """Print both distributions and their ratios beside the bounds; return whether they hold."""
+    of = {name: statistics.quantiles(values, n=100) for name, values in times.items()}
+    print(
+        f"  {what}: {len(times['query'])} calls; "
+        + "; ".join(
+            f"{name} p50 {each[49] * 1e6:.0f} us, p90 {each[89] * 1e6:.0f} us, p99 {each[98] * 1e6:.0f} us"
+            for name, each in of.items()
+        )
+    )
+    holds = verdict(f"{what}: p50 to the echo's", of["query"][49] / of["echo"][49], p50, "x")
+    if p99:
+        holds &= verdict(f"{what}: p99 to the echo's", of["query"][98] / of["echo"][98], p99, "x")
+    return holds
+
+
+def driving(folder: Path) -> Path:
+    """Return a vehicle file of the Raptor that publishes POSE at 100 Hz and keeps nothing."""
+    text = (RAPTOR / "vehicle.yaml").read_text()
+    text = text.replace("geometry: geometry.yaml", f"geometry: {RAPTOR / 'geometry.yaml'}\nstate_directory: {folder}")
+    file = folder / "vehicle.yaml"
+    file.write_text(text.replace("rate_hz: 50", "rate_hz: 100"))
+    return file
+
+
+def main() -> int:
+    url = free_url()
+    times_asked = itertools.count(1_700_000_000_000_000)
+    with daemon(url, RAPTOR / "vehicle.yaml") as platform:
+        request, reply = captured(url, platform)
+        frames = frames_of(platform)
+        pairs = list(itertools.product(frames, frames))
+        random.Random(1).shuffle(pairs)
+        with echoing(url, request, reply) as echo:
             actions = {
                 "echo": echo.ask,
                 "query": lambda: platform.get_transformation(INTEREST, REFERENCE),
                 "query at": lambda: platform.get_transformation(INTEREST, REFERENCE, at=next(times_asked)),
             }
             interleaved(5, CALLS, actions)  # warm up: the interpreter specializes what runs often
+            first = in_turns(platform, echo, pairs)
+            again = in_turns(platform, echo, pairs * REPEATS)
             times = interleaved(ROUNDS, CALLS, actions)
-    print(f"  request {len(request)} bytes, reply {len(reply)} bytes; p50, median of {ROUNDS} rounds:")
+    print(f"  request {len(request)} bytes, reply {len(reply)} bytes; {len(frames)} frames, {len(pairs)} pairs")
+    holds = compare("random pairs, first time", first, 1.6, 4.0)
+    holds &= compare("random pairs, repeated", again, 1.25)
+    url = free_url()
+    with tempfile.TemporaryDirectory() as folder, daemon(url, driving(Path(folder))) as platform:
+        with process("-m", "benchmarks.query_latency", "sensors", url=url), echoing(url, request, reply) as echo:
+            time.sleep(5.0)
+            some = in_turns(platform, echo, pairs[:DRIVING_PAIRS] * 2)
+            some = {name: values[DRIVING_PAIRS:] for name, values in some.items()}
+    holds &= compare("random pairs, beside POSE and IMU at 100 Hz", some, 2.0)
+    print(f"  one pair, p50, median of {ROUNDS} rounds:")
     for name, values in times.items():
         print(f"  {name:10} {statistics.median(values) * 1e6:7.1f} us")
-    holds = verdict("query to echo", ratio(times["query"], times["echo"]), 1.25, "x")
+    holds &= verdict("query to echo", ratio(times["query"], times["echo"]), 1.25, "x")
     holds &= verdict("query with its own `at` each time, to echo", ratio(times["query at"], times["echo"]), 1.5, "x")
     return 0 if holds else 1
 
 
-if __name__ == "__main__" and sys.argv[1:2] == ["echo"]:
-    echo_server(sys.argv[2])
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["echo"]:
+        echo_server(sys.argv[2])
+    elif sys.argv[1:2] == ["sensors"]:
+        sensors(100.0, WHEELS, -1.0)
+    else:
+        sys.exit(main())

@@ -188,11 +188,11 @@ class Loop:
         return count == SENSORS_PER_PASS or (count > 0 and self._clock.monotonic_ns() - now_ns >= most_ns)
 
     def _tick_if_due(self) -> None:
-        now = self._clock.now()
         due = self._due_ns
-        ahead = due - now.monotonic_ns
-        if ahead > self._lead.ns:
+        if due - self._clock.monotonic_ns() > self._lead.ns:
             return
+        now = self._clock.now()
+        ahead = due - now.monotonic_ns
         # a tick that was missed is skipped and counted: catching up would burst old poses
         missed = max(-ahead, 0) // self._settings.period_ns
         self._due_ns += (missed + 1) * self._settings.period_ns

@@ -3,7 +3,8 @@
 One pass of the server loop gives it a slice of at most a millisecond:
 
 1. Receive. What waits in liblcm's queue goes into the per-client queues, without being decoded. So fairness begins
-   at the socket: behind a queue shared by all, a flood would delay everyone.
+   at the socket: behind a queue shared by all, a flood would delay everyone. Only the first request of a pass, where
+   none waits, is answered before the next is received: a lone client then waits for nothing.
 2. Answer queued requests in the order of the scheduler (`scheduler`).
 3. Work on the deferred reply, if one is in progress: steps of about half a millisecond, begun only where they end
    before the next tick (`deferred`). One is worked out at a time, the others wait in their queues.
@@ -140,6 +141,7 @@ class RequestHandler:
         self._deferred: DeferredReply | None = None
         self._deferred_request: QueuedRequest | None = None
         self._stepped_ns = 0
+        self._is_first = False
         self.is_flooded = False
         """Whether requests were dropped in the last pass."""
         self.is_ready = False
@@ -174,24 +176,23 @@ class RequestHandler:
         if contention.wants_delay(begin):
             contention.add_delay(self._run_delay(), begin)
         scheduler.set_contended(contention.is_contended(begin), begin)
+        self._is_first = True
         unread = self._receive(begin + SLICE_NS // 2)
-        now = clock.monotonic_ns()
+        now = clock.monotonic_ns() if scheduler.queued else begin
         defers = self._deferred is not None or (may_defer and scheduler.deferred > 0)
         # both sorts of work get their half where both wait
         until = end - SLICE_NS // 2 if defers else end
-        budget = self._per_pass
-        while budget > 0:
-            request = scheduler.next(now)
-            if request is None:
-                break
+        budget = self._per_pass - (not self._is_first)
+        while budget > 0 and (request := scheduler.next(now)) is not None:
             budget -= 1
             self._answer(request)
             now = clock.monotonic_ns()
             if now >= until:
                 break
         stepped = defers and self._work_deferred(now, end, due_ns, may_defer)
-        for _ in range(min(REJECTIONS_PER_PASS, len(self._rejections))):
-            self._send_rejection(self._rejections.popleft())
+        if self._rejections:
+            for _ in range(min(REJECTIONS_PER_PASS, len(self._rejections))):
+                self._send_rejection(self._rejections.popleft())
         now = clock.monotonic_ns()
         scheduler.spend((now - begin) * 1e-9, now)
         self.is_flooded = bool(self._dropped)
@@ -246,8 +247,13 @@ class RequestHandler:
         def receive(channel: str, data: bytes) -> None:
             now_ns = monotonic_ns()
             name = SIGNED_CLIENT if signed else client_of(data)
+            client = scheduler.client(name, now_ns)
             request = QueuedRequest(name, channel, type_name, data)
-            dropped = scheduler.enqueue(scheduler.client(name, now_ns), request, now_ns)
+            if self._is_first and scheduler.admit(client, now_ns):
+                self._is_first = False
+                self._answer(request)
+                return
+            dropped = scheduler.enqueue(client, request, now_ns)
             if dropped is not None:
                 self._drop(dropped)
 

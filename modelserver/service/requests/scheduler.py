@@ -169,6 +169,16 @@ class RequestScheduler:
         client.seen_ns = now_ns
         return client
 
+    def admit(self, client: ClientQueue, now_ns: int) -> bool:
+        """Return whether a request that has just come may be answered without queueing, and charge its client."""
+        if self.queued:
+            return False
+        self._refill(client, now_ns)
+        if client.tokens < 1.0 and not self.may_exceed:
+            return False
+        client.tokens = max(min(client.tokens, 0.0), client.tokens - 1.0)
+        return True
+
     def enqueue(self, client: ClientQueue, request: QueuedRequest, now_ns: int) -> QueuedRequest | None:
         """Queue a request; return the one that is dropped for it where too many wait: of the longest queue."""
         requests = client.requests
