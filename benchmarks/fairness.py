@@ -1,6 +1,7 @@
 """Five clients that do not wait for replies beside a polite sixth; and POSE beside long answers.
 
-The five and the service share the machine, so it is loaded. The polite client asks ten times a second and waits for each
+The five and the service share the machine, so it is loaded. The polite client asks ten times a second and waits for
+each
 reply: it is to get all of them within 50 ms, and the service is to be back within a second after the flood.
 """
 

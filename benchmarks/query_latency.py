@@ -161,11 +161,15 @@ def main() -> int:
     holds = compare("random pairs, first time", first, 1.6, 4.0)
     holds &= compare("random pairs, repeated", again, 1.25)
     url = free_url()
-    with tempfile.TemporaryDirectory() as folder, daemon(url, driving(Path(folder))) as platform:
-        with process("-m", "benchmarks.query_latency", "sensors", url=url), echoing(url, request, reply) as echo:
-            time.sleep(5.0)
-            some = in_turns(platform, echo, pairs[:DRIVING_PAIRS] * 2)
-            some = {name: values[DRIVING_PAIRS:] for name, values in some.items()}
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        daemon(url, driving(Path(folder))) as platform,
+        process("-m", "benchmarks.query_latency", "sensors", url=url),
+        echoing(url, request, reply) as echo,
+    ):
+        time.sleep(5.0)
+        some = in_turns(platform, echo, pairs[:DRIVING_PAIRS] * 2)
+        some = {name: values[DRIVING_PAIRS:] for name, values in some.items()}
     holds &= compare("random pairs, beside POSE and IMU at 100 Hz", some, 2.0)
     print(f"  one pair, p50, median of {ROUNDS} rounds:")
     for name, values in times.items():

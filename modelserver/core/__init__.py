@@ -19,6 +19,7 @@ from modelserver.core.state import (
     MAX_COUNTERS,
     RUNNING,
     STARTING,
+    AllOutputs,
     CoreSettings,
     CoreState,
     Expected,
@@ -65,12 +66,12 @@ from modelserver.messages import (
 from modelserver.reload import ModelLoaded
 
 
-def step(state: CoreState, event: Event | ModelLoaded, now: Instant) -> Step:
+def step(state: CoreState, event: Event | ModelLoaded, now: Instant) -> tuple[CoreState, AllOutputs]:
     """Return the state after an event, and what is to be sent."""
     return _HANDLERS[type(event)](state, event, now)
 
 
-_HANDLERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], Step]]] = {
+_HANDLERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], tuple[CoreState, AllOutputs]]]] = {
     GpsSample: sample_taken,
     ImuSample: sample_taken,
     WheelsSample: sample_taken,
@@ -111,6 +112,7 @@ __all__ = [
     "SET_COVARIANCE",
     "START",
     "STARTING",
+    "AllOutputs",
     "CoreSettings",
     "CoreState",
     "Expected",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from modelserver.answers import DeferredAnswer, answers, failure, is_deferred
-from modelserver.core.state import CoreState, Instant, Outputs, Parked, Step, TimedRequest, counted
+from modelserver.core.state import AllOutputs, CoreState, Instant, Outputs, Parked, Step, TimedRequest, counted
 from modelserver.errors import Status
 from modelserver.geometry import names
 from modelserver.messages import (
@@ -26,7 +26,7 @@ _TIMED: Final = (GetTransformation, GetStateVector, GetHTransform, GetMotion, Ge
 """Requests that ask about a time, and may wait for it."""
 
 
-def requested(state: CoreState, request: Request, now: Instant) -> Step:
+def requested(state: CoreState, request: Request, now: Instant) -> tuple[CoreState, AllOutputs]:
     """Answer a question, have it answered in steps, or park it until the data come that it is ready to wait for."""
     if not request.header.is_answerable(state.settings.reply_prefix):
         return counted(state, CHANNEL_OF[type(request)], "reply_channel"), ()

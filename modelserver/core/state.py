@@ -206,8 +206,11 @@ class CoreState(NamedTuple):
         return self.view.history
 
 
-Outputs: TypeAlias = tuple[Output | DeferredAnswer, ...]
+Outputs: TypeAlias = tuple[Output, ...]
 Step: TypeAlias = tuple[CoreState, Outputs]
+
+AllOutputs: TypeAlias = tuple[Output | DeferredAnswer, ...]
+"""Outputs of an event, which may be a request whose answer takes long."""
 
 
 def start(settings: CoreSettings, model: Model, localizer: Localizer | None, now: Instant) -> CoreState:

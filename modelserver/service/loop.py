@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from modelserver import core
 from modelserver.answers import DeferredAnswer
-from modelserver.core import CoreState, Instant, Outputs
+from modelserver.core import AllOutputs, CoreState, Instant
 from modelserver.errors import WireError
 from modelserver.geometry import names
 from modelserver.messages import (
@@ -339,7 +339,7 @@ class Loop:
             # what is said beside it is sent all the same
             self.failed(channel, error)
 
-    def send(self, outputs: Outputs) -> None:
+    def send(self, outputs: AllOutputs) -> None:
         """Send what the core says."""
         for output in outputs:
             try:

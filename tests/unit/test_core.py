@@ -11,7 +11,7 @@ from support_samples import ME, ORIGIN, START, Scripted, cart, decided, drive, g
 
 from modelserver import core
 from modelserver.answers import DeferredAnswer
-from modelserver.core import MAX_COUNTERS, CoreSettings, CoreState, Instant, Outputs, step
+from modelserver.core import MAX_COUNTERS, AllOutputs, CoreSettings, CoreState, Instant, step
 from modelserver.errors import Status, UnknownBodyError, UnknownFrameError
 from modelserver.geometry import names
 from modelserver.history import STEP_US
@@ -89,7 +89,7 @@ class Run:
         self.state: CoreState = started(localizer, **settings)
         self.at = START
 
-    def feed(self, event: Event, at: float = 0.0) -> Outputs:
+    def feed(self, event: Event, at: float = 0.0) -> AllOutputs:
         """Handle an event `at` seconds after START."""
         self.at = START + round(at * S)
         self.state, outputs = step(self.state, event, now_at(self.at))

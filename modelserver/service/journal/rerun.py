@@ -7,7 +7,7 @@ from collections.abc import Container, Mapping
 
 from modelserver import core
 from modelserver.answers import DeferredAnswer
-from modelserver.core import Instant, Outputs
+from modelserver.core import AllOutputs, Instant
 from modelserver.errors import RecordingError, WireError
 from modelserver.messages import (
     PublishDecisions,
@@ -155,7 +155,7 @@ class Rerun(Loop):
         except Exception as error:
             self.failed("", error)
 
-    def send(self, outputs: Outputs) -> None:
+    def send(self, outputs: AllOutputs) -> None:
         """Say what the core says; whatever else it wants was seen to then."""
         super().send(tuple(each for each in outputs if isinstance(each, SAYING)))
 
