@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -36,8 +37,7 @@ class TimedInbox(FakeInbox):
     """An inbox whose messages come at their times; taking one costs time."""
 
     def __init__(self, clock: FakeClock):
-        super().__init__()
-        self._clock = clock
+        super().__init__(clock)
         self.arrivals: list[tuple[int, int, str, bytes]] = []
 
     def at(self, time_ns: int, channel: str, data: bytes) -> None:
@@ -48,7 +48,7 @@ class TimedInbox(FakeInbox):
             _, _, channel, data = heapq.heappop(self.arrivals)
             self.put(channel, data)
 
-    def drain(self, limit: int) -> int:
+    def drain(self, limit: int, seconds: float = math.inf) -> int:
         count = 0
         while count < limit:
             self.arrive()
