@@ -51,6 +51,8 @@ def test_given_the_vehicles_of_this_project_then_they_load_whole(path: Path) -> 
     loaded = load_vehicle(load_config(path))
     assert loaded.mounts is not None
     heard = {"GPS": Heard("gps_t"), "IMU": Heard("imu_t"), "WHEELS": Heard("wheels_t")}
+    if loaded.config.sensors.wheels and loaded.config.sensors.wheels.steering:
+        heard["VEHICLE_STATUS"] = Heard("vehicle_status_t")
     if loaded.model.joints:
         heard["JOINTS"] = Heard("joints_t")
     if loaded.config.localization.mode_channel:
