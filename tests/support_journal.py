@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-from support_samples import GEOMETRY, VEHICLE, drive, write_vehicle
+from support_samples import FORWARD, GEOMETRY, VEHICLE, drive, write_vehicle
 from support_signing import ALLOWED, KEY, envelope, write_test_key
 
 from modelserver.config import load_config
@@ -26,7 +26,7 @@ from modelserver.wire.codec import encode
 START = 1_700_000_000_000_000
 
 OPEN = VEHICLE + (
-    "localization: {mode_channel: LOCALIZATION_MODE}\n"
+    f"localization: {{mode_channel: LOCALIZATION_MODE, {FORWARD}}}\n"
     f"{ALLOWED}"
     "limits: {history_s: 20, parked_requests: 4, queued_requests: 4}\n"
 )

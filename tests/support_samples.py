@@ -93,11 +93,15 @@ sensors:
 """
 
 
+FORWARD = "filter: {reverse_speed: 1.5}"
+"""What the vehicle file says for `drive`: it starts at 2 m/s without wheels, so only this says that it is forward."""
+
+
 def write_vehicle(folder: Path, vehicle: str = VEHICLE, geometry: str = GEOMETRY) -> Path:
-    """Write both files; return the path of the vehicle file."""
+    """Write both files; return the path of the vehicle file. One without localization settings gets `FORWARD`."""
     (folder / "geometry.yaml").write_text(geometry)
     path = folder / "vehicle.yaml"
-    path.write_text(vehicle)
+    path.write_text(vehicle if "localization:" in vehicle else f"{vehicle}localization: {{{FORWARD}}}\n")
     return path
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from conftest import BRISK, Daemon
 from support_lcm import Listener, wait_until
-from support_samples import gps, imu
+from support_samples import FORWARD, gps, imu
 from support_signing import ALLOWED, KEY, envelope, write_test_key
 from test_moving import run_tool
 
@@ -119,7 +119,7 @@ def test_given_the_command_for_modes_then_it_signs_and_says_why_it_is_not_heard(
     start_signed: StartDaemon, tmp_path: Path
 ) -> None:
     vehicle = BRISK.replace("rate_hz: 50", "rate_hz: 50, state_hz: 20") + ALLOWED
-    daemon = start_signed(vehicle + "localization: {mode_channel: LOCALIZATION_MODE}\n")
+    daemon = start_signed(vehicle + f"localization: {{mode_channel: LOCALIZATION_MODE, {FORWARD}}}\n")
     daemon.fed()
     code, out, err = run_tool(daemon, "mode", "no_gps", "-c", str(tmp_path / "vehicle.yaml"))
     assert (code, err) == (0, "")

@@ -37,9 +37,7 @@ from modelserver.wire.codec import decode, encode
 from modelserver.wire.snapshot import PART_BYTES, Assembler
 
 S = 1_000_000
-# it starts at 2 m/s, without wheels: only this setting says that it drives forward
-FULL = VEHICLE + "localization: {filter: {reverse_speed: 1.5}}\n"
-RAW = VEHICLE + "localization: {mode: raw}\n"
+FULL, RAW = VEHICLE, VEHICLE + "localization: {mode: raw}\n"
 HIGHER_CAMERA = GEOMETRY.replace("xyz: [0, 0, 0.1]", "xyz: [0, 0, 0.2]")
 MOVED_ANTENNA = GEOMETRY.replace("[-0.4, 0.2, 1.2]", "[-0.4, 0.2, 1.5]")
 NODDING = GEOMETRY.replace("xyz: [0, 0, 0.1]", "xyz: [0, 0, 0.1], joint: {type: revolute, axis: [0, 1, 0]}")
