@@ -142,6 +142,7 @@ headers = st.builds(
     st.integers(0, 65_535),
     st.integers(0, 2**32 - 1),
     st.booleans(),
+    st.integers(0, 31),
 )
 
 

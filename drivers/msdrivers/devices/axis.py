@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
@@ -12,6 +12,7 @@ from modelserver.messages import JointsSample, SensorHeader
 from msdrivers.devices.axis_nod import Nodding
 from msdrivers.devices.axis_readings import Readings
 from msdrivers.devices.axis_settings import AxisSettings, NodMap
+from msdrivers.protocol.bounded_counter import BoundedCounter
 from msdrivers.protocol.modbus.registers import (
     FailureKind,
     ModbusFailure,
@@ -66,7 +67,7 @@ class AxisDriver:
         self._told: set[str] = set()
         self._phase = Phase.WAITING
         self._seq = 0
-        self._counts: Counter[str] = Counter()
+        self._counts = BoundedCounter()
 
     def opened(self, now: Now) -> list[Output[ModbusUnit]]:
         """Begin: set the nodding up, then read."""
@@ -228,7 +229,7 @@ class AxisDriver:
         return self._broken(f"{why}; check its power, the network cable, address and port")
 
     def _refused(self, asked: _Asked, failure: ModbusFailure, now: Now) -> list[Output[ModbusUnit]]:
-        self._counts[f"rejected.exception_{failure.code}"] += 1
+        self._counts.add(f"rejected.exception_{failure.code}")
         self._asked = None
         self._heard_ns = now.monotonic_ns
         again_ns = now.monotonic_ns + round(self.settings.retry * 1e9)

@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
+from msdrivers.protocol.bounded_counter import BoundedCounter
+
 M = TypeVar("M")
 M_co = TypeVar("M_co", covariant=True)
 
@@ -58,7 +60,7 @@ class Scanner(Generic[M]):
         self._buffer = bytearray()
         self._offset = 0
         self._skipped = 0
-        self._frames: Counter[str] = Counter()
+        self._frames = BoundedCounter()
         self._rejected: Counter[str] = Counter()
 
     @property
@@ -106,7 +108,7 @@ class Scanner(Generic[M]):
                 self._skip(at, at + 1)
                 at += 1
                 continue
-            self._frames[verdict.kind] += 1
+            self._frames.add(verdict.kind)
             if verdict.message is not None:
                 messages.append(verdict.message)
             at = verdict.end

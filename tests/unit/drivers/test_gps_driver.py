@@ -256,6 +256,22 @@ def test_given_a_rolled_over_week_when_it_comes_then_the_time_is_of_these_days()
     assert abs(right.header.device_utime - START) < 10 * SECOND
 
 
+@pytest.mark.parametrize("binary", [True, False])
+def test_given_logs_of_both_antennas_when_they_come_then_only_those_of_the_primary_are_used(binary: bool):
+    body = Position(0, PositionType.SINGLE, 50.0, -111.0, 700.0, -20.0, 61, 1.0, 2.0, 3.0, "", 0.0, 0.0, 9, 8)
+    sent = []
+    for n in range(6):
+        # the secondary antenna is logged in between, a metre away
+        at = 252_818_000 + n * 500
+        header = LogHeader("BESTPOS", 2288, at, TimeStatus.FINESTEERING, "COM1", 0, 0, binary, n % 2)
+        sent.append(encode(NovatelLog(header, body._replace(latitude=50.0 + (n % 2) * 1e-5))))
+    driven = alone(*sent)
+    assert {each.latitude_deg for each in driven.samples} == {50.0}
+    assert len(driven.samples) == 3
+    assert driven.driver.counts["rejected.secondary_antenna"] == 3
+    assert sum("secondary antenna" in each for each in driven.words.splitlines()) == 1
+
+
 def test_given_a_leap_second_when_it_comes_then_the_fix_is_published_without_a_device_time():
     # week 1930, 18 s is 2017-01-01 00:00:00 UTC
     body = Position(0, PositionType.SINGLE, 50.0, -111.0, 700.0, -20.0, 61, 1.0, 2.0, 3.0, "", 0.0, 0.0, 9, 8)

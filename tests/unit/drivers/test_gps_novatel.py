@@ -248,3 +248,43 @@ def test_given_a_stray_beginning_of_text_when_a_good_message_follows_then_it_is_
     alone.feed(good)
     stream.feed(noise + good + b"\r\n")
     assert {**stream.counts, "skipped": 0} == {**alone.counts, "skipped": 0}
+
+
+@pytest.mark.parametrize("as_binary", [True, False])
+def test_given_a_log_of_the_secondary_antenna_when_read_then_it_is_marked(as_binary: bool):
+    body = one(BESTPOSB).body
+    header = LogHeader("BESTPOS", 2288, 5000, TimeStatus.FINE, "COM1", 0, 0, as_binary, antenna=1)
+    frame = encode(NovatelLog(header, body))
+    stream = GpsStream()
+    (log,) = stream.feed(frame)
+    assert isinstance(log, NovatelLog)
+    assert (log.header.name, log.header.antenna) == ("BESTPOS", 1)
+    assert stream.counts[f"novatel.BESTPOS{'B' if as_binary else 'A'}_1"] == 1
+
+
+def test_given_bits_of_format_and_source_when_read_then_only_the_source_is_taken_for_the_antenna():
+    assert one(binary(42, one_body(), kind=0x1F)).header.antenna == 31
+    assert one(binary(42, one_body(), kind=0x00)).header.antenna == 0
+
+
+def test_given_a_source_that_five_bits_cannot_hold_when_read_then_the_log_is_rejected():
+    head = "BESTPOSA_32,COM1,0,0.0,FINE,2288,5.000,00000000,0000,0"
+    stream = GpsStream()
+    assert stream.feed(text(f"{head};{BESTPOSA.decode().partition(';')[2].partition('*')[0]}")) == []
+    assert stream.counts["rejected.novatel_value"] == 1
+
+
+def one_body() -> bytes:
+    return BESTPOSB[28:-4]
+
+
+def test_given_thousands_of_log_names_when_counted_then_the_counters_stay_few_and_short():
+    stream = GpsStream()
+    for number in range(2000):
+        stream.feed(text(f"LOG{number}XA,COM1,0,0.0,FINE,2288,5.000,00000000,0000,0;1"))
+        stream.feed(binary(3000 + number, b""))
+    counts = stream.counts
+    assert len(counts) <= 70
+    assert max(map(len, counts)) <= 48
+    # nothing is lost from the sum
+    assert sum(number for name, number in counts.items() if name.startswith("novatel.")) == 4000

@@ -56,7 +56,8 @@ class Fixes:
         self._told: set[str] = set()
         self.counts: Counter[str] = Counter()
         """`repeated`: instants that came again. `superseded`: NMEA epochs beside the position log. `rejected.datum`:
-        positions on another datum than WGS 84. `unknown_type`: fixes published as none for their type."""
+        positions on another datum than WGS 84. `rejected.secondary_antenna`: logs of an antenna that the position is not
+        asked of. `unknown_type`: fixes published as none for their type."""
 
     def clear(self) -> None:
         """Forget what waits: the line was closed, or the receiver has started anew."""
@@ -97,6 +98,12 @@ class Fixes:
     def log(self, log: NovatelLog, host_utime: int, now: Now) -> list[Fix]:
         """Take a log that began to come in at `host_utime`."""
         if log.header.name not in self._logs or log.body is None:
+            return []
+        if log.header.antenna:
+            self.counts["rejected.secondary_antenna"] += 1
+            self._problem(
+                f"{log.header.label} is of the secondary antenna and is not used: log {log.header.name} without _1"
+            )
             return []
         instant = (log.header.week, log.header.milliseconds)
         if not isinstance(log.body, Position):

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from modelserver.messages import FixType
 from modelserver.messages.flags import NAN
 from msdrivers.protocol.gps_time import DAY, SECOND
-from msdrivers.protocol.nmea.fix import fix_type
+from msdrivers.protocol.nmea.fix import fix_type, satellites_used
 from msdrivers.protocol.nmea.sentences import NmeaSentence
 
 POSITION_KINDS = frozenset({"GGA", "GNS", "RMC", "GLL"})
@@ -221,7 +221,6 @@ def merged(sentences: list[NmeaSentence], instant: int | None, utime: int) -> Nm
 
     # the height goes with its own place, not with another sentence's
     heights = [each for each in places if each.kind in ("GGA", "GNS")]
-    counts = [each.satellites for each in sentences if each.satellites is not None]
     return NmeaEpoch(
         start=sentences[0].start,
         kinds=tuple(each.kind for each in sentences),
@@ -232,7 +231,7 @@ def merged(sentences: list[NmeaSentence], instant: int | None, utime: int) -> Nm
         longitude=said("longitude", places),
         height_msl=said("height_msl", heights),
         undulation=said("undulation", heights),
-        satellites=max(counts, default=-1),
+        satellites=satellites_used(sentences),
         hdop=said("hdop", last),
         vdop=said("vdop", last),
         pdop=said("pdop", last),

@@ -14,8 +14,10 @@ _QUALITY = {
     4: FixType.RTK_FIXED,
     5: FixType.RTK_FLOAT,
     6: FixType.DEAD_RECKONING,
+    9: FixType.DIFFERENTIAL,
 }
-"""GGA's indicator. 7 (typed in by hand) and 8 (simulated) are no measurement: NONE, as 0."""
+"""GGA's indicator. 7 (typed in by hand) and 8 (simulated) are no measurement: NONE, as 0. 9 is no value of the standard:
+NovAtel receivers send it for corrections by satellite (SBAS)."""
 
 _MODE = {
     "A": FixType.FIX_3D,
@@ -31,7 +33,7 @@ _MODE = {
 def fix_type(sentences: Sequence[NmeaSentence]) -> FixType:
     """Return the fix type; NONE if any sentence flags the fix invalid, or none has a position."""
     placed = [each for each in sentences if each.has_position]
-    if not placed or any(_denies(each) for each in sentences):
+    if not placed or any(_denies(each) for each in sentences) or _has_no_satellites(sentences):
         return FixType.NONE
     dimensions = [each.dimension for each in sentences if each.dimension is not None]
     dimension = max(dimensions, default=None)
@@ -55,6 +57,22 @@ def _denies(sentence: NmeaSentence) -> bool:
             return True
         return sentence.status != "A" and sentence.mode != "E"
     return False
+
+
+def satellites_used(sentences: Sequence[NmeaSentence]) -> int:
+    """Return how many satellites the fix of one instant uses; -1 where no sentence counts them.
+
+    Some receivers (Furuno GL, Garmin 25) send a GGA with 0 in use while the GSA of the same instant lists them: then the
+    list counts.
+    """
+    counted = max((each.satellites for each in sentences if each.satellites is not None), default=-1)
+    return counted or sum(each.listed for each in sentences)
+
+
+def _has_no_satellites(sentences: Sequence[NmeaSentence]) -> bool:
+    """Return whether a GGA counts no satellites in use: some receivers keep the last quality when they lose all."""
+    counts = any(each.kind == "GGA" and each.satellites == 0 for each in sentences)
+    return counts and satellites_used(sentences) == 0
 
 
 def _statements(placed: Iterable[NmeaSentence]) -> Iterator[FixType]:

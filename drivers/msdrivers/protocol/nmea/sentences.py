@@ -27,7 +27,8 @@ class NmeaSentence:
     time_of_day: microseconds of UTC's day, 86,400 s and more inside a leap second. day: days since 1970-01-01.
     latitude, longitude: degrees on WGS 84, or the receiver's own datum. height_msl, undulation: metres.
     quality: GGA's indicator, 0 = no fix. status: "A" or "V" of RMC and GLL. mode: letters of the mode indicator, one
-    per satellite system for GNS. dimension: 1 none, 2, 3, of GSA.
+    per satellite system for GNS. dimension: 1 none, 2, 3, of GSA. satellites: the number in use, of GGA and GNS.
+    listed: how many GSA names as in use.
     speed: m/s. track, heading: degrees clockwise from true north, of the motion and of the antenna baseline. Speed and
     track are nan where the sentence says that they are not valid.
     sigma_*: standard deviations along latitude, longitude and height, metres.
@@ -47,6 +48,7 @@ class NmeaSentence:
     mode: str = ""
     dimension: int | None = None
     satellites: int | None = None
+    listed: int = 0
     hdop: float = NAN
     vdop: float = NAN
     pdop: float = NAN
@@ -227,10 +229,15 @@ def _gsa(said: _Fields, start: int) -> NmeaSentence:
         "GSA",
         start,
         dimension=fields.whole(said["mode_fix_type"], 1, 3),
+        listed=sum(bool(said[name]) for name in _LISTED),
         pdop=fields.amount(said["pdop"]),
         hdop=fields.amount(said["hdop"]),
         vdop=fields.amount(said["vdop"]),
     )
+
+
+_LISTED = tuple(f"sv_id{number:02d}" for number in range(1, 13))
+"""Fields of GSA with the satellites in use."""
 
 
 def _gst(said: _Fields, start: int) -> NmeaSentence:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Callable, Sequence
 from enum import IntEnum
 from math import isfinite
 
 from msdrivers.protocol.novatel.logs import (
     DATUMS,
+    GREATEST_ANTENNA,
     Body,
     Heading,
     LogHeader,
@@ -34,8 +36,9 @@ def long_header(fields: Sequence[str]) -> LogHeader:
     name, port, sequence, _, status, week, seconds, receiver, _, _ = fields
     milliseconds = _milliseconds(seconds)
     known = TimeStatus[status] if status in TimeStatus.__members__ else TimeStatus.UNKNOWN
+    name, antenna = _name(name)
     return LogHeader(
-        _name(name),
+        name,
         _whole(week, 0xFFFF),
         milliseconds,
         known,
@@ -43,13 +46,16 @@ def long_header(fields: Sequence[str]) -> LogHeader:
         _whole(sequence, 0xFFFF),
         _bounded(int(receiver, 16), 0xFFFF_FFFF),
         False,
+        antenna,
     )
 
 
 def short_header(fields: Sequence[str]) -> LogHeader:
     """Read the three fields of `%NAMESA,...`."""
     name, week, seconds = fields
-    return LogHeader(_name(name), _whole(week, 0xFFFF), _milliseconds(seconds), TimeStatus.UNKNOWN, "", 0, 0, False)
+    name, antenna = _name(name)
+    milliseconds = _milliseconds(seconds)
+    return LogHeader(name, _whole(week, 0xFFFF), milliseconds, TimeStatus.UNKNOWN, "", 0, 0, False, antenna)
 
 
 def read(name: str, fields: Sequence[str]) -> Body | None:
@@ -67,10 +73,15 @@ def read(name: str, fields: Sequence[str]) -> Body | None:
     return body
 
 
-def _name(name: str) -> str:
-    if not name.endswith("A"):
-        raise ValueError(f"{name} is no ASCII log")
-    return name[:-1]
+_NAME = re.compile(r"(\w+)A(?:_([0-9]{1,2}))?", re.ASCII)
+
+
+def _name(text: str) -> tuple[str, int]:
+    """Return the name of a log and its measurement source."""
+    parts = _NAME.fullmatch(text)
+    if parts is None:
+        raise ValueError(f"{text} is no ASCII log")
+    return parts[1], _whole(parts[2] or "0", GREATEST_ANTENNA)
 
 
 def _milliseconds(seconds: str) -> int:

@@ -45,7 +45,7 @@ def _binary(log: NovatelLog, body: Body) -> bytes:
         b"\xaa\x44\x12",
         binary.LONG_HEADER.size,
         _IDS[header.name],
-        0,
+        header.antenna,
         port,
         len(content),
         header.sequence,
@@ -79,7 +79,7 @@ def _ascii(log: NovatelLog, body: Body) -> bytes:
     header = log.header
     status = TimeStatus(header.time_status).name
     head = (
-        f"{header.name}A,{header.port or 'COM1'},{header.sequence},0.0,{status},{header.week},"
+        f"{header.label},{header.port or 'COM1'},{header.sequence},0.0,{status},{header.week},"
         f"{header.milliseconds / 1000.0:.3f},{header.receiver_status:08x},0000,{_BUILD}"
     )
     text = f"{head};{','.join(_fields(header.name, body))}"

@@ -9,7 +9,7 @@ from msdrivers.protocol.framing import CHANCE, Refused, Taken
 from msdrivers.protocol.novatel import ascii as text_logs
 from msdrivers.protocol.novatel.binary import LONG_HEADER, READERS, SHORT_HEADER
 from msdrivers.protocol.novatel.crc import crc32
-from msdrivers.protocol.novatel.logs import MESSAGE_IDS, Body, LogHeader, NovatelLog, TimeStatus
+from msdrivers.protocol.novatel.logs import GREATEST_ANTENNA, MESSAGE_IDS, Body, LogHeader, NovatelLog, TimeStatus
 
 LONGEST = 1024
 """Bytes of a log. Longer ones (raw observations) are not read here; a broken length must not swallow good logs."""
@@ -82,8 +82,8 @@ class BinaryFormat:
             body = reader(buffer[at + head : end])
             if body is None:
                 return Refused("novatel_value")
-        header = LogHeader(name, week, ms, status, str(port), sequence, receiver, True)
-        return Taken(end + 4, f"novatel.{name}B", NovatelLog(header, body, start))
+        header = LogHeader(name, week, ms, status, str(port), sequence, receiver, True, kind & GREATEST_ANTENNA)
+        return Taken(end + 4, f"novatel.{header.label}", NovatelLog(header, body, start))
 
     def _short(self, buffer: bytearray, at: int, available: int, start: int) -> Taken[NovatelLog] | Refused | None:
         end = at + SHORT_HEADER.size + buffer[at + 3]
@@ -106,7 +106,7 @@ def _sum_is_right(buffer: bytearray, at: int, end: int) -> bool:
 
 
 class AsciiFormat:
-    """`#NAMEA,header;body*crc32` and `%NAMESA,header;body*crc32`."""
+    """`#NAMEA,header;body*crc32` and `%NAMESA,header;body*crc32`; `NAMEA_1` is of the secondary antenna."""
 
     leads = b"#%"
     _begin = re.compile(rb"[#%][A-Z][A-Z0-9_]*(,?)")
@@ -140,7 +140,7 @@ class AsciiFormat:
             header, said = _read_text(content.decode("ascii"), long)
         except ValueError:
             return Refused("novatel_value")
-        return Taken(end + 9, f"novatel.{header.name}A", NovatelLog(header, said, start))
+        return Taken(end + 9, f"novatel.{header.label}", NovatelLog(header, said, start))
 
 
 def _read_text(content: str, long: bool) -> tuple[LogHeader, Body | None]:

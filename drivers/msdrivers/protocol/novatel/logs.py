@@ -87,7 +87,8 @@ class LogHeader(NamedTuple):
 
     name: e.g. "BESTPOS", or "id 1234" for an unknown binary log. week may be rolled over, see `gps_time`.
     milliseconds: of the week. time_status: a `TimeStatus`; of a short header UNKNOWN, for it tells none.
-    port: as ASCII names it, or the binary address's number.
+    port: as ASCII names it, or the binary address's number. antenna: the measurement source, 0 for the primary antenna,
+    1 for the secondary one; ASCII writes it as a suffix of the name (`BESTPOSA_1`).
     """
 
     name: str
@@ -98,6 +99,12 @@ class LogHeader(NamedTuple):
     sequence: int
     receiver_status: int
     binary: bool
+    antenna: int = 0
+
+    @property
+    def label(self) -> str:
+        """The name as receivers write it: `BESTPOSB`, `BESTPOSA_1`."""
+        return f"{self.name}{'B' if self.binary else 'A'}{f'_{self.antenna}' if self.antenna else ''}"
 
 
 class Position(NamedTuple):
@@ -207,6 +214,9 @@ MESSAGE_IDS = {
     1335: "HEADING2",
     1465: "INSPVAX",
 }
+
+GREATEST_ANTENNA = 31
+"""The largest measurement source: five bits of a binary log's message type."""
 
 DATUMS = {"WGS84": 61}
 """Datum names of ASCII logs to the numbers of binary ones; others become 0, for the driver takes WGS 84 only."""
