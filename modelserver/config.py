@@ -21,6 +21,7 @@ from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.magnetometer import MagnetometerCalibration
 from modelserver.localization.raw.settings import RawSettings
 from modelserver.messages import Mode
+from modelserver.regular_files import NotRegularFileError, read_start
 
 _STRICT: ConfigDict = {"extra": "forbid", "allow_inf_nan": False}
 
@@ -532,13 +533,17 @@ _INSTEAD: dict[FileKind, str] = {
 
 
 def _bytes(path: Path) -> bytes:
-    """Return what a vehicle file holds. Raises ConfigError for a directory and what is a file of another kind."""
-    if path.is_dir():
+    """Return what a vehicle file holds.
+
+    Raises ConfigError for a directory, a FIFO, a device, and a file of another kind; OSError.
+    """
+    try:
+        # the beginning of a larger file says what it is; the reader rejects it
+        raw = read_start(path, config_reader.MAX_BYTES + 1)
+    except NotRegularFileError as error:
         there = next((each for each in ("vehicle.yaml", "vehicle.yml") if (path / each).is_file()), "")
-        fix = f"give {path / there}" if there else "give the vehicle file itself"
-        raise _no_vehicle_file(path, f"this is a directory, {NOT_ONE}", fix)
-    with path.open("rb") as file:
-        raw = file.read(config_reader.MAX_BYTES + 1)
+        fix = f"give {path / there}" if error.is_directory and there else "give the vehicle file itself"
+        raise _no_vehicle_file(path, f"this is {error.kind}, {NOT_ONE}", fix) from None
     kind = file_kind(raw)
     if kind in _INSTEAD:
         what = kind.value if kind.is_nothing else f"{kind.value}, {NOT_ONE}"

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from modelserver.errors import KeyFileError, shown
+from modelserver.regular_files import open_regular
 from modelserver.signing import SHORTEST_KEY, Key
 
 MAX_BYTES: Final = 8192
@@ -41,7 +42,7 @@ def read_keys(path: str | Path) -> tuple[Key, ...]:
     path = Path(path)
     handed = _credential(path.name)
     try:
-        with (handed or path).open("rb") as file:
+        with open_regular(handed or path) as file:
             status = os.fstat(file.fileno())
             raw = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
@@ -49,7 +50,7 @@ def read_keys(path: str | Path) -> tuple[Key, ...]:
     except OSError as error:
         raise KeyFileError(f"the key file {shown(str(path), LONGEST_PATH)} cannot be read: {error.strerror}") from None
     # what systemd hands over lies in a directory that nobody else may enter
-    if handed is None and stat.S_ISREG(status.st_mode):
+    if handed is None:
         if status.st_mode & (stat.S_IRWXO | stat.S_IWGRP):
             mode = stat.S_IMODE(status.st_mode)
             raise KeyFileError(

@@ -9,7 +9,11 @@ import os
 from pathlib import Path
 
 from modelserver.errors import ModelServerError, shown
+from modelserver.regular_files import read_regular
 from msdrivers.emulate.gx1_unit import Eeprom
+
+MAX_BYTES = 1 << 16
+"""The memory has 128 words; more is another file."""
 
 
 def read_eeprom(path: Path) -> Eeprom:
@@ -18,7 +22,7 @@ def read_eeprom(path: Path) -> Eeprom:
     Raises ModelServerError for a file that holds something else, OSError for one that cannot be read.
     """
     try:
-        text = path.read_text(encoding="ascii", errors="replace")
+        text = read_regular(path, MAX_BYTES).decode("ascii", errors="replace")
     except FileNotFoundError:
         return Eeprom.factory()
     words: dict[int, int] = {}

@@ -13,6 +13,7 @@ clock in nanoseconds, and the unit in hexadecimal. A last line that breaks off i
 from __future__ import annotations
 
 import contextlib
+import io
 import itertools
 import logging
 from collections.abc import Iterator
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, TextIO, TypeVar
 
 from modelserver.errors import RecordingError
+from modelserver.regular_files import NotRegularFileError, open_regular
 from msdrivers.station import Now
 
 log = logging.getLogger(__name__)
@@ -195,7 +197,10 @@ def recording(path: Path, limit: int) -> Iterator[RawWriter]:
             break
         except FileExistsError:
             if not path.is_file():
-                # a device, e.g. /dev/null
+                if not path.is_char_device():
+                    # opening a FIFO would wait for its reader
+                    raise RecordingError(f"{path} is there and is no file; name another") from None
+                # e.g. /dev/null
                 stream = path.open("w", encoding="ascii", errors="replace")
                 break
             if number == 1 and not _is_recording(path):
@@ -214,7 +219,7 @@ def recording(path: Path, limit: int) -> Iterator[RawWriter]:
 
 def _is_recording(file: Path) -> bool:
     """Return whether a file begins as a recording does, as far as it goes: one that a full disk cut short does too."""
-    with file.open("rb") as stream:
+    with open_regular(file) as stream:
         return MAGIC.encode().startswith(stream.read(len(MAGIC)))
 
 
@@ -222,14 +227,17 @@ def _is_blank(file: Path) -> bool:
     """Return whether a file has no more than a first line."""
     if not file.is_file():
         return False
-    with file.open("rb") as stream:
+    with open_regular(file) as stream:
         stream.readline(MAX_LINE)
         return not stream.read(1)
 
 
 def open_for_reading(path: Path) -> RawReader:
     """Return the reader of a file. Raises RecordingError where it is no recording, OSError where it cannot be read."""
-    stream = path.open(encoding="ascii", errors="replace")
+    try:
+        stream = io.TextIOWrapper(open_regular(path), encoding="ascii", errors="replace")
+    except NotRegularFileError as error:
+        raise RecordingError(f"{path}: this is {error.kind}, not a recording of a driver") from None
     try:
         return RawReader(stream, str(path))
     except RecordingError:

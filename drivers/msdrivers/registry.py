@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from modelserver.errors import ConfigError, Problem, Severity, Source, nearest_names, shown
 from modelserver.messages import GpsSample, ImuSample, JointsSample, Sample, VehicleStatusSample, WheelsSample
+from modelserver.regular_files import read_regular
 from msdrivers.faults import FAULTS, Fault
 from msdrivers.line_settings import CanSettings, LineSettings, ModbusSettings, SerialSettings, TcpSettings
 from msdrivers.station import Station
@@ -168,15 +169,16 @@ def _axis_unit(wanted: Emulation) -> Station[Any]:
 
 def _dbc(settings: Any, folder: Path) -> CanDatabase:
     """Return what the DBC file of a driver's settings says. Raises ConfigError."""
-    from msdrivers.protocol.can.database import parse_dbc
+    from msdrivers.protocol.can.database import MAX_TEXT, parse_dbc
 
     path = Path(settings.dbc)
     file = folder / path.expanduser()
     try:
         # some tools write the degree sign in Latin-1
-        text = file.read_bytes().decode("latin-1")
+        text = read_regular(file, MAX_TEXT).decode("latin-1")
     except (OSError, ValueError) as error:
-        there = [each.name for each in file.parent.glob("*")]
+        # the name nearest to that of a file which is there is its own
+        there = [each.name for each in file.parent.glob("*")] if isinstance(error, FileNotFoundError) else []
         near = tuple(str(path.with_name(name)) for name in nearest_names(path.name, there))
         fix = f"write {near[0]}" if near else "the path of a DBC file, relative to the vehicle file"
         said = f"the DBC file {shown(str(file), 200)} cannot be read: {getattr(error, 'strerror', None) or error}"

@@ -18,6 +18,7 @@ from typing import Self, TypeAlias
 
 from modelserver.errors import RecordingError
 from modelserver.messages import MAX_CHANNEL_LENGTH
+from modelserver.regular_files import NotRegularFileError, open_regular
 from modelserver.wire.fields import MAX_UTIME
 
 MAX_DATA = 256 << 20
@@ -116,7 +117,11 @@ class LogFile:
         self._data: Buffer = b""
 
     def __enter__(self) -> Self:
-        with self.path.open("rb") as file:
+        try:
+            file = open_regular(self.path)
+        except NotRegularFileError as error:
+            raise RecordingError(f"{self.path}: this is {error.kind}, not an LCM event log") from None
+        with file:
             self.size = file.seek(0, 2)
             if self.size == 0:
                 raise RecordingError(f"{self.path}: the log is empty")

@@ -15,7 +15,7 @@ VALUES = {"errors", "version", "spatial"}
 GEOMETRY = VALUES | {"geometry"}
 POSES = VALUES | {"messages", "geodesy", "earth", "magnetism", "history"}
 CORE = GEOMETRY | POSES | {"joints", "joint_reading", "joint_track", "joint_vector", "localization", "platform"}
-WIRE = VALUES | {"messages", "wire", "mslcm"}
+WIRE = VALUES | {"messages", "wire", "mslcm", "regular_files"}
 SIGNING = {"keys", "signing"}
 SERVICE = CORE | WIRE | {"answers", "core", "config", "file_kinds", "formats", "reload", "snapshot"} | SIGNING
 
@@ -26,7 +26,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "geometry": VALUES,
     "messages": VALUES,
     "signing": VALUES | {"messages"},
-    "keys": VALUES | {"messages", "signing"},
+    "keys": VALUES | {"messages", "signing", "regular_files"},
     "geodesy": VALUES | {"messages"},
     "earth": VALUES,
     "magnetism": VALUES,
@@ -36,9 +36,10 @@ MAY_IMPORT: dict[str, set[str]] = {
     "joint_vector": GEOMETRY | {"joint_reading", "joint_track"},
     "joints": GEOMETRY | {"messages", "joint_reading", "joint_track"},
     "file_kinds": set(),
+    "regular_files": set(),
     # loads code, and neither computes nor reads anything
     "filterpy_import": set(),
-    "formats": GEOMETRY | {"file_kinds"},
+    "formats": GEOMETRY | {"file_kinds", "regular_files"},
     "localization": GEOMETRY | POSES | {"filterpy_import"},
     "platform": CORE,
     "answers": CORE,
@@ -46,7 +47,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "snapshot": GEOMETRY | {"formats"},
     "core": CORE | {"answers", "reload"},
     "simulation": GEOMETRY | {"messages", "geodesy", "earth"},
-    "config": GEOMETRY | {"messages", "localization", "config_reader", "file_kinds"},
+    "config": GEOMETRY | {"messages", "localization", "config_reader", "file_kinds", "regular_files"},
     "config_reader": {"errors"},
     "wire": WIRE,
     "service": SERVICE,

@@ -71,8 +71,9 @@ def open_bag(path: Path) -> Iterator[Bag]:
         with path.open("rb") as file:
             if path.suffix == ".bag" and not file.read(9).startswith(b"#ROSBAG V"):
                 raise RecordingError(f"{path}: not a ROS bag: it does not begin with #ROSBAG")
-    elif not path.exists():
-        raise RecordingError(f"{path}: no such file")
+    elif not path.is_dir():
+        # a FIFO or a device would be waited for
+        raise RecordingError(f"{path}: {'neither a file nor a folder' if path.exists() else 'no such file'}")
     reader = None
     with _explained(path, "on opening it"):
         # ROS 2 bags may come without their type definitions; those of ROS itself have been stable

@@ -14,6 +14,7 @@ from modelserver.errors import ConfigError, GeometryError, Problem, Severity, So
 from modelserver.file_kinds import LOOKED_AT, FileKind, file_kind
 from modelserver.formats import check_file
 from modelserver.geometry.model import Model
+from modelserver.regular_files import NotRegularFileError, read_start
 from mstools.check_drivers import drivers_problems
 from mstools.missing import nearest_path
 from mstools.options import Variables, parse_variables
@@ -58,7 +59,7 @@ def _checked(file: str, variables: dict[str, str], strict: bool) -> tuple[Model 
     try:
         if is_vehicle_file(file):
             return checked_vehicle(file, strict)
-        if os.path.isfile(file) and not os.path.getsize(file):
+        if os.path.isfile(file) and not read_start(file, 1):
             fix = "see docs/geometry-files.md, or docs/vehicle-file.md for a vehicle file, for an example to begin with"
             return None, (Problem(Severity.ERROR, "the file is empty", Source(file), fix),)
         return check_file(file, variables, strict=strict)
@@ -70,11 +71,11 @@ def _checked(file: str, variables: dict[str, str], strict: bool) -> tuple[Model 
 
 
 def is_vehicle_file(file: str) -> bool:
-    """Return whether a file is a vehicle file, by what stands in it."""
-    if not os.path.isfile(file):
+    """Return whether a file is a vehicle file, by what stands in it. Raises OSError where it cannot be read."""
+    try:
+        return file_kind(read_start(file, LOOKED_AT)) is FileKind.VEHICLE
+    except NotRegularFileError:
         return False
-    with open(file, "rb") as stream:
-        return file_kind(stream.read(LOOKED_AT)) is FileKind.VEHICLE
 
 
 def checked_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tuple[Problem, ...]]:

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from modelserver.errors import ConfigError, Severity, shown
+from modelserver.formats.content import MAX_BYTES as LARGEST_FILE
+from modelserver.regular_files import read_regular
 from mstools import install_files
 from mstools.gathered import Gathered
 from mstools.install_place import check_installation, examples, program
@@ -263,7 +265,7 @@ def sources_of(made: Made) -> dict[str, bytes]:
             gathered.add(str(vehicle), f"it names {shown(name)}, a name that is taken", "give the file another one")
         else:
             with gathered.of(whole):
-                found[relative] = Path(whole).read_bytes()
+                found[relative] = read_regular(whole, LARGEST_FILE)
     gathered.check()
     return found
 

@@ -19,6 +19,7 @@ import typer
 
 from modelserver.errors import RecordingError, nearest_names, shown
 from modelserver.messages import Decision, Invalid, Verdict
+from modelserver.regular_files import FileTooLargeError, read_regular
 from modelserver.wire.eventlog import LogEvent, LogFile
 from modelserver.wire.kinds import is_of_service
 from mstools.asking import JsonOption, UrlOption
@@ -386,21 +387,20 @@ def read_times(path: Path) -> list[int]:
 
     Raises RecordingError with the line for anything else, OSError.
     """
-    if path.stat().st_size > TIMES_LIMIT:
-        raise RecordingError(f"{path}: larger than {TIMES_LIMIT >> 20} MiB: is this the file of times?")
+    try:
+        content = read_regular(path, TIMES_LIMIT)
+    except FileTooLargeError:
+        raise RecordingError(f"{path}: larger than {TIMES_LIMIT >> 20} MiB: is this the file of times?") from None
     times: list[int] = []
-    with path.open("r", encoding="utf-8", errors="replace") as file:
-        for number, line in enumerate(file, start=1):
-            text = line.partition("#")[0].strip()
-            if not text:
-                continue
-            if not (text.isascii() and text.isdigit()) or not 0 < (utime := int(text[:20])) < 1 << 61:
-                raise RecordingError(f"{path}:{number}: {shown(text, 40)} is no time in microseconds since 1970")
-            if times and utime < times[-1]:
-                raise RecordingError(
-                    f"{path}:{number}: {utime} is before {times[-1]}, the time above it; sort the file"
-                )
-            times.append(utime)
+    for number, line in enumerate(content.decode("utf-8", errors="replace").split("\n"), start=1):
+        text = line.partition("#")[0].strip()
+        if not text:
+            continue
+        if not (text.isascii() and text.isdigit()) or not 0 < (utime := int(text[:20])) < 1 << 61:
+            raise RecordingError(f"{path}:{number}: {shown(text, 40)} is no time in microseconds since 1970")
+        if times and utime < times[-1]:
+            raise RecordingError(f"{path}:{number}: {utime} is before {times[-1]}, the time above it; sort the file")
+        times.append(utime)
     if not times:
         raise RecordingError(f"{path}: lists no times")
     return times

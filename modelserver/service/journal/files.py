@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from modelserver.errors import RecordingError
+from modelserver.regular_files import open_regular
 from modelserver.service.journal.ring import SEGMENT_NAME, segments
 from modelserver.wire.eventlog import Buffer, LogEvent, scan
 from modelserver.wire.journal import MAGIC
@@ -32,7 +33,7 @@ def files_of(journal: Path) -> list[Path]:
 
 def _check(path: Path) -> None:
     """Raise RecordingError for a file that is none of a journal. One that was damaged is."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         if file.seek(0, 2) == 0:
             raise RecordingError(f"{path}: the file is empty, so there is nothing to verify; give the journal's folder")
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:

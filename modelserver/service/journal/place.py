@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Final
 
 from modelserver.config import VehicleConfig
+from modelserver.formats.content import MAX_BYTES as LARGEST_FILE
+from modelserver.regular_files import read_regular
 from modelserver.service.clock import Clock
 from modelserver.service.journal import build as journal_build
 from modelserver.service.journal.queue import JournalQueue
@@ -72,7 +74,8 @@ def make_writer(
     within = lock if lock is not None and directory.is_relative_to(lock.path.parent) else None
     ring = Ring(directory, most, min(LARGEST_SEGMENT, most // SEGMENTS), within)
     facts = {**journal_build.facts(), "vehicle": config.vehicle, "run": secrets.token_hex(8), "pid": os.getpid()}
-    files = [(str(path), path.read_bytes()) for path in (Path(file), Path(config.geometry)) if path.is_file()]
+    paths = [path for path in (Path(file), Path(config.geometry)) if path.is_file()]
+    files = [(str(path), read_regular(path, LARGEST_FILE)) for path in paths]
     queue = JournalQueue()
     origins = Origins(facts, files, config)
     return queue, JournalWriter(queue, ring, origins, clock, config.journal.sync_s, key=key)

@@ -23,6 +23,7 @@ from typing import Any, Final
 
 from modelserver.errors import RecordingError, WireError
 from modelserver.messages import GetHistory, GetTransformations, Noticed, Rejected
+from modelserver.regular_files import open_regular
 from modelserver.service.journal import build as journal_build
 from modelserver.service.journal import state as journal_state
 from modelserver.service.journal.chain import NEWEST_NAME, Chain, Finding, read_newest
@@ -188,7 +189,7 @@ class _Verifier:
         end: End | None = None
         found, before = self.found, self.found.bytes
         facts: dict[str, Any] | None = None
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             size = file.seek(0, 2)
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
         try:

@@ -13,6 +13,7 @@ from typing import Any
 
 from modelserver.geodesy import make_origin
 from modelserver.messages import Origin
+from modelserver.regular_files import read_start
 from modelserver.service.keeping.lock import Lock
 from modelserver.service.keeping.trouble import words_on
 
@@ -86,8 +87,7 @@ class OriginKeeper:
     def load(self) -> Origin | None:
         """Return the kept origin; None where there is none or the file is damaged, which is logged."""
         try:
-            with self.path.open("rb") as file:
-                text = file.read(MAX_BYTES).decode()
+            text = read_start(self.path, MAX_BYTES).decode()
         except FileNotFoundError:
             return None
         except (OSError, UnicodeDecodeError) as error:

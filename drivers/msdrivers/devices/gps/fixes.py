@@ -56,8 +56,8 @@ class Fixes:
         self._told: set[str] = set()
         self.counts: Counter[str] = Counter()
         """`repeated`: instants that came again. `superseded`: NMEA epochs beside the position log. `rejected.datum`:
-        positions on another datum than WGS 84. `rejected.secondary_antenna`: logs of an antenna that the position is not
-        asked of. `unknown_type`: fixes published as none for their type."""
+        positions on another datum than WGS 84. `rejected.secondary_antenna`: logs of the secondary antenna.
+        `unknown_type`: fixes published as none for their type."""
 
     def clear(self) -> None:
         """Forget what waits: the line was closed, or the receiver has started anew."""

@@ -16,8 +16,8 @@ _QUALITY = {
     6: FixType.DEAD_RECKONING,
     9: FixType.DIFFERENTIAL,
 }
-"""GGA's indicator. 7 (typed in by hand) and 8 (simulated) are no measurement: NONE, as 0. 9 is no value of the standard:
-NovAtel receivers send it for corrections by satellite (SBAS)."""
+"""GGA's indicator. 7 (typed in by hand) and 8 (simulated) are no measurement: NONE, as 0. 9 is not in the
+standard: NovAtel receivers send it for corrections by satellite (SBAS)."""
 
 _MODE = {
     "A": FixType.FIX_3D,
@@ -62,8 +62,8 @@ def _denies(sentence: NmeaSentence) -> bool:
 def satellites_used(sentences: Sequence[NmeaSentence]) -> int:
     """Return how many satellites the fix of one instant uses; -1 where no sentence counts them.
 
-    Some receivers (Furuno GL, Garmin 25) send a GGA with 0 in use while the GSA of the same instant lists them: then the
-    list counts.
+    Some receivers (Furuno GL, Garmin 25) send a GGA with 0 in use while the GSA of the same instant lists them: then
+    the list counts.
     """
     counted = max((each.satellites for each in sentences if each.satellites is not None), default=-1)
     return counted or sum(each.listed for each in sentences)
