@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import heapq
 import operator
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
@@ -137,6 +138,58 @@ def _sharing_most(wanted: str, candidates: list[str]) -> list[str]:
     lengths = map(abs, map(operator.sub, map(len, candidates), repeat(len(wanted))))
     ranked = zip(map(operator.neg, shared), lengths, range(len(candidates)), strict=True)
     return [candidates[index] for _, _, index in heapq.nsmallest(COMPARED_NAMES, ranked)]
+
+
+_WORD = re.compile(r"\d+|[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[^\W\d_]+")
+"""The words of a name: `UtmGrid10S` has Utm, Grid, 10, S."""
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """Return the known name that `name` is a misspelling of; empty where that is not clear.
+
+    Clear is a single nearest name by the optimal string alignment distance (a letter more, less or other, or two
+    neighbors exchanged): at most one such step for up to seven characters, two for more. Numbers and single letters
+    tell names of a family apart (`Wheel1`, `CameraL`, `UtmGrid10S`), so they must be the same: another of the family is
+    another thing. Case is no difference.
+    """
+    wanted = name.casefold()
+    if not 3 <= len(wanted) <= COMPARED_LENGTH:
+        exact = [each for each in islice(known, KNOWN_NAMES) if each.casefold() == wanted and name]
+        return exact[0] if len(exact) == 1 else ""
+    most = 1 if len(wanted) <= 7 else 2
+    names = [each for each in islice(known, KNOWN_NAMES) if abs(len(each) - len(wanted)) <= most]
+    if len(names) > COMPARED_NAMES:
+        folded = [each.casefold() for each in names]
+        chosen = set(_sharing_most(wanted, folded))
+        names = [each for each, key in zip(names, folded, strict=True) if key in chosen]
+    found = sorted((distance, each) for each in names if (distance := _distance(wanted, each.casefold(), most)) <= most)
+    if not found or (len(found) > 1 and found[0][0] == found[1][0]):
+        return ""
+    best = found[0][1]
+    return best if _codes(best) == _codes(name) else ""
+
+
+def _codes(name: str) -> list[str]:
+    """Return the numbers and single letters among the words of a name."""
+    words = [word.casefold() for word in _WORD.findall(name)]
+    return [word for word in words if len(word) == 1 or word.isdecimal()]
+
+
+def _distance(a: str, b: str, most: int) -> int:
+    """Return the optimal string alignment distance of two words, or more than `most`."""
+    two_above: list[int] = []
+    above = list(range(len(b) + 1))
+    for i, letter in enumerate(a, 1):
+        row = [i]
+        for j, other in enumerate(b, 1):
+            cost = min(above[j] + 1, row[j - 1] + 1, above[j - 1] + (letter != other))
+            if i > 1 and j > 1 and letter == b[j - 2] and a[i - 2] == other:
+                cost = min(cost, two_above[j - 2] + 1)
+            row.append(cost)
+        if min(row) > most:
+            return most + 1
+        two_above, above = above, row
+    return above[-1]
 
 
 def shown(name: str, limit: int = 80) -> str:

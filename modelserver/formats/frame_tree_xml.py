@@ -10,6 +10,9 @@ axes: Rz(yaw) Ry(pitch) Rx(roll)); what is left out is 0. The form knows no bodi
 
 So a frame keeps its own name, `Parent:Frame`, and what is mounted together moves together, which is how joints
 will enter. Numbers are taken as written. NASA's own files are x forward, y right, z down.
+
+A Parent is a path as `frame_paths` describes it. One that the file does not define but that is outside a vehicle's file
+by its nature (an absolute path, the earth, a UTM grid) becomes a root itself, so that what stands in it stays together.
 """
 
 from __future__ import annotations
@@ -21,11 +24,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from modelserver.errors import Severity, Source, nearest_names, shown
+from modelserver.errors import Severity, Source, nearest_names, shown, suggestion
 from modelserver.formats import numbers
 from modelserver.formats.circles import circles
+from modelserver.formats.frame_paths import ANY, ROOT, Ancestry, FramePath, parse_path
 from modelserver.formats.spelling import label
 from modelserver.formats.xml_document import Named, line
+from modelserver.geometry import names
 from modelserver.geometry.builder import BodyBuilder, ModelBuilder
 from modelserver.spatial.pose import Pose
 
@@ -60,9 +65,13 @@ def load(root: Element, builder: ModelBuilder, file: str, variables: Mapping[str
         reader.frame(element)
     reader.others(root)
     reader.report_variables()
-    if reader.parents_exist():
+    if reader.place():
         reader.group()
     return builder
+
+
+_OUTSIDE = re.compile(r"Earth|UtmGrid\d{1,2}[A-Z]|\$\{?SITE_FRAME\}?")
+"""Frames that NASA's frame store has without a file: the earth, its UTM grids, and the site that the robot is at."""
 
 
 @dataclass(slots=True)
@@ -72,6 +81,7 @@ class _Frame:
     pose: Pose
     source: Source
     parent_source: Source
+    path: FramePath
 
 
 class _Reader:
@@ -80,6 +90,9 @@ class _Reader:
         self.file = file
         self.variables = variables
         self.frames: dict[str, _Frame] = {}
+        """By name; a further frame of a name, which stands in another parent, by its parent and name."""
+        self.parents: dict[str, str] = {}
+        """For each frame the key of its parent, empty for a root."""
         self.undefined: dict[str, list[Source]] = {}
 
     def frame(self, element: Element) -> None:
@@ -98,17 +111,26 @@ class _Reader:
             )
         parent = self.expanded(parts.text("Parent") or "", parts.source("Parent"))
         pose = self.pose(parts)
-        frame = _Frame(name, parent, pose or Pose.identity(), parts.source(), parts.source("Parent"))
+        path = parse_path(parent)
+        frame = _Frame(name, parent, pose or Pose.identity(), parts.source(), parts.source("Parent"), path)
         first = self.frames.get(name)
+        key = name
+        if first is not None and first.path != path:
+            # names are unique below one parent only
+            key = f"{parent}/{name}"
+            first = self.frames.get(key)
         if first is None:
-            self.frames[name] = frame
-            return
-        moved, turned = first.pose.distance(frame.pose)
-        parents = "" if first.parent == parent else f", and hang on {label(first.parent)} and {label(parent)}"
+            self.frames[key] = frame
+        else:
+            self.report_twice(first, frame)
+
+    def report_twice(self, first: _Frame, second: _Frame) -> None:
+        """Report a second frame of a name in the same parent."""
+        moved, turned = first.pose.distance(second.pose)
+        lines = f"on line {first.source.line} and on line {second.source.line}"
         self.builder.warning(
-            f"frame {label(name)} is defined twice: on line {first.source.line} and on line {frame.source.line}; "
-            f"the two are {moved:.6g} m and {math.degrees(turned):.6g} deg apart{parents}; the first stands",
-            frame.source,
+            f"frame {label(first.name)} is defined twice: {lines}; the two are {moved:.6g} m and {math.degrees(turned):.6g} deg apart; the first stands",
+            second.source,
             "rename one of the two, or remove the wrong one",
         )
 
@@ -191,58 +213,195 @@ class _Reader:
                 "frames have type rapid::FrameRpyParameters" if severity is Severity.WARNING else "",
             )
 
-    def parents_exist(self) -> bool:
-        """Report parents that are not there and parents that go round in a circle; return whether all is well."""
-        well = True
-        near: dict[str, tuple[str, ...]] = {}
-        for frame in self.frames.values():
-            if frame.parent and frame.parent not in self.frames:
-                well = False
-                if frame.parent not in near:
-                    near[frame.parent] = nearest_names(frame.parent, self.frames) if len(near) < SUGGESTED else ()
-                names = near[frame.parent]
-                self.builder.error(
-                    f"Parent names {shown(frame.parent)}, which does not exist",
-                    frame.parent_source,
-                    f"write {names[0]}" if names else "name a frame of this file, or leave it empty for a root",
-                    names,
+    def place(self) -> bool:
+        """Find the parent of each frame; report those that are not there, and cycles. Return whether all is well."""
+        self.add_outside()
+        keys: dict[str, list[str]] = {}
+        for key, frame in self.frames.items():
+            keys.setdefault(frame.name, []).append(key)
+        ancestry = Ancestry({key: frame.name for key, frame in self.frames.items()}, self.parents)
+        several: list[str] = []
+        for key, frame in self.frames.items():
+            candidates = keys.get(frame.path.name, [])
+            if not frame.path.parts:
+                self.parents[key] = ""
+            elif len(candidates) == 1:
+                # whether its own ancestors are those of the path is looked at when all are placed
+                self.parents[key] = candidates[0]
+            elif candidates:
+                several.append(key)
+        self.choose(several, keys, ancestry)
+        missing = [key for key in self.frames if key not in self.parents]
+        well = self.has_no_cycles()
+        if well:
+            for key, frame in self.frames.items():
+                parent = self.parents.get(key, "")
+                if parent and not frame.path.is_plain and not self.fits(frame, parent, ancestry):
+                    missing.append(key)
+        self.report_missing(missing, keys, ancestry)
+        if ancestry.is_exhausted:
+            self.builder.error("the paths of parents are too many and too deep", Source(self.file), "write plain names")
+        return well and not missing and not ancestry.is_exhausted
+
+    def add_outside(self) -> None:
+        """Make a root of each parent that is not in the file and need not be."""
+        known = {frame.name for frame in self.frames.values()}
+        for frame in tuple(self.frames.values()):
+            path = frame.path
+            if not path.parts or not known.isdisjoint(path.parts) or path.name == ANY:
+                continue
+            is_outside = bool(_OUTSIDE.fullmatch(path.name))
+            if not is_outside and (not path.is_absolute or suggestion(path.name, known)):
+                continue
+            if path.name in names.RESERVED_BODIES:
+                # the service has a frame of that name itself: what stands there is a root
+                frame.path = ROOT
+            elif path.name not in self.frames:
+                source = frame.parent_source
+                self.frames[path.name] = _Frame(path.name, "", Pose.identity(), source, source, ROOT)
+                self.builder.problem(
+                    Severity.NOTE, f"Parent {label(frame.parent)} is not in the file; it becomes a root", source
                 )
-        for circle in circles(self.frames, lambda name: self.frames[name].parent if name in self.frames else None):
+
+    def choose(self, several: list[str], keys: dict[str, list[str]], ancestry: Ancestry) -> None:
+        """Place frames whose parent has a name that several frames have, once the ancestors of those are placed."""
+        while several and not ancestry.is_exhausted:
+            left: list[str] = []
+            for key in several:
+                path = self.frames[key].path
+                above = {each: ancestry.of(each) for each in keys[path.name] if each != key}
+                fitting = [(len(at), each) for each, at in above.items() if at is not None and path.matches(at)]
+                if None in above.values() and not any(depth == 1 for depth, _ in fitting):
+                    left.append(key)
+                elif fitting:
+                    self.parents[key] = min(fitting, key=lambda found: found[0])[1]
+                    if len(fitting) > 1:
+                        self.report_ambiguous(key, [each for _, each in fitting], ancestry)
+            if len(left) == len(several):
+                return
+            several = left
+
+    def report_ambiguous(self, key: str, fitting: list[str], ancestry: Ancestry) -> None:
+        frame = self.frames[key]
+        paths = ["/".join(ancestry.of(each) or ()) for each in fitting]
+        chosen = "/".join(ancestry.of(self.parents[key]) or ())
+        self.builder.warning(
+            f"Parent {label(frame.parent)} names {len(fitting)} frames: {', '.join(map(label, paths[:4]))}; "
+            f"{label(chosen)} is taken",
+            frame.parent_source,
+            "write the path of the one that is meant",
+        )
+
+    def fits(self, frame: _Frame, parent: str, ancestry: Ancestry) -> bool:
+        """Return whether the ancestors of the parent of a frame are those of its path."""
+        above = ancestry.of(parent)
+        if above is None:
+            return ancestry.is_exhausted
+        path = frame.path
+        if path.is_absolute:
+            # what stands above the roots of the file cannot be looked at
+            known = {each.name for each in self.frames.values()}
+            inside = next((n for n, part in enumerate(path.parts) if part in known or part == ANY), 0)
+            path = FramePath(path.parts[inside:], True)
+        return path.matches(above)
+
+    def report_missing(self, missing: list[str], keys: dict[str, list[str]], ancestry: Ancestry) -> None:
+        """Report parents that no frame is, each with what was probably meant, where that is clear."""
+        meant: dict[FramePath, str] = {}
+        for key in missing:
+            frame = self.frames[key]
+            path = frame.path
+            if path not in meant:
+                meant[path] = self.meant(frame, keys, ancestry) if len(meant) < SUGGESTED else ""
+            near = meant[path]
+            why = ""
+            if self.parents.get(key):
+                why = f": {label(path.name)} is {label('/'.join(ancestry.of(self.parents[key]) or ()))}"
+            self.builder.error(
+                f"Parent names {shown(frame.parent)}, which does not exist{why}",
+                frame.parent_source,
+                f"write {near}" if near else "name a frame of this file, or leave it empty for a root",
+                (near,) if near else (),
+            )
+
+    def meant(self, frame: _Frame, keys: dict[str, list[str]], ancestry: Ancestry) -> str:
+        """Return the parent that a path probably means with one name of it misspelled; empty where that is not clear.
+
+        It has as many names as the path: an ancestor is another place, and the frame itself cannot be its parent.
+        """
+        parts = list(frame.path.parts)
+        unknown = [n for n, part in enumerate(parts) if part not in keys and part != ANY]
+        if len(unknown) != 1:
+            return ""
+        (at,) = unknown
+        near = suggestion(parts[at], [name for name in keys if name != frame.name and name not in parts])
+        if not near:
+            return ""
+        parts[at] = near
+        found = FramePath(tuple(parts), frame.path.is_absolute)
+        placed = (ancestry.of(key) for key in keys[found.name])
+        if not found.is_plain and not any(above is not None and found.matches(above) for above in placed):
+            return ""
+        return ("/" if found.is_absolute else "") + "/".join(parts)
+
+    def has_no_cycles(self) -> bool:
+        """Report parents that form a cycle; return whether there is none."""
+        well = True
+        for circle in circles(self.frames, lambda key: self.parents.get(key) or None):
             well = False
             self.builder.error(
-                f"parents go round in a circle: {' in '.join(map(label, circle))}",
+                f"parents form a cycle: {' in '.join(map(label, circle))}",
                 self.frames[circle[-1]].parent_source,
-                "one of them must stand in a frame outside the circle, or have an empty Parent",
+                "one of them must stand in a frame outside the cycle, or have an empty Parent",
             )
         return well
 
     def group(self) -> None:
         """Make bodies of roots and of frames that carry others; see the module's text."""
-        carrying = {frame.parent for frame in self.frames.values() if frame.parent}
-        roots = [frame for frame in self.frames.values() if not frame.parent]
-        mounted = [frame for frame in self.frames.values() if frame.parent and frame.name in carrying]
+        self.drop_repeated()
+        carrying = {parent for parent in self.parents.values() if parent}
+        roots = [key for key in self.frames if not self.parents[key]]
+        mounted = [key for key in self.frames if self.parents[key] and key in carrying]
         bodies: dict[str, BodyBuilder] = {}
-        for frame in (*roots, *mounted):
-            bodies[frame.name] = self.builder.body(frame.name, source=frame.source)
-            bodies[frame.name].frame(ORIGIN, source=frame.source)
-        for frame in self.frames.values():
-            if not frame.parent:
+        taken: set[str] = set()
+        for key in (*roots, *mounted):
+            frame = self.frames[key]
+            name = frame.name
+            if name in taken:
+                name = f"{self.frames[self.parents[key]].name}.{name}" if self.parents[key] else name
+            taken.add(name)
+            bodies[key] = self.builder.body(name, source=frame.source)
+            bodies[key].frame(ORIGIN, source=frame.source)
+        for key, frame in self.frames.items():
+            parent = self.parents[key]
+            if not parent:
                 if frame.pose != Pose.identity():
-                    bodies[frame.name].pose = frame.pose
+                    bodies[key].pose = frame.pose
                 continue
             if frame.name == ORIGIN:
+                where = label(bodies[parent].name)
                 self.builder.error(
-                    f"a frame in {label(frame.parent)} is named {ORIGIN}, as the frame that stands for "
-                    f"{label(frame.parent)} itself will be",
+                    f"a frame in {where} is named {ORIGIN}, as the frame that stands for {where} itself will be",
                     frame.source,
                     "rename it",
                 )
                 continue
-            bodies[frame.parent].frame(frame.name, frame.pose, source=frame.source)
-            if frame.name in bodies:
-                self.builder.constraint(
-                    f"{frame.name}Fixed",
-                    f"{frame.parent}:{frame.name}",
-                    f"{frame.name}:{ORIGIN}",
-                    source=frame.source,
-                )
+            bodies[parent].frame(frame.name, frame.pose, source=frame.source)
+            if key in bodies:
+                name = bodies[key].name
+                end = f"{bodies[parent].name}:{frame.name}"
+                self.builder.constraint(f"{name}Fixed", end, f"{name}:{ORIGIN}", source=frame.source)
+
+    def drop_repeated(self) -> None:
+        """Drop what stands twice in one parent that is written in two ways, e.g. as a name and as a path."""
+        first: dict[tuple[str, str], str] = {}
+        kept: dict[str, str] = {}
+        for key, frame in self.frames.items():
+            kept[key] = first.setdefault((frame.name, self.parents[key]), key)
+        if len(first) == len(self.frames):
+            return
+        for key, stays in kept.items():
+            if key != stays:
+                self.report_twice(self.frames[stays], self.frames.pop(key))
+                del self.parents[key]
+        self.parents = {key: kept.get(parent, parent) for key, parent in self.parents.items()}

@@ -99,6 +99,158 @@ def test_a_missing_parent_offers_the_nearest():
     assert problem.line == line_of(text, "Mats")
 
 
+ARM = (tree_frame("Rover"), tree_frame("PanTiltUnit", "Rover", Z="-1"), tree_frame("Pan", "PanTiltUnit", X="0.5"))
+
+
+@pytest.mark.parametrize(
+    "parent",
+    ["Pan", "PanTiltUnit/Pan", "Rover/PanTiltUnit/Pan", "/Rover/PanTiltUnit/Pan", "Rover/.../Pan", "/.../Pan"]
+    + [
+        "/Rover/.../Pan",
+        ".../PanTiltUnit/Pan",
+        "PanTiltUnit//Pan/",
+        "./PanTiltUnit/./Pan",
+        "PanTiltUnit/Pan/.../Pan/..",
+    ]
+    + ["PanTiltUnit/Other/../Pan", "/Earth/UtmGrid10S/Rover/PanTiltUnit/Pan", " PanTiltUnit / Pan "],
+)
+def test_a_parent_that_is_a_path_is_resolved(parent):
+    if parent == "PanTiltUnit/Pan/.../Pan/..":
+        parent = "PanTiltUnit/Pan/Tilt/.."
+    model = read(tree(tree_frame("Lens", parent, X="1"), *ARM))
+    assert model.problems == ()
+    assert model.get_transformation("Pan:Lens", "Rover:Origin").pose.xyz == (1.5, 0.0, -1.0)
+    # as if the name alone had been written
+    assert model.revision == read(tree(tree_frame("Lens", "Pan", X="1"), *ARM)).revision
+
+
+@pytest.mark.parametrize("parent", ["Rover/Pan", "/Pan", "/PanTiltUnit/Pan", "Pan/PanTiltUnit", "Pan/.../Rover"])
+def test_a_path_that_leads_nowhere_is_an_error_and_no_ancestor_is_proposed(parent):
+    problem = only_problem(tree(*ARM, tree_frame("Lens", parent)))
+    assert "does not exist" in problem.message
+    assert problem.nearest == ()
+    assert "write" not in problem.fix
+
+
+@pytest.mark.parametrize(
+    ("parent", "meant"),
+    [
+        ("PanTiltUnit/Pna", "PanTiltUnit/Pan"),
+        ("PanTitlUnit/Pan", "PanTiltUnit/Pan"),
+        ("/Rovre/PanTiltUnit/Pan", "/Rover/PanTiltUnit/Pan"),
+        ("Rover/.../Pna", "Rover/.../Pan"),
+        # an ancestor, or the frame itself, is never meant
+        ("PanTiltUnit/Camera", ""),
+        ("PanTiltUnits/Camera", ""),
+        ("PanTiltUnit/Lnes", ""),
+        ("Lnes", ""),
+        ("PanTiltUnit/PanTiltUnti", ""),
+    ],
+)
+def test_a_misspelled_name_in_a_path_is_corrected_in_its_place_or_not_at_all(parent, meant):
+    problem = only_problem(tree(*ARM, tree_frame("Lens", parent)))
+    assert problem.nearest == ((meant,) if meant else ())
+    if meant:
+        assert read(tree(*ARM, tree_frame("Lens", meant))).frame("Pan:Lens")
+
+
+@pytest.mark.parametrize("parent", ["/Earth", "/Site", "UtmGrid10S", "/Earth/UtmGrid10S", "Earth", "/Moon/Crater"])
+def test_a_parent_outside_the_file_becomes_a_root_and_what_stands_in_it_stays_together(parent):
+    text = tree(tree_frame("Rover", parent, X="3"), tree_frame("Beacon", parent, X="1"), tree_frame("Mast", "Rover"))
+    (note,) = problems_of(text)
+    name = parent.split("/")[-1]
+    assert (note.severity, note.nearest) == (Severity.NOTE, ())
+    assert note.message == f"Parent {parent} is not in the file; it becomes a root"
+    model = read(text)
+    assert model.root.name == name
+    assert model.get_transformation("Rover:Mast", f"{name}:Beacon").pose.xyz == (2.0, 0.0, 0.0)
+
+
+def test_another_utm_zone_or_hemisphere_is_never_proposed():
+    text = tree(tree_frame("UtmGrid11S"), tree_frame("UtmGrid10N"), tree_frame("Rover", "UtmGrid10S"))
+    assert all(not each.nearest for each in problems_of(text))
+    assert read(text).get_body_list() == ["UtmGrid10S", "UtmGrid11S", "UtmGrid10N"] or read(text).frame(
+        "UtmGrid10S:Rover"
+    )
+    # nor where the name is no known one of the frame store
+    assert only_problem(tree(tree_frame("Grid11S"), tree_frame("Rover", "Grid10S"))).nearest == ()
+
+
+def test_a_misspelled_root_in_an_absolute_path_is_an_error_not_another_root():
+    assert only_problem(tree(tree_frame("Rover"), tree_frame("Mast", "/Rovr"))).nearest == ("/Rover",)
+
+
+def test_a_parent_in_the_world_that_the_service_keeps_is_a_root():
+    assert read(tree(tree_frame("Rover", "/World", X="3"), tree_frame("Mast", "Rover"))).root.name == "Rover"
+
+
+TWO_ARMS = (
+    tree_frame("Rover"),
+    tree_frame("LeftArm", "Rover", Y="1"),
+    tree_frame("RightArm", "Rover", Y="-1"),
+    tree_frame("Wrist", "LeftArm", X="0.5"),
+    tree_frame("Wrist", "RightArm", X="0.7"),
+)
+
+
+def test_a_name_that_occurs_below_two_parents_is_two_frames():
+    model = read(tree(*TWO_ARMS))
+    assert model.problems == ()
+    assert model.get_transformation("LeftArm:Wrist", "RightArm:Wrist").pose.xyz == pytest.approx((-0.2, 2.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("parent", "x"), [("LeftArm/Wrist", 0.5), ("RightArm/Wrist", 0.7), ("/Rover/.../RightArm/Wrist", 0.7)]
+)
+def test_a_path_tells_frames_of_one_name_apart(parent, x):
+    for frames in ((tree_frame("Tip", parent), *TWO_ARMS), (*TWO_ARMS, tree_frame("Tip", parent))):
+        model = read(tree(*frames))
+        assert model.problems == ()
+        (tip,) = [body for body in model.bodies if body.has_frame("Tip")]
+        assert model.get_transformation(f"{tip.name}:Tip", "Rover:Origin").pose.xyz[0] == x
+
+
+def test_a_name_that_is_ambiguous_is_a_warning_with_the_paths():
+    problem = only_problem(tree(*TWO_ARMS, tree_frame("Tip", "Wrist")), Severity.WARNING)
+    assert "names 2 frames: Rover/LeftArm/Wrist, Rover/RightArm/Wrist" in problem.message
+    # a root goes before frames further down
+    text = tree(*TWO_ARMS, tree_frame("Wrist"), tree_frame("Tip", "/Wrist"), tree_frame("Tap", "Wrist"))
+    model = read(text)
+    assert model.frame("Wrist:Tip")
+    assert model.frame("Wrist:Tap")
+
+
+def test_both_of_a_name_may_carry_frames():
+    model = read(tree(*TWO_ARMS, tree_frame("Tip", "LeftArm/Wrist"), tree_frame("Tip", "RightArm/Wrist", X="0.1")))
+    assert model.problems == ()
+    assert model.get_body_list() == ["Rover", "LeftArm", "RightArm", "Wrist", "RightArm.Wrist"]
+    assert model.get_transformation("RightArm.Wrist:Tip", "Wrist:Tip").pose.xyz == pytest.approx((0.3, -2.0, 0.0))
+
+
+def test_a_frame_twice_in_one_parent_that_is_written_in_two_ways_is_a_warning():
+    text = tree(*ARM, tree_frame("Lens", "Pan", X="1"), tree_frame("Lens", "PanTiltUnit/Pan", X="2"))
+    problem = only_problem(text, Severity.WARNING)
+    assert "defined twice" in problem.message
+    assert read(text).frame("Pan:Lens").pose.xyz == (1.0, 0.0, 0.0)
+
+
+def test_paths_in_a_cycle_are_an_error():
+    for frames in (
+        (tree_frame("A", "B/C"), tree_frame("B", "A"), tree_frame("C", "B")),
+        (tree_frame("R"), tree_frame("A", "A/A")),
+        (tree_frame("A", "A/B"), tree_frame("B", "A/B"), tree_frame("B", "B/A")),
+    ):
+        assert any(each.severity is Severity.ERROR for each in problems_of(tree(*frames)))
+
+
+def test_many_deep_paths_end_in_time():
+    deep = "/".join(f"F{n}" for n in range(2000))
+    frames = [tree_frame("F0"), *(tree_frame(f"F{n}", f"F{n - 1}") for n in range(1, 2000))]
+    frames += [tree_frame(f"G{n}", f"/{deep}") for n in range(2000)]
+    (problem,) = [each for each in problems_of(tree(*frames)) if each.severity is Severity.ERROR]
+    assert "too many and too deep" in problem.message
+
+
 def test_parents_in_a_circle_are_an_error_that_lists_them():
     text = tree(tree_frame("A"), tree_frame("B", "D"), tree_frame("C", "B"), tree_frame("D", "C"), tree_frame("E", "D"))
     problem = only_problem(text)
