@@ -129,7 +129,8 @@ class _Reader:
         moved, turned = first.pose.distance(second.pose)
         lines = f"on line {first.source.line} and on line {second.source.line}"
         self.builder.warning(
-            f"frame {label(first.name)} is defined twice: {lines}; the two are {moved:.6g} m and {math.degrees(turned):.6g} deg apart; the first stands",
+            f"frame {label(first.name)} is defined twice: {lines}; "
+            f"the two are {moved:.6g} m and {math.degrees(turned):.6g} deg apart; the first stands",
             second.source,
             "rename one of the two, or remove the wrong one",
         )
@@ -215,6 +216,11 @@ class _Reader:
 
     def place(self) -> bool:
         """Find the parent of each frame; report those that are not there, and cycles. Return whether all is well."""
+        named = {frame.name for frame in self.frames.values()}
+        for frame in self.frames.values():
+            if "/" in frame.parent and frame.parent in named:
+                # a name may hold slashes
+                frame.path = FramePath((frame.parent,), False)
         self.add_outside()
         keys: dict[str, list[str]] = {}
         for key, frame in self.frames.items():

@@ -104,19 +104,24 @@ ARM = (tree_frame("Rover"), tree_frame("PanTiltUnit", "Rover", Z="-1"), tree_fra
 
 @pytest.mark.parametrize(
     "parent",
-    ["Pan", "PanTiltUnit/Pan", "Rover/PanTiltUnit/Pan", "/Rover/PanTiltUnit/Pan", "Rover/.../Pan", "/.../Pan"]
-    + [
+    [
+        "Pan",
+        "PanTiltUnit/Pan",
+        "Rover/PanTiltUnit/Pan",
+        "/Rover/PanTiltUnit/Pan",
+        "Rover/.../Pan",
+        "/.../Pan",
         "/Rover/.../Pan",
         ".../PanTiltUnit/Pan",
         "PanTiltUnit//Pan/",
         "./PanTiltUnit/./Pan",
-        "PanTiltUnit/Pan/.../Pan/..",
-    ]
-    + ["PanTiltUnit/Other/../Pan", "/Earth/UtmGrid10S/Rover/PanTiltUnit/Pan", " PanTiltUnit / Pan "],
+        "PanTiltUnit/Pan/Tilt/..",
+        "PanTiltUnit/Other/../Pan",
+        "/Earth/UtmGrid10S/Rover/PanTiltUnit/Pan",
+        " PanTiltUnit / Pan ",
+    ],
 )
 def test_a_parent_that_is_a_path_is_resolved(parent):
-    if parent == "PanTiltUnit/Pan/.../Pan/..":
-        parent = "PanTiltUnit/Pan/Tilt/.."
     model = read(tree(tree_frame("Lens", parent, X="1"), *ARM))
     assert model.problems == ()
     assert model.get_transformation("Pan:Lens", "Rover:Origin").pose.xyz == (1.5, 0.0, -1.0)
@@ -169,9 +174,7 @@ def test_a_parent_outside_the_file_becomes_a_root_and_what_stands_in_it_stays_to
 def test_another_utm_zone_or_hemisphere_is_never_proposed():
     text = tree(tree_frame("UtmGrid11S"), tree_frame("UtmGrid10N"), tree_frame("Rover", "UtmGrid10S"))
     assert all(not each.nearest for each in problems_of(text))
-    assert read(text).get_body_list() == ["UtmGrid10S", "UtmGrid11S", "UtmGrid10N"] or read(text).frame(
-        "UtmGrid10S:Rover"
-    )
+    assert read(text).frame("UtmGrid10S:Rover")
     # nor where the name is no known one of the frame store
     assert only_problem(tree(tree_frame("Grid11S"), tree_frame("Rover", "Grid10S"))).nearest == ()
 
@@ -243,6 +246,11 @@ def test_paths_in_a_cycle_are_an_error():
         assert any(each.severity is Severity.ERROR for each in problems_of(tree(*frames)))
 
 
+def test_a_name_with_slashes_is_a_name_where_a_frame_has_it():
+    model = read(tree(tree_frame("A"), tree_frame("A/B", "A", X="1"), tree_frame("C", "A/B")))
+    assert model.get_transformation("A/B:C", "A:Origin").pose.xyz == (1.0, 0.0, 0.0)
+
+
 def test_many_deep_paths_end_in_time():
     deep = "/".join(f"F{n}" for n in range(2000))
     frames = [tree_frame("F0"), *(tree_frame(f"F{n}", f"F{n - 1}") for n in range(1, 2000))]
@@ -255,7 +263,7 @@ def test_parents_in_a_circle_are_an_error_that_lists_them():
     text = tree(tree_frame("A"), tree_frame("B", "D"), tree_frame("C", "B"), tree_frame("D", "C"), tree_frame("E", "D"))
     problem = only_problem(text)
     assert "B in D in C in B" in problem.message
-    assert "outside the circle" in problem.fix
+    assert "outside the cycle" in problem.fix
     assert "A in A" in only_problem(tree(tree_frame("A", "A"))).message
 
 
