@@ -483,13 +483,14 @@ def load_config(path: str | Path) -> VehicleConfig:
     return _with_paths(parse_config(_bytes(path), str(path)), path)
 
 
-def load_partly(path: str | Path) -> tuple[VehicleConfig | None, tuple[Problem, ...]]:
+def load_partly(path: str | Path, *, blank: bool = False) -> tuple[VehicleConfig | None, tuple[Problem, ...]]:
     """Read a vehicle file without what is wrong in it: None where too little is left; and every problem.
 
+    With `blank` the name, the geometry or the base frame that is missing is empty, so that the rest can be examined.
     Raises ConfigError for what is no YAML mapping, OSError where it cannot be read.
     """
     path = Path(path)
-    config, problems = parse_partly(_bytes(path), str(path))
+    config, problems = parse_partly(_bytes(path), str(path), blank=blank)
     return None if config is None else _with_paths(config, path), problems
 
 
@@ -562,7 +563,7 @@ def _with_paths(config: VehicleConfig, path: Path) -> VehicleConfig:
 
     return dataclasses.replace(
         config,
-        geometry=absolute(config.geometry),
+        geometry=absolute(config.geometry) if config.geometry else "",
         state_directory=absolute(config.state_directory) if config.state_directory else "",
         commands=dataclasses.replace(
             config.commands, key_file=absolute(config.commands.key_file) if config.commands.key_file else ""
@@ -578,9 +579,12 @@ def config_lines(path: str | Path) -> dict[tuple[str | int, ...], int]:
     return config_reader.lines(_bytes(Path(path)), str(path), VehicleConfig)
 
 
-def parse_partly(raw: bytes, name: str = "") -> tuple[VehicleConfig | None, tuple[Problem, ...]]:
+def parse_partly(
+    raw: bytes, name: str = "", *, blank: bool = False
+) -> tuple[VehicleConfig | None, tuple[Problem, ...]]:
     """Check the bytes of a vehicle file called `name`; as `load_partly`, with the paths as they stand there."""
-    return config_reader.read_partly(raw, name, VehicleConfig)
+    blanks = dict.fromkeys(("vehicle", "geometry", "base_frame"), "") if blank else None
+    return config_reader.read_partly(raw, name, VehicleConfig, blanks)
 
 
 def parse_config(raw: bytes, name: str = "") -> VehicleConfig:

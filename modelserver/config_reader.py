@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+from collections.abc import Mapping
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
-from modelserver.errors import ConfigError, Problem, Severity, Source, nearest_names, shown
+from modelserver.errors import ConfigError, Problem, Severity, Source, Suggested, shown, suggest_key, suggestions
 
 MAX_BYTES = 1 << 20
 
@@ -35,10 +36,13 @@ def read(raw: bytes, name: str, schema: type[S]) -> S:
     return found
 
 
-def read_partly(raw: bytes, name: str, schema: type[S]) -> tuple[S | None, tuple[Problem, ...]]:
+def read_partly(
+    raw: bytes, name: str, schema: type[S], blanks: Mapping[str, str] | None = None
+) -> tuple[S | None, tuple[Problem, ...]]:
     """Return what the bytes hold without what is wrong in them, None where too little is left; and every problem.
 
-    Raises ConfigError for what is no YAML mapping at all.
+    A required key of the top level that is missing or wrong takes its value from `blanks`, so that the rest can be
+    examined all the same. Raises ConfigError for what is no YAML mapping at all.
     """
     reader, values = _composed(raw, name, schema)
     problems = list(reader.problems)
@@ -57,6 +61,8 @@ def read_partly(raw: bytes, name: str, schema: type[S]) -> tuple[S | None, tuple
         fresh = [(at, problem) for at, problem in explained if at not in dropped]
         problems += [problem for _, problem in fresh]
         gone = [_drop(values, at, dropped) for at, _ in fresh]
+        filled = [key for key, value in (blanks or {}).items() if values.setdefault(key, value) is value]
+        gone = [*(each for each in gone if each), *(True for _ in filled)] if filled else gone
         if not gone or not all(gone):
             break
     return found, tuple(sorted(problems, key=lambda each: each.line))
@@ -194,20 +200,22 @@ class _Reader:
         if isinstance(got, (str, int, float, bool)):
             message += f", got {shown(str(got))}"
         if detail["type"] == "literal_error" and isinstance(got, str):
-            near = nearest_names(got, re.findall(r"'([^']*)'", str(detail["ctx"]["expected"])))
+            near = suggestions(got, re.findall(r"'([^']*)'", str(detail["ctx"]["expected"])))
         return near, f"write {near[0]}" if near else "", _fit(message)
 
     def _instead_of(self, key: str, at: Path_) -> tuple[tuple[str, ...], str]:
         """Return the known keys nearest to one that is not known at a place, and what to write."""
         known = _known_keys(self.schema, at)
+        # one that is given already is not what was meant
+        free = [each for each in known if (*at, each) not in self.lines]
         below: dict[str, list[str]] = {}
         for section in known:
             for each in _known_keys(self.schema, (*at, section)):
                 below.setdefault(each, []).append(".".join(map(str, (*at, section))))
-        near = () if key in below else nearest_names(key, known)
+        near = Suggested() if key in below else suggest_key(key, free)
         if near:
             return near, f"write {near[0]}"
-        deeper = (key,) if key in below else nearest_names(key, below)
+        deeper = (key,) if key in below else tuple(suggest_key(key, below))
         if deeper:
             # one level up is a common slip, and what an older version's file may have
             return deeper, f"write {deeper[0]} under {' or '.join(below[deeper[0]])}"

@@ -64,10 +64,51 @@ class Source:
 
 
 @dataclass(frozen=True, slots=True)
+class Edit:
+    """A change of one line of a file that fixes a problem: `old`, a name or a word there, becomes `new`."""
+
+    line: int
+    old: str
+    new: str
+
+    def apply(self, text: str) -> str:
+        """Return the text of the file with the change.
+
+        Raises ValueError where it is not clear which occurrence is meant: `old` is not exactly once on the line, as a
+        whole word, and not exactly once in the file.
+        """
+        word = re.compile(rf"(?<![\w./:-]){re.escape(self.old)}(?![\w./-])")
+        lines = text.split("\n")
+        for numbers in ([self.line - 1], range(len(lines))):
+            found = [(n, match) for n in numbers if 0 <= n < len(lines) for match in word.finditer(lines[n])]
+            if len(found) == 1:
+                ((n, match),) = found
+                lines[n] = lines[n][: match.start()] + self.new + lines[n][match.end() :]
+                return "\n".join(lines)
+            if found:
+                break
+        raise ValueError(f"{shown(self.old)} is not clear on line {self.line}")
+
+
+class Suggested(tuple[str, ...]):
+    """Names proposed in place of one that is misspelled, `replaced`; how `Problem` takes them in."""
+
+    replaced = ""
+
+    @classmethod
+    def of(cls, replaced: str, *names: str) -> Suggested:
+        """Return the proposal of `names` for `replaced`."""
+        found = cls(name for name in names if name)
+        found.replaced = replaced
+        return found
+
+
+@dataclass(frozen=True, slots=True)
 class Problem:
     """One thing that is wrong with a file: where, what, and what to do about it.
 
-    `nearest` holds the known names closest to a mistyped one, best first.
+    `nearest` holds the known names closest to a mistyped one, best first; `replaced` is the mistyped one as it stands
+    in the file, where writing the first of `nearest` in its place is known to be right (`suggestion`).
     """
 
     severity: Severity
@@ -75,6 +116,18 @@ class Problem:
     source: Source = Source()
     fix: str = ""
     nearest: tuple[str, ...] = ()
+    replaced: str = ""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.nearest, Suggested):
+            # stored as plain values: a problem is compared, kept and sent
+            object.__setattr__(self, "replaced", self.nearest.replaced if self.nearest else "")
+            object.__setattr__(self, "nearest", tuple(self.nearest))
+
+    @property
+    def edit(self) -> Edit | None:
+        """The change of the file that fixes the problem; None where no single one is known to."""
+        return Edit(self.line, self.replaced, self.nearest[0]) if self.replaced and self.nearest else None
 
     @property
     def file(self) -> str:
@@ -144,19 +197,19 @@ _WORD = re.compile(r"\d+|[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[^\W\d_]+")
 """The words of a name: `UtmGrid10S` has Utm, Grid, 10, S."""
 
 
-def suggestion(name: str, known: Iterable[str]) -> str:
+def suggestion(name: str, known: Iterable[str], *, is_family: bool = True) -> str:
     """Return the known name that `name` is a misspelling of; empty where that is not clear.
 
     Clear is a single nearest name by the optimal string alignment distance (a letter more, less or other, or two
-    neighbors exchanged): at most one such step for up to seven characters, two for more. Numbers and single letters
-    tell names of a family apart (`Wheel1`, `CameraL`, `UtmGrid10S`), so they must be the same: another of the family is
-    another thing. Case is no difference.
+    neighbors exchanged): at most one such step for up to six characters, two for more. Numbers and single letters
+    tell names of a family apart (`Wheel1`, `CameraL`, `UtmGrid10S`), so they must be the same where `is_family`:
+    another of the family is another thing. Case is no difference.
     """
     wanted = name.casefold()
     if not 3 <= len(wanted) <= COMPARED_LENGTH:
         exact = [each for each in islice(known, KNOWN_NAMES) if each.casefold() == wanted and name]
         return exact[0] if len(exact) == 1 else ""
-    most = 1 if len(wanted) <= 7 else 2
+    most = 1 if len(wanted) <= 6 else 2
     names = [each for each in islice(known, KNOWN_NAMES) if abs(len(each) - len(wanted)) <= most]
     if len(names) > COMPARED_NAMES:
         folded = [each.casefold() for each in names]
@@ -166,7 +219,19 @@ def suggestion(name: str, known: Iterable[str]) -> str:
     if not found or (len(found) > 1 and found[0][0] == found[1][0]):
         return ""
     best = found[0][1]
-    return best if _codes(best) == _codes(name) else ""
+    return best if not is_family or _codes(best) == _codes(name) else ""
+
+
+def suggestions(name: str, known: Iterable[str]) -> Suggested:
+    """Return the `suggestion` for a name as a problem takes it: none, or one."""
+    return Suggested.of(name, suggestion(name, known))
+
+
+def suggest_key(key: str, known: Iterable[str]) -> Suggested:
+    """Return the key of a schema that `key` misspells, or is without its unit (`rate` for `rate_hz`): none, or one."""
+    known = list(known)
+    longer = [each for each in known if each.startswith(f"{key}_")] if key else []
+    return Suggested.of(key, longer[0] if len(longer) == 1 else suggestion(key, known, is_family=False))
 
 
 def _codes(name: str) -> list[str]:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Collection, Hashable, Iterable, Iterator
 from pathlib import Path
 
-from modelserver.errors import ConfigError, Problem, Severity, nearest_names, shown
+from modelserver.errors import ConfigError, Problem, Severity, shown, suggestion, suggestions
 from msdrivers.line_settings import CanSettings, LineSettings, ModbusSettings, SerialSettings, first_key
 from msdrivers.making import station_of
 from msdrivers.settings import DriverSettings
@@ -44,10 +44,19 @@ def _owned(line: LineSettings) -> Hashable | None:
 
 def unknown_wheels(driver: DriverSettings, frames: Collection[str]) -> Iterator[Problem]:
     """Yield the wheels that the vehicle does not have, by the names in `sensors.wheels.frames`; none there: any."""
-    for name in getattr(driver.station, "wheels", ()) if frames else ():
-        if name not in frames:
-            what = f"sensors.wheels.frames has no {shown(name)}: what is measured of this wheel is not used"
-            yield _unknown(driver, what, name, frames, "wheels", name)
+    wheels = tuple(getattr(driver.station, "wheels", ()))
+    for name in wheels if frames else ():
+        if name in frames:
+            continue
+        what = f"sensors.wheels.frames has no {shown(name)}: what is measured of this wheel is not used"
+        # a wheel there that this driver does not measure is meant: but which of the two names is the misspelled one?
+        left = [frame for frame in frames if frame not in wheels]
+        near = suggestion(name, left)
+        if near:
+            fix = f"write one name in both places: here it is {shown(name)}, in sensors.wheels.frames {shown(near)}"
+        else:
+            fix = f"known: {', '.join(list(frames)[:10])}"
+        yield Problem(Severity.WARNING, what, driver.place.source("drivers", driver.name, "wheels", name), fix)
 
 
 def unknown_joint(driver: DriverSettings, constraints: Collection[str]) -> Iterator[Problem]:
@@ -55,10 +64,6 @@ def unknown_joint(driver: DriverSettings, constraints: Collection[str]) -> Itera
     joint = getattr(driver.station, "joint", "")
     if joint and joint not in constraints:
         what = f"the geometry has no constraint {shown(joint)}: what is measured of this joint moves nothing"
-        yield _unknown(driver, what, joint, constraints, "joint")
-
-
-def _unknown(driver: DriverSettings, what: str, name: str, known: Collection[str], *path: str) -> Problem:
-    near = nearest_names(name, known)
-    fix = f"write {near[0]}" if near else f"known: {', '.join(list(known)[:10]) or 'none'}"
-    return Problem(Severity.WARNING, what, driver.place.source("drivers", driver.name, *path), fix, near)
+        near = suggestions(joint, constraints)
+        fix = f"write {near[0]}" if near else f"known: {', '.join(list(constraints)[:10]) or 'none'}"
+        yield Problem(Severity.WARNING, what, driver.place.source("drivers", driver.name, "joint"), fix, near)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import ClassVar, TypeAlias
 
-from modelserver.errors import nearest_names, shown
+from modelserver.errors import shown, suggestions
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ def against_interface(interface: str) -> str:
 
     if interface in VALID_INTERFACES:
         return ""
-    near = nearest_names(interface, VALID_INTERFACES)
+    near = suggestions(interface, VALID_INTERFACES)
     fix = f"write {near[0]}" if near else f"known: {', '.join(sorted(VALID_INTERFACES))}"
     return f"{shown(interface)} is no interface of python-can's; {fix}"
 

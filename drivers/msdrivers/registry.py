@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from modelserver.errors import ConfigError, Problem, Severity, Source, nearest_names, shown
+from modelserver.errors import ConfigError, Problem, Severity, Source, Suggested, shown, suggestions
 from modelserver.messages import GpsSample, ImuSample, JointsSample, Sample, VehicleStatusSample, WheelsSample
 from modelserver.regular_files import read_regular
 from msdrivers.faults import FAULTS, Fault
@@ -179,7 +179,7 @@ def _dbc(settings: Any, folder: Path) -> CanDatabase:
     except (OSError, ValueError) as error:
         # the name nearest to that of a file which is there is its own
         there = [each.name for each in file.parent.glob("*")] if isinstance(error, FileNotFoundError) else []
-        near = tuple(str(path.with_name(name)) for name in nearest_names(path.name, there))
+        near = Suggested.of(settings.dbc, *(str(path.with_name(name)) for name in suggestions(path.name, there)))
         fix = f"write {near[0]}" if near else "the path of a DBC file, relative to the vehicle file"
         said = f"the DBC file {shown(str(file), 200)} cannot be read: {getattr(error, 'strerror', None) or error}"
         place = Source(element=f"drivers.{settings.source}.dbc")

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from modelserver.errors import ConfigError, Problem, Severity, Source, nearest_names, shown
+from modelserver.errors import ConfigError, Problem, Severity, Source, shown, suggest_key, suggestions
 from msdrivers.line_settings import LineSettings, first_key
 from msdrivers.registry import Kind
 from msdrivers.settings_words import Words, of_value
@@ -53,7 +53,7 @@ class SectionReader:
             words = Words("device is missing", f"add a line: device: ... ({known})")
             raise ConfigError([self._problem(words, "device")])
         if not isinstance(given, str) or given not in kinds:
-            near = nearest_names(str(given), kinds)
+            near = suggestions(str(given), kinds)
             fix = f"write {near[0]}" if near else known
             raise ConfigError([self._problem(Words(f"unknown device {shown(str(given))}", fix, near), "device")])
         return kinds[given]
@@ -91,7 +91,7 @@ class SectionReader:
                 there = f"and {on}" if owner not in firsts else f"and the line here is {first_key(line)}"
                 self.refuse(key, Words(f"{key} goes with {owner}, {there}", "take it out"))
             else:
-                near = nearest_names(key, known)
+                near = suggest_key(key, [each for each in known if each not in self.section])
                 fix = f"write {near[0]}" if near else f"known here: {', '.join(dict.fromkeys(known))}"
                 self.refuse(key, Words(f"unknown key {shown(key)}", fix, near))
 
@@ -133,7 +133,9 @@ class SectionReader:
             return path, words if self._has_line or last not in keys_of(*get_args(LineSettings)) else None
         if detail["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
             known = _known_keys(kind, path[:-1])
-            near = nearest_names(last, known)
+            around = _inside(self.section, path[:-1])
+            given = around if isinstance(around, dict) else {}
+            near = suggest_key(last, [each for each in known if each not in given])
             return path, Words(
                 f"unknown key {shown(last)}", f"write {near[0]}" if near else f"known here: {', '.join(known)}", near
             )

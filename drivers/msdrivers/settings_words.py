@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from modelserver.errors import nearest_names, shown
+from modelserver.errors import shown, suggestions
 
 _LISTS = ("tuple_type", "list_type")
 _SECTIONS = ("dataclass_type", "dict_type")
@@ -39,7 +39,7 @@ def of_value(detail: Any, keys: Sequence[str]) -> Words:
     said = f", got {written(got)}" if isinstance(got, str | int | float) else ""
     if kind in _CHOICES:
         expected = detail["ctx"]["expected"]
-        near = nearest_names(str(got), re.findall(r"'([^']*)'", expected))
+        near = suggestions(str(got), re.findall(r"'([^']*)'", expected))
         return Words(f"{name} is {expected}{said}", f"write {near[0]}" if near else "", near)
     if kind not in _WANTED:
         message = str(detail["msg"])

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from typing import NamedTuple
 
 from modelserver.errors import GeometryError, Problem
 from modelserver.formats import content, registry
@@ -17,7 +18,17 @@ from modelserver.formats.registry import FORMS, form_of_path
 from modelserver.formats.saved import Saved
 from modelserver.geometry.model import Model
 
-__all__ = ["FORMS", "Saved", "check_file", "form_of_path", "load_model", "parse_model", "save_model"]
+__all__ = [
+    "FORMS",
+    "Examined",
+    "Saved",
+    "check_file",
+    "examine_file",
+    "form_of_path",
+    "load_model",
+    "parse_model",
+    "save_model",
+]
 
 
 def load_model(
@@ -68,6 +79,33 @@ def check_file(
     except GeometryError as error:
         return None, error.problems
     return registry.read(text, os.fspath(path), variables, strict).check(repair)
+
+
+class Examined(NamedTuple):
+    """What is found in a geometry file.
+
+    model: None where there is an error. problems: in the order of the file. stated: the bodies of a file with errors
+    too, without constraints, so that what others say of its frames can be checked; None where none can be read.
+    constraints: the names of all constraints.
+    """
+
+    model: Model | None = None
+    problems: tuple[Problem, ...] = ()
+    stated: Model | None = None
+    constraints: tuple[str, ...] = ()
+
+
+def examine_file(
+    path: str | os.PathLike[str], variables: Mapping[str, str] | None = None, *, strict: bool = False
+) -> Examined:
+    """Return what is in a geometry file, as far as it can be read. Raises OSError where it cannot be opened."""
+    try:
+        text = content.read(path)
+    except GeometryError as error:
+        return Examined(problems=error.problems)
+    builder = registry.read(text, os.fspath(path), variables, strict)
+    model, problems = builder.check()
+    return Examined(model, problems, model or builder.stated(), builder.constraint_names)
 
 
 def save_model(model: Model, form: str) -> Saved:

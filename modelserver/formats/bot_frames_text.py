@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from modelserver.errors import Severity, Source, nearest_names, shown
+from modelserver.errors import Severity, Source, Suggested, shown, suggestions
 from modelserver.formats import bot_param, numbers
 from modelserver.formats.bot_param import Block, Value
 from modelserver.formats.circles import circles
@@ -252,7 +252,7 @@ class _Reader:
         for frame in self.frames.values():
             if frame.parent != top and frame.parent not in self.frames:
                 suggested += 1
-                near = nearest_names(frame.parent, (top, *self.frames)) if suggested <= SUGGESTED else ()
+                near = suggestions(frame.parent, (top, *self.frames)) if suggested <= SUGGESTED else Suggested()
                 self.error(
                     f"relative_to names frame {shown(frame.parent)}, which does not exist",
                     frame.parent_source,

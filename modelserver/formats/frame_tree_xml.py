@@ -24,7 +24,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from modelserver.errors import Severity, Source, nearest_names, shown, suggestion
+from modelserver.errors import Severity, Source, Suggested, shown, suggestion, suggestions
 from modelserver.formats import numbers
 from modelserver.formats.circles import circles
 from modelserver.formats.frame_paths import ANY, ROOT, Ancestry, FramePath, parse_path
@@ -152,7 +152,7 @@ class _Reader:
                     f"{key} takes its number from ${missing[0]}, which is not defined",
                     parts.source(key),
                     f"give it: --set {missing[0]}=NUMBER, or export {missing[0]}",
-                    nearest_names(missing[0], self.variables),
+                    tuple(suggestions(missing[0], self.variables)),
                 )
                 continue
             try:
@@ -194,7 +194,7 @@ class _Reader:
                 f"${name} is not defined{uses}; it stands in names as it is written",
                 places[0],
                 f"give it: --set {name}=NAME, or export {name}",
-                nearest_names(name, self.variables),
+                tuple(suggestions(name, self.variables)),
             )
 
     def others(self, root: Element) -> None:
@@ -327,7 +327,7 @@ class _Reader:
                 f"Parent names {shown(frame.parent)}, which does not exist{why}",
                 frame.parent_source,
                 f"write {near}" if near else "name a frame of this file, or leave it empty for a root",
-                (near,) if near else (),
+                Suggested.of(frame.parent, near),
             )
 
     def meant(self, frame: _Frame, keys: dict[str, list[str]], ancestry: Ancestry) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from modelserver.errors import Severity, Source, shown
+from modelserver.errors import Severity, Source, Suggested, shown
 from modelserver.formats import numbers
 from modelserver.formats.spelling import label, nearest_keys
 from modelserver.formats.xml_document import Named, children, line, tag
@@ -57,7 +57,7 @@ class _Reader:
                     f"unexpected element <{label(tag(child))}>; passed over",
                     Source(self.file, line(child)),
                     f"elements here are {', '.join(_CONTAINERS)}",
-                    nearest_keys(tag(child), _CONTAINERS),
+                    tuple(nearest_keys(tag(child), _CONTAINERS)),
                 )
             elif not self.looks_misspelt(child, inside):
                 self.scan(child)
@@ -66,7 +66,7 @@ class _Reader:
         """Report what has the parts of a body or a constraint but no name, which would be lost in silence."""
         if tag(element) != "parameter":
             return False
-        near: tuple[str, ...] = ()
+        near = Suggested()
         wrong = ""
         for child in children(element):
             if child.get("value") is not None:
@@ -111,7 +111,7 @@ class _Reader:
                 f"unknown parameter {shown(name)} holds frames; taken for Frames",
                 Source(self.file, line(child), place),
                 "write Frames",
-                ("Frames",),
+                Suggested.of(name, "Frames"),
             )
         return found
 
@@ -154,6 +154,9 @@ class _Reader:
                 _folded(parts.text("Description")),
                 source=parts.source(),
             )
+        elif from_ is not None or to is not None:
+            sense, end = ("From", from_) if from_ is not None else ("To", to)
+            self.builder.loose_ends.append((parts.text("ConstraintName") or "", sense, end or "", parts.source()))
 
     def end(self, parts: Named, key: str) -> str | None:
         """Return the frame a constraint names, without white space around its two names; None with an error."""

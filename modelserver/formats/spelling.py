@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from modelserver.errors import nearest_names, shown
+from modelserver.errors import Suggested, shown, suggest_key
 
 
 def label(name: str) -> str:
@@ -13,6 +13,6 @@ def label(name: str) -> str:
 
 
 @lru_cache(maxsize=1024)
-def nearest_keys(name: str, known: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the keys most like `name`; a file tends to misspell one the same way a thousand times."""
-    return nearest_names(name, known)
+def nearest_keys(name: str, known: tuple[str, ...]) -> Suggested:
+    """Return the key that `name` misspells; a file tends to misspell one the same way a thousand times."""
+    return suggest_key(name, known)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from modelserver.errors import Severity, nearest_names, shown
+from modelserver.errors import Severity, Suggested, shown, suggestions
 from modelserver.formats.spelling import label, nearest_keys
 from modelserver.formats.urdf_shapes import Attributes
 from modelserver.formats.xml_document import children, tag
@@ -47,10 +47,10 @@ class JointReader(Attributes):
         if kind is not None:
             self.of_type.setdefault((element.get("name") or "").strip(), kind)
 
-    def nearest(self, name: str, known: Iterable[str]) -> tuple[str, ...]:
-        """Return the names most like one that is not known."""
+    def nearest(self, name: str, known: Iterable[str]) -> Suggested:
+        """Return the name that one which is not known misspells."""
         self.suggested += 1
-        return nearest_names(name, known) if self.suggested <= SUGGESTED else ()
+        return suggestions(name, known) if self.suggested <= SUGGESTED else Suggested()
 
     def motion(self, element: Element, parts: dict[str, Element], place: str) -> Joint | None:
         """Return how a joint moves; None, with the error reported, where that cannot be said."""

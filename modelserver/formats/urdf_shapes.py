@@ -40,22 +40,28 @@ class Attributes:
         """Report a warning at an element."""
         self.builder.warning(message, self.at(element, place), fix, nearest)
 
-    def parts(self, element: Element, known: tuple[str, ...], place: str) -> dict[str, Element]:
-        """Return the first child of each name in `known`; a second one is an error, and what is misspelt a warning."""
+    def parts(
+        self, element: Element, known: tuple[str, ...], place: str, once: tuple[str, ...] = ()
+    ) -> dict[str, Element]:
+        """Return the first child of each name in `known`; a second one is an error, and what is misspelt a warning.
+
+        A second one of those in `once` is a warning: no answer depends on it.
+        """
         found: dict[str, Element] = {}
         for child in children(element):
             name = tag(child)
             if name in found:
-                self.error(
-                    f"<{name}> is given twice (first on line {line(found[name])})",
-                    child,
-                    place,
-                    "remove one of the two",
-                )
+                twice, fix = f"<{name}> is given twice (first on line {line(found[name])})", "remove one of the two"
+                if name in once:
+                    self.warning(f"{twice}; the first is used", child, place, fix)
+                else:
+                    self.error(twice, child, place, fix)
             elif name in known:
                 found[name] = child
             elif near := nearest_keys(name, known):
-                self.warning(f"unknown element <{label(name)}>; passed over", child, place, f"write <{near[0]}>", near)
+                self.warning(
+                    f"unknown element <{label(name)}>; passed over", child, place, f"write <{near[0]}>", tuple(near)
+                )
         return found
 
     def numbers(
@@ -150,7 +156,7 @@ def read_material(reader: Attributes, element: Element, known: dict[str, Materia
 
 def read_shape(reader: Attributes, element: Element, known: dict[str, Material], place: str) -> Shape | None:
     """Return a visual or a collision; None, with a warning, where it has no geometry that is known."""
-    parts = reader.parts(element, ("origin", "geometry", "material"), place)
+    parts = reader.parts(element, ("origin", "geometry", "material"), place, once=("material",))
     if "geometry" not in parts:
         reader.warning(
             f"<{tag(element)}> has no <geometry>; passed over",
@@ -174,7 +180,7 @@ def read_shape(reader: Attributes, element: Element, known: dict[str, Material],
             parts["geometry"],
             place,
             f"write <{near[0]}>" if near else f"shapes are {', '.join(_GEOMETRY)}",
-            near,
+            tuple(near),
         )
         return None
     size = _size(reader, inside[0], place)

@@ -98,7 +98,9 @@ class _Reader(JointReader):
             if name in elements:
                 elements[name].append(child)
             elif near := nearest_keys(name, _ROBOT):
-                self.warning(f"unknown element <{label(name)}>; passed over", child, "", f"write <{near[0]}>", near)
+                self.warning(
+                    f"unknown element <{label(name)}>; passed over", child, "", f"write <{near[0]}>", tuple(near)
+                )
             else:
                 passed[name] += 1
         if passed:
@@ -170,7 +172,9 @@ class _Reader(JointReader):
         name = self.text(parts[key], "link", place)
         if name is None or name in self.links:
             return name
-        near = self.nearest(name, self.links)
+        other = parts.get("parent" if key == "child" else "child")
+        taken = "" if other is None else (other.get("link") or "").strip()
+        near = self.nearest(name, [link for link in self.links if link != taken])
         self.error(
             f"{key} names link {shown(name)}, which does not exist",
             parts[key],
@@ -257,7 +261,7 @@ class _Reader(JointReader):
                 inertia = None if found is None else found.matrix()
             elif near := nearest_keys(tag(child), (*_LINK, *_SHAPES)):
                 said = label(tag(child))
-                self.warning(f"unknown element <{said}>; passed over", child, place, f"write <{near[0]}>", near)
+                self.warning(f"unknown element <{said}>; passed over", child, place, f"write <{near[0]}>", tuple(near))
         body = self.builder.body(name, inertia=inertia, source=Source(self.file, line(element), place))
         body.visuals, body.collisions = tuple(shapes["visual"]), tuple(shapes["collision"])
         return body.frame(ORIGIN, source=body.source)

@@ -120,6 +120,7 @@ class Named:
         self.file = file
         self.place = place
         self.found: dict[str, Element] = {}
+        given = {(child.get("name") or "").strip() for child in children(element)}
         for child in children(element):
             name = (child.get("name") or "").strip()
             if child.tag != "parameter" and tag(child) != "parameter":
@@ -127,7 +128,7 @@ class Named:
                     f"unexpected element <{label(tag(child))}>; passed over",
                     Source(file, line(child), place),
                     "write <parameter name=... value=.../>",
-                    nearest_keys(tag(child), ("parameter",)),
+                    tuple(nearest_keys(tag(child), ("parameter",))),
                 )
             elif name in self.found:
                 builder.error(
@@ -136,7 +137,8 @@ class Named:
                     "remove one of the two",
                 )
             elif name not in known:
-                near = nearest_keys(name, known)
+                # one that is given already is not what was meant
+                near = nearest_keys(name, tuple(each for each in known if each not in given))
                 builder.warning(
                     f"unknown parameter {shown(name)}; passed over"
                     if name

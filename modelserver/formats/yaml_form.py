@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from modelserver.errors import Severity, nearest_names, shown
+from modelserver.errors import Severity, shown, suggestions
 from modelserver.formats import yaml_nodes
 from modelserver.formats.spelling import label
 from modelserver.formats.yaml_joint import read_joint
@@ -166,7 +166,7 @@ class _Form:
         if template is not None:
             template.used = True
         elif name:
-            near = nearest_names(name, self.templates)
+            near = suggestions(name, self.templates)
             known = ", ".join(list(self.templates)[:8]) or "none"
             self.reader.error(
                 f"there is no template {shown(name)}",
@@ -227,6 +227,8 @@ class _Form:
         from_, to = (self.read_end(end, fields, key, place) for end in ("from", "to"))
         if from_ and to:
             self.builder.constraint(name, from_, to, pose, description, sigma, joint, self.reader.at(key, place))
+        elif from_ or to:
+            self.builder.loose_ends.append((name, "From" if from_ else "To", from_ or to, self.reader.at(key, place)))
 
     def read_end(self, end: str, fields: dict[str, Node], key: Node, place: str) -> str:
         """Return the frame that a constraint names, empty with an error where it names none."""

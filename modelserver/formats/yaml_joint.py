@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from modelserver.errors import nearest_names, shown
+from modelserver.errors import shown, suggestions
 from modelserver.formats import numbers
 from modelserver.formats.yaml_nodes import Kind, Node
 from modelserver.formats.yaml_reader import NodeReader
@@ -47,7 +47,7 @@ def _type(reader: NodeReader, node: Node, place: str, key: str) -> JointType | N
         return None
     if text in _TYPES:
         return JointType(text)
-    near = nearest_names(text, _TYPES)
+    near = suggestions(text, _TYPES)
     fix = f"write {key}: {near[0]}" if near else f"joints are {', '.join(_TYPES)}"
     reader.error(f"there is no joint {shown(text)}", node, place, fix, near)
     return None

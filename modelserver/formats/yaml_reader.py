@@ -28,9 +28,12 @@ class NodeReader:
         """Return the values of a mapping by key, without those that are nothing; unknown and double keys are errors."""
         found: dict[str, Node] = {}
         first: dict[str, int] = {}
-        for name, key, value in self.named(node, place):
+        pairs = self.named(node, place)
+        given = {name for name, _, _ in pairs}
+        for name, key, value in pairs:
             if name not in known:
-                near = nearest_keys(name, known)
+                # one that is given already is not what was meant
+                near = nearest_keys(name, tuple(each for each in known if each not in given))
                 self.error(
                     f"unknown key {shown(name)}",
                     key,

@@ -67,6 +67,8 @@ class ModelBuilder:
         self.unclear_joints: set[str] = set()
         """Constraints whose joint a file states in a way that could not be read; they are added as fixed."""
         self._bodies: list[BodyBuilder] = []
+        self.loose_ends: list[tuple[str, str, str, Source]] = []
+        """Constraint, sense (From or To) and frame of ends whose other end is missing; they are examined too."""
         self._constraints: list[tuple[Constraint, Source]] = []
 
     @classmethod
@@ -158,6 +160,19 @@ class ModelBuilder:
     def warning(self, message: str, source: Source = NOWHERE, fix: str = "", nearest: tuple[str, ...] = ()) -> None:
         """Note a problem that the model can live with."""
         self.problem(Severity.WARNING, message, source, fix, nearest)
+
+    def stated(self) -> Model | None:
+        """Return the well-formed bodies alone, also of a model with errors; None where there is none.
+
+        Whether a frame exists can be looked at in it, while no answer can be: it has no constraints.
+        """
+        bodies = Review(self, repair=True).bodies()
+        return Model(tuple(bodies.values()), (), self.name, self.description) if bodies else None
+
+    @property
+    def constraint_names(self) -> tuple[str, ...]:
+        """The names of all constraints, also of those with errors."""
+        return tuple(constraint.name for constraint, _ in self._constraints)
 
     def build(self, repair: bool = False) -> Model:
         """Check every rule and return the model; its `problems` hold the warnings and notes.

@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
-from modelserver.errors import Source, nearest_names, shown
+from modelserver.errors import Source, shown, suggestions
 from modelserver.geometry.drives import at_rest, drives, followed
 from modelserver.geometry.joint import Joint, coordinate_names
 from modelserver.geometry.parts import Constraint
@@ -130,7 +130,7 @@ class JointRules:
             elif mimic.joint in self._known:
                 self._refuse_follower(constraint, source)
             else:
-                near = nearest_names(mimic.joint, joints)
+                near = suggestions(mimic.joint, joints)
                 self._refuse(
                     f"{label}: its joint follows {shown(mimic.joint)}, and there is no constraint of that name",
                     source,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
-from modelserver.errors import UnknownFrameError, nearest_names, shown
+from modelserver.errors import UnknownFrameError, nearest_names, shown, suggestion
 from modelserver.geometry import inertia as spatial_inertia
 from modelserver.geometry import names
 from modelserver.geometry.joint import FIXED, Joint
@@ -182,3 +182,19 @@ class Constraint:
         if frame == self.to:
             return self.from_
         raise ValueError(f"constraint {self.name} does not join {frame}")
+
+
+def meant_frame(name: str, bodies: Mapping[str, Body]) -> str:
+    """Return the frame that a misspelled full name means; empty where that is not clear.
+
+    One of its two names is misspelled at most: with both wrong, neither says what the other means.
+    """
+    try:
+        body, frame = names.split(name)
+    except ValueError:
+        return suggestion(name, (names.joined(each.name, frame.name) for each in bodies.values() for frame in each))
+    if body in bodies:
+        near = suggestion(frame, (each.name for each in bodies[body]))
+        return names.joined(body, near) if near else ""
+    near = suggestion(body, (each for each in bodies if bodies[each].has_frame(frame)))
+    return names.joined(near, frame) if near else ""

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from modelserver.errors import Problem, Severity, Source, nearest_names, shown
+from modelserver.errors import Problem, Severity, Source, Suggested, shown
 from modelserver.geometry import loops, names
 from modelserver.geometry.joint_rules import JointRules, Placed
 from modelserver.geometry.loops import MOST_SIGMAS, Closure
-from modelserver.geometry.parts import Body, BodyFrame, Constraint
+from modelserver.geometry.parts import Body, BodyFrame, Constraint, meant_frame
 from modelserver.geometry.topology import Topology
 from modelserver.geometry.wording import LISTED, few, first_at
 
@@ -93,8 +92,8 @@ class Review:
         elif len(kept) == 1:
             (only,) = kept
             self.note(
-                Severity.WARNING,
-                f"there is one body, {only}; a model joins two or more",
+                Severity.NOTE,
+                f"there is one body, {only}; most models join two or more",
                 self.places[only],
                 "add the bodies mounted on it, or leave it if the vehicle is one rigid body",
             )
@@ -165,27 +164,24 @@ class Review:
             for _, end in ends:
                 by_frame[end] = (constraint.name, source)
             kept.append((constraint, source))
+        for name, sense, end, source in self.builder.loose_ends:
+            self._end_exists(f"constraint {shown(name)}", sense, end, bodies, source)
         return tuple(kept)
 
     def _end_exists(self, label: str, sense: str, end: str, bodies: dict[str, Body], source: Source) -> bool:
         try:
             body, frame = names.split(end)
         except ValueError:
-            everything = (names.joined(body.name, frame.name) for body in bodies.values() for frame in body)
-            near = self._nearest(end, everything)
+            near = self._nearest(end, bodies)
             self.fault(f"{label}: {sense} {shown(end)} is not of the form Body:Frame", source, _use(near), near)
             return False
         if body not in bodies:
-            near = tuple(
-                names.joined(name, frame) if bodies[name].has_frame(frame) else name
-                for name in self._nearest(body, bodies)
-            )
+            near = self._nearest(end, bodies)
             self.fault(f"{label}: {sense} names body {shown(body)}, which does not exist", source, _use(near), near)
             return False
         if not bodies[body].has_frame(frame):
             known = [each.name for each in bodies[body].frames[: LISTED + 1]]
-            frames = (each.name for each in bodies[body])
-            near = tuple(names.joined(body, name) for name in self._nearest(frame, frames))
+            near = self._nearest(end, bodies)
             self.fault(
                 f"{label}: {sense} names frame {shown(frame)}, which body {body} does not have",
                 source,
@@ -205,9 +201,20 @@ class Review:
             self.note(Severity.WARNING, warning.message, warning.source, warning.fix)
         return rules.kept
 
-    def _nearest(self, name: str, known: Iterable[str]) -> tuple[str, ...]:
+    def _nearest(self, end: str, bodies: dict[str, Body]) -> Suggested:
+        """Return the end of a constraint that is meant by one that does not exist.
+
+        Where several constraints name what does not exist and none names what is near, the latter is misspelled: no
+        proposal.
+        """
         self.suggested += 1
-        return nearest_names(name, known) if self.suggested <= SUGGESTED else ()
+        near = meant_frame(end, bodies) if self.suggested <= SUGGESTED else ""
+        wrong, _, _ = end.partition(":")
+        right, _, _ = near.partition(":")
+        named = [each.partition(":")[0] for other, _ in self.builder._constraints for each in (other.from_, other.to)]
+        if wrong != right and named.count(wrong) > 1 and right not in named:
+            return Suggested()
+        return Suggested.of(end, near)
 
     def connections(
         self, bodies: dict[str, Body], placed: tuple[Placed, ...]

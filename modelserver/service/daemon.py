@@ -24,10 +24,21 @@ from modelserver.config import (
     with_lines,
 )
 from modelserver.core import CoreSettings, CoreState, Expected, Instant
-from modelserver.errors import ConfigError, GeometryError, KeyFileError, Problem, QueryError, Severity, Source, shown
-from modelserver.formats import load_model
+from modelserver.errors import (
+    ConfigError,
+    GeometryError,
+    KeyFileError,
+    Problem,
+    QueryError,
+    Severity,
+    Source,
+    Suggested,
+    shown,
+)
+from modelserver.formats import Examined, examine_file
 from modelserver.geodesy import GeodesyError, make_origin
 from modelserver.geometry import Model
+from modelserver.geometry.parts import meant_frame
 from modelserver.keys import read_keys
 from modelserver.localization.findings import find_unusable
 from modelserver.localization.mounts import Mounts
@@ -282,34 +293,38 @@ def load_vehicle(config: VehicleConfig, file: str = "", strict: bool = False) ->
     `file` is the vehicle file's path, for the problems; with `strict` a frame has one constraint at most. Raises
     GeometryError, ConfigError, OSError.
     """
-    try:
-        model = load_model(config.geometry, variables=config.variables, strict=strict)
-    except OSError as error:
-        why = f"the geometry file {config.geometry} cannot be read: {error.strerror}"
-        raise ConfigError(with_lines([Problem(Severity.ERROR, why, Source(file, element="geometry"))], file)) from None
-    problems: list[Problem] = []
+    geometry, problems = examine_vehicle(config, file, strict)
+    model = geometry.model
+    if model is None and geometry.problems:
+        raise GeometryError(geometry.problems)
+    if model is None or problems:
+        raise ConfigError(problems)
+    mounts = None
     gps, imu = config.sensors.gps, config.sensors.imu
-    named = [("base_frame", config.base_frame)]
-    named += [("rolling_frame", config.rolling_frame)] if config.rolling_frame else []
-    named += [(f"sensors.{key}.frame", each.frame) for key, each in (("gps", gps), ("imu", imu)) if each is not None]
-    named += [("sensors.gps.second_frame", gps.second_frame)] if gps is not None and gps.second_frame else []
-    if config.sensors.wheels is not None:
-        named += [(f"sensors.wheels.frames.{name}", frame) for name, frame in config.sensors.wheels.frames.items()]
-    base_stands = True
-    for key, frame in named:
+    if gps is not None and imu is not None:
+        mounts = Mounts.from_model(model, config.rolling_frame or config.base_frame, gps.frame, imu.frame)
+    return Vehicle(config, model, mounts, _rig(config, model))
+
+
+def examine_vehicle(
+    config: VehicleConfig, file: str = "", strict: bool = False
+) -> tuple[Examined, tuple[Problem, ...]]:
+    """Return the geometry with its problems, and those of the vehicle file: all that can be found at once.
+
+    What does not depend on the geometry is examined without it, and frames are looked up among the bodies that a
+    geometry with errors states. An empty name of a geometry or of a base frame is one that the vehicle file lacks.
+    """
+    geometry = Examined()
+    problems: list[Problem] = []
+    if config.geometry:
         try:
-            model.frame(frame)
-            if base_stands:
-                model.get_transformation(frame, config.base_frame)
-                legs = () if problems else model.route(frame, config.rolling_frame or config.base_frame).legs
-                if legs:
-                    why = f"joint {legs[0].name} moves {frame} against the vehicle; localization needs it bolted on"
-                    fix = "name a frame of the vehicle's own body, or make the constraint fixed"
-                    problems.append(Problem(Severity.ERROR, why, Source(file, element=key), fix))
-        except QueryError as error:
-            base_stands = base_stands and key != "base_frame"
-            fix = f"write {error.nearest[0]}" if error.nearest else f"see: modelserver bodies --model {config.geometry}"
-            problems.append(Problem(Severity.ERROR, str(error), Source(file, element=key), fix, error.nearest))
+            geometry = examine_file(config.geometry, config.variables, strict=strict)
+        except OSError as error:
+            why = f"the geometry file {config.geometry} cannot be read: {error.strerror}"
+            problems.append(Problem(Severity.ERROR, why, Source(file, element="geometry")))
+    if geometry.stated is not None:
+        problems += _frame_problems(config, geometry.stated, file, is_whole=geometry.model is not None)
+    gps, imu = config.sensors.gps, config.sensors.imu
     if config.localization.mode == "raw" and (gps is None or imu is None):
         why = "raw mode takes a GPS and an IMU, and sensors does not name both"
         problems.append(Problem(Severity.ERROR, why, Source(file, element="localization.mode"), "write mode: full"))
@@ -321,12 +336,47 @@ def load_vehicle(config: VehicleConfig, file: str = "", strict: bool = False) ->
         configured_origin(config)
     except GeodesyError as error:
         problems.append(Problem(Severity.ERROR, str(error), Source(file, element="origin.initial_utm")))
-    if problems:
-        raise ConfigError(with_lines(problems, file))
-    mounts = None
-    if gps is not None and imu is not None:
-        mounts = Mounts.from_model(model, config.rolling_frame or config.base_frame, gps.frame, imu.frame)
-    return Vehicle(config, model, mounts, _rig(config, model))
+    return geometry, tuple(with_lines(problems, file))
+
+
+def _frame_problems(config: VehicleConfig, model: Model, file: str, is_whole: bool) -> list[Problem]:
+    """Return what is wrong with the frames that the vehicle file names; `model` has constraints where `is_whole`."""
+    gps, imu = config.sensors.gps, config.sensors.imu
+    named = [("base_frame", config.base_frame), ("rolling_frame", config.rolling_frame)]
+    named += [(f"sensors.{key}.frame", each.frame) for key, each in (("gps", gps), ("imu", imu)) if each is not None]
+    named += [("sensors.gps.second_frame", gps.second_frame)] if gps is not None else []
+    if config.sensors.wheels is not None:
+        named += [(f"sensors.wheels.frames.{name}", frame) for name, frame in config.sensors.wheels.frames.items()]
+    problems: list[Problem] = []
+    unknown: set[str] = set()
+    for key, frame in named:
+        if not frame and key in ("base_frame", "rolling_frame", "sensors.gps.second_frame"):
+            continue
+        try:
+            model.frame(frame)
+        except QueryError as error:
+            unknown.add(frame)
+            near = Suggested.of(frame, meant_frame(frame, {body.name: body for body in model.bodies}))
+            fix = f"write {near[0]}" if near else f"see: modelserver bodies --model {config.geometry}"
+            problems.append(Problem(Severity.ERROR, str(error), Source(file, element=key), fix, near))
+    if not is_whole or not config.base_frame or config.base_frame in unknown:
+        return problems
+    body = config.rolling_frame or config.base_frame
+    for key, frame in named:
+        if not frame or frame in unknown:
+            continue
+        try:
+            model.get_transformation(frame, config.base_frame)
+            legs = () if body in unknown else model.route(frame, body).legs
+        except QueryError as error:
+            fix = f"see: modelserver bodies --model {config.geometry}"
+            problems.append(Problem(Severity.ERROR, str(error), Source(file, element=key), fix))
+            continue
+        if legs:
+            why = f"joint {legs[0].name} moves {frame} against the vehicle; localization needs it bolted on"
+            fix = "name a frame of the vehicle's own body, or make the constraint fixed"
+            problems.append(Problem(Severity.ERROR, why, Source(file, element=key), fix))
+    return problems
 
 
 def _rig(config: VehicleConfig, model: Model) -> Rig | None:

@@ -180,11 +180,11 @@ def test_given_a_missing_key_then_it_is_named(missing: str) -> None:
 @pytest.mark.parametrize(
     ("text", "element", "line", "near"),
     [
-        ("geometri: x\n", "geometri", 4, "geometry"),
+        ("jornal: {}\n", "jornal", 4, "journal"),
         ("lcm:\n  ulr: x\n", "lcm.ulr", 5, "url"),
         ("publish:\n  mode: timer\n  rate: 5\n", "publish.rate", 6, "rate_hz"),
         ("sensors:\n  gsp: {channel: GPS, frame: A:B}\n", "sensors.gsp", 5, "gps"),
-        ("sensors:\n  gps:\n    channel: G\n    frame: A:B\n    fram: A:B\n", "sensors.gps.fram", 8, "frame"),
+        ("sensors:\n  gps:\n    channel: G\n    frame: A:B\n    latnecy: 0\n", "sensors.gps.latnecy", 8, "latency"),
         ("sensors:\n  wheels:\n    chanel: W\n", "sensors.wheels.chanel", 6, "channel"),
         (
             "sensors:\n  gps:\n    channel: G\n    frame: A:B\n    second_fram: A:C\n",
@@ -192,14 +192,14 @@ def test_given_a_missing_key_then_it_is_named(missing: str) -> None:
             8,
             "second_frame",
         ),
-        ("origin:\n  kept: true\n", "origin.kept", 5, "keep"),
+        ("origin:\n  kepe: true\n", "origin.kepe", 5, "keep"),
         ("localization:\n  raw:\n    gps_timeot: 3\n", "localization.raw.gps_timeot", 6, "gps_timeout"),
         ("localization:\n  mode_chanel: M\n", "localization.mode_chanel", 5, "mode_channel"),
         (
-            "sensors:\n  aiding:\n    vo: {chanel: V, type: range, channel: V}\n",
-            "sensors.aiding.vo.chanel",
+            "sensors:\n  aiding:\n    vo: {channel: V, type: range, latncy: 0}\n",
+            "sensors.aiding.vo.latncy",
             6,
-            "channel",
+            "latency",
         ),
         ("sensors:\n  wheels:\n    kinematic: ackermann\n", "sensors.wheels.kinematic", 6, "kinematics"),
         ("limits:\n  wait: 3\n", "limits.wait", 5, "wait_ms"),
@@ -231,6 +231,11 @@ def test_given_a_key_that_stands_one_level_deeper_then_where_is_told(text: str, 
     assert (found.element, found.line, found.nearest[0]) == (f"localization.{key}", 5, near)
     assert found.fix.startswith(fix)
     assert f"unknown key '{key}'" in found.message
+
+
+def test_given_an_unknown_key_like_one_that_is_given_already_then_that_is_not_proposed() -> None:
+    found = problem("geometri: x\n")
+    assert (found.element, found.nearest, found.edit) == ("geometri", (), None)
 
 
 def test_given_a_key_of_a_section_at_the_top_then_the_section_is_told() -> None:

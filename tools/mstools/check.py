@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from modelserver.errors import ConfigError, GeometryError, Problem, Severity, Source
+from modelserver.errors import ConfigError, Problem, Severity, Source
 from modelserver.file_kinds import LOOKED_AT, FileKind, file_kind
 from modelserver.formats import check_file
 from modelserver.geometry.model import Model
@@ -82,30 +82,38 @@ def checked_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tupl
     """Return the model of a vehicle file, None where anything is wrong, and every problem. Raises OSError."""
     # imported here: a geometry file needs neither the configuration's libraries nor geodesy
     from modelserver.config import load_partly, with_lines
-    from modelserver.service.daemon import load_vehicle
+    from modelserver.service.daemon import examine_vehicle, load_vehicle
 
     try:
-        config, problems = load_partly(file)
+        config, problems = load_partly(file, blank=True)
     except ConfigError as error:
         return None, error.problems
     if config is None:
         return None, problems
-    model = None
-    try:
-        vehicle = load_vehicle(config, file, strict)
-        vehicle.gate(0, file)
-        model = vehicle.model
-        more = (*model.problems, *with_lines(_unusable(vehicle, file), file))
-    except (ConfigError, GeometryError) as error:
-        more = error.problems
-    more += drivers_problems(config, file, model)
-    if any(each.element.startswith("sensors") for each in problems):
-        # a sensor that was left out as wrong is not missing
-        more = tuple(each for each in more if each.element != "localization.mode")
-    more += tuple(with_lines(_worth_knowing(config, file), file)) if not problems else ()
+    # each stage examines what it can, whatever another has found: all faults are reported in one run
+    geometry, of_vehicle = examine_vehicle(config, file, strict)
+    more = [*of_vehicle, *drivers_problems(config, file, geometry.constraints), *_worth_knowing(config, file)]
+    if geometry.model is not None and config.base_frame and not of_vehicle:
+        try:
+            vehicle = load_vehicle(config, file, strict)
+            vehicle.gate(0, file)
+            more += _unusable(vehicle, file)
+        except ConfigError as error:
+            more += error.problems
+    # what a wrong value was left out of is not missing, and what was left out says nothing of itself
+    wrong = {each.element for each in problems}
+    more = [each for each in with_lines(more, file) if not _is_within(each.element, wrong)]
+    found = (*problems, *more, *geometry.problems)
     # a model beside a wrong vehicle file would look as if all were well
-    clean = not any(each.severity is Severity.ERROR for each in (*problems, *more))
-    return model if clean else None, (*sorted((*problems, *more), key=lambda each: (each.file != file, each.line)),)
+    clean = not any(each.severity is Severity.ERROR for each in found)
+    return geometry.model if clean else None, (*sorted(found, key=lambda each: (each.file != file, each.line)),)
+
+
+def _is_within(element: str, wrong: set[str]) -> bool:
+    """Return whether a finding rests on what was left out of a vehicle file as wrong: its own key, or the sensors."""
+    if element == "localization.mode" or element == "sensors":
+        return any(each.partition(".")[0] == "sensors" for each in wrong)
+    return any(f"{element}.".startswith(f"{each}.") or f"{each}.".startswith(f"{element}.") for each in wrong if each)
 
 
 def _worth_knowing(config: VehicleConfig, file: str) -> Iterator[Problem]:

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from modelserver.errors import ConfigError, GeometryError, Problem
+from modelserver.errors import Problem
 
 if TYPE_CHECKING:
     from modelserver.config import VehicleConfig
-    from modelserver.geometry.model import Model
     from msdrivers.settings import DriverSettings
 
 
-def drivers_problems(vehicle: VehicleConfig, file: str, model: Model | None) -> tuple[Problem, ...]:
-    """Return everything that is wrong with the drivers of a vehicle file; `model` None: its geometry is not known."""
+def drivers_problems(vehicle: VehicleConfig, file: str, constraints: Collection[str]) -> tuple[Problem, ...]:
+    """Return everything that is wrong with the drivers of a vehicle file.
+
+    `constraints` are those of its geometry; none where it is not known.
+    """
     from modelserver.config import config_lines
 
     lines = config_lines(file)
@@ -30,11 +32,13 @@ def drivers_problems(vehicle: VehicleConfig, file: str, model: Model | None) -> 
         *problems,
         *unfit_files(drivers, Path(file).parent),
         *shared_lines(drivers),
-        *misnamed(vehicle, drivers, model),
+        *misnamed(vehicle, drivers, constraints),
     )
 
 
-def misnamed(vehicle: VehicleConfig, drivers: Iterable[DriverSettings], model: Model | None) -> Iterator[Problem]:
+def misnamed(
+    vehicle: VehicleConfig, drivers: Iterable[DriverSettings], constraints: Collection[str]
+) -> Iterator[Problem]:
     """Yield the wheels and joints of drivers that the rest of the vehicle file and the geometry do not have."""
     from msdrivers.checks import unknown_joint, unknown_wheels
 
@@ -43,15 +47,15 @@ def misnamed(vehicle: VehicleConfig, drivers: Iterable[DriverSettings], model: M
         # on a channel of its own the service does not hear it
         if wheels is not None and driver.channel in ("", wheels.channel):
             yield from unknown_wheels(driver, wheels.frames)
-        if model is not None:
-            yield from unknown_joint(driver, [each.name for each in model.constraints])
+        if constraints:
+            yield from unknown_joint(driver, constraints)
 
 
-def model_of(vehicle: VehicleConfig) -> Model | None:
-    """Return the geometry that a vehicle file names; None where it cannot be had, which others tell."""
-    from modelserver.formats import load_model
+def constraints_of(vehicle: VehicleConfig) -> tuple[str, ...]:
+    """Return the constraints of the geometry that a vehicle file names; none where it cannot be read."""
+    from modelserver.formats import examine_file
 
     try:
-        return load_model(vehicle.geometry, variables=vehicle.variables)
-    except (ConfigError, GeometryError, OSError):
-        return None
+        return examine_file(vehicle.geometry, vehicle.variables).constraints
+    except OSError:
+        return ()

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from modelserver.config import VehicleConfig, load_config
-from modelserver.errors import ConfigError, GeometryError, Problem, Severity
+from modelserver.errors import Problem, Severity
 from modelserver.service.probing.findings import Finding, Grade
 from modelserver.service.probing.probe import Interface
 from modelserver.version import __version__
@@ -48,18 +48,14 @@ def vehicle_findings(vehicle: VehicleConfig, file: Path) -> tuple[Finding, ...]:
 
 def _read(vehicle: VehicleConfig, file: Path) -> tuple[tuple[Problem, ...], Iterable[DriverSettings]]:
     from modelserver.config import config_lines
-    from modelserver.service.daemon import load_vehicle
+    from modelserver.service.daemon import examine_vehicle
     from msdrivers.settings import Place, read_drivers
     from mstools.check_drivers import drivers_problems
 
-    model = None
-    try:
-        model = load_vehicle(vehicle, str(file)).model
-        problems = model.problems
-    except (ConfigError, GeometryError) as error:
-        problems = error.problems
+    geometry, of_vehicle = examine_vehicle(vehicle, str(file))
+    problems = (*geometry.problems, *of_vehicle)
     drivers, _ = read_drivers(vehicle.drivers, Place(str(file), config_lines(file)))
-    return (*problems, *drivers_problems(vehicle, str(file), model)), drivers.values()
+    return (*problems, *drivers_problems(vehicle, str(file), geometry.constraints)), drivers.values()
 
 
 def file_finding(problems: Iterable[Problem], file: Path) -> Finding:

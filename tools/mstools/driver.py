@@ -118,12 +118,12 @@ def show_ports() -> None:
 
 def show_drivers(config: Path) -> None:
     """Print the drivers of a vehicle file, and what is wrong with them, as `modelserver check` does."""
-    from mstools.check_drivers import drivers_problems, model_of
+    from mstools.check_drivers import constraints_of, drivers_problems
 
     vehicle, drivers = load_drivers(config)
     for name, driver in drivers.items():
         typer.echo(safe(f"{name:<16} {driver.kind.name}: {driver.kind.about}; {driver.line}"))
-    problems = drivers_problems(vehicle, str(config), model_of(vehicle))
+    problems = drivers_problems(vehicle, str(config), constraints_of(vehicle))
     for problem in problems:
         print_problem(problem, err=True)
     if any(problem.severity is Severity.ERROR for problem in problems):
@@ -169,10 +169,10 @@ def load_driver(
 
 def warn_of_names(vehicle: VehicleConfig, settings: DriverSettings) -> None:
     """Log the names of a driver's wheels and joints that the vehicle does not have: what has them is lost."""
-    from mstools.check_drivers import misnamed, model_of
+    from mstools.check_drivers import constraints_of, misnamed
 
-    model = model_of(vehicle) if hasattr(settings.station, "joint") else None
-    for problem in misnamed(vehicle, [settings], model):
+    constraints = constraints_of(vehicle) if hasattr(settings.station, "joint") else ()
+    for problem in misnamed(vehicle, [settings], constraints):
         logging.getLogger(__name__).warning("%s: %s; %s", problem.source, problem.message, problem.fix)
 
 

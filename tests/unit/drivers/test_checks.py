@@ -105,12 +105,14 @@ def test_given_lines_that_are_for_many_then_nothing_is_told() -> None:
     assert len(list(shared_lines([axis("a", "front"), axis("b", "back")]))) == 1
 
 
-def test_given_a_wheel_that_the_vehicle_does_not_have_then_it_is_a_warning_with_the_nearest() -> None:
+def test_given_a_wheel_that_the_vehicle_does_not_have_then_both_names_are_shown_and_neither_is_preferred() -> None:
     (problem,) = unknown_wheels(wheels(), ["frontleft", "front_right"])
     assert problem.severity is Severity.WARNING
     assert str(problem.source) == "v.yaml:10 (drivers.wheels.wheels.front_left)"
     assert problem.message.startswith("sensors.wheels.frames has no 'front_left'")
-    assert problem.fix == "write frontleft"
+    # which of the two is the misspelled one nobody knows
+    assert problem.nearest == ()
+    assert "write one name in both places: here it is 'front_left', in sensors.wheels.frames 'frontleft'" in problem.fix
     for frames in (["front_left"], []):
         assert list(unknown_wheels(wheels(), frames)) == []
     assert list(unknown_wheels(axis("nod"), ["front_left"])) == []

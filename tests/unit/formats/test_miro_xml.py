@@ -152,11 +152,17 @@ def test_every_problem_of_a_file_is_reported_at_once_in_the_order_of_the_file():
     ],
 )
 def test_an_unknown_parameter_is_a_warning_with_the_nearest_name(wrong, right, element):
-    mast = miro_frame("Mast", f'<parameter name="{wrong}" value="x"/>{rows()}')
+    mast = miro_frame("Mast", f'<parameter name="{wrong}" value="x"/>')
     problem = only_problem(miro([miro_body("Cart", mast), CART_AND[1]]), Severity.WARNING)
     assert problem.nearest == (right,)
     assert problem.fix == f"write {right}"
     assert problem.element == element
+
+
+def test_a_parameter_that_is_given_already_is_not_proposed():
+    mast = miro_frame("Mast", f'<parameter name="HTransfrom" value="x"/>{rows()}')
+    problem = only_problem(miro([miro_body("Cart", mast), CART_AND[1]]), Severity.WARNING)
+    assert problem.nearest == ()
 
 
 def test_a_misspelt_row_is_both_unknown_and_missing():

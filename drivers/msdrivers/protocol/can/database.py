@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from modelserver.errors import ConfigError, ModelServerError, Problem, Severity, Source, nearest_names, shown
+from modelserver.errors import ConfigError, ModelServerError, Problem, Severity, Source, Suggested, shown, suggestions
 from msdrivers.protocol.can.frame import CanFrame, FrameKey
 
 if TYPE_CHECKING:
@@ -166,13 +166,15 @@ class Binder:
         `whole`: its bits are needed as a whole number of at most `bits` bits.
         """
         message_name, _, name = path.partition(".")
-        message = self.message(message_name, key)
+        message = self.message(message_name, key, f"{{}}.{name}" if name else "{}")
         if message is None:
             return None
         signal = next((each for each in message.signals if each.name == name), None)
         if signal is None:
             known = [each.name for each in message.signals]
-            self._missing(key, f"message {message_name} has no signal", name, known, message_name + ".")
+            # at a key of its own name the signal stands without its message
+            form = "{}" if key.endswith(f".{name}") else f"{message_name}.{{}}"
+            self._missing(key, f"message {message_name} has no signal", name, known, form)
             return None
         if whole and (signal.is_float or signal.length > bits):
             kind = "a floating-point number" if signal.is_float else f"{signal.length} bits long"
@@ -182,11 +184,11 @@ class Binder:
             return None
         return _bound(message, signal)
 
-    def message(self, name: str, key: str) -> Message | None:
-        """Return the message of that name; None and a problem without."""
+    def message(self, name: str, key: str, form: str = "{}") -> Message | None:
+        """Return the message of that name; None and a problem without. `form` is how the settings write it."""
         message = self._database.messages.get(name)
         if message is None:
-            self._missing(key, "there is no message", name, list(self._database.messages), "")
+            self._missing(key, "there is no message", name, list(self._database.messages), form)
         return message
 
     def problem(self, key: str, message: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
@@ -200,10 +202,10 @@ class Binder:
         if self.problems:
             raise ConfigError(self.problems)
 
-    def _missing(self, key: str, what: str, name: str, known: list[str], prefix: str) -> None:
-        near = nearest_names(name, known)
+    def _missing(self, key: str, what: str, name: str, known: list[str], form: str) -> None:
+        near = Suggested.of(form.replace("{}", name), *(form.replace("{}", each) for each in suggestions(name, known)))
         listed = ", ".join(known[:10]) + (", ..." if len(known) > 10 else "")
-        fix = f"write {prefix}{near[0]}" if near else f"known there: {listed or 'nothing'}"
+        fix = f"write {near[0]}" if near else f"known there: {listed or 'nothing'}"
         self.problem(key, f"{what} {shown(name)}", fix, near)
 
 
