@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
-from modelserver.errors import Severity, shown, suggestions
+from modelserver.errors import Severity, Suggested, shown, suggestions
 from modelserver.formats import yaml_nodes
 from modelserver.formats.spelling import label
 from modelserver.formats.yaml_joint import read_joint
@@ -61,6 +62,8 @@ class _Form:
         self.defaults = Defaults()
         self.templates: dict[str, _Template] = {}
         self.frames = 0
+        self.uses: Counter[str] = Counter()
+        """How many bodies name a template."""
 
     def read(self, root: Node) -> None:
         reader = self.reader
@@ -93,6 +96,8 @@ class _Form:
         if "templates" in fields:
             self.read_templates(fields["templates"])
         if "bodies" in fields:
+            bodies = [value for _, value in fields["bodies"].pairs]
+            self.uses.update(v.text.strip() for body in bodies for k, v in body.pairs if k.text.strip() == "template")
             for name, key, value in reader.named(fields["bodies"], "bodies"):
                 self.read_body(name, key, value)
         elif not any(problem.severity is Severity.ERROR for problem in self.builder.problems):
@@ -167,6 +172,9 @@ class _Form:
             template.used = True
         elif name:
             near = suggestions(name, self.templates)
+            if near and self.uses[name] > 1 and not self.uses[near[0]]:
+                # several bodies name what does not exist and none what is near: that is what is misspelled
+                near = Suggested()
             known = ", ".join(list(self.templates)[:8]) or "none"
             self.reader.error(
                 f"there is no template {shown(name)}",
