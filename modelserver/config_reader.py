@@ -6,7 +6,6 @@ import dataclasses
 import json
 import re
 from collections.abc import Mapping
-from functools import lru_cache
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
@@ -51,10 +50,12 @@ def read_partly(
         return None, tuple(problems)  # with such keys the rest is not what was meant
     dropped: set[Path_] = set()
     found: S | None = None
+    # making one takes longer than using it
+    adapter = TypeAdapter(schema)
     for _ in range(ROUNDS):
         try:
             # by way of JSON: strict there means that "4" is no number, while a mapping still makes a section
-            found = _adapter(schema).validate_json(json.dumps(values, default=str), strict=True)
+            found = adapter.validate_json(json.dumps(values, default=str), strict=True)
             break
         except ValidationError as error:
             explained = [each for detail in error.errors() for each in reader.explain(detail)]
@@ -67,12 +68,6 @@ def read_partly(
         if not gone or not all(gone):
             break
     return found, tuple(sorted(problems, key=lambda each: each.line))
-
-
-@lru_cache(maxsize=32)
-def _adapter(schema: type[S]) -> TypeAdapter[S]:
-    """Return the validator of a schema; making one takes longer than using it."""
-    return TypeAdapter(schema)
 
 
 def _drop(values: Any, at: Path_, dropped: set[Path_]) -> bool:
