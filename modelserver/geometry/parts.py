@@ -194,6 +194,9 @@ def meant_frame(name: str, bodies: Mapping[str, Body]) -> str:
     except ValueError:
         return suggestion(name, (names.joined(each.name, frame.name) for each in bodies.values() for frame in each))
     if body in bodies:
+        if any(each.has_frame(frame) for each in bodies.values()):
+            # a name that other bodies have is no misspelling
+            return ""
         near = suggestion(frame, (each.name for each in bodies[body]))
         return names.joined(body, near) if near else ""
     near = suggestion(body, (each for each in bodies if bodies[each].has_frame(frame)))
