@@ -60,9 +60,13 @@ def read_partly(
         except ValidationError as error:
             explained = [each for detail in error.errors() for each in reader.explain(detail)]
         # a section's own rules are looked at once all in it is of the right type: so what is wrong goes, and again
-        fresh = [(at, problem) for at, problem in explained if at not in dropped]
+        renamed = [
+            at for at, problem in explained if problem.replaced and reader.rename(values, at, problem.nearest[0])
+        ]
+        meant = {(*at[:-1], problem.nearest[0]) for at, problem in explained if at in renamed}
+        fresh = [(at, problem) for at, problem in explained if at not in dropped and at not in meant]
         problems += [problem for _, problem in fresh]
-        gone = [_drop(values, at, dropped) for at, _ in fresh]
+        gone = [at in renamed or _drop(values, at, dropped) for at, _ in fresh]
         filled = [key for key, value in (blanks or {}).items() if values.setdefault(key, value) is value]
         gone = [*(each for each in gone if each), *(True for _ in filled)] if filled else gone
         if not gone or not all(gone):
@@ -76,15 +80,19 @@ def _drop(values: Any, at: Path_, dropped: set[Path_]) -> bool:
     while steps:
         if steps in dropped:
             return True
-        inside = values
-        for step in steps[:-1]:
-            inside = inside.get(step) if isinstance(inside, dict) else None
+        inside = _inside(values, steps[:-1])
         if isinstance(inside, dict) and steps[-1] in inside:
             del inside[steps[-1]]
             dropped.add(steps)
             return True
         steps = steps[:-1]
     return False
+
+
+def _inside(values: Any, at: Path_) -> Any:
+    for step in at:
+        values = values.get(step) if isinstance(values, dict) else None
+    return values
 
 
 def lines(raw: bytes, name: str, schema: type) -> dict[Path_, int]:
@@ -161,6 +169,19 @@ class _Reader:
 
     def problem(self, at: Path_, message: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
         self.problems.append(Problem(Severity.ERROR, message, self.place(at), fix, nearest))
+
+    def rename(self, values: Any, at: Path_, meant: str) -> bool:
+        """Move what stands at a misspelled key to the key that is meant, so that it is examined, and not missing.
+
+        Return whether there is such a key.
+        """
+        known, around = _known_keys(self.schema, at[:-1]), _inside(values, at[:-1])
+        if meant not in known or at[-1] in known or not isinstance(around, dict) or meant in around:
+            return False
+        around[meant] = around.pop(at[-1])
+        moved = {path: line for path, line in self.lines.items() if path[: len(at)] == at}
+        self.lines.update({(*at[:-1], meant, *path[len(at) :]): line for path, line in moved.items()})
+        return True
 
     def place(self, at: Path_) -> Source:
         line = next((self.lines[at[:n]] for n in range(len(at), -1, -1) if at[:n] in self.lines), 0)

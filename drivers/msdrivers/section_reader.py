@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Mapping
-from typing import Any, TypeAlias, get_args, get_type_hints
+from typing import Any, TypeAlias, TypeGuard, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from modelserver.errors import ConfigError, Problem, Severity, Source, shown, suggest_key, suggestions
+from modelserver.errors import ConfigError, Problem, Severity, Source, Suggested, shown, suggest_key, suggestions
 from msdrivers.line_settings import LineSettings, first_key
 from msdrivers.registry import Kind
 from msdrivers.settings_words import Words, of_value
@@ -58,9 +58,17 @@ class SectionReader:
             raise ConfigError([self._problem(Words(f"unknown device {shown(str(given))}", fix, near), "device")])
         return kinds[given]
 
-    def line(self, kind: Kind) -> type[LineSettings]:
-        """Return which of its lines the section names: the one whose first key stands there."""
+    def line(self, kind: Kind, more: list[str]) -> type[LineSettings]:
+        """Return which of its lines the section names: the one whose first key stands there.
+
+        `more`: the keys beside those of the line.
+        """
         firsts = {first_key(each): each for each in kind.lines}
+        if not any(key in self.section for key in firsts):
+            known = [*keys_of(*kind.lines), *more]
+            for key in [each for each in self.section if each not in known]:
+                if not firsts.keys().isdisjoint(self._meant(key, known)):
+                    self._refuse_misspelled(key, known)
         given = [key for key in firsts if key in self.section]
         if len(given) == 1:
             return firsts[given[0]]
@@ -79,9 +87,7 @@ class SectionReader:
         firsts = [first_key(each) for each in kind.lines]
         on = f"device {kind.name} is on {' or '.join(firsts)}"
         others = _other_lines(kind)
-        for key in self.section:
-            if key in known:
-                continue
+        for key in [each for each in self.section if each not in known]:
             if key in others:
                 what = f"{on}, not on {others[key]}"
                 fix = "take it out" if self._has_line else f"write {firsts[0]}: ... in its place"
@@ -91,9 +97,19 @@ class SectionReader:
                 there = f"and {on}" if owner not in firsts else f"and the line here is {first_key(line)}"
                 self.refuse(key, Words(f"{key} goes with {owner}, {there}", "take it out"))
             else:
-                near = suggest_key(key, [each for each in known if each not in self.section])
-                fix = f"write {near[0]}" if near else f"known here: {', '.join(dict.fromkeys(known))}"
-                self.refuse(key, Words(f"unknown key {shown(key)}", fix, near))
+                self._refuse_misspelled(key, known)
+
+    def _meant(self, key: str, known: list[str]) -> Suggested:
+        """Return the key that one of the section misspells; one that is given already is not what was meant."""
+        return suggest_key(key, [each for each in known if each not in self.section])
+
+    def _refuse_misspelled(self, key: str, known: list[str]) -> None:
+        """Report an unknown key; its value is that of the key that is meant, which is not missing then."""
+        near = self._meant(key, known)
+        fix = f"write {near[0]}" if near else f"known here: {', '.join(dict.fromkeys(known))}"
+        self.refuse(key, Words(f"unknown key {shown(key)}", fix, near))
+        if near:
+            self.section = {near[0] if name == key else name: value for name, value in self.section.items()}
 
     def refuse(self, key: str, words: Words) -> None:
         """Tell what is wrong with a key of the section."""
@@ -115,9 +131,13 @@ class SectionReader:
                 return None if gone else found
             except ValidationError as error:
                 wrong = [self._explained(kind, detail) for detail in error.errors()]
+            # a key that is misspelled is not missing
+            meant = {
+                (*path[:-1], each) for path, words in wrong if _is_misspelled(path, words) for each in words.nearest
+            }
             for path, words in wrong:
                 # what misses a part that was left out is no mistake
-                if words is not None and not any(each[: len(path)] == path for each in gone):
+                if words is not None and path not in meant and not any(each[: len(path)] == path for each in gone):
                     self.problems.append(self._problem(words, *path))
             # each goes, also where one before it could not
             dropped = [_drop(values, path, gone) for path, _ in wrong]
@@ -157,6 +177,10 @@ def _other_lines(kind: Kind) -> dict[str, str]:
     own = {first_key(each) for each in kind.lines}
     every = {first_key(each): each.about for each in get_args(LineSettings)}
     return {key: about for key, about in every.items() if key not in own}
+
+
+def _is_misspelled(path: Path, words: Words | None) -> TypeGuard[Words]:
+    return words is not None and isinstance(words.nearest, Suggested) and words.nearest.replaced == path[-1]
 
 
 def _inside(values: Any, path: Path) -> Any:

@@ -110,9 +110,10 @@ def read_driver(
     reader = SectionReader(name, section, place.source)
     kind = reader.kind(kinds)
     settings = kind.load().settings
-    line = reader.line(kind)
     station_keys = [key for key in keys_of(settings) if key != SOURCE and key not in kind.presets]
-    reader.refuse_unknown(kind, line, [*keys_of(_Common), *station_keys])
+    more = [*keys_of(_Common), *station_keys]
+    line = reader.line(kind, more)
+    reader.refuse_unknown(kind, line, more)
     line_values = reader.values(line)
     given: dict[str, Any] = {SOURCE: name, **kind.presets}
     baud = getattr(line_values, "baud", 0)

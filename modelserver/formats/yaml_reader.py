@@ -25,7 +25,10 @@ class NodeReader:
         self.builder.error(message, Source(self.file, node.line, place), fix, nearest)
 
     def fields(self, node: Node, place: str, known: tuple[str, ...]) -> dict[str, Node]:
-        """Return the values of a mapping by key, without those that are nothing; unknown and double keys are errors."""
+        """Return the values of a mapping by key, without those that are nothing; unknown and double keys are errors.
+
+        The value of a misspelled key is that of the key that is meant, so that it is examined, and not missing.
+        """
         found: dict[str, Node] = {}
         first: dict[str, int] = {}
         pairs = self.named(node, place)
@@ -41,6 +44,8 @@ class NodeReader:
                     f"write {near[0]}" if near else f"keys here are {', '.join(known)}",
                     near,
                 )
+                if near and not value.is_nothing:
+                    found.setdefault(near[0], value)
             elif name in first:
                 self.error(f"{name} is given twice (first on line {first[name]})", key, place, "remove one of the two")
             else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 from collections import Counter
@@ -175,6 +176,7 @@ def _as_data(file: str, model: Model | None, problems: tuple[Problem, ...]) -> d
                 "message": problem.message,
                 "fix": problem.fix,
                 "nearest": list(problem.nearest),
+                "edit": None if problem.edit is None else dataclasses.asdict(problem.edit),
             }
             for problem in problems
         ],

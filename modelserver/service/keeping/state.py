@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import threading
 from pathlib import Path
 from uuid import UUID
 
 from modelserver.core import Instant
 from modelserver.messages import Kept, Recalled
+from modelserver.regular_files import read_start
 from modelserver.service.keeping.form import MAX_BYTES, KeptError, kept_from_bytes, kept_to_bytes
 from modelserver.service.keeping.lock import HeldError, Lock
 from modelserver.service.keeping.origin import safe, write_whole
@@ -78,9 +78,7 @@ class StateKeeper:
             return nothing._replace(why=f"what is kept in {self.path} is that of {error.holder}, which is running")
         self._tidy()
         try:
-            # a pipe in its place is not waited for
-            with open(self.path, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)) as file:
-                data = file.read(MAX_BYTES + 1)
+            data = read_start(self.path, MAX_BYTES + 1)
         except FileNotFoundError:
             return nothing._replace(why="nothing is kept of an earlier run")
         except OSError as error:

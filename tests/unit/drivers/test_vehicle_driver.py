@@ -394,7 +394,7 @@ def test_given_limits_that_the_frame_cannot_say_then_it_is_told() -> None:
 
 def test_given_a_mistyped_status_signal_then_the_nearest_is_told() -> None:
     status = StatusMap(forward_speed=SignalMap("VehicleStatus.ForwardSped"))
-    with pytest.raises(ConfigError, match="nearest: ForwardSpeed"):
+    with pytest.raises(ConfigError, match=r"nearest: VehicleStatus\.ForwardSpeed;"):
         VehicleDriver(vehicle_settings(status=status), DATABASE)
 
 

@@ -151,8 +151,8 @@ def test_given_a_file_that_is_not_right_then_the_start_is_cold_and_says_why(
 def test_given_a_directory_or_a_pipe_in_its_place_then_the_start_is_cold(tmp_path: Path) -> None:
     (tmp_path / "state-cart.json").mkdir()
     os.mkfifo(tmp_path / "state-van.json")
-    assert "cannot be read: Is a directory" in recalled(StateKeeper(tmp_path, "cart")).why
-    assert recalled(StateKeeper(tmp_path, "van")).kept is None
+    assert "cannot be read: this is a directory" in recalled(StateKeeper(tmp_path, "cart")).why
+    assert "cannot be read: this is a FIFO" in recalled(StateKeeper(tmp_path, "van")).why
 
 
 @pytest.mark.parametrize(

@@ -121,8 +121,16 @@ def test_json_holds_all_for_scripts(check):
         "message": "xyz has 2 numbers, not 3",
         "fix": "write xyz: [number, number, number], in metres",
         "nearest": [],
+        "edit": None,
     }
     assert (good["clean"], good["notes"], good["model"]["frames"]) == (True, 1, 3)
+
+
+def test_json_holds_the_edit_that_fixes_a_misspelled_name(check):
+    _, out, _ = check("--json", bad=YAML.replace("bodies:", "boddies:"))
+    (bad,) = json.loads(out)["files"]
+    (problem,) = [each for each in bad["problems"] if each["severity"] == "error"]
+    assert problem["edit"] == {"line": problem["line"], "old": "boddies", "new": "bodies"}
 
 
 def test_control_characters_from_a_file_do_not_reach_the_terminal(check):

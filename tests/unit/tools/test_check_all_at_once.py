@@ -116,6 +116,32 @@ def test_a_fault_is_found_alone_and_beside_each_other_fault(tmp_path: Path, faul
         assert alone <= both, f"{fault[2]!r} is not found beside {other[2]!r}"
 
 
+@pytest.mark.parametrize(
+    ("where", "right", "wrong"),
+    [
+        ("vehicle", "vehicle: cart", "vehicel: cart"),
+        ("vehicle", "geometry: geometry", "geometri: geometry"),
+        ("vehicle", "base_frame: ", "base_fram: "),
+        ("vehicle", "channel: IMU", "chanel: IMU"),
+        ("vehicle", "frame: Cart:Antenna", "fram: Cart:Antenna"),
+        ("vehicle", "port: /dev/ttyS1", "prot: /dev/ttyS1"),
+        ("geometry", "from: Cart:Mast", "form: Cart:Mast"),
+    ],
+)
+def test_a_misspelled_required_key_is_one_problem(tmp_path: Path, where: str, right: str, wrong: str) -> None:
+    ((_, message),) = found(tmp_path, (where, right, wrong, ""))
+    assert message == f"unknown key '{wrong.partition(':')[0]}'"
+
+
+def test_the_value_of_a_misspelled_key_is_examined(tmp_path: Path) -> None:
+    texts = [
+        message for _, message in found(tmp_path, ("vehicle", "base_frame: Cart:Origin", "base_fram: Cart:Orgin", ""))
+    ]
+    assert any("unknown key 'base_fram'" in text for text in texts)
+    assert any("no frame 'Orgin'" in text for text in texts)
+    assert len(texts) == 2
+
+
 def test_five_faults_of_different_kinds_are_found_in_one_run(tmp_path: Path) -> None:
     kinds = [FAULTS[n] for n in (2, 4, 5, 9, 14, 17, 20)]
     messages = [message for _, message in found(tmp_path, *kinds)]

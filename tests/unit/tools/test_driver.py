@@ -161,11 +161,11 @@ def test_given_a_log_without_the_channel_or_of_long_ago_then_it_is_an_error_at_o
 
 
 def test_given_the_raptor_then_its_drivers_have_no_error() -> None:
-    from mstools.check_drivers import drivers_problems, model_of
+    from mstools.check_drivers import constraints_of, drivers_problems
 
     path = RAPTOR / "vehicle.yaml"
     config = load_config(path)
-    found = drivers_problems(config, str(path), model_of(config))
+    found = drivers_problems(config, str(path), constraints_of(config))
     assert [each for each in found if each.element != "drivers.front_axis.joint"] == []
 
 

@@ -200,13 +200,18 @@ def test_given_a_proposal_that_exists_then_it_stays(tmp_path: Path, run: Run) ->
 INTERRUPTED = """
 import sys
 from pathlib import Path
-from mstools import cli, tune
+from mstools import cli, tune, tune_runs
 from mstools.tune_runs import Job
+
+def read_pipe(job: Job) -> None:
+    job.config.read_bytes()
 
 def command(log: Path, config: Path) -> None:
     with tune._pool(2, 1) as runs:
         runs([Job(log, config, "half", ())] * 2)
 
+# in the workers too: each imports this file
+tune_runs.run = read_pipe
 tune.command = command
 if __name__ == "__main__":
     cli.main(["tune", *sys.argv[1:]])
@@ -216,11 +221,12 @@ if __name__ == "__main__":
 @pytest.mark.slow
 def test_given_ctrl_c_while_workers_run_then_all_end_at_once_with_130(tmp_path: Path) -> None:
     # a worker that reads a pipe which nobody writes never ends by itself
-    config = tmp_path / "vehicle.yaml"
+    config, script = tmp_path / "pipe", tmp_path / "interrupted.py"
     os.mkfifo(config)
+    script.write_text(INTERRUPTED)
     with (
         subprocess.Popen(
-            [sys.executable, "-c", INTERRUPTED, tmp_path / "drive.lcm", config],
+            [sys.executable, script, tmp_path / "drive.lcm", config],
             start_new_session=True,
             stderr=subprocess.PIPE,
             text=True,
