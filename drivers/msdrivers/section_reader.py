@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Mapping
-from typing import Any, TypeAlias, TypeGuard, get_args, get_type_hints
+from typing import Any, TypeAlias, get_args, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -132,9 +132,7 @@ class SectionReader:
             except ValidationError as error:
                 wrong = [self._explained(kind, detail) for detail in error.errors()]
             # a key that is misspelled is not missing
-            meant = {
-                (*path[:-1], each) for path, words in wrong if _is_misspelled(path, words) for each in words.nearest
-            }
+            meant = {each for path, words in wrong for each in _meant_paths(path, words)}
             for path, words in wrong:
                 # what misses a part that was left out is no mistake
                 if words is not None and path not in meant and not any(each[: len(path)] == path for each in gone):
@@ -179,8 +177,11 @@ def _other_lines(kind: Kind) -> dict[str, str]:
     return {key: about for key, about in every.items() if key not in own}
 
 
-def _is_misspelled(path: Path, words: Words | None) -> TypeGuard[Words]:
-    return words is not None and isinstance(words.nearest, Suggested) and words.nearest.replaced == path[-1]
+def _meant_paths(path: Path, words: Words | None) -> tuple[Path, ...]:
+    """Return the path of the key that is meant by one that is misspelled; none where that is not what is wrong."""
+    if words is None or not isinstance(words.nearest, Suggested) or path[-1:] != (words.nearest.replaced,):
+        return ()
+    return tuple((*path[:-1], each) for each in words.nearest)
 
 
 def _inside(values: Any, path: Path) -> Any:

@@ -86,13 +86,13 @@ class Examined(NamedTuple):
 
     model: None where there is an error. problems: in the order of the file. stated: the bodies of a file with errors
     too, without constraints, so that what others say of its frames can be checked; None where none can be read.
-    constraints: the names of all constraints.
+    constraints: the names of all constraints; None where no body can be read.
     """
 
     model: Model | None = None
     problems: tuple[Problem, ...] = ()
     stated: Model | None = None
-    constraints: tuple[str, ...] = ()
+    constraints: tuple[str, ...] | None = None
 
 
 def examine_file(
@@ -105,7 +105,8 @@ def examine_file(
         return Examined(problems=error.problems)
     builder = registry.read(text, os.fspath(path), variables, strict)
     model, problems = builder.check()
-    return Examined(model, problems, model or builder.stated(), builder.constraint_names)
+    stated = model or builder.stated()
+    return Examined(model, problems, stated, None if stated is None else builder.constraint_names)
 
 
 def save_model(model: Model, form: str) -> Saved:

@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from msdrivers.settings import DriverSettings
 
 
-def drivers_problems(vehicle: VehicleConfig, file: str, constraints: Collection[str]) -> tuple[Problem, ...]:
+def drivers_problems(vehicle: VehicleConfig, file: str, constraints: Collection[str] | None) -> tuple[Problem, ...]:
     """Return everything that is wrong with the drivers of a vehicle file.
 
-    `constraints` are those of its geometry; none where it is not known.
+    `constraints` are those of its geometry; None where it is not known.
     """
     from modelserver.config import config_lines
 
@@ -37,7 +37,7 @@ def drivers_problems(vehicle: VehicleConfig, file: str, constraints: Collection[
 
 
 def misnamed(
-    vehicle: VehicleConfig, drivers: Iterable[DriverSettings], constraints: Collection[str]
+    vehicle: VehicleConfig, drivers: Iterable[DriverSettings], constraints: Collection[str] | None
 ) -> Iterator[Problem]:
     """Yield the wheels and joints of drivers that the rest of the vehicle file and the geometry do not have."""
     from msdrivers.checks import unknown_joint, unknown_wheels
@@ -47,15 +47,15 @@ def misnamed(
         # on a channel of its own the service does not hear it
         if wheels is not None and driver.channel in ("", wheels.channel):
             yield from unknown_wheels(driver, wheels.frames)
-        if constraints:
+        if constraints is not None:
             yield from unknown_joint(driver, constraints)
 
 
-def constraints_of(vehicle: VehicleConfig) -> tuple[str, ...]:
-    """Return the constraints of the geometry that a vehicle file names; none where it cannot be read."""
+def constraints_of(vehicle: VehicleConfig) -> tuple[str, ...] | None:
+    """Return the constraints of the geometry that a vehicle file names; None where it cannot be read."""
     from modelserver.formats import examine_file
 
     try:
         return examine_file(vehicle.geometry, vehicle.variables).constraints
     except OSError:
-        return ()
+        return None

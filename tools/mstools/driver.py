@@ -171,7 +171,7 @@ def warn_of_names(vehicle: VehicleConfig, settings: DriverSettings) -> None:
     """Log the names of a driver's wheels and joints that the vehicle does not have: what has them is lost."""
     from mstools.check_drivers import constraints_of, misnamed
 
-    constraints = constraints_of(vehicle) if hasattr(settings.station, "joint") else ()
+    constraints = constraints_of(vehicle) if hasattr(settings.station, "joint") else None
     for problem in misnamed(vehicle, [settings], constraints):
         logging.getLogger(__name__).warning("%s: %s; %s", problem.source, problem.message, problem.fix)
 

@@ -297,3 +297,24 @@ drivers:
         "write CameraFixed",
     ):
         assert words in out
+
+
+AXIS = """
+vehicle: cart
+geometry: geometry.yaml
+base_frame: Cart:Origin
+drivers:
+  axis:
+    device: axis
+    address: "127.0.0.1:5020"
+    joint: Nod
+    registers: {angle: {address: 0, scale_deg: 0.01}}
+"""
+
+
+def test_a_geometry_without_constraints_does_not_have_the_joint_and_an_unreadable_one_may(check):
+    one_body = "bodies: {Cart: {frames: {Origin: {}}}}"
+    _, out, _ = check(**{"vehicle.yaml": AXIS, "geometry.yaml": one_body})
+    assert "the geometry has no constraint 'Nod'" in out
+    _, out, _ = check(**{"vehicle.yaml": AXIS, "geometry.yaml": "bodies: ["})
+    assert "has no constraint" not in out
