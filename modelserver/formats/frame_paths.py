@@ -36,6 +36,9 @@ class FramePath:
 
     def matches(self, names: Sequence[str]) -> bool:
         """Return whether the frame with these names, from the root down to its own, is one that the path names."""
+        if ANY not in self.parts:
+            above = len(names) - len(self.parts)
+            return above >= 0 and (not self.is_absolute or above == 0) and tuple(names[above:]) == self.parts
         parts = self.parts if self.is_absolute else (ANY, *self.parts)
         # as a star in a file name: on a mismatch the last wildcard takes a level more
         at = part = 0
@@ -84,6 +87,11 @@ class Ancestry:
     def is_exhausted(self) -> bool:
         """Whether more levels were walked than a file may take."""
         return self.steps > GREATEST_STEPS
+
+    def match(self, path: FramePath, names: Sequence[str]) -> bool:
+        """Return whether a path names the frame with these names; False once the file is exhausted."""
+        self.steps += len(names) * (len(path.parts) if ANY in path.parts else 1)
+        return not self.is_exhausted and path.matches(names)
 
     def of(self, key: str) -> list[str] | None:
         """Return the names from the root down to a frame; None where one is not placed yet, or they form a cycle."""

@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -242,23 +242,28 @@ class _Reader:
         if well:
             for key, frame in self.frames.items():
                 parent = self.parents.get(key, "")
-                if parent and not frame.path.is_plain and not self.fits(frame, parent, ancestry):
+                if parent and not frame.path.is_plain and not self.fits(frame, parent, keys, ancestry):
                     missing.append(key)
-        self.report_missing(missing, keys, ancestry)
-        if ancestry.is_exhausted:
+        if not ancestry.is_exhausted:
+            self.report_missing(missing, keys, ancestry)
+        else:
             self.builder.error("the paths of parents are too many and too deep", Source(self.file), "write plain names")
         return well and not missing and not ancestry.is_exhausted
 
     def add_outside(self) -> None:
         """Make a root of each parent that is not in the file and need not be."""
         known = {frame.name for frame in self.frames.values()}
+        meant: dict[str, str] = {}
         for frame in tuple(self.frames.values()):
             path = frame.path
             if not path.parts or not known.isdisjoint(path.parts) or path.name == ANY:
                 continue
             is_outside = bool(_OUTSIDE.fullmatch(path.name))
-            if not is_outside and (not path.is_absolute or suggestion(path.name, known)):
-                continue
+            if not is_outside:
+                if path.is_absolute and path.name not in meant:
+                    meant[path.name] = suggestion(path.name, known) if len(meant) < SUGGESTED else ""
+                if not path.is_absolute or meant[path.name]:
+                    continue
             if path.name in names.RESERVED_BODIES:
                 # the service has a frame of that name itself: what stands there is a root
                 frame.path = ROOT
@@ -271,12 +276,14 @@ class _Reader:
 
     def choose(self, several: list[str], keys: dict[str, list[str]], ancestry: Ancestry) -> None:
         """Place frames whose parent has a name that several frames have, once the ancestors of those are placed."""
-        while several and not ancestry.is_exhausted:
+        while several:
             left: list[str] = []
             for key in several:
+                if ancestry.is_exhausted:
+                    return
                 path = self.frames[key].path
                 above = {each: ancestry.of(each) for each in keys[path.name] if each != key}
-                fitting = [(len(at), each) for each, at in above.items() if at is not None and path.matches(at)]
+                fitting = [(len(at), each) for each, at in above.items() if at is not None and ancestry.match(path, at)]
                 if None in above.values() and not any(depth == 1 for depth, _ in fitting):
                     left.append(key)
                 elif fitting:
@@ -298,7 +305,7 @@ class _Reader:
             "write the path of the one that is meant",
         )
 
-    def fits(self, frame: _Frame, parent: str, ancestry: Ancestry) -> bool:
+    def fits(self, frame: _Frame, parent: str, named: Collection[str], ancestry: Ancestry) -> bool:
         """Return whether the ancestors of the parent of a frame are those of its path."""
         above = ancestry.of(parent)
         if above is None:
@@ -306,10 +313,9 @@ class _Reader:
         path = frame.path
         if path.is_absolute:
             # what stands above the roots of the file cannot be looked at
-            known = {each.name for each in self.frames.values()}
-            inside = next((n for n, part in enumerate(path.parts) if part in known or part == ANY), 0)
+            inside = next((n for n, part in enumerate(path.parts) if part in named or part == ANY), 0)
             path = FramePath(path.parts[inside:], True)
-        return path.matches(above)
+        return ancestry.match(path, above) or ancestry.is_exhausted
 
     def report_missing(self, missing: list[str], keys: dict[str, list[str]], ancestry: Ancestry) -> None:
         """Report parents that no frame is, each with what was probably meant, where that is clear."""
@@ -346,7 +352,7 @@ class _Reader:
         parts[at] = near
         found = FramePath(tuple(parts), frame.path.is_absolute)
         placed = (ancestry.of(key) for key in keys[found.name])
-        if not found.is_plain and not any(above is not None and found.matches(above) for above in placed):
+        if not found.is_plain and not any(above is not None and ancestry.match(found, above) for above in placed):
             return ""
         return ("/" if found.is_absolute else "") + "/".join(parts)
 

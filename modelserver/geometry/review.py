@@ -208,7 +208,8 @@ class Review:
         proposal.
         """
         self.suggested += 1
-        near = meant_frame(end, bodies) if self.suggested <= SUGGESTED else ""
+        if self.suggested > SUGGESTED or not (near := meant_frame(end, bodies)):
+            return Suggested()
         wrong, _, _ = end.partition(":")
         right, _, _ = near.partition(":")
         named = [each.partition(":")[0] for other, _ in self.builder._constraints for each in (other.from_, other.to)]

@@ -259,6 +259,29 @@ def test_many_deep_paths_end_in_time():
     assert "too many and too deep" in problem.message
 
 
+def test_paths_with_many_wildcards_end_in_time():
+    frames = [tree_frame("F0"), *(tree_frame(f"F{n}", f"F{n - 1}") for n in range(1, 1000))]
+    wild = "/.../".join(f"F{n}" for n in range(0, 1000, 2))
+    frames += [tree_frame(f"G{n}", wild) for n in range(200)]
+    (problem,) = [each for each in problems_of(tree(*frames)) if each.severity is Severity.ERROR]
+    assert "too many and too deep" in problem.message
+
+
+def test_many_frames_of_one_name_end_in_time():
+    frames = [tree_frame("Top"), *(tree_frame(f"F{n}", "Top") for n in range(3000))]
+    frames += [tree_frame("Pan", f"F{n}") for n in range(3000)]
+    frames += [tree_frame(f"G{n}", "Pan") for n in range(3000)]
+    (problem,) = [each for each in problems_of(tree(*frames)) if each.severity is Severity.ERROR]
+    assert "too many and too deep" in problem.message
+
+
+def test_many_parents_outside_the_file_are_roots():
+    frames = [tree_frame(f"Frame{n:04d}", f"/Outside{n:04d}") for n in range(3000)]
+    problems = problems_of(tree(*frames))
+    assert sum("it becomes a root" in problem.message for problem in problems) == 3000
+    assert not [each for each in problems if each.severity is Severity.ERROR]
+
+
 def test_parents_in_a_circle_are_an_error_that_lists_them():
     text = tree(tree_frame("A"), tree_frame("B", "D"), tree_frame("C", "B"), tree_frame("D", "C"), tree_frame("E", "D"))
     problem = only_problem(text)
