@@ -97,8 +97,9 @@ def checked_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tupl
     if geometry.model is not None and config.base_frame and not of_vehicle:
         try:
             vehicle = load_vehicle(config, file, strict)
+            if not any(each.element.partition(".")[0] == "sensors" for each in problems):
+                more += _unusable(vehicle, file)
             vehicle.gate(0, file)
-            more += _unusable(vehicle, file)
         except ConfigError as error:
             more += error.problems
     # what a wrong value was left out of is not missing, and what was left out says nothing of itself

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from modelserver.errors import RecordingError
+from modelserver.regular_files import open_regular, read_start
 from modelserver.service.journal.ring import SEGMENT_NAME, segments
 from modelserver.signing import Key
 from modelserver.wire.journal import End, Head, read, read_end
@@ -64,8 +65,7 @@ def read_newest(directory: Path, keys: Sequence[Key], checks: bool = True) -> Ne
     keys at all. Without checks such a file counts as none.
     """
     try:
-        with (directory / NEWEST_NAME).open("rb") as file:
-            data = file.read(LONGEST_NEWEST)
+        data = read_start(directory / NEWEST_NAME, LONGEST_NEWEST)
     except OSError:
         return None
     try:
@@ -111,7 +111,7 @@ def last_link(directory: Path) -> Last:
     held = segments(directory)
     if not held:
         return Last()
-    with held[-1].open("rb") as file:
+    with open_regular(held[-1]) as file:
         if not file.seek(0, 2):
             return Last()
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
