@@ -17,11 +17,11 @@ import pytest
 from support_formats import YAML, miro, tree, tree_frame
 
 from modelserver.config import VehicleConfig
-from modelserver.config_reader import read_partly
+from modelserver.config_reader import lines, read_partly
 from modelserver.errors import ConfigError, Problem, Severity
 from modelserver.formats import parse_model
 from modelserver.formats.registry import read
-from msdrivers.settings import read_drivers
+from msdrivers.settings import Place, read_drivers
 
 ROOT = Path(__file__).resolve().parents[2]
 GEOMETRIES = sorted(
@@ -32,7 +32,7 @@ GEOMETRIES = sorted(
 VEHICLES = sorted((ROOT / "config").rglob("vehicle*.yaml"))
 WORD = re.compile(r"[A-Za-z][A-Za-z0-9_]{2,}")
 MOST = 25
-"""Words of a file that are misspelled, spread evenly over it."""
+"""Words of a file outside of comments that are misspelled, spread evenly over it."""
 
 TREE = tree(
     tree_frame("Rover"),
@@ -60,7 +60,9 @@ def misspellings(word: str, number: int) -> Iterator[str]:
 
 def broken(text: str) -> Iterator[tuple[str, str]]:
     """Yield a file with one word misspelled, many times, each with the file where that word is so everywhere."""
-    places = list(WORD.finditer(text))
+    places = [
+        each for each in WORD.finditer(text) if "#" not in text[text.rfind("\n", 0, each.start()) + 1 : each.start()]
+    ]
     for number, place in enumerate(places[:: max(1, len(places) // MOST)]):
         for wrong in misspellings(place[0], number):
             once = text[: place.start()] + wrong + text[place.end() :]
@@ -81,7 +83,7 @@ def vehicle(text: str) -> tuple[object, tuple[Problem, ...]]:
         return None, error.problems
     if config is None:
         return None, problems
-    drivers, more = read_drivers(config.drivers)
+    drivers, more = read_drivers(config.drivers, Place("file", lines(text.encode(), "file", VehicleConfig)))
     return (config, sorted(drivers)), (*problems, *more)
 
 
