@@ -89,8 +89,9 @@ def command(
     means. --report draws the same run: track, innovations, biases, gaps, validity, and what looks wrong.
     A log that breaks off in its last event is used up to there; for other damage the exit code is 1.
     With --verify a service's journal is run again, and the first message that is not reproduced is named. Exit code 0:
-    all is reproduced bit for bit, and authentic by --key; 3: reproduced, but nothing proves that it is authentic; 4:
-    the same to within 1e-9 m and rad, as with another numpy; 1: it differs, or is damaged, incomplete or forged.
+    all is reproduced bit for bit, and authentic where --key is given; 3: reproduced, but --key does not prove that it
+    is authentic; 4: the same to within 1e-9 m and rad, as with another numpy; 1: it differs, or is damaged, incomplete
+    or forged.
     Files named by --poses, --decisions and --report that exist are replaced, without --force.
 
     \b

@@ -38,7 +38,10 @@ POSES: Final = ("POSE", "POSE_VECTOR", "POSE_ODOM")
 
 
 class Result(IntEnum):
-    """What a verification found; the value is the exit code of `modelserver replay --verify`."""
+    """What a verification found; the value is the exit code of `modelserver replay --verify`.
+
+    REPRODUCED ends with 0 where no key is given: then nobody asks for more.
+    """
 
     AUTHENTIC = 0
     """All is reproduced bit for bit, and the key proves that it is genuine and whole."""

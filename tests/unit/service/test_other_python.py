@@ -39,7 +39,7 @@ def ran(python: str, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 def verified(python: str, journal: Path) -> None:
     found = ran(python, "-c", "from mstools.cli import main; main()", "replay", "--verify", str(journal), "--json")
-    assert found.returncode in (Result.REPRODUCED, Result.CLOSE), found.stdout + found.stderr
+    assert found.returncode in (0, Result.CLOSE), found.stdout + found.stderr
     report = json.loads(found.stdout)
     assert report["difference"] is None
     assert report["poses"] + sum(report["close"].values()) > 800

@@ -64,7 +64,7 @@ def test_given_a_journal_when_verified_then_the_counts_are_printed_and_the_code_
 ) -> None:
     for target in (folder, folder / "journal-00000000.lcm"):
         code, out, err = run("--verify", target)
-        assert (code, err) == (Result.REPRODUCED, "")
+        assert (code, err) == (0, "")
         assert "not proved authentic (--key FILE checks the seals" in out
         assert "1 segment of 1 run" in out
         assert "reproduced bit for bit" in out
@@ -74,7 +74,7 @@ def test_given_a_journal_when_verified_then_the_counts_are_printed_and_the_code_
 def test_given_json_then_it_holds_all_of_it(run: Run, folder: Path) -> None:
     code, out, _ = run("--verify", folder, "--json")
     told = json.loads(out)
-    assert code == Result.REPRODUCED
+    assert code == 0
     assert (told["result"], told["proved"], told["authentic"]) == ("reproduced", True, False)
     assert told["poses"] == 3 * told["said"]["POSE"] > 200
     assert told["difference"] is None
@@ -99,7 +99,7 @@ def test_given_a_torn_tail_then_it_is_told_and_the_code_is_that_of_reproduced(ru
     path = folder / "journal-00000000.lcm"
     path.write_bytes(path.read_bytes()[:-300])
     code, _, err = run("--verify", folder)
-    assert code == Result.REPRODUCED
+    assert code == 0
     assert "breaks off" in err
 
 
