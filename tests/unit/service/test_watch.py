@@ -112,5 +112,5 @@ def test_given_several_drivers_of_joints_then_they_share_the_channel() -> None:
 def test_given_the_vehicle_file_then_second_writers_are_ignored_unless_it_says_otherwise(tmp_path: Any) -> None:
     path = write_vehicle(tmp_path)
     assert load_config(path).sensors.second_writer == "ignore"
-    path.write_text(path.read_text() + "  second_writer: use\n")
+    path.write_text(path.read_text().replace("sensors:\n", "sensors:\n  second_writer: use\n"))
     assert load_config(path).sensors.second_writer == "use"

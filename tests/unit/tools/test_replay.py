@@ -53,6 +53,16 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_log(tmp_path_factory.mktemp("recordings") / "drive.lcm", drive(40.0))
 
 
+@pytest.fixture(scope="session")
+def forward(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The Husky's vehicle file for `drive`, which starts at speed without wheels: it says that this is forward."""
+    folder = tmp_path_factory.mktemp("husky")
+    (folder / "geometry.yaml").write_bytes(HUSKY.with_name("geometry.yaml").read_bytes())
+    path = folder / "vehicle.yaml"
+    path.write_text(HUSKY.read_text().replace("  filter:\n", "  filter:\n    reverse_speed: 1.5\n"))
+    return path
+
+
 def rows(path: Path) -> list[list[float]]:
     lines = path.read_text().splitlines()
     assert lines[0] == HEADER
@@ -63,9 +73,11 @@ def rows(path: Path) -> list[list[float]]:
 
 
 @pytest.mark.slow
-def test_given_a_drive_when_replayed_then_the_antenna_is_where_it_was(driven: Path, tmp_path: Path, run: Run) -> None:
+def test_given_a_drive_when_replayed_then_the_antenna_is_where_it_was(
+    driven: Path, forward: Path, tmp_path: Path, run: Run
+) -> None:
     out = tmp_path / "poses.csv"
-    code, words, err = run(driven, "-c", HUSKY, "--poses", out, "--frame", "Antenna:PhaseCentre", "--rate", 10)
+    code, words, err = run(driven, "-c", forward, "--poses", out, "--frame", "Antenna:PhaseCentre", "--rate", 10)
     assert (code, err) == (0, "")
     assert "times real time" in words
     found = rows(out)
@@ -83,9 +95,11 @@ def test_given_a_drive_when_replayed_then_the_antenna_is_where_it_was(driven: Pa
 
 
 @pytest.mark.slow
-def test_given_no_frame_when_replayed_then_it_is_the_base_frame(driven: Path, tmp_path: Path, run: Run) -> None:
+def test_given_no_frame_when_replayed_then_it_is_the_base_frame(
+    driven: Path, forward: Path, tmp_path: Path, run: Run
+) -> None:
     for name, options in (("base.csv", ()), ("antenna.csv", ("--frame", "Antenna:PhaseCentre"))):
-        assert run(driven, "-c", HUSKY, "--poses", tmp_path / name, *options)[0] == 0
+        assert run(driven, "-c", forward, "--poses", tmp_path / name, *options)[0] == 0
     base, antenna = rows(tmp_path / "base.csv")[-1], rows(tmp_path / "antenna.csv")[-1]
     assert antenna[1] - base[1] == pytest.approx(0.2475, abs=0.01)
     assert antenna[3] - base[3] == pytest.approx(0.2231, abs=0.01)
@@ -293,14 +307,14 @@ def test_given_a_log_that_breaks_off_when_replayed_then_the_rest_counts_and_it_i
 
 @pytest.mark.slow
 def test_given_damage_within_when_replayed_then_what_is_good_is_used_and_the_exit_code_tells(
-    driven: Path, tmp_path: Path, run: Run
+    driven: Path, forward: Path, tmp_path: Path, run: Run
 ) -> None:
     whole = driven.read_bytes()
     broken = bytearray(whole)
     broken[24:28] = struct.pack(">i", 0x7FFFFFFF)  # the first event's length: lcm's own reader dies of it
     log = tmp_path / "broken.lcm"
     log.write_bytes(broken)
-    code, words, err = run(log, "-c", HUSKY, "--poses", tmp_path / "p.csv")
+    code, words, err = run(log, "-c", forward, "--poses", tmp_path / "p.csv")
     assert code == 1
     assert "bytes after event 0, at byte 0, are no event and were skipped" in err
     assert "of 2199 messages" in words
