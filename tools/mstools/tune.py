@@ -254,7 +254,7 @@ def _pool(processes: int, parts: int) -> Iterator[Callable[[Sequence[Job]], list
     if count == 1:
         yield lambda jobs: [_run(job) for job in jobs]
         return
-    pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"), initializer=_ignore_interrupts)
+    pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
     try:
         yield lambda jobs: [future.result() for future in _submitted(pool, jobs)]
     except BaseException:
@@ -270,24 +270,17 @@ def _pool(processes: int, parts: int) -> Iterator[Callable[[Sequence[Job]], list
 
 
 def _submitted(pool: ProcessPoolExecutor, jobs: Sequence[Job]) -> list[Future[Outcome | None]]:
-    """Return what will come of jobs. Ctrl-C counts once all are handed over.
+    """Submit jobs and return their futures. SIGINT is blocked meanwhile, and delivered afterwards.
 
-    Handing over starts workers: one that is cut off half-way is running, and the pool does not know it.
+    Submitting starts workers. One whose start is interrupted would run unknown to the pool, and one that is still
+    importing would print a traceback: Ctrl-C reaches all processes of a terminal. Workers inherit the mask and keep
+    it, so only the process that started them ends by Ctrl-C, and ends them.
     """
-    came: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        futures = [pool.submit(_run, job) for job in jobs]
+        return [pool.submit(_run, job) for job in jobs]
     finally:
-        signal.signal(signal.SIGINT, before)
-    if came:
-        raise KeyboardInterrupt
-    return futures
-
-
-def _ignore_interrupts() -> None:
-    """Leave Ctrl-C, which reaches all processes of a terminal, to the one that began the others."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _run(job: Job) -> Outcome | None:
