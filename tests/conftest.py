@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import sys
 
 # Modules are compiled once, also where the environment forbids it: each worker and each of the hundreds of processes
@@ -19,6 +20,10 @@ from pathlib import Path  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 from support_lcm import reserved_url  # noqa: E402
+
+# A shell script's background jobs ignore SIGINT, and so would the programs that tests start and interrupt.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The same examples on every run and every machine; a loaded machine must not fail a test by its slowness.
 settings.register_profile("repeatable", derandomize=True, deadline=None, max_examples=50)
