@@ -88,6 +88,15 @@ def _hints(declared: Any) -> dict[str, Any]:
     return typing.get_type_hints(declared, localns={"array": _Arrays})
 
 
+def _expand_alias(hint: Any) -> Any:
+    """Return what a type alias stands for (PEP 695): since numpy 2.5 NDArray is one."""
+    alias = typing.get_origin(hint) or hint
+    if not hasattr(alias, "__value__") or not hasattr(alias, "__type_params__"):
+        return hint
+    arguments = typing.get_args(hint)
+    return alias.__value__[arguments] if arguments else alias.__value__
+
+
 def _name(cls: type) -> str:
     return f"{cls.__module__}.{cls.__qualname__}".removeprefix(_OWN)
 
@@ -179,6 +188,7 @@ class Schema:
     # --- from annotations to nodes ---
 
     def _node(self, hint: Any, place: str) -> Node:
+        hint = _expand_alias(hint)
         origin, arguments = typing.get_origin(hint), typing.get_args(hint)
         if hint in _SCALARS:
             return Scalar([_SCALARS[hint]])
