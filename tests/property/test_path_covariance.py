@@ -17,6 +17,8 @@ from modelserver.geometry import Joint, JointType, Mimic, ModelBuilder, Sigma
 from modelserver.geometry.route import Route
 from modelserver.spatial import Pose, chain
 
+pytestmark = pytest.mark.slow
+
 RELATIVE = 1e-12
 
 

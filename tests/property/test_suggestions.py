@@ -23,6 +23,8 @@ from modelserver.formats import parse_model
 from modelserver.formats.registry import read
 from msdrivers.settings import Place, read_drivers
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 GEOMETRIES = sorted(
     path

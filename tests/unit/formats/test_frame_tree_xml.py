@@ -251,6 +251,7 @@ def test_a_name_with_slashes_is_a_name_where_a_frame_has_it():
     assert model.get_transformation("A/B:C", "A:Origin").pose.xyz == (1.0, 0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_many_deep_paths_end_in_time():
     deep = "/".join(f"F{n}" for n in range(2000))
     frames = [tree_frame("F0"), *(tree_frame(f"F{n}", f"F{n - 1}") for n in range(1, 2000))]
@@ -267,6 +268,7 @@ def test_paths_with_many_wildcards_end_in_time():
     assert "too many and too deep" in problem.message
 
 
+@pytest.mark.slow
 def test_many_frames_of_one_name_end_in_time():
     frames = [tree_frame("Top"), *(tree_frame(f"F{n}", "Top") for n in range(3000))]
     frames += [tree_frame("Pan", f"F{n}") for n in range(3000)]

@@ -22,6 +22,8 @@ from modelserver.simulation.scenario import START_UTIME
 from tests.support_filter import GPS_TIMING, IMU_TIMING, ORIGIN, WHEELS_TIMING, Run, Transform, drive, untouched
 from tests.support_restart import longest_wrong
 
+pytestmark = pytest.mark.slow
+
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor" / "vehicle.yaml"
 AT_ONCE = Phase(1e-3, -2.0)
 STRAIGHT_BACK = (AT_ONCE, Phase(60.0))

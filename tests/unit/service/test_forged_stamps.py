@@ -13,6 +13,8 @@ from support_stamps import FORGED, Attack, Drive
 from modelserver.localization.filter import engine
 from modelserver.localization.filter.clocks import REPLAY_BURST, REPLAY_RATE
 
+pytestmark = pytest.mark.slow
+
 START = 1_700_000_000_000_000
 WARM_S, PHASE_S = 9.0, 0.2
 

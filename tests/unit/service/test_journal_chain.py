@@ -17,6 +17,8 @@ from modelserver.service.journal.verify import Result, Verified, verify
 from modelserver.signing import Key
 from modelserver.wire.journal import End, Head, Kind, Record, batch_written, end_written, head_written, read
 
+pytestmark = pytest.mark.slow
+
 KEY = Key("rover", bytes(range(32)))
 OTHER = Key("rover", bytes(range(1, 33)))
 STRANGE = Key("boat", bytes(range(32)))

@@ -38,6 +38,8 @@ from modelserver.service.journal.state import Run
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.transformation import Transformation
 
+pytestmark = pytest.mark.slow
+
 NODDING = GEOMETRY.replace("xyz: [0, 0, 0.1]", "xyz: [0, 0, 0.1], joint: {type: revolute, axis: [0, 1, 0]}")
 
 

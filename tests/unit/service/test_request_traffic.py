@@ -26,6 +26,8 @@ from modelserver.service.loop import Loop, LoopSettings
 from modelserver.spatial import chains
 from modelserver.wire.codec import decode, encode
 
+pytestmark = pytest.mark.slow
+
 MS = 1_000_000
 S = 1_000 * MS
 BEGIN_NS = 10 * S

@@ -39,6 +39,8 @@ from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import written
 from modelserver.wire.journal import Record, batch_written, read
 
+pytestmark = pytest.mark.slow
+
 S = 1_000_000
 NODDING = GEOMETRY.replace("xyz: [0, 0, 0.1]", "xyz: [0, 0, 0.1], joint: {type: revolute, axis: [0, 1, 0]}")
 
@@ -53,7 +55,6 @@ def proved(found: Verified) -> bool:
     return found.proved and not found.skipped and not found.old
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "more", ["", "localization: {mode: raw}\n", "publish: {mode: event}\n"], ids=["timer", "raw", "event"]
 )
@@ -111,7 +112,6 @@ def test_given_everything_that_can_be_asked_when_verified_then_every_reply_is_re
     assert found.said["replies"] == replies > 12
 
 
-@pytest.mark.slow
 def test_given_wishes_and_a_geometry_read_anew_when_verified_then_what_comes_of_them_is_reproduced(
     tmp_path: Path,
 ) -> None:
@@ -198,7 +198,6 @@ def test_given_an_error_of_the_core_and_one_of_the_bus_when_verified_then_all_is
     assert proved(found)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 2])
 def test_given_a_segment_taken_out_of_the_middle_when_verified_then_that_is_damage(tmp_path: Path, number: int) -> None:
     kept = Kept(tmp_path, SMALL, segment_bytes=150_000)
@@ -214,7 +213,6 @@ def test_given_a_segment_taken_out_of_the_middle_when_verified_then_that_is_dama
     assert 1.0 < found.seconds < whole - 0.1
 
 
-@pytest.mark.slow
 def test_given_a_segment_cut_off_in_the_middle_when_verified_then_that_is_damage(tmp_path: Path) -> None:
     kept = Kept(tmp_path, SMALL, segment_bytes=150_000)
     kept.drive(12.0)
@@ -279,7 +277,6 @@ def test_given_a_ring_that_lost_its_beginning_when_verified_then_it_is_taken_up_
     assert found.said["POSE"] > 20
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("text", [OPEN, SMALL], ids=["filter", "raw"])
 def test_given_each_segment_by_itself_when_verified_then_its_poses_are_reproduced(tmp_path: Path, text: str) -> None:
     kept = Kept(tmp_path, text, segment_bytes=700_000 if text is OPEN else 150_000)
@@ -297,7 +294,6 @@ def test_given_each_segment_by_itself_when_verified_then_its_poses_are_reproduce
     assert text is OPEN or any(each.old for each in alone)
 
 
-@pytest.mark.slow
 def test_given_a_segment_that_is_missing_when_verified_then_the_run_is_taken_up_after_it(tmp_path: Path) -> None:
     kept = Kept(tmp_path, SMALL, segment_bytes=150_000)
     kept.drive(7.0)
@@ -310,7 +306,6 @@ def test_given_a_segment_that_is_missing_when_verified_then_the_run_is_taken_up_
     assert found.segments == len(files) - 1
 
 
-@pytest.mark.slow
 def test_given_a_second_start_when_verified_then_both_runs_are_and_nothing_is_overwritten(tmp_path: Path) -> None:
     first = Kept(tmp_path, run="one")
     first.drive(6.0)
@@ -324,7 +319,6 @@ def test_given_a_second_start_when_verified_then_both_runs_are_and_nothing_is_ov
     assert (found.runs, found.segments) == (2, 2)
 
 
-@pytest.mark.slow
 def test_given_a_journal_that_breaks_off_anywhere_when_verified_then_what_is_sealed_holds(tmp_path: Path) -> None:
     kept = Kept(tmp_path)
     kept.drive(2.0)
@@ -342,7 +336,6 @@ def test_given_a_journal_that_breaks_off_anywhere_when_verified_then_what_is_sea
     assert poses[-1] > 90
 
 
-@pytest.mark.slow
 def test_given_damage_in_the_middle_when_verified_then_its_place_is_told_and_what_follows_is_not_guessed(
     tmp_path: Path,
 ) -> None:

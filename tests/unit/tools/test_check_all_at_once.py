@@ -8,6 +8,8 @@ import pytest
 
 from mstools.check import checked_vehicle
 
+pytestmark = pytest.mark.slow
+
 VEHICLE = """\
 vehicle: cart
 geometry: geometry.yaml

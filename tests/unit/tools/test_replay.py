@@ -30,6 +30,8 @@ from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools import cli
 from mstools.replay import _inputs, read_times
 
+pytestmark = pytest.mark.slow
+
 HEADER = "utime,easting,northing,up,qw,qx,qy,qz,pose_valid,invalid_reasons"
 
 Run = Callable[..., tuple[int, str, str]]
@@ -72,7 +74,6 @@ def rows(path: Path) -> list[list[float]]:
 # --- offline ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_given_a_drive_when_replayed_then_the_antenna_is_where_it_was(
     driven: Path, forward: Path, tmp_path: Path, run: Run
 ) -> None:
@@ -94,7 +95,6 @@ def test_given_a_drive_when_replayed_then_the_antenna_is_where_it_was(
     assert math.hypot(x, y) < 0.01
 
 
-@pytest.mark.slow
 def test_given_no_frame_when_replayed_then_it_is_the_base_frame(
     driven: Path, forward: Path, tmp_path: Path, run: Run
 ) -> None:
@@ -105,14 +105,12 @@ def test_given_no_frame_when_replayed_then_it_is_the_base_frame(
     assert antenna[3] - base[3] == pytest.approx(0.2231, abs=0.01)
 
 
-@pytest.mark.slow
 def test_given_the_same_log_when_replayed_twice_then_the_same_bytes(driven: Path, tmp_path: Path, run: Run) -> None:
     for name in ("one.csv", "two.csv"):
         assert run(driven, "-c", HUSKY, "--poses", tmp_path / name)[0] == 0
     assert (tmp_path / "one.csv").read_bytes() == (tmp_path / "two.csv").read_bytes()
 
 
-@pytest.mark.slow
 def test_given_times_when_replayed_then_a_row_for_each_whatever_comes_after(
     driven: Path, tmp_path: Path, run: Run
 ) -> None:
@@ -127,7 +125,6 @@ def test_given_times_when_replayed_then_a_row_for_each_whatever_comes_after(
     assert (tmp_path / "whole.csv").read_bytes() == (tmp_path / "short.csv").read_bytes()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("factor", "words"),
     [(1e-6, "these look like seconds"), (1e3, "these look like nanoseconds"), (2.0, "the log lasts")],
@@ -143,7 +140,6 @@ def test_given_times_that_lie_outside_the_log_then_that_is_told(
     assert words in err
 
 
-@pytest.mark.slow
 def test_given_poses_that_are_not_valid_then_the_summary_says_how_many_and_why(
     driven: Path, tmp_path: Path, run: Run
 ) -> None:
@@ -268,7 +264,6 @@ def test_given_a_ledger_on_standard_output_then_only_that_goes_there(driven: Pat
     assert "times real time" in err
 
 
-@pytest.mark.slow
 def test_given_raw_mode_then_the_ledger_is_empty_and_the_poses_are_the_same(
     driven: Path, tmp_path: Path, run: Run
 ) -> None:
@@ -293,7 +288,6 @@ def test_given_a_ledger_over_a_file_that_is_needed_then_it_is_refused(driven: Pa
 # --- bad input ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_given_a_log_that_breaks_off_when_replayed_then_the_rest_counts_and_it_is_told(
     driven: Path, tmp_path: Path, run: Run
 ) -> None:
@@ -305,7 +299,6 @@ def test_given_a_log_that_breaks_off_when_replayed_then_the_rest_counts_and_it_i
     assert len(rows(tmp_path / "p.csv")) > 1900
 
 
-@pytest.mark.slow
 def test_given_damage_within_when_replayed_then_what_is_good_is_used_and_the_exit_code_tells(
     driven: Path, forward: Path, tmp_path: Path, run: Run
 ) -> None:
