@@ -21,8 +21,8 @@ from typing import Final
 from modelserver.geometry import names
 from modelserver.geometry.parts import Body
 from modelserver.geometry.path_covariance import (
-    Crossing,
     EdgeCovariance,
+    JointCrossing,
     JointMotion,
     PathCovariance,
     edge_covariance,
@@ -31,8 +31,7 @@ from modelserver.geometry.path_covariance import (
     sum_at,
 )
 from modelserver.geometry.route import Edge, EdgeKind, Leg, Route
-from modelserver.geometry.topology import Crossing as ConstraintCrossing
-from modelserver.geometry.topology import Topology
+from modelserver.geometry.topology import Crossing, Topology
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
 
@@ -98,7 +97,7 @@ class FrameTree:
                 edge = Edge(EdgeKind.FRAME, full, True, frame.pose, frame.sigma)
                 self.nodes[full] = self._add(origin, edge, body.name)
 
-    def _cross(self, crossing: ConstraintCrossing, body: Body) -> Node:
+    def _cross(self, crossing: Crossing, body: Body) -> Node:
         """Add the edges of a constraint, and of its joint where that moves; return the node in the body entered."""
         each, forward = crossing.constraint, crossing.forward
         edges = [Edge(EdgeKind.CONSTRAINT, each.name, forward, each.pose, each.sigma)]
@@ -187,7 +186,7 @@ class FrameTree:
 
 def _covariance(up: Sequence[Node], down: Sequence[Node]) -> PathCovariance:
     segments: list[list[EdgeCovariance]] = [[]]
-    crossings: list[Crossing] = []
+    crossings: list[JointCrossing] = []
     is_stated = True
     for nodes, is_upward in ((up, True), (down, False)):
         for node in nodes:
@@ -201,7 +200,7 @@ def _covariance(up: Sequence[Node], down: Sequence[Node]) -> PathCovariance:
                 number = len(crossings)
                 # the motion is written in the segment that F is in: the one before the joint, or behind it
                 at, sign = (number, 1.0) if edge.forward else (number + 1, -1.0)
-                crossings.append(Crossing(node.motion, at, sign, edge.leader or edge.name))
+                crossings.append(JointCrossing(node.motion, at, sign, edge.leader or edge.name))
                 segments.append([])
     return PathCovariance(segments, crossings, is_stated)
 

@@ -84,7 +84,7 @@ class JointMotion(NamedTuple):
         return twists
 
 
-class Crossing(NamedTuple):
+class JointCrossing(NamedTuple):
     """A joint on a path: its motion, in the base of segment number `segment`; `sign` -1.0 where passed from T to F.
 
     `source` names where its error comes from: joints of one source err together.
@@ -108,13 +108,13 @@ class PathCovariance:
     def __init__(
         self,
         segments: Sequence[Sequence[EdgeCovariance]],
-        crossings: Sequence[Crossing] = (),
+        crossings: Sequence[JointCrossing] = (),
         is_stated: bool = True,
     ):
         self.is_stated = is_stated
         self._segments = segments
         # the joints of each segment with their numbers on the path
-        self._joints: list[list[tuple[int, Crossing]]] = [[] for _ in segments]
+        self._joints: list[list[tuple[int, JointCrossing]]] = [[] for _ in segments]
         for number, each in enumerate(crossings):
             self._joints[each.segment].append((number, each))
         sources = [each.source for each in crossings]
@@ -124,7 +124,7 @@ class PathCovariance:
     def along(cls, edges: Sequence[Edge]) -> PathCovariance:
         """Return that of a path given by its edges; each segment's base is its first frame."""
         segments: list[list[EdgeCovariance]] = [[]]
-        crossings: list[Crossing] = []
+        crossings: list[JointCrossing] = []
         is_stated = True
         pose = Pose.identity()
         for edge in edges:
@@ -133,7 +133,7 @@ class PathCovariance:
                 # the frame that the motion starts from is the last of this segment, or the first of the next
                 motion = JointMotion.at(edge.joint, pose if edge.forward else Pose.identity())
                 at, sign = (number, 1.0) if edge.forward else (number + 1, -1.0)
-                crossings.append(Crossing(motion, at, sign, edge.leader or edge.name))
+                crossings.append(JointCrossing(motion, at, sign, edge.leader or edge.name))
                 segments.append([])
                 pose = Pose.identity()
                 continue
