@@ -6,6 +6,7 @@ import dataclasses
 import json
 import re
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
@@ -50,8 +51,7 @@ def read_partly(
         return None, tuple(problems)  # with such keys the rest is not what was meant
     dropped: set[Path_] = set()
     found: S | None = None
-    # making one takes longer than using it
-    adapter = TypeAdapter(schema)
+    adapter = adapter_of(schema)
     for _ in range(ROUNDS):
         try:
             # by way of JSON: strict there means that "4" is no number, while a mapping still makes a section
@@ -72,6 +72,17 @@ def read_partly(
         if not gone or not all(gone):
             break
     return found, tuple(sorted(problems, key=lambda each: each.line))
+
+
+_ADAPTERS: dict[type, TypeAdapter[Any]] = {}
+
+
+def adapter_of(schema: type[S]) -> TypeAdapter[S]:
+    """Return what checks values by a dataclass, kept: making one takes a hundred times as long as using it."""
+    found = _ADAPTERS.get(schema)
+    if found is None:
+        found = _ADAPTERS[schema] = TypeAdapter(schema)
+    return found
 
 
 def _drop(values: Any, at: Path_, dropped: set[Path_]) -> bool:
@@ -272,10 +283,15 @@ def _known_keys(schema: type, at: Path_) -> list[str]:
         if get_origin(kind) is dict:
             kind = get_args(kind)[1]
         else:
-            kind = get_type_hints(kind).get(str(step)) if dataclasses.is_dataclass(kind) else None
+            kind = _hints(kind).get(str(step)) if isinstance(kind, type) and dataclasses.is_dataclass(kind) else None
         section = (each for each in (kind, *get_args(kind)) if dataclasses.is_dataclass(each))
         kind = kind if get_origin(kind) is dict else next(section, None)
     return [each.name for each in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
 
 
 def _check_shape(raw: bytes, name: str) -> None:

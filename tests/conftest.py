@@ -12,6 +12,8 @@ import sys
 # imports, for pytest compiles what it rewrites when it is imported.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# As in the `modelserver` command: threads of numpy's linear algebra cost each process 0.1 s and save nothing.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from collections.abc import Iterator  # noqa: E402
 from itertools import zip_longest  # noqa: E402

@@ -8,8 +8,7 @@ import struct
 from collections.abc import Mapping
 from typing import Any, get_args
 
-from pydantic import TypeAdapter
-
+from modelserver.config_reader import adapter_of
 from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings, TcpSettings, split_address
 from msdrivers.links import Link
 from msdrivers.protocol.can.frame import CanFrame
@@ -55,7 +54,7 @@ class ModbusForm:
         try:
             name, fields = json.loads(data)
             kind = _MODBUS[name]
-            unit: ModbusUnit = TypeAdapter(kind).validate_python(fields)
+            unit: ModbusUnit = adapter_of(kind).validate_python(fields)
         except (TypeError, KeyError) as error:
             raise ValueError(f"no Modbus unit: {error}") from None
         return unit

@@ -7,8 +7,9 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias, get_args, get_type_hints
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 
+from modelserver.config_reader import adapter_of
 from modelserver.errors import ConfigError, Problem, Severity, Source, Suggested, shown, suggest_key, suggestions
 from msdrivers.line_settings import LineSettings, first_key
 from msdrivers.registry import Kind
@@ -127,7 +128,7 @@ class SectionReader:
         while True:
             try:
                 # by way of JSON: strict there means that "4" is no number, while a list still makes a tuple
-                found: Any = TypeAdapter(kind).validate_json(json.dumps(values), strict=True)
+                found: Any = adapter_of(kind).validate_json(json.dumps(values), strict=True)
                 return None if gone else found
             except ValidationError as error:
                 wrong = [self._explained(kind, detail) for detail in error.errors()]

@@ -25,10 +25,8 @@ from modelserver.geometry.path_covariance import (
     JointCrossing,
     JointMotion,
     PathCovariance,
+    covariance_at,
     edge_covariance,
-    expand,
-    rotate_axes,
-    sum_at,
 )
 from modelserver.geometry.route import Edge, EdgeKind, Leg, Route
 from modelserver.geometry.topology import Crossing, Topology
@@ -157,7 +155,7 @@ class FrameTree:
                 edges.append(node.covariance)
             elif node.is_unstated:
                 return None
-        return expand(rotate_axes(sum_at(edges, far), so3.matrix_rows(q)))
+        return covariance_at(edges, so3.rotate(q, far), q)
 
     @classmethod
     def route(cls, interest: Node, reference: Node) -> Route:

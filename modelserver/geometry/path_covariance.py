@@ -11,12 +11,15 @@ share is
 
     cov(v) = P + [r]x W [r]x',   cov(v, w) = -[r]x W,   cov(w) = W
 
-These are summed over the edges of a segment, then turned to the axes of the frame of reference. Every edge has its own
-lever, so nothing of a common ancestor is subtracted and no long lever to a distant base cancels after it was squared.
-The result is that of `spatial.chain.covariance`, which carries every edge by itself from frame to frame.
+These are summed over the edges of a segment, along the axes of the frame of reference. Every edge has its own lever, so
+nothing of a common ancestor is subtracted and no long lever to a distant base cancels after it was squared. The result
+is that of `spatial.chain.covariance`, which carries every edge by itself from frame to frame.
 
-A joint's motion is written in the segment that contains its F frame, the frame that the motion starts from. The sign of
-an edge that is passed backward matters only where two joints share an error (one follows the other): those are added
+Most surveys state one variance for all axes. Such a P or W is the same along any axes; only r has to be turned. With W
+a number, cov(v, w) = -W [r]x is a vector, and the sum over such edges is 10 numbers (`Isotropic`) instead of 21.
+
+A joint's motion is written in the segment that contains its F frame, the frame that the motion starts from. Motions are
+turned to the axes of the reference, where those of one source (one joint follows another) are added, signs and all,
 before they are squared.
 
 All of it is plain floats. A service sleeps between two requests and runs with cold caches, where a call of numpy on 6x6
@@ -43,10 +46,16 @@ if TYPE_CHECKING:
 Place: TypeAlias = tuple[Vector3, Quaternion]
 """Position and orientation of a frame, as plain floats."""
 
-EdgeCovariance: TypeAlias = tuple[Vector3, tuple[float, ...], float | tuple[float, ...]]
-"""p_T (3), and the upper triangles (6) of P and W, of a fixed edge in the base of its segment.
+Variance: TypeAlias = float | tuple[float, ...]
+"""Covariance (3, 3): one variance where it is the same along all axes, else its upper triangle (6)."""
 
-W is one variance where it is the same about all axes, as most surveys state it: half the work.
+EdgeCovariance: TypeAlias = tuple[Vector3, Variance, Variance]
+"""p_T (3), P and W of a fixed edge in the base of its segment."""
+
+Isotropic: TypeAlias = tuple[float, ...]
+"""Sum over edges whose rotation variance W is the same about all axes: 10 numbers.
+
+They are the upper triangle of cov(v), s = sum of W r with cov(v, w) = -[s]x, and w = sum of W with cov(w) = w I.
 """
 
 Twists: TypeAlias = list[tuple[Vector3, Vector3]]
@@ -103,7 +112,7 @@ class PathCovariance:
     where an edge states no sigma, and counts as exact here.
     """
 
-    __slots__ = ("_joints", "_segments", "_shared", "is_stated")
+    __slots__ = ("_joints", "_segments", "is_stated")
 
     def __init__(
         self,
@@ -117,8 +126,6 @@ class PathCovariance:
         self._joints: list[list[tuple[int, JointCrossing]]] = [[] for _ in segments]
         for number, each in enumerate(crossings):
             self._joints[each.segment].append((number, each))
-        sources = [each.source for each in crossings]
-        self._shared = {source for source in sources if sources.count(source) > 1}
 
     @classmethod
     def along(cls, edges: Sequence[Edge]) -> PathCovariance:
@@ -153,81 +160,115 @@ class PathCovariance:
         Parameters: `bases` are the places of the segments' bases in the frame of reference, `far` the position of the
         far end there; `positions` and `sigmas` those of the joints' coordinates, nan counts as exact.
         """
-        total = _ZERO
-        shared: dict[tuple[str, int], tuple[float, ...]] = {}
-        for edges, joints, ((x, y, z), q) in zip(self._segments, self._joints, bases, strict=True):
-            if not edges and not joints:
-                continue
-            x, y, z = far[0] - x, far[1] - y, far[2] - z
-            R = so3.matrix_rows(q)
-            (a, b, c), (d, e, f), (g, h, i) = R
-            # the far end in the base
-            p_N = (a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z)
-            numbers = sum_at(edges, p_N) if edges else _ZERO
+        isotropic = _NONE
+        others: tuple[float, ...] | None = None
+        twists: dict[tuple[str, int], tuple[float, ...]] = {}
+        for edges, joints, (base, q) in zip(self._segments, self._joints, bases, strict=True):
+            # from the base to the far end, along the axes of the reference
+            lever = (far[0] - base[0], far[1] - base[1], far[2] - base[2])
+            if edges:
+                isotropic, rest = add_edges(isotropic, edges, lever, q)
+                if rest is not None:
+                    others = rest if others is None else tuple(map(add, others, rest))
             for index, crossing in joints:
                 motion, sign, source = crossing.motion, crossing.sign, crossing.source
-                twists = motion.twists if motion.joint.count == 1 else motion.at_position(positions[index])
-                for coordinate, ((vx, vy, vz), w) in enumerate(twists):
+                units = motion.twists if motion.joint.count == 1 else motion.at_position(positions[index])
+                for coordinate, (v, w) in enumerate(units):
                     s = sigmas[index][coordinate] * sign
                     if s != s:
                         continue
-                    wx, wy, wz = w
-                    a, b, c = so3.cross(w, p_N)
-                    v, w = (s * (vx + a), s * (vy + b), s * (vz + c)), (s * wx, s * wy, s * wz)
-                    if source not in self._shared:
-                        numbers = add_square(numbers, (*v, *w))
-                        continue
-                    # along the axes of the reference, where it meets the others of its source
-                    twist = (*so3.rotate(q, v), *so3.rotate(q, w))
-                    known = shared.get((source, coordinate))
-                    shared[source, coordinate] = twist if known is None else tuple(map(add, known, twist))
-            numbers = rotate_axes(numbers, R)
-            total = numbers if total is _ZERO else tuple(map(add, total, numbers))
-        for sum_of_source in shared.values():
-            total = add_square(total, sum_of_source)
-        return expand(total)
+                    vx, vy, vz = so3.rotate(q, v)
+                    wx, wy, wz = w = so3.rotate(q, w)
+                    a, b, c = so3.cross(w, lever)
+                    twist: tuple[float, ...] = (s * (vx + a), s * (vy + b), s * (vz + c), s * wx, s * wy, s * wz)
+                    known = twists.get((source, coordinate))
+                    twists[source, coordinate] = twist if known is None else tuple(map(add, known, twist))
+        numbers = upper(isotropic)
+        if others is not None:
+            numbers = tuple(map(add, numbers, others))
+        for twist in twists.values():
+            numbers = add_square(numbers, twist)
+        return expand(numbers)
 
 
 def edge_covariance(q_F: Quaternion, p_T: Vector3, sigma: Sigma) -> EdgeCovariance:
     """Return what a fixed edge keeps: orientation of F and position of T are those in the base of its segment."""
     R = np.array(so3.matrix_rows(q_F))
-    upper = np.triu_indices(3)
-    P, W = ((R * np.square(each)) @ R.T for each in (sigma.position, sigma.rotation))
-    about_x, about_y, about_z = sigma.rotation
-    same = about_x == about_y == about_z
-    return p_T, tuple(P[upper].tolist()), about_x * about_x if same else tuple(W[upper].tolist())
+    return p_T, _variance(sigma.position, R), _variance(sigma.rotation, R)
 
 
-def sum_at(edges: Sequence[EdgeCovariance], far: Vector3) -> tuple[float, ...]:
-    """Return the sum of the edges' shares at a point of their base, along its axes: 21 numbers.
+def _variance(sigma: Vector3, R: Array) -> Variance:
+    x, y, z = sigma
+    if x == y == z:
+        return x * x
+    numbers: list[float] = ((R * np.square(sigma)) @ R.T)[np.triu_indices(3)].tolist()
+    return tuple(numbers)
+
+
+def covariance_at(edges: Sequence[EdgeCovariance], lever: Vector3, q: Quaternion) -> tuple[float, ...]:
+    """Return the covariance that the edges make at a point: 36 numbers; parameters as in `add_edges`."""
+    isotropic, others = add_edges(_NONE, edges, lever, q)
+    numbers = upper(isotropic)
+    return expand(numbers if others is None else tuple(map(add, numbers, others)))
+
+
+def add_edges(
+    isotropic: Isotropic, edges: Sequence[EdgeCovariance], lever: Vector3, q: Quaternion
+) -> tuple[Isotropic, tuple[float, ...] | None]:
+    """Return the sum with the shares of a segment's edges added, and the sum of those with a matrix W by itself.
+
+    `lever` leads from the base to the far end along the axes of the reference, `q` turns to them from the base's. The
+    second is None where there is no such edge, else 21 numbers: see `sum_others`.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = R = so3.matrix_rows(q)
+    lx, ly, lz = lever
+    vxx, vxy, vxz, vyy, vyz, vzz, sx, sy, sz, w = isotropic
+    others: list[EdgeCovariance] = []
+    for edge in edges:
+        (x, y, z), P, W = edge
+        if isinstance(W, tuple):
+            others.append(edge)
+            continue
+        x, y, z = lx - a * x - b * y - c * z, ly - d * x - e * y - f * z, lz - g * x - h * y - i * z
+        xW, yW, zW = x * W, y * W, z * W
+        sx += xW
+        sy += yW
+        sz += zW
+        w += W
+        vxy -= x * yW
+        vxz -= x * zW
+        vyz -= y * zW
+        xx, yy, zz = x * xW, y * yW, z * zW
+        if isinstance(P, tuple):
+            Pxx, Pxy, Pxz, Pyy, Pyz, Pzz = rotate_symmetric(P, R)
+            vxx += Pxx + yy + zz
+            vyy += Pyy + xx + zz
+            vzz += Pzz + xx + yy
+            vxy += Pxy
+            vxz += Pxz
+            vyz += Pyz
+        else:
+            vxx += P + yy + zz
+            vyy += P + xx + zz
+            vzz += P + xx + yy
+    isotropic = (vxx, vxy, vxz, vyy, vyz, vzz, sx, sy, sz, w)
+    return isotropic, sum_others(others, lever, R) if others else None
+
+
+def sum_others(
+    edges: Sequence[EdgeCovariance], lever: Vector3, R: tuple[Vector3, Vector3, Vector3]
+) -> tuple[float, ...]:
+    """Return the sum of the shares of edges whose W is a matrix: 21 numbers; parameters as in `add_edges`.
 
     They are the upper triangle of cov(v), all of cov(v, w) row by row, and the upper triangle of cov(w).
     """
-    px, py, pz = far
     vxx = vxy = vxz = vyy = vyz = vzz = 0.0
     cxx = cxy = cxz = cyx = cyy = cyz = czx = czy = czz = 0.0
     wxx = wxy = wxz = wyy = wyz = wzz = 0.0
-    for (x, y, z), (Pxx, Pxy, Pxz, Pyy, Pyz, Pzz), W in edges:
-        x, y, z = px - x, py - y, pz - z
-        if not isinstance(W, tuple):
-            xW, yW, zW = x * W, y * W, z * W
-            vxx += Pxx + y * yW + z * zW
-            vxy += Pxy - x * yW
-            vxz += Pxz - x * zW
-            vyy += Pyy + x * xW + z * zW
-            vyz += Pyz - y * zW
-            vzz += Pzz + x * xW + y * yW
-            cxy += zW
-            cxz -= yW
-            cyx -= zW
-            cyz += xW
-            czx += yW
-            czy -= xW
-            wxx += W
-            wyy += W
-            wzz += W
-            continue
-        a, b, c, d, e, f = W
+    for (x, y, z), P, W in edges:
+        Pxx, Pxy, Pxz, Pyy, Pyz, Pzz = rotate_symmetric(P, R) if isinstance(P, tuple) else (P, 0.0, 0.0, P, 0.0, P)
+        a, b, c, d, e, f = rotate_symmetric(W, R) if isinstance(W, tuple) else (W, 0.0, 0.0, W, 0.0, W)
+        x, y, z = (u - row[0] * x - row[1] * y - row[2] * z for u, row in zip(lever, R, strict=True))
         # [r]x W
         sxx, sxy, sxz = y * c - z * b, y * e - z * d, y * f - z * e
         syx, syy, syz = z * a - x * c, z * b - x * e, z * c - x * f
@@ -258,29 +299,32 @@ def sum_at(edges: Sequence[EdgeCovariance], far: Vector3) -> tuple[float, ...]:
     )  # fmt: skip
 
 
-def rotate_axes(numbers: tuple[float, ...], R: tuple[Vector3, Vector3, Vector3]) -> tuple[float, ...]:
-    """Return the 21 numbers of `sum_at` along other axes: R cov R' for each block, R from the old to the new."""
+def rotate_symmetric(numbers: tuple[float, ...], R: tuple[Vector3, Vector3, Vector3]) -> tuple[float, ...]:
+    """Return R M R', of a symmetric M (3, 3): upper triangles (6)."""
     (a, b, c), (d, e, f), (g, h, i) = R
-    vxx, vxy, vxz, vyy, vyz, vzz, cxx, cxy, cxz, cyx, cyy, cyz, czx, czy, czz, wxx, wxy, wxz, wyy, wyz, wzz = numbers
-    # R times each block
-    v0, v1, v2 = a * vxx + b * vxy + c * vxz, a * vxy + b * vyy + c * vyz, a * vxz + b * vyz + c * vzz
-    v3, v4, v5 = d * vxx + e * vxy + f * vxz, d * vxy + e * vyy + f * vyz, d * vxz + e * vyz + f * vzz
-    v6, v7, v8 = g * vxx + h * vxy + i * vxz, g * vxy + h * vyy + i * vyz, g * vxz + h * vyz + i * vzz
-    c0, c1, c2 = a * cxx + b * cyx + c * czx, a * cxy + b * cyy + c * czy, a * cxz + b * cyz + c * czz
-    c3, c4, c5 = d * cxx + e * cyx + f * czx, d * cxy + e * cyy + f * czy, d * cxz + e * cyz + f * czz
-    c6, c7, c8 = g * cxx + h * cyx + i * czx, g * cxy + h * cyy + i * czy, g * cxz + h * cyz + i * czz
-    w0, w1, w2 = a * wxx + b * wxy + c * wxz, a * wxy + b * wyy + c * wyz, a * wxz + b * wyz + c * wzz
-    w3, w4, w5 = d * wxx + e * wxy + f * wxz, d * wxy + e * wyy + f * wyz, d * wxz + e * wyz + f * wzz
-    w6, w7, w8 = g * wxx + h * wxy + i * wxz, g * wxy + h * wyy + i * wyz, g * wxz + h * wyz + i * wzz
+    xx, xy, xz, yy, yz, zz = numbers
+    # R M
+    m0, m1, m2 = a * xx + b * xy + c * xz, a * xy + b * yy + c * yz, a * xz + b * yz + c * zz
+    m3, m4, m5 = d * xx + e * xy + f * xz, d * xy + e * yy + f * yz, d * xz + e * yz + f * zz
+    m6, m7, m8 = g * xx + h * xy + i * xz, g * xy + h * yy + i * yz, g * xz + h * yz + i * zz
     # fmt: off
     return (
-        v0 * a + v1 * b + v2 * c, v0 * d + v1 * e + v2 * f, v0 * g + v1 * h + v2 * i,
-        v3 * d + v4 * e + v5 * f, v3 * g + v4 * h + v5 * i, v6 * g + v7 * h + v8 * i,
-        c0 * a + c1 * b + c2 * c, c0 * d + c1 * e + c2 * f, c0 * g + c1 * h + c2 * i,
-        c3 * a + c4 * b + c5 * c, c3 * d + c4 * e + c5 * f, c3 * g + c4 * h + c5 * i,
-        c6 * a + c7 * b + c8 * c, c6 * d + c7 * e + c8 * f, c6 * g + c7 * h + c8 * i,
-        w0 * a + w1 * b + w2 * c, w0 * d + w1 * e + w2 * f, w0 * g + w1 * h + w2 * i,
-        w3 * d + w4 * e + w5 * f, w3 * g + w4 * h + w5 * i, w6 * g + w7 * h + w8 * i,
+        m0 * a + m1 * b + m2 * c, m0 * d + m1 * e + m2 * f, m0 * g + m1 * h + m2 * i,
+        m3 * d + m4 * e + m5 * f, m3 * g + m4 * h + m5 * i, m6 * g + m7 * h + m8 * i,
+    )
+    # fmt: on
+
+
+def upper(numbers: Isotropic) -> tuple[float, ...]:
+    """Return the 21 numbers of `sum_others` of a sum."""
+    vxx, vxy, vxz, vyy, vyz, vzz, sx, sy, sz, w = numbers
+    # fmt: off
+    return (
+        vxx, vxy, vxz, vyy, vyz, vzz,
+        0.0, sz, -sy,
+        -sz, 0.0, sx,
+        sy, -sx, 0.0,
+        w, 0.0, 0.0, w, 0.0, w,
     )
     # fmt: on
 
@@ -301,7 +345,7 @@ def add_square(numbers: tuple[float, ...], twist: tuple[float, ...]) -> tuple[fl
 
 
 def expand(numbers: tuple[float, ...]) -> tuple[float, ...]:
-    """Return all 36 numbers of the covariance whose 21 `sum_at` gives."""
+    """Return all 36 numbers of the covariance whose 21 `sum_others` gives."""
     vxx, vxy, vxz, vyy, vyz, vzz, cxx, cxy, cxz, cyx, cyy, cyz, czx, czy, czz, wxx, wxy, wxz, wyy, wyz, wzz = numbers
     # fmt: off
     return (
@@ -320,4 +364,4 @@ def as_array(numbers: tuple[float, ...]) -> Array:
     return np.array(numbers).reshape(6, 6)
 
 
-_ZERO: Final[tuple[float, ...]] = (0.0,) * 21
+_NONE: Final[Isotropic] = (0.0,) * 10

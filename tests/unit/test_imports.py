@@ -57,7 +57,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "msdrivers.devices": VALUES | {"messages", "msdrivers.protocol", "msdrivers.station"},
     "msdrivers.emulate": VALUES | {"messages", "geodesy", "simulation", "msdrivers.protocol", "msdrivers.station"},
     "msdrivers": WIRE
-    | {"geodesy", "msdrivers.protocol", "msdrivers.station", "msdrivers.devices", "msdrivers.emulate"},
+    | {"config_reader", "geodesy", "msdrivers.protocol", "msdrivers.station", "msdrivers.devices", "msdrivers.emulate"},
     "mslcm": set(),
     "mstools": SERVICE
     | {

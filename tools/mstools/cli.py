@@ -6,6 +6,7 @@ finds by its own: 1 warnings, 3 errors.
 
 from __future__ import annotations
 
+import gc
 import importlib
 import sys
 from collections.abc import Callable, Sequence
@@ -120,12 +121,27 @@ def build(arguments: Sequence[str]) -> typer.Typer:
     for name, summary in COMMANDS.items():
         function: Callable[..., None] | typer.Typer = _stub
         if name == wanted:
-            function = importlib.import_module(f"mstools.{name.replace('-', '_')}").command
+            function = _import_command(name)
         if isinstance(function, typer.Typer):
             app.add_typer(function, name=name, short_help=summary)
         else:
             app.command(name, short_help=summary)(function)
     return app
+
+
+def _import_command(name: str) -> Callable[..., None] | typer.Typer:
+    """Import a subcommand, without the garbage collector: what is imported stays, and looking for garbage in it takes
+    a sixth of the time."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        command: Callable[..., None] | typer.Typer
+        command = importlib.import_module(f"mstools.{name.replace('-', '_')}").command
+        return command
+    finally:
+        if was_on:
+            gc.freeze()
+            gc.enable()
 
 
 def _command_of(arguments: Sequence[str]) -> str:
