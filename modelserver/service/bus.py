@@ -6,6 +6,7 @@ import math
 import select
 import time
 from collections.abc import Callable
+from enum import Enum
 from typing import Final, Protocol, TypeAlias
 
 from modelserver.service.membership import RENEW_S, Membership
@@ -95,6 +96,20 @@ class Bus(Protocol):
         ...
 
 
+class Expected(Enum):
+    """What `LcmBus.wait` has just seen of an inbox."""
+
+    NOTHING = 0
+    ONE = 1
+    """It was empty until now, and a message has come. There may be more by now, which the next wait finds."""
+    ANY = 2
+    """Not known."""
+
+
+SLEPT_S: Final = 20e-6
+"""A wait that took longer had to wait."""
+
+
 class LcmInbox:
     """An inbox on an LCM instance of its own."""
 
@@ -102,8 +117,7 @@ class LcmInbox:
         self._queue_bytes = queue_bytes
         self.lcm = open_lcm(url)
         self.fileno = self.lcm.fileno()
-        self.may_have = True
-        """Whether something may have come; false only where `LcmBus.wait` has just seen that nothing has."""
+        self.expected = Expected.ANY
 
     def subscribe(self, channel: str, handler: Handler) -> None:
         """Hand every message of exactly `channel` to `handler`."""
@@ -124,9 +138,13 @@ class LcmInbox:
 
         The message that is being handled when the time is up is the last.
         """
-        if not self.may_have:
-            self.may_have = True
+        expected, self.expected = self.expected, Expected.ANY
+        if expected is Expected.NOTHING or not limit:
             return 0
+        if expected is Expected.ONE:
+            # without asking whether there is one: a call to the kernel less, while a client waits for its reply
+            self.lcm.handle()
+            return 1
         end = time.monotonic() + seconds
         for count in range(limit):
             if not take_message(self.lcm):
@@ -152,22 +170,20 @@ class LcmBus:
 
     def wait(self, seconds: float, requests: bool = True) -> None:
         """Return when something has come or the time is up; without `requests` only samples count."""
-        if time.monotonic() >= self._renew_at:
-            self._renew_at = time.monotonic() + RENEW_S
+        begin = time.monotonic()
+        if begin >= self._renew_at:
+            self._renew_at = begin + RENEW_S
             self._membership.renew()
         if not requests:
             readable, _, _ = select.select((self.sensors.fileno,), (), (), max(0.0, seconds))
-            self.sensors.may_have = bool(readable)
+            self.sensors.expected = Expected.ANY if readable else Expected.NOTHING
             return
         # poll is the cheaper call but counts in milliseconds; select keeps the deadline to the microsecond
         milliseconds = int(seconds * 1e3)
-        ready = self._poll.poll(milliseconds)
-        if len(ready) == 1:
-            file = ready[0][0]
-            self.sensors.may_have = file == self.sensors.fileno
-            self.requests.may_have = file == self.requests.fileno
-        elif not ready:
+        ready = [file for file, _ in self._poll.poll(milliseconds)]
+        if not ready:
             files = (self.sensors.fileno, self.requests.fileno)
-            readable, _, _ = select.select(files, (), (), max(0.0, seconds - milliseconds * 1e-3))
-            self.sensors.may_have = self.sensors.fileno in readable
-            self.requests.may_have = self.requests.fileno in readable
+            ready, _, _ = select.select(files, (), (), max(0.0, seconds - milliseconds * 1e-3))
+        some = Expected.ONE if time.monotonic() - begin > SLEPT_S else Expected.ANY
+        for inbox in (self.sensors, self.requests):
+            inbox.expected = some if inbox.fileno in ready else Expected.NOTHING

@@ -177,7 +177,11 @@ class Loop:
             # waking for each request of a flood would be most of the work
             self._bus.wait(0.0 if requests.is_ready else min(seconds, FLOOD_PAUSE_S), requests=False)
         elif not requests.is_ready:
-            self._bus.wait(min(seconds, FLOOD_PAUSE_S) if requests.waiting else seconds)
+            if requests.waiting:
+                seconds = min(seconds, FLOOD_PAUSE_S)
+            elif requests.prepare(begin_ns):
+                seconds = 0.0
+            self._bus.wait(seconds)
 
     def _drain_sensors(self) -> bool:
         """Handle the samples that have come, up to the next tick; return whether more may wait."""

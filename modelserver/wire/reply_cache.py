@@ -12,7 +12,7 @@ import struct
 from typing import Final
 
 from modelserver.errors import Status
-from modelserver.messages import Policy, SendReply, TransformReply
+from modelserver.messages import Policy, Reply, TransformReply
 from modelserver.wire.fields import MAX_UTIME
 from mslcm.get_transformation_reply_t import get_transformation_reply_t
 from mslcm.get_transformation_request_t import get_transformation_request_t
@@ -77,13 +77,12 @@ class StaticReplyCache:
             return None
         return b"%b%b%b%b" % (_REPLY, request[8:16], _UTIME.pack(utime), rest)
 
-    def add(self, request: bytes, client: bytes, reply: SendReply, encoded: bytes) -> None:
+    def add(self, request: bytes, client: bytes, reply: Reply, encoded: bytes) -> None:
         """Cache a reply to a request, if it does not depend on time; `encoded` are its bytes."""
-        body = reply.reply
-        if not isinstance(body, TransformReply) or body.header.status is not Status.OK or body.answer is None:
+        if not isinstance(reply, TransformReply) or reply.header.status is not Status.OK or reply.answer is None:
             return
         pair = request[_CHANNEL + len(client) : -_TIME.size]
-        if body.answer.transformation.utime or len(pair) > LONGEST_PAIR:
+        if reply.answer.transformation.utime or len(pair) > LONGEST_PAIR:
             return
         if len(self._entries) >= self._capacity:
             self._entries.pop(next(iter(self._entries), b""), None)

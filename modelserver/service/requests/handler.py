@@ -9,23 +9,29 @@ One pass of the server loop gives it a slice of at most a millisecond:
 3. Work on the deferred reply, if one is in progress: steps of about half a millisecond, begun only where they end
    before the next tick (`deferred`). One is worked out at a time, the others wait in their queues.
 4. Send replies to some of the requests that were dropped.
+
+Where a pass finds nothing to do, `prepare` works out static replies ahead (`StaticReplyCache`), once somebody asks.
 """
 
 from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from itertools import islice, product
 from typing import Final, Protocol
 
 from modelserver import core
-from modelserver.answers import DeferredAnswer, effort_of, is_deferred
+from modelserver.answers import DeferredAnswer, answers, effort_of, is_deferred
 from modelserver.core import CoreState, Instant
-from modelserver.errors import WireError
+from modelserver.errors import QueryError, WireError
+from modelserver.geometry import names
 from modelserver.messages import (
     CHANNEL_OF,
     Commanded,
     Event,
+    GetTransformation,
     Noticed,
     Output,
     Rejected,
@@ -33,6 +39,7 @@ from modelserver.messages import (
     RequestHeader,
     SendReply,
     SwitchMode,
+    TimeQuery,
 )
 from modelserver.service.bus import Bus
 from modelserver.service.clock import Clock
@@ -50,7 +57,7 @@ from modelserver.service.requests.scheduler import (
 from modelserver.wire.channels import BY_NAME, REQUESTS
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.journal import Kind
-from modelserver.wire.reply_cache import CACHED_TYPE, StaticReplyCache
+from modelserver.wire.reply_cache import CACHED_TYPE, LARGEST_CACHE, StaticReplyCache
 from modelserver.wire.requests import request_header
 from modelserver.wire.signed import SIGNED
 
@@ -70,6 +77,12 @@ STEP_ROOM_NS: Final = 1_500_000
 
 STARVED_NS: Final = 50_000_000
 """Deferred work that has not had a step for so long gets one all the same."""
+
+PREPARE_NS: Final = 100_000
+"""How long replies are worked out ahead before the loop looks for messages again: so long may one have to wait."""
+
+PREPARED_MOST: Final = 16
+"""Pairs of frames worked out ahead at once, at most."""
 
 REJECTIONS_PER_PASS: Final = 2
 REJECTIONS_WAITING: Final = 128
@@ -133,6 +146,7 @@ class RequestHandler:
         self._scheduler = RequestScheduler(limits, clock.monotonic_ns())
         self.contention = ContentionDetector()
         self._cache = StaticReplyCache()
+        self._unprepared: Iterator[tuple[str, str]] = iter(())
         self._answered = 0
         self._dropped: dict[str, int] = {}
         self._rejections: deque[QueuedRequest] = deque()
@@ -204,11 +218,38 @@ class RequestHandler:
             self._report = report
             self._context.step(Noticed("requests", report), clock.now())
 
+    def prepare(self, until_ns: int) -> bool:
+        """Work out some static replies ahead, before `until_ns`; return whether to go on with more.
+
+        It begins with the first request for a transformation, and again with the first one after a change of model.
+        """
+        now = self._clock.now()
+        view = self._context.state.view
+        if (
+            until_ns - now.monotonic_ns < 2 * PREPARE_NS
+            or not self._cache.is_of(view.model)
+            or self.contention.is_contended(now.monotonic_ns)
+        ):
+            return False
+        for _ in range(PREPARED_MOST):
+            pair = next(self._unprepared, None)
+            if pair is None:
+                return False
+            with suppress(QueryError):
+                if view.model.rigid_transformation(*pair) is None:
+                    continue
+                request = GetTransformation(RequestHeader(0, ""), *pair, TimeQuery())
+                for reply in answers(view, request, now.utime):
+                    self._cache.add(encode(request), b"", reply, encode(reply))
+            if self._clock.monotonic_ns() - now.monotonic_ns >= PREPARE_NS:
+                break
+        return True
+
     def cache(self, output: SendReply, encoded: bytes) -> None:
         """Cache a reply that has just been sent, where it answers the current request and does not depend on time."""
         current = self._current
         if current is not None and current.type_name == CACHED_TYPE and current.client:
-            self._model_cache().add(current.data, current.client, output, encoded)
+            self._model_cache().add(current.data, current.client, output.reply, encoded)
 
     def defer(self, answer: DeferredAnswer) -> None:
         """Take on a deferred answer; one is in progress at a time."""
@@ -362,14 +403,15 @@ class RequestHandler:
     def _send_cached(self, client: bytes, channel: str, data: bytes) -> bool:
         """Answer a request from the cache; return whether that was possible."""
         now = self._clock.now()
+        context = self._context
         reply = self._model_cache().find(data, client, now.utime)
         if reply is None:
             return False
         header = RequestHeader(0, client.decode("utf-8", "replace"))
-        if not header.is_answerable(self._context.state.settings.reply_prefix):
+        if not header.is_answerable(context.state.settings.reply_prefix):
             return False
-        self._context.note(Kind.REMEMBERED, channel, data, now)
-        self._context.publish(header.reply_channel, reply)
+        context.note(Kind.REMEMBERED, channel, data, now)
+        context.publish(header.reply_channel, reply)
         self._answered += 1
         return True
 
@@ -377,7 +419,9 @@ class RequestHandler:
         """Return the cache, emptied where its model is no longer in use."""
         model = self._context.state.view.model
         if not self._cache.is_of(model):
-            self._cache.reset(model, sum(len(body.frames) for body in model.bodies))
+            frames = [names.joined(body.name, frame.name) for body in model.bodies for frame in body]
+            self._cache.reset(model, len(frames))
+            self._unprepared = islice(product(frames, frames), LARGEST_CACHE)
         return self._cache
 
     def _fail(self, queued: QueuedRequest, request: Request, error: Exception) -> None:

@@ -50,7 +50,7 @@ def cache_of(model: Model, frames: int = 10) -> StaticReplyCache:
 def filled(model: Model) -> StaticReplyCache:
     cache = cache_of(model)
     reply = reply_of(model, asked(1), Instant(1, 2))
-    cache.add(encode(asked(1)), CLIENT, reply, encode(reply.reply))
+    cache.add(encode(asked(1)), CLIENT, reply.reply, encode(reply.reply))
     return cache
 
 
@@ -103,7 +103,7 @@ def test_given_a_question_that_fails_then_it_is_not_cached() -> None:
     wrong = asked(interest="Camera:Lans")
     reply = reply_of(model, wrong)
     cache = cache_of(model)
-    cache.add(encode(wrong), CLIENT, reply, encode(reply.reply))
+    cache.add(encode(wrong), CLIENT, reply.reply, encode(reply.reply))
     assert len(cache) == 0
 
 
@@ -113,7 +113,7 @@ def test_given_all_pairs_of_a_model_then_they_fit() -> None:
     reply = reply_of(model, asked())
     requests = [encode(GetTransformation(RequestHeader(1, "REPLY_TEST"), f"A:{n}", "B:C")) for n in range(57 * 57)]
     for request in requests:
-        cache.add(request, CLIENT, reply, encode(reply.reply))
+        cache.add(request, CLIENT, reply.reply, encode(reply.reply))
     assert all(cache.find(request, CLIENT, 5) is not None for request in requests)
 
 
@@ -124,12 +124,12 @@ def test_given_more_pairs_than_fit_then_the_one_not_used_for_longest_goes(monkey
     reply = reply_of(model, asked())
     requests = [encode(GetTransformation(RequestHeader(1, "REPLY_TEST"), f"A:{n}", "B:C")) for n in range(20)]
     for request in requests[:3]:
-        cache.add(request, CLIENT, reply, encode(reply.reply))
+        cache.add(request, CLIENT, reply.reply, encode(reply.reply))
     assert cache.find(requests[0], CLIENT, 5) is not None
-    cache.add(requests[3], CLIENT, reply, encode(reply.reply))
+    cache.add(requests[3], CLIENT, reply.reply, encode(reply.reply))
     assert [cache.find(request, CLIENT, 5) is not None for request in requests[:4]] == [True, False, True, True]
     for request in requests:
-        cache.add(request, CLIENT, reply, encode(reply.reply))
+        cache.add(request, CLIENT, reply.reply, encode(reply.reply))
         assert len(cache) <= 3
 
 
@@ -138,5 +138,5 @@ def test_given_a_pair_of_long_names_then_it_is_not_cached() -> None:
     cache = cache_of(model)
     reply = reply_of(model, asked())
     long = GetTransformation(RequestHeader(1, "REPLY_TEST"), "x" * 600, "y")
-    cache.add(encode(long), CLIENT, reply, encode(reply.reply))
+    cache.add(encode(long), CLIENT, reply.reply, encode(reply.reply))
     assert len(cache) == 0
