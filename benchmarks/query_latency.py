@@ -1,28 +1,36 @@
 """A query over LCM, reply decoded, beside a bare LCM echo of as many bytes: one pair, and random pairs of all frames.
 
-Echo and query take turns call by call, so that a machine that is busy with something else slows both.
+Echo and query take turns call by call, so that a machine that is busy with something else slows both. Between the two
+stands the least service that Python could be (`least_server`): two inboxes as the daemon has, and a look into a
+dictionary, asked by the same client. What it takes more than the echo no daemon in Python can save.
 """
 
 from __future__ import annotations
 
 import itertools
 import random
+import select
 import statistics
+import struct
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import lcm
 
 from benchmarks.flood import sensors
+from benchmarks.query_cost import loaded
 from benchmarks.support import RAPTOR, daemon, free_url, interleaved, process, ratio, verdict
+from modelserver import core
 from modelserver.client.remote import Platform
 from modelserver.messages import CHANNEL_OF, GetTransformation
 from modelserver.wire.channels import literal
+from modelserver.wire.codec import decode, encode
 from modelserver.wire.provider import resolve_url
+from modelserver.wire.queries import write_question
 
 INTEREST, REFERENCE = "Digiclops:ImagePlane", "Raptor:CG"
 ROUNDS, CALLS = 40, 100
@@ -32,6 +40,14 @@ REPEATS = 3
 DRIVING_PAIRS = 1000
 WHEELS = ("front_left", "front_right")
 
+LEAST = "LEAST_"
+"""Channel prefix of the least service."""
+
+_REQUEST = "get_transformation_request_t"
+_NAMES_AT = 21
+"""Where the names begin in a request whose reply channel is empty; the channel begins one byte before."""
+_UTIME = struct.Struct(">q")
+
 
 def echo_server(reply_file: str) -> None:
     """Answer every message on ECHO with the bytes of a file: the least that a Python server can do."""
@@ -40,6 +56,42 @@ def echo_server(reply_file: str) -> None:
     bus.subscribe("ECHO", lambda channel, data: bus.publish("REPLY_ECHO", reply)).set_queue_capacity(0)
     while True:
         bus.handle()
+
+
+def least_server() -> None:
+    """Answer each question for a transformation from a dictionary, and do nothing else."""
+    state, names, now = loaded(moving=False)
+    replies = {}
+    for pair in itertools.product(names, repeat=2):
+        question = write_question(0, "", *pair, 0, 0, 0)
+        (output,) = core.step(state, decode(_REQUEST, write_question(0, "REPLY_LEAST", *pair, 0, 0, 0)), now)[1]
+        replies[question[_NAMES_AT:]] = encode(output.reply)
+    requests, sensors = lcm.LCM(resolve_url()), lcm.LCM(resolve_url())
+    sensors.subscribe("NOTHING", lambda channel, data: None)
+
+    def answer(channel: str, data: bytes) -> None:
+        client, _, names = data[_NAMES_AT - 1 :].partition(b"\0")
+        reply = replies[names]
+        requests.publish(client.decode(), reply[:8] + data[8:16] + _UTIME.pack(time.time_ns() // 1000) + reply[24:])
+
+    requests.subscribe(literal(f"{LEAST}{CHANNEL_OF[GetTransformation]}"), answer)
+    poll = select.poll()
+    poll.register(requests.fileno(), select.POLLIN)
+    poll.register(sensors.fileno(), select.POLLIN)
+    while True:
+        if poll.poll(20):
+            requests.handle()
+
+
+@contextmanager
+def least_service(url: str) -> Iterator[Platform]:
+    """Run the least service, and return a client that it has answered."""
+    with (
+        process("-m", "benchmarks.query_latency", "least", url=url),
+        Platform(url, channel_prefix=LEAST, name="least", retries=40, timeout=0.5) as platform,
+    ):
+        platform.get_transformation(INTEREST, REFERENCE)
+        yield platform
 
 
 class EchoClient:
@@ -101,16 +153,22 @@ def frames_of(platform: Platform) -> list[str]:
     return [f"{body}:{frame}" for body in bodies for frame in platform.get_body_frame_list(body)]
 
 
-def in_turns(platform: Platform, echo: EchoClient, pairs: Sequence[tuple[str, str]]) -> dict[str, list[float]]:
-    """Return the seconds of an echo and of a query for each pair, one after the other."""
-    times: dict[str, list[float]] = {"echo": [], "query": []}
-    for interest, reference in pairs:
-        begin = time.perf_counter()
-        echo.ask()
-        middle = time.perf_counter()
-        platform.get_transformation(interest, reference)
-        times["query"].append(time.perf_counter() - middle)
-        times["echo"].append(middle - begin)
+def in_turns(
+    platform: Platform, echo: EchoClient, least: Platform, pairs: Sequence[tuple[str, str]]
+) -> dict[str, list[float]]:
+    """Return the seconds of an echo, of a query, and of one to the least service, for each pair in random order."""
+    actions: dict[str, Callable[[str, str], object]] = {
+        "echo": lambda interest, reference: echo.ask(),
+        "query": platform.get_transformation,
+        "least service": least.get_transformation,
+    }
+    times: dict[str, list[float]] = {name: [] for name in actions}
+    order = random.Random(2)
+    for pair in pairs:
+        for name in order.sample(list(actions), len(actions)):
+            begin = time.perf_counter()
+            actions[name](*pair)
+            times[name].append(time.perf_counter() - begin)
     return times
 
 
@@ -124,6 +182,7 @@ def compare(what: str, times: dict[str, list[float]], p50: float, p99: float = 0
             for name, each in of.items()
         )
     )
+    print(f"  {what}: the least service takes {of['least service'][49] / of['echo'][49]:.2f} times the echo")
     holds = verdict(f"{what}: p50 to the echo's", of["query"][49] / of["echo"][49], p50, "x")
     if p99:
         holds &= verdict(f"{what}: p99 to the echo's", of["query"][98] / of["echo"][98], p99, "x")
@@ -147,15 +206,15 @@ def main() -> int:
         frames = frames_of(platform)
         pairs = list(itertools.product(frames, frames))
         random.Random(1).shuffle(pairs)
-        with echoing(url, request, reply) as echo:
+        with echoing(url, request, reply) as echo, least_service(free_url()) as least:
             actions = {
                 "echo": echo.ask,
                 "query": lambda: platform.get_transformation(INTEREST, REFERENCE),
                 "query at": lambda: platform.get_transformation(INTEREST, REFERENCE, at=next(times_asked)),
             }
             interleaved(5, CALLS, actions)  # warm up: the interpreter specializes what runs often
-            first = in_turns(platform, echo, pairs)
-            again = in_turns(platform, echo, pairs * REPEATS)
+            first = in_turns(platform, echo, least, pairs)
+            again = in_turns(platform, echo, least, pairs * REPEATS)
             times = interleaved(ROUNDS, CALLS, actions)
     print(f"  request {len(request)} bytes, reply {len(reply)} bytes; {len(frames)} frames, {len(pairs)} pairs")
     holds = compare("random pairs, first time", first, 1.6, 4.0)
@@ -166,9 +225,10 @@ def main() -> int:
         daemon(url, driving(Path(folder))) as platform,
         process("-m", "benchmarks.query_latency", "sensors", url=url),
         echoing(url, request, reply) as echo,
+        least_service(free_url()) as least,
     ):
         time.sleep(5.0)
-        some = in_turns(platform, echo, pairs[:DRIVING_PAIRS] * 2)
+        some = in_turns(platform, echo, least, pairs[:DRIVING_PAIRS] * 2)
         some = {name: values[DRIVING_PAIRS:] for name, values in some.items()}
     holds &= compare("random pairs, beside POSE and IMU at 100 Hz", some, 2.0)
     print(f"  one pair, p50, median of {ROUNDS} rounds:")
@@ -182,6 +242,8 @@ def main() -> int:
 if __name__ == "__main__":
     if sys.argv[1:2] == ["echo"]:
         echo_server(sys.argv[2])
+    elif sys.argv[1:2] == ["least"]:
+        least_server()
     elif sys.argv[1:2] == ["sensors"]:
         sensors(100.0, WHEELS, -1.0)
     else:
