@@ -1,7 +1,7 @@
 # Two commands on a fresh machine with python3, python3-venv and make:
 #   make demo     makes its own environment, installs, runs the demo
 #   make test     the same for the tests
-# and: make test-quick (without processes and long drives, for the inner loop: 1.5 minutes on two cores),
+# and: make test-quick (without processes and long drives, for the inner loop: 50 seconds on two cores),
 #      make check (format, lint, types), make bench (ratio benchmarks), make clean.
 
 PYTHON ?= python3

@@ -57,6 +57,7 @@ class Drive:
     pitch: Callable[[float], float] = field(default_factory=lambda: constant(0.0))
 
     def __post_init__(self) -> None:
+        self._poses: dict[int, Pose] = {}
         dt = 1e-3
         self.t = np.arange(-0.1, self.seconds + 0.2, dt)
         v = np.array([self.speed(t) for t in self.t])
@@ -68,6 +69,14 @@ class Drive:
 
     def pose(self, t: float) -> Pose:
         """The true pose in the tangent plane, `t` seconds after START."""
+        # a sample needs the poses around it too, which are those of its neighbours
+        nanoseconds = round(t * 1e9)
+        found = self._poses.get(nanoseconds)
+        if found is None:
+            found = self._poses[nanoseconds] = self._pose(nanoseconds * 1e-9)
+        return found
+
+    def _pose(self, t: float) -> Pose:
         x, y, yaw = (float(np.interp(t, self.t, each)) for each in (self.x, self.y, self.yaws))
         return Pose.from_rpy((x, y, 0.0), self.roll(t), self.pitch(t), yaw)
 

@@ -44,6 +44,7 @@ class Ride:
     seconds: float
     simulation: Simulation
     _truths: dict[int, Pose] = field(default_factory=dict)
+    _events: tuple[Event, ...] | None = None
     _lock: threading.Lock = field(default_factory=threading.Lock)
     """Held while the simulation works: one thread may stream its events and another ask for its truth."""
 
@@ -54,7 +55,9 @@ class Ride:
 
     def events(self, transform: Transform = lambda events: events) -> list[Event]:
         """What arrives during the drive, in the order of arrival (host_utime)."""
-        return list(self.stream(transform))
+        if self._events is None:
+            self._events = tuple(self.stream())
+        return list(transform(self._events))
 
     def stream(self, transform: Transform = lambda events: events) -> Iterator[Event]:
         """The same, each simulated when it is asked for."""

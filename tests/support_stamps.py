@@ -32,6 +32,7 @@ from modelserver.service.clock import FakeClock
 from modelserver.service.daemon import load_vehicle
 from modelserver.service.fake_bus import FakeBus
 from modelserver.service.loop import Loop, LoopSettings
+from modelserver.simulation import Event
 from modelserver.wire.codec import decode, encode
 
 AIDING = {
@@ -78,7 +79,9 @@ class Attack:
 
     def events(self, ride: Ride, until: float) -> Iterator[tuple[int, bytes]]:
         """Yield the instants of arrival (utime) and the messages."""
-        true = [each for each in ride.events() if CHANNELS.get(type(each)) == self.channel]
+        true: list[Event] = []
+        if self.seq_ahead is not None:
+            true = [each for each in ride.events() if CHANNELS.get(type(each)) == self.channel]
         stamps = itertools.cycle(self.stamps)
         for n in range(min(self.count, int((until - self.since) * self.hz))):
             at = ride.start_utime + round((self.since + (n + 0.37) / self.hz) * 1e6)
