@@ -16,15 +16,15 @@ import lcm
 import numpy as np
 
 from benchmarks.support import free_url, interleaved, process, verdict
-from modelserver.answers import DeferredAnswer
 from modelserver.client.remote import Platform
+from modelserver.core.answers import DeferredAnswer
 from modelserver.errors import NoServerError
 from modelserver.geometry import names
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType
 from modelserver.geometry.parts import Sigma
 from modelserver.history import History
-from modelserver.joints import Joints
+from modelserver.joints.joints import Joints
 from modelserver.messages import (
     CHANNEL_OF,
     Estimate,

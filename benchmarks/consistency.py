@@ -32,7 +32,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from benchmarks import husky_nis
-from modelserver.geodesy import origin_at
+from modelserver.earth.geodesy import origin_at
 from modelserver.geometry import ModelBuilder
 from modelserver.localization.filter.localizer import FilterLocalizer
 from modelserver.localization.filter.settings import FilterSettings

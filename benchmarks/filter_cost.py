@@ -26,11 +26,11 @@ from benchmarks.withheld import data_directory
 from modelserver import core
 from modelserver.config import load_config
 from modelserver.core import Instant
-from modelserver.geodesy import Geodesy, origin_at
+from modelserver.earth.geodesy import Geodesy, origin_at
 from modelserver.localization.modes import ModeLocalizer
 from modelserver.messages import FixType, GpsSample, ImuSample, Sample, SensorHeader, WheelSample, WheelsSample
 from modelserver.service.daemon import Vehicle, load_vehicle
-from mstools.import_bag import import_bag
+from mstools.commands.import_bag import import_bag
 
 ROOT = Path(__file__).resolve().parent.parent
 HUSKY = ROOT / "config" / "husky" / "vehicle.yaml"

@@ -13,7 +13,7 @@ from modelserver.messages import Decision, Verdict
 from modelserver.service.daemon import load_vehicle
 from modelserver.service.offline import Run
 from modelserver.wire.eventlog import LogFile
-from mstools.import_bag import import_bag
+from mstools.commands.import_bag import import_bag
 
 KINDS = ("gps_position", "wheel_speed")
 

@@ -25,7 +25,7 @@ from modelserver.service.journal.ring import Ring
 from modelserver.service.journal.writer import JournalWriter, Origins, pause
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.wire.codec import encode
-from mstools.demo_drive import simulation
+from mstools.demo.drive import simulation
 
 START = 1_700_000_000_000_000
 ROUNDS, SAMPLES = 40, 200

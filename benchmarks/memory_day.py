@@ -45,7 +45,7 @@ from modelserver.service.loop import Loop, LoopSettings
 from modelserver.simulation import GpsModel, ImuModel, Timing, WheelsModel
 from modelserver.wire.codec import encode
 from modelserver.wire.provider import resolve_url
-from mstools.demo_drive import simulation
+from mstools.demo.drive import simulation
 
 START = 1_700_000_000_000_000
 IMU_HZ, WHEELS_HZ, GPS_HZ, ODD_EVERY = 20.0, 5.0, 1.0, 50

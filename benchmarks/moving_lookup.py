@@ -22,7 +22,7 @@ from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType
 from modelserver.geometry.parts import Sigma
 from modelserver.history import History
-from modelserver.joints import Joints
+from modelserver.joints.joints import Joints
 from modelserver.messages import JointSample, JointsSample, SensorHeader, TimeQuery
 from modelserver.platform import PlatformView
 from modelserver.spatial.pose import Pose

@@ -16,8 +16,8 @@ from benchmarks.overrides import vehicle_with
 from benchmarks.recordings import plaza
 from benchmarks.recordings.plaza import Array, Beacons
 from benchmarks.support import ROOT
+from modelserver.earth.geodesy import Geodesy
 from modelserver.errors import ModelServerError
-from modelserver.geodesy import Geodesy
 from modelserver.service.daemon import Vehicle, configured_origin
 from modelserver.service.offline import Run
 from modelserver.wire.eventlog import LogEvent, LogFile

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from modelserver.geodesy import Geodesy, LocalFrame, origin_at
+from modelserver.earth.geodesy import Geodesy, LocalFrame, origin_at
 from modelserver.geometry import Model, ModelBuilder
 from modelserver.localization.filter.localizer import FilterLocalizer
 from modelserver.localization.filter.measurements.gps import LATENCY

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from modelserver.geodesy import origin_at
+from modelserver.earth.geodesy import origin_at
 from modelserver.geometry import ModelBuilder
 from modelserver.localization.filter.localizer import FilterLocalizer
 from modelserver.localization.filter.settings import FilterSettings

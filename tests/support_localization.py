@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from modelserver.geodesy import Geodesy, origin_at
+from modelserver.earth.geodesy import Geodesy, origin_at
 from modelserver.localization.mounts import Mounts
 from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.messages import FixType, GpsSample, ImuSample, OrientationReference, SensorHeader

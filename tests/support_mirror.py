@@ -10,10 +10,10 @@ from support_moving import view as exact_view
 
 from modelserver.client.knowledge import Knowledge, Known
 from modelserver.client.local import LocalPlatform
+from modelserver.formats.snapshot import Snapshot, written
 from modelserver.geometry.model import Model
 from modelserver.messages import Estimate, SnapshotPart
 from modelserver.platform import PlatformView
-from modelserver.snapshot import Snapshot, written
 from modelserver.wire.codec import encode
 from modelserver.wire.snapshot import PART_BYTES
 

@@ -12,7 +12,7 @@ from modelserver.geometry.joint import Joint, JointType, Mimic
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Sigma
 from modelserver.history import History
-from modelserver.joints import Joints
+from modelserver.joints.joints import Joints
 from modelserver.messages import Estimate, JointSample, JointsSample, Origin, SensorHeader, VehicleMotion
 from modelserver.platform import PlatformView
 from modelserver.spatial import so3

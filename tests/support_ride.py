@@ -18,7 +18,7 @@ from modelserver.messages import GpsSample, ImuSample, Invalid, PoseAnswer, Publ
 from modelserver.service.daemon import Vehicle, load_vehicle
 from modelserver.simulation import Event, Simulation
 from modelserver.spatial.pose import Pose
-from mstools.demo_drive import simulation
+from mstools.demo.drive import simulation
 
 RAPTOR = Path(__file__).parents[1] / "config" / "raptor"
 CHANNELS: dict[type, str] = {GpsSample: "GPS", ImuSample: "IMU", WheelsSample: "WHEELS"}

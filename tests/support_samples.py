@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from modelserver.core import CoreSettings, CoreState, Instant, start
-from modelserver.geodesy import Geodesy, origin_at
+from modelserver.earth.geodesy import Geodesy, origin_at
 from modelserver.geometry import Model, ModelBuilder, Sigma
 from modelserver.localization.interface import Note
 from modelserver.messages import (

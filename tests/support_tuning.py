@@ -9,7 +9,7 @@ import yaml
 from support_recordings import REPOSITORY, write_log
 
 from modelserver.config import load_config
-from modelserver.geodesy import origin_at
+from modelserver.earth.geodesy import origin_at
 from modelserver.messages import GpsSample, ImuSample, WheelsSample
 from modelserver.service.daemon import load_vehicle
 from modelserver.simulation import ImuModel, Simulation, Timing, Trajectory, figure_eight

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from modelserver.wire.channels import CHANNELS, Way
-from mstools.lcm_wheel import binary
+from mstools.spy.lcm_wheel import binary
 
 ROOT = Path(__file__).resolve().parent.parent
 TYPES = ROOT / "lcmtypes"

@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.recordings.writing import Arrival, write_samples
-from modelserver.geodesy import LocalFrame, geodetic_from_ecef
+from modelserver.earth.geodesy import LocalFrame, geodetic_from_ecef
 from modelserver.messages import FixType, GpsSample, ImuSample, Matrix3, SensorHeader
 
 Array = npt.NDArray[np.float64]

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from modelserver.config import load_config
-from modelserver.geodesy import origin_at
+from modelserver.earth.geodesy import origin_at
 from modelserver.localization.filter.layout import ErrorState
 from modelserver.localization.filter.localizer import FilterLocalizer
 from modelserver.localization.filter.measurements import REGISTRY, Compared, register

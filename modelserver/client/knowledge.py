@@ -17,12 +17,12 @@ import numpy as np
 
 from modelserver.client.told import LONGEST_SPAN_US, SHORTEST_SPAN_US, Carried, Stand, Told
 from modelserver.errors import WireError, shown
+from modelserver.formats.snapshot import Snapshot, read
 from modelserver.geometry import names
 from modelserver.history import History
-from modelserver.joints import NO_JOINTS, Joints
+from modelserver.joints.joints import NO_JOINTS, Joints
 from modelserver.messages import JointsSample, PoseAnswer, SnapshotPart
 from modelserver.platform import PlatformView
-from modelserver.snapshot import Snapshot, read
 from modelserver.spatial.transformation import Transformation
 from modelserver.wire.codec import decode
 from modelserver.wire.snapshot import Assembler

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from modelserver.geodesy import Geodesy, GeodesyError
+from modelserver.earth.geodesy import Geodesy, GeodesyError
 from modelserver.history import Later
 from modelserver.messages import (
     NAN,

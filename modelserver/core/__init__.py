@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from modelserver.core.commands import OPERATOR, SET_COVARIANCE, commanded, model_loaded, unsigned
 from modelserver.core.keeping import START, kept, start_told
+from modelserver.core.reload import ModelLoaded
 from modelserver.core.requests import denied, fail, refuse, requested, turn_back
 from modelserver.core.samples import AHEAD_LIMIT_S, FUTURE_LIMIT_S, mode_wished, sample_taken
 from modelserver.core.state import (
@@ -63,7 +64,6 @@ from modelserver.messages import (
     VehicleStatusSample,
     WheelsSample,
 )
-from modelserver.reload import ModelLoaded
 
 
 def step(state: CoreState, event: Event | ModelLoaded, now: Instant) -> tuple[CoreState, AllOutputs]:

@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from modelserver.core.reload import ModelLoaded
 from modelserver.core.requests import turned_down
 from modelserver.core.samples import FUTURE_LIMIT_S, localized, mode_wished
 from modelserver.core.state import CoreState, Instant, Step, counted
@@ -38,7 +39,6 @@ from modelserver.messages import (
     SwitchMode,
     Verdict,
 )
-from modelserver.reload import ModelLoaded
 from modelserver.spatial.covariance import fault
 
 SET_COVARIANCE: Final = tuple(np.diag([1.0] * 3 + [math.radians(5.0) ** 2] * 3).ravel().tolist())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from modelserver.answers import DeferredAnswer, answers, failure, is_deferred
+from modelserver.core.answers import DeferredAnswer, answers, failure, is_deferred
 from modelserver.core.state import AllOutputs, CoreState, Instant, Outputs, Parked, Step, TimedRequest, counted
 from modelserver.errors import Status
 from modelserver.geometry import names

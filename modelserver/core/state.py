@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, Literal, NamedTuple, TypeAlias
 
-from modelserver.answers import DeferredAnswer
+from modelserver.core.answers import DeferredAnswer
 from modelserver.core.host_clock import HostClock
 from modelserver.errors import NotConnectedError
 from modelserver.geometry.model import Model
 from modelserver.history import History
-from modelserver.joints import Joints
+from modelserver.joints.joints import Joints
 from modelserver.localization.interface import Localizer
 from modelserver.messages import (
     NAN,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from modelserver.geodesy import NORTHERN_LIMIT, SOUTHERN_LIMIT
+from modelserver.earth.geodesy import NORTHERN_LIMIT, SOUTHERN_LIMIT
 from modelserver.localization.settings import FixSettings
 from modelserver.messages import FixType, GpsSample
 

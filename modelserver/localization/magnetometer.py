@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
 
-from modelserver import magnetism
+from modelserver.earth import magnetism
 from modelserver.spatial.so3 import Vector3
 
 _YEAR_US = 31_557_600_000_000

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from modelserver.geodesy import GeodesyError, geodetic_from_ecef, origin_at
+from modelserver.earth.geodesy import GeodesyError, geodetic_from_ecef, origin_at
 from modelserver.localization.settings import FixSettings
 from modelserver.messages import Origin
 from modelserver.spatial.so3 import Vector3

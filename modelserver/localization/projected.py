@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from modelserver.geodesy import Geodesy, GeodesyError, LocalFrame
+from modelserver.earth.geodesy import Geodesy, GeodesyError, LocalFrame
 from modelserver.localization.gate import GoodFix
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import Quaternion

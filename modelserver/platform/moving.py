@@ -7,7 +7,7 @@ import numpy as np
 from modelserver.errors import NoPoseError
 from modelserver.geometry.joint import Joint
 from modelserver.geometry.route import EdgeKind
-from modelserver.joints import How
+from modelserver.joints.joints import How
 from modelserver.messages import NAN, Estimate, MotionAnswer, Policy, TimeQuery
 from modelserver.platform.path import Step, way
 from modelserver.platform.view import PlatformView

@@ -9,7 +9,7 @@ import numpy as np
 
 from modelserver.geometry import names
 from modelserver.geometry.route import Edge, EdgeKind, Route
-from modelserver.joints import Reading
+from modelserver.joints.joints import Reading
 from modelserver.messages import NO_FLAGS, VALID, Estimate, Invalid, Quality, TimeQuery
 from modelserver.platform.placing import Placed
 from modelserver.platform.view import ODOM_INVALID, PlatformView

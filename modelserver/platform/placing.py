@@ -10,8 +10,8 @@ from modelserver.geometry.drives import Drive
 from modelserver.geometry.joint import Coordinates
 from modelserver.geometry.model import Model
 from modelserver.geometry.route import Route
-from modelserver.joint_vector import VECTORS, together
-from modelserver.joints import AHEAD_S, LONGEST_GAP_S, How, Joints, JointTrack, Reading
+from modelserver.joints.joints import AHEAD_S, LONGEST_GAP_S, How, Joints, JointTrack, Reading
+from modelserver.joints.vector import VECTORS, together
 from modelserver.messages import NAN, NO_FLAGS, VALID, Invalid, Policy, Quality
 
 _FLAG_OF: Mapping[How, int] = {

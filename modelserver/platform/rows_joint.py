@@ -8,9 +8,9 @@ import numpy as np
 
 from modelserver.geometry.joint import ROUNDING, Joint, JointType
 from modelserver.geometry.route import EdgeKind, Leg
-from modelserver.joint_vector import VECTORS
-from modelserver.joint_vector import columns as vector_columns
-from modelserver.joints import LONGEST_GAP_S
+from modelserver.joints.joints import LONGEST_GAP_S
+from modelserver.joints.vector import VECTORS
+from modelserver.joints.vector import columns as vector_columns
 from modelserver.messages import Invalid, Quality
 from modelserver.platform.rows import Rows
 from modelserver.platform.view import PlatformView

@@ -29,7 +29,7 @@ from modelserver.geometry.model import Model
 from modelserver.geometry.path_covariance import as_array
 from modelserver.geometry.route import Route
 from modelserver.history import History, at_time
-from modelserver.joints import NO_JOINTS, Joints, JointTrack
+from modelserver.joints.joints import NO_JOINTS, Joints, JointTrack
 from modelserver.localization.interface import Localizer
 from modelserver.messages import (
     NAN,

@@ -24,6 +24,8 @@ from modelserver.config import (
     with_lines,
 )
 from modelserver.core import CoreSettings, CoreState, Expected, Instant
+from modelserver.core.reload import ModelLoaded
+from modelserver.earth.geodesy import GeodesyError, make_origin
 from modelserver.errors import (
     ConfigError,
     GeometryError,
@@ -36,7 +38,7 @@ from modelserver.errors import (
     shown,
 )
 from modelserver.formats import Examined, examine_file
-from modelserver.geodesy import GeodesyError, make_origin
+from modelserver.formats.snapshot import Snapshot, written
 from modelserver.geometry import Model
 from modelserver.geometry.parts import meant_frame
 from modelserver.keys import read_keys
@@ -61,7 +63,6 @@ from modelserver.messages import (
     VehicleStatusSample,
     WheelsSample,
 )
-from modelserver.reload import ModelLoaded
 from modelserver.service.bus import LcmBus
 from modelserver.service.clock import SystemClock
 from modelserver.service.gauges import read_gauges, read_run_delay
@@ -78,7 +79,6 @@ from modelserver.service.requests.gate import Gate
 from modelserver.service.supervision.notify import Notifier
 from modelserver.service.supervision.supervised import Supervision
 from modelserver.signing import Key
-from modelserver.snapshot import Snapshot, written
 from modelserver.version import __version__
 from modelserver.wire.channels import CHANNELS, Way
 from modelserver.wire.provider import resolve_url

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from modelserver.core import CoreState
+from modelserver.core.reload import ModelLoaded
 from modelserver.messages import Gauges, Kept, LoadModel, OriginLatched, SwitchMode
-from modelserver.reload import ModelLoaded
 from modelserver.service.heard import Heard
 from modelserver.service.journal.queue import Journal, NoJournal
 from modelserver.service.requests.gate import Gate

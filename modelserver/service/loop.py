@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from modelserver import core
-from modelserver.answers import DeferredAnswer
 from modelserver.core import AllOutputs, CoreState, Instant
+from modelserver.core.answers import DeferredAnswer
+from modelserver.core.reload import ModelLoaded
 from modelserver.errors import WireError
 from modelserver.geometry import names
 from modelserver.messages import (
@@ -31,7 +32,6 @@ from modelserver.messages import (
     SwitchMode,
     Tick,
 )
-from modelserver.reload import ModelLoaded
 from modelserver.service.ahead import Lead
 from modelserver.service.bus import Bus
 from modelserver.service.clock import Clock

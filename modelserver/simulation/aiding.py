@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from modelserver.geodesy import Geodesy
+from modelserver.earth.geodesy import Geodesy
 from modelserver.messages import AbsolutePoseSample, RangeSample, RelativePoseSample
 from modelserver.simulation import rigid
 from modelserver.simulation.noise import Noise

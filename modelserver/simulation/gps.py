@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from modelserver.geodesy import Geodesy, LocalFrame
+from modelserver.earth.geodesy import Geodesy, LocalFrame
 from modelserver.messages import NAN, FixType, GpsSample
 from modelserver.simulation import rigid
 from modelserver.simulation.noise import GaussMarkov, Noise, diagonal

@@ -11,8 +11,8 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from modelserver import earth
-from modelserver.geodesy import Geodesy, about_up
+from modelserver.earth import gravity as earth
+from modelserver.earth.geodesy import Geodesy, about_up
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.simulation import rigid
 from modelserver.simulation.magnetometer import Magnetometer, MagnetometerModel

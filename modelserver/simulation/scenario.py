@@ -6,7 +6,7 @@ import heapq
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from modelserver.geodesy import Geodesy
+from modelserver.earth.geodesy import Geodesy
 from modelserver.geometry.model import Model
 from modelserver.messages import (
     AbsolutePoseSample,

@@ -22,7 +22,7 @@ from modelserver.spatial.transformation import Transformation
 from modelserver.wire import fields
 from modelserver.wire.channels import CHANNELS
 from modelserver.wire.codec import encode, type_names
-from mstools.lcm_wheel import binary, type_files
+from mstools.spy.lcm_wheel import binary, type_files
 
 ROOT = Path(__file__).resolve().parents[2]
 TYPES = ROOT / "lcmtypes"

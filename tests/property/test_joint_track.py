@@ -11,10 +11,10 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from modelserver import joint_track
 from modelserver.geometry.joint import left_jacobian
-from modelserver.joint_track import JointTrack
-from modelserver.joint_vector import columns, together
+from modelserver.joints.joints import track as joint_track
+from modelserver.joints.track import JointTrack
+from modelserver.joints.vector import columns, together
 from modelserver.spatial import so3
 
 NAN = math.nan

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from support_formats import models
 
 from modelserver.errors import WireError
+from modelserver.formats.snapshot import Snapshot, read, written
 from modelserver.geometry.model import Model
 from modelserver.messages import SnapshotPart
-from modelserver.snapshot import Snapshot, read, written
 from modelserver.wire.snapshot import Assembler, in_parts
 
 

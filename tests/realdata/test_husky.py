@@ -17,7 +17,7 @@ from modelserver.service.daemon import load_vehicle
 from modelserver.service.offline import Run
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogFile
-from mstools.import_bag import Report, import_bag
+from mstools.commands.import_bag import Report, import_bag
 
 pytestmark = pytest.mark.realdata
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from modelserver.geodesy import Geodesy
+from modelserver.earth.geodesy import Geodesy
 from modelserver.localization.mounts import Mounts
 from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.messages import FixType, GpsSample, ImuSample, OrientationReference, Quality, SensorHeader

@@ -17,8 +17,8 @@ import pytest
 from support_lcm import PATIENCE_S
 
 from modelserver.errors import NoServerError
-from mstools import demo
-from mstools.demo_children import Children, DemoError
+from mstools.commands import demo
+from mstools.demo.children import Children, DemoError
 
 DEMO = [sys.executable, "-c", "from mstools.cli import main; main()", "demo"]
 

@@ -16,8 +16,8 @@ from support_ride import RAPTOR, Ride
 from modelserver.config import load_config
 from modelserver.messages import DriverHealth, DriverPhase
 from modelserver.wire.codec import decode
-from mstools.demo_drive import simulation
-from mstools.demo_lines import lay_lines
+from mstools.demo.drive import simulation
+from mstools.demo.lines import lay_lines
 
 CHANNELS = {"gps": "GPS", "imu": "IMU", "wheels": "WHEELS", "raptor": "VEHICLE_STATUS", "front_axis": "JOINTS"}
 LOCALIZING = ("gps", "imu", "wheels")

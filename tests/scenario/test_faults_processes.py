@@ -13,14 +13,14 @@ from support_daemon import trial
 from support_lcm import PATIENCE_S
 
 from modelserver.client.mirror import PlatformMirror
+from modelserver.earth.geodesy import origin_at
 from modelserver.errors import NoPoseError, NoServerError
-from modelserver.geodesy import origin_at
 from modelserver.service.keeping.origin import OriginKeeper
 
 SAVING = """
 import sys
 from pathlib import Path
-from modelserver.geodesy import origin_at
+from modelserver.earth.geodesy import origin_at
 from modelserver.service.keeping.origin import OriginKeeper
 keeper, n = OriginKeeper(Path(sys.argv[1]), "raptor"), 0
 while True:

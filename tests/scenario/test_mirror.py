@@ -20,7 +20,7 @@ import modelserver as ms
 from modelserver.client.interface import PlatformClient
 from modelserver.messages import JointSample, JointsSample, Quality, SensorHeader
 from modelserver.wire.codec import encode
-from mstools.lcm_wheel import binary
+from mstools.spy.lcm_wheel import binary
 
 NODDING = GEOMETRY.replace(
     "xyz: [0, 0, 0.1]}", "xyz: [0, 0, 0.1], joint: {type: revolute, axis: [0, 1, 0], sigma_deg: 0.1}}"

@@ -16,8 +16,8 @@ from support_lcm import Listener, invoke, wait_until
 from support_samples import GEOMETRY, write_vehicle
 
 import modelserver as ms
+from modelserver.formats.snapshot import read
 from modelserver.messages import Invalid, JointSample, JointsSample, Quality, SensorHeader
-from modelserver.snapshot import read
 from modelserver.spatial import Pose, Transformation
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.snapshot import Assembler

@@ -10,8 +10,8 @@ import pytest
 from support_samples import ME, ORIGIN, START, Scripted, cart, decided, drive, gps, imu, now_at, started
 
 from modelserver import core
-from modelserver.answers import DeferredAnswer
 from modelserver.core import MAX_COUNTERS, AllOutputs, CoreSettings, CoreState, Instant, step
+from modelserver.core.answers import DeferredAnswer
 from modelserver.errors import Status, UnknownBodyError, UnknownFrameError
 from modelserver.geometry import names
 from modelserver.history import STEP_US

@@ -13,6 +13,7 @@ from support_moving import T0 as ROVER_T0
 from support_samples import ME, ORIGIN, START, Scripted, cart, decided, imu, now_at, started
 
 from modelserver.core import CoreSettings, CoreState, Instant, start, step
+from modelserver.core.reload import ModelLoaded
 from modelserver.errors import Status
 from modelserver.geometry import Model, ModelBuilder
 from modelserver.localization.mounts import Mounts
@@ -41,7 +42,6 @@ from modelserver.messages import (
     TransformReply,
     Verdict,
 )
-from modelserver.reload import ModelLoaded
 from modelserver.spatial import Pose, Transformation
 
 S = 1_000_000

@@ -17,6 +17,7 @@ from support_samples import ORIGIN, START, Scripted, cart, gps, imu, now_at, sta
 from modelserver import core
 from modelserver.core import CoreState, Expected, step
 from modelserver.core.health import percentile
+from modelserver.core.reload import ModelLoaded
 from modelserver.core.state import CHANGE_PERIOD_NS, SILENT_LEAST_S
 from modelserver.messages import (
     Decision,
@@ -39,7 +40,6 @@ from modelserver.messages import (
     Tick,
     Verdict,
 )
-from modelserver.reload import ModelLoaded
 from modelserver.wire.codec import encode
 
 S = 1_000_000

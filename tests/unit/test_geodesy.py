@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pyproj import Geod, Proj, Transformer
 from scipy.spatial.transform import Rotation
 
-from modelserver.geodesy import (
+from modelserver.earth.geodesy import (
     Geodesy,
     GeodesyError,
     LocalFrame,

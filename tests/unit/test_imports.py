@@ -13,11 +13,11 @@ ROOT = Path(__file__).resolve().parents[2]
 
 VALUES = {"errors", "version", "spatial"}
 GEOMETRY = VALUES | {"geometry"}
-POSES = VALUES | {"messages", "geodesy", "earth", "magnetism", "history"}
-CORE = GEOMETRY | POSES | {"joints", "joint_reading", "joint_track", "joint_vector", "localization", "platform"}
+POSES = VALUES | {"messages", "earth", "history"}
+CORE = GEOMETRY | POSES | {"joints", "localization", "platform"}
 WIRE = VALUES | {"messages", "wire", "mslcm", "regular_files"}
 SIGNING = {"keys", "signing"}
-SERVICE = CORE | WIRE | {"answers", "core", "config", "file_kinds", "formats", "reload", "snapshot"} | SIGNING
+SERVICE = CORE | WIRE | {"core", "config", "file_kinds", "formats"} | SIGNING
 
 MAY_IMPORT: dict[str, set[str]] = {
     "version": set(),
@@ -27,14 +27,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "messages": VALUES,
     "signing": VALUES | {"messages"},
     "keys": VALUES | {"messages", "signing", "regular_files"},
-    "geodesy": VALUES | {"messages"},
-    "earth": VALUES,
-    "magnetism": VALUES,
+    "earth": VALUES | {"messages"},
     "history": VALUES | {"messages"},
-    "joint_reading": {"messages"},
-    "joint_track": VALUES | {"messages", "joint_reading"},
-    "joint_vector": GEOMETRY | {"joint_reading", "joint_track"},
-    "joints": GEOMETRY | {"messages", "joint_reading", "joint_track"},
+    "joints": GEOMETRY | {"messages"},
     "file_kinds": set(),
     "regular_files": set(),
     # loads code, and neither computes nor reads anything
@@ -42,22 +37,19 @@ MAY_IMPORT: dict[str, set[str]] = {
     "formats": GEOMETRY | {"file_kinds", "regular_files"},
     "localization": GEOMETRY | POSES | {"filterpy_import"},
     "platform": CORE,
-    "answers": CORE,
-    "reload": CORE,
-    "snapshot": GEOMETRY | {"formats"},
-    "core": CORE | {"answers", "reload"},
-    "simulation": GEOMETRY | {"messages", "geodesy", "earth"},
+    "core": CORE,
+    "simulation": GEOMETRY | {"messages", "earth"},
     "config": GEOMETRY | {"messages", "localization", "config_reader", "file_kinds", "regular_files"},
     "config_reader": {"errors"},
     "wire": WIRE,
     "service": SERVICE,
-    "client": WIRE | GEOMETRY | POSES | {"formats", "joints", "platform", "snapshot"} | SIGNING,
+    "client": WIRE | GEOMETRY | POSES | {"formats", "joints", "platform"} | SIGNING,
     "msdrivers.protocol": VALUES | {"messages"},
     "msdrivers.station": VALUES | {"messages"},
     "msdrivers.devices": VALUES | {"messages", "msdrivers.protocol", "msdrivers.station"},
-    "msdrivers.emulate": VALUES | {"messages", "geodesy", "simulation", "msdrivers.protocol", "msdrivers.station"},
+    "msdrivers.emulate": VALUES | {"messages", "earth", "simulation", "msdrivers.protocol", "msdrivers.station"},
     "msdrivers": WIRE
-    | {"config_reader", "geodesy", "msdrivers.protocol", "msdrivers.station", "msdrivers.devices", "msdrivers.emulate"},
+    | {"config_reader", "earth", "msdrivers.protocol", "msdrivers.station", "msdrivers.devices", "msdrivers.emulate"},
     "mslcm": set(),
     "mstools": SERVICE
     | {
@@ -80,20 +72,13 @@ PURE = {
     "file_kinds",
     "spatial",
     "geometry",
-    "geodesy",
     "earth",
-    "magnetism",
     "localization",
     "messages",
     "signing",
     "history",
-    "joint_reading",
-    "joint_track",
-    "joint_vector",
     "joints",
     "platform",
-    "answers",
-    "reload",
     "core",
     "simulation",
     "msdrivers.protocol",

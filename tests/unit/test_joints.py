@@ -16,8 +16,7 @@ from modelserver.geometry.joint import Joint, JointType
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Constraint
 from modelserver.history import History
-from modelserver.joint_track import BLOCK, LEAST_CHANGE
-from modelserver.joints import (
+from modelserver.joints.joints import (
     ABSURD,
     AHEAD_S,
     LONGEST_GAP_S,
@@ -28,6 +27,7 @@ from modelserver.joints import (
     Joints,
     JointTrack,
 )
+from modelserver.joints.track import BLOCK, LEAST_CHANGE
 from modelserver.messages import NAN, Invalid, JointSample, JointsSample, Policy, Quality, SensorHeader, TimeQuery
 from modelserver.platform import PlatformView
 from modelserver.platform.many import many
@@ -519,7 +519,7 @@ def test_given_a_thousand_unknown_joints_in_one_message_then_the_nearest_name_of
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     searched: list[str] = []
-    monkeypatch.setattr("modelserver.joints.nearest_names", lambda name, known: searched.append(name) or [])
+    monkeypatch.setattr("modelserver.joints.joints.nearest_names", lambda name, known: searched.append(name) or [])
     unknown = [JointSample(f"x{n}", 0.1) for n in range(1024)]
     _, refused = Joints(constraints(), 60.0).taken(sample(1.0, *unknown), at(1.0))
     assert len(refused) == 1024

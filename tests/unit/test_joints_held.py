@@ -9,7 +9,7 @@ from support_mirror import fed, joints, parts, snapshot
 from support_moving import BASE, SCAN, T0, S, joints_at, rover
 
 from modelserver.client.knowledge import NEVER
-from modelserver.joints import Joints
+from modelserver.joints.joints import Joints
 from modelserver.messages import NAN, Invalid, JointSample, JointsSample, Policy, SensorHeader, TimeQuery
 from modelserver.wire.codec import encode
 

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import pytest
 
-from modelserver.magnetism import MagnetismError, declination, field_at, is_covered
+from modelserver.earth.magnetism import MagnetismError, declination, field_at, is_covered
 
 # WMM2025 test values, table 6 of the report and the file WMM2025_TestValues.txt that the NCEI give out with the
 # coefficients: decimal year, height in km, latitude, longitude; north, east, down in nT, declination in degrees.
@@ -116,6 +116,6 @@ def test_given_a_year_when_it_passes_then_the_field_moves_evenly() -> None:
 
 
 def test_given_the_module_when_imported_then_the_library_is_not_loaded_yet() -> None:
-    code = "import sys, modelserver.magnetism; print('pygeomag' in sys.modules)"
+    code = "import sys, modelserver.earth.magnetism; print('pygeomag' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

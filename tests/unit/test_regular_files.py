@@ -30,7 +30,7 @@ from msdrivers.gx1_memory import read_eeprom
 from msdrivers.making import station_of
 from msdrivers.raw_log import open_for_reading, recording
 from msdrivers.settings import Place, read_driver
-from mstools.replay import read_times
+from mstools.commands.replay import read_times
 
 
 @contextmanager

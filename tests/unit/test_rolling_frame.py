@@ -8,8 +8,8 @@ import pytest
 
 from modelserver import core
 from modelserver.core import CoreSettings, Instant
+from modelserver.earth.geodesy import origin_at
 from modelserver.errors import NotConnectedError, UnknownFrameError
-from modelserver.geodesy import origin_at
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.localization.mounts import Mounts
 from modelserver.localization.raw.localizer import RawLocalizer

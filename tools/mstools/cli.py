@@ -16,8 +16,8 @@ import typer
 
 from modelserver.errors import ConfigError, GeometryError, ModelServerError, QueryError, nearest_names, shown
 from modelserver.version import __version__
-from mstools.missing import meant
-from mstools.output import print_problem, safe
+from mstools.terminal.missing import meant
+from mstools.terminal.output import print_problem, safe
 
 COMMANDS = {
     "demo": "Run the whole service on simulated sensors and watch it answer.",
@@ -44,8 +44,8 @@ COMMANDS = {
     "install": "Have systemd run the service and its drivers.",
     "uninstall": "Take back what install did.",
 }
-"""Subcommands and what each is for. `import-bag` is function `command` of module `mstools.import_bag`, and so on; a
-command with subcommands of its own has a Typer application there instead."""
+"""Subcommands and what each is for. `import-bag` is function `command` of module `mstools.commands.import_bag`, and so
+on; a command with subcommands of its own has a Typer application there instead."""
 
 
 OTHER_WORDS = {
@@ -136,7 +136,7 @@ def _import_command(name: str) -> Callable[..., None] | typer.Typer:
     gc.disable()
     try:
         command: Callable[..., None] | typer.Typer
-        command = importlib.import_module(f"mstools.{name.replace('-', '_')}").command
+        command = importlib.import_module(f"mstools.commands.{name.replace('-', '_')}").command
         return command
     finally:
         if was_on:

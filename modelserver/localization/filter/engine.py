@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from typing import TypeAlias
 
-from modelserver.geodesy import Geodesy
+from modelserver.earth.geodesy import Geodesy
 from modelserver.localization.filter import fixes, fixing, inertial, motion, rolling, updates
 from modelserver.localization.filter.handling import begun_anew, begun_level, counts, measured, scene_of
 from modelserver.localization.filter.items import INERTIAL, NOTHING, STEERING, Fused, Item, refused, took_up

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from modelserver.geodesy import GeodesyError, LocalFrame, ecef_from_geodetic, geodetic_from_ecef, origin_at
+from modelserver.earth.geodesy import GeodesyError, LocalFrame, ecef_from_geodetic, geodetic_from_ecef, origin_at
 from modelserver.localization import gate
 from modelserver.localization.filter import alignment, lateness, motion, placing, updates
 from modelserver.localization.filter.alignment import Fit, Passed, Turn, horizontal

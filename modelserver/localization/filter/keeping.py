@@ -6,8 +6,8 @@ import hashlib
 import math
 from functools import lru_cache
 
+from modelserver.earth.geodesy import geodetic_from_ecef
 from modelserver.errors import shown
-from modelserver.geodesy import geodetic_from_ecef
 from modelserver.localization.filter import motion
 from modelserver.localization.filter.nav import Nav
 from modelserver.localization.filter.setup import Setup

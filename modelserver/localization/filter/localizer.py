@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-from modelserver.geodesy import Geodesy
+from modelserver.earth.geodesy import Geodesy
 from modelserver.localization.filter import clocks, engine, inertial, keeping, motion, start, world
 from modelserver.localization.filter.clocks import Clocks
 from modelserver.localization.filter.items import INERTIAL, Item, items

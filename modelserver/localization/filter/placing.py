@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from modelserver.geodesy import about_up
+from modelserver.earth.geodesy import about_up
 from modelserver.localization.filter import kalman
 from modelserver.localization.filter.alignment import Passed, Turn
 from modelserver.localization.filter.layout import Layout

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from modelserver.geodesy import GeodesyError, LocalFrame
+from modelserver.earth.geodesy import GeodesyError, LocalFrame
 from modelserver.localization.filter import kalman, motion
 from modelserver.localization.filter.ageing import aged, with_biases
 from modelserver.localization.filter.handling import without_gps

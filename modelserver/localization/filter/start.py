@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from modelserver.geodesy import geodetic_from_ecef
+from modelserver.earth.geodesy import geodetic_from_ecef
 from modelserver.localization.filter import strapdown
 from modelserver.localization.filter.layout import ACCELEROMETER_BIAS, GYRO_BIAS, STRAPDOWN, VELOCITY
 from modelserver.localization.filter.measurements.constraints import tilt_of

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-from modelserver.geodesy import Geodesy, LocalFrame
+from modelserver.earth.geodesy import Geodesy, LocalFrame
 from modelserver.localization.filter.alignment import Passed
 from modelserver.localization.filter.nav import Nav
 from modelserver.localization.filter.stillness import Stillness

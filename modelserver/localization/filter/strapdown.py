@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from modelserver import earth as earth_model
+from modelserver.earth import gravity as earth_model
 from modelserver.localization.filter import kalman
 from modelserver.localization.filter.layout import STRAPDOWN, Layout
 from modelserver.localization.filter.nav import ZERO, Nav

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.geodesy import Geodesy, GeodesyError, LocalFrame, about_up, geodetic_from_ecef
+from modelserver.earth.geodesy import Geodesy, GeodesyError, LocalFrame, about_up, geodetic_from_ecef
 from modelserver.localization.filter import bounds, motion, strapdown
 from modelserver.localization.filter.measurements.constraints import tilt_of
 from modelserver.localization.filter.nav import ZERO, Nav, jacobian_of_body_velocity

@@ -6,7 +6,7 @@ import cmath
 import math
 from dataclasses import dataclass, field, replace
 
-from modelserver.geodesy import LocalFrame, ecef_from_geodetic
+from modelserver.earth.geodesy import LocalFrame, ecef_from_geodetic
 from modelserver.localization.gate import GoodFix
 from modelserver.localization.raw import track
 from modelserver.localization.raw.bounds import grown

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from modelserver.geodesy import Geodesy, geodetic_from_ecef
+from modelserver.earth.geodesy import Geodesy, geodetic_from_ecef
 from modelserver.localization import gate
 from modelserver.localization.interface import Note
 from modelserver.localization.mounts import Mounts

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from modelserver.geodesy import GeodesyError, LocalFrame, about_up, geodetic_from_ecef
+from modelserver.earth.geodesy import GeodesyError, LocalFrame, about_up, geodetic_from_ecef
 from modelserver.localization.projected import Projected
 from modelserver.localization.raw import bounds
 from modelserver.localization.raw.heading import UNKNOWN_VARIANCE

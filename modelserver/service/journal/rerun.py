@@ -6,8 +6,8 @@ import math
 from collections.abc import Container, Mapping
 
 from modelserver import core
-from modelserver.answers import DeferredAnswer
 from modelserver.core import AllOutputs, Instant
+from modelserver.core.answers import DeferredAnswer
 from modelserver.errors import RecordingError, WireError
 from modelserver.messages import (
     PublishDecisions,

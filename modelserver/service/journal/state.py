@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 
 from modelserver.config import VehicleConfig
 from modelserver.core import CoreState
+from modelserver.core.reload import ModelLoaded
 from modelserver.history import Later
 from modelserver.localization.filter.localizer import Deferred
 from modelserver.localization.filter.measurements import REGISTRY, Measurement
@@ -21,7 +22,6 @@ from modelserver.localization.filter.world import TwistCovariance
 from modelserver.localization.interface import Localizer
 from modelserver.localization.modes import ModeLocalizer
 from modelserver.messages import Event, MotionCovariance
-from modelserver.reload import ModelLoaded
 from modelserver.service.encoding.document import read_document, write_document
 from modelserver.service.encoding.schema import Schema
 

@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from modelserver.geodesy import make_origin
+from modelserver.earth.geodesy import make_origin
 from modelserver.messages import Origin
 from modelserver.regular_files import read_start
 from modelserver.service.keeping.lock import Lock

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-from modelserver.answers import COVARIANCES_IN_PART, DeferredAnswer
+from modelserver.core.answers import COVARIANCES_IN_PART, DeferredAnswer
 from modelserver.messages import GetHistory, GetTransformations, Request
 from modelserver.platform import HISTORY_LIMIT
 from modelserver.platform.steps import Steps, complete

@@ -23,8 +23,8 @@ from itertools import islice, product
 from typing import Final, Protocol
 
 from modelserver import core
-from modelserver.answers import DeferredAnswer, answers, effort_of, is_deferred
 from modelserver.core import CoreState, Instant
+from modelserver.core.answers import DeferredAnswer, answers, effort_of, is_deferred
 from modelserver.errors import QueryError, WireError
 from modelserver.geometry import names
 from modelserver.messages import (

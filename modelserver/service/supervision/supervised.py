@@ -11,9 +11,9 @@ from contextlib import contextmanager
 from typing import Final
 
 from modelserver.core import CoreState, Instant
+from modelserver.core.reload import ModelLoaded
 from modelserver.errors import shown
 from modelserver.messages import Invalid, LoadModel
-from modelserver.reload import ModelLoaded
 from modelserver.service.clock import Clock
 from modelserver.service.supervision.notify import Notifier
 from modelserver.service.supervision.progress import LocalizationProgress

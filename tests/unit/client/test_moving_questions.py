@@ -13,9 +13,9 @@ import pytest
 from support_lcm import PATIENCE_S, reserved_url
 from support_moving import BASE, DEEP, ODOM, SCAN, T0, UTM, S, rover, view
 
-from modelserver.answers import DeferredAnswer
 from modelserver.client.remote import Platform
 from modelserver.core import CoreSettings, Instant, start, step
+from modelserver.core.answers import DeferredAnswer
 from modelserver.errors import LimitError, MalformedRequestError, Status, TooNewError, UnknownFrameError, WireError
 from modelserver.messages import (
     CHANNEL_OF,

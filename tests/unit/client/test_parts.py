@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from support_moving import BASE, DEEP, SCAN, T0, UTM, S, view
 
-from modelserver.answers import COVARIANCES_IN_PART, POSES_IN_PART, DeferredAnswer
 from modelserver.client.parts import Parts, stacked
+from modelserver.core.answers import COVARIANCES_IN_PART, POSES_IN_PART, DeferredAnswer
 from modelserver.errors import WireError
 from modelserver.messages import GetTransformations, ManyReply, RequestHeader
 from modelserver.platform.many import many

@@ -7,7 +7,7 @@ import math
 import pytest
 from support_gx1 import START_UTIME, Line, angle_between, standing, turning
 
-from modelserver.geodesy import Geodesy, origin_at
+from modelserver.earth.geodesy import Geodesy, origin_at
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.simulation import ImuModel, Phase, Trajectory
 from modelserver.simulation.imu import readings

@@ -24,8 +24,8 @@ from support_vehicle_bus import (
 )
 
 from modelserver import load_model
+from modelserver.earth.geodesy import origin_at
 from modelserver.errors import ConfigError
-from modelserver.geodesy import origin_at
 from modelserver.messages import Direction, WheelsSample
 from modelserver.simulation import Simulation, Timing, Trajectory, WheelsModel, figure_eight
 from msdrivers.devices.wheels import WheelsDriver, WheelsSettings

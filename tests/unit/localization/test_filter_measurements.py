@@ -21,7 +21,7 @@ from support_cart import (
     some_nav,
 )
 
-from modelserver.geodesy import geodetic_from_ecef
+from modelserver.earth.geodesy import geodetic_from_ecef
 from modelserver.localization.filter.measurements import REGISTRY, Compared, Measurement, Scene, constraints
 from modelserver.localization.filter.measurements.gps import stated_velocity
 from modelserver.localization.filter.nav import Nav, cross

@@ -11,7 +11,7 @@ from support_moving import BASE, ODOM, SCAN, T0, UTM, S, rover, truth, view
 
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType
-from modelserver.joints import Joints
+from modelserver.joints.joints import Joints
 from modelserver.localization.rig import Rig
 from modelserver.messages import Invalid, JointSample, JointsSample, Quality, SensorHeader, TimeQuery
 from modelserver.platform.many import many

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support_moving import BASE, DEEP, ODOM, SCAN, T0, UTM, S, view
 
-from modelserver.joints import Joints
+from modelserver.joints.joints import Joints
 from modelserver.messages import JointSample, JointsSample, Policy, SensorHeader, TimeQuery
 from modelserver.platform import PlatformView
 from modelserver.platform.explained import explained

@@ -13,7 +13,7 @@ from support_moving import BASE, DEEP, ENU, ODOM, ORIGIN, SCAN, T0, UTM, S, esti
 
 from modelserver.errors import LimitError, NoPoseError, QueryError, Status, UnknownFrameError
 from modelserver.history import History
-from modelserver.joints import NO_JOINTS, Joints
+from modelserver.joints.joints import NO_JOINTS, Joints
 from modelserver.messages import MOST_INSTANTS, Invalid, JointSample, PoseAnswer, Quality, TimeQuery
 from modelserver.platform import PlatformView
 from modelserver.platform.many import many

@@ -14,7 +14,7 @@ from modelserver.errors import NoPoseError, UnknownFrameError
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType, Mimic
 from modelserver.history import History
-from modelserver.joints import Joints
+from modelserver.joints.joints import Joints
 from modelserver.messages import JointSample, JointsSample, Policy, Quality, SensorHeader, TimeQuery
 from modelserver.platform import PlatformView
 from modelserver.platform.moving import motion

@@ -10,7 +10,7 @@ from support_moving import NOD, NOD_RATE, T0, UTM, S, estimate, vehicle
 
 from modelserver.formats import load_model
 from modelserver.history import History
-from modelserver.joints import Joints
+from modelserver.joints.joints import Joints
 from modelserver.messages import Estimate, JointSample, JointsSample, SensorHeader, TimeQuery
 from modelserver.platform import PlatformView
 from modelserver.spatial.pose import Pose

@@ -14,6 +14,7 @@ from support_samples import GEOMETRY, ME, drive, imu
 
 from modelserver import core
 from modelserver.core import CoreState, Instant
+from modelserver.core.reload import ModelLoaded
 from modelserver.errors import RecordingError
 from modelserver.localization.filter.measurements import REGISTRY
 from modelserver.messages import (
@@ -32,7 +33,6 @@ from modelserver.messages import (
     Tick,
     TimeQuery,
 )
-from modelserver.reload import ModelLoaded
 from modelserver.service.journal import state as journal_state
 from modelserver.service.journal.state import Run
 from modelserver.spatial.pose import Pose

@@ -169,7 +169,7 @@ def test_given_a_disk_that_refuses_half_way_then_the_old_origin_stays_and_nothin
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from modelserver.geodesy import make_origin
+from modelserver.earth.geodesy import make_origin
 from modelserver.service.keeping.origin import OriginKeeper
 def kill(*_): os.kill(os.getpid(), signal.SIGKILL)
 if sys.argv[2] == "sync": os.fsync = kill

@@ -12,7 +12,9 @@ from support_samples import GEOMETRY, ME, START, VEHICLE, Scripted, cart, drive,
 
 from modelserver.config import load_config
 from modelserver.core import CoreState
+from modelserver.core.reload import ModelLoaded
 from modelserver.errors import Status
+from modelserver.formats.snapshot import read
 from modelserver.localization.modes import ModeLocalizer
 from modelserver.messages import (
     Commanded,
@@ -25,14 +27,12 @@ from modelserver.messages import (
     SensorHeader,
     SnapshotPart,
 )
-from modelserver.reload import ModelLoaded
 from modelserver.service.clock import FakeClock
 from modelserver.service.daemon import Vehicle, load_vehicle
 from modelserver.service.fake_bus import FakeBus
 from modelserver.service.hooks import Hooks
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.service.snapshots import SnapshotWriter
-from modelserver.snapshot import read
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.snapshot import PART_BYTES, Assembler
 

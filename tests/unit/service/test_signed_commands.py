@@ -8,6 +8,7 @@ import pytest
 from support_samples import ME, START, Scripted, imu, started
 from support_signing import KEY, envelope
 
+from modelserver.core.reload import ModelLoaded
 from modelserver.errors import Status
 from modelserver.messages import (
     CHANNEL_OF,
@@ -22,7 +23,6 @@ from modelserver.messages import (
     SetStateVector,
     SwitchMode,
 )
-from modelserver.reload import ModelLoaded
 from modelserver.service.clock import FakeClock
 from modelserver.service.fake_bus import FakeBus
 from modelserver.service.heard import Heard

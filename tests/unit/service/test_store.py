@@ -21,7 +21,7 @@ from support_signing import write_test_key
 
 from modelserver.config import VehicleConfig, load_config
 from modelserver.core import Instant
-from modelserver.geodesy import make_origin
+from modelserver.earth.geodesy import make_origin
 from modelserver.service.clock import SystemClock
 from modelserver.service.journal.place import make_writer
 from modelserver.service.journal.ring import Ring

@@ -9,8 +9,8 @@ import pytest
 from support_samples import START, Scripted, cart, gps, imu, started
 
 from modelserver.core import CoreState
+from modelserver.core.reload import ModelLoaded
 from modelserver.messages import Estimate, Invalid, LoadModel, Noticed, ReloadModel, RequestHeader
-from modelserver.reload import ModelLoaded
 from modelserver.service.clock import FakeClock
 from modelserver.service.fake_bus import FakeBus
 from modelserver.service.heard import Heard

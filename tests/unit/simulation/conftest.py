@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from modelserver.geodesy import origin_at
+from modelserver.earth.geodesy import origin_at
 from modelserver.geometry import Model, ModelBuilder
 from modelserver.simulation import (
     GpsModel,

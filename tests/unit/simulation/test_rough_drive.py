@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from modelserver import earth
-from modelserver.geodesy import Geodesy
+from modelserver.earth import gravity as earth
+from modelserver.earth.geodesy import Geodesy
 from modelserver.simulation import GpsModel, ImuModel, SideSlip, Timing, WheelsModel
 from modelserver.spatial import so3
 

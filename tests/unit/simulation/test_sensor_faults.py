@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from modelserver.geodesy import Geodesy
+from modelserver.earth.geodesy import Geodesy
 from modelserver.messages import Direction, OrientationReference, YawSource
 from modelserver.simulation import (
     EncoderModel,

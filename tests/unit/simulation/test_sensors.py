@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from modelserver import earth
-from modelserver.geodesy import Geodesy, LocalFrame, origin_at
+from modelserver.earth import gravity as earth
+from modelserver.earth.geodesy import Geodesy, LocalFrame, origin_at
 from modelserver.geometry import Model, ModelBuilder
 from modelserver.messages import (
     Direction,

@@ -19,7 +19,8 @@ from support_recordings import HUSKY, LATENCY, START, write_log
 
 from modelserver.messages import FixType, GpsSample, ImuSample, SensorHeader
 from modelserver.wire.codec import encode
-from mstools import cli, svg
+from mstools import cli
+from mstools.report import svg
 
 Run = Callable[..., tuple[int, str, str]]
 Event = tuple[int, str, bytes]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mstools.check import checked_vehicle
+from mstools.commands.check import checked_vehicle
 
 pytestmark = pytest.mark.slow
 

@@ -11,9 +11,9 @@ from modelserver.messages import GpsSample, WheelsSample
 from msdrivers.emulate.wheels import WheelsEmulator
 from msdrivers.protocol.can.database import parse_dbc
 from msdrivers.station import Now
-from mstools.demo import vehicle_file
-from mstools.demo_drive import simulation
-from mstools.driver import load_driver
+from mstools.commands.demo import vehicle_file
+from mstools.commands.driver import load_driver
+from mstools.demo.drive import simulation
 
 START = 1_750_000_000_000_000
 

@@ -8,10 +8,10 @@ import pytest
 
 from modelserver.config import load_config
 from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings
-from mstools import demo_lines
-from mstools.demo import vehicle_file
-from mstools.demo_children import DemoError
-from mstools.driver import load_drivers
+from mstools.commands.demo import vehicle_file
+from mstools.commands.driver import load_drivers
+from mstools.demo import lines as demo_lines
+from mstools.demo.children import DemoError
 
 
 def test_given_the_vehicle_file_then_all_its_drivers_are_led_to_lines_of_this_machine(tmp_path: Path) -> None:

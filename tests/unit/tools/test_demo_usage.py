@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 from modelserver.messages import ChannelHealth
-from mstools.demo import usage
-from mstools.demo_children import DemoError
-from mstools.status_text import as_data, report
+from mstools.commands.demo import usage
+from mstools.demo.children import DemoError
+from mstools.terminal.status_text import as_data, report
 from tests.unit.tools.test_status import WELL
 
 WHEELS = ChannelHealth("sensor:wheels", 1230, 100.0, 0.01, measured=217, used=215)

@@ -22,9 +22,10 @@ from modelserver.service.probing.servers import Answers, Server
 from modelserver.wire.channels import DEFAULT_URL
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
 from msdrivers.settings import read_drivers
-from mstools import doctor, doctor_vehicle
 from mstools.cli import main
-from mstools.doctor_vehicle import file_finding, line_findings, vehicle_findings
+from mstools.commands import doctor
+from mstools.deployment import doctor_vehicle
+from mstools.deployment.doctor_vehicle import file_finding, line_findings, vehicle_findings
 
 LO = Interface("lo", loopback=True)
 WELL = BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), True, True, RECEIVE_BUFFER_BYTES, RECEIVE_BUFFER_BYTES, 0)

@@ -15,8 +15,8 @@ from support_signing import ALLOWED, write_test_key
 from modelserver.config import VehicleConfig, load_config
 from modelserver.keys import read_keys
 from modelserver.service.probing.findings import Finding, Grade
-from mstools import doctor_files
-from mstools.doctor_files import file_findings, kept_findings, key_findings, state_findings
+from mstools.deployment import doctor_files
+from mstools.deployment.doctor_files import file_findings, kept_findings, key_findings, state_findings
 
 
 class Usage(NamedTuple):

@@ -18,8 +18,8 @@ from modelserver.errors import ModelServerError
 from modelserver.messages import FixType, GpsSample, SensorHeader
 from modelserver.wire.codec import encode
 from mstools.cli import main
-from mstools.driver import load_driver, warn_of_names
-from mstools.emulate_samples import Wanted, samples_of, told_end
+from mstools.commands.driver import load_driver, warn_of_names
+from mstools.commands.emulate_samples import Wanted, samples_of, told_end
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 
@@ -161,7 +161,7 @@ def test_given_a_log_without_the_channel_or_of_long_ago_then_it_is_an_error_at_o
 
 
 def test_given_the_raptor_then_its_drivers_have_no_error() -> None:
-    from mstools.check_drivers import constraints_of, drivers_problems
+    from mstools.commands.check_drivers import constraints_of, drivers_problems
 
     path = RAPTOR / "vehicle.yaml"
     config = load_config(path)

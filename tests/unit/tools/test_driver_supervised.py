@@ -9,7 +9,7 @@ from modelserver.messages import DriverPhase
 from modelserver.service.supervision.notify import Notifier
 from modelserver.service.supervision.progress import PATIENCE_S
 from msdrivers.runner import Runner
-from mstools.driver_supervised import DriverSupervision
+from mstools.commands.driver_supervised import DriverSupervision
 
 
 class Runs:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from support_moving import BASE, DEEP, SCAN, T0, UTM, S, view
 
-from modelserver.joints import Joints
+from modelserver.joints.joints import Joints
 from modelserver.messages import (
     EdgeReport,
     Explanation,
@@ -26,8 +26,8 @@ from modelserver.platform.explained import explained
 from modelserver.platform.moving import motion
 from modelserver.spatial import Pose, Transformation, so3
 from mstools.cli import main
-from mstools.explain import coordinates, describe_edges, describe_motion, edges_as_data, motion_as_data
-from mstools.query import describe
+from mstools.commands.explain import coordinates, describe_edges, describe_motion, edges_as_data, motion_as_data
+from mstools.commands.query import describe
 
 Run = Callable[..., tuple[int, str, str]]
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "moving-geometry.md"

@@ -16,8 +16,8 @@ from modelserver.messages import Direction, FixType, ImuSample, OrientationRefer
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools import cli
-from mstools.bag_messages import DEFAULTS, Altitude, ImuOrientation, Kind, Options
-from mstools.import_bag import import_bag
+from mstools.commands.import_bag import import_bag
+from mstools.recordings.bag_messages import DEFAULTS, Altitude, ImuOrientation, Kind, Options
 
 TYPE_NAMES = {"GPS": "gps_t", "IMU": "imu_t", "WHEELS": "wheels_t", "JOINTS": "joints_t"}
 

@@ -13,9 +13,11 @@ import pytest
 
 from modelserver.errors import ConfigError, ModelServerError
 from modelserver.keys import new_key, write_key
-from mstools import install, install_place, install_steps
 from mstools.cli import main
-from mstools.install_files import (
+from mstools.commands import install
+from mstools.deployment import place as install_place
+from mstools.deployment import steps as install_steps
+from mstools.deployment.files import (
     SerialDriver,
     check_drivers,
     check_seen,
@@ -27,7 +29,7 @@ from mstools.install_files import (
     rules,
     units,
 )
-from mstools.install_plan import SYSCTL, Facts
+from mstools.deployment.plan import SYSCTL, Facts
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 OWN_KEY = "commands.key"

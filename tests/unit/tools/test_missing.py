@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mstools.cli import main
-from mstools.missing import meant, nearest_path
+from mstools.terminal.missing import meant, nearest_path
 
 
 @pytest.fixture

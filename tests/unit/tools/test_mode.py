@@ -30,7 +30,7 @@ from modelserver.signing import is_genuine
 from modelserver.spatial import Pose
 from modelserver.wire.codec import decode, encode
 from mstools.cli import main
-from mstools.mode import MODES, parse_mode
+from mstools.commands.mode import MODES, parse_mode
 
 LISTENS = VEHICLE + "commands: {key_file: commands.key}\nlocalization: {mode_channel: console/mode}\n"
 Run = Callable[..., tuple[int, str, str]]
@@ -122,7 +122,7 @@ def test_given_a_daemon_that_goes_to_raw_mode_then_its_silence_or_its_decision_t
     with reserved_url() as url:
         with Answering(url, decides=True):
             assert run("raw", "-c", config, "--url", url)[:2] == (0, "now raw (was full)\n")
-        monkeypatch.setattr("mstools.mode.PATIENCE_S", 1.0)
+        monkeypatch.setattr("mstools.commands.mode.PATIENCE_S", 1.0)
         with Answering(url):
             assert run("raw", "-c", config, "--url", url)[:2] == (0, "now raw (was full)\n")
         with Answering(url, mode=Mode.RAW):
@@ -132,7 +132,7 @@ def test_given_a_daemon_that_goes_to_raw_mode_then_its_silence_or_its_decision_t
 def test_given_a_daemon_that_stays_in_its_mode_then_that_is_told(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mstools.mode.PATIENCE_S", 0.5)
+    monkeypatch.setattr("mstools.commands.mode.PATIENCE_S", 0.5)
     with reserved_url() as url, Answering(url, obeys=False):
         code, out, err = run("no_gps", "-c", write_vehicle(tmp_path, LISTENS), "--url", url)
     assert (code, out) == (1, "")
@@ -142,7 +142,7 @@ def test_given_a_daemon_that_stays_in_its_mode_then_that_is_told(
 def test_given_nobody_then_it_is_told_what_was_sent_and_that_nobody_answers(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mstools.mode.PATIENCE_S", 0.1)
+    monkeypatch.setattr("mstools.commands.mode.PATIENCE_S", 0.1)
     with reserved_url() as url:
         config = write_vehicle(tmp_path, f"{LISTENS}lcm: {{url: '{url}'}}\n")
         listener = Listener(url, "MODELSERVER_SIGNED")
@@ -155,7 +155,7 @@ def test_given_nobody_then_it_is_told_what_was_sent_and_that_nobody_answers(
 def test_given_a_state_that_is_never_published_then_it_says_that_nothing_confirms(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mstools.mode.PATIENCE_S", 0.5)
+    monkeypatch.setattr("mstools.commands.mode.PATIENCE_S", 0.5)
     config = write_vehicle(tmp_path, f"{LISTENS}publish: {{state_hz: 0}}\n")
     with reserved_url() as url, Answering(url, mode=Mode.RAW, obeys=False):
         code, out, _ = run("no_gps", "-c", config, "--url", url)

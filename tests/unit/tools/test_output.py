@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from modelserver.errors import ModelServerError
-from mstools.output import check_target, write_file, written_whole
+from mstools.terminal.output import check_target, write_file, written_whole
 
 
 def test_given_an_error_half_way_then_the_file_is_as_it_was(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from modelserver import __version__
 from modelserver.messages import Invalid, Origin, PoseAnswer, Quality
 from modelserver.spatial import Pose, Transformation
 from mstools.cli import COMMANDS, main
-from mstools.query import as_dict, describe
+from mstools.commands.query import as_dict, describe
 
 # Written as DRDC TR 2005-240, Annex C prints it: the camera in the front nodding scanner's frame.
 ANNEX_C = """\

@@ -15,7 +15,7 @@ from support_moving import BASE, ODOM, SCAN, T0, UTM, S, estimate, joints_at, ro
 from support_recordings import write_log
 
 from modelserver.formats import save_model
-from modelserver.joints import Joints
+from modelserver.joints.joints import Joints
 from modelserver.spatial import Pose
 from modelserver.wire.codec import encode
 from mstools.cli import main

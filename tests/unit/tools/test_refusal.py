@@ -13,7 +13,7 @@ from modelserver.errors import BusError, ConfigError, ModelServerError, Problem,
 from modelserver.service.supervision.notify import Notifier
 from modelserver.service.supervision.patience import Files
 from mstools.cli import main
-from mstools.refusal import Start, status_of
+from mstools.deployment.refusal import Start, status_of
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 CONFIG = Path("/none/vehicle.yaml")

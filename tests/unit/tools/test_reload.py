@@ -12,7 +12,7 @@ from modelserver.errors import NoServerError
 from modelserver.messages import ReloadReply, ReplyHeader
 from modelserver.spatial import Pose, Transformation
 from mstools.cli import main
-from mstools.reload import as_data, describe
+from mstools.commands.reload import as_data, describe
 
 SAME = ReloadReply(ReplyHeader(1, 2, model_revision="aaaa"), "aaaa")
 OTHER = ReloadReply(ReplyHeader(1, 2, model_revision="aaaa"), "bbbb", ("body Lamp is gone", "evil\x1b[2J"))

@@ -28,7 +28,7 @@ from modelserver.spatial import Pose, Transformation
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools import cli
-from mstools.replay import _inputs, read_times
+from mstools.commands.replay import _inputs, read_times
 
 pytestmark = pytest.mark.slow
 

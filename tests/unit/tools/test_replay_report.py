@@ -12,7 +12,8 @@ from support_recordings import HUSKY, drive, write_log
 from support_tuning import in_raw_mode, simulated
 
 from modelserver.simulation import EncoderModel, WheelsModel
-from mstools import cli, panels
+from mstools import cli
+from mstools.report import panels
 
 Run = Callable[..., tuple[int, str, str]]
 

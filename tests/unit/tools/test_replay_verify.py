@@ -16,7 +16,7 @@ from modelserver.service.journal.verify import Result
 from modelserver.wire.codec import encode
 from modelserver.wire.journal import Record, batch_written, read
 from mstools import cli
-from mstools.replay_verify import differing
+from mstools.commands.replay_verify import differing
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -10,10 +10,10 @@ import pytest
 
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.messages import VALID, Decision, FixType, GpsSample, ImuSample, Mode, Phase, SensorHeader, Verdict
-from mstools.finding import Finding, Grade
-from mstools.report_data import Replayed, Sensor, Snapshot
-from mstools.report_findings import findings
-from mstools.report_raw import RawCollector, RawMotion
+from mstools.report.data import Replayed, Sensor, Snapshot
+from mstools.report.finding import Finding, Grade
+from mstools.report.findings import findings
+from mstools.report.raw import RawCollector, RawMotion
 
 START = 1_700_000_000
 SECONDS = 120

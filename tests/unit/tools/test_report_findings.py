@@ -10,9 +10,9 @@ import pytest
 
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.messages import VALID, Decision, Invalid, Phase, Verdict
-from mstools import consistency
-from mstools.report_data import Fix, Replayed, Sensor, Snapshot, WheelTurn
-from mstools.report_findings import Grade, findings, fix_latency
+from mstools.report import consistency
+from mstools.report.data import Fix, Replayed, Sensor, Snapshot, WheelTurn
+from mstools.report.findings import Grade, findings, fix_latency
 
 START = 1_700_000_000_000_000
 

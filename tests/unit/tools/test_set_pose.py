@@ -17,7 +17,7 @@ from modelserver.messages import Decision, PoseAnswer, PublishDecisions, Verdict
 from modelserver.spatial import Pose, Transformation
 from modelserver.wire.codec import encode
 from mstools.cli import main
-from mstools.set_pose import Listener, Result, Target, as_data, describe, to_covariance, to_pose
+from mstools.commands.set_pose import Listener, Result, Target, as_data, describe, to_covariance, to_pose
 
 CURRENT = Pose.from_rpy((100.0, 50.0, 5.0), 0.1, -0.2, 1.0)
 UTM = (ORIGIN.easting + 30.0, ORIGIN.northing + 40.0, ORIGIN.height + 2.0)

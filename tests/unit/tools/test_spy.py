@@ -14,9 +14,10 @@ from support_lcm import MODELSERVER
 
 from modelserver.wire import provider
 from modelserver.wire.channels import DEFAULT_URL
-from mstools import spy, spy_terminal
 from mstools.cli import main
-from mstools.lcm_wheel import MissingToolError, type_files
+from mstools.commands import spy
+from mstools.spy import terminal as spy_terminal
+from mstools.spy.lcm_wheel import MissingToolError, type_files
 
 needs_javac = pytest.mark.skipif(shutil.which("javac") is None, reason="no Java compiler (default-jdk-headless)")
 

@@ -17,12 +17,13 @@ import mslcm
 from modelserver.errors import ModelServerError
 from modelserver.wire.codec import encode
 from modelserver.wire.kinds import type_name_of
-from mstools import spy_terminal, spy_types
-from mstools.spy_fields import ENTRIES, MAX_LINES, NUMBERS, TEXT, fields, told
-from mstools.spy_keys import Key, keys
-from mstools.spy_terminal import Ear, View, is_whole, message_lines, picture, print_once, rows, summary
-from mstools.spy_traffic import CHECKED_PER_S, MAX_CHANNELS, Seen, Traffic
-from mstools.spy_types import Constants, constants_of, known_constants
+from mstools.spy import terminal as spy_terminal
+from mstools.spy import types as spy_types
+from mstools.spy.fields import ENTRIES, MAX_LINES, NUMBERS, TEXT, fields, told
+from mstools.spy.keys import Key, keys
+from mstools.spy.terminal import Ear, View, is_whole, message_lines, picture, print_once, rows, summary
+from mstools.spy.traffic import CHECKED_PER_S, MAX_CHANNELS, Seen, Traffic
+from mstools.spy.types import Constants, constants_of, known_constants
 
 POSE = encode(EXAMPLES["pose_transform_t"][0])
 HEALTH = encode(EXAMPLES["health_t"][1])

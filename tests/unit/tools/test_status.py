@@ -27,8 +27,8 @@ from modelserver.messages import (
     Phase,
 )
 from modelserver.wire.codec import encode
-from mstools import status
-from mstools.status_text import MAX_ROWS, as_data, clock, duration, is_well, line, report
+from mstools.commands import status
+from mstools.terminal.status_text import MAX_ROWS, as_data, clock, duration, is_well, line, report
 
 BARE, FULL = EXAMPLES["health_t"]
 WELL: Health = replace(FULL, state=RUNNING)

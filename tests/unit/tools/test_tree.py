@@ -13,17 +13,17 @@ from support_lcm import reserved_url
 from support_samples import START, VEHICLE, write_vehicle
 
 from modelserver.formats import load_model
+from modelserver.formats.snapshot import Snapshot, written
 from modelserver.geometry import ModelBuilder
 from modelserver.geometry.model import Model
-from modelserver.snapshot import Snapshot, written
 from modelserver.spatial import Pose
 from modelserver.wire.codec import encode
 from modelserver.wire.snapshot import in_parts
 from mstools.cli import main
-from mstools.graph import nodes
-from mstools.table import drawable
-from mstools.tree import lines
-from mstools.tree_svg import drawing
+from mstools.commands.tree import lines
+from mstools.terminal.graph import nodes
+from mstools.terminal.table import drawable
+from mstools.terminal.tree_svg import drawing
 
 Run = Callable[..., tuple[int, str, str]]
 

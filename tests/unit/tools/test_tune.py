@@ -21,9 +21,9 @@ from support_tuning import RAPTOR, simulated
 from modelserver.config import load_config
 from modelserver.simulation import GpsModel, Timing
 from mstools import cli
-from mstools.tune import TUNABLES
-from mstools.tune_runs import mixed
-from mstools.tune_search import Parameter, Score, search
+from mstools.commands.tune import TUNABLES
+from mstools.tuning.runs import mixed
+from mstools.tuning.search import Parameter, Score, search
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -122,7 +122,7 @@ def noisy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_given_fixes_that_scatter_more_than_is_set_when_tuned_then_more_is_taken_for_new(
     noisy: tuple[Path, Path], tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mstools.tune.TUNABLES", TUNABLES[:1])
+    monkeypatch.setattr("mstools.commands.tune.TUNABLES", TUNABLES[:1])
     log, config = noisy
     out = tmp_path / "proposal.yaml"
     before = config.read_bytes()
@@ -139,7 +139,7 @@ def test_given_fixes_that_scatter_more_than_is_set_when_tuned_then_more_is_taken
 def test_given_the_same_drive_when_tuned_twice_then_the_same_is_told(
     noisy: tuple[Path, Path], run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mstools.tune.TUNABLES", TUNABLES[:0])
+    monkeypatch.setattr("mstools.commands.tune.TUNABLES", TUNABLES[:0])
     first, second = (run(*noisy[:1], "-c", noisy[1], "--quick", "--processes", 1, "--json") for _ in range(2))
     assert first[0] == 0
     assert first[1] == second[1]
@@ -201,7 +201,7 @@ INTERRUPTED = """
 import sys
 from pathlib import Path
 from mstools import cli, tune, tune_runs
-from mstools.tune_runs import Job
+from mstools.tuning.runs import Job
 
 def read_pipe(job: Job) -> None:
     job.config.read_bytes()

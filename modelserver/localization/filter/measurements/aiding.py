@@ -12,7 +12,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from modelserver.geodesy import GeodesyError, LocalFrame, about_up
+from modelserver.earth.geodesy import GeodesyError, LocalFrame, about_up
 from modelserver.geometry import names
 from modelserver.localization.filter.layout import ErrorState
 from modelserver.localization.filter.measurements.base import INSTANT, Compared, Scene, register

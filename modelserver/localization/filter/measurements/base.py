@@ -7,7 +7,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 
-from modelserver.geodesy import Geodesy, LocalFrame
+from modelserver.earth.geodesy import Geodesy, LocalFrame
 from modelserver.localization.filter.layout import ErrorState, Layout
 from modelserver.localization.filter.nav import Nav
 from modelserver.localization.filter.settings import FilterSettings

@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from modelserver.geodesy import LocalFrame, ecef_from_geodetic
+from modelserver.earth.geodesy import LocalFrame, ecef_from_geodetic
 from modelserver.localization import gate
 from modelserver.localization.filter.layout import ErrorState
 from modelserver.localization.filter.measurements.base import Compared, Scene, azimuth, register, wrapped

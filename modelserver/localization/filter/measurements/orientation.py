@@ -8,7 +8,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from modelserver.geodesy import geodetic_from_ecef
+from modelserver.earth.geodesy import geodetic_from_ecef
 from modelserver.localization.filter.layout import ErrorState
 from modelserver.localization.filter.measurements.base import Compared, Scene, azimuth, register, wrapped
 from modelserver.localization.filter.settings import FilterSettings

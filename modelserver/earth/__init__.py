@@ -1,0 +1,1 @@
+"""The earth: ellipsoid and UTM, gravity and rotation, magnetic field."""

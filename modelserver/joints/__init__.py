@@ -1,0 +1,1 @@
+"""Joint states over time: the readings of each coordinate, and where it is between them."""

@@ -1,0 +1,1 @@
+"""Calibration of an inertial unit and its magnetometer from a log."""

@@ -1,0 +1,33 @@
+"""`modelserver frames`: which frames has a body?"""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+import typer
+
+from modelserver.geometry import names
+from mstools.commands.asking import JsonOption, ModelOption, PrefixOption, TimeoutOption, UrlOption, answers
+from mstools.terminal.options import Variables
+from mstools.terminal.output import safe
+
+
+def command(
+    body: Annotated[str, typer.Argument(metavar="BODY", help="Name of the body.")],
+    model: ModelOption = None,
+    settings: Variables = None,
+    as_json: JsonOption = False,
+    url: UrlOption = "",
+    prefix: PrefixOption = "",
+    timeout: TimeoutOption = 1.0,
+) -> None:
+    """List the frames of a body, as Body:Frame.
+
+    Asks the running daemon, or with --model a geometry file.
+
+    Example: modelserver frames Digiclops --model config/raptor/geometry.yaml
+    """
+    found = answers(model, settings, url, prefix, timeout).get_body_frame_list(body)
+    frames = [names.joined(body, frame) for frame in found]
+    typer.echo(json.dumps(frames) if as_json else "\n".join(map(safe, frames)))

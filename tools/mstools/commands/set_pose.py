@@ -1,0 +1,368 @@
+"""`modelserver set-pose`: sets the pose of the vehicle in the running daemon, and reports the decision on it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import numpy as np
+import typer
+
+from modelserver.errors import ForbiddenError, ModelServerError, NoServerError, RejectedError, WireError
+from modelserver.geometry import names
+from modelserver.messages import Decision, Invalid, PoseAnswer, PublishDecisions, Verdict
+from modelserver.spatial import so3
+from modelserver.spatial.pose import Pose
+from modelserver.spatial.so3 import Quaternion, Vector3
+from modelserver.spatial.transformation import Transformation
+from modelserver.wire.provider import open_lcm, resolve_url
+from mstools.commands.asking import JsonOption, KeyOption, PrefixOption, TimeoutOption, UrlOption, handle_until
+from mstools.terminal.output import safe
+
+if TYPE_CHECKING:
+    import lcm
+
+    from modelserver.earth.geodesy import Geodesy
+
+CONFIRM_S = 4.0
+"""How long to wait for the decision, seconds: it is final one filter horizon, about a second, after the request."""
+
+FARTHEST_M = 200_000.0
+"""A position farther from the origin than this, meters, is a slip: another UTM zone, or two numbers exchanged."""
+
+OPERATOR = "operator"
+"""The source under which the ledger lists a pose that was set."""
+
+PROGRAM = "modelserver"
+
+Triple = tuple[float, float, float]
+
+
+class Target(NamedTuple):
+    """The pose to set, as the command line states it; exactly one position and one orientation is not None.
+
+    `utm`: grid easting, grid northing, ellipsoidal height, m, absolute. `xyz`: m from the origin. `geodetic`: latitude
+    and longitude, deg, and ellipsoidal height, m; None keeps the height. `yaw`: rad from grid east, `heading`: rad
+    clockwise from true north; both keep roll and pitch. `rpy`: rad.
+    """
+
+    utm: Triple | None = None
+    xyz: Triple | None = None
+    geodetic: tuple[float, float, float | None] | None = None
+    yaw: float | None = None
+    heading: float | None = None
+    rpy: Triple | None = None
+    quaternion: Quaternion | None = None
+
+
+def command(
+    utm: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--utm", metavar="E N H", help="Position: grid easting, northing, ellipsoidal height, meters."),
+    ] = None,
+    xyz: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--xyz", metavar="X Y Z", help="Position: meters from the origin of World:UTM (initial_utm)."),
+    ] = None,
+    latlon: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--latlon", metavar="LAT LON", help="Position: WGS 84, degrees, north and east positive."),
+    ] = None,
+    height: Annotated[
+        float | None,
+        typer.Option("--height", metavar="H", help="With --latlon: ellipsoidal height, meters. Default: as it is."),
+    ] = None,
+    yaw: Annotated[
+        float | None,
+        typer.Option("--yaw", metavar="DEG", help="Degrees counterclockwise from grid east; roll and pitch stay."),
+    ] = None,
+    heading: Annotated[
+        float | None,
+        typer.Option("--heading", metavar="DEG", help="Degrees clockwise from true north; roll and pitch stay."),
+    ] = None,
+    rpy: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--rpy", metavar="R P Y", help="Roll, pitch and yaw, degrees, yaw from grid east."),
+    ] = None,
+    quaternion: Annotated[
+        tuple[float, float, float, float] | None,
+        typer.Option("--quaternion", metavar="S X Y Z", help="Orientation in World:UTM, scalar first."),
+    ] = None,
+    sigma: Annotated[
+        float, typer.Option("--sigma", metavar="M", help="Standard deviation of each coordinate, meters.")
+    ] = 1.0,
+    sigma_deg: Annotated[
+        float, typer.Option("--sigma-deg", metavar="DEG", help="Standard deviation about each axis, degrees.")
+    ] = 5.0,
+    as_json: JsonOption = False,
+    url: UrlOption = "",
+    prefix: PrefixOption = "",
+    timeout: TimeoutOption = 2.0,
+    key: KeyOption = None,
+) -> None:
+    """Set the pose of the vehicle in the running daemon, and report what localization did with it.
+
+    Give one position (--utm, --xyz or --latlon) and one orientation (--yaw, --heading, --rpy or --quaternion) of the
+    base frame. Before the heading is known the pose is taken as it is; later it is a measurement like any other, fused
+    by its sigmas, and the gates may reject it. The daemon accepts it where its vehicle file has commands:
+    {set_pose: true, key_file: ...} and the request is signed with that key (--key). It is sent once. Exits 1 where it
+    is denied or rejected.
+
+    \b
+    Examples:
+      modelserver set-pose --latlon 50.27 -111.1 --heading 90 --sigma 0.05 --sigma-deg 1
+      modelserver set-pose --utm 350283.1 5570712.6 700 --yaw 12.5 --key /etc/modelserver/commands.key
+    """
+    target = parse_target(utm, xyz, latlon, height, yaw, heading, rpy, quaternion)
+    covariance = to_covariance(sigma, sigma_deg)
+    from modelserver.client.remote import Platform
+    from modelserver.earth.geodesy import Geodesy
+
+    bus = open_lcm(resolve_url(url))
+    listener = Listener(bus, prefix)
+    if not listener.wait(timeout, lambda: listener.pose is not None):
+        raise NoServerError(
+            f"no {prefix}POSE within {timeout:g} s on {resolve_url(url)}, so the base frame and the origin are not "
+            "known: is the daemon running, on this bus (--url) and with this prefix (--prefix)?"
+        )
+    before = listener.pose
+    assert before is not None
+    if before.origin is None:
+        raise ModelServerError(
+            "the origin of World:UTM is not known yet: wait for fixes, or write initial_utm, zone and hemisphere under "
+            "origin in the vehicle file"
+        )
+    geodesy = Geodesy(before.origin)
+    pose = to_pose(target, geodesy, before.transformation.pose)
+    base = before.transformation.frame_of_interest
+    request = Transformation(base, names.WORLD_UTM, pose, covariance, origin_id=before.origin.origin_id)
+    with Platform(url, channel_prefix=prefix, timeout=timeout, retries=0, name=PROGRAM, key_file=key or "") as platform:
+        try:
+            accepted = platform.set_state_vector(request)
+        except (ForbiddenError, RejectedError) as error:
+            raise ModelServerError(f"the pose was not set: {error}") from None
+    listener.wait(CONFIRM_S, lambda: listener.decision(accepted.header.utime) is not None)
+    decision = listener.decision(accepted.header.utime)
+    listener.pose = None
+    listener.wait(timeout, lambda: listener.pose is not None)
+    result = Result(request, geodesy, (sigma, sigma_deg), decision, listener.has_decisions, listener.pose)
+    typer.echo(json.dumps(as_data(result), indent=2) if as_json else describe(result))
+    if decision is not None and decision.verdict is Verdict.REJECTED:
+        raise ModelServerError(
+            f"localization rejected the pose: {safe(decision.reason or 'it contradicts what is known')}; if you are "
+            "sure of it, give the sigmas that it deserves (--sigma, --sigma-deg) and check the axes and units"
+        )
+
+
+class Result(NamedTuple):
+    """The pose that was set, `decision` on it if one was received, and the next pose that the daemon published."""
+
+    request: Transformation
+    geodesy: Geodesy
+    sigmas: tuple[float, float]
+    decision: Decision | None
+    has_decisions: bool
+    after: PoseAnswer | None
+
+
+def parse_target(
+    utm: Triple | None,
+    xyz: Triple | None,
+    latlon: tuple[float, float] | None,
+    height: float | None,
+    yaw: float | None,
+    heading: float | None,
+    rpy: Triple | None,
+    quaternion: Quaternion | None,
+) -> Target:
+    """Return the pose that the options state. Raises typer.BadParameter where they state none, two or no numbers."""
+    positions = {"--utm": utm, "--xyz": xyz, "--latlon": latlon}
+    orientations = {"--yaw": yaw, "--heading": heading, "--rpy": rpy, "--quaternion": quaternion}
+    for what, options in (("position", positions), ("orientation", orientations)):
+        given = [name for name, value in options.items() if value is not None]
+        if len(given) != 1:
+            got = f"got {' and '.join(given)}" if given else "got none"
+            raise typer.BadParameter(f"give one {what}, {', '.join(options)}; {got}")
+    if height is not None and latlon is None:
+        raise typer.BadParameter("it goes with --latlon; --utm and --xyz have a height", param_hint="--height")
+    numbers = {"--height": height, **positions, **orientations}
+    for name, value in numbers.items():
+        if value is not None and not np.isfinite(value).all():
+            raise typer.BadParameter("expected finite numbers", param_hint=name)
+    if quaternion is not None and not any(quaternion):
+        raise typer.BadParameter("a quaternion of zeros has no direction", param_hint="--quaternion")
+    return Target(
+        utm,
+        xyz,
+        None if latlon is None else (*latlon, height),
+        None if yaw is None else math.radians(yaw),
+        None if heading is None else math.radians(heading),
+        None if rpy is None else (math.radians(rpy[0]), math.radians(rpy[1]), math.radians(rpy[2])),
+        quaternion,
+    )
+
+
+def to_covariance(sigma: float, sigma_deg: float) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return the covariance (6, 6) of a pose with one sigma (m) for the coordinates and one (deg) about the axes.
+
+    Raises typer.BadParameter for one that is not above 0.
+    """
+    for name, value in (("--sigma", sigma), ("--sigma-deg", sigma_deg)):
+        if not (math.isfinite(value) and value > 0.0):
+            raise typer.BadParameter(f"a standard deviation is above 0, got {value:g}", param_hint=name)
+    return np.diag([sigma**2] * 3 + [math.radians(sigma_deg) ** 2] * 3)
+
+
+def to_pose(target: Target, geodesy: Geodesy, current: Pose) -> Pose:
+    """Return the pose in World:UTM, in meters from the origin, that a target states.
+
+    `current` is the pose in force: its height, roll and pitch stay where the target has none. Raises GeodesyError for a
+    place out of reach of the zone, ModelServerError for one too far from the origin.
+    """
+    origin = geodesy.origin
+    east, north, up = origin.initial_utm
+    if target.geodetic is not None:
+        latitude, longitude, height = target.geodetic
+        here = up + current.xyz[2] if height is None else height
+        position = geodesy.relative(geodesy.utm_from_geodetic(latitude, longitude, here))
+    else:
+        position = target.xyz if target.xyz is not None else geodesy.relative(target.utm or (0.0, 0.0, 0.0))
+    away = math.hypot(*position)
+    if away > FARTHEST_M:
+        side = "north" if origin.north else "south"
+        raise ModelServerError(
+            f"the position is {away / 1e3:.0f} km from the origin (easting {east:.1f}, northing {north:.1f}, zone "
+            f"{origin.zone} {side}); --utm takes absolute coordinates of that zone, --xyz meters from the origin"
+        )
+    return Pose(position, _orientation(target, geodesy, position, current))
+
+
+def _orientation(target: Target, geodesy: Geodesy, position: Vector3, current: Pose) -> Quaternion:
+    if target.quaternion is not None:
+        return target.quaternion
+    if target.rpy is not None:
+        return so3.from_rpy(*target.rpy)
+    roll, pitch, _ = so3.to_rpy(current.wxyz)
+    if target.yaw is not None:
+        return so3.from_rpy(roll, pitch, target.yaw)
+    east, north, up = geodesy.origin.initial_utm
+    latitude, longitude, _ = geodesy.geodetic_from_utm(east + position[0], north + position[1], up + position[2])
+    # heading counts from true north, yaw from grid east: the convergence lies between
+    yaw = math.pi / 2 - (target.heading or 0.0) + geodesy.convergence(latitude, longitude)
+    return so3.from_rpy(roll, pitch, yaw)
+
+
+class Listener:
+    """Receives what the daemon publishes: `pose`, the latest pose, and the decisions on poses that were set."""
+
+    def __init__(self, bus: lcm.LCM, prefix: str):
+        from modelserver.wire.channels import literal
+
+        self.pose: PoseAnswer | None = None
+        self.has_decisions = False
+        self._decisions: dict[int, Decision] = {}
+        self._bus = bus
+        bus.subscribe(literal(f"{prefix}POSE"), self._on_pose)
+        bus.subscribe(literal(f"{prefix}LOCALIZATION_DECISIONS"), self._on_decisions)
+
+    def decision(self, utime: int) -> Decision | None:
+        """Return the decision on the pose that was set at an instant, None while there is none."""
+        return self._decisions.get(utime)
+
+    def wait(self, seconds: float, until: Callable[[], bool]) -> bool:
+        """Handle messages until `until`, for so many seconds at most; return whether it came to that."""
+        return handle_until(self._bus, seconds, until)
+
+    def _on_pose(self, _: str, data: bytes) -> None:
+        from modelserver.wire.codec import decode
+
+        # a message of another type is a stranger's, or another version's: the next one may be good
+        with suppress(WireError):
+            self.pose = decode("pose_transform_t", data)
+
+    def _on_decisions(self, _: str, data: bytes) -> None:
+        from modelserver.wire.codec import decode
+
+        try:
+            published: PublishDecisions = decode("decisions_t", data)
+        except WireError:
+            return
+        self.has_decisions = True
+        for each in published.decisions:
+            if each.source == OPERATOR and each.kind == "absolute_pose":
+                self._decisions[each.utime] = each
+
+
+_VERDICTS = {
+    Verdict.USED: "used",
+    Verdict.REJECTED: "rejected",
+    Verdict.MONITORED: "monitored",
+    Verdict.TOOK_UP: "set",
+}
+
+
+def describe(result: Result) -> str:
+    """Return the result for people to read."""
+    pose = result.request.pose
+    origin = result.geodesy.origin
+    east, north, height = (a + b for a, b in zip(origin.initial_utm, pose.xyz, strict=True))
+    latitude, longitude, _ = result.geodesy.geodetic_from_utm(east, north, height)
+    sigma, sigma_deg = result.sigmas
+    lines = [
+        f"{safe(result.request.frame_of_interest)} in World:UTM: {pose}",
+        f"  easting {east:.3f} m, northing {north:.3f} m, height {height:.3f} m, zone {origin.zone} "
+        f"{'north' if origin.north else 'south'}; latitude {latitude:.7f}, longitude {longitude:.7f} deg",
+        f"  sigma {sigma:g} m, {sigma_deg:g} deg",
+    ]
+    decision = result.decision
+    if decision is not None:
+        reason = f": {safe(decision.reason)}" if decision.reason else ""
+        tested = ""
+        if math.isfinite(decision.statistic) and math.isfinite(decision.limit):
+            tested = f" (chi-square {decision.statistic:.1f} of {decision.limit:.1f} allowed, {decision.dof} numbers)"
+        lines.append(f"decision: {_VERDICTS[decision.verdict]}{reason}{tested}")
+    elif result.has_decisions:
+        lines.append("decision: accepted for localization; no decision on it was received")
+    else:
+        lines.append(
+            "decision: accepted for localization; LOCALIZATION_DECISIONS is silent (publish.decisions: false?)"
+        )
+    if result.after is not None:
+        now = result.after.transformation
+        state = "valid" if now.valid else f"not valid: {Invalid(now.invalid_reasons).explain()}"
+        lines.append(f"now: {now.pose}; {state}")
+    return "\n".join(lines)
+
+
+def as_data(result: Result) -> dict[str, Any]:
+    """Return the result for scripts to read; angles in radians, a pose as its 7-vector."""
+    origin, decision, after = result.geodesy.origin, result.decision, result.after
+    sigma, sigma_deg = result.sigmas
+    return {
+        "frame_of_interest": result.request.frame_of_interest,
+        "frame_of_reference": result.request.frame_of_reference,
+        "state_vector": result.request.state_vector.tolist(),
+        "sigma": [sigma] * 3 + [math.radians(sigma_deg)] * 3,
+        "initial_utm": list(origin.initial_utm),
+        "utm_zone": origin.zone,
+        "utm_north": origin.north,
+        "decision": None
+        if decision is None
+        else {
+            "utime": decision.utime,
+            "verdict": _VERDICTS[decision.verdict],
+            "reason": decision.reason,
+            "statistic": decision.statistic if math.isfinite(decision.statistic) else None,
+            "limit": decision.limit if math.isfinite(decision.limit) else None,
+        },
+        "pose_after": None
+        if after is None
+        else {
+            "utime": after.transformation.utime,
+            "state_vector": after.transformation.state_vector.tolist(),
+            "valid": after.transformation.valid,
+        },
+    }

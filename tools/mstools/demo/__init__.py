@@ -1,0 +1,1 @@
+"""The demo: its processes, its drive, its lines on the screen."""

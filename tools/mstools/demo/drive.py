@@ -1,0 +1,89 @@
+"""The simulated drive of `modelserver demo` and of emulated devices: whoever begins it at one instant has one truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from modelserver.config import VehicleConfig
+from modelserver.earth.geodesy import origin_at
+from modelserver.formats import load_model
+from modelserver.geometry import Model
+from modelserver.messages import GpsSample, ImuSample, Sample, VehicleStatusSample, WheelsSample
+from modelserver.simulation import GpsModel, ImuModel, Simulation, StatusModel, Timing, Trajectory, WheelsModel, figures
+from modelserver.simulation.trajectory import Phase
+
+SUFFIELD = (50.27, -111.18, 700.0)
+"""Where the report's vehicle was tried, roughly: latitude and longitude in degrees, height in metres."""
+
+STAND_SECONDS = 3.0
+"""Levelling takes two seconds at rest, and a moment until rest is seen."""
+
+WHEELS_HZ = 100.0
+"""How often wheels and the vehicle controller measure."""
+
+TYPICAL_WHEELBASE = 1.5
+"""Meters; for a vehicle whose file does not name the wheels that steer."""
+
+LAP_SECONDS = 25.0
+"""An eight takes a little longer."""
+
+
+def simulation(
+    config: VehicleConfig,
+    start_utime: int,
+    seconds: float,
+    scenario: str = "eight",
+    seed: int = 1,
+    sensors: Sequence[type[Sample]] = (),
+    gps_model: GpsModel | None = None,
+    imu_model: ImuModel | None = None,
+    wheels_model: WheelsModel | None = None,
+) -> Simulation:
+    """Return a drive of the vehicle for `seconds` or more, and what those of its sensors in `sensors` measure."""
+    gps, imu, wheels = config.sensors.gps, config.sensors.imu, config.sensors.wheels
+    model = load_model(config.geometry, variables=config.variables)
+    status = None
+    if VehicleStatusSample in sensors:
+        status = StatusModel(_wheelbase(config, model), wheels_model.timing if wheels_model else Timing(WHEELS_HZ))
+    return Simulation(
+        model,
+        config.base_frame,
+        Trajectory(_phases(scenario, seconds, seed), yaw=0.5),
+        origin_at(*SUFFIELD),
+        gps_frame=gps.frame if gps and GpsSample in sensors else None,
+        imu_frame=imu.frame if imu and ImuSample in sensors else None,
+        wheel_frames=wheels.frames if wheels and WheelsSample in sensors else None,
+        rolling_frame=config.rolling_frame or config.base_frame,
+        seed=seed,
+        start_utime=start_utime,
+        gps_model=gps_model,
+        imu_model=imu_model,
+        wheels_model=wheels_model,
+        status_model=status,
+    )
+
+
+def _wheelbase(config: VehicleConfig, model: Model) -> float:
+    """Return how far ahead of the rolling frame the steered axle is, m; `TYPICAL_WHEELBASE` where none is named."""
+    wheels = config.sensors.wheels
+    if wheels is None or wheels.steering is None:
+        return TYPICAL_WHEELBASE
+    rolling = config.rolling_frame or config.base_frame
+    steered = [wheels.frames[name] for name in wheels.steering.wheels if name in wheels.frames]
+    ahead = [model.get_transformation(frame, rolling).pose.xyz[0] for frame in steered]
+    return sum(ahead) / len(ahead) if ahead else TYPICAL_WHEELBASE
+
+
+def _phases(scenario: str, seconds: float, seed: int) -> tuple[Phase, ...]:
+    if scenario == "stand":
+        return figures.stand(seconds)
+    if scenario == "circle":
+        # as for finding the offsets of a magnetometer
+        return (Phase(3.0, 4.0, 0.25), Phase(seconds), Phase(3.0, 0.0))
+    if scenario == "straight":
+        return figures.straight()
+    if scenario == "city":
+        return figures.city(seed, seconds)
+    laps = max(1, math.ceil(seconds / LAP_SECONDS))
+    return figures.figure_eight(speed=3.0, radius=6.0, stand=STAND_SECONDS, ramp=2.0, laps=laps)

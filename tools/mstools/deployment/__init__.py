@@ -1,0 +1,1 @@
+"""Installation with systemd, and what the service needs of a machine."""

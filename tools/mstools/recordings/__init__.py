@@ -1,0 +1,1 @@
+"""Recordings as input: ROS bags, answers from LCM logs."""

@@ -1,0 +1,1 @@
+"""The report on a replay: data, findings with causes, drawings."""

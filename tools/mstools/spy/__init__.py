@@ -1,0 +1,1 @@
+"""Channels decoded for watching: in the terminal, or for lcm-spy."""

@@ -1,0 +1,1 @@
+"""Search of noise settings by withheld fixes."""
