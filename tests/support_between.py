@@ -12,7 +12,7 @@ import numpy as np
 
 from modelserver.errors import NoPoseError
 from modelserver.geometry import names
-from modelserver.geometry.route import Edge, EdgeKind
+from modelserver.geometry.edges import Edge, EdgeKind
 from modelserver.messages import NO_FLAGS, Estimate, Invalid, Policy, PoseAnswer, Quality, TimeQuery
 from modelserver.platform.path import Step, Way, way
 from modelserver.platform.view import PlatformView

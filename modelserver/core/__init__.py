@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from modelserver.core.commands import OPERATOR, SET_COVARIANCE, commanded, model_loaded, unsigned
+from modelserver.core.host_clock import Instant
 from modelserver.core.keeping import START, kept, start_told
 from modelserver.core.reload import ModelLoaded
 from modelserver.core.requests import denied, fail, refuse, requested, turn_back
@@ -24,7 +25,6 @@ from modelserver.core.state import (
     CoreSettings,
     CoreState,
     Expected,
-    Instant,
     Outputs,
     Parked,
     Step,

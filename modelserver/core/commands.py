@@ -8,10 +8,11 @@ from typing import Final
 
 import numpy as np
 
+from modelserver.core.host_clock import Instant
 from modelserver.core.reload import ModelLoaded
 from modelserver.core.requests import turned_down
 from modelserver.core.samples import FUTURE_LIMIT_S, localized, mode_wished
-from modelserver.core.state import CoreState, Instant, Step, counted
+from modelserver.core.state import CoreState, Step, counted
 from modelserver.errors import Status
 from modelserver.geometry import names
 from modelserver.geometry.difference import changes

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from modelserver.core.state import CHANGE_PERIOD_NS, CoreState, Instant, Outputs, Signs, Traffic, silent_after
+from modelserver.core.host_clock import Instant
+from modelserver.core.state import CHANGE_PERIOD_NS, CoreState, Outputs, Signs, Traffic, silent_after
 from modelserver.messages import (
     NAN,
     VALID,

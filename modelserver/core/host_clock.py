@@ -6,13 +6,17 @@ Stamps of messages are no evidence, since whoever can send can stamp as it likes
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
-
-if TYPE_CHECKING:
-    from modelserver.core.state import Instant
+from typing import Final, NamedTuple
 
 STEP_US: Final = 100_000
 """A smaller fall of the offset between two looks is slewing: chronyd slews by at most 8 %, 2 ms between two ticks."""
+
+
+class Instant(NamedTuple):
+    """When an event is handled: the host's monotonic clock in nanoseconds, and its time of day as utime."""
+
+    monotonic_ns: int
+    utime: int
 
 
 class HostClock(NamedTuple):

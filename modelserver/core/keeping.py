@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from modelserver.core.state import CoreState, Instant, Outputs, Step, noticed
+from modelserver.core.host_clock import Instant
+from modelserver.core.state import CoreState, Outputs, Step, noticed
 from modelserver.localization.interface import Keeps
 from modelserver.messages import Decision, KeepState, Kept, Noticed, StartTold
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 from modelserver.core.answers import DeferredAnswer, answers, failure, is_deferred
-from modelserver.core.state import AllOutputs, CoreState, Instant, Outputs, Parked, Step, TimedRequest, counted
+from modelserver.core.host_clock import Instant
+from modelserver.core.state import AllOutputs, CoreState, Outputs, Parked, Step, TimedRequest, counted
 from modelserver.errors import Status
 from modelserver.geometry import names
 from modelserver.messages import (

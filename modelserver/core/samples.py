@@ -6,20 +6,10 @@ from collections import Counter
 from dataclasses import replace
 from typing import Final
 
+from modelserver.core.host_clock import Instant
 from modelserver.core.keeping import KEPT, start_told
 from modelserver.core.requests import answer_parked
-from modelserver.core.state import (
-    DEGRADED,
-    RUNNING,
-    STARTING,
-    CoreState,
-    Instant,
-    Step,
-    counted,
-    decided,
-    heard,
-    traffic_noted,
-)
+from modelserver.core.state import DEGRADED, RUNNING, STARTING, CoreState, Step, counted, decided, heard, traffic_noted
 from modelserver.geometry import names
 from modelserver.localization.interface import Localizer
 from modelserver.messages import (

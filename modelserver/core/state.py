@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Final, Literal, NamedTuple, TypeAlias
 
 from modelserver.core.answers import DeferredAnswer
-from modelserver.core.host_clock import HostClock
+from modelserver.core.host_clock import HostClock, Instant
 from modelserver.errors import NotConnectedError
 from modelserver.geometry.model import Model
 from modelserver.history import History
@@ -52,13 +52,6 @@ CHANGE_PERIOD_NS: Final = 100_000_000
 
 TimedRequest: TypeAlias = GetTransformation | GetStateVector | GetHTransform | GetMotion | GetExplanation
 """A request that asks about a time, and may wait for it."""
-
-
-class Instant(NamedTuple):
-    """When an event is handled: the host's monotonic clock in nanoseconds, and its time of day as utime."""
-
-    monotonic_ns: int
-    utime: int
 
 
 @dataclass(frozen=True, slots=True)

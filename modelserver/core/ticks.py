@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Final
 
 from modelserver.core import health
+from modelserver.core.host_clock import Instant
 from modelserver.core.keeping import keep_if_due
 from modelserver.core.requests import answer_parked
 from modelserver.core.samples import check_host_clock, published
-from modelserver.core.state import CoreState, Instant, Step
+from modelserver.core.state import CoreState, Step
 from modelserver.messages import Output, PublishNavigation, PublishSnapshot, Tick
 
 LATENESS_KEPT: Final = 512

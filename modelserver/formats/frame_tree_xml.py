@@ -31,7 +31,8 @@ from modelserver.formats.frame_paths import ANY, ROOT, Ancestry, FramePath, pars
 from modelserver.formats.spelling import label
 from modelserver.formats.xml_document import Named, line
 from modelserver.geometry import names
-from modelserver.geometry.builder import BodyBuilder, ModelBuilder
+from modelserver.geometry.builder import ModelBuilder
+from modelserver.geometry.draft import BodyBuilder
 from modelserver.spatial.pose import Pose
 
 if TYPE_CHECKING:

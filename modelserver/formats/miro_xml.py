@@ -14,7 +14,8 @@ from modelserver.errors import Severity, Source, Suggested, shown
 from modelserver.formats import numbers
 from modelserver.formats.spelling import label, nearest_keys
 from modelserver.formats.xml_document import Named, children, line, tag
-from modelserver.geometry.builder import BodyBuilder, ModelBuilder
+from modelserver.geometry.builder import ModelBuilder
+from modelserver.geometry.draft import BodyBuilder
 from modelserver.spatial.pose import Pose
 
 if TYPE_CHECKING:

@@ -22,7 +22,8 @@ from modelserver.formats.urdf_joints import JointReader
 from modelserver.formats.urdf_shapes import read_inertial, read_materials, read_shape
 from modelserver.formats.xml_document import children, line, tag
 from modelserver.geometry import names
-from modelserver.geometry.builder import BodyBuilder, ModelBuilder
+from modelserver.geometry.builder import ModelBuilder
+from modelserver.geometry.draft import BodyBuilder
 from modelserver.geometry.joint import Joint
 from modelserver.geometry.shape import Material, Shape
 from modelserver.spatial.pose import Pose

@@ -1,7 +1,8 @@
 """The vehicle's geometry: bodies, frames, constraints, and the graph they make. Pure."""
 
 from modelserver.geometry.adjacency import Neighbor
-from modelserver.geometry.builder import BodyBuilder, ModelBuilder
+from modelserver.geometry.builder import ModelBuilder
+from modelserver.geometry.draft import BodyBuilder
 from modelserver.geometry.joint import Joint, JointType, Mimic
 from modelserver.geometry.model import Model, Search
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma

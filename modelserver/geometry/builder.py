@@ -14,62 +14,18 @@ A file format fills one and adds the problems it met on the way; a program may d
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 from modelserver.errors import GeometryError, NotConnectedError, Problem, Severity, Source, shown
 from modelserver.geometry.adjacency import full_name
+from modelserver.geometry.draft import NOWHERE, BodyBuilder, Draft
 from modelserver.geometry.joint import FIXED, Joint
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
-from modelserver.geometry.review import NOWHERE, Review
-from modelserver.geometry.shape import Shape
+from modelserver.geometry.review import Review
 from modelserver.spatial.pose import Pose
 
 
-@dataclass(slots=True)
-class BodyBuilder:
-    """Collects one body; made by `ModelBuilder.body`."""
-
-    owner: ModelBuilder
-    name: str
-    source: Source = NOWHERE
-    description: str = ""
-    pose: Pose | None = None
-    inertia: tuple[tuple[float, ...], ...] | None = None
-    frames: list[tuple[BodyFrame, Source]] = field(default_factory=list)
-    visuals: tuple[Shape, ...] = ()
-    collisions: tuple[Shape, ...] = ()
-
-    def frame(
-        self,
-        name: str,
-        pose: Pose | None = None,
-        description: str = "",
-        sigma: Sigma | None = None,
-        source: Source = NOWHERE,
-    ) -> BodyBuilder:
-        """Add a frame at `pose` in body coordinates; return this body, to go on."""
-        self.frames.append((BodyFrame(name, pose or Pose.identity(), description, sigma, self.name), source))
-        return self
-
-
-class ModelBuilder:
-    """Collects a model; `build` checks it. See the module's example.
-
-    `strict` holds to the rule of 2005 that a frame has one constraint at most.
-    """
-
-    def __init__(self, name: str = "", description: str = "", strict: bool = False):
-        self.name = name
-        self.description = description
-        self.strict = strict
-        self.problems: list[Problem] = []
-        self.unclear_joints: set[str] = set()
-        """Constraints whose joint a file states in a way that could not be read; they are added as fixed."""
-        self._bodies: list[BodyBuilder] = []
-        self.loose_ends: list[tuple[str, str, str, Source]] = []
-        """Constraint, sense (From or To) and frame of ends whose other end is missing; they are examined too."""
-        self._constraints: list[tuple[Constraint, Source]] = []
+class ModelBuilder(Draft):
+    """Collects a model; `build` checks it. See the module's example."""
 
     @classmethod
     def from_model(cls, model: Model, strict: bool = False) -> ModelBuilder:
@@ -77,13 +33,13 @@ class ModelBuilder:
         builder = cls(model.name, model.description, strict)
         for body in model.bodies:
             builder.add(body)
-        builder._constraints = [(constraint, NOWHERE) for constraint in model.constraints]
+        builder.constraints = [(constraint, NOWHERE) for constraint in model.constraints]
         return builder
 
     @property
     def is_empty(self) -> bool:
         """Whether neither a body nor a constraint was added."""
-        return not self._bodies and not self._constraints
+        return not self.bodies and not self.constraints
 
     def body(
         self,
@@ -94,8 +50,8 @@ class ModelBuilder:
         source: Source = NOWHERE,
     ) -> BodyBuilder:
         """Add a body; return its builder, to add frames. The first body added is the root."""
-        body = BodyBuilder(self, name, source, description, pose, inertia)
-        self._bodies.append(body)
+        body = BodyBuilder(name, source, description, pose, inertia)
+        self.bodies.append(body)
         return body
 
     def add(self, body: Body, source: Source = NOWHERE) -> BodyBuilder:
@@ -121,7 +77,7 @@ class ModelBuilder:
         Of a joint that moves, that is its place with all coordinates 0. Return self, to go on.
         """
         constraint = Constraint(name, from_, to, pose or Pose.identity(), description, sigma, joint)
-        self._constraints.append((constraint, source))
+        self.constraints.append((constraint, source))
         return self
 
     def unconstrain(self, frame: str | BodyFrame, constraint: str = "") -> tuple[str, ...]:
@@ -133,13 +89,11 @@ class ModelBuilder:
         """
         name = full_name(frame)
         removed = tuple(
-            each.name
-            for each, _ in self._constraints
-            if name in (each.from_, each.to) and constraint in ("", each.name)
+            each.name for each, _ in self.constraints if name in (each.from_, each.to) and constraint in ("", each.name)
         )
         if not removed:
             raise NotConnectedError(f"frame {name} has no constraint" + (f" {shown(constraint)}" if constraint else ""))
-        self._constraints = [item for item in self._constraints if item[0].name not in removed]
+        self.constraints = [item for item in self.constraints if item[0].name not in removed]
         return removed
 
     def problem(
@@ -172,7 +126,7 @@ class ModelBuilder:
     @property
     def constraint_names(self) -> tuple[str, ...]:
         """The names of all constraints, also of those with errors."""
-        return tuple(constraint.name for constraint, _ in self._constraints)
+        return tuple(constraint.name for constraint, _ in self.constraints)
 
     def build(self, repair: bool = False) -> Model:
         """Check every rule and return the model; its `problems` hold the warnings and notes.

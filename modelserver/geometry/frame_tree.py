@@ -19,6 +19,7 @@ from functools import partial
 from typing import Final
 
 from modelserver.geometry import names
+from modelserver.geometry.edges import Edge, EdgeKind
 from modelserver.geometry.parts import Body
 from modelserver.geometry.path_covariance import (
     EdgeCovariance,
@@ -28,7 +29,7 @@ from modelserver.geometry.path_covariance import (
     covariance_at,
     edge_covariance,
 )
-from modelserver.geometry.route import Edge, EdgeKind, Leg, Route
+from modelserver.geometry.route import Leg, Route
 from modelserver.geometry.topology import Crossing, Topology
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose

@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from modelserver.geometry.edges import edges_along
 from modelserver.geometry.parts import BodyFrame
-from modelserver.geometry.route import edges_along
 from modelserver.geometry.topology import Crossing
 from modelserver.spatial import chain, so3
 from modelserver.spatial.chain import Link

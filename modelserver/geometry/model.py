@@ -22,10 +22,11 @@ from modelserver.errors import (
 from modelserver.geometry import adjacency, names
 from modelserver.geometry.adjacency import Neighbor
 from modelserver.geometry.drives import drives
+from modelserver.geometry.edges import Edge, edges_along
 from modelserver.geometry.frame_tree import FrameTree, Node
 from modelserver.geometry.joint import Coordinates, Joint
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
-from modelserver.geometry.route import Edge, Route, edges_along
+from modelserver.geometry.route import Route
 from modelserver.geometry.topology import Crossing, Topology
 from modelserver.spatial import chain
 from modelserver.spatial.pose import Pose

@@ -30,18 +30,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from operator import add
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
+from modelserver.geometry.edges import Edge
 from modelserver.geometry.joint import Coordinates, Joint
+from modelserver.geometry.parts import Sigma
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array, Quaternion, Vector3
-
-if TYPE_CHECKING:
-    from modelserver.geometry.parts import Sigma
-    from modelserver.geometry.route import Edge
 
 Place: TypeAlias = tuple[Vector3, Quaternion]
 """Position and orientation of a frame, as plain floats."""

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from modelserver.errors import Problem, Severity, Source, Suggested, shown
 from modelserver.geometry import loops, names
+from modelserver.geometry.draft import NOWHERE, BodyBuilder, Draft
 from modelserver.geometry.joint_rules import JointRules, Placed
 from modelserver.geometry.loops import MOST_SIGMAS, Closure
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, meant_frame
 from modelserver.geometry.topology import Topology
 from modelserver.geometry.wording import LISTED, few, first_at
-
-if TYPE_CHECKING:
-    from modelserver.geometry.builder import BodyBuilder, ModelBuilder
-
-NOWHERE = Source()
 
 UNLIKELY = 3.0
 """A loop that misses by more standard deviations than this is warned of: one in 370 honest ones does."""
@@ -26,12 +21,12 @@ SUGGESTED = 100
 
 
 class Review:
-    """One pass over what a builder holds: finds problems, and what is left when the faulty is dropped."""
+    """One pass over a draft: finds problems, and what is left when the faulty is dropped."""
 
-    def __init__(self, builder: ModelBuilder, repair: bool):
-        self.builder = builder
+    def __init__(self, draft: Draft, repair: bool):
+        self.draft = draft
         self.repair = repair
-        self.problems = list(builder.problems)
+        self.problems = list(draft.problems)
         self.places: dict[str, Source] = {}
         self.suggested = 0
 
@@ -49,7 +44,7 @@ class Review:
     def bodies(self) -> dict[str, Body]:
         """Return the bodies by name, each with its well-formed frames."""
         kept: dict[str, Body] = {}
-        for draft in self.builder._bodies:
+        for draft in self.draft.bodies:
             label = f"body {shown(draft.name)}"
             if fault := names.fault(draft.name):
                 self.fault(f"{label}: {fault}", draft.source, "give it a plain name, e.g. FrontCamera")
@@ -120,7 +115,7 @@ class Review:
         kept: list[Placed] = []
         by_name: dict[str, Source] = {}
         by_frame: dict[str, tuple[str, Source]] = {}
-        for constraint, source in self.builder._constraints:
+        for constraint, source in self.draft.constraints:
             label = f"constraint {shown(constraint.name)}"
             if fault := names.fault(constraint.name):
                 self.fault(f"{label}: {fault}", source, "give it a plain name, e.g. DigiclopsFixed")
@@ -152,7 +147,7 @@ class Review:
                     "frames of a body are already fixed to each other; remove it, or move one frame to another body",
                 )
                 continue
-            taken = [(end, *by_frame[end]) for _, end in ends if self.builder.strict and end in by_frame]
+            taken = [(end, *by_frame[end]) for _, end in ends if self.draft.strict and end in by_frame]
             for end, other, place in taken:
                 self.fault(
                     f"{label}: frame {end} already has constraint {other}{first_at(place)}; a frame has one at most",
@@ -164,7 +159,7 @@ class Review:
             for _, end in ends:
                 by_frame[end] = (constraint.name, source)
             kept.append((constraint, source))
-        for name, sense, end, source in self.builder.loose_ends:
+        for name, sense, end, source in self.draft.loose_ends:
             self._end_exists(f"constraint {shown(name)}", sense, end, bodies, source)
         return tuple(kept)
 
@@ -193,8 +188,8 @@ class Review:
 
     def joints(self, placed: tuple[Placed, ...]) -> tuple[Placed, ...]:
         """Return the constraints whose joints can be told apart and placed; those that follow are settled at rest."""
-        known = [constraint.name for constraint, _ in self.builder._constraints]
-        rules = JointRules(placed, known, self.builder.unclear_joints, self.repair)
+        known = [constraint.name for constraint, _ in self.draft.constraints]
+        rules = JointRules(placed, known, self.draft.unclear_joints, self.repair)
         for fault in rules.faults:
             self.fault(fault.message, fault.source, fault.fix, fault.nearest)
         for warning in rules.warnings:
@@ -212,7 +207,7 @@ class Review:
             return Suggested()
         wrong, _, _ = end.partition(":")
         right, _, _ = near.partition(":")
-        named = [each.partition(":")[0] for other, _ in self.builder._constraints for each in (other.from_, other.to)]
+        named = [each.partition(":")[0] for other, _ in self.draft.constraints for each in (other.from_, other.to)]
         if wrong != right and named.count(wrong) > 1 and right not in named:
             return Suggested()
         return Suggested.of(end, near)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from modelserver.geometry.route import EdgeKind
+from modelserver.geometry.edges import EdgeKind
 from modelserver.joints.joints import AHEAD_S, LONGEST_GAP_S, How
 from modelserver.messages import NAN, EdgeReport, Estimate, Explanation, Policy, Quality, TimeQuery
 from modelserver.platform.path import Step, way

@@ -9,7 +9,8 @@ import numpy as np
 
 from modelserver.errors import LimitError, Status
 from modelserver.geometry import names
-from modelserver.geometry.route import EdgeKind, Route
+from modelserver.geometry.edges import EdgeKind
+from modelserver.geometry.route import Route
 from modelserver.messages import MOST_INSTANTS, Invalid, ManyPoses, Origin, Policy, Quality, TimeQuery
 from modelserver.platform.path import Step, Way, way
 from modelserver.platform.rows import STEP_ROWS, Rows, Times

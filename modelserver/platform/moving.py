@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from modelserver.errors import NoPoseError
+from modelserver.geometry.edges import EdgeKind
 from modelserver.geometry.joint import Joint
-from modelserver.geometry.route import EdgeKind
 from modelserver.joints.joints import How
 from modelserver.messages import NAN, Estimate, MotionAnswer, Policy, TimeQuery
 from modelserver.platform.path import Step, way

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from modelserver.geometry import names
-from modelserver.geometry.route import Edge, EdgeKind, Route
+from modelserver.geometry.edges import Edge, EdgeKind
+from modelserver.geometry.route import Route
 from modelserver.joints.joints import Reading
 from modelserver.messages import NO_FLAGS, VALID, Estimate, Invalid, Quality, TimeQuery
 from modelserver.platform.placing import Placed

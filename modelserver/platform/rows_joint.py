@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
+from modelserver.geometry.edges import EdgeKind
 from modelserver.geometry.joint import ROUNDING, Joint, JointType
-from modelserver.geometry.route import EdgeKind, Leg
+from modelserver.geometry.route import Leg
 from modelserver.joints.joints import LONGEST_GAP_S
 from modelserver.joints.vector import VECTORS
 from modelserver.joints.vector import columns as vector_columns

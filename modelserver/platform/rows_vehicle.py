@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from modelserver.errors import NoPoseError, Status
 from modelserver.geometry import names
-from modelserver.geometry.route import EdgeKind
+from modelserver.geometry.edges import EdgeKind
 from modelserver.messages import Estimate, Origin, Quality
 from modelserver.platform.rows import STEP_ROWS, Rows
 from modelserver.platform.steps import Steps

@@ -149,8 +149,8 @@ def test_covariance_along_a_path_agrees_with_monte_carlo(seed):
 
 def test_covariance_is_none_where_a_part_states_none_and_zero_for_a_frame_in_itself():
     builder = random_builder(random.Random(3), 5, sigmas=True)
-    frame, source = builder._bodies[4].frames[0]
-    builder._bodies[4].frames[0] = (type(frame)(frame.name, frame.pose), source)
+    frame, source = builder.bodies[4].frames[0]
+    builder.bodies[4].frames[0] = (type(frame)(frame.name, frame.pose), source)
     model = builder.build()
     unsure = f"B4:{frame.name}"
     other = next(name for name in all_frames(model) if name.startswith("B0:"))

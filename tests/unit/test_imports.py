@@ -225,6 +225,20 @@ def test_pure_packages_touch_no_clock_bus_disk_thread_or_log():
     complain(findings(impure), "Time, data and chance enter a pure package as arguments. These reach out:")
 
 
+def test_no_module_imports_itself_through_others() -> None:
+    modules = {module_of(path): path for path in sources()}
+    graph: dict[str, set[str]] = {}
+    for module, path in modules.items():
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        found = {
+            name if name in modules else name.rpartition(".")[0]
+            for _, name in imported(tree, module, path.name == "__init__.py")
+        }
+        # a package that a module is inside of is loaded before it in any case
+        graph[module] = {name for name in found & modules.keys() if not f"{module}.".startswith(f"{name}.")}
+    graphlib.TopologicalSorter(graph).prepare()
+
+
 def test_the_table_itself_has_no_circle():
     graphlib.TopologicalSorter({package: others - {package} for package, others in MAY_IMPORT.items()}).prepare()
     assert set(MAY_IMPORT) >= PURE

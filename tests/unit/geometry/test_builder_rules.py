@@ -94,7 +94,7 @@ def test_two_bodies_of_one_name_say_both_places():
 
 def test_two_frames_of_one_name_say_both_places():
     builder = cart()
-    builder._bodies[1].frame("Head", Pose((9, 9, 9)), source=at(20))
+    builder.bodies[1].frame("Head", Pose((9, 9, 9)), source=at(20))
     problem = one_error(builder)
     assert problem.message == "frame 'Head' of body 'Mast' is defined twice (first at cart.xml:6 (element 6))"
     assert problem.line == 20
