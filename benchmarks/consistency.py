@@ -40,23 +40,23 @@ from modelserver.localization.filter.setup import Setup
 from modelserver.localization.rig import Rig
 from modelserver.messages import Estimate, FixType, OrientationReference, WheelsSample
 from modelserver.simulation import (
+    DrivePhase,
     EncoderModel,
     Event,
     GpsModel,
     ImuModel,
-    Motion,
-    Phase,
     Ride,
     SideSlip,
     Simulation,
     Terrain,
     Timing,
     Trajectory,
+    TrajectoryMotion,
     TriadModel,
     WheelsModel,
     city,
 )
-from modelserver.simulation.noise import Noise
+from modelserver.simulation.noise import NoiseSource
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Vector3
 
@@ -128,7 +128,7 @@ class _Wandering:
     """
 
     def __init__(self, sigma: float, lasting: float, seed: int, count: int = 60):
-        noise = Noise(seed, "wandering")
+        noise = NoiseSource(seed, "wandering")
         top = 0.5 / lasting
         amplitude = sigma * math.sqrt(2.0 / count)
         # one frequency in each of even cells: an even spectrum
@@ -137,7 +137,7 @@ class _Wandering:
             for k in range(count)
         ]
 
-    def at(self, t: float, motion: Motion, higher: Vector3) -> Vector3:
+    def at(self, t: float, motion: TrajectoryMotion, higher: Vector3) -> Vector3:
         v, v1, v2 = motion.speed, motion.forward_acceleration, higher[2]
         w = w1 = w2 = 0.0
         for amplitude, omega, phase in self._sines:
@@ -156,7 +156,7 @@ class _Wheels:
     """Wheels with one error of scale, and with a way that errs anew over each period that is compared."""
 
     def __init__(self, settings: FilterSettings, seed: int):
-        self._noise = Noise(seed, "matched wheels")
+        self._noise = NoiseSource(seed, "matched wheels")
         self._scale = 1.0 + self._noise.normal(settings.wheel_scale_sigma)
         self._period = settings.wheel_period
         self._last: dict[str, tuple[int, float]] = {}
@@ -197,10 +197,10 @@ def _rig(turned: float) -> Rig:
 
 def matched(seed: int) -> Drive:
     settings = MATCHED
-    rig = _rig(Noise(seed, "wheel yaw").normal(settings.wheel_yaw_sigma))
+    rig = _rig(NoiseSource(seed, "wheel yaw").normal(settings.wheel_yaw_sigma))
     share = settings.gps_white_share
     # it stands first: levelling on the move rests on a guess of how hard vehicles accelerate
-    trajectory = Trajectory((Phase(5.0), *city(seed, SECONDS - 5.0, speed=5.0)), yaw=0.7)
+    trajectory = Trajectory((DrivePhase(5.0), *city(seed, SECONDS - 5.0, speed=5.0)), yaw=0.7)
     ride = Ride(trajectory, None, SideSlip(), seed)
     ride._slip = _Wandering(settings.side_sigma, settings.slip_time, seed)  # type: ignore[assignment]
     simulation = Simulation(
@@ -272,7 +272,7 @@ def stronger(seed: int) -> Drive:
 
 
 def faults(seed: int) -> Drive:
-    chance = Noise(seed, "faults")
+    chance = NoiseSource(seed, "faults")
     angle = chance.uniform(-math.pi, math.pi)
     far = (5.0, 20.0, 700.0)[seed % 3]
     jumped = chance.uniform(95.0, 105.0)

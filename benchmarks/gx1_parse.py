@@ -11,7 +11,7 @@ from collections.abc import Callable
 from benchmarks.support import verdict
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
 from msdrivers.emulate.gx1_unit import Eeprom
-from msdrivers.protocol.gx1 import DATA, Command, Gx1Parser, Packet, RequestParser
+from msdrivers.protocol.gx1 import DATA, CommandByte, Gx1Parser, Packet, RequestParser
 from msdrivers.station import Measured, Now, Send
 
 REPLIES = 50_000
@@ -26,7 +26,7 @@ FUZZ_BYTES = 10_000_000
 
 
 def _reply(number: int) -> bytes:
-    return Packet(Command.EULER_VECTORS, (number % 1000, 2, 3, 4, 5, 6, 7, 8, -4681), number % 65_536).to_bytes()
+    return Packet(CommandByte.EULER_VECTORS, (number % 1000, 2, 3, 4, 5, 6, 7, 8, -4681), number % 65_536).to_bytes()
 
 
 def parser() -> Gx1Parser:
@@ -71,12 +71,12 @@ def _driven(chunks: list[bytes], per_chunk: float) -> int:
         for output in outputs:
             for request in requests.feed(output.unit) if isinstance(output, Send) else ():
                 words: tuple[int, ...] = (1234,)
-                if request.command == Command.CONTINUOUS:
+                if request.command == CommandByte.CONTINUOUS:
                     streamed = request.data[0]
                     words = (streamed, 0)
-                elif request.command == Command.READ_EEPROM:
+                elif request.command == CommandByte.READ_EEPROM:
                     words = (eeprom.word(request.data[1]),)
-                ticks = 65_535 if request.command == Command.READ_EEPROM else None
+                ticks = 65_535 if request.command == CommandByte.READ_EEPROM else None
                 replies += Packet(request.command, words, ticks).to_bytes()
         due = driver.due()
         now = Now(max(now.monotonic_ns, due or 0), 1)

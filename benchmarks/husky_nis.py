@@ -11,7 +11,7 @@ from benchmarks.withheld import data_directory
 from modelserver.config import load_config
 from modelserver.messages import Decision, Verdict
 from modelserver.service.daemon import load_vehicle
-from modelserver.service.offline import Run
+from modelserver.service.offline import OfflineRun
 from modelserver.wire.eventlog import LogFile
 from mstools.commands.import_bag import import_bag
 
@@ -34,6 +34,6 @@ def mean_statistics() -> dict[str, float] | None:
         log = Path(directory) / "husky.lcm"
         import_bag(bag, log)
         with LogFile(log) as recording:
-            for _ in Run(vehicle, recording, vehicle.config.base_frame, noted).rows(None, 0.1):
+            for _ in OfflineRun(vehicle, recording, vehicle.config.base_frame, noted).rows(None, 0.1):
                 pass
     return {kind: statistics.mean(values) for kind, values in found.items()}

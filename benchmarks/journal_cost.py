@@ -113,7 +113,7 @@ def main() -> int:
         chunks = Chunks()
         for _ in range(STATES):
             chunks.begin()
-            run = journal_state.Run(config, journal_state.detach(with_it.loop.state))
+            run = journal_state.RunState(config, journal_state.detach(with_it.loop.state))
             size = len(journal_state.encode_run(run, chunks))
             chunks()
         write.finish()

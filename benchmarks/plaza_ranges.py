@@ -19,7 +19,7 @@ from benchmarks.support import ROOT
 from modelserver.earth.geodesy import Geodesy
 from modelserver.errors import ModelServerError
 from modelserver.service.daemon import Vehicle, configured_origin
-from modelserver.service.offline import Run
+from modelserver.service.offline import OfflineRun
 from modelserver.wire.eventlog import LogEvent, LogFile
 
 VEHICLE = ROOT / "benchmarks" / "vehicles" / "plaza" / "vehicle.yaml"
@@ -50,7 +50,7 @@ def _withheld(name: str, data: Path, where: Beacons, vehicle: Vehicle, directory
     plaza.convert(data, log, name, where)
     chosen = plaza.scored(increments, ranges, where)
     with LogFile(log) as recording:
-        run = Run(vehicle, _given(recording), plaza.FRAME)
+        run = OfflineRun(vehicle, _given(recording), plaza.FRAME)
         rows = list(run.rows([plaza.utime_of(t) for t in ranges[chosen, 0]]))
     origin = configured_origin(vehicle.config)
     assert origin is not None

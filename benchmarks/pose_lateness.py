@@ -74,16 +74,16 @@ def observed_daemon(config: str, found: str) -> None:
             made.append(self)
             super().run()
 
-    earlier = heard.Heard.read
+    earlier = heard.SensorChannel.read
 
-    def read(self: heard.Heard, data: bytes) -> object:
+    def read(self: heard.SensorChannel, data: bytes) -> object:
         sample = earlier(self, data)
         ages.append((time.monotonic_ns(), time.time_ns() - sample.header.host_utime * 1000))
         return sample
 
     daemon.LcmBus = ObservedBus  # type: ignore[misc]
     daemon.Loop = ObservedLoop  # type: ignore[misc]
-    heard.Heard.read = read  # type: ignore[assignment, method-assign]
+    heard.SensorChannel.read = read  # type: ignore[assignment, method-assign]
     daemon.run(daemon.load_vehicle(load_config(Path(config)), config), file=config)
     Path(found).write_text(json.dumps({"late": late, "ages": ages, "missed": made[0].state.ticks_missed}))
 

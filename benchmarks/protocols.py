@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from benchmarks.overrides import vehicle_with
 from benchmarks.withheld import Fixes, common_scorer, read_fixes
-from modelserver.service.offline import Run
+from modelserver.service.offline import OfflineRun
 from modelserver.wire.eventlog import LogEvent, LogFile
 
 Array = npt.NDArray[np.float64]
@@ -151,11 +151,11 @@ def run(job: Job) -> Outcome:
             events: Iterable[LogEvent] = protocol.given(recording, gps.channel)
             if job.transform is not None:
                 events = job.transform(events)
-            estimated, valid, rejected = _estimates(Run(vehicle, events, gps.frame), protocol)
+            estimated, valid, rejected = _estimates(OfflineRun(vehicle, events, gps.frame), protocol)
         return _scored(protocol, estimated, valid, rejected, scorer, Path(directory))
 
 
-def _estimates(replayed: Run, protocol: Protocol) -> tuple[Array, Mask, Mapping[tuple[str, str], int]]:
+def _estimates(replayed: OfflineRun, protocol: Protocol) -> tuple[Array, Mask, Mapping[tuple[str, str], int]]:
     """Return east, north, up, yaw at the withheld fixes, whether they are valid, and what was rejected."""
     # stamps of one receiver rise, but nothing forces a recording's to
     at = np.maximum.accumulate(protocol.fixes.utime[protocol.withheld])

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import ConfigDict
 
 from modelserver import config_reader
-from modelserver.errors import ConfigError, Problem, Severity, Source, shown
+from modelserver.errors import ConfigError, Location, Problem, Severity, shown
 from modelserver.file_kinds import FileKind, conversion_command, file_kind
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.localization.magnetometer import MagnetometerCalibration
@@ -554,7 +554,7 @@ def _bytes(path: Path) -> bytes:
 
 
 def _no_vehicle_file(path: Path, what: str, fix: str) -> ConfigError:
-    return ConfigError([Problem(Severity.ERROR, what, Source(str(path)), fix)])
+    return ConfigError([Problem(Severity.ERROR, what, Location(str(path)), fix)])
 
 
 def _with_paths(config: VehicleConfig, path: Path) -> VehicleConfig:

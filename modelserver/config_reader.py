@@ -12,7 +12,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
-from modelserver.errors import ConfigError, Problem, Severity, Source, Suggested, shown, suggest_key, suggestions
+from modelserver.errors import ConfigError, Location, Problem, Severity, Suggested, shown, suggest_key, suggestions
 
 MAX_BYTES = 1 << 20
 
@@ -194,9 +194,9 @@ class _Reader:
         self.lines.update({(*at[:-1], meant, *path[len(at) :]): line for path, line in moved.items()})
         return True
 
-    def place(self, at: Path_) -> Source:
+    def place(self, at: Path_) -> Location:
         line = next((self.lines[at[:n]] for n in range(len(at), -1, -1) if at[:n] in self.lines), 0)
-        return Source(self.name, line, ".".join(map(str, at)))
+        return Location(self.name, line, ".".join(map(str, at)))
 
     def explain(self, detail: Any) -> list[tuple[Path_, Problem]]:
         """Turn one of pydantic's findings into problems, each with its place, its line and the nearest key."""
@@ -310,4 +310,4 @@ def _check_shape(raw: bytes, name: str) -> None:
 
 
 def _one(name: str, line: int, message: str, fix: str) -> ConfigError:
-    return ConfigError([Problem(Severity.ERROR, message, Source(name, line), fix)])
+    return ConfigError([Problem(Severity.ERROR, message, Location(name, line), fix)])

@@ -49,7 +49,7 @@ class Severity(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class Location:
     """The place in a file that a value came from."""
 
     file: str = ""
@@ -113,7 +113,7 @@ class Problem:
 
     severity: Severity
     message: str
-    source: Source = Source()
+    source: Location = Location()
     fix: str = ""
     nearest: tuple[str, ...] = ()
     replaced: str = ""

@@ -14,7 +14,7 @@ from modelserver.errors import NoPoseError
 from modelserver.geometry import names
 from modelserver.geometry.edges import Edge, EdgeKind
 from modelserver.messages import NO_FLAGS, Estimate, Invalid, Policy, PoseAnswer, Quality, TimeQuery
-from modelserver.platform.path import Step, Way, way
+from modelserver.platform.path import PathState, PathStep, way
 from modelserver.platform.view import PlatformView
 from modelserver.platform.worlds import is_absolute
 from modelserver.spatial import chain, so3
@@ -67,7 +67,7 @@ def between(
     )
 
 
-def _joined(there: Way, here: Way, fixed: str) -> tuple[list[Step], Quality]:
+def _joined(there: PathState, here: PathState, fixed: str) -> tuple[list[PathStep], Quality]:
     """Return the steps of both ways as one, the vehicle's at the two times put together where they meet."""
     if not (there.steps and here.steps):
         return [*there.steps, *here.steps], NO_FLAGS
@@ -89,12 +89,12 @@ def _joined(there: Way, here: Way, fixed: str) -> tuple[list[Step], Quality]:
     return [*rest[0], *doubled, *rest[1]], Quality.CORRELATION_UNKNOWN
 
 
-def _travelled(before: Estimate, after: Estimate) -> Step:
+def _travelled(before: Estimate, after: Estimate) -> PathStep:
     """Return the step from the vehicle at one time to itself at another, by Odom."""
     X_FT = before.odom.inverse() @ after.odom
     edge = Edge(EdgeKind.VEHICLE, names.ODOM, True, X_FT)
     source = (EdgeKind.VEHICLE, names.ODOM, before.utime, after.utime)
-    return Step(edge, X_FT, _drift(before, after), source, estimate=after)
+    return PathStep(edge, X_FT, _drift(before, after), source, estimate=after)
 
 
 def _drift(before: Estimate, after: Estimate) -> Array | None:

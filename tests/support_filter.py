@@ -19,10 +19,10 @@ from modelserver.localization.modes import ModeLocalizer
 from modelserver.localization.rig import Rig
 from modelserver.messages import Decision, Estimate, FixType, Mode, Sample, SwitchMode, Verdict
 from modelserver.simulation import (
+    DrivePhase,
     Event,
     GpsModel,
     ImuModel,
-    Phase,
     Simulation,
     Timing,
     Trajectory,
@@ -77,7 +77,9 @@ def rig(turned: float = 0.0, imu: Pose = MOUNT, kinematics: Any = "differential"
 RIG = rig()
 
 
-def simulation(phases: Sequence[Phase], on: Rig = RIG, *, yaw: float = 0.7, seed: int = 1, **more: Any) -> Simulation:
+def simulation(
+    phases: Sequence[DrivePhase], on: Rig = RIG, *, yaw: float = 0.7, seed: int = 1, **more: Any
+) -> Simulation:
     """A drive of the vehicle; `more` goes to the simulator, over what stands here."""
     arguments: dict[str, Any] = {
         "gps_frame": "Car:Antenna",

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from modelserver.messages import FixType, GpsSample, SensorHeader
 from msdrivers.devices.gps import GpsDriver
 from msdrivers.emulate.gps import GpsEmulator
-from msdrivers.station import Measured, Now, Output, Phase, Reopen, Send, Told
+from msdrivers.station import Measured, Now, Output, Reopen, Send, StationPhase, StationStatus
 
 START = 1_700_000_000_000_000
 SECOND = 1_000_000
@@ -62,7 +62,7 @@ class Line:
     right_baud: int | None = None
     baud: int | None = None
     measured: list[Measured] = field(default_factory=list)
-    told: list[Told] = field(default_factory=list)
+    told: list[StationStatus] = field(default_factory=list)
     reopened: list[Reopen] = field(default_factory=list)
     sent: list[bytes] = field(default_factory=list)
 
@@ -81,7 +81,7 @@ class Line:
         return "\n".join(f"{each.phase.value}: {each.text}" for each in self.told)
 
     @property
-    def phases(self) -> list[Phase]:
+    def phases(self) -> list[StationPhase]:
         phases = [each.phase for each in self.told]
         return [each for n, each in enumerate(phases) if n == 0 or each is not phases[n - 1]]
 
@@ -130,7 +130,7 @@ class Line:
                         self.from_device(self.device.received(unit, self.now))
                 case Measured():
                     self.measured.append(each)
-                case Told():
+                case StationStatus():
                     self.told.append(each)
                 case Reopen():
                     self.reopened.append(each)

@@ -11,7 +11,7 @@ from modelserver.messages import ImuSample, OrientationReference, SensorHeader
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import Vector3
 from msdrivers.emulate.gx1 import Gx1Emulator
-from msdrivers.station import Measured, Now, Output, Phase, Reopen, Send, Station, Told
+from msdrivers.station import Measured, Now, Output, Reopen, Send, Station, StationPhase, StationStatus
 
 START_UTIME = 1_700_000_000_000_000
 FIELD_NED: Vector3 = (18e-6, 0.0, 50e-6)
@@ -61,7 +61,7 @@ class Line:
     spoil: Callable[[bytes], bytes] = bytes
     now_ns: int = 5_000_000_000
     samples: list[Measured] = field(default_factory=list)
-    told: list[Told] = field(default_factory=list)
+    told: list[StationStatus] = field(default_factory=list)
     reopened: list[Reopen] = field(default_factory=list)
     sent: list[bytes] = field(default_factory=list)
     host_baud: int = 38400
@@ -94,7 +94,7 @@ class Line:
             self.device.received(unit, self.now())
         self._to_device.clear()
 
-    def texts(self, phase: Phase | None = None) -> list[str]:
+    def texts(self, phase: StationPhase | None = None) -> list[str]:
         return [told.text for told in self.told if phase in (None, told.phase)]
 
     def _next(self) -> int:
@@ -133,7 +133,7 @@ class Line:
                     self._to_device.append((self.now_ns + round(self.flight_s * 1e9), output.unit))
             elif isinstance(output, Measured):
                 self.samples.append(output)
-            elif isinstance(output, Told):
+            elif isinstance(output, StationStatus):
                 self.told.append(output)
             else:
                 self.reopened.append(output)

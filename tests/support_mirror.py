@@ -10,7 +10,7 @@ from support_moving import view as exact_view
 
 from modelserver.client.knowledge import Knowledge, Known
 from modelserver.client.local import LocalPlatform
-from modelserver.formats.snapshot import Snapshot, written
+from modelserver.formats.snapshot import ModelSnapshot, written
 from modelserver.geometry.model import Model
 from modelserver.messages import Estimate, SnapshotPart
 from modelserver.platform import PlatformView
@@ -25,11 +25,11 @@ DELAY = 1_500
 """Microseconds from a stamp to the arrival."""
 
 
-def snapshot(model: Model | None = None, latency_us: int = 0, channel: str = "JOINTS") -> Snapshot:
-    return Snapshot("rover", rover() if model is None else model, BASE, BASE, 60.0, channel, latency_us)
+def snapshot(model: Model | None = None, latency_us: int = 0, channel: str = "JOINTS") -> ModelSnapshot:
+    return ModelSnapshot("rover", rover() if model is None else model, BASE, BASE, 60.0, channel, latency_us)
 
 
-def parts(of: Snapshot, utime: int = T0, size: int = PART_BYTES) -> list[Message]:
+def parts(of: ModelSnapshot, utime: int = T0, size: int = PART_BYTES) -> list[Message]:
     data, revision = written(of), of.model.revision
     pieces = [data[start : start + size] for start in range(0, len(data), size)]
     return [

@@ -12,28 +12,28 @@ from functools import cache
 from modelserver.localization.filter.localizer import FilterLocalizer
 from modelserver.localization.filter.setup import Setup
 from modelserver.messages import Kept, Mode, Recalled, WheelsSample
-from modelserver.simulation import Event, Phase, Simulation, Trajectory
+from modelserver.simulation import DrivePhase, Event, Simulation, Trajectory
 from tests.support_filter import IMU, ORIGIN, PLAIN_GPS, RIG, WHEELS, WHEELS_MODEL, Run, drive, simulation
 
 FIRST, GAP = 40.0, 4.0
 """Seconds of the first run, and until the second one hears its first sample."""
 
-TO_A_STOP = (Phase(4.0), Phase(2.0, 2.0, 0.0), Phase(20.0, 2.0, 0.1), Phase(2.0, 0.0))
+TO_A_STOP = (DrivePhase(4.0), DrivePhase(2.0, 2.0, 0.0), DrivePhase(20.0, 2.0, 0.1), DrivePhase(2.0, 0.0))
 """28 s: a vehicle that drove and stands; it stands on until what follows."""
 
-DRIVES_OFF = (Phase(2.0, 2.0, 0.0), Phase(20.0, 2.0, 0.1), Phase(2.0, 0.0))
+DRIVES_OFF = (DrivePhase(2.0, 2.0, 0.0), DrivePhase(20.0, 2.0, 0.1), DrivePhase(2.0, 0.0))
 
 
-def first_run(after: Sequence[Phase] = (), seed: int = 1, seconds: float = FIRST) -> tuple[Run, Kept]:
+def first_run(after: Sequence[DrivePhase] = (), seed: int = 1, seconds: float = FIRST) -> tuple[Run, Kept]:
     """The run that is broken off, and what it kept."""
     run, kept = _first_run(tuple(after), seed, seconds)
     return replace(run, simulation=_fork(run.simulation)), kept
 
 
 @cache
-def _first_run(after: tuple[Phase, ...], seed: int, seconds: float) -> tuple[Run, Kept]:
+def _first_run(after: tuple[DrivePhase, ...], seed: int, seconds: float) -> tuple[Run, Kept]:
     """Simulate a first run once for all tests of it; nobody may draw from its simulation but through `_fork`."""
-    sim = simulation((*TO_A_STOP, *after, Phase(200.0)), seed=seed)
+    sim = simulation((*TO_A_STOP, *after, DrivePhase(200.0)), seed=seed)
     (sim._arrivals,) = itertools.tee(sim._arrivals, 1)
     run = drive(sim, seconds)
     kept = run.localizer.kept()
@@ -64,7 +64,9 @@ def lose(sim: Simulation, seconds: float) -> None:
         pass
 
 
-def elsewhere(run: Run, gap: float, east: float, turn: float, phases: Sequence[Phase], seed: int = 1) -> Simulation:
+def elsewhere(
+    run: Run, gap: float, east: float, turn: float, phases: Sequence[DrivePhase], seed: int = 1
+) -> Simulation:
     """The vehicle of a run again, `east` metres away and turned by `turn` radians when the gap is over."""
     true = run.simulation.truth(run.simulation.start_utime + round(FIRST * 1e6))
     x, y, _ = true.enu.xyz

@@ -24,7 +24,7 @@ from msdrivers.protocol.can.mapping import (
 )
 from msdrivers.protocol.modbus.axis_map import AxisRegisters
 from msdrivers.protocol.modbus.numbers import RegisterMap
-from msdrivers.station import Measured, Now, Output, Reopen, Send, Station, Told
+from msdrivers.station import Measured, Now, Output, Reopen, Send, Station, StationStatus
 
 START_UTIME = 1_750_000_000_000_000
 START_NS = 5_000_000_000
@@ -139,7 +139,7 @@ class Wire(Generic[U]):
     spoil: Callable[[U, float], list[U]] = lambda unit, t: [unit]
     t: float = 0.0
     samples: list[tuple[float, Measured]] = field(default_factory=list)
-    told: list[tuple[float, Told]] = field(default_factory=list)
+    told: list[tuple[float, StationStatus]] = field(default_factory=list)
     reopened: list[tuple[float, Reopen]] = field(default_factory=list)
     to_host: list[tuple[float, U]] = field(default_factory=list)
     to_device: list[tuple[float, U]] = field(default_factory=list)
@@ -203,7 +203,7 @@ class Wire(Generic[U]):
                 self.to_device.append((self.t + self.flight_s, output.unit))
             elif isinstance(output, Measured):
                 self.samples.append((self.t, output))
-            elif isinstance(output, Told):
+            elif isinstance(output, StationStatus):
                 self.told.append((self.t, output))
             elif isinstance(output, Reopen):
                 self.reopened.append((self.t, output))

@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from modelserver.wire.channels import CHANNELS, Way
+from modelserver.wire.channels import CHANNELS, ChannelUse
 from mstools.spy.lcm_wheel import binary
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -23,11 +23,11 @@ TYPES = ROOT / "lcmtypes"
 WIRE_PAGE = ROOT / "docs" / "wire.md"
 
 SPEAKERS = {
-    Way.SENSOR: "driver",
-    Way.REQUEST: "client",
-    Way.BROADCAST: "service",
-    Way.COMMAND: "whoever commands",
-    Way.REPORT: "driver",
+    ChannelUse.SENSOR: "driver",
+    ChannelUse.REQUEST: "client",
+    ChannelUse.BROADCAST: "service",
+    ChannelUse.COMMAND: "whoever commands",
+    ChannelUse.REPORT: "driver",
 }
 
 TABLE_BEGIN = "<!-- channels: written by `make types` -->\n"

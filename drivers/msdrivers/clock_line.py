@@ -40,7 +40,7 @@ class Point(NamedTuple):
     difference: int
 
 
-class Block(NamedTuple):
+class SampleBlock(NamedTuple):
     """Some seconds of samples: the lowest for the least and for the greatest drift, sums over all. Microseconds."""
 
     start: int
@@ -51,13 +51,13 @@ class Block(NamedTuple):
     differences: int
 
     @classmethod
-    def begun(cls, point: Point, counted: int) -> Block:
+    def begun(cls, point: Point, counted: int) -> SampleBlock:
         """Return the block of one sample, whose difference counts in the mean as `counted`."""
         return cls(point.device, point, point, 1, point.device, counted)
 
-    def taken(self, point: Point, counted: int, max_drift: float) -> Block:
+    def taken(self, point: Point, counted: int, max_drift: float) -> SampleBlock:
         """Return the block with one sample more."""
-        return Block(
+        return SampleBlock(
             self.start,
             point if _is_lower(point, self.falling, -max_drift) else self.falling,
             point if _is_lower(point, self.rising, max_drift) else self.rising,
@@ -71,7 +71,7 @@ def _is_lower(point: Point, other: Point, drift: float) -> bool:
     return point.difference - other.difference < drift * (point.device - other.device)
 
 
-class Line(NamedTuple):
+class ClockLine(NamedTuple):
     """The line at device time `at`: offset, drift, their covariance (microseconds), the spread of the delays.
 
     raised: by how much the lower edge of the latest samples lies higher than so many delays explain, microseconds.
@@ -97,7 +97,7 @@ class Line(NamedTuple):
         return self.offset + self.drift * after, max(variance, 0.0)
 
 
-def fitted(blocks: tuple[Block, ...], at: int, drift: float, max_drift: float) -> Line:
+def fitted(blocks: tuple[SampleBlock, ...], at: int, drift: float, max_drift: float) -> ClockLine:
     """Return the line through the lower edge of the blocks at device time `at`; `drift` is a first guess."""
     points = [point for block in blocks for point in block[1:3]]
     base = points[-1].difference
@@ -131,7 +131,7 @@ def fitted(blocks: tuple[Block, ...], at: int, drift: float, max_drift: float) -
     span = (blocks[-1].start - blocks[0].start) * 1e-6
     spread = below**2 * count / (count + 2) + (BEND * span**2 / 8.0 * 1e6) ** 2
     raised = _raised(blocks, lows - mean_drift * times - mean_edge, jitter)
-    return Line(
+    return ClockLine(
         at,
         base + mean_edge - below,
         mean_drift,
@@ -144,7 +144,7 @@ def fitted(blocks: tuple[Block, ...], at: int, drift: float, max_drift: float) -
     )
 
 
-def _raised(blocks: tuple[Block, ...], above: np.ndarray, jitter: float) -> float:
+def _raised(blocks: tuple[SampleBlock, ...], above: np.ndarray, jitter: float) -> float:
     """Return by how much the floor since some block lies too high, for the block where that is most. Microseconds."""
     floors = np.minimum.accumulate(np.minimum(above[0::2], above[1::2])[::-1])
     numbers = np.cumsum([block.number for block in reversed(blocks)])

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from msdrivers.clock_line import Block, Line, Point, fitted
+from msdrivers.clock_line import ClockLine, Point, SampleBlock, fitted
 
 BLOCK_US = 2_000_000
 WINDOW_US = 120_000_000
@@ -65,8 +65,8 @@ class DeviceClock:
     tick_us: float = 1.0
     max_drift: float = 200e-6
     restarts: int = 0
-    _blocks: tuple[Block, ...] = ()
-    _line: Line | None = None
+    _blocks: tuple[SampleBlock, ...] = ()
+    _line: ClockLine | None = None
     _last_us: int | None = None
     _begun_us: int = 0
     _late: int = 0
@@ -124,7 +124,7 @@ class DeviceClock:
         return clock._answer(device_us, excess if excess > CLIP * usual else 0.0)
 
     def _restarted(self, device_us: int, difference: int, risen: float) -> tuple[DeviceClock, int, float]:
-        block = Block.begun(Point(device_us, difference), difference)
+        block = SampleBlock.begun(Point(device_us, difference), difference)
         clock = replace(
             self,
             _blocks=(block,),
@@ -142,7 +142,7 @@ class DeviceClock:
         assert self._line is not None
         last, point = self._blocks[-1], Point(device_us, difference)
         if device_us - last.start >= BLOCK_US:
-            block = Block.begun(point, counted)
+            block = SampleBlock.begun(point, counted)
             recent = (each for each in self._blocks if abs(device_us - each.start) < WINDOW_US)
             blocks = (*recent, block)
         else:
@@ -154,7 +154,7 @@ class DeviceClock:
         line = self._line._replace(since=self._line.since + 1)
         return replace(self, _blocks=blocks, _line=line, _last_us=device_us, _late=0)
 
-    def _refitted(self, blocks: tuple[Block, ...], device_us: int) -> DeviceClock:
+    def _refitted(self, blocks: tuple[SampleBlock, ...], device_us: int) -> DeviceClock:
         assert self._line is not None
         max_drift = self.max_drift
         line = fitted(blocks, device_us, self._line.drift, max_drift)

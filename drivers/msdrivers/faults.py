@@ -17,7 +17,7 @@ FAULTS: Mapping[str, str] = {
 """Kinds of faults that every emulator knows, and what the amount of each is where the emulator does not differ."""
 
 
-class Fault(NamedTuple):
+class InjectedFault(NamedTuple):
     """Something that goes wrong `at` seconds after the start; of what the `amount` is depends on the kind."""
 
     at: float
@@ -25,7 +25,7 @@ class Fault(NamedTuple):
     amount: float = 1.0
 
 
-def parse_fault(text: str, known: Mapping[str, str] = FAULTS) -> Fault:
+def parse_fault(text: str, known: Mapping[str, str] = FAULTS) -> InjectedFault:
     """Return the fault of `KIND@SECONDS[:AMOUNT]`, one of the `known` kinds.
 
     Raises ValueError that says what is wrong with the text.
@@ -40,7 +40,7 @@ def parse_fault(text: str, known: Mapping[str, str] = FAULTS) -> Fault:
         raise ValueError(f"{shown(kind, 40)} is no fault; {hint}")
     at, _, amount = when.partition(":")
     try:
-        fault = Fault(float(at), kind, float(amount) if amount else 1.0)
+        fault = InjectedFault(float(at), kind, float(amount) if amount else 1.0)
     except ValueError:
         raise ValueError(f"{shown(when, 40)} is not of the form SECONDS[:AMOUNT], e.g. 10:2") from None
     if not (0.0 <= fault.at < 1e9 and 0.0 < fault.amount < 1e9):

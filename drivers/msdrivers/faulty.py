@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
-from msdrivers.faults import Fault
+from msdrivers.faults import InjectedFault
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.modbus.registers import Registers
-from msdrivers.station import Now, Output, Phase, Send, Station, Told
+from msdrivers.station import Now, Output, Send, Station, StationPhase, StationStatus
 
 U = TypeVar("U")
 
@@ -21,7 +21,7 @@ class FaultyStation(Generic[U]):
     `make` makes the device as it is when it was switched on.
     """
 
-    def __init__(self, make: Callable[[], Station[U]], faults: Sequence[Fault]):
+    def __init__(self, make: Callable[[], Station[U]], faults: Sequence[InjectedFault]):
         """Take the maker, and what goes wrong how long after the line was first opened."""
         self._make = make
         self._inner = make()
@@ -93,7 +93,7 @@ class FaultyStation(Generic[U]):
                 self._ahead_ns += amount_ns
             else:
                 self._pending[fault.kind] += round(fault.amount)
-            told.append(Told(Phase.STREAMING, f"fault: {fault.kind}, {fault.amount:g}"))
+            told.append(StationStatus(StationPhase.STREAMING, f"fault: {fault.kind}, {fault.amount:g}"))
         return told
 
     def _said(self, outputs: Sequence[Output[U]], now: Now) -> list[Output[U]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from modelserver.errors import ConfigError
-from msdrivers.faults import Fault
+from msdrivers.faults import InjectedFault
 from msdrivers.registry import Emulation
 from msdrivers.settings import DriverSettings
 from msdrivers.station import Station
@@ -24,7 +24,7 @@ def emulator_of(
     driver: DriverSettings,
     folder: Path,
     samples: Iterable[Any],
-    faults: tuple[Fault, ...] = (),
+    faults: tuple[InjectedFault, ...] = (),
     memory: Path | None = None,
 ) -> Station[Any]:
     """Return the station of the emulated device; see `Emulation`. Raises ConfigError."""

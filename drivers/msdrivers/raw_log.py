@@ -64,7 +64,7 @@ class BytesForm:
         return data
 
 
-class Way(StrEnum):
+class RecordDirection(StrEnum):
     """The direction of a record, as it is written."""
 
     RECEIVED = "<"
@@ -72,10 +72,10 @@ class Way(StrEnum):
     WORD = "="
 
 
-class Record(NamedTuple):
+class RawRecord(NamedTuple):
     """One line of a recording."""
 
-    way: Way
+    way: RecordDirection
     now: Now
     data: bytes
 
@@ -110,9 +110,9 @@ class RawWriter:
         """Write the first line."""
         self._put(f"{MAGIC}{kind} {source} {device}\n")
 
-    def record(self, way: Way, now: Now, data: bytes) -> None:
+    def record(self, way: RecordDirection, now: Now, data: bytes) -> None:
         """Write a record; the text of a word is written as it is."""
-        said = data.decode() if way is Way.WORD else data.hex()
+        said = data.decode() if way is RecordDirection.WORD else data.hex()
         self._put(f"{way} {now.utime} {now.monotonic_ns} {said}\n")
 
     def close(self) -> None:
@@ -161,7 +161,7 @@ class RawReader:
             raise RecordingError(f"{self.name} is no recording of a driver: it does not begin with {MAGIC.strip()!r}")
         self.kind, self.source, self.device = words
 
-    def __iter__(self) -> Iterator[Record]:
+    def __iter__(self) -> Iterator[RawRecord]:
         while line := self.stream.readline(MAX_LINE):
             record = _record(line)
             if record is None:
@@ -170,15 +170,15 @@ class RawReader:
                 yield record
 
 
-def _record(line: str) -> Record | None:
+def _record(line: str) -> RawRecord | None:
     way, _, rest = line.partition(" ")
     parts = rest.split(" ", 2)
     if not line.endswith("\n") or len(parts) != 3:
         return None
     try:
-        direction = Way(way)
-        data = parts[2].encode().strip() if direction is Way.WORD else bytes.fromhex(parts[2])
-        return Record(direction, Now(int(parts[1]), int(parts[0])), data)
+        direction = RecordDirection(way)
+        data = parts[2].encode().strip() if direction is RecordDirection.WORD else bytes.fromhex(parts[2])
+        return RawRecord(direction, Now(int(parts[1]), int(parts[0])), data)
     except ValueError:
         return None
 

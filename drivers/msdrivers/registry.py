@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from modelserver.errors import ConfigError, Problem, Severity, Source, Suggested, shown, suggestions
+from modelserver.errors import ConfigError, Location, Problem, Severity, Suggested, shown, suggestions
 from modelserver.messages import GpsSample, ImuSample, JointsSample, Sample, VehicleStatusSample, WheelsSample
 from modelserver.regular_files import read_regular
-from msdrivers.faults import FAULTS, Fault
+from msdrivers.faults import FAULTS, InjectedFault
 from msdrivers.line_settings import CanSettings, LineSettings, ModbusSettings, SerialSettings, TcpSettings
 from msdrivers.station import Station
 
@@ -30,7 +30,7 @@ CHANNELS: Mapping[type[Sample], str] = {
 """The customary channel of what a device says."""
 
 
-class Made(NamedTuple):
+class DeviceModules(NamedTuple):
     """What a kind's modules hold.
 
     settings: the dataclass of its settings; a field `source` takes the driver's name, a field `bauds` the rates to try;
@@ -45,19 +45,19 @@ class Made(NamedTuple):
 class Emulation(NamedTuple):
     """What drives a device in software: its driver's settings, their folder, samples in the order of their stamps.
 
-    faults: what is to go wrong, of the kinds that `Kind.faults` names. memory: where a device that `Kind.remembers`
-    keeps what it was told to keep; None: nowhere.
+    faults: what is to go wrong, of the kinds that `DeviceKind.faults` names. memory: where a device that
+    `DeviceKind.remembers` keeps what it was told to keep; None: nowhere.
     """
 
     settings: Any
     folder: Path
     samples: Iterable[Any]
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[InjectedFault, ...] = ()
     memory: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class DeviceKind:
     """A kind of device.
 
     sample: what it says in the main, and what its emulator is driven by. lines: what it may hang on, the usual one
@@ -72,7 +72,7 @@ class Kind:
     about: str
     sample: type[Sample]
     lines: tuple[type[LineSettings], ...]
-    load: Callable[[], Made]
+    load: Callable[[], DeviceModules]
     emulate: Callable[[Emulation], Station[Any]]
     baud: int = 0
     presets: Mapping[str, Any] = field(default_factory=dict)
@@ -83,10 +83,10 @@ class Kind:
     hard_iron: bool = False
 
 
-def _gps() -> Made:
+def _gps() -> DeviceModules:
     from msdrivers.devices.gps import GpsDriver, GpsSettings
 
-    return Made(GpsSettings, lambda settings, _: GpsDriver(settings))
+    return DeviceModules(GpsSettings, lambda settings, _: GpsDriver(settings))
 
 
 def _gps_unit(wanted: Emulation) -> Station[Any]:
@@ -103,16 +103,16 @@ def _gps_unit(wanted: Emulation) -> Station[Any]:
     return FaultyStation(lambda: GpsEmulator(samples, unit), wanted.faults)
 
 
-def _gx1() -> Made:
+def _gx1() -> DeviceModules:
     from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
 
-    return Made(Gx1Settings, lambda settings, _: Gx1Driver(settings))
+    return DeviceModules(Gx1Settings, lambda settings, _: Gx1Driver(settings))
 
 
 def _gx1_unit(wanted: Emulation) -> Station[Any]:
     from msdrivers.emulate.gx1 import Gx1Emulator
-    from msdrivers.emulate.gx1_unit import Fault as UnitFault
     from msdrivers.emulate.gx1_unit import Gx1Unit
+    from msdrivers.emulate.gx1_unit import UnitFault as UnitFault
     from msdrivers.gx1_memory import read_eeprom, write_eeprom
 
     unit = Gx1Unit(faults=tuple(UnitFault(*each) for each in wanted.faults))
@@ -122,10 +122,10 @@ def _gx1_unit(wanted: Emulation) -> Station[Any]:
     return Gx1Emulator(wanted.samples, read_eeprom(memory), unit, lambda eeprom: write_eeprom(memory, eeprom))
 
 
-def _wheels() -> Made:
+def _wheels() -> DeviceModules:
     from msdrivers.devices.wheels import WheelsDriver, WheelsSettings
 
-    return Made(WheelsSettings, lambda settings, folder: WheelsDriver(settings, _dbc(settings, folder)))
+    return DeviceModules(WheelsSettings, lambda settings, folder: WheelsDriver(settings, _dbc(settings, folder)))
 
 
 def _wheels_unit(wanted: Emulation) -> Station[Any]:
@@ -137,11 +137,11 @@ def _wheels_unit(wanted: Emulation) -> Station[Any]:
     return WheelsEmulator(wanted.settings.wheels, database, wanted.samples, faults)
 
 
-def _vehicle() -> Made:
+def _vehicle() -> DeviceModules:
     from msdrivers.devices.vehicle import VehicleDriver
     from msdrivers.devices.vehicle_settings import VehicleSettings
 
-    return Made(VehicleSettings, lambda settings, folder: VehicleDriver(settings, _dbc(settings, folder)))
+    return DeviceModules(VehicleSettings, lambda settings, folder: VehicleDriver(settings, _dbc(settings, folder)))
 
 
 def _vehicle_unit(wanted: Emulation) -> Station[Any]:
@@ -153,11 +153,11 @@ def _vehicle_unit(wanted: Emulation) -> Station[Any]:
     return VehicleEmulator(database, settings.status, settings.command, samples=wanted.samples, faults=faults)
 
 
-def _axis() -> Made:
+def _axis() -> DeviceModules:
     from msdrivers.devices.axis import AxisDriver
     from msdrivers.devices.axis_settings import AxisSettings
 
-    return Made(AxisSettings, lambda settings, _: AxisDriver(settings))
+    return DeviceModules(AxisSettings, lambda settings, _: AxisDriver(settings))
 
 
 def _axis_unit(wanted: Emulation) -> Station[Any]:
@@ -182,7 +182,7 @@ def _dbc(settings: Any, folder: Path) -> CanDatabase:
         near = Suggested.of(settings.dbc, *(str(path.with_name(name)) for name in suggestions(path.name, there)))
         fix = f"write {near[0]}" if near else "the path of a DBC file, relative to the vehicle file"
         said = f"the DBC file {shown(str(file), 200)} cannot be read: {getattr(error, 'strerror', None) or error}"
-        place = Source(element=f"drivers.{settings.source}.dbc")
+        place = Location(element=f"drivers.{settings.source}.dbc")
         raise ConfigError([Problem(Severity.ERROR, said, place, fix, near)]) from None
     return parse_dbc(text, str(file))
 
@@ -192,13 +192,13 @@ _CAN_FAULTS = {**FAULTS, "jump": "counts by which counters jump", "bus_off": "se
 _BYTES: tuple[type[LineSettings], ...] = (SerialSettings, TcpSettings)
 
 _ALL = (
-    Kind(
+    DeviceKind(
         "novatel", "NovAtel OEM4 and heirs", GpsSample, _BYTES, _gps, _gps_unit, 9600, presets={"protocol": "novatel"}
     ),
-    Kind(
+    DeviceKind(
         "nmea", "receiver that speaks NMEA 0183", GpsSample, _BYTES, _gps, _gps_unit, 4800, presets={"protocol": "nmea"}
     ),
-    Kind(
+    DeviceKind(
         "gx1",
         "MicroStrain 3DM-GX1 inertial unit",
         ImuSample,
@@ -210,7 +210,7 @@ _ALL = (
         remembers=True,
         hard_iron=True,
     ),
-    Kind(
+    DeviceKind(
         "wheels",
         "wheels on a CAN bus, by a DBC file",
         WheelsSample,
@@ -219,7 +219,7 @@ _ALL = (
         _wheels_unit,
         faults=_CAN_FAULTS,
     ),
-    Kind(
+    DeviceKind(
         "vehicle",
         "vehicle controller on a CAN bus, by a DBC file",
         VehicleStatusSample,
@@ -229,7 +229,7 @@ _ALL = (
         commands="VEHICLE_COMMAND",
         faults=_CAN_FAULTS,
     ),
-    Kind(
+    DeviceKind(
         "axis",
         "nodding axis behind Modbus/TCP",
         JointsSample,
@@ -241,5 +241,5 @@ _ALL = (
     ),
 )
 
-KINDS: Mapping[str, Kind] = {kind.name: kind for kind in _ALL}
+KINDS: Mapping[str, DeviceKind] = {kind.name: kind for kind in _ALL}
 """Kinds of devices by the name that a vehicle file gives as `device`."""

@@ -18,7 +18,7 @@ from msdrivers.raw_log import Time
 from msdrivers.reporting import Reporter
 from msdrivers.retries import Retries
 from msdrivers.stamping import Stamper
-from msdrivers.station import Commanded, Measured, Now, Output, Quiet, Reopen, Send, Station, Told
+from msdrivers.station import CommandableStation, Measured, Now, Output, Quiet, Reopen, Send, Station, StationStatus
 
 log = logging.getLogger(__name__)
 
@@ -125,9 +125,9 @@ class Runner(Generic[U]):
         """Let the station count and tell what came as a command and cannot be one."""
         self._commanded(lambda station, now: station.refuse(reason, text, now))
 
-    def _commanded(self, ask: Callable[[Commanded[U], Now], Sequence[Output[U]]]) -> None:
+    def _commanded(self, ask: Callable[[CommandableStation[U], Now], Sequence[Output[U]]]) -> None:
         station = self._station
-        if not self._is_open or not isinstance(station, Commanded):
+        if not self._is_open or not isinstance(station, CommandableStation):
             self.counts["commands_lost"] += 1
             return
         now = self._clock.now()
@@ -240,7 +240,7 @@ class Runner(Generic[U]):
                 self._link.send(output.unit)
             elif isinstance(output, Measured):
                 self._measured(output)
-            elif isinstance(output, Told):
+            elif isinstance(output, StationStatus):
                 self._tell(DriverPhase[output.phase.name], output.text, output.is_trouble)
             else:
                 self._reopen(output)

@@ -10,9 +10,9 @@ from typing import Any, TypeAlias, get_args, get_type_hints
 from pydantic import ValidationError
 
 from modelserver.config_reader import adapter_of
-from modelserver.errors import ConfigError, Problem, Severity, Source, Suggested, shown, suggest_key, suggestions
+from modelserver.errors import ConfigError, Location, Problem, Severity, Suggested, shown, suggest_key, suggestions
 from msdrivers.line_settings import LineSettings, first_key
-from msdrivers.registry import Kind
+from msdrivers.registry import DeviceKind
 from msdrivers.settings_words import Words, of_value
 
 Path: TypeAlias = tuple[str | int, ...]
@@ -40,13 +40,13 @@ def _known_keys(kind: Any, path: tuple[str | int, ...]) -> list[str]:
 class SectionReader:
     """Reads one section, and keeps what is wrong with it."""
 
-    def __init__(self, name: str, section: Mapping[str, Any], source: Callable[..., Source]):
+    def __init__(self, name: str, section: Mapping[str, Any], source: Callable[..., Location]):
         """Take the driver's name, its section, and what tells the place of a path in the vehicle file."""
         self.name, self.section, self._source = name, section, source
         self.problems: list[Problem] = []
         self._has_line = True
 
-    def kind(self, kinds: Mapping[str, Kind]) -> Kind:
+    def kind(self, kinds: Mapping[str, DeviceKind]) -> DeviceKind:
         """Return the kind of device that the section names. Raises ConfigError."""
         given = self.section.get("device")
         known = f"kinds: {', '.join(kinds)}"
@@ -59,7 +59,7 @@ class SectionReader:
             raise ConfigError([self._problem(Words(f"unknown device {shown(str(given))}", fix, near), "device")])
         return kinds[given]
 
-    def line(self, kind: Kind, more: list[str]) -> type[LineSettings]:
+    def line(self, kind: DeviceKind, more: list[str]) -> type[LineSettings]:
         """Return which of its lines the section names: the one whose first key stands there.
 
         `more`: the keys beside those of the line.
@@ -82,7 +82,7 @@ class SectionReader:
         self._has_line = False
         return next(iter(firsts.values()))
 
-    def refuse_unknown(self, kind: Kind, line: type[LineSettings], more: list[str]) -> None:
+    def refuse_unknown(self, kind: DeviceKind, line: type[LineSettings], more: list[str]) -> None:
         """Tell the keys that a driver of this kind on this line does not have."""
         known = [*keys_of(*((line,) if self._has_line else kind.lines)), *more]
         firsts = [first_key(each) for each in kind.lines]
@@ -171,7 +171,7 @@ class SectionReader:
         return Problem(Severity.ERROR, words.message, source, words.fix, words.nearest)
 
 
-def _other_lines(kind: Kind) -> dict[str, str]:
+def _other_lines(kind: DeviceKind) -> dict[str, str]:
     """Return the first keys of the lines that a kind is not on, and what they are lines to."""
     own = {first_key(each) for each in kind.lines}
     every = {first_key(each): each.about for each in get_args(LineSettings)}

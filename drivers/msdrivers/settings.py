@@ -14,9 +14,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from modelserver.errors import ConfigError, Problem, Severity, Source
+from modelserver.errors import ConfigError, Location, Problem, Severity
 from msdrivers.line_settings import LineSettings, TcpSettings
-from msdrivers.registry import KINDS, Kind
+from msdrivers.registry import KINDS, DeviceKind
 from msdrivers.section_reader import SectionReader, keys_of
 from msdrivers.settings_words import Words
 
@@ -34,10 +34,10 @@ class Place:
     file: str = ""
     lines: Mapping[tuple[str | int, ...], int] = field(default_factory=dict)
 
-    def source(self, *path: str | int) -> Source:
+    def source(self, *path: str | int) -> Location:
         """Return the place of a key, or of the nearest section around it."""
         line = next((self.lines[path[:n]] for n in range(len(path), 0, -1) if path[:n] in self.lines), 0)
-        return Source(self.file, line, ".".join(map(str, path)))
+        return Location(self.file, line, ".".join(map(str, path)))
 
     def located(self, name: str, problems: Iterable[Problem]) -> tuple[Problem, ...]:
         """Return problems of the driver `name` with the lines of the keys that they are about.
@@ -55,7 +55,7 @@ class Place:
             parts = key.split(".")
             around = (".".join(parts[:n]) for n in range(len(parts), 0, -1))
             line = next((lines[each] for each in around if each in lines), 0)
-            return dataclasses.replace(problem, source=Source(self.file, line, key))
+            return dataclasses.replace(problem, source=Location(self.file, line, key))
 
         return tuple(map(there, problems))
 
@@ -68,7 +68,7 @@ class DriverSettings:
     """
 
     name: str
-    kind: Kind
+    kind: DeviceKind
     line: LineSettings
     station: Any
     channel: str = ""
@@ -76,7 +76,7 @@ class DriverSettings:
 
 
 def read_drivers(
-    sections: Mapping[str, Mapping[str, Any]], place: Place | None = None, kinds: Mapping[str, Kind] = KINDS
+    sections: Mapping[str, Mapping[str, Any]], place: Place | None = None, kinds: Mapping[str, DeviceKind] = KINDS
 ) -> tuple[dict[str, DriverSettings], tuple[Problem, ...]]:
     """Return the settings of every driver of which nothing is wrong, by its name; and every problem of the others."""
     place = place or Place()
@@ -103,7 +103,7 @@ def empty_section(name: str, place: Place) -> Problem:
 
 
 def read_driver(
-    name: str, section: Mapping[str, Any], place: Place | None = None, kinds: Mapping[str, Kind] = KINDS
+    name: str, section: Mapping[str, Any], place: Place | None = None, kinds: Mapping[str, DeviceKind] = KINDS
 ) -> DriverSettings:
     """Return the settings of one driver. Raises ConfigError with every problem of its section."""
     place = place or Place()

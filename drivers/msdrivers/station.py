@@ -21,7 +21,7 @@ class Now(NamedTuple):
     utime: int
 
 
-class Phase(Enum):
+class StationPhase(Enum):
     """How far a driver has come with its device."""
 
     WAITING = "waiting"
@@ -61,13 +61,13 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class StationStatus:
     """A word for the log and the health channel: the driver's phase, and what there is to say for a person.
 
     `is_trouble`: something is wrong even where the phase is not SILENT, e.g. the device has refused what it was told.
     """
 
-    phase: Phase
+    phase: StationPhase
     text: str
     is_trouble: bool = False
 
@@ -80,7 +80,7 @@ class Reopen:
     baud: int | None = None
 
 
-Output: TypeAlias = Send[U] | Measured | Told | Reopen
+Output: TypeAlias = Send[U] | Measured | StationStatus | Reopen
 
 
 class Station(Protocol[U]):
@@ -107,7 +107,7 @@ class Station(Protocol[U]):
 
 
 @runtime_checkable
-class Commanded(Protocol[U]):
+class CommandableStation(Protocol[U]):
     """A station that takes commands from the bus too."""
 
     def command(self, command: VehicleCommand, now: Now) -> Sequence[Output[U]]:

@@ -19,9 +19,9 @@ from msdrivers.faulty import FaultyStation
 from msdrivers.line_settings import SerialSettings, TcpSettings
 from msdrivers.links.fake import FakeLink, FakeTime
 from msdrivers.protocol.framing import CHANCE, Refused, Scanner, Taken
-from msdrivers.registry import Emulation, Kind, Made
+from msdrivers.registry import DeviceKind, DeviceModules, Emulation
 from msdrivers.runner import Runner, RunnerSettings
-from msdrivers.station import Measured, Now, Output, Phase, Send, Told
+from msdrivers.station import Measured, Now, Output, Send, StationPhase, StationStatus
 
 LONGEST = 32
 
@@ -88,7 +88,7 @@ class SpeedDriver(Quiet):
         outputs: list[Output[bytes]] = []
         for speed in self._scanner.feed(unit):
             if self._silent_ns is None:
-                outputs.append(Told(Phase.STREAMING, "$SPD comes"))
+                outputs.append(StationStatus(StationPhase.STREAMING, "$SPD comes"))
             self._silent_ns = now.monotonic_ns + round(self._settings.silence * 1e9)
             # the device has no time, so device_utime stays 0; utime is for the runner to find from `delay`
             header = SensorHeader(0, self._settings.source, self._seq, now.utime)
@@ -101,7 +101,11 @@ class SpeedDriver(Quiet):
         if self._silent_ns is None or now.monotonic_ns < self._silent_ns:
             return []
         self._silent_ns = None
-        return [Told(Phase.SILENT, f"no $SPD for {self._settings.silence:g} s: check its power, cable and baud")]
+        return [
+            StationStatus(
+                StationPhase.SILENT, f"no $SPD for {self._settings.silence:g} s: check its power, cable and baud"
+            )
+        ]
 
     def due(self) -> int | None:
         return self._silent_ns
@@ -131,12 +135,12 @@ class SpeedUnit(Quiet):
         return None if self._next is None else self._next.header.utime * 1000 + self._shift_ns
 
 
-KIND = Kind(
+KIND = DeviceKind(
     "speed",
     "speed sensor that sends $SPD",
     WheelsSample,
     (SerialSettings, TcpSettings),
-    lambda: Made(SpeedSettings, lambda settings, _: SpeedDriver(settings)),
+    lambda: DeviceModules(SpeedSettings, lambda settings, _: SpeedDriver(settings)),
     lambda wanted: FaultyStation(lambda: SpeedUnit(wanted), wanted.faults),
     baud=9600,
 )

@@ -15,9 +15,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from modelserver.client.told import LONGEST_SPAN_US, SHORTEST_SPAN_US, Carried, Stand, Told
+from modelserver.client.told import LONGEST_SPAN_US, SHORTEST_SPAN_US, Carried, PublishedEstimate, Stand
 from modelserver.errors import WireError, shown
-from modelserver.formats.snapshot import Snapshot, read
+from modelserver.formats.snapshot import ModelSnapshot, read
 from modelserver.geometry import names
 from modelserver.history import History
 from modelserver.joints.joints import NO_JOINTS, Joints
@@ -25,7 +25,7 @@ from modelserver.messages import JointsSample, PoseAnswer, SnapshotPart
 from modelserver.platform import PlatformView
 from modelserver.spatial.transformation import Transformation
 from modelserver.wire.codec import decode
-from modelserver.wire.snapshot import Assembler
+from modelserver.wire.snapshot import SnapshotAssembler
 
 HISTORY_S: Final = 60.0
 """Poses held until the snapshot says for how long the service holds them."""
@@ -67,7 +67,7 @@ class Known:
     """
 
     view: PlatformView | None = None
-    snapshot: Snapshot | None = None
+    snapshot: ModelSnapshot | None = None
     history: History = field(default_factory=lambda: History(HISTORY_S))
     carried: Carried = field(default_factory=Carried)
     joints: Joints = NO_JOINTS
@@ -95,7 +95,7 @@ class Knowledge:
     With `given` the geometry is known beforehand; with `keeping` it stays, whatever poses say they rest on.
     """
 
-    def __init__(self, channel_prefix: str = "", given: Snapshot | None = None, keeping: bool = False):
+    def __init__(self, channel_prefix: str = "", given: ModelSnapshot | None = None, keeping: bool = False):
         self.known = Known()
         self._pose = f"{channel_prefix}POSE"
         self._odom = f"{channel_prefix}POSE_ODOM"
@@ -104,7 +104,7 @@ class Knowledge:
         self._state = f"{channel_prefix}LOCALIZATION_STATE"
         self._keeping = keeping
         self._rejected: dict[tuple[str, str], int] = {}
-        self._assembler = Assembler()
+        self._assembler = SnapshotAssembler()
         self._sent = 0  # stamp of the snapshot in hand
         self._bytes = b""
         self._world: PoseAnswer | None = None
@@ -187,7 +187,7 @@ class Knowledge:
                 self._learn(snapshot)
         self.known = replace(self.known, geometry_heard=now)
 
-    def _learn(self, snapshot: Snapshot) -> None:
+    def _learn(self, snapshot: ModelSnapshot) -> None:
         known = self.known
         if known.snapshot is None:
             joints = Joints(snapshot.model.joints.values(), snapshot.history_s)
@@ -246,7 +246,7 @@ class Knowledge:
             self._stands.clear()
         period = (utime - known.carried.utime) * 1e-6 if 0 < known.carried.utime < utime else known.carried.period
         walks = self._filter_heard == NEVER or now - self._filter_heard > FILTER_US
-        estimate = Told(world, odom, self._earlier(stand), walks)
+        estimate = PublishedEstimate(world, odom, self._earlier(stand), walks)
         # before it has heard of any motion the service answers no question about the vehicle, and broadcasts Odom's
         # beginning without a covariance
         is_known = odom.transformation.covariance is not None
@@ -301,7 +301,7 @@ class Knowledge:
 
     # --- joints
 
-    def _take_joints(self, sample: JointsSample, now: int, snapshot: Snapshot) -> None:
+    def _take_joints(self, sample: JointsSample, now: int, snapshot: ModelSnapshot) -> None:
         known = self.known
         if snapshot.joints_latency_us:
             utime = max(1, sample.header.utime - snapshot.joints_latency_us)
@@ -318,7 +318,7 @@ class Knowledge:
             view = _view(snapshot, known.carried, known.history, joints)
             self.known = replace(known, joints=joints, view=view, joints_heard=now)
 
-    def _take_held(self, sample: JointsSample, now: int, snapshot: Snapshot) -> None:
+    def _take_held(self, sample: JointsSample, now: int, snapshot: ModelSnapshot) -> None:
         """Take what the service holds of joints: told before this listened. It does not make them heard of now."""
         known = self.known
         if sample.header.utime > known.service_time(now) + AHEAD_US:
@@ -329,6 +329,6 @@ class Knowledge:
             self.known = replace(known, joints=joints, view=_view(snapshot, known.carried, known.history, joints))
 
 
-def _view(snapshot: Snapshot, carried: Carried, history: History, joints: Joints) -> PlatformView:
+def _view(snapshot: ModelSnapshot, carried: Carried, history: History, joints: Joints) -> PlatformView:
     # the poses that are told are of the base frame: from there on all is the same, whatever frame rolls
     return PlatformView(snapshot.model, snapshot.base_frame, carried, history, snapshot.base_frame, joints=joints)

@@ -59,7 +59,7 @@ class Stand(NamedTuple):
     odom: Pose
 
 
-class Told:
+class PublishedEstimate:
     """The estimate that a POSE and the POSE_ODOM beside it tell: of the base frame, worked out when it is looked at.
 
     `earlier` is a pose in Odom a little before it, from which the velocity comes. `walks`: how Odom's covariance grows.

@@ -21,7 +21,6 @@ from modelserver.messages import (
     CHANNEL_OF,
     AbsolutePoseSample,
     Acknowledgement,
-    Commanded,
     Decision,
     LoadModel,
     Origin,
@@ -37,6 +36,7 @@ from modelserver.messages import (
     SensorHeader,
     SetHTransform,
     SetStateVector,
+    SignedCommand,
     SwitchMode,
     Verdict,
 )
@@ -67,7 +67,7 @@ def unsigned(state: CoreState, request: ReloadModel | SetStateVector | SetHTrans
     return state, turned_down(state, type(request), request.header, Status.FORBIDDEN, UNSIGNED, now)
 
 
-def commanded(state: CoreState, command: Commanded, now: Instant) -> Step:
+def commanded(state: CoreState, command: SignedCommand, now: Instant) -> Step:
     """Do what a sender who has proved to know the key asks for, where the vehicle file allows it."""
     order = command.order
     if isinstance(order, SwitchMode):

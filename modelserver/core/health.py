@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from modelserver.core.host_clock import Instant
-from modelserver.core.state import CHANGE_PERIOD_NS, CoreState, Outputs, Signs, Traffic, silent_after
+from modelserver.core.state import CHANGE_PERIOD_NS, CoreState, Outputs, Signs, SourceTraffic, silent_after
 from modelserver.messages import (
     NAN,
     VALID,
@@ -91,7 +91,7 @@ def _unused(state: CoreState, now: Instant) -> Iterator[tuple[str, str, str]]:
             yield name, traffic.reason, f"{counts}; the last {traffic.dropped} were dropped: {traffic.reason}"
 
 
-def _is_silent(name: str, traffic: Traffic, now: Instant) -> bool:
+def _is_silent(name: str, traffic: SourceTraffic, now: Instant) -> bool:
     return (
         traffic.count >= JUDGED_FROM
         and (now.monotonic_ns - traffic.last_ns) * 1e-9 > silent_after(traffic.interval)
@@ -104,7 +104,7 @@ def _counted_up(state: CoreState, now: Instant) -> CoreState:
     """Return the state with rates and delays of the period that ends now, and the next one begun."""
     elapsed = (now.monotonic_ns - state.health_sent_ns) * 1e-9 if state.health_sent_ns else 0.0
 
-    def next_one(each: Traffic) -> Traffic:
+    def next_one(each: SourceTraffic) -> SourceTraffic:
         rate = (each.count - each.reported) / elapsed if elapsed > 0 else 0.0
         return replace(each, reported=each.count, rate=rate, delay=NAN, told_delay=each.delay)
 
@@ -168,7 +168,7 @@ def _localization(state: CoreState, estimate: Estimate | None, now: Instant) -> 
     )
 
 
-def _channel_health(name: str, traffic: Traffic, now: Instant) -> ChannelHealth:
+def _channel_health(name: str, traffic: SourceTraffic, now: Instant) -> ChannelHealth:
     age = (now.monotonic_ns - traffic.last_ns) * 1e-9
     return ChannelHealth(
         name,

@@ -82,7 +82,7 @@ class CoreSettings:
     may_reload: bool = False
     may_set_pose: bool = False
     keep_period_ns: int = 0
-    sensors: tuple[Expected, ...] = ()
+    sensors: tuple[ExpectedSensor, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ class Parked:
     until_ns: int
 
 
-class Expected(NamedTuple):
+class ExpectedSensor(NamedTuple):
     """A sensor of the vehicle file: its channel, what its samples are, and, where that is told, its name for itself."""
 
     channel: str
@@ -102,7 +102,7 @@ class Expected(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Traffic:
+class SourceTraffic:
     """Messages of one source: how many, the last one's arrival, and how many there were at the last whole report.
 
     `measured` counts the measurements of its samples that localization decided on, `used` those that it used, `dropped`
@@ -140,7 +140,7 @@ class Signs(NamedTuple):
     unused: tuple[tuple[str, str], ...] = ()
 
 
-class Watch(NamedTuple):
+class HealthInputs(NamedTuple):
     """What the health report needs beside the rest.
 
     `gauges`: the last that came, at `gauged_ns`; `cpu_share` what follows from the last two. `due_ns`: when signs are
@@ -165,7 +165,7 @@ class CoreState(NamedTuple):
     started_ns: int
     parked: tuple[Parked, ...] = ()
     rejected: Mapping[tuple[str, str], int] = MappingProxyType({})
-    traffic: Mapping[str, Traffic] = MappingProxyType({})
+    traffic: Mapping[str, SourceTraffic] = MappingProxyType({})
     lateness: tuple[float, ...] = ()
     health_due_ns: int = 0
     health_sent_ns: int = 0
@@ -178,9 +178,9 @@ class CoreState(NamedTuple):
     snapshot_due_ns: int = 0
     notices: Mapping[str, str] = MappingProxyType({})
     keep_due_ns: int = 0
-    unheard: tuple[Expected, ...] = ()
+    unheard: tuple[ExpectedSensor, ...] = ()
     pose_invalid: int = 0
-    watch: Watch = Watch()
+    watch: HealthInputs = HealthInputs()
     requests_answered: int = 0  # stays last: see `_request`
 
     @property
@@ -259,7 +259,7 @@ def traffic_noted(state: CoreState, source: str, host_utime: int, now: Instant) 
     known = state.traffic.get(source)
     if known is None and len(state.traffic) >= MAX_COUNTERS:
         return state
-    known = known or Traffic()
+    known = known or SourceTraffic()
     interval, delay = known.interval, known.delay
     if known.count:
         since = (now.monotonic_ns - known.last_ns) * 1e-9
@@ -270,7 +270,7 @@ def traffic_noted(state: CoreState, source: str, host_utime: int, now: Instant) 
         took = (now.utime - host_utime) * 1e-6
         # a nan fails the comparison
         delay = delay if delay >= took else took
-    updated = Traffic(
+    updated = SourceTraffic(
         known.count + 1,
         now.monotonic_ns,
         known.reported,

@@ -16,9 +16,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from modelserver.errors import Severity, Source, Suggested, shown, suggestions
+from modelserver.errors import Location, Severity, Suggested, shown, suggestions
 from modelserver.formats import bot_param, numbers
-from modelserver.formats.bot_param import Block, Value
+from modelserver.formats.bot_param import ParamBlock, Value
 from modelserver.formats.circles import circles
 from modelserver.formats.spelling import label, nearest_keys
 from modelserver.geometry import names
@@ -53,8 +53,8 @@ class _Frame:
     parent: str
     pose: Pose
     driven: bool
-    source: Source
-    parent_source: Source
+    source: Location
+    parent_source: Location
 
 
 class _Reader:
@@ -64,14 +64,14 @@ class _Reader:
         self.frames: dict[str, _Frame] = {}
         self.broken = False
 
-    def at(self, line: int, place: str) -> Source:
-        return Source(self.file, line, place)
+    def at(self, line: int, place: str) -> Location:
+        return Location(self.file, line, place)
 
-    def error(self, message: str, source: Source, fix: str, nearest: tuple[str, ...] = ()) -> None:
+    def error(self, message: str, source: Location, fix: str, nearest: tuple[str, ...] = ()) -> None:
         self.builder.error(message, source, fix, nearest)
         self.broken = True
 
-    def read(self, root: Block) -> None:
+    def read(self, root: ParamBlock) -> None:
         for name, value in root.values():
             if name == "INCLUDE":
                 files = ", ".join(value.texts[:5])
@@ -102,7 +102,7 @@ class _Reader:
         if not self.broken and self.parents_exist(top):
             self.join(top, blocks[0])
 
-    def root_of(self, blocks: list[Block]) -> str | None:
+    def root_of(self, blocks: list[ParamBlock]) -> str | None:
         """Return the name of the root frame."""
         named = [value for block in blocks for name, value in block.values() if name == "root_frame"]
         for block in blocks:
@@ -125,7 +125,7 @@ class _Reader:
         top = named[0].texts[0]
         return top if self.is_sound(top, self.at(named[0].line, "root_frame")) else None
 
-    def is_sound(self, name: str, source: Source) -> bool:
+    def is_sound(self, name: str, source: Location) -> bool:
         fault = names.fault(name)
         if name in names.RESERVED_BODIES:
             fault = "the service keeps this name for its world frames"
@@ -133,7 +133,7 @@ class _Reader:
             self.error(f"frame {shown(name)}: {fault}", source, "rename it, here and in relative_to")
         return not fault
 
-    def frame(self, name: str, block: Block, top: str) -> None:
+    def frame(self, name: str, block: ParamBlock, top: str) -> None:
         """Take one frame."""
         place = f"frame {label(name)}"
         source = self.at(block.line, place)
@@ -157,7 +157,7 @@ class _Reader:
         if not isinstance(parent, Value) or len(parent.texts) != 1 or not parent.texts[0]:
             self.error("relative_to is missing", source, f'add relative_to = "{top}"; or the frame it stands in')
             return
-        if not isinstance(transform, Block):
+        if not isinstance(transform, ParamBlock):
             fix = "add initial_transform { translation = [0, 0, 0]; rpy = [0, 0, 0]; }"
             self.error("initial_transform is missing", source, fix)
             return
@@ -169,9 +169,9 @@ class _Reader:
                 name, parent.texts[0], pose, driven, source, self.at(parent.line, f"{place}, relative_to")
             )
 
-    def fields(self, block: Block, known: tuple[str, ...], place: str) -> dict[str, Value | Block]:
+    def fields(self, block: ParamBlock, known: tuple[str, ...], place: str) -> dict[str, Value | ParamBlock]:
         """Return the entries of a block by name; double ones are errors, unknown ones warnings."""
-        found: dict[str, Value | Block] = {}
+        found: dict[str, Value | ParamBlock] = {}
         for name, entry in block.entries:
             if name in found:
                 first = found[name].line
@@ -192,7 +192,7 @@ class _Reader:
                 )
         return found
 
-    def transform(self, block: Block, place: str) -> Pose | None:
+    def transform(self, block: ParamBlock, place: str) -> Pose | None:
         fields = self.fields(block, ("translation", *_ROTATIONS), place)
         source = self.at(block.line, place)
         turns = [key for key in _ROTATIONS if key in fields]
@@ -214,7 +214,7 @@ class _Reader:
             return None
         return Pose(position, turned)
 
-    def rotation(self, key: str, values: list[float], source: Source) -> Quaternion | None:
+    def rotation(self, key: str, values: list[float], source: Location) -> Quaternion | None:
         if key == "quat":
             return numbers.quaternion(values, self.builder, source)
         if max(map(abs, values)) > numbers.GREATEST_LENGTH:
@@ -231,10 +231,10 @@ class _Reader:
         scale = angle / length if length > 0.0 else 0.0
         return so3.exponential((x * scale, y * scale, z * scale))
 
-    def numbers(self, entry: Value | Block, key: str, count: int, unit: str, place: str) -> list[float] | None:
+    def numbers(self, entry: Value | ParamBlock, key: str, count: int, unit: str, place: str) -> list[float] | None:
         source = self.at(entry.line, place)
         fix = f"write {key} = [{', '.join(['number'] * count)}]; ({unit})"
-        if isinstance(entry, Block):
+        if isinstance(entry, ParamBlock):
             self.error(f"{key} is a block, not a list of {count} numbers", source, fix)
             return None
         try:
@@ -269,7 +269,7 @@ class _Reader:
             )
         return not self.broken
 
-    def join(self, top: str, block: Block) -> None:
+    def join(self, top: str, block: ParamBlock) -> None:
         """Make bodies of the frames, root first, and join them."""
         bodies = {top: self.builder.body(top, source=self.at(block.line, f"frame {label(top)}"))}
         for frame in self.frames.values():

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from modelserver.errors import Source, shown
+from modelserver.errors import Location, shown
 from modelserver.geometry.builder import ModelBuilder
 
 GREATEST_DEPTH = 20
@@ -36,19 +36,19 @@ class Value:
 
 
 @dataclass(slots=True)
-class Block:
+class ParamBlock:
     """A block: its entries in order, each with its name."""
 
     line: int
-    entries: list[tuple[str, Value | Block]] = field(default_factory=list)
+    entries: list[tuple[str, Value | ParamBlock]] = field(default_factory=list)
 
     def values(self) -> Iterator[tuple[str, Value]]:
         """Yield the assignments."""
         return ((name, entry) for name, entry in self.entries if isinstance(entry, Value))
 
-    def blocks(self) -> Iterator[tuple[str, Block]]:
+    def blocks(self) -> Iterator[tuple[str, ParamBlock]]:
         """Yield the blocks inside."""
-        return ((name, entry) for name, entry in self.entries if isinstance(entry, Block))
+        return ((name, entry) for name, entry in self.entries if isinstance(entry, ParamBlock))
 
 
 def is_likely(content: bytes) -> bool:
@@ -63,21 +63,21 @@ class _SyntaxError(Exception):
         self.fix = fix
 
 
-def parse(content: bytes, builder: ModelBuilder, file: str) -> Block | None:
+def parse(content: bytes, builder: ModelBuilder, file: str) -> ParamBlock | None:
     """Return what the file holds as one block, or None with the problem added to `builder`."""
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         builder.error(
             f"the file is not UTF-8 text: byte {content[error.start]:#04x} in this line",
-            Source(file, content.count(b"\n", 0, error.start) + 1),
+            Location(file, content.count(b"\n", 0, error.start) + 1),
             "save it as UTF-8",
         )
         return None
     try:
         return _Parser(text).parsed()
     except _SyntaxError as error:
-        builder.error(str(error), Source(file, error.line), error.fix)
+        builder.error(str(error), Location(file, error.line), error.fix)
         return None
 
 
@@ -107,8 +107,8 @@ class _Parser:
         self.at = match.end()
         return kind, match[kind]
 
-    def parsed(self) -> Block:
-        root = Block(self.line)
+    def parsed(self) -> ParamBlock:
+        root = ParamBlock(self.line)
         open_blocks = [root]
         while True:
             kind, text = self.next()
@@ -134,7 +134,7 @@ class _Parser:
                         line,
                         "look for blocks that are not closed",
                     )
-                block = Block(line)
+                block = ParamBlock(line)
                 open_blocks[-1].entries.append((text, block))
                 open_blocks.append(block)
             elif mark == ("mark", "="):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from modelserver.errors import GeometryError, Problem, Severity, Source
+from modelserver.errors import GeometryError, Location, Problem, Severity
 from modelserver.regular_files import FileTooLargeError, NotRegularFileError, read_regular
 
 MAX_BYTES = 32 * 1024 * 1024
@@ -24,4 +24,4 @@ def read(path: str | os.PathLike[str]) -> bytes:
         fix = "name the file inside it" if error.is_directory else "save the geometry to a file, and give that"
     except FileTooLargeError as error:
         message, fix = str(error.strerror), "name a geometry file; point clouds and meshes do not belong in one"
-    raise GeometryError([Problem(Severity.ERROR, message, Source(os.fspath(path)), fix)])
+    raise GeometryError([Problem(Severity.ERROR, message, Location(os.fspath(path)), fix)])

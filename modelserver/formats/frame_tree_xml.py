@@ -24,7 +24,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from modelserver.errors import Severity, Source, Suggested, shown, suggestion, suggestions
+from modelserver.errors import Location, Severity, Suggested, shown, suggestion, suggestions
 from modelserver.formats import numbers
 from modelserver.formats.circles import circles
 from modelserver.formats.frame_paths import ANY, ROOT, Ancestry, FramePath, parse_path
@@ -80,8 +80,8 @@ class _Frame:
     name: str
     parent: str
     pose: Pose
-    source: Source
-    parent_source: Source
+    source: Location
+    parent_source: Location
     path: FramePath
 
 
@@ -94,7 +94,7 @@ class _Reader:
         """By name; a further frame of a name, which stands in another parent, by its parent and name."""
         self.parents: dict[str, str] = {}
         """For each frame the key of its parent, empty for a root."""
-        self.undefined: dict[str, list[Source]] = {}
+        self.undefined: dict[str, list[Location]] = {}
 
     def frame(self, element: Element) -> None:
         """Take one instance; a second one of a name is refused with a warning, the first stands."""
@@ -180,7 +180,7 @@ class _Reader:
 
         return _VARIABLE.sub(value, text), missing
 
-    def expanded(self, text: str, source: Source) -> str:
+    def expanded(self, text: str, source: Location) -> str:
         """Return a name with its variables filled in; what is not defined stays, and is remembered."""
         filled, missing = self.substituted(text)
         for name in missing:
@@ -211,7 +211,7 @@ class _Reader:
             self.builder.problem(
                 severity,
                 f"{len(lines)} instance{'' if len(lines) == 1 else 's'} of type {label(kind)} passed over",
-                Source(self.file, lines[0]),
+                Location(self.file, lines[0]),
                 "frames have type rapid::FrameRpyParameters" if severity is Severity.WARNING else "",
             )
 
@@ -248,7 +248,9 @@ class _Reader:
         if not ancestry.is_exhausted:
             self.report_missing(missing, keys, ancestry)
         else:
-            self.builder.error("the paths of parents are too many and too deep", Source(self.file), "write plain names")
+            self.builder.error(
+                "the paths of parents are too many and too deep", Location(self.file), "write plain names"
+            )
         return well and not missing and not ancestry.is_exhausted
 
     def add_outside(self) -> None:

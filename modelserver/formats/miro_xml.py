@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from modelserver.errors import Severity, Source, Suggested, shown
+from modelserver.errors import Location, Severity, Suggested, shown
 from modelserver.formats import numbers
 from modelserver.formats.spelling import label, nearest_keys
 from modelserver.formats.xml_document import Named, children, line, tag
@@ -56,7 +56,7 @@ class _Reader:
             elif tag(child) not in _CONTAINERS:
                 self.builder.warning(
                     f"unexpected element <{label(tag(child))}>; passed over",
-                    Source(self.file, line(child)),
+                    Location(self.file, line(child)),
                     f"elements here are {', '.join(_CONTAINERS)}",
                     tuple(nearest_keys(tag(child), _CONTAINERS)),
                 )
@@ -80,7 +80,7 @@ class _Reader:
         self.builder.error(
             "this is neither a body nor a constraint: it has no BodyName and no ConstraintName"
             + (f", but {label(wrong)}" if near else ""),
-            Source(self.file, line(element)),
+            Location(self.file, line(element)),
             f"write {near[0]}" if near else "add BodyName to a body, ConstraintName to a constraint",
             near,
         )
@@ -94,7 +94,7 @@ class _Reader:
             parts.text("BodyName") or "",
             _folded(parts.text("Description")),
             self.transform(parts),
-            source=Source(self.file, line(element), place),
+            source=Location(self.file, line(element), place),
         )
         for name, child in parts.found.items():
             if name not in ("BodyName", "Description", "HTransform"):
@@ -110,7 +110,7 @@ class _Reader:
             found.append(name)
             self.builder.warning(
                 f"unknown parameter {shown(name)} holds frames; taken for Frames",
-                Source(self.file, line(child), place),
+                Location(self.file, line(child), place),
                 "write Frames",
                 Suggested.of(name, "Frames"),
             )

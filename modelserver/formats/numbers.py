@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from modelserver.errors import Source, shown
+from modelserver.errors import Location, shown
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import Quaternion
@@ -43,7 +43,7 @@ def parse(text: str, where: str = "") -> float:
     raise ValueError(f"{where}{shown(text, 40)} is not a number")
 
 
-def within_reach(position: Sequence[float], builder: ModelBuilder, source: Source) -> bool:
+def within_reach(position: Sequence[float], builder: ModelBuilder, source: Location) -> bool:
     """Return whether a position is near enough to compute with; report it where it is not."""
     if all(abs(value) <= GREATEST_LENGTH for value in position):
         return True
@@ -56,7 +56,7 @@ def within_reach(position: Sequence[float], builder: ModelBuilder, source: Sourc
     return False
 
 
-def rotation(rows: Sequence[Sequence[float]], builder: ModelBuilder, source: Source, where: str) -> Quaternion | None:
+def rotation(rows: Sequence[Sequence[float]], builder: ModelBuilder, source: Location, where: str) -> Quaternion | None:
     """Return the rotation nearest to three rows of three numbers.
 
     What is off by more than `SILENT_DEVIATION` is reported as a warning; None, and an error, where no
@@ -105,7 +105,7 @@ def rotation(rows: Sequence[Sequence[float]], builder: ModelBuilder, source: Sou
     return so3.from_matrix(matrix)
 
 
-def quaternion(wxyz: Sequence[float], builder: ModelBuilder, source: Source) -> Quaternion | None:
+def quaternion(wxyz: Sequence[float], builder: ModelBuilder, source: Location) -> Quaternion | None:
     """Return the unit quaternion nearest to four numbers, w first; judged as `rotation`, by its squared length."""
     w, x, y, z = wxyz
     deviation = abs(w * w + x * x + y * y + z * z - 1.0)

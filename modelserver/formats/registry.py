@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import PurePath
 
-from modelserver.errors import Source, shown
+from modelserver.errors import Location, shown
 from modelserver.file_kinds import FileKind, conversion_command, file_kind, geometry_named
 from modelserver.formats import bot_param
 from modelserver.formats.saved import Saved
@@ -59,12 +59,12 @@ def read(
     builder = ModelBuilder(strict=strict)
     text = content.removeprefix(b"\xef\xbb\xbf").lstrip()
     if not text:
-        builder.error("the file is empty", Source(file), "see docs/geometry-files.md for an example to begin with")
+        builder.error("the file is empty", Location(file), "see docs/geometry-files.md for an example to begin with")
     elif (kind := file_kind(text)) in _INSTEAD:
         named = geometry_named(text) if kind is FileKind.VEHICLE else ""
         what = kind.value if kind.is_nothing else f"{kind.value}, not a geometry file"
         fix = _INSTEAD[kind].replace("{command}", conversion_command(file or "FILE.xml"))
-        builder.error(what, Source(file), fix + (f", {shown(named, 100)}" if named else ""))
+        builder.error(what, Location(file), fix + (f", {shown(named, 100)}" if named else ""))
     else:
         with _collector_paused():
             if text.startswith(b"<") or PurePath(file).suffix.lower() in _XML_ENDINGS:
@@ -112,7 +112,7 @@ def _read_xml(content: bytes, builder: ModelBuilder, file: str, variables: Mappi
     if root is None:
         return
     name = xml_document.tag(root)
-    first = Source(file, xml_document.line(root), f"<{label(name)}>")
+    first = Location(file, xml_document.line(root), f"<{label(name)}>")
     if name == "robot":
         urdf_xml.load(root, builder, file)
         return

@@ -15,7 +15,7 @@ MAX_BYTES = 64 << 20
 
 
 @dataclass(frozen=True, slots=True)
-class Snapshot:
+class ModelSnapshot:
     """A vehicle's geometry, and what else a mirror of the service has to know. See model_snapshot_t.
 
     `joints_latency_us`: microseconds by which the stamps on that channel are later than the measurement.
@@ -30,7 +30,7 @@ class Snapshot:
     joints_latency_us: int = 0
 
 
-def written(snapshot: Snapshot) -> bytes:
+def written(snapshot: ModelSnapshot) -> bytes:
     """Return the bytes of a snapshot: a zlib stream of JSON."""
     content = {
         "vehicle": snapshot.vehicle,
@@ -45,7 +45,7 @@ def written(snapshot: Snapshot) -> bytes:
     return zlib.compress(json.dumps(content, ensure_ascii=False).encode(), 9)
 
 
-def read(data: bytes) -> Snapshot:
+def read(data: bytes) -> ModelSnapshot:
     """Return the snapshot in its bytes. Raises WireError where they are none, or the geometry is not what it says."""
     unpacker = zlib.decompressobj()
     try:
@@ -54,7 +54,7 @@ def read(data: bytes) -> Snapshot:
             raise WireError("malformed", f"a snapshot unpacks to more than {MAX_BYTES} bytes")
         content = json.loads(text)
         model = parse_model(content["geometry"].encode(), "the service's snapshot")
-        snapshot = Snapshot(
+        snapshot = ModelSnapshot(
             str(content["vehicle"]),
             model,
             str(content["base_frame"]),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from modelserver.errors import Source, shown
+from modelserver.errors import Location, shown
 from modelserver.formats import numbers
 from modelserver.formats.spelling import label, nearest_keys
 from modelserver.formats.xml_document import children, line, tag
@@ -28,9 +28,9 @@ class Attributes:
         self.builder = builder
         self.file = file
 
-    def at(self, element: Element, place: str) -> Source:
+    def at(self, element: Element, place: str) -> Location:
         """Return the place of an element."""
-        return Source(self.file, line(element), place)
+        return Location(self.file, line(element), place)
 
     def error(self, message: str, element: Element, place: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
         """Report an error at an element."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, NamedTuple
 
-from modelserver.errors import Severity, Source, shown
+from modelserver.errors import Location, Severity, shown
 from modelserver.formats.circles import circles
 from modelserver.formats.spelling import label, nearest_keys
 from modelserver.formats.urdf_joints import JointReader
@@ -263,7 +263,7 @@ class _Reader(JointReader):
             elif near := nearest_keys(tag(child), (*_LINK, *_SHAPES)):
                 said = label(tag(child))
                 self.warning(f"unknown element <{said}>; passed over", child, place, f"write <{near[0]}>", tuple(near))
-        body = self.builder.body(name, inertia=inertia, source=Source(self.file, line(element), place))
+        body = self.builder.body(name, inertia=inertia, source=Location(self.file, line(element), place))
         body.visuals, body.collisions = tuple(shapes["visual"]), tuple(shapes["collision"])
         return body.frame(ORIGIN, source=body.source)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from lxml import etree
 
-from modelserver.errors import Source, shown
+from modelserver.errors import Location, shown
 from modelserver.formats.spelling import label, nearest_keys
 from modelserver.geometry.builder import ModelBuilder
 
@@ -24,7 +24,7 @@ def parse(content: bytes, builder: ModelBuilder, file: str) -> Element | None:
     """Return the root element, or None with the problem added to `builder`."""
     if b"\0" in content:
         # UTF-16 would hide a DOCTYPE from the look below
-        builder.error("the file holds NUL bytes: it is binary, or UTF-16", Source(file, 1), "save it as UTF-8 text")
+        builder.error("the file holds NUL bytes: it is binary, or UTF-16", Location(file, 1), "save it as UTF-8 text")
         return None
     if _refused_doctype(content, builder, file):
         return None
@@ -39,17 +39,17 @@ def parse(content: bytes, builder: ModelBuilder, file: str) -> Element | None:
         line, message = (log[0].line, log[0].message) if len(log) else (error.lineno or 0, str(error))
         builder.error(
             f"the XML is not well-formed: {message.strip()}",
-            Source(file, line),
+            Location(file, line),
             "close every element and quote every value; an editor that knows XML shows the place",
         )
         return None
     except ValueError as error:
-        builder.error(f"the XML cannot be read: {error}", Source(file), "save it as UTF-8 text")
+        builder.error(f"the XML cannot be read: {error}", Location(file), "save it as UTF-8 text")
         return None
     # a second look after parsing, for encodings in which the first saw no DOCTYPE
     dtd: Any = root.getroottree().docinfo.internalDTD
     if dtd is not None and (dtd.external_id or dtd.system_url or list(dtd.iterentities()) or list(dtd.iterelements())):
-        builder.error("the DOCTYPE declares entities or names a DTD, which is refused", Source(file), _FIX_DOCTYPE)
+        builder.error("the DOCTYPE declares entities or names a DTD, which is refused", Location(file), _FIX_DOCTYPE)
         return None
     return root
 
@@ -66,7 +66,7 @@ def _refused_doctype(content: bytes, builder: ModelBuilder, file: str) -> bool:
     what = "names a DTD outside the file" if names_dtd else "has declarations of its own (entities)"
     builder.error(
         f"the DOCTYPE {what}, which is refused: such files can read other files or grow without bound",
-        Source(file, content.count(b"\n", 0, start) + 1, "DOCTYPE"),
+        Location(file, content.count(b"\n", 0, start) + 1, "DOCTYPE"),
         _FIX_DOCTYPE,
     )
     return True
@@ -126,14 +126,14 @@ class Named:
             if child.tag != "parameter" and tag(child) != "parameter":
                 builder.warning(
                     f"unexpected element <{label(tag(child))}>; passed over",
-                    Source(file, line(child), place),
+                    Location(file, line(child), place),
                     "write <parameter name=... value=.../>",
                     tuple(nearest_keys(tag(child), ("parameter",))),
                 )
             elif name in self.found:
                 builder.error(
                     f"parameter {name} is given twice (first on line {line(self.found[name])})",
-                    Source(file, line(child), place),
+                    Location(file, line(child), place),
                     "remove one of the two",
                 )
             elif name not in known:
@@ -143,7 +143,7 @@ class Named:
                     f"unknown parameter {shown(name)}; passed over"
                     if name
                     else "a parameter without a name; passed over",
-                    Source(file, line(child), place),
+                    Location(file, line(child), place),
                     f"write {near[0]}" if near else f"known here: {', '.join(known)}",
                     near,
                 )
@@ -163,9 +163,9 @@ class Named:
             return None
         return value.strip()
 
-    def source(self, name: str = "") -> Source:
+    def source(self, name: str = "") -> Location:
         """Return the place of a parameter, or of the whole element where it is absent or not named."""
         child = self.found.get(name)
         if child is None:
-            return Source(self.file, line(self.element), self.place)
-        return Source(self.file, line(child), f"{self.place}, {name}" if self.place else name)
+            return Location(self.file, line(self.element), self.place)
+        return Location(self.file, line(child), f"{self.place}, {name}" if self.place else name)

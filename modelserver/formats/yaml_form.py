@@ -9,7 +9,7 @@ from modelserver.errors import Severity, Suggested, shown, suggestions
 from modelserver.formats import yaml_nodes
 from modelserver.formats.spelling import label
 from modelserver.formats.yaml_joint import read_joint
-from modelserver.formats.yaml_nodes import Kind, Node
+from modelserver.formats.yaml_nodes import NodeKind, YamlNode
 from modelserver.formats.yaml_pose import POSE_KEYS, Defaults, read_pose, read_sigma, read_sigma_parts
 from modelserver.formats.yaml_reader import NodeReader
 from modelserver.formats.yaml_shapes import read_shapes
@@ -33,7 +33,7 @@ _FRAME = (*POSE_KEYS, "description", "sigma")
 _CONSTRAINT = ("from", "to", *POSE_KEYS, "description", "sigma", "joint")
 
 _Inertia = tuple[tuple[float, ...], ...]
-_PlacedFrame = tuple[BodyFrame, Node]
+_PlacedFrame = tuple[BodyFrame, YamlNode]
 
 
 def load(content: bytes, builder: ModelBuilder, file: str) -> ModelBuilder:
@@ -49,7 +49,7 @@ class _Template:
     description: str
     inertia: _Inertia | None
     frames: list[_PlacedFrame]
-    node: Node
+    node: YamlNode
     visuals: tuple[Shape, ...]
     collisions: tuple[Shape, ...]
     used: bool = field(default=False)
@@ -65,9 +65,9 @@ class _Form:
         self.uses: Counter[str] = Counter()
         """How many bodies name a template."""
 
-    def read(self, root: Node) -> None:
+    def read(self, root: YamlNode) -> None:
         reader = self.reader
-        if root.kind is not Kind.MAPPING:
+        if root.kind is not NodeKind.MAPPING:
             reader.error(
                 f"the file is no geometry: its top level is {root.kind.value}, not a mapping",
                 root,
@@ -111,7 +111,7 @@ class _Form:
                     Severity.NOTE, f"no body uses template {label(name)}", reader.at(template.node, "templates")
                 )
 
-    def read_templates(self, node: Node) -> None:
+    def read_templates(self, node: YamlNode) -> None:
         for name, key, value in self.reader.named(node, "templates"):
             place = f"template {label(name)}"
             if name in self.templates:
@@ -130,7 +130,7 @@ class _Form:
                 read_shapes(self.reader, fields.get("collisions"), f"{place}, collisions"),
             )
 
-    def read_body(self, name: str, key: Node, value: Node) -> None:
+    def read_body(self, name: str, key: YamlNode, value: YamlNode) -> None:
         place = f"body {label(name)}"
         fields = self.reader.fields(value, place, _BODY)
         template = self.template_of(fields.get("template"), place)
@@ -163,7 +163,7 @@ class _Form:
         for frame, node in frames:
             body.frames.append((frame, self.reader.at(node, f"{place}, frame {label(frame.name)}")))
 
-    def template_of(self, node: Node | None, place: str) -> _Template | None:
+    def template_of(self, node: YamlNode | None, place: str) -> _Template | None:
         if node is None:
             return None
         name = self.reader.text(node, place, "template")
@@ -185,7 +185,7 @@ class _Form:
             )
         return template
 
-    def read_frames(self, node: Node | None, place: str) -> list[_PlacedFrame]:
+    def read_frames(self, node: YamlNode | None, place: str) -> list[_PlacedFrame]:
         if node is None:
             return []
         return [
@@ -193,7 +193,7 @@ class _Form:
             for name, key, value in self.reader.named(node, f"{place}, frames")
         ]
 
-    def read_frame(self, name: str, node: Node, place: str) -> BodyFrame:
+    def read_frame(self, name: str, node: YamlNode, place: str) -> BodyFrame:
         fields = self.reader.fields(node, place, _FRAME)
         return BodyFrame(
             name,
@@ -202,7 +202,7 @@ class _Form:
             self.sigma_of(fields, place),
         )
 
-    def sigma_of(self, fields: dict[str, Node], place: str) -> Sigma | None:
+    def sigma_of(self, fields: dict[str, YamlNode], place: str) -> Sigma | None:
         """Return the sigma of a frame or constraint.
 
         The defaults count for what states a pose: a frame that states none, like Origin, stands where it
@@ -216,13 +216,13 @@ class _Form:
         none = (0.0, 0.0, 0.0)
         return Sigma(position or none, rotation or none)
 
-    def read_inertia(self, node: Node | None, place: str) -> _Inertia | None:
+    def read_inertia(self, node: YamlNode | None, place: str) -> _Inertia | None:
         if node is None:
             return None
         rows = self.reader.rows(node, (6,), 6, place, "inertia")
         return None if rows is None else tuple(tuple(row) for row in rows)
 
-    def read_constraint(self, name: str, key: Node, value: Node) -> None:
+    def read_constraint(self, name: str, key: YamlNode, value: YamlNode) -> None:
         place = f"constraint {label(name)}"
         fields = self.reader.fields(value, place, _CONSTRAINT)
         pose = read_pose(self.reader, fields, place)
@@ -238,13 +238,13 @@ class _Form:
         elif from_ or to:
             self.builder.loose_ends.append((name, "From" if from_ else "To", from_ or to, self.reader.at(key, place)))
 
-    def read_end(self, end: str, fields: dict[str, Node], key: Node, place: str) -> str:
+    def read_end(self, end: str, fields: dict[str, YamlNode], key: YamlNode, place: str) -> str:
         """Return the frame that a constraint names, empty with an error where it names none."""
         node = fields.get(end)
         if node is None:
             self.reader.error(f"{end} is missing", key, place, f"add {end}: Body:Frame")
             return ""
-        if node.kind is Kind.MAPPING and len(node.pairs) == 1:
+        if node.kind is NodeKind.MAPPING and len(node.pairs) == 1:
             self.reader.error(
                 f"{end} is a mapping: there is a space after the colon",
                 node,

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from modelserver.errors import shown, suggestions
 from modelserver.formats import numbers
-from modelserver.formats.yaml_nodes import Kind, Node
+from modelserver.formats.yaml_nodes import NodeKind, YamlNode
 from modelserver.formats.yaml_reader import NodeReader
 from modelserver.geometry.joint import AXIAL, FIXED, SUFFIXES, Joint, JointType, Mimic
 from modelserver.spatial.so3 import Vector3
@@ -22,15 +22,15 @@ _TYPES = tuple(str(each) for each in JointType)
 _INFINITE = {".inf": math.inf, "+.inf": math.inf, "-.inf": -math.inf}
 
 _Values = tuple[float, ...]
-_Read = Callable[[Node, str, bool], _Values | None]
+_Read = Callable[[YamlNode, str, bool], _Values | None]
 """Reads what stands at a key, given the key and whether it is in degrees; None where it is wrong, which is reported."""
 
 
-def read_joint(reader: NodeReader, node: Node, place: str) -> Joint | None:
+def read_joint(reader: NodeReader, node: YamlNode, place: str) -> Joint | None:
     """Return the joint that a constraint states, None where it is wrong, which is reported."""
-    if node.kind is not Kind.MAPPING:
+    if node.kind is not NodeKind.MAPPING:
         kind = _type(reader, node, place, "joint")
-        fields: dict[str, Node] = {}
+        fields: dict[str, YamlNode] = {}
     else:
         place = f"{place}, joint"
         fields = reader.fields(node, place, _KEYS)
@@ -41,9 +41,9 @@ def read_joint(reader: NodeReader, node: Node, place: str) -> Joint | None:
     return None if kind is None else _Joint(reader, node, place, kind, fields).read()
 
 
-def _type(reader: NodeReader, node: Node, place: str, key: str) -> JointType | None:
+def _type(reader: NodeReader, node: YamlNode, place: str, key: str) -> JointType | None:
     text = reader.text(node, place, key)
-    if node.kind is not Kind.SCALAR:
+    if node.kind is not NodeKind.SCALAR:
         return None
     if text in _TYPES:
         return JointType(text)
@@ -54,7 +54,7 @@ def _type(reader: NodeReader, node: Node, place: str, key: str) -> JointType | N
 
 
 class _Joint:
-    def __init__(self, reader: NodeReader, node: Node, place: str, kind: JointType, fields: dict[str, Node]):
+    def __init__(self, reader: NodeReader, node: YamlNode, place: str, kind: JointType, fields: dict[str, YamlNode]):
         self.reader = reader
         self.node = node
         self.place = place
@@ -98,11 +98,11 @@ class _Joint:
             self.error(str(error), self.node, "see Joints in docs/geometry-files.md")
             return None
 
-    def error(self, message: str, node: Node, fix: str) -> None:
+    def error(self, message: str, node: YamlNode, fix: str) -> None:
         self.wrong = True
         self.reader.error(message, node, self.place, fix)
 
-    def given(self, key: str) -> Node:
+    def given(self, key: str) -> YamlNode:
         """Return the node of a quantity that is there, in whichever unit."""
         return self.fields.get(key) or self.fields.get(f"{key}_deg") or self.node
 
@@ -150,7 +150,7 @@ class _Joint:
         assert plain is not None
         return self.several(key, plain, read, left_out)
 
-    def single(self, key: str, plain: Node | None, degrees: Node | None, read: _Read) -> dict[str, _Values]:
+    def single(self, key: str, plain: YamlNode | None, degrees: YamlNode | None, read: _Read) -> dict[str, _Values]:
         if degrees is not None and not self.is_angle[""]:
             self.error(f"{key}_deg: a {self.kind} joint moves in metres", degrees, f"write {key}: in metres")
             return {}
@@ -162,9 +162,9 @@ class _Joint:
         self.wrong |= value is None
         return {} if value is None else {"": value}
 
-    def several(self, key: str, node: Node, read: _Read, left_out: _Values | None) -> dict[str, _Values]:
+    def several(self, key: str, node: YamlNode, read: _Read, left_out: _Values | None) -> dict[str, _Values]:
         keys = self.coordinate_keys()
-        if node.kind is not Kind.MAPPING:
+        if node.kind is not NodeKind.MAPPING:
             example = ", ".join(f"{each}: ..." for each in list(keys)[: len(self.names)])
             self.error(
                 f"{key} of a {self.kind} joint is a mapping by coordinate, got {node.kind.value}",
@@ -199,17 +199,17 @@ class _Joint:
         keys |= {name: (name, False) for name in self.names}
         return keys | {f"{name}_deg": (name, True) for name in self.names}
 
-    def name_of(self, node: Node, key: str) -> str:
+    def name_of(self, node: YamlNode, key: str) -> str:
         """Return the name of the joint that this one follows, empty with an error where there is none."""
         name = self.reader.text(node, self.place, key)
-        if node.kind is Kind.SCALAR and not name:
+        if node.kind is NodeKind.SCALAR and not name:
             self.error(f"{key} names no joint", node, f"write {key}: NAME, of another constraint")
         self.wrong |= not name
         return name
 
-    def limits(self, node: Node, key: str, is_degrees: bool) -> _Values | None:
+    def limits(self, node: YamlNode, key: str, is_degrees: bool) -> _Values | None:
         fix = f"write {key}: [lower, upper]; .inf is none"
-        if node.kind is not Kind.LIST or len(node.items) != 2:
+        if node.kind is not NodeKind.LIST or len(node.items) != 2:
             self.error(f"{key} is a list of 2 numbers, lower and upper", node, fix)
             return None
         pair = []
@@ -226,7 +226,7 @@ class _Joint:
             return None
         return (math.radians(low), math.radians(high)) if is_degrees else (low, high)
 
-    def not_negative(self, node: Node, key: str, is_degrees: bool) -> _Values | None:
+    def not_negative(self, node: YamlNode, key: str, is_degrees: bool) -> _Values | None:
         value = self.number(node, key, f"write {key}: number")
         if value is None:
             return None
@@ -235,11 +235,11 @@ class _Joint:
             return None
         return (math.radians(value) if is_degrees else value,)
 
-    def default(self, node: Node, key: str, is_degrees: bool) -> _Values | None:
+    def default(self, node: YamlNode, key: str, is_degrees: bool) -> _Values | None:
         value = self.number(node, key, f"write {key}: number")
         return None if value is None else (math.radians(value) if is_degrees else value,)
 
-    def number(self, node: Node, key: str, fix: str) -> float | None:
+    def number(self, node: YamlNode, key: str, fix: str) -> float | None:
         """Return one number that can be computed with."""
         value = self.reader.number(node, self.place, key, fix)
         if value is not None and abs(value) > numbers.GREATEST_LENGTH:
@@ -256,7 +256,7 @@ class _Joint:
             fix = "remove mimic; what follows another is revolute or prismatic"
             self.error(f"a {self.kind} joint has several coordinates and cannot follow another", node, fix)
             return None
-        if node.kind is not Kind.MAPPING:
+        if node.kind is not NodeKind.MAPPING:
             name = self.name_of(node, "mimic")
             return Mimic(name) if name else None
         place = f"{self.place}, mimic"

@@ -15,7 +15,7 @@ from typing import Any
 
 import yaml
 
-from modelserver.errors import Source
+from modelserver.errors import Location
 from modelserver.geometry.builder import ModelBuilder
 
 GREATEST_DEPTH = 20
@@ -27,7 +27,7 @@ GREATEST_SIZE = 4_000_000
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
-class Kind(Enum):
+class NodeKind(Enum):
     """What a node is."""
 
     SCALAR = "a single value"
@@ -35,7 +35,7 @@ class Kind(Enum):
     MAPPING = "a mapping"
 
 
-class Node:
+class YamlNode:
     """A value with its line. `text` is a scalar's, `items` a list's, `pairs` a mapping's, in order.
 
     `plain` is true for a scalar without quotes; `size` counts the nodes in it, aliases written out.
@@ -43,24 +43,24 @@ class Node:
 
     __slots__ = ("items", "kind", "line", "pairs", "plain", "size", "text")
 
-    def __init__(self, kind: Kind, line: int, text: str = "", plain: bool = False):
+    def __init__(self, kind: NodeKind, line: int, text: str = "", plain: bool = False):
         self.kind = kind
         self.line = line
         self.text = text
         self.plain = plain
         self.size = 1
         # most nodes are scalars: empty lists of their own would double what the garbage collector walks
-        self.items: list[Node] = [] if kind is Kind.LIST else _NO_ITEMS
-        self.pairs: list[tuple[Node, Node]] = [] if kind is Kind.MAPPING else _NO_PAIRS
+        self.items: list[YamlNode] = [] if kind is NodeKind.LIST else _NO_ITEMS
+        self.pairs: list[tuple[YamlNode, YamlNode]] = [] if kind is NodeKind.MAPPING else _NO_PAIRS
 
     @property
     def is_nothing(self) -> bool:
         """Whether it is an empty value, `~` or `null` without quotes."""
-        return self.kind is Kind.SCALAR and self.plain and self.text in ("", "~", "null", "Null", "NULL")
+        return self.kind is NodeKind.SCALAR and self.plain and self.text in ("", "~", "null", "Null", "NULL")
 
 
-_NO_ITEMS: list[Node] = []
-_NO_PAIRS: list[tuple[Node, Node]] = []
+_NO_ITEMS: list[YamlNode] = []
+_NO_PAIRS: list[tuple[YamlNode, YamlNode]] = []
 
 
 class _RefusedError(Exception):
@@ -70,7 +70,7 @@ class _RefusedError(Exception):
         self.fix = fix
 
 
-def parse(content: bytes, builder: ModelBuilder, file: str) -> Node | None:
+def parse(content: bytes, builder: ModelBuilder, file: str) -> YamlNode | None:
     """Return the one document in `content`, or None with the problem added to `builder`."""
     try:
         text = content.decode("utf-8-sig")
@@ -78,25 +78,25 @@ def parse(content: bytes, builder: ModelBuilder, file: str) -> Node | None:
         line = content.count(b"\n", 0, error.start) + 1
         builder.error(
             f"the file is not UTF-8 text: byte {content[error.start]:#04x} in this line",
-            Source(file, line),
+            Location(file, line),
             "save it as UTF-8; if it is no text at all, it is not a geometry file",
         )
         return None
     try:
         return _Builder().build(text)
     except _RefusedError as error:
-        builder.error(str(error), Source(file, error.line), error.fix)
+        builder.error(str(error), Location(file, error.line), error.fix)
     except yaml.MarkedYAMLError as error:
         _report_syntax(error, text, builder, file)
     except yaml.reader.ReaderError as error:
         place = error.position if isinstance(error.position, int) else 0
         builder.error(
             f"the file holds a character that YAML forbids: {_character(error.character)}",
-            Source(file, text.count("\n", 0, place) + 1),
+            Location(file, text.count("\n", 0, place) + 1),
             "remove it; if the file is no text at all, it is not a geometry file",
         )
     except yaml.YAMLError as error:
-        builder.error(f"the YAML cannot be read: {error}", Source(file), "write it as in docs/geometry-files.md")
+        builder.error(f"the YAML cannot be read: {error}", Location(file), "write it as in docs/geometry-files.md")
     return None
 
 
@@ -112,25 +112,27 @@ def _report_syntax(error: yaml.MarkedYAMLError, text: str, builder: ModelBuilder
     indent = re.match(r"[ ]*(\t)?", lines[number - 1]) if 0 < number <= len(lines) else None
     if indent is not None and indent[1]:
         builder.error(
-            "the line is indented with a tab, which YAML forbids", Source(file, number), "write spaces instead of tabs"
+            "the line is indented with a tab, which YAML forbids",
+            Location(file, number),
+            "write spaces instead of tabs",
         )
         return
     context = f" {error.context}" if error.context else ""
     builder.error(
         f"the YAML is not well-formed: {error.problem or 'unreadable'}{context}",
-        Source(file, number),
+        Location(file, number),
         "look at this line and the one before: a missing colon, bracket or quote, or a wrong indentation",
     )
 
 
 class _Builder:
     def __init__(self) -> None:
-        self.anchors: dict[str, Node] = {}
+        self.anchors: dict[str, YamlNode] = {}
         self.total = 0
 
-    def build(self, text: str) -> Node:
-        root: Node | None = None
-        open_nodes: list[tuple[Node, str | None, Node | None]] = []
+    def build(self, text: str) -> YamlNode:
+        root: YamlNode | None = None
+        open_nodes: list[tuple[YamlNode, str | None, YamlNode | None]] = []
         """Containers not yet closed: node, its anchor, and for a mapping the key that waits for its value."""
         events: Iterator[Any] = yaml.parse(text, Loader=_LOADER)
         for event in events:
@@ -139,7 +141,7 @@ class _Builder:
                 line = event.start_mark.line + 1
                 if event.tag is not None:
                     self.untagged(event.tag, line)
-                node = Node(Kind.SCALAR, line, event.value, not event.style)
+                node = YamlNode(NodeKind.SCALAR, line, event.value, not event.style)
                 self.count(1, line)
                 if event.anchor:
                     self.anchors[event.anchor] = node
@@ -153,7 +155,7 @@ class _Builder:
                         "no form of geometry needs that; look for brackets that are not closed",
                     )
                 self.count(1, line)
-                container = Node(Kind.MAPPING if kind is yaml.MappingStartEvent else Kind.LIST, line)
+                container = YamlNode(NodeKind.MAPPING if kind is yaml.MappingStartEvent else NodeKind.LIST, line)
                 open_nodes.append((container, event.anchor, None))
                 continue
             elif kind is yaml.MappingEndEvent or kind is yaml.SequenceEndEvent:
@@ -173,14 +175,14 @@ class _Builder:
                 continue
             parent, anchor, key = open_nodes[-1]
             parent.size += node.size
-            if parent.kind is Kind.LIST:
+            if parent.kind is NodeKind.LIST:
                 parent.items.append(node)
             elif key is None:
                 open_nodes[-1] = (parent, anchor, node)
             else:
                 parent.pairs.append((key, node))
                 open_nodes[-1] = (parent, anchor, None)
-        return root or Node(Kind.SCALAR, 1, "", plain=True)
+        return root or YamlNode(NodeKind.SCALAR, 1, "", plain=True)
 
     def count(self, size: int, line: int) -> None:
         self.total += size
@@ -191,7 +193,7 @@ class _Builder:
                 "split it, or use a template instead of aliases within aliases",
             )
 
-    def alias(self, anchor: str, line: int) -> Node:
+    def alias(self, anchor: str, line: int) -> YamlNode:
         node = self.anchors.get(anchor)
         if node is None:
             raise _RefusedError(

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from modelserver.errors import Source
+from modelserver.errors import Location
 from modelserver.formats import numbers
-from modelserver.formats.yaml_nodes import Kind, Node
+from modelserver.formats.yaml_nodes import NodeKind, YamlNode
 from modelserver.formats.yaml_reader import NodeReader
 from modelserver.geometry.parts import Sigma
 from modelserver.spatial import so3
@@ -28,7 +28,7 @@ class Defaults:
     rotation: Vector3 | None = None
 
 
-def read_pose(reader: NodeReader, fields: dict[str, Node], place: str) -> Pose | None:
+def read_pose(reader: NodeReader, fields: dict[str, YamlNode], place: str) -> Pose | None:
     """Return the pose that `fields` give; None where they give none, or a wrong one, which is reported."""
     given = [key for key in POSE_KEYS if key in fields]
     if not given:
@@ -63,7 +63,7 @@ def read_pose(reader: NodeReader, fields: dict[str, Node], place: str) -> Pose |
     return None if position is None or turned is None else Pose(position, turned)
 
 
-def _rotation(reader: NodeReader, key: str, node: Node, place: str) -> Quaternion | None:
+def _rotation(reader: NodeReader, key: str, node: YamlNode, place: str) -> Quaternion | None:
     if key == "rotation":
         rows = reader.rows(node, (3,), 3, place, key)
         return None if rows is None else numbers.rotation(rows, reader.builder, reader.at(node, place), "rotation")
@@ -85,7 +85,7 @@ def _rotation(reader: NodeReader, key: str, node: Node, place: str) -> Quaternio
     return so3.from_rpy(roll, pitch, yaw)
 
 
-def _matrix(reader: NodeReader, node: Node, place: str) -> Pose | None:
+def _matrix(reader: NodeReader, node: YamlNode, place: str) -> Pose | None:
     rows = reader.rows(node, (3, 4), 4, place, "matrix")
     if rows is None:
         return None
@@ -102,7 +102,7 @@ def _matrix(reader: NodeReader, node: Node, place: str) -> Pose | None:
     return Pose(position, turned)
 
 
-def read_sigma(reader: NodeReader, node: Node, place: str, defaults: Defaults) -> Sigma | None:
+def read_sigma(reader: NodeReader, node: YamlNode, place: str, defaults: Defaults) -> Sigma | None:
     """Return the sigma of a frame or constraint; a part that is not given is the default's, else 0."""
     stated = read_sigma_parts(reader, node, place)
     if stated is None:
@@ -111,7 +111,7 @@ def read_sigma(reader: NodeReader, node: Node, place: str, defaults: Defaults) -
     return Sigma(stated.position or defaults.position or none, stated.rotation or defaults.rotation or none)
 
 
-def read_sigma_parts(reader: NodeReader, node: Node, place: str) -> Defaults | None:
+def read_sigma_parts(reader: NodeReader, node: YamlNode, place: str) -> Defaults | None:
     """Return the parts that a sigma states; None where one is wrong, which is reported."""
     place = f"{place}, sigma" if place else "sigma"
     fields = reader.fields(node, place, ("xyz", "rpy_deg", "rpy"))
@@ -129,11 +129,11 @@ def read_sigma_parts(reader: NodeReader, node: Node, place: str) -> Defaults | N
     return Defaults(position, rotation) if (position is not None) + (rotation is not None) == expected else None
 
 
-def _deviations(reader: NodeReader, node: Node | None, place: str, key: str, unit: str) -> Vector3 | None:
+def _deviations(reader: NodeReader, node: YamlNode | None, place: str, key: str, unit: str) -> Vector3 | None:
     """Return three standard deviations, given as three numbers or one for all."""
     if node is None:
         return None
-    if node.kind is Kind.SCALAR:
+    if node.kind is NodeKind.SCALAR:
         value = reader.number(node, place, key, f"write {key}: number, or [number, number, number], in {unit}")
         values = None if value is None else [value] * 3
     else:
@@ -147,7 +147,7 @@ def _deviations(reader: NodeReader, node: Node | None, place: str, key: str, uni
                 f"{key}: a standard deviation is not negative, got {value:g}"
                 if value < 0
                 else f"{key}: a standard deviation of {value:g} is out of reach",
-                Source(reader.file, node.line, place),
+                Location(reader.file, node.line, place),
                 f"write how far off the survey may be, in {unit}",
             )
             return None

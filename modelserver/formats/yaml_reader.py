@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from modelserver.errors import Source, shown
+from modelserver.errors import Location, shown
 from modelserver.formats import numbers
 from modelserver.formats.spelling import nearest_keys
-from modelserver.formats.yaml_nodes import Kind, Node
+from modelserver.formats.yaml_nodes import NodeKind, YamlNode
 from modelserver.geometry.builder import ModelBuilder
 
 
@@ -16,20 +16,20 @@ class NodeReader:
         self.builder = builder
         self.file = file
 
-    def at(self, node: Node, place: str) -> Source:
+    def at(self, node: YamlNode, place: str) -> Location:
         """Return the place of a node."""
-        return Source(self.file, node.line, place)
+        return Location(self.file, node.line, place)
 
-    def error(self, message: str, node: Node, place: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
+    def error(self, message: str, node: YamlNode, place: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
         """Report an error at a node."""
-        self.builder.error(message, Source(self.file, node.line, place), fix, nearest)
+        self.builder.error(message, Location(self.file, node.line, place), fix, nearest)
 
-    def fields(self, node: Node, place: str, known: tuple[str, ...]) -> dict[str, Node]:
+    def fields(self, node: YamlNode, place: str, known: tuple[str, ...]) -> dict[str, YamlNode]:
         """Return the values of a mapping by key, without those that are nothing; unknown and double keys are errors.
 
         The value of a misspelled key is that of the key that is meant, so that it is examined, and not missing.
         """
-        found: dict[str, Node] = {}
+        found: dict[str, YamlNode] = {}
         first: dict[str, int] = {}
         pairs = self.named(node, place)
         given = {name for name, _, _ in pairs}
@@ -54,17 +54,17 @@ class NodeReader:
                     found[name] = value
         return found
 
-    def named(self, node: Node, place: str) -> list[tuple[str, Node, Node]]:
+    def named(self, node: YamlNode, place: str) -> list[tuple[str, YamlNode, YamlNode]]:
         """Return key text, key and value of each pair of a mapping, in order."""
         if node.is_nothing:
             return []
-        if node.kind is not Kind.MAPPING:
+        if node.kind is not NodeKind.MAPPING:
             what = node.kind.value
             self.error(f"expected a mapping (key: value), got {what}", node, place, "write key: value, one a line")
             return []
         pairs = []
         for key, value in node.pairs:
-            if key.kind is not Kind.SCALAR:
+            if key.kind is not NodeKind.SCALAR:
                 self.error(f"a key is a name, got {key.kind.value}", key, place, "write name: value")
             elif key.text == "<<" and key.plain:
                 self.error("merge keys (<<) are not read", key, place, "use templates; see docs/geometry-files.md")
@@ -72,22 +72,22 @@ class NodeReader:
                 pairs.append((key.text.strip(), key, value))
         return pairs
 
-    def text(self, node: Node | None, place: str, key: str) -> str:
+    def text(self, node: YamlNode | None, place: str, key: str) -> str:
         """Return a scalar's text with white space folded, empty where it is absent or wrong."""
         if node is None:
             return ""
-        if node.kind is not Kind.SCALAR:
+        if node.kind is not NodeKind.SCALAR:
             self.error(
                 f"{key} is a text, got {node.kind.value}", node, place, f"write {key}: some text, in quotes if need be"
             )
             return ""
         return node.text.strip()
 
-    def numbers(self, node: Node, count: int, place: str, key: str, unit: str) -> list[float] | None:
+    def numbers(self, node: YamlNode, count: int, place: str, key: str, unit: str) -> list[float] | None:
         """Return a list of `count` numbers."""
         fix = f"write {key}: [{', '.join(['number'] * count)}]" + (f", in {unit}" if unit else "")
-        if node.kind is not Kind.LIST:
-            got = shown(node.text, 40) if node.kind is Kind.SCALAR else node.kind.value
+        if node.kind is not NodeKind.LIST:
+            got = shown(node.text, 40) if node.kind is NodeKind.SCALAR else node.kind.value
             self.error(f"{key} is a list of {count} numbers, got {got}", node, place, fix)
             return None
         values = []
@@ -106,9 +106,9 @@ class NodeReader:
             return None
         return values
 
-    def number(self, node: Node, place: str, key: str, fix: str) -> float | None:
+    def number(self, node: YamlNode, place: str, key: str, fix: str) -> float | None:
         """Return one number."""
-        if node.kind is not Kind.SCALAR:
+        if node.kind is not NodeKind.SCALAR:
             self.error(f"{key}: expected a number, got {node.kind.value}", node, place, fix)
             return None
         try:
@@ -119,11 +119,13 @@ class NodeReader:
             self.error(f"{key}: {error}", node, place, fix)
             return None
 
-    def rows(self, node: Node, shapes: tuple[int, ...], width: int, place: str, key: str) -> list[list[float]] | None:
+    def rows(
+        self, node: YamlNode, shapes: tuple[int, ...], width: int, place: str, key: str
+    ) -> list[list[float]] | None:
         """Return rows of `width` numbers; as many as one of `shapes` says."""
         wanted = " or ".join(str(shape) for shape in shapes)
         fix = f"write {key}: [[...], ...] with {wanted} rows of {width} numbers"
-        if node.kind is not Kind.LIST:
+        if node.kind is not NodeKind.LIST:
             self.error(f"{key} is a list of rows, got {node.kind.value}", node, place, fix)
             return None
         if len(node.items) not in shapes:

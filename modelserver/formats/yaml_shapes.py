@@ -13,7 +13,7 @@ visuals:
 
 from __future__ import annotations
 
-from modelserver.formats.yaml_nodes import Kind, Node
+from modelserver.formats.yaml_nodes import NodeKind, YamlNode
 from modelserver.formats.yaml_pose import POSE_KEYS, read_pose
 from modelserver.formats.yaml_reader import NodeReader
 from modelserver.geometry.shape import DIMENSIONS, Material, Shape, ShapeKind
@@ -23,11 +23,11 @@ _KINDS = tuple(str(kind) for kind in ShapeKind)
 _SHAPE = (*_KINDS, "scale", *POSE_KEYS, "name", "material")
 
 
-def read_shapes(reader: NodeReader, node: Node | None, place: str) -> tuple[Shape, ...]:
+def read_shapes(reader: NodeReader, node: YamlNode | None, place: str) -> tuple[Shape, ...]:
     """Return the shapes of a list; those that are wrong are reported and left out."""
     if node is None:
         return ()
-    if node.kind is not Kind.LIST:
+    if node.kind is not NodeKind.LIST:
         reader.error(
             f"expected a list of shapes, got {node.kind.value}", node, place, "begin each shape with - box: ..."
         )
@@ -36,7 +36,7 @@ def read_shapes(reader: NodeReader, node: Node | None, place: str) -> tuple[Shap
     return tuple(shape for shape in found if shape is not None)
 
 
-def _shape(reader: NodeReader, node: Node, place: str) -> Shape | None:
+def _shape(reader: NodeReader, node: YamlNode, place: str) -> Shape | None:
     fields = reader.fields(node, place, _SHAPE)
     kinds = [key for key in _KINDS if key in fields]
     if len(kinds) != 1:
@@ -66,7 +66,7 @@ def _shape(reader: NodeReader, node: Node, place: str) -> Shape | None:
         return None
 
 
-def _size(reader: NodeReader, kind: ShapeKind, node: Node, place: str) -> list[float] | None:
+def _size(reader: NodeReader, kind: ShapeKind, node: YamlNode, place: str) -> list[float] | None:
     if kind is ShapeKind.BOX:
         return reader.numbers(node, 3, place, "box", "metres")
     wanted = DIMENSIONS[kind]
@@ -81,7 +81,7 @@ def _size(reader: NodeReader, kind: ShapeKind, node: Node, place: str) -> list[f
     return values if len(values) == len(wanted) else None
 
 
-def _material(reader: NodeReader, node: Node, place: str) -> Material | None:
+def _material(reader: NodeReader, node: YamlNode, place: str) -> Material | None:
     fields = reader.fields(node, place, ("name", "colour", "texture"))
     colour = None
     if "colour" in fields:

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from modelserver.errors import (
+    Location,
     MalformedRequestError,
     NotConnectedError,
     Problem,
     Severity,
-    Source,
     UnknownFrameError,
     nearest_names,
     shown,
@@ -77,7 +77,7 @@ def find_problems(
 ) -> tuple[Problem, ...]:
     """Return what is wrong at a frame: it is not the model's, its body is an orphan, or it has several constraints."""
     problems = []
-    source = Source(element=f"frame {name}")
+    source = Location(element=f"frame {name}")
     if is_other:
         problems.append(
             Problem(

@@ -14,7 +14,7 @@ A file format fills one and adds the problems it met on the way; a program may d
 
 from __future__ import annotations
 
-from modelserver.errors import GeometryError, NotConnectedError, Problem, Severity, Source, shown
+from modelserver.errors import GeometryError, Location, NotConnectedError, Problem, Severity, shown
 from modelserver.geometry.adjacency import full_name
 from modelserver.geometry.draft import NOWHERE, BodyBuilder, Draft
 from modelserver.geometry.joint import FIXED, Joint
@@ -47,14 +47,14 @@ class ModelBuilder(Draft):
         description: str = "",
         pose: Pose | None = None,
         inertia: tuple[tuple[float, ...], ...] | None = None,
-        source: Source = NOWHERE,
+        source: Location = NOWHERE,
     ) -> BodyBuilder:
         """Add a body; return its builder, to add frames. The first body added is the root."""
         body = BodyBuilder(name, source, description, pose, inertia)
         self.bodies.append(body)
         return body
 
-    def add(self, body: Body, source: Source = NOWHERE) -> BodyBuilder:
+    def add(self, body: Body, source: Location = NOWHERE) -> BodyBuilder:
         """Add a body that exists already, e.g. `camera.renamed("RearCamera")`; return its builder."""
         draft = self.body(body.name, body.description, body.pose, body.inertia, source)
         draft.frames.extend((frame, source) for frame in body)
@@ -70,7 +70,7 @@ class ModelBuilder(Draft):
         description: str = "",
         sigma: Sigma | None = None,
         joint: Joint = FIXED,
-        source: Source = NOWHERE,
+        source: Location = NOWHERE,
     ) -> ModelBuilder:
         """Join two frames, named `Body:Frame`, rigidly or by a joint; `pose` is the place of `to` in `from_`.
 
@@ -100,18 +100,18 @@ class ModelBuilder(Draft):
         self,
         severity: Severity,
         message: str,
-        source: Source = NOWHERE,
+        source: Location = NOWHERE,
         fix: str = "",
         nearest: tuple[str, ...] = (),
     ) -> None:
         """Note a problem that was met while reading."""
         self.problems.append(Problem(severity, message, source, fix, nearest))
 
-    def error(self, message: str, source: Source = NOWHERE, fix: str = "", nearest: tuple[str, ...] = ()) -> None:
+    def error(self, message: str, source: Location = NOWHERE, fix: str = "", nearest: tuple[str, ...] = ()) -> None:
         """Note a problem that makes the model unusable."""
         self.problem(Severity.ERROR, message, source, fix, nearest)
 
-    def warning(self, message: str, source: Source = NOWHERE, fix: str = "", nearest: tuple[str, ...] = ()) -> None:
+    def warning(self, message: str, source: Location = NOWHERE, fix: str = "", nearest: tuple[str, ...] = ()) -> None:
         """Note a problem that the model can live with."""
         self.problem(Severity.WARNING, message, source, fix, nearest)
 

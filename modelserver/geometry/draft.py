@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final
 
-from modelserver.errors import Problem, Source
+from modelserver.errors import Location, Problem
 from modelserver.geometry.parts import BodyFrame, Constraint, Sigma
 from modelserver.geometry.shape import Shape
 from modelserver.spatial.pose import Pose
 
-NOWHERE: Final = Source()
+NOWHERE: Final = Location()
 
 
 @dataclass(slots=True)
@@ -18,11 +18,11 @@ class BodyBuilder:
     """Collects one body; made by `ModelBuilder.body`."""
 
     name: str
-    source: Source = NOWHERE
+    source: Location = NOWHERE
     description: str = ""
     pose: Pose | None = None
     inertia: tuple[tuple[float, ...], ...] | None = None
-    frames: list[tuple[BodyFrame, Source]] = field(default_factory=list)
+    frames: list[tuple[BodyFrame, Location]] = field(default_factory=list)
     visuals: tuple[Shape, ...] = ()
     collisions: tuple[Shape, ...] = ()
 
@@ -32,7 +32,7 @@ class BodyBuilder:
         pose: Pose | None = None,
         description: str = "",
         sigma: Sigma | None = None,
-        source: Source = NOWHERE,
+        source: Location = NOWHERE,
     ) -> BodyBuilder:
         """Add a frame at `pose` in body coordinates; return this body, to go on."""
         self.frames.append((BodyFrame(name, pose or Pose.identity(), description, sigma, self.name), source))
@@ -53,6 +53,6 @@ class Draft:
     strict: bool = False
     problems: list[Problem] = field(default_factory=list)
     unclear_joints: set[str] = field(default_factory=set)
-    loose_ends: list[tuple[str, str, str, Source]] = field(default_factory=list)
+    loose_ends: list[tuple[str, str, str, Location]] = field(default_factory=list)
     bodies: list[BodyBuilder] = field(default_factory=list)
-    constraints: list[tuple[Constraint, Source]] = field(default_factory=list)
+    constraints: list[tuple[Constraint, Location]] = field(default_factory=list)

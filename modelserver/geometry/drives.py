@@ -10,7 +10,7 @@ from modelserver.geometry.joint import Mimic, coordinate_names
 from modelserver.geometry.parts import Constraint
 
 
-class Drive(NamedTuple):
+class JointDrive(NamedTuple):
     """A joint's position: `multiplier` times the coordinates of these names, plus `offset`.
 
     Where it follows another, which may follow a third, the numbers are those of the whole way.
@@ -22,22 +22,22 @@ class Drive(NamedTuple):
     offset: float = 0.0
 
 
-def drives(joints: Iterable[Constraint]) -> dict[str, Drive]:
+def drives(joints: Iterable[Constraint]) -> dict[str, JointDrive]:
     """Return the drive of each joint by its constraint's name; those that follow lead to one that does not.
 
     Where they do not, `followed` says so; no model is built of those.
     """
     by_name = {each.name: each for each in joints}
-    found: dict[str, Drive] = {}
+    found: dict[str, JointDrive] = {}
     for each in by_name.values():
         way: list[tuple[str, Mimic]] = []
         while each.name not in found and (mimic := each.joint.mimic) is not None:
             way.append((each.name, mimic))
             each = by_name[mimic.joint]
-        drive = found.setdefault(each.name, Drive(coordinate_names(each.name, each.joint), each.name))
+        drive = found.setdefault(each.name, JointDrive(coordinate_names(each.name, each.joint), each.name))
         for name, mimic in reversed(way):
             offset = mimic.multiplier * drive.offset + mimic.offset
-            drive = Drive(drive.names, drive.leader, mimic.multiplier * drive.multiplier, offset)
+            drive = JointDrive(drive.names, drive.leader, mimic.multiplier * drive.multiplier, offset)
             found[name] = drive
     return {name: found[name] for name in by_name}
 

@@ -36,7 +36,7 @@ from modelserver.spatial.pose import Pose
 
 
 @dataclass(slots=True, eq=False, repr=False)
-class Node:
+class FrameNode:
     """A frame, or the far end of an edge. Immutable by habit: only the tree sets, while it is made.
 
     `edge` leads down to it from `parent`, `back` is the same passed upward; a root's parent is the root itself. `X_GN`
@@ -53,8 +53,8 @@ class Node:
     covariance: EdgeCovariance | None = None
     is_unstated: bool = False
     motion: JointMotion | None = None
-    parent: Node = field(init=False)
-    group: Node = field(init=False)
+    parent: FrameNode = field(init=False)
+    group: FrameNode = field(init=False)
     X_NG: Pose = field(init=False)
 
     def __post_init__(self) -> None:
@@ -70,15 +70,15 @@ class FrameTree:
     def __init__(self, bodies: Mapping[str, Body], topology: Topology, leader: Callable[[str], str]):
         """Spread every assembly; `leader` gives the joint that places a joint, itself where it follows none."""
         self._leader = leader
-        self.nodes: dict[str, Node] = {}
+        self.nodes: dict[str, FrameNode] = {}
         for number, assembly in enumerate(topology.assemblies):
             root = assembly[0]
-            self._add_frames(bodies[root], Node(number, root, Pose.identity()))
+            self._add_frames(bodies[root], FrameNode(number, root, Pose.identity()))
             for _, crossing in topology.spread(root):
                 body = bodies[names.split(crossing.leaves)[0]]
                 self._add_frames(body, self._cross(crossing, body), crossing.leaves)
 
-    def _add_frames(self, body: Body, entered: Node, by: str = "") -> None:
+    def _add_frames(self, body: Body, entered: FrameNode, by: str = "") -> None:
         """Add the frames of a body that is entered at its origin, or by the frame of that full name."""
         origin = entered
         if by:
@@ -96,7 +96,7 @@ class FrameTree:
                 edge = Edge(EdgeKind.FRAME, full, True, frame.pose, frame.sigma)
                 self.nodes[full] = self._add(origin, edge, body.name)
 
-    def _cross(self, crossing: Crossing, body: Body) -> Node:
+    def _cross(self, crossing: Crossing, body: Body) -> FrameNode:
         """Add the edges of a constraint, and of its joint where that moves; return the node in the body entered."""
         each, forward = crossing.constraint, crossing.forward
         edges = [Edge(EdgeKind.CONSTRAINT, each.name, forward, each.pose, each.sigma)]
@@ -109,12 +109,12 @@ class FrameTree:
             node = self._add(node, edge, body.name)
         return node
 
-    def _add(self, parent: Node, edge: Edge, body: str) -> Node:
+    def _add(self, parent: FrameNode, edge: Edge, body: str) -> FrameNode:
         back = edge._replace(forward=not edge.forward)
         depth = parent.depth + 1
         if edge.joint is not None:
             motion = JointMotion.at(edge.joint, parent.X_GN if edge.forward else _IDENTITY)
-            node = Node(parent.assembly, body, _IDENTITY, depth, edge, back, motion=motion)
+            node = FrameNode(parent.assembly, body, _IDENTITY, depth, edge, back, motion=motion)
             node.parent = parent
             return node
         X_GN = parent.X_GN @ (edge.pose if edge.forward else edge.pose.inverse())
@@ -122,15 +122,15 @@ class FrameTree:
         if edge.sigma is not None and not edge.sigma.is_zero:
             X_F, X_T = (parent.X_GN, X_GN) if edge.forward else (X_GN, parent.X_GN)
             covariance = edge_covariance(X_F.wxyz, X_T.xyz, edge.sigma)
-        node = Node(parent.assembly, body, X_GN, depth, edge, back, covariance, edge.is_unstated)
+        node = FrameNode(parent.assembly, body, X_GN, depth, edge, back, covariance, edge.is_unstated)
         node.parent, node.group = parent, parent.group
         return node
 
     @staticmethod
-    def path(interest: Node, reference: Node) -> tuple[list[Node], list[Node]]:
+    def path(interest: FrameNode, reference: FrameNode) -> tuple[list[FrameNode], list[FrameNode]]:
         """Return the nodes whose edges are passed upward from the reference, then downward to the interest."""
-        up: list[Node] = []
-        down: list[Node] = []
+        up: list[FrameNode] = []
+        down: list[FrameNode] = []
         while reference is not interest:
             if reference.depth >= interest.depth:
                 up.append(reference)
@@ -142,7 +142,7 @@ class FrameTree:
         return up, down
 
     @staticmethod
-    def rigid_covariance(interest: Node, reference: Node) -> tuple[float, ...] | None:
+    def rigid_covariance(interest: FrameNode, reference: FrameNode) -> tuple[float, ...] | None:
         """Return the covariance, 36 numbers, of a frame in another of its group; None where an edge states none."""
         q, far = reference.X_NG._q, interest.X_GN._p
         edges: list[EdgeCovariance] = []
@@ -159,7 +159,7 @@ class FrameTree:
         return covariance_at(edges, so3.rotate(q, far), q)
 
     @classmethod
-    def route(cls, interest: Node, reference: Node) -> Route:
+    def route(cls, interest: FrameNode, reference: FrameNode) -> Route:
         """Return the route from one frame to another of the same assembly."""
         up, down = cls.path(interest, reference)
         legs: list[Leg] = []
@@ -183,7 +183,7 @@ class FrameTree:
         return Route.assemble(legs, last, bases, partial(_edges, up, down), partial(_covariance, up, down))
 
 
-def _covariance(up: Sequence[Node], down: Sequence[Node]) -> PathCovariance:
+def _covariance(up: Sequence[FrameNode], down: Sequence[FrameNode]) -> PathCovariance:
     segments: list[list[EdgeCovariance]] = [[]]
     crossings: list[JointCrossing] = []
     is_stated = True
@@ -204,7 +204,7 @@ def _covariance(up: Sequence[Node], down: Sequence[Node]) -> PathCovariance:
     return PathCovariance(segments, crossings, is_stated)
 
 
-def _edges(up: Sequence[Node], down: Sequence[Node]) -> tuple[Edge, ...]:
+def _edges(up: Sequence[FrameNode], down: Sequence[FrameNode]) -> tuple[Edge, ...]:
     return tuple([edge for edge in (*[each.back for each in up], *[each.edge for each in down]) if edge is not None])
 
 

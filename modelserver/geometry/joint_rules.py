@@ -6,13 +6,13 @@ import math
 from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
-from modelserver.errors import Source, shown, suggestions
+from modelserver.errors import Location, shown, suggestions
 from modelserver.geometry.drives import at_rest, drives, followed
 from modelserver.geometry.joint import Joint, coordinate_names
 from modelserver.geometry.parts import Constraint
 from modelserver.geometry.wording import LISTED, few, first_at
 
-Placed = tuple[Constraint, Source]
+Placed = tuple[Constraint, Location]
 """A constraint and where it came from."""
 
 
@@ -24,11 +24,11 @@ MOST_TURNED = 2.0 * math.tau
 """Radians; an angle beyond two turns is rather one in degrees."""
 
 
-class Finding(NamedTuple):
+class JointProblem(NamedTuple):
     """What is wrong with a joint, where, and what to do."""
 
     message: str
-    source: Source
+    source: Location
     fix: str
     nearest: tuple[str, ...] = ()
 
@@ -45,8 +45,8 @@ class JointRules:
     def __init__(
         self, placed: Sequence[Placed], known: Iterable[str], unclear: Collection[str] = (), repair: bool = False
     ):
-        self.faults: list[Finding] = []
-        self.warnings: list[Finding] = []
+        self.faults: list[JointProblem] = []
+        self.warnings: list[JointProblem] = []
         self._known = set(known)
         self._unclear = unclear
         self._repair = repair
@@ -64,7 +64,7 @@ class JointRules:
             if clash is not None:
                 other, place = taken[clash]
                 self.faults.append(
-                    Finding(
+                    JointProblem(
                         f"constraint {shown(constraint.name)}: a coordinate of its joint is called {shown(clash)}, as "
                         f"is one of constraint {other.name}{first_at(place)}",
                         source,
@@ -140,14 +140,14 @@ class JointRules:
             refused.add(constraint.name)
         return refused
 
-    def _refuse_follower(self, constraint: Constraint, source: Source) -> None:
+    def _refuse_follower(self, constraint: Constraint, source: Location) -> None:
         """Report one that follows what is dropped; where nothing is, that was complaint enough."""
         if self._repair and constraint.joint.mimic is not None:
             message = f"constraint {shown(constraint.name)}: its joint follows {constraint.joint.mimic.joint}"
             self._refuse(f"{message}, which was removed", source, "mend that one")
 
-    def _refuse(self, message: str, source: Source, fix: str, nearest: tuple[str, ...] = ()) -> None:
-        self.faults.append(Finding(message, source, fix, nearest))
+    def _refuse(self, message: str, source: Location, fix: str, nearest: tuple[str, ...] = ()) -> None:
+        self.faults.append(JointProblem(message, source, fix, nearest))
 
     def _settled(self, placed: Sequence[Placed]) -> tuple[Placed, ...]:
         placed = self._within_reach(placed)
@@ -160,7 +160,7 @@ class JointRules:
             label = f"constraint {shown(each.name)}"
             if stated.joint.default not in ((), joint.default):
                 self.warnings.append(
-                    Finding(
+                    JointProblem(
                         f"{label}: the default of its joint counts for nothing, for it follows {mimic.joint}",
                         source,
                         f"remove it, or state the default of {mimic.joint}",
@@ -168,7 +168,7 @@ class JointRules:
                 )
             if stated.joint.sigma:
                 self.warnings.append(
-                    Finding(
+                    JointProblem(
                         f"{label}: the sigma of its joint counts for nothing, for it follows {mimic.joint}",
                         source,
                         f"remove it, or state the sigma of {mimic.joint}: a follower errs with its leader",
@@ -176,7 +176,7 @@ class JointRules:
                 )
             if joint.out_of_limits(joint.default):
                 self.warnings.append(
-                    Finding(
+                    JointProblem(
                         f"{label}: where {mimic.joint} rests, its joint is at {_measure(joint)}, out of its limits",
                         source,
                         "mend the multiplier or offset of mimic, the limits, or the default of the joint it follows",
@@ -197,7 +197,7 @@ class JointRules:
                 if turns:
                     what = "default" if key == "default" else f"{key} limit"
                     self.warnings.append(
-                        Finding(
+                        JointProblem(
                             f"constraint {shown(constraint.name)}: the {what} of its joint is {turns[0]:.6g} rad, "
                             f"{abs(turns[0]) / math.tau:.3g} turns",
                             source,

@@ -19,7 +19,7 @@ from modelserver.geometry.edges import edges_along
 from modelserver.geometry.parts import BodyFrame
 from modelserver.geometry.topology import Crossing
 from modelserver.spatial import chain, so3
-from modelserver.spatial.chain import Link
+from modelserver.spatial.chain import ChainLink
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array
 
@@ -62,19 +62,19 @@ def closure(path: Sequence[Crossing], frame: Callable[[str], BodyFrame]) -> Clos
     Joints are taken to stand exactly where they rest: what is weighed is the survey.
     """
     start = path[0].enters
-    links: list[Link] = []
+    links: list[ChainLink] = []
     unstated: list[str] = []
     joints: list[str] = []
     for edge in edges_along(path, frame, start, start):
         source = (edge.kind, edge.name)
         if edge.joint is not None:
             joints.append(edge.name)
-            links.append(Link(edge.joint.motion(edge.joint.rest), edge.forward, _CERTAIN, source))
+            links.append(ChainLink(edge.joint.motion(edge.joint.rest), edge.forward, _CERTAIN, source))
             continue
         factor = edge.survey_factor
         if factor is None:
             unstated.append(edge.name)
-        links.append(Link(edge.pose, edge.forward, factor, source))
+        links.append(ChainLink(edge.pose, edge.forward, factor, source))
     round_ = chain.product(links)
     metres, radians = round_.distance(Pose.identity())
     with np.errstate(over="ignore", invalid="ignore"):
@@ -91,7 +91,7 @@ def _residual(pose: Pose) -> Array:
     return np.array((*pose.xyz, *so3.logarithm(pose.wxyz)))
 
 
-def _reach(links: Sequence[Link]) -> float:
+def _reach(links: Sequence[ChainLink]) -> float:
     """Return how far from its start a way round comes at most, metres."""
     place, farthest = Pose.identity(), 0.0
     for link in links:

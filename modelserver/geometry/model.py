@@ -23,7 +23,7 @@ from modelserver.geometry import adjacency, names
 from modelserver.geometry.adjacency import Neighbor
 from modelserver.geometry.drives import drives
 from modelserver.geometry.edges import Edge, edges_along
-from modelserver.geometry.frame_tree import FrameTree, Node
+from modelserver.geometry.frame_tree import FrameNode, FrameTree
 from modelserver.geometry.joint import Coordinates, Joint
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
 from modelserver.geometry.route import Route
@@ -290,7 +290,7 @@ class Model:
             )
         return found, found.frame(frame_name)
 
-    def _ends(self, frame_of_interest: str, frame_of_reference: str) -> tuple[Node, Node]:
+    def _ends(self, frame_of_interest: str, frame_of_reference: str) -> tuple[FrameNode, FrameNode]:
         """Return the nodes of two frames of one assembly. Raises as `route`."""
         nodes = self._tree.nodes
         try:
@@ -314,7 +314,7 @@ class Model:
         return self._kept(frame_of_interest, frame_of_reference, route.pose(route.rest), covariance)
 
     def _rigid(
-        self, frame_of_interest: str, frame_of_reference: str, interest: Node, reference: Node
+        self, frame_of_interest: str, frame_of_reference: str, interest: FrameNode, reference: FrameNode
     ) -> Transformation:
         # a frame in itself is so exactly
         pose = Pose.identity() if interest is reference else reference.X_NG @ interest.X_GN

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from modelserver.errors import Problem, Severity, Source, Suggested, shown
+from modelserver.errors import Location, Problem, Severity, Suggested, shown
 from modelserver.geometry import loops, names
 from modelserver.geometry.draft import NOWHERE, BodyBuilder, Draft
 from modelserver.geometry.joint_rules import JointRules, Placed
@@ -27,17 +27,17 @@ class Review:
         self.draft = draft
         self.repair = repair
         self.problems = list(draft.problems)
-        self.places: dict[str, Source] = {}
+        self.places: dict[str, Location] = {}
         self.suggested = 0
 
-    def fault(self, message: str, source: Source, fix: str, nearest: tuple[str, ...] = ()) -> None:
+    def fault(self, message: str, source: Location, fix: str, nearest: tuple[str, ...] = ()) -> None:
         """Report something badly formed: an error, or with repair the warning that it was removed."""
         if self.repair:
             self.problems.append(Problem(Severity.WARNING, f"{message}; removed", source, fix, nearest))
         else:
             self.problems.append(Problem(Severity.ERROR, message, source, fix, nearest))
 
-    def note(self, severity: Severity, message: str, source: Source, fix: str = "") -> None:
+    def note(self, severity: Severity, message: str, source: Location, fix: str = "") -> None:
         """Report something that the model can live with."""
         self.problems.append(Problem(severity, message, source, fix))
 
@@ -95,7 +95,7 @@ class Review:
         return kept
 
     def _frames(self, draft: BodyBuilder) -> tuple[BodyFrame, ...]:
-        kept: dict[str, tuple[BodyFrame, Source]] = {}
+        kept: dict[str, tuple[BodyFrame, Location]] = {}
         for frame, source in draft.frames:
             label = f"frame {shown(frame.name)} of body {shown(draft.name)}"
             if fault := names.fault(frame.name):
@@ -113,8 +113,8 @@ class Review:
     def constraints(self, bodies: dict[str, Body]) -> tuple[Placed, ...]:
         """Return the well-formed constraints: both ends exist and differ; where it is strict, one for each frame."""
         kept: list[Placed] = []
-        by_name: dict[str, Source] = {}
-        by_frame: dict[str, tuple[str, Source]] = {}
+        by_name: dict[str, Location] = {}
+        by_frame: dict[str, tuple[str, Location]] = {}
         for constraint, source in self.draft.constraints:
             label = f"constraint {shown(constraint.name)}"
             if fault := names.fault(constraint.name):
@@ -163,7 +163,7 @@ class Review:
             self._end_exists(f"constraint {shown(name)}", sense, end, bodies, source)
         return tuple(kept)
 
-    def _end_exists(self, label: str, sense: str, end: str, bodies: dict[str, Body], source: Source) -> bool:
+    def _end_exists(self, label: str, sense: str, end: str, bodies: dict[str, Body], source: Location) -> bool:
         try:
             body, frame = names.split(end)
         except ValueError:

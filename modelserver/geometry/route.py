@@ -17,7 +17,7 @@ from modelserver.geometry.edges import Edge
 from modelserver.geometry.joint import Coordinates, Joint, JointType
 from modelserver.geometry.path_covariance import PathCovariance, Place
 from modelserver.spatial import so3
-from modelserver.spatial.chain import Link
+from modelserver.spatial.chain import ChainLink
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Quaternion
 
@@ -196,7 +196,7 @@ class Route:
             bases.append(place)
         return path.at(bases, places[-1][0], positions, sigmas)
 
-    def links(self, positions: Sequence[Coordinates], sigmas: Sequence[Coordinates], stamp: int = 0) -> list[Link]:
+    def links(self, positions: Sequence[Coordinates], sigmas: Sequence[Coordinates], stamp: int = 0) -> list[ChainLink]:
         """Return the chain of the route, link by link, with what each is unsure of.
 
         `sigmas` are those of the legs' coordinates, nan where nobody told; of a joint that follows, its multiplier
@@ -207,7 +207,7 @@ class Route:
         number = 0
         for edge in self.edges:
             if edge.joint is None:
-                links.append(Link(edge.pose, edge.forward, edge.survey_factor, (edge.kind, edge.name)))
+                links.append(ChainLink(edge.pose, edge.forward, edge.survey_factor, (edge.kind, edge.name)))
                 continue
             position, sigma = positions[number], sigmas[number]
             number += 1
@@ -215,7 +215,7 @@ class Route:
             if not any(map(np.isnan, sigma)):
                 factor = edge.joint.jacobian(position) * np.array(sigma)
             source = (edge.kind, edge.leader or edge.name, stamp)
-            links.append(Link(edge.joint.motion(position), edge.forward, factor, source))
+            links.append(ChainLink(edge.joint.motion(position), edge.forward, factor, source))
         return links
 
 

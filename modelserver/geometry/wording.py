@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from modelserver.errors import Source
+from modelserver.errors import Location
 
 LISTED = 12
 """Names that a message lists at most."""
 
 
-def first_at(place: Source) -> str:
+def first_at(place: Location) -> str:
     """Return where the first of two stands, for a message about the second."""
     return f" (first at {place})" if str(place) else ""
 

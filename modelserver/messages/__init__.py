@@ -12,7 +12,6 @@ from modelserver.messages.decisions import Decision, Verdict
 from modelserver.messages.driver_health import DriverHealth, DriverPhase
 from modelserver.messages.estimates import Estimate, MotionCovariance, Origin, VehicleMotion
 from modelserver.messages.events import (
-    Commanded,
     Denied,
     Event,
     KeepState,
@@ -27,6 +26,7 @@ from modelserver.messages.events import (
     PublishSnapshot,
     Rejected,
     SendReply,
+    SignedCommand,
     SnapshotPart,
     StartTold,
     SwitchMode,
@@ -118,7 +118,6 @@ __all__ = [
     "AbsolutePoseSample",
     "Acknowledgement",
     "ChannelHealth",
-    "Commanded",
     "Decision",
     "Denied",
     "Direction",
@@ -193,6 +192,7 @@ __all__ = [
     "SensorHeader",
     "SetHTransform",
     "SetStateVector",
+    "SignedCommand",
     "SnapshotPart",
     "StartTold",
     "StateVectorReply",

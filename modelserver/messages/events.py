@@ -58,7 +58,7 @@ class SwitchMode:
 
 
 @dataclass(frozen=True, slots=True)
-class Commanded:
+class SignedCommand:
     """What changes the service, from a sender who has proved to know the vehicle's key."""
 
     order: ReloadModel | SetStateVector | SetHTransform | SwitchMode
@@ -81,7 +81,7 @@ class Denied:
     malformed: bool = False
 
 
-Event: TypeAlias = Sample | SwitchMode | Request | Commanded | Denied | Tick | Rejected | Noticed
+Event: TypeAlias = Sample | SwitchMode | Request | SignedCommand | Denied | Tick | Rejected | Noticed
 
 
 class SendReply(NamedTuple):

@@ -7,7 +7,7 @@ import numpy as np
 from modelserver.geometry.edges import EdgeKind
 from modelserver.joints.joints import AHEAD_S, LONGEST_GAP_S, How
 from modelserver.messages import NAN, EdgeReport, Estimate, Explanation, Policy, Quality, TimeQuery
-from modelserver.platform.path import Step, way
+from modelserver.platform.path import PathStep, way
 from modelserver.platform.view import PlatformView
 from modelserver.spatial import chain
 
@@ -47,7 +47,7 @@ def explained(view: PlatformView, interest: str, reference: str, time: TimeQuery
     )
 
 
-def _part(own: float, whole: float, step: Step) -> float:
+def _part(own: float, whole: float, step: PathStep) -> float:
     if step.factor is None:
         return NAN
     return own / whole if whole > 0.0 else 0.0
@@ -59,7 +59,7 @@ def _stamp(view: PlatformView, estimate: Estimate, how: How) -> int:
     return (following or view.history.held(estimate.utime)).utime
 
 
-def _doubt(view: PlatformView, step: Step, time: TimeQuery, now: int) -> str:
+def _doubt(view: PlatformView, step: PathStep, time: TimeQuery, now: int) -> str:
     """Return in words what speaks against where a joint stands, as its flags say of the whole answer; see `placed`."""
     edge = step.edge
     assert edge.joint is not None
@@ -80,7 +80,7 @@ def _doubt(view: PlatformView, step: Step, time: TimeQuery, now: int) -> str:
     return ", ".join(words)
 
 
-def _told_by(view: PlatformView, leader: str, step: Step) -> str:
+def _told_by(view: PlatformView, leader: str, step: PathStep) -> str:
     """Return who told where a joint stands: the sources of its coordinates, in their order, each once."""
     tracks = view.joints.tracks
     names = view.model.drives[step.edge.name].names
@@ -89,7 +89,7 @@ def _told_by(view: PlatformView, leader: str, step: Step) -> str:
     return source if leader == step.edge.name else f"{source} of {leader}".strip()
 
 
-def _report(view: PlatformView, step: Step, shares: tuple[float, float], time: TimeQuery, now: int) -> EdgeReport:
+def _report(view: PlatformView, step: PathStep, shares: tuple[float, float], time: TimeQuery, now: int) -> EdgeReport:
     edge = step.edge
     X = step.X_FT if edge.forward else step.X_FT.inverse()
     how, stamp, source, doubt = "fixed", 0, "", ""

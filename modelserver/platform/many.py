@@ -12,7 +12,7 @@ from modelserver.geometry import names
 from modelserver.geometry.edges import EdgeKind
 from modelserver.geometry.route import Route
 from modelserver.messages import MOST_INSTANTS, Invalid, ManyPoses, Origin, Policy, Quality, TimeQuery
-from modelserver.platform.path import Step, Way, way
+from modelserver.platform.path import PathState, PathStep, way
 from modelserver.platform.rows import STEP_ROWS, Rows, Times
 from modelserver.platform.rows_joint import joint_moved
 from modelserver.platform.rows_vehicle import differ, drifts, vehicle
@@ -187,7 +187,7 @@ def _route(view: PlatformView, route: Route, rows: Rows) -> Steps[tuple[list[Lin
     return links, rows
 
 
-def _met(view: PlatformView, there: Way, links: list[Links], rows: Rows, fixed: str) -> tuple[list[Links], Rows]:
+def _met(view: PlatformView, there: PathState, links: list[Links], rows: Rows, fixed: str) -> tuple[list[Links], Rows]:
     """Return the links behind those of the reference's one time, the vehicle's put together where both meet."""
     before = [_constant(step) for step in there.steps]
     rows = rows.told(int(there.invalid), int(there.quality))
@@ -260,5 +260,5 @@ def _is_fixed(link: Links) -> bool:
     return link.source[0] in (EdgeKind.FRAME, EdgeKind.CONSTRAINT)
 
 
-def _constant(step: Step) -> Links:
+def _constant(step: PathStep) -> Links:
     return Links(Poses.of(step.X_FT), step.edge.forward, step.factor, step.source, step.link.bends)

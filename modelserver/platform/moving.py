@@ -9,10 +9,10 @@ from modelserver.geometry.edges import EdgeKind
 from modelserver.geometry.joint import Joint
 from modelserver.joints.joints import How
 from modelserver.messages import NAN, Estimate, MotionAnswer, Policy, TimeQuery
-from modelserver.platform.path import Step, way
+from modelserver.platform.path import PathStep, way
 from modelserver.platform.view import PlatformView
 from modelserver.spatial import chain, so3
-from modelserver.spatial.chain import Link
+from modelserver.spatial.chain import ChainLink
 from modelserver.spatial.kinematics import UNKNOWN, RigidMotion
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Array, Vector3, cross
@@ -32,13 +32,13 @@ def motion(
     answer = view.transformation(interest, reference, time, now)
     path = way(view, interest, reference, time, now)
     moved = RigidMotion(Pose.identity())
-    uncertain: list[Link] = []
+    uncertain: list[ChainLink] = []
     for step in path.steps:
         each, factor = _moved(view, step)
         moved = moved.then(each if step.edge.forward else each.inverse())
         # the vehicle has one motion, whichever world it is told in
         source = step.source if step.estimate is None else (EdgeKind.VEHICLE,)
-        uncertain.append(Link(step.X_FT, step.edge.forward, factor, source))
+        uncertain.append(ChainLink(step.X_FT, step.edge.forward, factor, source))
     R = so3.IDENTITY
     axes = expressed_in or reference
     if axes != reference:
@@ -66,7 +66,7 @@ def motion(
     )
 
 
-def _moved(view: PlatformView, step: Step) -> tuple[RigidMotion, Array | None]:
+def _moved(view: PlatformView, step: PathStep) -> tuple[RigidMotion, Array | None]:
     """Return how a step's far end moves in its near one, and the factor of that velocity's covariance."""
     if step.estimate is not None:
         return _vehicle(view, step.X_FT, step.estimate)
@@ -75,7 +75,7 @@ def _moved(view: PlatformView, step: Step) -> tuple[RigidMotion, Array | None]:
     return _joint(view, step, step.edge.joint)
 
 
-def _joint(view: PlatformView, step: Step, joint: Joint) -> tuple[RigidMotion, Array | None]:
+def _joint(view: PlatformView, step: PathStep, joint: Joint) -> tuple[RigidMotion, Array | None]:
     drive = view.model.drives[step.edge.name]
     position, rates, changes, sigmas = [], [], [], []
     for name, reading in zip(drive.names, step.readings, strict=True):

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from modelserver.errors import TooNewError, TooOldError
-from modelserver.geometry.drives import Drive
+from modelserver.geometry.drives import JointDrive
 from modelserver.geometry.joint import Coordinates
 from modelserver.geometry.model import Model
 from modelserver.geometry.route import Route
@@ -122,7 +122,7 @@ def placed(route: Route, model: Model, joints: Joints, utime: int, policy: Polic
     )
 
 
-def _reading(name: str, drive: Drive, model: Model, joints: Joints, utime: int, policy: Policy) -> Reading:
+def _reading(name: str, drive: JointDrive, model: Model, joints: Joints, utime: int, policy: Policy) -> Reading:
     track = joints.tracks.get(name)
     if track is None:
         leader = model.joints[drive.leader].joint
@@ -146,7 +146,7 @@ def _as_one(found: tuple[Reading, ...], names: tuple[str, ...], joints: Joints) 
     return (*found[:-3], *together(tracks, found[-3:], limits))
 
 
-def _following(reading: Reading, drive: Drive) -> Reading:
+def _following(reading: Reading, drive: JointDrive) -> Reading:
     """Return the reading of a joint that follows the one read: its sigmas have the multiplier's sign, as errors do."""
     factor = drive.multiplier
     return reading._replace(

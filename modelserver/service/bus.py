@@ -96,7 +96,7 @@ class Bus(Protocol):
         ...
 
 
-class Expected(Enum):
+class InboxState(Enum):
     """What `LcmBus.wait` has just seen of an inbox."""
 
     NOTHING = 0
@@ -117,7 +117,7 @@ class LcmInbox:
         self._queue_bytes = queue_bytes
         self.lcm = open_lcm(url)
         self.fileno = self.lcm.fileno()
-        self.expected = Expected.ANY
+        self.expected = InboxState.ANY
 
     def subscribe(self, channel: str, handler: Handler) -> None:
         """Hand every message of exactly `channel` to `handler`."""
@@ -138,10 +138,10 @@ class LcmInbox:
 
         The message that is being handled when the time is up is the last.
         """
-        expected, self.expected = self.expected, Expected.ANY
-        if expected is Expected.NOTHING or not limit:
+        expected, self.expected = self.expected, InboxState.ANY
+        if expected is InboxState.NOTHING or not limit:
             return 0
-        if expected is Expected.ONE:
+        if expected is InboxState.ONE:
             # without asking whether there is one: a call to the kernel less, while a client waits for its reply
             self.lcm.handle()
             return 1
@@ -176,7 +176,7 @@ class LcmBus:
             self._membership.renew()
         if not requests:
             readable, _, _ = select.select((self.sensors.fileno,), (), (), max(0.0, seconds))
-            self.sensors.expected = Expected.ANY if readable else Expected.NOTHING
+            self.sensors.expected = InboxState.ANY if readable else InboxState.NOTHING
             return
         # poll is the cheaper call but counts in milliseconds; select keeps the deadline to the microsecond
         milliseconds = int(seconds * 1e3)
@@ -184,6 +184,6 @@ class LcmBus:
         if not ready:
             files = (self.sensors.fileno, self.requests.fileno)
             ready, _, _ = select.select(files, (), (), max(0.0, seconds - milliseconds * 1e-3))
-        some = Expected.ONE if time.monotonic() - begin > SLEPT_S else Expected.ANY
+        some = InboxState.ONE if time.monotonic() - begin > SLEPT_S else InboxState.ANY
         for inbox in (self.sensors, self.requests):
-            inbox.expected = some if inbox.fileno in ready else Expected.NOTHING
+            inbox.expected = some if inbox.fileno in ready else InboxState.NOTHING

@@ -23,22 +23,22 @@ from modelserver.config import (
     WheelsConfig,
     with_lines,
 )
-from modelserver.core import CoreSettings, CoreState, Expected, Instant
+from modelserver.core import CoreSettings, CoreState, ExpectedSensor, Instant
 from modelserver.core.reload import ModelLoaded
 from modelserver.earth.geodesy import GeodesyError, make_origin
 from modelserver.errors import (
     ConfigError,
     GeometryError,
     KeyFileError,
+    Location,
     Problem,
     QueryError,
     Severity,
-    Source,
     Suggested,
     shown,
 )
 from modelserver.formats import Examined, examine_file
-from modelserver.formats.snapshot import Snapshot, written
+from modelserver.formats.snapshot import ModelSnapshot, written
 from modelserver.geometry import Model
 from modelserver.geometry.parts import meant_frame
 from modelserver.keys import read_keys
@@ -66,7 +66,7 @@ from modelserver.messages import (
 from modelserver.service.bus import LcmBus
 from modelserver.service.clock import SystemClock
 from modelserver.service.gauges import read_gauges, read_run_delay
-from modelserver.service.heard import Heard
+from modelserver.service.heard import SensorChannel
 from modelserver.service.hooks import Hooks
 from modelserver.service.journal.place import make_writer
 from modelserver.service.journal.queue import NoJournal
@@ -80,7 +80,7 @@ from modelserver.service.supervision.notify import Notifier
 from modelserver.service.supervision.supervised import Supervision
 from modelserver.signing import Key
 from modelserver.version import __version__
-from modelserver.wire.channels import CHANNELS, Way
+from modelserver.wire.channels import CHANNELS, ChannelUse
 from modelserver.wire.provider import resolve_url
 
 if TYPE_CHECKING:
@@ -172,7 +172,7 @@ class Vehicle:
         try:
             return read_keys(path) if path else ()
         except KeyFileError as error:
-            problem = Problem(Severity.ERROR, str(error), Source(file, element="commands.key_file"))
+            problem = Problem(Severity.ERROR, str(error), Location(file, element="commands.key_file"))
             raise ConfigError(with_lines([problem], file)) from None
 
     def gate(self, started_ns: int, file: str = "") -> Gate:
@@ -186,7 +186,7 @@ class Vehicle:
         """Return the bytes of the snapshot of the model in force."""
         view = state.view
         return written(
-            Snapshot(
+            ModelSnapshot(
                 self.config.vehicle,
                 view.model,
                 view.base_frame,
@@ -236,7 +236,7 @@ class Vehicle:
         state_hz = self.config.publish.state_hz
         return max(1, round(self.tick_hz() / state_hz)) if state_hz else 0
 
-    def expected(self) -> tuple[Expected, ...]:
+    def expected(self) -> tuple[ExpectedSensor, ...]:
         """Return the sensors that the vehicle file names, with the channels they are to be heard on."""
         prefix, sensors = self.config.lcm.channel_prefix, self.config.sensors
         named: list[
@@ -249,14 +249,14 @@ class Vehicle:
             (sensors.joints, JointsSample),
         ]
         return (
-            *(Expected(f"{prefix}{each.channel}", kind) for each, kind in named if each is not None),
+            *(ExpectedSensor(f"{prefix}{each.channel}", kind) for each, kind in named if each is not None),
             *(
-                Expected(f"{prefix}{each.channel}", AIDING_SAMPLES[each.type], name)
+                ExpectedSensor(f"{prefix}{each.channel}", AIDING_SAMPLES[each.type], name)
                 for name, each in sensors.aiding.items()
             ),
         )
 
-    def sensor_channels(self, model: Model | None = None) -> dict[str, Heard]:
+    def sensor_channels(self, model: Model | None = None) -> dict[str, SensorChannel]:
         """Return what is heard on each channel that localization listens to, with the prefix.
 
         Those are the sensors' channels, that of joints where the geometry has any (`model`, by default the one that was
@@ -266,7 +266,7 @@ class Vehicle:
         prefix = self.config.lcm.channel_prefix
         sensors = self.config.sensors
         heard = {
-            f"{prefix}{each.channel}": Heard(type_name, round(each.latency * 1e6))
+            f"{prefix}{each.channel}": SensorChannel(type_name, round(each.latency * 1e6))
             for each, type_name in (
                 (sensors.gps, "gps_t"),
                 (sensors.imu, "imu_t"),
@@ -278,7 +278,7 @@ class Vehicle:
             if each is not None
         }
         if self.config.localization.mode_channel:
-            heard[f"{prefix}{self.config.localization.mode_channel}"] = Heard("localization_mode_t")
+            heard[f"{prefix}{self.config.localization.mode_channel}"] = SensorChannel("localization_mode_t")
         return heard
 
 
@@ -321,21 +321,21 @@ def examine_vehicle(
             geometry = examine_file(config.geometry, config.variables, strict=strict)
         except OSError as error:
             why = f"the geometry file {config.geometry} cannot be read: {error.strerror}"
-            problems.append(Problem(Severity.ERROR, why, Source(file, element="geometry")))
+            problems.append(Problem(Severity.ERROR, why, Location(file, element="geometry")))
     if geometry.stated is not None:
         problems += _frame_problems(config, geometry.stated, file, is_whole=geometry.model is not None)
     gps, imu = config.sensors.gps, config.sensors.imu
     if config.localization.mode == "raw" and (gps is None or imu is None):
         why = "raw mode takes a GPS and an IMU, and sensors does not name both"
-        problems.append(Problem(Severity.ERROR, why, Source(file, element="localization.mode"), "write mode: full"))
+        problems.append(Problem(Severity.ERROR, why, Location(file, element="localization.mode"), "write mode: full"))
     problems += _channel_problems(config, file)
     if config.localization.mode_channel and not config.commands.key_file:
         why = f"wishes about the mode are heard signed alone: {MAKE_KEY}"
-        problems.append(Problem(Severity.ERROR, why, Source(file, element="localization.mode_channel")))
+        problems.append(Problem(Severity.ERROR, why, Location(file, element="localization.mode_channel")))
     try:
         configured_origin(config)
     except GeodesyError as error:
-        problems.append(Problem(Severity.ERROR, str(error), Source(file, element="origin.initial_utm")))
+        problems.append(Problem(Severity.ERROR, str(error), Location(file, element="origin.initial_utm")))
     return geometry, tuple(with_lines(problems, file))
 
 
@@ -358,7 +358,7 @@ def _frame_problems(config: VehicleConfig, model: Model, file: str, is_whole: bo
             unknown.add(frame)
             near = Suggested.of(frame, meant_frame(frame, {body.name: body for body in model.bodies}))
             fix = f"write {near[0]}" if near else f"see: modelserver bodies --model {config.geometry}"
-            problems.append(Problem(Severity.ERROR, str(error), Source(file, element=key), fix, near))
+            problems.append(Problem(Severity.ERROR, str(error), Location(file, element=key), fix, near))
     if not is_whole or not config.base_frame or config.base_frame in unknown:
         return problems
     body = config.rolling_frame or config.base_frame
@@ -370,12 +370,12 @@ def _frame_problems(config: VehicleConfig, model: Model, file: str, is_whole: bo
             legs = () if body in unknown else model.route(frame, body).legs
         except QueryError as error:
             fix = f"see: modelserver bodies --model {config.geometry}"
-            problems.append(Problem(Severity.ERROR, str(error), Source(file, element=key), fix))
+            problems.append(Problem(Severity.ERROR, str(error), Location(file, element=key), fix))
             continue
         if legs:
             why = f"joint {legs[0].name} moves {frame} against the vehicle; localization needs it bolted on"
             fix = "name a frame of the vehicle's own body, or make the constraint fixed"
-            problems.append(Problem(Severity.ERROR, why, Source(file, element=key), fix))
+            problems.append(Problem(Severity.ERROR, why, Location(file, element=key), fix))
     return problems
 
 
@@ -422,12 +422,12 @@ def _channel_problems(config: VehicleConfig, file: str) -> list[Problem]:
         if each is not None
     }
     own = {f"{prefix}{channel.name}" for channel in CHANNELS}
-    not_for_sensors = {f"{prefix}{channel.name}" for channel in CHANNELS if channel.way is not Way.SENSOR}
+    not_for_sensors = {f"{prefix}{channel.name}" for channel in CHANNELS if channel.way is not ChannelUse.SENSOR}
     problems = [
         Problem(
             Severity.ERROR,
             f"{channel} is a channel that the service itself uses, no sensor's",
-            Source(file, element=key),
+            Location(file, element=key),
             "give the sensor another channel",
         )
         for key, channel in heard.items()
@@ -440,7 +440,7 @@ def _channel_problems(config: VehicleConfig, file: str) -> list[Problem]:
                 Problem(
                     Severity.ERROR,
                     f"{channel} is used for something else, so no wishes about the mode can be heard on it",
-                    Source(file, element="localization.mode_channel"),
+                    Location(file, element="localization.mode_channel"),
                     f"write {MODE_CHANNEL}",
                 )
             )
@@ -451,7 +451,7 @@ def _channel_problems(config: VehicleConfig, file: str) -> list[Problem]:
             Problem(
                 Severity.ERROR,
                 f"with the reply prefix {reply_prefix} a request could make the server speak on {spoken_on[0]}",
-                Source(file, element="lcm.reply_prefix"),
+                Location(file, element="lcm.reply_prefix"),
                 "choose one that no other channel begins with, e.g. REPLY_",
             )
         )

@@ -22,7 +22,7 @@ _NEW: Final = tuple.__new__
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class SensorChannel:
     """A channel that is listened to: its wire type, and by how many microseconds its stamps come late."""
 
     type_name: str
@@ -40,7 +40,7 @@ class Heard:
 
 
 def peek(data: bytes, fingerprint: bytes) -> Mark | None:
-    """Return whose sample a message is, at a tenth of what `Heard.read` costs; None where only that can say.
+    """Return whose sample a message is, at a tenth of what `SensorChannel.read` costs; None where only that can say.
 
     `fingerprint` is that of the type which the channel carries. The message may still be damaged behind its header.
     """

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from modelserver.core import CoreState
 from modelserver.core.reload import ModelLoaded
 from modelserver.messages import Gauges, Kept, LoadModel, OriginLatched, SwitchMode
-from modelserver.service.heard import Heard
+from modelserver.service.heard import SensorChannel
 from modelserver.service.journal.queue import Journal, NoJournal
 from modelserver.service.requests.gate import Gate
 
@@ -35,7 +35,7 @@ class Hooks:
     on_wish: Callable[[SwitchMode, CoreState, CoreState], None] = lambda wish, before, after: None
     on_load: Callable[[LoadModel, CoreState], ModelLoaded] = _nothing_to_load
     snapshot: Callable[[CoreState], bytes] = lambda state: b""
-    channels: Callable[[CoreState], Mapping[str, Heard]] = lambda state: {}
+    channels: Callable[[CoreState], Mapping[str, SensorChannel]] = lambda state: {}
     on_keep: Callable[[Kept], str] = lambda kept: ""
     gauges: Callable[[int], Gauges | None] = lambda queued: None
     run_delay: Callable[[], int | None] = lambda: None

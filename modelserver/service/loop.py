@@ -15,7 +15,6 @@ from modelserver.core.reload import ModelLoaded
 from modelserver.errors import WireError
 from modelserver.geometry import names
 from modelserver.messages import (
-    Commanded,
     Event,
     KeepState,
     LoadModel,
@@ -28,6 +27,7 @@ from modelserver.messages import (
     PublishSnapshot,
     Rejected,
     SendReply,
+    SignedCommand,
     StartTold,
     SwitchMode,
     Tick,
@@ -35,16 +35,16 @@ from modelserver.messages import (
 from modelserver.service.ahead import Lead
 from modelserver.service.bus import Bus
 from modelserver.service.clock import Clock
-from modelserver.service.heard import Heard, peek
+from modelserver.service.heard import SensorChannel, peek
 from modelserver.service.hooks import Hooks
 from modelserver.service.log import RateLimited, plain, plain_lines
 from modelserver.service.requests.handler import RequestHandler
 from modelserver.service.requests.scheduler import RequestLimits
 from modelserver.service.snapshots import SnapshotWriter
 from modelserver.service.unused import Unused
-from modelserver.service.watch import SECOND, Watch
+from modelserver.service.watch import SECOND, PublisherMonitor
 from modelserver.wire.codec import encode, fingerprint_of
-from modelserver.wire.journal import Kind
+from modelserver.wire.journal import RecordKind
 from modelserver.wire.navigation import MAX_DECISIONS
 
 log = logging.getLogger(__name__)
@@ -79,7 +79,7 @@ class LoopSettings:
     """
 
     period_ns: int
-    sensors: Mapping[str, Heard] = field(default_factory=dict)
+    sensors: Mapping[str, SensorChannel] = field(default_factory=dict)
     channel_prefix: str = ""
     queued_requests: int = 256
     requests_per_pass: int = 16
@@ -124,7 +124,9 @@ class Loop:
         self._model, self._held = f"{prefix}MODEL_SNAPSHOT", f"{prefix}JOINTS_HELD"
         self._decisions, self._state = f"{prefix}LOCALIZATION_DECISIONS", f"{prefix}LOCALIZATION_STATE"
         self._unused = Unused(self.step, self._journal)
-        self._watch = Watch(self.step, self._unused.count, self._log, settings.second_writer, settings.shared)
+        self._watch = PublisherMonitor(
+            self.step, self._unused.count, self._log, settings.second_writer, settings.shared
+        )
         self._hear(settings.sensors)
         limits = RequestLimits(
             settings.queued_requests, settings.client_hz, settings.request_share, settings.client_reply_bytes
@@ -247,20 +249,20 @@ class Loop:
         """Requests that wait to be answered."""
         return self._requests.waiting
 
-    def obey(self, command: Commanded, now: Instant) -> None:
+    def obey(self, command: SignedCommand, now: Instant) -> None:
         """Have a signed command obeyed."""
         before = self.state
         self.step(command, now)
         if isinstance(command.order, SwitchMode):
             self._on_wish(command.order, before, self.state)
 
-    def _hear(self, channels: Mapping[str, Heard]) -> None:
+    def _hear(self, channels: Mapping[str, SensorChannel]) -> None:
         for channel, heard in channels.items():
             if channel not in self._hearing:
                 self._hearing.add(channel)
                 self._bus.sensors.subscribe(channel, self._sensor_handler(channel, heard))
 
-    def _sensor_handler(self, own: str, heard: Heard) -> Callable[[str, bytes], None]:
+    def _sensor_handler(self, own: str, heard: SensorChannel) -> Callable[[str, bytes], None]:
         writer = self._watch.writer(own)
         watched, fingerprint = heard.has_publisher, fingerprint_of(heard.type_name)
 
@@ -277,7 +279,7 @@ class Loop:
                             channel, writer, mark, now
                         )
                     if ignored:
-                        self._unused.drop(Kind.IGNORED, channel, SECOND, data, now)
+                        self._unused.drop(RecordKind.IGNORED, channel, SECOND, data, now)
                         return
                 event = heard.read(data)
                 if isinstance(event, SwitchMode):
@@ -292,7 +294,7 @@ class Loop:
     def _wished(self, channel: str, wish: SwitchMode, now: Instant) -> None:
         """Take a wish for a mode that came without a signature, where none is asked for; else count it."""
         if self._gate is None:
-            self.obey(Commanded(wish), now)
+            self.obey(SignedCommand(wish), now)
             return
         self._unused.count(channel, "unsigned", now)
         self._told.add((channel, "unsigned"))
@@ -307,7 +309,7 @@ class Loop:
         now = self._clock.now()
         if isinstance(error, WireError):
             if data:
-                self._unused.note(Kind.UNREAD, channel, data, now)
+                self._unused.note(RecordKind.UNREAD, channel, data, now)
             self._unused.count(channel, error.reason, now)
             self._told.add((channel, error.reason))
             self._log.warning(f"{channel}:{error.reason}", "rejected a message on %s: %s", channel, error)
@@ -327,7 +329,7 @@ class Loop:
         if outputs:
             self.send(outputs)
 
-    def note(self, kind: Kind, channel: str, data: bytes, now: Instant) -> None:
+    def note(self, kind: RecordKind, channel: str, data: bytes, now: Instant) -> None:
         """Have the journal note a request with which something else is done than handing it to the core.
 
         All of it: what was said to it is to be said again.

@@ -19,7 +19,7 @@ from modelserver.geometry import names
 from modelserver.localization.interface import Localizer
 from modelserver.messages import NAN, Decision, Envelope, Event, Policy, PublishDecisions, Rejected, TimeQuery
 from modelserver.service.daemon import Vehicle
-from modelserver.service.heard import Heard
+from modelserver.service.heard import SensorChannel
 from modelserver.service.requests.gate import MODE_TYPE
 from modelserver.spatial.so3 import Quaternion
 from modelserver.wire.codec import decode
@@ -32,7 +32,7 @@ _NO_ROTATION: Final = (NAN, NAN, NAN, NAN)
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class TrackRow:
     """Where a frame was estimated to be: UTM easting and northing, height above the ellipsoid, metres; nan = no pose.
 
     `rotation` turns the frame's axes to grid east, grid north, up. `invalid` are the reason bits.
@@ -54,7 +54,7 @@ class Row:
 
 
 @dataclass(slots=True)
-class Run:
+class OfflineRun:
     """One pass through a recording. Iterate `rows`; the counts fill on the way.
 
     `events` counts all events of the log, `samples` those that the core was given, `unheard` the channels that the
@@ -81,7 +81,7 @@ class Run:
     def __post_init__(self) -> None:
         self.vehicle.model.get_transformation(self.frame, self.vehicle.config.base_frame)
 
-    def rows(self, times: Iterable[int] | None, rate_hz: float = 50.0) -> Iterator[Row]:
+    def rows(self, times: Iterable[int] | None, rate_hz: float = 50.0) -> Iterator[TrackRow]:
         """Yield the estimate at each of `times`, in their order; without them at an even rate while the log lasts.
 
         Times must not fall. The even rate's first time is that of the log's first event.
@@ -110,7 +110,7 @@ class Run:
         state = self.vehicle.core(now)
         return state._replace(settings=replace(state.settings, publish_decisions=self.on_decision is not None))
 
-    def _take(self, event: LogEvent, heard: Heard | None) -> None:
+    def _take(self, event: LogEvent, heard: SensorChannel | None) -> None:
         assert self._state is not None
         self.events += 1
         self.position = event.end
@@ -140,18 +140,18 @@ class Run:
         """What is known after the events read so far; None before the first."""
         return None if self._state is None else self._state.localizer
 
-    def _row(self, utime: int) -> Row:
+    def _row(self, utime: int) -> TrackRow:
         assert self._state is not None
         try:
             answer = self._state.view.transformation(self.frame, names.WORLD_UTM, TimeQuery(utime, Policy.PREDICTED))
         except (NoPoseError, TooOldError, TooNewError):
             localizer = self._state.localizer
-            return Row(utime, invalid=0 if localizer is None else int(localizer.estimate(utime).invalid))
+            return TrackRow(utime, invalid=0 if localizer is None else int(localizer.estimate(utime).invalid))
         found, origin = answer.transformation, answer.origin
         if origin is None:
-            return Row(utime, invalid=int(found.invalid_reasons))
+            return TrackRow(utime, invalid=int(found.invalid_reasons))
         x, y, z = found.pose.xyz
-        return Row(
+        return TrackRow(
             utime,
             origin.easting + x,
             origin.northing + y,
@@ -162,7 +162,7 @@ class Run:
         )
 
 
-def _unsealed(event: LogEvent, channels: Mapping[str, Heard]) -> LogEvent:
+def _unsealed(event: LogEvent, channels: Mapping[str, SensorChannel]) -> LogEvent:
     """Return the wish for a mode in an envelope as if it had come by itself; any other event as it is.
 
     Whether it was signed well is not asked again: a recording has no key.

@@ -14,7 +14,7 @@ from typing import Final, Protocol
 from modelserver.core import Instant
 from modelserver.messages import Rejected
 from modelserver.service.journal.queue import Heard
-from modelserver.wire.journal import Kind
+from modelserver.wire.journal import RecordKind
 
 A_SECOND: Final = 8
 """Messages of a channel a second whose bytes are noted, and refusals of one cause a second that are told singly."""
@@ -28,7 +28,7 @@ SECOND_NS: Final = 1_000_000_000
 class Noting(Protocol):
     """The part of a journal that is told of messages that the core is not handed."""
 
-    def note(self, kind: Kind, heard: Heard, now: Instant) -> None:
+    def note(self, kind: RecordKind, heard: Heard, now: Instant) -> None:
         """Note a message, and what is done with it."""
         ...
 
@@ -64,7 +64,7 @@ class Unused:
         self._waiting: dict[tuple[str, str], int] = {}
         self._told_ns = 0
 
-    def note(self, kind: Kind, channel: str, data: bytes, now: Instant) -> None:
+    def note(self, kind: RecordKind, channel: str, data: bytes, now: Instant) -> None:
         """Have the journal keep how a message begins, while the channel's budget lasts."""
         if self._noted.grants(channel, now.monotonic_ns):
             self._journal.note(kind, (channel, data[:MOST_NOTED]), now)
@@ -73,7 +73,7 @@ class Unused:
         """Have the core count a message: now, or where many come, with `tell`."""
         self._count((channel, reason), now)
 
-    def drop(self, kind: Kind, channel: str, reason: str, data: bytes, now: Instant) -> None:
+    def drop(self, kind: RecordKind, channel: str, reason: str, data: bytes, now: Instant) -> None:
         """Count a message and note it, within the budgets; beyond them this costs a microsecond."""
         if self._count((channel, reason), now):
             self.note(kind, channel, data, now)

@@ -21,7 +21,7 @@ AGO_S: Final = 5.0
 """A second writer whose stamps lie this far in the past plays a recording."""
 
 
-class Watch:
+class PublisherMonitor:
     """Watches the sensors' channels. `shared` names those where several sources speak: each is watched by itself.
 
     `step` hands the core an event, `count` has it count a sample that is used by channel and reason; whoever ignores

@@ -30,20 +30,19 @@ from modelserver.simulation.scenario import Event, Simulation, Truth
 from modelserver.simulation.side_slip import SideSlip
 from modelserver.simulation.stamps import Timing
 from modelserver.simulation.terrain import Terrain, Wave
-from modelserver.simulation.trajectory import Drive, Motion, Phase, Trajectory
+from modelserver.simulation.trajectory import DrivePhase, MotionModel, Trajectory, TrajectoryMotion
 from modelserver.simulation.triad import TriadModel
 from modelserver.simulation.wheels import StatusModel, WheelsModel
 
 __all__ = [
     "AbsolutePoseModel",
-    "Drive",
+    "DrivePhase",
     "EncoderModel",
     "Event",
     "GpsModel",
     "ImuModel",
     "MagnetometerModel",
-    "Motion",
-    "Phase",
+    "MotionModel",
     "RangeModel",
     "RelativePoseModel",
     "Ride",
@@ -53,6 +52,7 @@ __all__ = [
     "Terrain",
     "Timing",
     "Trajectory",
+    "TrajectoryMotion",
     "TriadModel",
     "Truth",
     "Wave",

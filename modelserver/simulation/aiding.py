@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from modelserver.earth.geodesy import Geodesy
 from modelserver.messages import AbsolutePoseSample, RangeSample, RelativePoseSample
 from modelserver.simulation import rigid
-from modelserver.simulation.noise import Noise
+from modelserver.simulation.noise import NoiseSource
 from modelserver.simulation.stamps import Intervals, Timing, headers, within
-from modelserver.simulation.trajectory import Drive
+from modelserver.simulation.trajectory import MotionModel
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Vector3
@@ -77,7 +77,7 @@ class RangeModel:
 
 def absolute_poses(
     model: AbsolutePoseModel,
-    drive: Drive,
+    drive: MotionModel,
     frame: str,
     X_VF: Pose,
     geodesy: Geodesy,
@@ -86,9 +86,9 @@ def absolute_poses(
     source: str,
 ) -> Iterator[AbsolutePoseSample]:
     """Yield the samples, for ever. `X_VF` is the pose of `frame` in the vehicle's moving frame."""
-    noise = Noise(seed, f"absolute/{source}").draw_ahead()
+    noise = NoiseSource(seed, f"absolute/{source}").draw_ahead()
     covariance = _covariance(model.position_sigma, model.orientation_sigma)
-    arrival = Noise(seed, f"absolute/{source}/arrival")
+    arrival = NoiseSource(seed, f"absolute/{source}/arrival")
     for header in headers(model.timing, start_utime, start_utime - 1_000_000, source, arrival):
         shift, turn = noise.vector(model.position_sigma), noise.vector(model.orientation_sigma)
         t = (header.utime - start_utime) * 1e-6
@@ -109,13 +109,13 @@ def absolute_poses(
 
 
 def relative_poses(
-    model: RelativePoseModel, drive: Drive, frame: str, X_VF: Pose, start_utime: int, seed: int, source: str
+    model: RelativePoseModel, drive: MotionModel, frame: str, X_VF: Pose, start_utime: int, seed: int, source: str
 ) -> Iterator[RelativePoseSample]:
     """Yield the samples, for ever; the first at the second instant. `X_VF` is as in `absolute_poses`."""
-    noise = Noise(seed, f"relative/{source}").draw_ahead()
+    noise = NoiseSource(seed, f"relative/{source}").draw_ahead()
     scale = 1.0 + noise.normal(model.scale_sigma)
     covariance = _covariance(model.position_sigma, model.orientation_sigma)
-    arrival = Noise(seed, f"relative/{source}/arrival")
+    arrival = NoiseSource(seed, f"relative/{source}/arrival")
     since: int | None = None
     before = Pose()
     for header in headers(model.timing, start_utime, start_utime - 1_000_000, source, arrival):
@@ -131,7 +131,7 @@ def relative_poses(
 
 def ranges(
     model: RangeModel,
-    drive: Drive,
+    drive: MotionModel,
     frame: str,
     lever: Vector3,
     beacons: Mapping[str, Vector3],
@@ -143,10 +143,10 @@ def ranges(
 
     `lever` is the place of `frame` in the vehicle's moving frame. `seq` counts samples.
     """
-    noise = Noise(seed, f"range/{source}").draw_ahead()
+    noise = NoiseSource(seed, f"range/{source}").draw_ahead()
     biases = {name: noise.normal(model.bias_sigma) for name in beacons}
     sigma = max(math.hypot(model.sigma, model.bias_sigma), _LEAST)
-    arrival = Noise(seed, f"range/{source}/arrival")
+    arrival = NoiseSource(seed, f"range/{source}/arrival")
     X_VF = Pose(lever)
     seq = 0
     for header in headers(model.timing, start_utime, start_utime - 1_000_000, source, arrival):

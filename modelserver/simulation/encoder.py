@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from modelserver.messages import NAN, Direction, WheelSample
-from modelserver.simulation.noise import Noise, quantised
+from modelserver.simulation.noise import NoiseSource, quantised
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +43,8 @@ class Encoder:
         travel_step: float,
         speed_sigma: float,
         standstill: float,
-        noise: Noise,
-        faults: Noise,
+        noise: NoiseSource,
+        faults: NoiseSource,
     ):
         """Take the model, the wheel's name, its measures as in `WheelsModel`, and where chance comes from.
 

@@ -13,7 +13,7 @@ from dataclasses import fields, replace
 from typing import Any, TypeVar
 
 from modelserver.messages import RelativePoseSample, SensorHeader
-from modelserver.simulation.noise import Noise
+from modelserver.simulation.noise import NoiseSource
 from modelserver.simulation.scenario import Event
 
 _E = TypeVar("_E", bound=Event)
@@ -21,7 +21,7 @@ _E = TypeVar("_E", bound=Event)
 
 def drop(events: Iterable[Event], seed: int, share: float, source: str | None = None) -> Iterator[Event]:
     """Yield the samples without a random `share` of them."""
-    chance = Noise(seed, f"drop/{source}")
+    chance = NoiseSource(seed, f"drop/{source}")
     for event in events:
         if not (_is(event, source) and chance.chance(share)):
             yield event
@@ -51,7 +51,7 @@ def late(
     """
     if not 0.0 <= least <= most < math.inf:
         raise ValueError(f"a delay is finite and not negative, got {least} to {most} s")
-    chance = Noise(seed, f"late/{source}")
+    chance = NoiseSource(seed, f"late/{source}")
     waiting: list[tuple[int, int, Event]] = []
     last: dict[str, int] = {}
     for number, event in enumerate(events):
@@ -74,7 +74,7 @@ def duplicate(
     events: Iterable[Event], seed: int, share: float, source: str | None = None, delay: float = 0.0
 ) -> Iterator[Event]:
     """Yield a random `share` of the samples twice, the second one up to `delay` seconds later."""
-    chance = Noise(seed, f"duplicate/{source}")
+    chance = NoiseSource(seed, f"duplicate/{source}")
     waiting: list[tuple[int, int, Event]] = []
     for number, event in enumerate(events):
         arrival = event.header.host_utime
@@ -90,7 +90,7 @@ def duplicate(
 
 def not_a_number(events: Iterable[Event], seed: int, share: float, source: str | None = None) -> Iterator[Event]:
     """Yield the samples, one number in a random `share` of them nan: any of the sample's own, in vectors too."""
-    chance = Noise(seed, f"nan/{source}")
+    chance = NoiseSource(seed, f"nan/{source}")
     for event in events:
         yield _holed(event, chance) if _is(event, source) and chance.chance(share) else event
 
@@ -129,7 +129,7 @@ def _with(event: _E, **changes: int) -> _E:
     return replace(event, header=header)
 
 
-def _holed(event: Event, chance: Noise) -> Event:
+def _holed(event: Event, chance: NoiseSource) -> Event:
     numbers = [path for each in fields(event) if each.name != "header" for path in _numbers(event, each.name)]
     if not numbers:
         return event

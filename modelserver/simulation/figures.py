@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 
-from modelserver.simulation.noise import Noise
-from modelserver.simulation.trajectory import Phase, Trajectory
+from modelserver.simulation.noise import NoiseSource
+from modelserver.simulation.trajectory import DrivePhase, Trajectory
 
 _QUARTERS = 3.0 * math.pi / 2.0
 """How far each loop of the eight turns: the straights then cross at a right angle."""
 
 
-def straight(speed: float = 2.0, length: float = 30.0, stand: float = 4.0, ramp: float = 3.0) -> tuple[Phase, ...]:
+def straight(speed: float = 2.0, length: float = 30.0, stand: float = 4.0, ramp: float = 3.0) -> tuple[DrivePhase, ...]:
     """Return: stand, drive `length` metres straight ahead, stop, stand as long again.
 
     Speed in m/s, times in seconds; `ramp` is the time to reach the speed and to stop. The direction of
@@ -20,7 +20,7 @@ def straight(speed: float = 2.0, length: float = 30.0, stand: float = 4.0, ramp:
     cruise = length / abs(speed) - ramp
     if cruise <= 0:
         raise ValueError(f"{length:g} m at {speed:g} m/s leave no way between two ramps of {ramp:g} s")
-    return (Phase(stand), Phase(ramp, speed), Phase(cruise), Phase(ramp, 0.0), Phase(stand))
+    return (DrivePhase(stand), DrivePhase(ramp, speed), DrivePhase(cruise), DrivePhase(ramp, 0.0), DrivePhase(stand))
 
 
 def figure_eight(
@@ -31,7 +31,7 @@ def figure_eight(
     ramp: float = 3.0,
     stop: float = 0.0,
     reverse: float = 0.0,
-) -> tuple[Phase, ...]:
+) -> tuple[DrivePhase, ...]:
     """Return: stand, set off, `laps` times round an eight of two loops of `radius` metres, stop, stand.
 
     Speed in m/s, times in seconds. The steering moves between straight and full lock during `ramp`, and so
@@ -48,50 +48,61 @@ def figure_eight(
         raise ValueError(f"a loop of {radius:g} m at {speed:g} m/s is over before {ramp:g} s of steering are")
     # the straights are as long as it takes for the tangents at both ends of a loop to meet in the crossing
     probe = Trajectory(
-        (Phase(ramp, speed), Phase(ramp, curvature=curvature), Phase(hold), Phase(ramp, curvature=0.0), Phase(1.0, 0.0))
+        (
+            DrivePhase(ramp, speed),
+            DrivePhase(ramp, curvature=curvature),
+            DrivePhase(hold),
+            DrivePhase(ramp, curvature=0.0),
+            DrivePhase(1.0, 0.0),
+        )
     )
     (x0, _, _), (x1, _, _) = probe.at(ramp).position, probe.at(3 * ramp + hold).position
     half = (x0 - x1) / (1.0 + math.cos(_QUARTERS)) / speed
     if half <= 0:
         raise ValueError(f"{ramp:g} s of steering are too long for a loop of {radius:g} m at {speed:g} m/s")
 
-    def loop(side: float) -> tuple[Phase, ...]:
-        return (Phase(ramp, curvature=side * curvature), Phase(hold), Phase(ramp, curvature=0.0))
+    def loop(side: float) -> tuple[DrivePhase, ...]:
+        return (DrivePhase(ramp, curvature=side * curvature), DrivePhase(hold), DrivePhase(ramp, curvature=0.0))
 
-    phases = [Phase(stand), Phase(ramp, speed)] if stand > 0 else [Phase(ramp, speed)]
+    phases = [DrivePhase(stand), DrivePhase(ramp, speed)] if stand > 0 else [DrivePhase(ramp, speed)]
     for _ in range(laps):
-        phases += [Phase(half), *loop(1.0), Phase(2.0 * half), *loop(-1.0), Phase(half)]
+        phases += [DrivePhase(half), *loop(1.0), DrivePhase(2.0 * half), *loop(-1.0), DrivePhase(half)]
         if stop > 0 or reverse > 0:
-            phases += [Phase(ramp, 0.0), Phase(max(stop, 1.0))]
+            phases += [DrivePhase(ramp, 0.0), DrivePhase(max(stop, 1.0))]
             if reverse > 0:
-                phases += [Phase(ramp, -speed / 2.0), Phase(reverse), Phase(ramp, 0.0), Phase(max(stop, 1.0))]
-            phases.append(Phase(ramp, speed))
-    phases.append(Phase(ramp, 0.0))
+                phases += [
+                    DrivePhase(ramp, -speed / 2.0),
+                    DrivePhase(reverse),
+                    DrivePhase(ramp, 0.0),
+                    DrivePhase(max(stop, 1.0)),
+                ]
+            phases.append(DrivePhase(ramp, speed))
+    phases.append(DrivePhase(ramp, 0.0))
     if stand > 0:
-        phases.append(Phase(stand))
+        phases.append(DrivePhase(stand))
     return tuple(phases)
 
 
 def there_and_back(
     speed: float = 2.0, length: float = 20.0, stand: float = 4.0, ramp: float = 3.0
-) -> tuple[Phase, ...]:
+) -> tuple[DrivePhase, ...]:
     """Return: stand, drive `length` metres ahead, stop, stand, back up to the start, stand."""
     return straight(speed, length, stand, ramp) + straight(-speed, length, stand, ramp)[1:]
 
 
 def reverse_eight(
     speed: float = 2.0, radius: float = 8.0, stand: float = 4.0, laps: int = 1, ramp: float = 3.0
-) -> tuple[Phase, ...]:
+) -> tuple[DrivePhase, ...]:
     """Return `figure_eight` driven backward from the start on; `speed` is its size."""
     return tuple(
-        Phase(phase.duration, None if phase.speed is None else -phase.speed, phase.curvature)
+        DrivePhase(phase.duration, None if phase.speed is None else -phase.speed, phase.curvature)
         for phase in figure_eight(speed, radius, stand, laps, ramp)
     )
 
 
-def stand(seconds: float) -> tuple[Phase, ...]:
+def stand(seconds: float) -> tuple[DrivePhase, ...]:
     """Return: stand."""
-    return (Phase(seconds),)
+    return (DrivePhase(seconds),)
 
 
 def stop_and_go(
@@ -101,15 +112,15 @@ def stop_and_go(
     times: int = 5,
     ramp: float = 2.0,
     curvature: float = 0.0,
-) -> tuple[Phase, ...]:
+) -> tuple[DrivePhase, ...]:
     """Return: stand, then `times` over set off, go on for `go` seconds, stop, stand for `stop` seconds.
 
     `curvature` (1/m) is that of every going, to either side in turn.
     """
-    phases = [Phase(stop)]
+    phases = [DrivePhase(stop)]
     for number in range(times):
         side = curvature if number % 2 == 0 else -curvature
-        phases += [Phase(ramp, speed, side), Phase(go), Phase(ramp, 0.0, 0.0), Phase(stop)]
+        phases += [DrivePhase(ramp, speed, side), DrivePhase(go), DrivePhase(ramp, 0.0, 0.0), DrivePhase(stop)]
     return tuple(phases)
 
 
@@ -120,7 +131,7 @@ _PUSH = 1.5
 """m/s2, on average, with which he sets off and stops at most."""
 
 
-def city(seed: int, seconds: float = 120.0, speed: float = 6.0, tightest: float = 6.0) -> tuple[Phase, ...]:
+def city(seed: int, seconds: float = 120.0, speed: float = 6.0, tightest: float = 6.0) -> tuple[DrivePhase, ...]:
     """Return a random drive of `seconds`: straights, turns either way, stops, backing up; at rest at both ends.
 
     `speed` is the largest in m/s, `tightest` the smallest radius in metres. The same seed gives the same drive.
@@ -128,38 +139,42 @@ def city(seed: int, seconds: float = 120.0, speed: float = 6.0, tightest: float 
     """
     if not (seconds >= 20.0 and speed > 0 and tightest > 0):
         raise ValueError(f"a drive in town takes 20 s, a speed and a radius, got {seconds}, {speed}, {tightest}")
-    chance = Noise(seed, "city")
-    phases = [Phase(chance.uniform(2.0, 4.0))]
+    chance = NoiseSource(seed, "city")
+    phases = [DrivePhase(chance.uniform(2.0, 4.0))]
     left = seconds - phases[0].duration
     now = 0.0
 
-    def to(target: float) -> Phase:
+    def to(target: float) -> DrivePhase:
         """Reach a speed; how hard differs from time to time."""
-        return Phase(max(1.5, abs(target - now) / chance.uniform(0.5 * _PUSH, _PUSH)), target)
+        return DrivePhase(max(1.5, abs(target - now) / chance.uniform(0.5 * _PUSH, _PUSH)), target)
 
     while True:
-        part: list[Phase] = []
+        part: list[DrivePhase] = []
         end = now
         kind = chance.index(6) if now else 5
         if kind == 4:
-            part, end = [to(0.0), Phase(chance.uniform(1.0, 6.0))], 0.0
+            part, end = [to(0.0), DrivePhase(chance.uniform(1.0, 6.0))], 0.0
         elif kind == 3:
             back = -chance.uniform(0.2, 0.4) * speed
             bend = chance.uniform(-1.0, 1.0) / tightest
-            part = [to(0.0), Phase(chance.uniform(0.5, 2.0)), Phase(2.0, back, bend)]
-            part += [Phase(chance.uniform(1.0, 5.0)), Phase(2.0, 0.0, 0.0), Phase(chance.uniform(0.5, 2.0))]
+            part = [to(0.0), DrivePhase(chance.uniform(0.5, 2.0)), DrivePhase(2.0, back, bend)]
+            part += [
+                DrivePhase(chance.uniform(1.0, 5.0)),
+                DrivePhase(2.0, 0.0, 0.0),
+                DrivePhase(chance.uniform(0.5, 2.0)),
+            ]
             end = 0.0
         elif kind in (1, 2):
             bend = math.copysign(1.0, chance.uniform(-1.0, 1.0)) / (tightest * chance.uniform(1.0, 4.0))
             slow = min(now, math.sqrt(_LATERAL / abs(bend)))
             # the steering alone turns by half of what it does at full lock
             hold = max(chance.uniform(0.3, 2.0) / (abs(bend) * slow) - 1.5, 0.2)
-            part, end = [to(slow), Phase(1.5, None, bend), Phase(hold), Phase(1.5, None, 0.0)], slow
+            part, end = [to(slow), DrivePhase(1.5, None, bend), DrivePhase(hold), DrivePhase(1.5, None, 0.0)], slow
         elif kind == 0:
-            part = [Phase(chance.uniform(1.0, 6.0))]
+            part = [DrivePhase(chance.uniform(1.0, 6.0))]
         else:
             end = chance.uniform(0.4, 1.0) * speed
-            part = [to(end), Phase(chance.uniform(0.5, 4.0))]
+            part = [to(end), DrivePhase(chance.uniform(0.5, 4.0))]
         # what is left must do to stop
         if sum(phase.duration for phase in part) + end / (0.5 * _PUSH) + 2.0 > left:
             break
@@ -168,6 +183,6 @@ def city(seed: int, seconds: float = 120.0, speed: float = 6.0, tightest: float 
         now = end
     if now:
         stopping = max(1.5, now / (0.5 * _PUSH))
-        phases.append(Phase(stopping, 0.0))
+        phases.append(DrivePhase(stopping, 0.0))
         left -= stopping
-    return (*phases, Phase(left))
+    return (*phases, DrivePhase(left))

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from modelserver.earth.geodesy import Geodesy, LocalFrame
 from modelserver.messages import NAN, FixType, GpsSample
 from modelserver.simulation import rigid
-from modelserver.simulation.noise import GaussMarkov, Noise, diagonal
+from modelserver.simulation.noise import GaussMarkov, NoiseSource, diagonal
 from modelserver.simulation.stamps import Intervals, Timing, headers, within
-from modelserver.simulation.trajectory import Drive
+from modelserver.simulation.trajectory import MotionModel
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Vector3
@@ -72,7 +72,7 @@ class GpsModel:
 
 def fixes(
     model: GpsModel,
-    drive: Drive,
+    drive: MotionModel,
     X_VA: Pose,
     geodesy: Geodesy,
     start_utime: int,
@@ -85,9 +85,9 @@ def fixes(
     Position is true on the ellipsoid; velocity is along true east, north and up of the antenna's own place.
     `second` is the place of a second antenna in the vehicle's moving frame, None for none.
     """
-    noise = Noise(seed, f"gps/{source}").draw_ahead()
-    again = Noise(seed, f"gps/{source}/duplicates")
-    baseline_noise = Noise(seed, f"gps/{source}/baseline")
+    noise = NoiseSource(seed, f"gps/{source}").draw_ahead()
+    again = NoiseSource(seed, f"gps/{source}/duplicates")
+    baseline_noise = NoiseSource(seed, f"gps/{source}/baseline")
     baseline = None
     if second is not None:
         baseline = (second[0] - X_VA.xyz[0], second[1] - X_VA.xyz[1], second[2] - X_VA.xyz[2])
@@ -97,7 +97,7 @@ def fixes(
     velocity_sigma = max(model.velocity_sigma, _LEAST_SIGMA) * model.stated_factor
     position_covariance = diagonal(*(position_sigma * scale for scale in scales)) if model.tells_covariance else None
     velocity_covariance = diagonal(*(velocity_sigma * scale for scale in scales)) if model.tells_covariance else None
-    stamps = headers(model.timing, start_utime, GPS_EPOCH, source, Noise(seed, f"gps/{source}/arrival"))
+    stamps = headers(model.timing, start_utime, GPS_EPOCH, source, NoiseSource(seed, f"gps/{source}/arrival"))
     for header in stamps:
         # drawn for fixes in an outage too, so that an outage leaves the later fixes as they were
         error = [

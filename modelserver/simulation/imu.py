@@ -15,10 +15,10 @@ from modelserver.earth import gravity as earth
 from modelserver.earth.geodesy import Geodesy, about_up
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.simulation import rigid
-from modelserver.simulation.magnetometer import Magnetometer, MagnetometerModel
-from modelserver.simulation.noise import Noise, diagonal, quantised
+from modelserver.simulation.magnetometer import MagnetometerModel, SimulatedMagnetometer
+from modelserver.simulation.noise import NoiseSource, diagonal, quantised
 from modelserver.simulation.stamps import Intervals, Timing, headers, within
-from modelserver.simulation.trajectory import Drive
+from modelserver.simulation.trajectory import MotionModel
 from modelserver.simulation.triad import Triad, TriadModel
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
@@ -95,14 +95,16 @@ class ImuModel:
 
 
 def readings(
-    model: ImuModel, drive: Drive, X_VS: Pose, geodesy: Geodesy, start_utime: int, seed: int, source: str
+    model: ImuModel, drive: MotionModel, X_VS: Pose, geodesy: Geodesy, start_utime: int, seed: int, source: str
 ) -> Iterator[ImuSample]:
     """Yield the samples, for ever. `X_VS` is the pose of the unit's own axes in the vehicle's moving frame.
 
     Gravity is normal gravity at the origin, along the up of its tangent plane: a hundred metres away the vertical of
     the place leans by 16 microradians from it, which no such unit can tell.
     """
-    stamps = headers(model.timing, start_utime, start_utime - 1_000_000, source, Noise(seed, f"imu/{source}/arrival"))
+    stamps = headers(
+        model.timing, start_utime, start_utime - 1_000_000, source, NoiseSource(seed, f"imu/{source}/arrival")
+    )
     unit = _Unit(model, drive, X_VS, geodesy, seed, source)
     last: ImuSample | None = None
     for header in stamps:
@@ -118,7 +120,7 @@ def readings(
 class _Unit:
     """The unit at work: what is drawn once, and what drifts."""
 
-    def __init__(self, model: ImuModel, drive: Drive, X_VS: Pose, geodesy: Geodesy, seed: int, source: str):
+    def __init__(self, model: ImuModel, drive: MotionModel, X_VS: Pose, geodesy: Geodesy, seed: int, source: str):
         latitude, _, height = geodesy.geodetic_from_enu((0.0, 0.0, 0.0))
         self.model = model
         self.drive = drive
@@ -126,7 +128,7 @@ class _Unit:
         self.lever = X_VS.xyz
         self.up = earth.gravity(latitude, height)
         self.turning = earth.rotation(latitude) if model.earth_rotation else (0.0, 0.0, 0.0)
-        noise = Noise(seed, f"imu/{source}")
+        noise = NoiseSource(seed, f"imu/{source}")
         rate = model.timing.rate_hz
         self.gyro_bias = noise.vector(model.gyro_bias_sigma)
         self.accelerometer_bias = noise.vector(model.accelerometer_bias_sigma)
@@ -141,7 +143,7 @@ class _Unit:
         orientation_sigma = max(math.hypot(model.tilt_sigma, model.tilt_noise), 1e-4)
         # a yaw that starts anywhere has the variance of a uniform one
         yaw_sigma = math.pi / math.sqrt(3.0)
-        self.yaw_noise = Noise(seed, f"imu/{source}/yaw")
+        self.yaw_noise = NoiseSource(seed, f"imu/{source}/yaw")
         if model.yaw_source is not YawSource.NONE:
             self.yaw_error = (model.yaw_offset or 0.0) + self.yaw_noise.normal(model.yaw_sigma)
             yaw_sigma = max(math.hypot(model.yaw_sigma, model.yaw_noise), 1e-4)
@@ -149,16 +151,16 @@ class _Unit:
         self.force_covariance = _axes(max(math.hypot(self.accelerometer_sigma, model.accelerometer_bias_sigma), 1e-6))
         self.orientation_covariance = diagonal(orientation_sigma, orientation_sigma, yaw_sigma)
         # None costs nothing: most units are without
-        self.gyro = None if model.gyro == _SOUND else Triad(model.gyro, rate, Noise(seed, f"imu/{source}/gyro"))
+        self.gyro = None if model.gyro == _SOUND else Triad(model.gyro, rate, NoiseSource(seed, f"imu/{source}/gyro"))
         self.accelerometer = (
             None
             if model.accelerometer == _SOUND
-            else Triad(model.accelerometer, rate, Noise(seed, f"imu/{source}/accelerometer"))
+            else Triad(model.accelerometer, rate, NoiseSource(seed, f"imu/{source}/accelerometer"))
         )
         self.magnetometer = (
             None
             if model.magnetometer is None
-            else Magnetometer(model.magnetometer, Noise(seed, f"imu/{source}/magnetometer"))
+            else SimulatedMagnetometer(model.magnetometer, NoiseSource(seed, f"imu/{source}/magnetometer"))
         )
 
     def sample(self, header: SensorHeader, t: float) -> ImuSample:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from modelserver.simulation.noise import Noise
+from modelserver.simulation.noise import NoiseSource
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import Quaternion, Vector3
 
@@ -33,12 +33,12 @@ class MagnetometerModel:
     disturbances: tuple[tuple[float, float, Vector3], ...] = ()
 
 
-class Magnetometer:
+class SimulatedMagnetometer:
     """A magnetometer at work."""
 
     __slots__ = ("_model", "_noise")
 
-    def __init__(self, model: MagnetometerModel, noise: Noise):
+    def __init__(self, model: MagnetometerModel, noise: NoiseSource):
         """Take the model and a source of noise of its own."""
         self._model = model
         self._noise = noise.draw_ahead()

@@ -12,7 +12,7 @@ from modelserver.spatial.so3 import Vector3
 _BLOCK = 512
 
 
-class Noise:
+class NoiseSource:
     """Normally distributed numbers of one source: the same seed and name give the same ones."""
 
     __slots__ = ("_ahead", "_random")
@@ -22,7 +22,7 @@ class Noise:
         self._random = np.random.default_rng([seed, *name.encode()])
         self._ahead: Iterator[float] | None = None
 
-    def draw_ahead(self) -> Noise:
+    def draw_ahead(self) -> NoiseSource:
         """Return itself, from now on drawing normal numbers many at a time: the same ones at a fifth of the cost.
 
         Other draws would come out of their order then and are refused.
@@ -82,7 +82,7 @@ class GaussMarkov:
 
     __slots__ = ("_dt", "_fresh", "_keep", "_noise", "sigma", "time_constant", "value")
 
-    def __init__(self, sigma: float, time_constant: float, noise: Noise):
+    def __init__(self, sigma: float, time_constant: float, noise: NoiseSource):
         self.sigma = sigma
         self.time_constant = time_constant
         self._noise = noise

@@ -10,14 +10,14 @@ import math
 
 from modelserver.simulation.side_slip import SideSlip, SlipAngle
 from modelserver.simulation.terrain import Rise, Terrain
-from modelserver.simulation.trajectory import Attitude, Drive, Motion, Trajectory
+from modelserver.simulation.trajectory import Attitude, MotionModel, Trajectory, TrajectoryMotion
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import Vector3
 
 
 def ride(
     trajectory: Trajectory, terrain: Terrain | None = None, side_slip: SideSlip | None = None, seed: int = 1
-) -> Drive:
+) -> MotionModel:
     """Return the drive: the trajectory itself on level ground without slip."""
     if terrain is None and side_slip is None:
         return trajectory
@@ -35,7 +35,7 @@ class Ride:
         self._terrain = terrain
         self._slip = None if side_slip is None else SlipAngle(side_slip, seed)
 
-    def at(self, t: float) -> Motion:
+    def at(self, t: float) -> TrajectoryMotion:
         """Return the motion `t` seconds after the start."""
         plan = self._trajectory.at(t)
         turn = (plan.yaw, plan.yaw_rate, plan.yaw_acceleration)
@@ -49,7 +49,7 @@ class Ride:
         ax, ay, _ = plan.acceleration
         push = ax * cos + ay * sin
         if self._terrain is None:
-            return Motion(
+            return TrajectoryMotion(
                 plan.position,
                 plan.velocity,
                 plan.acceleration,
@@ -68,7 +68,7 @@ class Ride:
         z, vz, az = ground.height
         # forward is (cos, sin, ahead) / length; along the ground to the left a way is longer than over the plan
         left = across * slope.steepness / slope.length
-        return Motion(
+        return TrajectoryMotion(
             (plan.position[0], plan.position[1], z),
             (plan.velocity[0], plan.velocity[1], vz),
             (ax, ay, az),

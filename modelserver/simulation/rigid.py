@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from modelserver.simulation.trajectory import Motion
+from modelserver.simulation.trajectory import TrajectoryMotion
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Quaternion, Vector3
 
 
-def orientation(motion: Motion) -> Quaternion:
+def orientation(motion: TrajectoryMotion) -> Quaternion:
     """Return the quaternion that turns the vehicle's axes to east, north, up."""
     if motion.attitude is not None:
         return motion.attitude.wxyz
@@ -18,19 +18,19 @@ def orientation(motion: Motion) -> Quaternion:
     return (math.cos(half), 0.0, 0.0, math.sin(half))
 
 
-def pose(motion: Motion, X_VP: Pose) -> Pose:
+def pose(motion: TrajectoryMotion, X_VP: Pose) -> Pose:
     """Return the pose, along east, north, up, of a frame that stands at `X_VP` in the vehicle's moving frame."""
     return Pose(motion.position, orientation(motion)) @ X_VP
 
 
-def angular_rate(motion: Motion) -> Vector3:
+def angular_rate(motion: TrajectoryMotion) -> Vector3:
     """Return the angular rate along east, north, up, rad/s."""
     if motion.attitude is not None:
         return so3.rotate(motion.attitude.wxyz, motion.attitude.rate)
     return (0.0, 0.0, motion.yaw_rate)
 
 
-def velocity(motion: Motion, lever: Vector3) -> Vector3:
+def velocity(motion: TrajectoryMotion, lever: Vector3) -> Vector3:
     """Return the velocity, east, north, up, of the point at `lever` in the vehicle's moving frame."""
     vx, vy, vz = motion.velocity
     if motion.attitude is not None:
@@ -41,7 +41,7 @@ def velocity(motion: Motion, lever: Vector3) -> Vector3:
     return (vx - w * y, vy + w * x, vz)
 
 
-def acceleration(motion: Motion, lever: Vector3) -> Vector3:
+def acceleration(motion: TrajectoryMotion, lever: Vector3) -> Vector3:
     """Return the acceleration, east, north, up, of the point at `lever` in the vehicle's moving frame."""
     ax, ay, az = motion.acceleration
     if motion.attitude is not None:

@@ -25,7 +25,7 @@ from modelserver.simulation.imu import ImuModel
 from modelserver.simulation.ride import ride
 from modelserver.simulation.side_slip import SideSlip
 from modelserver.simulation.terrain import Terrain
-from modelserver.simulation.trajectory import Drive, Trajectory
+from modelserver.simulation.trajectory import MotionModel, Trajectory
 from modelserver.simulation.wheels import StatusModel, WheelsModel
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.so3 import Vector3, conjugate, rotate
@@ -115,7 +115,7 @@ class Simulation:
             return model.get_transformation(frame, rolling).pose
 
         self.trajectory = trajectory
-        self.drive: Drive = ride(trajectory, terrain, side_slip, seed)
+        self.drive: MotionModel = ride(trajectory, terrain, side_slip, seed)
         """The trajectory as it is driven: on its ground and with its side slip."""
         self.geodesy = Geodesy(origin)
         self.start_utime = start_utime

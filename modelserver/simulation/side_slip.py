@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from modelserver.simulation.noise import Noise
-from modelserver.simulation.trajectory import Motion
+from modelserver.simulation.noise import NoiseSource
+from modelserver.simulation.trajectory import TrajectoryMotion
 from modelserver.spatial.so3 import Vector3
 
 
@@ -38,7 +38,7 @@ class SlipAngle:
 
     def __init__(self, model: SideSlip, seed: int):
         """Take the model and the seed of its sines."""
-        noise = Noise(seed, "side slip")
+        noise = NoiseSource(seed, "side slip")
         amplitude = model.wander_sigma * math.sqrt(2.0 / model.count)
         shortest, longest = map(math.log, model.periods)
         self._cornering = model.cornering
@@ -48,7 +48,7 @@ class SlipAngle:
             for _ in range(model.count if amplitude else 0)
         ]
 
-    def at(self, t: float, motion: Motion, higher: Vector3) -> Vector3:
+    def at(self, t: float, motion: TrajectoryMotion, higher: Vector3) -> Vector3:
         """Return the angle in radians and its first and second rate at `t` seconds.
 
         `motion` is that of the trajectory then, and `higher` what `Trajectory.higher_rates` says.

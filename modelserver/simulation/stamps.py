@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from modelserver.messages import SensorHeader
-from modelserver.simulation.noise import Noise
+from modelserver.simulation.noise import NoiseSource
 
 Intervals: TypeAlias = tuple[tuple[float, float], ...]
 """Seconds since the start, from and to."""
@@ -35,7 +35,9 @@ class Timing:
             raise ValueError(f"a rate is above 0 and at most 10000 Hz, a latency not negative; got {self}")
 
 
-def headers(timing: Timing, start_utime: int, device_epoch: int, source: str, noise: Noise) -> Iterator[SensorHeader]:
+def headers(
+    timing: Timing, start_utime: int, device_epoch: int, source: str, noise: NoiseSource
+) -> Iterator[SensorHeader]:
     """Yield the header of each sample, for ever; the first is taken at `start_utime`.
 
     `device_epoch` is the utime at which the device's own clock shows 0.

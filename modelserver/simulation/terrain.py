@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from modelserver.simulation.noise import Noise
+from modelserver.simulation.noise import NoiseSource
 from modelserver.spatial.so3 import Vector3
 
 
@@ -62,7 +62,7 @@ class Terrain:
         cls, seed: int, steepness: float = 0.05, count: int = 4, lengths: tuple[float, float] = (20.0, 120.0)
     ) -> Terrain:
         """Return waves of random direction, phase and length whose slope has the root mean square `steepness`."""
-        noise = Noise(seed, "terrain")
+        noise = NoiseSource(seed, "terrain")
         waves = []
         for _ in range(count):
             length = math.exp(noise.uniform(math.log(lengths[0]), math.log(lengths[1])))

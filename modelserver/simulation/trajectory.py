@@ -33,7 +33,7 @@ _NODES: tuple[tuple[float, float], ...] = tuple(
 
 
 @dataclass(frozen=True, slots=True)
-class Phase:
+class DrivePhase:
     """A stretch of a drive: what speed and curvature are reached at its end; None keeps the one there is.
 
     `duration` in seconds. `speed` is forward, m/s; below 0 the vehicle backs up. `curvature` is 1/m, to the
@@ -57,7 +57,7 @@ class Attitude(NamedTuple):
     acceleration: Vector3
 
 
-class Motion(NamedTuple):
+class TrajectoryMotion(NamedTuple):
     """The vehicle at one instant: the point that drives the trajectory, and how the vehicle turns.
 
     `position`, `velocity`, `acceleration` along east, north, up. `yaw` is counter-clockwise from east and not
@@ -82,10 +82,10 @@ class Motion(NamedTuple):
     attitude: Attitude | None = None
 
 
-class Drive(Protocol):
+class MotionModel(Protocol):
     """Whatever tells the vehicle's motion at any time."""
 
-    def at(self, t: float) -> Motion:
+    def at(self, t: float) -> TrajectoryMotion:
         """Return the motion `t` seconds after the start."""
 
 
@@ -97,7 +97,7 @@ class Trajectory:
 
     __slots__ = ("_pieces", "_starts", "duration")
 
-    def __init__(self, phases: Iterable[Phase], start: tuple[float, float] = (0.0, 0.0), yaw: float = 0.0):
+    def __init__(self, phases: Iterable[DrivePhase], start: tuple[float, float] = (0.0, 0.0), yaw: float = 0.0):
         """Take the phases, and where the drive starts: east and north in metres, yaw in radians."""
         self._pieces: list[_Piece] = []
         self._starts: list[float] = []
@@ -124,14 +124,14 @@ class Trajectory:
         if speed != 0.0:
             raise ValueError(f"a drive ends at rest, this one at {speed:g} m/s: add a phase with speed 0")
 
-    def at(self, t: float) -> Motion:
+    def at(self, t: float) -> TrajectoryMotion:
         """Return the motion `t` seconds after the start."""
         t = min(max(t, 0.0), self.duration)
         index = max(bisect_right(self._starts, t) - 1, 0)
         return self._pieces[index].at(t - self._starts[index])
 
     def higher_rates(self, t: float) -> Vector3:
-        """Return what `Motion` leaves out: the rate and second rate of curvature, 1/m/s and 1/m/s2, and jerk, m/s3.
+        """Return what `TrajectoryMotion` leaves out: rate and second rate of curvature (1/m/s, 1/m/s2), jerk (m/s3).
 
         Jerk is the second rate of forward speed.
         """
@@ -197,7 +197,7 @@ class _Piece:
             y += way * math.sin(angle)
         return (x, y)
 
-    def at(self, t: float) -> Motion:
+    def at(self, t: float) -> TrajectoryMotion:
         u = t / self.duration
         steps = len(self.knots) - 1
         knot = min(int(u * steps), steps - 1)
@@ -207,7 +207,7 @@ class _Piece:
         yaw = _value(self.yaw, u)
         yaw_rate = _value(self.yaw_rate, u)
         cos, sin = math.cos(yaw), math.sin(yaw)
-        return Motion(
+        return TrajectoryMotion(
             (x, y, 0.0),
             (v * cos, v * sin, 0.0),
             (rate * cos - v * yaw_rate * sin, rate * sin + v * yaw_rate * cos, 0.0),

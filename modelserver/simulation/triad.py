@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from modelserver.simulation.noise import GaussMarkov, Noise
+from modelserver.simulation.noise import GaussMarkov, NoiseSource
 from modelserver.spatial.so3 import Vector3
 
 _MOVING = 0.05
@@ -35,7 +35,7 @@ class Triad:
 
     __slots__ = ("_drift", "_instability", "_model", "_noise", "_period", "_rows", "_walk")
 
-    def __init__(self, model: TriadModel, rate_hz: float, noise: Noise):
+    def __init__(self, model: TriadModel, rate_hz: float, noise: NoiseSource):
         """Take the model, samples a second, and a source of noise of its own."""
         self._model = model
         self._noise = noise.draw_ahead()

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 from modelserver.messages import VehicleMode, VehicleStatusSample, WheelsSample
 from modelserver.simulation.encoder import Encoder, EncoderModel
-from modelserver.simulation.noise import Noise
+from modelserver.simulation.noise import NoiseSource
 from modelserver.simulation.stamps import Timing, headers
-from modelserver.simulation.trajectory import Drive, Motion, Trajectory
+from modelserver.simulation.trajectory import MotionModel, Trajectory, TrajectoryMotion
 from modelserver.spatial.so3 import Vector3
 
 _GRAVITY = 9.81
@@ -56,7 +56,7 @@ class WheelsModel:
 
 def turns(
     model: WheelsModel,
-    drive: Drive,
+    drive: MotionModel,
     contacts: Mapping[str, Vector3],
     start_utime: int,
     seed: int,
@@ -66,7 +66,7 @@ def turns(
 
     A wheel rolls by what its contact point moves along it: side slip it does not see, a slope it follows.
     """
-    noise = Noise(seed, f"wheels/{source}")
+    noise = NoiseSource(seed, f"wheels/{source}")
     encoders = {
         name: Encoder(
             model.encoder,
@@ -76,13 +76,13 @@ def turns(
             speed_sigma=model.speed_sigma,
             standstill=model.standstill,
             noise=noise,
-            faults=Noise(seed, f"wheels/{source}/{name}"),
+            faults=NoiseSource(seed, f"wheels/{source}/{name}"),
         )
         for name in contacts
     }
     noise.draw_ahead()
     stamps = headers(
-        model.timing, start_utime, start_utime - 1_000_000, source, Noise(seed, f"wheels/{source}/arrival")
+        model.timing, start_utime, start_utime - 1_000_000, source, NoiseSource(seed, f"wheels/{source}/arrival")
     )
     rolling = _Rolling(model, drive, contacts)
     for header in stamps:
@@ -105,7 +105,7 @@ def turns(
 class _Rolling:
     """What each wheel rolls from one instant to the next, in metres."""
 
-    def __init__(self, model: WheelsModel, drive: Drive, contacts: Mapping[str, Vector3]):
+    def __init__(self, model: WheelsModel, drive: MotionModel, contacts: Mapping[str, Vector3]):
         self.model = model
         self.drive = drive
         self.contacts = contacts
@@ -116,7 +116,7 @@ class _Rolling:
         self.before = drive.at(0.0)
         self.t_before = 0.0
 
-    def to(self, t: float) -> tuple[Motion, dict[str, float]]:
+    def to(self, t: float) -> tuple[TrajectoryMotion, dict[str, float]]:
         """Return the motion at `t` seconds, and each wheel's way since the last call, the first since 0."""
         model, drive, t_before, before = self.model, self.drive, self.t_before, self.before
         motion = drive.at(t)
@@ -155,12 +155,12 @@ class StatusModel:
 
 
 def statuses(
-    model: StatusModel, drive: Drive, start_utime: int, seed: int, source: str
+    model: StatusModel, drive: MotionModel, start_utime: int, seed: int, source: str
 ) -> Iterator[VehicleStatusSample]:
     """Yield the controller's samples, for ever: forward speed, and the steering angle of the equivalent front wheel."""
-    noise = Noise(seed, f"status/{source}")
+    noise = NoiseSource(seed, f"status/{source}")
     stamps = headers(
-        model.timing, start_utime, start_utime - 1_000_000, source, Noise(seed, f"status/{source}/arrival")
+        model.timing, start_utime, start_utime - 1_000_000, source, NoiseSource(seed, f"status/{source}/arrival")
     )
     for header in stamps:
         motion = drive.at((header.utime - start_utime) * 1e-6)
@@ -168,20 +168,20 @@ def statuses(
         yield VehicleStatusSample(header, VehicleMode.AUTONOMOUS, motion.speed, angle)
 
 
-def _rates(motion: Motion) -> Vector3:
+def _rates(motion: TrajectoryMotion) -> Vector3:
     """Return forward speed and the rates about the vehicle's z and y axes."""
     if motion.attitude is None:
         return (motion.speed, motion.yaw_rate, 0.0)
     return (motion.speed, motion.attitude.rate[2], motion.attitude.rate[1])
 
 
-def _steered_speed(motion: Motion, contact: Vector3) -> float:
+def _steered_speed(motion: TrajectoryMotion, contact: Vector3) -> float:
     """Return the speed of a contact point along the direction it moves in, negative when backing up."""
     k = motion.curvature
     return motion.speed * math.hypot(1.0 - k * contact[1], k * contact[0])
 
 
-def _steered_speed_sliding(motion: Motion, contact: Vector3) -> float:
+def _steered_speed_sliding(motion: TrajectoryMotion, contact: Vector3) -> float:
     """Return the speed of a contact point along its wheel, negative when backing up.
 
     The wheel is steered as a vehicle on level ground without side slip would need it, so it moves aslant.
@@ -193,7 +193,7 @@ def _steered_speed_sliding(motion: Motion, contact: Vector3) -> float:
     return (ahead * (1.0 - k * y) + left * k * x) / math.hypot(1.0 - k * y, k * x)
 
 
-def _push(motion: Motion) -> float:
+def _push(motion: TrajectoryMotion) -> float:
     """Return how hard the tyres push, m/s2: speeding up makes wheels turn too much, braking too little."""
     along = math.copysign(1.0, motion.speed) * motion.forward_acceleration
     return along + abs(motion.speed * motion.yaw_rate)

@@ -29,7 +29,7 @@ from modelserver.spatial.swing import swing
 BEND: Final = "bend"
 
 
-class Link(NamedTuple):
+class ChainLink(NamedTuple):
     """One link of a chain: `X_FT`, passed from F to T where `forward`.
 
     `factor` (6, n) times its transpose is the covariance of its perturbation; None: nobody stated one. `source` names
@@ -44,7 +44,7 @@ class Link(NamedTuple):
     bends: bool = False
 
 
-def product(links: Sequence[Link]) -> Pose:
+def product(links: Sequence[ChainLink]) -> Pose:
     """Return the pose of a chain's last frame in its first."""
     pose = Pose.identity()
     for link in links:
@@ -52,7 +52,7 @@ def product(links: Sequence[Link]) -> Pose:
     return pose
 
 
-def contributions(links: Sequence[Link]) -> dict[tuple[Hashable, ...], Array] | None:
+def contributions(links: Sequence[ChainLink]) -> dict[tuple[Hashable, ...], Array] | None:
     """Return for each source the (6, n) matrix whose square is its share of the covariance of `product(links)`.
 
     None where a link that is there states no covariance. What a link bends is a source of its own, `(*source, BEND)`.
@@ -80,7 +80,7 @@ def contributions(links: Sequence[Link]) -> dict[tuple[Hashable, ...], Array] | 
     return shares
 
 
-def covariance(links: Sequence[Link]) -> Array | None:
+def covariance(links: Sequence[ChainLink]) -> Array | None:
     """Return the covariance (6, 6) of `product(links)` along the axes of its first frame; None where it is unknown."""
     shares = contributions(links)
     if shares is None:

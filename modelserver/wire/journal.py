@@ -45,7 +45,7 @@ class Part(IntEnum):
     END = 5
 
 
-class Kind(IntEnum):
+class RecordKind(IntEnum):
     """What a record is.
 
     SAID: a message that was published. SAMPLE: one that a sensor's channel brought, or a wish about the mode.
@@ -68,14 +68,14 @@ class Kind(IntEnum):
     PORTION = 10
 
 
-class Record(NamedTuple):
+class JournalRecord(NamedTuple):
     """One thing that was handled or said, at an instant: the monotonic clock in ns, and utime.
 
     What was said has no monotonic time of its own, and the utime of what it follows from. `at` is the place in the
     segment, bytes.
     """
 
-    kind: Kind
+    kind: RecordKind
     monotonic_ns: int
     utime: int
     channel: str
@@ -136,7 +136,7 @@ class Broken:
         return f"{self.length} bytes at byte {self.start}: {self.why}"
 
 
-Item: TypeAlias = Head | File | State | Record | End | Broken
+Item: TypeAlias = Head | File | State | JournalRecord | End | Broken
 
 _OWN = struct.Struct(">8sBI")  # magic, part, checksum of what follows
 _DIGEST: Final = 32
@@ -178,18 +178,18 @@ def end_written(digest: bytes, utime: int, mac: bytes = b"") -> bytes:
     return _own(Part.END, utime, digest + mac)
 
 
-def batch_written(number: int, records: Iterable[Record]) -> bytes:
+def batch_written(number: int, records: Iterable[JournalRecord]) -> bytes:
     """Return a batch with its seal. The channels of records are to be text, their times 63 bits."""
     events: list[bytes] = []
     entries: list[bytes] = []
     utime = 0
     for kind, monotonic_ns, utime, channel, data, _ in records:
-        if kind >= Kind.EVENT or not _is_plain(channel) or not 0 <= utime < MAX_UTIME:
+        if kind >= RecordKind.EVENT or not _is_plain(channel) or not 0 <= utime < MAX_UTIME:
             name = channel.encode()
             entries.append(_INLINE.pack(kind | _APART, monotonic_ns, utime, len(name), len(data)) + name + data)
             continue
         events.append(event_written(len(events), utime, channel.encode(), data))
-        entries.append(b"\0" if kind == Kind.SAID else _HEARD.pack(kind, monotonic_ns))
+        entries.append(b"\0" if kind == RecordKind.SAID else _HEARD.pack(kind, monotonic_ns))
     batch = b"".join(events)
     body = _SEAL.pack(number, len(events)) + b"".join(entries)
     return batch + _own(Part.SEAL, min(max(utime, 0), MAX_UTIME - 1), body, zlib.crc32(batch))
@@ -295,16 +295,16 @@ def _batch(body: bytes, events: list[tuple[int, LogEvent]], expected: int, begin
                 at += _INLINE.size
                 channel, data = body[at : at + name].decode(), body[at + name : at + name + size]
                 at += name + size
-                found.append(Record(Kind(kind & ~_APART), monotonic_ns, utime, channel, data, begin))
+                found.append(JournalRecord(RecordKind(kind & ~_APART), monotonic_ns, utime, channel, data, begin))
                 continue
             place, event = next(waiting)
             monotonic_ns = 0
-            if kind == Kind.SAID:
+            if kind == RecordKind.SAID:
                 at += 1
             else:
                 kind, monotonic_ns = _HEARD.unpack_from(body, at)
                 at += _HEARD.size
-            found.append(Record(Kind(kind), monotonic_ns, event.utime, event.channel, event.data, place))
+            found.append(JournalRecord(RecordKind(kind), monotonic_ns, event.utime, event.channel, event.data, place))
     except (struct.error, ValueError, StopIteration):
         return None
     return found if at == len(body) and next(waiting, None) is None else None

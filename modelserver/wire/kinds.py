@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 import mslcm
-from modelserver.wire.channels import CHANNELS, Way
+from modelserver.wire.channels import CHANNELS, ChannelUse
 from modelserver.wire.codec import type_names
 from modelserver.wire.journal import MAGIC
 from modelserver.wire.signed import SIGNED
@@ -14,7 +14,7 @@ _INPUTS: Final = frozenset(
     getattr(mslcm, channel.type_name)._get_packed_fingerprint()
     for channel in CHANNELS
     # what was signed once is not to be said again: to play it from a recording is what signatures guard against
-    if channel.way in (Way.SENSOR, Way.COMMAND) and channel.name != SIGNED
+    if channel.way in (ChannelUse.SENSOR, ChannelUse.COMMAND) and channel.name != SIGNED
 )
 _SERVICE: Final = frozenset(getattr(mslcm, name)._get_packed_fingerprint() for name in type_names()) - _INPUTS | {MAGIC}
 

@@ -21,7 +21,7 @@ def in_parts(data: bytes, revision: str, utime: int) -> list[SnapshotPart]:
     return [SnapshotPart(utime, revision, number, len(pieces), piece) for number, piece in enumerate(pieces)]
 
 
-class Assembler:
+class SnapshotAssembler:
     """Puts the parts of snapshots together, in whatever order they come; holds one revision at a time."""
 
     def __init__(self) -> None:

@@ -31,14 +31,19 @@ ONE_PACKET = 1472
 """Bytes of UDP payload that one Ethernet frame holds: more is fragmented by IP."""
 
 
-@pytest.fixture(scope="module")
-def generator() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("generate_types", ROOT / "tools" / "generate_types.py")
+def script(name: str) -> ModuleType:
+    """Import a script of tools/, which is no package."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def generator() -> ModuleType:
+    return script("generate_types")
 
 
 @pytest.fixture(scope="module")
@@ -210,9 +215,14 @@ def test_given_names_and_frames_as_long_as_geometry_allows_then_the_wire_takes_t
     assert names.MAX_LENGTH * 2 + 1 == fields.MAX_FRAME_NAME
 
 
-def test_given_files_of_the_package_then_none_of_the_types_is_left_out_of_it() -> None:
-    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    assert re.findall(r'^"lcmtypes/(\w+)\.lcm" = "mslcm/lcm/\1\.lcm"$', project, re.MULTILINE) == NAMES
+def test_given_a_wheel_when_built_then_it_has_the_file_of_each_type() -> None:
+    pytest.importorskip("hatchling", reason="hatchling, which builds the wheel, is not installed")
+    hook = script("wheel_lcm_files").LcmFilesHook(str(ROOT), {}, None, None, "", "wheel")
+    build_data: dict[str, Any] = {"force_include": {}}
+    hook.initialize("standard", build_data)
+    assert build_data["force_include"] == {
+        str(ROOT / "lcmtypes" / f"{name}.lcm"): f"mslcm/lcm/{name}.lcm" for name in NAMES
+    }
 
 
 def test_given_the_codec_then_every_type_of_the_core_is_known() -> None:

@@ -59,7 +59,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     kept = Kept(Path(tmp_path_factory.mktemp("run")), OPEN)
     kept.drive(0.4)
     state = journal_state.detach(kept.loop.state)
-    return journal_state.encode_run(journal_state.Run(kept.vehicle.config, state))
+    return journal_state.encode_run(journal_state.RunState(kept.vehicle.config, state))
 
 
 def read(data: bytes) -> None:

@@ -12,7 +12,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from modelserver.geometry.joint import left_jacobian
-from modelserver.joints.joints import track as joint_track
+from modelserver.joints import track as joint_track
 from modelserver.joints.track import JointTrack
 from modelserver.joints.vector import columns, together
 from modelserver.spatial import so3

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from modelserver.wire.journal import CHANNEL, Broken, Kind, Record, batch_written, read
+from modelserver.wire.journal import CHANNEL, Broken, JournalRecord, RecordKind, batch_written, read
 
 CHANNELS = st.one_of(
     st.sampled_from(["IMU", "POSE", "REPLY_1", CHANNEL, ""]), st.text(max_size=70).filter(lambda t: t.isprintable())
@@ -15,10 +15,10 @@ INT64 = st.integers(-(1 << 63), (1 << 63) - 1)
 
 
 @st.composite
-def a_record(draw: st.DrawFn) -> Record:
-    kind = draw(st.sampled_from(Kind))
-    said = kind is Kind.SAID
-    return Record(
+def a_record(draw: st.DrawFn) -> JournalRecord:
+    kind = draw(st.sampled_from(RecordKind))
+    said = kind is RecordKind.SAID
+    return JournalRecord(
         kind,
         0 if said else draw(INT64),
         draw(st.one_of(INT64, st.just(5))),
@@ -30,12 +30,12 @@ def a_record(draw: st.DrawFn) -> Record:
 BATCHES = st.lists(st.lists(a_record(), min_size=1, max_size=5), min_size=1, max_size=4)
 
 
-def back(data: bytes) -> list[Record]:
-    return [each._replace(at=0) for each in read(data) if isinstance(each, Record)]
+def back(data: bytes) -> list[JournalRecord]:
+    return [each._replace(at=0) for each in read(data) if isinstance(each, JournalRecord)]
 
 
 @given(BATCHES)
-def test_given_any_records_then_they_come_back(batches: list[list[Record]]) -> None:
+def test_given_any_records_then_they_come_back(batches: list[list[JournalRecord]]) -> None:
     data = b"".join(batch_written(number, batch) for number, batch in enumerate(batches))
     found = list(read(data))
     assert not [each for each in found if isinstance(each, Broken)]
@@ -44,7 +44,7 @@ def test_given_any_records_then_they_come_back(batches: list[list[Record]]) -> N
 
 @pytest.mark.slow
 @given(BATCHES)
-def test_given_a_cut_at_every_byte_then_the_batches_before_it_come_back(batches: list[list[Record]]) -> None:
+def test_given_a_cut_at_every_byte_then_the_batches_before_it_come_back(batches: list[list[JournalRecord]]) -> None:
     written = [batch_written(number, batch) for number, batch in enumerate(batches)]
     data = b"".join(written)
     for cut in range(len(data)):
@@ -61,7 +61,7 @@ def test_given_a_cut_at_every_byte_then_the_batches_before_it_come_back(batches:
 
 @given(BATCHES, st.data())
 def test_given_bytes_that_were_changed_then_no_record_comes_back_changed(
-    batches: list[list[Record]], data: st.DataObject
+    batches: list[list[JournalRecord]], data: st.DataObject
 ) -> None:
     written = bytearray(b"".join(batch_written(number, batch) for number, batch in enumerate(batches)))
     for _ in range(data.draw(st.integers(1, 3))):
@@ -76,4 +76,4 @@ def test_given_bytes_that_were_changed_then_no_record_comes_back_changed(
 
 @given(st.binary(max_size=300))
 def test_given_any_bytes_then_nothing_is_raised(data: bytes) -> None:
-    assert sum(isinstance(each, Record) for each in read(data)) == 0
+    assert sum(isinstance(each, JournalRecord) for each in read(data)) == 0

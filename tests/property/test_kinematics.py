@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from support_spatial import poses
 
 from modelserver.spatial import chain, so3
-from modelserver.spatial.chain import Link
+from modelserver.spatial.chain import ChainLink
 from modelserver.spatial.kinematics import RigidMotion
 from modelserver.spatial.pose import Pose
 
@@ -73,7 +73,7 @@ def test_given_a_chain_then_each_links_jacobian_is_what_differencing_gives(some,
             off = np.zeros(6)
             off[column] = size if number == which else 0.0
             turn = so3.multiply(so3.exponential(tuple(off[3:].tolist())), X.wxyz)
-            links.append(Link(Pose((X.position + off[:3]).tolist(), turn), forward, None, (number,)))
+            links.append(ChainLink(Pose((X.position + off[:3]).tolist(), turn), forward, None, (number,)))
         return chain.product(links)
 
     step = 1e-5
@@ -82,7 +82,9 @@ def test_given_a_chain_then_each_links_jacobian_is_what_differencing_gives(some,
     expected = np.concatenate((ahead.position - behind.position, turned)) / (2 * step)
     factor = np.zeros((6, 1))
     factor[column] = 1.0
-    links = [Link(X, forward, factor if n == which else np.zeros((6, 1)), (n,)) for n, (X, forward) in enumerate(some)]
+    links = [
+        ChainLink(X, forward, factor if n == which else np.zeros((6, 1)), (n,)) for n, (X, forward) in enumerate(some)
+    ]
     shares = chain.contributions(links)
     assert shares is not None
     assert np.allclose(shares[(which,)][:, 0], expected, atol=1e-5 * (1.0 + np.abs(expected).max()))

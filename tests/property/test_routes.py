@@ -15,7 +15,7 @@ from support_spatial import rotations
 
 from modelserver.geometry import Joint, JointType, Mimic, ModelBuilder, Sigma
 from modelserver.spatial import Pose, chain, covariance
-from modelserver.spatial.chain import Link
+from modelserver.spatial.chain import ChainLink
 
 
 def product_of(route, positions):
@@ -52,7 +52,7 @@ def test_given_joints_anywhere_then_a_routes_pose_is_the_product_of_its_edges(mo
 near = st.tuples(*[st.floats(-3, 3)] * 3)
 poses = st.builds(Pose, near, rotations)
 factors = st.lists(st.floats(-1e-3, 1e-3), min_size=36, max_size=36).map(lambda flat: np.array(flat).reshape(6, 6))
-links = st.builds(Link, poses, st.booleans(), factors, st.integers(), st.just(False))
+links = st.builds(ChainLink, poses, st.booleans(), factors, st.integers(), st.just(False))
 chains = st.lists(links, min_size=1, max_size=6, unique_by=lambda link: link.source)
 
 
@@ -105,7 +105,7 @@ def test_given_a_chain_and_back_again_then_what_is_shared_cancels(some):
 
 def test_given_no_links_or_one_that_states_nothing_then_it_is_certain_or_unknown():
     assert np.array_equal(chain.covariance([]), np.zeros((6, 6)))
-    assert chain.covariance([Link(Pose(), True, None, 0)]) is None
+    assert chain.covariance([ChainLink(Pose(), True, None, 0)]) is None
 
 
 @pytest.mark.parametrize("rank", range(7))

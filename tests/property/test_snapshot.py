@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from support_formats import models
 
 from modelserver.errors import WireError
-from modelserver.formats.snapshot import Snapshot, read, written
+from modelserver.formats.snapshot import ModelSnapshot, read, written
 from modelserver.geometry.model import Model
 from modelserver.messages import SnapshotPart
-from modelserver.wire.snapshot import Assembler, in_parts
+from modelserver.wire.snapshot import SnapshotAssembler, in_parts
 
 
-def snapshot(model: Model) -> Snapshot:
-    return Snapshot("rover", model, "A:B", "C:D", 12.5, "ARM_JOINTS", 1500)
+def snapshot(model: Model) -> ModelSnapshot:
+    return ModelSnapshot("rover", model, "A:B", "C:D", 12.5, "ARM_JOINTS", 1500)
 
 
 @pytest.mark.slow
@@ -36,7 +36,7 @@ def test_given_parts_in_any_order_and_twice_then_the_whole_is_what_was_sent(data
     parts: list[SnapshotPart] = in_parts(data or b"x", "0" * 16, 1)
     shuffled = [*parts, *parts]
     random.shuffle(shuffled)  # type: ignore[attr-defined]
-    assembler = Assembler()
+    assembler = SnapshotAssembler()
     wholes = [whole for whole in map(assembler.add, shuffled) if whole is not None]
     assert wholes
     assert set(wholes) == {data or b"x"}

@@ -14,7 +14,7 @@ from support_recordings import HUSKY
 from benchmarks import protocols, withheld
 from modelserver.config import load_config
 from modelserver.service.daemon import load_vehicle
-from modelserver.service.offline import Run
+from modelserver.service.offline import OfflineRun
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogFile
 from mstools.commands.import_bag import Report, import_bag
@@ -35,7 +35,7 @@ def antenna(imported: tuple[Path, Report]) -> npt.NDArray[np.float64]:
     """Time (s from the first event), east, north, up, valid: the antenna at 10 Hz."""
     vehicle = load_vehicle(load_config(HUSKY))
     with LogFile(imported[0]) as log:
-        run = Run(vehicle, log, ANTENNA)
+        run = OfflineRun(vehicle, log, ANTENNA)
         rows = [(each.utime, each.easting, each.northing, each.up, each.valid) for each in run.rows(None, 10.0)]
         start = run.first_utime
     found = np.array(rows, float)
@@ -120,7 +120,7 @@ def test_given_the_recording_when_replayed_twice_then_the_same_bits(imported: tu
     def lines() -> list[str]:
         with LogFile(imported[0]) as log:
             first_minute = itertools.islice(log, 2500)
-            return [each.csv() for each in Run(vehicle, first_minute, ANTENNA).rows(None, 20.0)]
+            return [each.csv() for each in OfflineRun(vehicle, first_minute, ANTENNA).rows(None, 20.0)]
 
     assert lines() == lines()
 
@@ -129,6 +129,6 @@ def test_given_the_page_on_recordings_then_its_example_is_what_comes_out(importe
     page = (Path(__file__).parents[2] / "docs" / "recordings.md").read_text(encoding="utf-8")
     (shown,) = [line for line in page.splitlines() if line.startswith("14322")]
     with LogFile(imported[0]) as log:
-        run = Run(load_vehicle(load_config(HUSKY)), log, "Husky:Base")
+        run = OfflineRun(load_vehicle(load_config(HUSKY)), log, "Husky:Base")
         (row,) = run.rows([int(shown.partition(",")[0])], 1.0)
     assert row.csv() == shown

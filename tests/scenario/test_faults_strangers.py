@@ -13,7 +13,7 @@ from support_signing import ALLOWED, write_test_key
 from support_wire import EXAMPLES
 
 from modelserver.errors import WireError
-from modelserver.wire.channels import CHANNELS, Way
+from modelserver.wire.channels import CHANNELS, ChannelUse
 from modelserver.wire.codec import decode, encode
 
 MESSAGES = 100_000
@@ -62,7 +62,10 @@ def pool(chance: random.Random) -> list[tuple[str, bytes, bool]]:
     """Messages for every channel that is heard, and whether each cannot be decoded."""
     found = []
     for channel in CHANNELS:
-        if channel.way in (Way.BROADCAST, Way.REPORT) or channel.name in ("VEHICLE_STATUS", "VEHICLE_COMMAND"):
+        if channel.way in (ChannelUse.BROADCAST, ChannelUse.REPORT) or channel.name in (
+            "VEHICLE_STATUS",
+            "VEHICLE_COMMAND",
+        ):
             continue  # nobody listens
         good = encode(EXAMPLES[channel.type_name][-1])
         for _ in range(250):

@@ -20,7 +20,7 @@ from modelserver.formats.snapshot import read
 from modelserver.messages import Invalid, JointSample, JointsSample, Quality, SensorHeader
 from modelserver.spatial import Pose, Transformation
 from modelserver.wire.codec import decode, encode
-from modelserver.wire.snapshot import Assembler
+from modelserver.wire.snapshot import SnapshotAssembler
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "moving-geometry.md"
 StartDaemon = Callable[..., Daemon]
@@ -33,7 +33,7 @@ NODDING = GEOMETRY.replace(
 
 def heard_model(daemon: Daemon, revision: str) -> ms.Model:
     """Return the geometry that the daemon broadcasts under a revision."""
-    listener, assembler = Listener(daemon.url, "MODEL_SNAPSHOT"), Assembler()
+    listener, assembler = Listener(daemon.url, "MODEL_SNAPSHOT"), SnapshotAssembler()
     found: list[ms.Model] = []
 
     def arrived() -> bool:

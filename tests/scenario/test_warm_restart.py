@@ -15,7 +15,7 @@ from modelserver.errors import ModelServerError
 from modelserver.formats import save_model
 from modelserver.messages import GpsSample, ImuSample
 from modelserver.service.keeping.form import KeptError, kept_from_bytes
-from modelserver.simulation import Event, Phase
+from modelserver.simulation import DrivePhase, Event
 from modelserver.wire.codec import encode
 from tests.support_filter import RIG, simulation
 from tests.support_restart import TO_A_STOP
@@ -59,7 +59,7 @@ def test_given_a_daemon_that_ends_while_the_vehicle_stands_then_its_successor_kn
 ) -> None:
     geometry = save_model(RIG.model, "yaml").text
     begin = time.time_ns() // 1000 - round((FIRST + LOST + AGAIN) * 1e6)
-    sim = simulation((*TO_A_STOP, Phase(60.0)), start_utime=begin)
+    sim = simulation((*TO_A_STOP, DrivePhase(60.0)), start_utime=begin)
     first = start_daemon(VEHICLE, geometry=geometry)
     assert started_word(first, "cold start") == "cold start: nothing is kept of an earlier run"
     last = feed(first, sim.events(FIRST))

@@ -22,7 +22,6 @@ from modelserver.messages import (
     CHANNEL_OF,
     AbsolutePoseSample,
     Acknowledgement,
-    Commanded,
     GetBodyList,
     GetTransformation,
     LoadModel,
@@ -37,6 +36,7 @@ from modelserver.messages import (
     SendReply,
     SetHTransform,
     SetStateVector,
+    SignedCommand,
     Tick,
     TimeQuery,
     TransformReply,
@@ -65,7 +65,7 @@ def moved_cart() -> Model:
 
 def fed(state: CoreState, event: Any, at: float = 0.0) -> tuple[CoreState, tuple[Output, ...]]:
     signed = isinstance(event, (ReloadModel, SetStateVector, SetHTransform))
-    return step(state, Commanded(event, "me") if signed else event, now_at(START + round(at * S)))
+    return step(state, SignedCommand(event, "me") if signed else event, now_at(START + round(at * S)))
 
 
 def replied(state: CoreState, event: Any, at: float = 0.0) -> tuple[CoreState, Any]:

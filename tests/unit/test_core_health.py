@@ -15,7 +15,7 @@ from support_moving import rover
 from support_samples import ORIGIN, START, Scripted, cart, gps, imu, now_at, started
 
 from modelserver import core
-from modelserver.core import CoreState, Expected, step
+from modelserver.core import CoreState, ExpectedSensor, step
 from modelserver.core.health import percentile
 from modelserver.core.reload import ModelLoaded
 from modelserver.core.state import CHANGE_PERIOD_NS, SILENT_LEAST_S
@@ -88,9 +88,9 @@ def imus(begin: float, end: float, hz: float = 100.0) -> list[tuple[float, Event
 
 def test_given_sensors_of_the_vehicle_file_then_those_never_heard_are_told() -> None:
     sensors = (
-        Expected("A_GPS", GpsSample),
-        Expected("A_IMU", ImuSample),
-        Expected("A_RANGE", RangeSample, "beacons"),
+        ExpectedSensor("A_GPS", GpsSample),
+        ExpectedSensor("A_IMU", ImuSample),
+        ExpectedSensor("A_RANGE", RangeSample, "beacons"),
     )
     run = Run(sensors=sensors)
     run.until(0.2, [(0.05, imu(START))])
@@ -107,7 +107,7 @@ def test_given_sensors_of_the_vehicle_file_then_those_never_heard_are_told() -> 
 
 
 def test_given_a_geometry_without_joints_then_joints_are_not_missed() -> None:
-    run = Run(sensors=(Expected("JOINTS", JointsSample),))
+    run = Run(sensors=(ExpectedSensor("JOINTS", JointsSample),))
     run.until(0.1)
     assert run.last.channels == ()
 

@@ -11,10 +11,10 @@ from modelserver import errors
 from modelserver.errors import (
     ConfigError,
     GeometryError,
+    Location,
     Problem,
     QueryError,
     Severity,
-    Source,
     Status,
     UnknownBodyError,
     UnknownFrameError,
@@ -47,20 +47,20 @@ ODD = [
 
 def test_a_problem_reads_as_one_line():
     problem = Problem(
-        Severity.ERROR, "no body 'Camra'", Source("cart.xml", 12, "constraint C"), "write Camera", ("Camera",)
+        Severity.ERROR, "no body 'Camra'", Location("cart.xml", 12, "constraint C"), "write Camera", ("Camera",)
     )
     assert str(problem) == "cart.xml:12 (constraint C): error: no body 'Camra'; nearest: Camera; fix: write Camera"
     assert str(Problem(Severity.NOTE, "plain")) == "note: plain"
-    assert str(Source("", 0, "body A")) == "body A"
-    assert str(Source("", 7)) == "line 7"
-    assert str(Source("a.xml")) == "a.xml"
+    assert str(Location("", 0, "body A")) == "body A"
+    assert str(Location("", 7)) == "line 7"
+    assert str(Location("a.xml")) == "a.xml"
 
 
 @pytest.mark.parametrize(
     "error",
     [
         ConfigError([Problem(Severity.ERROR, "wrong"), Problem(Severity.WARNING, "odd")]),
-        GeometryError([Problem(Severity.ERROR, "wrong", Source("a", 1, "b"), "fix", ("c",))]),
+        GeometryError([Problem(Severity.ERROR, "wrong", Location("a", 1, "b"), "fix", ("c",))]),
         WireError("short", "too few bytes"),
         UnknownBodyError("no body", ["A", "B"]),
     ],

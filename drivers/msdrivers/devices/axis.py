@@ -25,7 +25,7 @@ from msdrivers.protocol.modbus.registers import (
     explain,
     fits,
 )
-from msdrivers.station import Measured, Now, Output, Phase, Reopen, Send, Told
+from msdrivers.station import Measured, Now, Output, Reopen, Send, StationPhase, StationStatus
 
 BUSY = (5, 6)
 """Exceptions of a device that will do it later."""
@@ -64,7 +64,7 @@ class AxisDriver:
         self._silent_ns: int | None = None
         self._is_open = False
         self._told: set[str] = set()
-        self._phase = Phase.WAITING
+        self._phase = StationPhase.WAITING
         self._seq = 0
         self._counts = BoundedCounter()
 
@@ -73,19 +73,19 @@ class AxisDriver:
         self._is_open, self._asked = True, None
         self._readings.clear()
         self._told.clear()
-        self._phase = Phase.WAITING
+        self._phase = StationPhase.WAITING
         self._next_ns = self._step_ns = self._heard_ns = self._usable_ns = now.monotonic_ns
         self._silent_ns = now.monotonic_ns + self._silence_ns
         if self._nod is not None:
             self._nodding.begin(self._nod)
-        return [Told(self._phase, f"asking the axis for joint {self.settings.joint}"), *self._ask(now)]
+        return [StationStatus(self._phase, f"asking the axis for joint {self.settings.joint}"), *self._ask(now)]
 
     def nod(self, nod: NodMap, now: Now) -> list[Output[ModbusUnit]]:
         """Nod otherwise from now on; what the axis cannot do is refused and told."""
         why = self.settings.against(nod)
         if why:
             self._counts["rejected.nod"] += 1
-            return [Told(self._phase, f"nodding refused: {why}", is_trouble=True)]
+            return [StationStatus(self._phase, f"nodding refused: {why}", is_trouble=True)]
         self._nod = nod
         self._told -= {"nod"}
         if not self._is_open:
@@ -123,9 +123,9 @@ class AxisDriver:
             said = self._nodding.done(unit)
             if said:
                 self._counts["readback"] += 1
-                outputs.append(Told(self._phase, said, is_trouble=True))
+                outputs.append(StationStatus(self._phase, said, is_trouble=True))
             elif not self._nodding.step:
-                outputs.append(Told(self._phase, "the axis nods as it was told"))
+                outputs.append(StationStatus(self._phase, "the axis nods as it was told"))
         return outputs + self._ask(now)
 
     def woken(self, now: Now) -> list[Output[ModbusUnit]]:
@@ -137,10 +137,10 @@ class AxisDriver:
             self._silent_ns = None
             # an axis that does not answer at all is told by and by, when the line is opened anew
             if self._heard_ns > self._usable_ns:
-                self._phase = Phase.SILENT
+                self._phase = StationPhase.SILENT
                 self._counts["silences"] += 1
                 why = f"no usable reading for {self.settings.silence:g} s although the axis answers"
-                outputs.append(Told(Phase.SILENT, f"{why}; the counters say what was rejected"))
+                outputs.append(StationStatus(StationPhase.SILENT, f"{why}; the counters say what was rejected"))
         return outputs + self._ask(now)
 
     def due(self) -> int | None:
@@ -212,9 +212,9 @@ class AxisDriver:
         header = SensorHeader(now.utime, self.settings.source, self._seq, now.utime)
         self._seq += 1
         self._counts["samples"] += 1
-        if self._phase is not Phase.STREAMING:
-            self._phase = Phase.STREAMING
-            told = [Told(self._phase, f"the axis tells joint {self.settings.joint}"), *told]
+        if self._phase is not StationPhase.STREAMING:
+            self._phase = StationPhase.STREAMING
+            told = [StationStatus(self._phase, f"the axis tells joint {self.settings.joint}"), *told]
             self._told -= {"refused", "length"}
         turn = turn_ns * 1e-9
         return [*told, Measured(JointsSample(header, (joint,)), turn / 2.0, turn / math.sqrt(12.0))]
@@ -235,7 +235,7 @@ class AxisDriver:
         if asked.is_poll:
             self._next_ns = again_ns
             if failure.code not in BUSY:
-                self._phase = Phase.SILENT
+                self._phase = StationPhase.SILENT
             text = f"the axis refuses {described(asked.request)}: {explain(failure.code)}; asked again every"
             return self._tell("refused", f"{text} {self.settings.retry:g} s, nothing is published")
         text = f"the axis refuses {self._nodding.step}: {explain(failure.code)}"
@@ -249,15 +249,15 @@ class AxisDriver:
         if not self._is_open:
             return []
         self._is_open, self._asked, self._silent_ns = False, None, None
-        self._phase = Phase.SILENT
+        self._phase = StationPhase.SILENT
         self._counts["broken"] += 1
-        return [Told(Phase.SILENT, why), Reopen(why)]
+        return [StationStatus(StationPhase.SILENT, why), Reopen(why)]
 
     def _tell(self, word: str, text: str) -> list[Output[ModbusUnit]]:
         if word in self._told:
             return []
         self._told.add(word)
-        return [Told(self._phase, text, is_trouble=True)]
+        return [StationStatus(self._phase, text, is_trouble=True)]
 
 
 _WORDS = {

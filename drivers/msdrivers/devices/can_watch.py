@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from msdrivers.protocol.can.database import FrameError
 from msdrivers.protocol.can.frame import CanFrame, FrameKey
-from msdrivers.station import Now, Output, Phase, Reopen, Told
+from msdrivers.station import Now, Output, Reopen, StationPhase, StationStatus
 
 SEEN = 8
 """Identifiers that are remembered to tell a person what is on the bus."""
@@ -35,28 +35,28 @@ class CanWatch:
         self._seen: dict[FrameKey, None] = {}
         self._told_wrong: set[FrameKey] = set()
         self._only_wrong = False
-        self.phase = Phase.WAITING
+        self.phase = StationPhase.WAITING
         self.is_off = False
         """The interface has left the bus; nothing can be sent."""
 
     def opened(self, now: Now) -> list[Output[CanFrame]]:
         """Begin: the line is open."""
-        self.phase, self.is_off = Phase.WAITING, False
+        self.phase, self.is_off = StationPhase.WAITING, False
         self._seen.clear()
         self._told_wrong.clear()
         self._only_wrong = False
         self._wait(now)
-        return [Told(Phase.WAITING, f"waiting for {self._names()}")] if self._needed else []
+        return [StationStatus(StationPhase.WAITING, f"waiting for {self._names()}")] if self._needed else []
 
     def usable(self, now: Now, text: str) -> list[Output[CanFrame]]:
         """Note that something came that can be used; `text` says what, for the first time."""
         self._wait(now)
         self._only_wrong = False
         self._seen.clear()
-        if self.phase is Phase.STREAMING:
+        if self.phase is StationPhase.STREAMING:
             return []
-        self.phase = Phase.STREAMING
-        return [Told(Phase.STREAMING, text)]
+        self.phase = StationPhase.STREAMING
+        return [StationStatus(StationPhase.STREAMING, text)]
 
     def other(self, frame: CanFrame) -> None:
         """Note a frame that is not needed here."""
@@ -71,7 +71,7 @@ class CanWatch:
         if frame.key in self._told_wrong:
             return []
         self._told_wrong.add(frame.key)
-        return [Told(self.phase, f"{error}; such frames are counted and not used", is_trouble=True)]
+        return [StationStatus(self.phase, f"{error}; such frames are counted and not used", is_trouble=True)]
 
     def error_frame(self, frame: CanFrame) -> list[Output[CanFrame]]:
         """Note what the interface says of the bus: bus-off asks to open it anew, once."""
@@ -80,20 +80,23 @@ class CanWatch:
             return []
         self._counts["bus_off"] += 1
         self.is_off = True
-        self.phase = Phase.SILENT
+        self.phase = StationPhase.SILENT
         self._silent_at = None
         why = "the CAN interface went bus-off: too many frames failed"
         fix = "check wiring, the terminators at both ends (60 ohm between the lines) and the bit rate"
-        return [Told(Phase.SILENT, f"{why}; {fix}; nothing is published or sent until it is back"), Reopen(why)]
+        return [
+            StationStatus(StationPhase.SILENT, f"{why}; {fix}; nothing is published or sent until it is back"),
+            Reopen(why),
+        ]
 
     def woken(self, now: Now) -> list[Output[CanFrame]]:
         """Tell silence where it has lasted long enough."""
         if self._silent_at is None or now.monotonic_ns < self._silent_at:
             return []
         self._silent_at = None
-        self.phase = Phase.SILENT
+        self.phase = StationPhase.SILENT
         self._counts["silences"] += 1
-        return [Told(Phase.SILENT, self._why())]
+        return [StationStatus(StationPhase.SILENT, self._why())]
 
     def due(self) -> int | None:
         """Return when silence will have lasted long enough."""

@@ -13,7 +13,7 @@ from msdrivers.devices.can_watch import CanWatch
 from msdrivers.devices.vehicle_settings import VehicleSettings
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.can.vehicle import BoundCommand
-from msdrivers.station import Now, Output, Send, Told
+from msdrivers.station import Now, Output, Send, StationStatus
 
 _TELL_AGAIN_NS = 10_000_000_000
 """How often a person is told of the same trouble."""
@@ -119,7 +119,9 @@ class Commanding:
             ended, self._in_force = self._in_force, None
             self._counts["dead_man"] += 1
             source = shown(ended.command.source, 40)
-            outputs.append(Told(self._watch.phase, f"no command after number {ended.command.seq} of {source}: stop"))
+            outputs.append(
+                StationStatus(self._watch.phase, f"no command after number {ended.command.seq} of {source}: stop")
+            )
             outputs.append(self._stop(now))
         elif self._speaks and now.monotonic_ns >= self._next_ns:
             outputs.append(self._say(now))
@@ -207,4 +209,4 @@ class Commanding:
         if now.monotonic_ns < self._told.get(reason, now.monotonic_ns):
             return []
         self._told[reason] = now.monotonic_ns + _TELL_AGAIN_NS
-        return [Told(self._watch.phase, text, is_trouble=True)]
+        return [StationStatus(self._watch.phase, text, is_trouble=True)]

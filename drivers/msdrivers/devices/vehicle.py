@@ -6,16 +6,16 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 
-from modelserver.errors import ConfigError, Problem, Severity, Source
+from modelserver.errors import ConfigError, Location, Problem, Severity
 from modelserver.messages import SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
 from msdrivers.devices.can_watch import CanWatch, arrival
 from msdrivers.devices.commanding import Commanding
 from msdrivers.devices.vehicle_settings import VehicleSettings
-from msdrivers.protocol.can.assembly import Assembler, Instant
+from msdrivers.protocol.can.assembly import CanFrameAssembler, CanFrameSet
 from msdrivers.protocol.can.database import CanDatabase, FrameError
 from msdrivers.protocol.can.frame import CanFrame, FrameKey
 from msdrivers.protocol.can.vehicle import NUMBERS, bind_command, bind_status
-from msdrivers.station import Measured, Now, Output, Told
+from msdrivers.station import Measured, Now, Output, StationStatus
 
 
 class VehicleDriver:
@@ -48,13 +48,13 @@ class VehicleDriver:
             ):
                 beyond = command.beyond(speed, angle)
                 if beyond:
-                    place = Source(database.name, 0, f"drivers.{settings.source}.limits")
+                    place = Location(database.name, 0, f"drivers.{settings.source}.limits")
                     raise ConfigError([Problem(Severity.ERROR, beyond, place, "lower the limit")])
             self._commanding = Commanding(settings, command, self._watch, self._counts)
             self._command_key = command.forward_speed.key
         signals = self._status.signals if self._status is not None else {}
         self._has_words = "fault_bits" in signals or "commands_refused" in signals
-        self._assembler = Assembler(self._needed, round(settings.window * 1e9))
+        self._assembler = CanFrameAssembler(self._needed, round(settings.window * 1e9))
         self._mode: VehicleMode | None = None
         self._seq = 0
 
@@ -126,7 +126,7 @@ class VehicleDriver:
         """Frames, samples, commands, stops, dead-man time-outs, and what was rejected by reason."""
         return self._counts
 
-    def _published(self, instants: list[Instant], now: Now) -> list[Output[CanFrame]]:
+    def _published(self, instants: list[CanFrameSet], now: Now) -> list[Output[CanFrame]]:
         status = self._status
         outputs: list[Output[CanFrame]] = []
         if status is None:
@@ -157,7 +157,7 @@ class VehicleDriver:
             self._counts["samples"] += 1
             outputs += self._watch.usable(now, f"the vehicle controller is heard; {_MODES[mode]}")
             if self._mode not in (None, mode):
-                outputs.append(Told(self._watch.phase, _MODES[mode]))
+                outputs.append(StationStatus(self._watch.phase, _MODES[mode]))
             self._mode = mode
             outputs.append(Measured(sample, self.settings.delay, self.settings.delay_sigma))
         return outputs

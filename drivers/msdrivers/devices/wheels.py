@@ -11,12 +11,12 @@ from typing import ClassVar
 from modelserver.errors import shown
 from modelserver.messages import NAN, Direction, SensorHeader, WheelSample, WheelsSample
 from msdrivers.devices.can_watch import CanWatch, arrival
-from msdrivers.protocol.can.assembly import Assembler, Instant
+from msdrivers.protocol.can.assembly import CanFrameAssembler, CanFrameSet
 from msdrivers.protocol.can.database import CanDatabase, FrameError
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.can.mapping import STRICT, WheelMap
 from msdrivers.protocol.can.wheels import BoundWheel, bind_wheels
-from msdrivers.station import Measured, Now, Output, Told
+from msdrivers.station import Measured, Now, Output, StationStatus
 
 MAX_WHEELS = 64
 
@@ -84,7 +84,7 @@ class WheelsDriver:
         self._counts: Counter[str] = Counter()
         self._watch = CanWatch(needed, settings.silence, self._counts)
         self._needed = frozenset(needed)
-        self._assembler = Assembler(self._needed, round(settings.window * 1e9))
+        self._assembler = CanFrameAssembler(self._needed, round(settings.window * 1e9))
         odometers = {wheel.name: wheel.odometer(settings.max_speed, settings.frame_delay) for wheel in self._wheels}
         self._odometers = {name: odometer for name, odometer in odometers.items() if odometer is not None}
         self._told: set[str] = set()
@@ -134,7 +134,7 @@ class WheelsDriver:
         """Frames, samples, incomplete ones, silences, and what was rejected by reason."""
         return self._counts
 
-    def _published(self, instants: list[Instant], now: Now) -> list[Output[CanFrame]]:
+    def _published(self, instants: list[CanFrameSet], now: Now) -> list[Output[CanFrame]]:
         outputs: list[Output[CanFrame]] = []
         for instant in instants:
             told: list[Output[CanFrame]] = []
@@ -152,7 +152,7 @@ class WheelsDriver:
             outputs += told
         return outputs
 
-    def _wheel(self, wheel: BoundWheel, instant: Instant, told: list[Output[CanFrame]]) -> WheelSample:
+    def _wheel(self, wheel: BoundWheel, instant: CanFrameSet, told: list[Output[CanFrame]]) -> WheelSample:
         direction = wheel.turning(instant)
         travel = travel_sigma = speed_sigma = NAN
         raw = instant.raw(wheel.count)
@@ -181,7 +181,7 @@ class WheelsDriver:
             return
         self._told.add(f"{name} {reason}")
         text = f"wheel {name}: {_DOUBTS[reason].format(self.settings.max_speed)}"
-        told.append(Told(self._watch.phase, text, is_trouble=reason != "resumed"))
+        told.append(StationStatus(self._watch.phase, text, is_trouble=reason != "resumed"))
 
 
 _DOUBTS = {

@@ -24,7 +24,7 @@ from msdrivers.protocol.modbus.registers import (
     Written,
     explain,
 )
-from msdrivers.station import Now, Output, Phase, Send, Told
+from msdrivers.station import Now, Output, Send, StationPhase, StationStatus
 
 ILLEGAL_ADDRESS, ILLEGAL_VALUE = 2, 3
 
@@ -83,7 +83,7 @@ class AxisEmulator:
         """Switch on at the first time; later the axis has gone on."""
         if self._begun_ns is None:
             self._begun_ns = self._moved_ns = now.monotonic_ns
-        return [Told(Phase.STREAMING, "axis emulated")]
+        return [StationStatus(StationPhase.STREAMING, "axis emulated")]
 
     def received(self, unit: ModbusUnit, now: Now) -> list[Output[ModbusUnit]]:
         """Answer a request."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from modelserver.messages import GpsSample
 from msdrivers.emulate import gps_logs
-from msdrivers.station import Now, Output, Phase, Send, Told
+from msdrivers.station import Now, Output, Send, StationPhase, StationStatus
 
 _LONGEST_COMMAND = 200
 _EFFECTLESS = frozenset({"fix", "com", "datum", "saveconfig", "undulationauto", "ecutoff", "dgpstimeout"})
@@ -83,7 +83,7 @@ class GpsEmulator:
         self._boots_at_ns = now.monotonic_ns + round(self._unit.boot * 1e9)
         self._logs.clear()
         self._line.clear()
-        return [Told(Phase.SILENT, "the emulated receiver restarts")]
+        return [StationStatus(StationPhase.SILENT, "the emulated receiver restarts")]
 
     def received(self, unit: bytes, now: Now) -> Sequence[Output[bytes]]:
         """Take what the host sends: lines of commands, ended by CR or LF."""

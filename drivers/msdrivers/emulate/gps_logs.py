@@ -11,7 +11,7 @@ from msdrivers.protocol import gps_time
 from msdrivers.protocol.nmea import encode as nmea
 from msdrivers.protocol.nmea.fields import KMH, KNOT
 from msdrivers.protocol.novatel import (
-    Heading,
+    HeadingLog,
     LogHeader,
     NovatelLog,
     Position,
@@ -119,14 +119,14 @@ def _velocity(sample: GpsSample) -> Velocity:
     return Velocity(SolutionStatus.SOL_COMPUTED, kind, latency, 0.0, speed, _track(_zero(course)), _zero(climb))
 
 
-def _heading(sample: GpsSample) -> Heading:
+def _heading(sample: GpsSample) -> HeadingLog:
     if sample.baseline_yaw != sample.baseline_yaw:
-        return Heading(SolutionStatus.INSUFFICIENT_OBS, PositionType.NONE, -1.0, 0.0, 0.0, 0.0, 0.0, "", 0, 0)
+        return HeadingLog(SolutionStatus.INSUFFICIENT_OBS, PositionType.NONE, -1.0, 0.0, 0.0, 0.0, 0.0, "", 0, 0)
     sigma = math.degrees(_zero(sample.baseline_yaw_sigma))
     used = max(0, sample.satellites)
     kind = PositionType.NARROW_INT
     heading = _track(sample.baseline_yaw)
-    return Heading(SolutionStatus.SOL_COMPUTED, kind, 1.0, heading, 0.0, sigma, sigma, "", used, used)
+    return HeadingLog(SolutionStatus.SOL_COMPUTED, kind, 1.0, heading, 0.0, sigma, sigma, "", used, used)
 
 
 NOVATEL: dict[str, Callable[[GpsSample], Body]] = {

@@ -13,9 +13,9 @@ from dataclasses import replace
 
 from modelserver.messages import ImuSample
 from modelserver.spatial.so3 import Vector3
-from msdrivers.emulate.gx1_samples import Instant, Samples
-from msdrivers.emulate.gx1_unit import GAINS, Clock, Eeprom, Fault, Gx1Unit
-from msdrivers.protocol.gx1 import DATA, Address, Command, Gains, Packet, Request, RequestParser
+from msdrivers.emulate.gx1_samples import Samples, SensedState
+from msdrivers.emulate.gx1_unit import GAINS, Eeprom, Gx1Unit, UnitClock, UnitFault
+from msdrivers.protocol.gx1 import DATA, Address, CommandByte, Gains, Packet, Request, RequestParser
 from msdrivers.protocol.gx1.scaling import (
     G0,
     HIGHEST,
@@ -27,7 +27,7 @@ from msdrivers.protocol.gx1.scaling import (
     vector,
     vector_words,
 )
-from msdrivers.station import Now, Output, Phase, Send, Told
+from msdrivers.station import Now, Output, Send, StationPhase, StationStatus
 
 BACKLOG = 100
 """Cycles that are made up for when the emulator was woken late."""
@@ -58,7 +58,7 @@ class Gx1Emulator:
         self._faults = deque(sorted(self.unit.faults, key=lambda fault: fault.at))
         self._opened_ns: int | None = None
         self._stalled_until_ns = 0
-        self._clock = Clock.of(self.eeprom, self.unit, 0, 0)
+        self._clock = UnitClock.of(self.eeprom, self.unit, 0, 0)
         self._tick = 0
         self._gains = GAINS
         self._bias: Vector3 = (0.0, 0.0, 0.0)
@@ -73,7 +73,12 @@ class Gx1Emulator:
         if self._opened_ns is None:
             self._opened_ns = now.monotonic_ns
             self._switch_on(now.monotonic_ns, self.unit.tick_offset)
-        return [Told(Phase.STREAMING if self.streamed else Phase.WAITING, f"3DM-GX1 {self.unit.serial} emulated")]
+        return [
+            StationStatus(
+                StationPhase.STREAMING if self.streamed else StationPhase.WAITING,
+                f"3DM-GX1 {self.unit.serial} emulated",
+            )
+        ]
 
     def received(self, unit: bytes, now: Now) -> list[Output[bytes]]:
         """Take bytes from the host."""
@@ -81,7 +86,7 @@ class Gx1Emulator:
         if now.monotonic_ns < max(self._clock.started_ns, self._stalled_until_ns):
             return outputs
         for request in self._requests.feed(unit):
-            self.counts[f"request.{Command(request.command).name.lower()}"] += 1
+            self.counts[f"request.{CommandByte(request.command).name.lower()}"] += 1
             self._handle(request, now)
         return outputs + self._sent(now.monotonic_ns)
 
@@ -110,7 +115,7 @@ class Gx1Emulator:
         """Leave: a device does nothing about it."""
         return []
 
-    def strike(self, fault: Fault, now: Now) -> None:
+    def strike(self, fault: UnitFault, now: Now) -> None:
         """Let something go wrong now."""
         if fault.kind == "stall":
             self._stalled_until_ns = now.monotonic_ns + round(fault.amount * 1e9)
@@ -123,7 +128,7 @@ class Gx1Emulator:
             self._pending[fault.kind] += round(fault.amount)
 
     def _switch_on(self, at_ns: int, ticks: int) -> None:
-        self._clock = Clock.of(self.eeprom, self.unit, at_ns, ticks)
+        self._clock = UnitClock.of(self.eeprom, self.unit, at_ns, ticks)
         self._tick, self._capture = 0, None
         self._outbox.clear()
         self._requests.clear()
@@ -145,7 +150,7 @@ class Gx1Emulator:
             elif self.streamed:
                 self._measure(self.streamed, at_ns)
 
-    def _measured(self, at_ns: int) -> Instant | None:
+    def _measured(self, at_ns: int) -> SensedState | None:
         return self._samples.at(at_ns // 1000 + self._utime_offset_us)
 
     def _measure(self, command: int, at_ns: int) -> None:
@@ -159,22 +164,22 @@ class Gx1Emulator:
             "acceleration": vector_words(_scaled(instant.force, self.unit.force_sign), self._gains.accelerometer, G0),
             "rate": vector_words(_difference(self._rate(instant), self._bias), self._gains.gyro),
         }
-        if command == Command.EULER_VECTORS:
+        if command == CommandByte.EULER_VECTORS:
             words = (*euler_words(instant.orientation), *vectors["acceleration"], *vectors["rate"])
-        elif command in (Command.INSTANTANEOUS_EULER, Command.STABILISED_EULER):
+        elif command in (CommandByte.INSTANTANEOUS_EULER, CommandByte.STABILISED_EULER):
             words = euler_words(instant.orientation)
         else:
             words = (*vectors["field"], *vectors["acceleration"], *vectors["rate"])
-            if command == Command.QUATERNION_VECTORS:
+            if command == CommandByte.QUATERNION_VECTORS:
                 words = (*quaternion_words(instant.orientation), *words)
         self._reply(command, words, at_ns)
 
-    def _rate(self, instant: Instant) -> Vector3:
+    def _rate(self, instant: SensedState) -> Vector3:
         x, y, z = instant.rate
         a, b, c = self.unit.gyro_bias
         return (x + a, y + b, z + c)
 
-    def _field_words(self, instant: Instant, offsets: Vector3) -> tuple[int, int, int]:
+    def _field_words(self, instant: SensedState, offsets: Vector3) -> tuple[int, int, int]:
         x, y, z = instant.field
         a, b, c = self.unit.field_offset
         return vector_words(_difference((x + a, y + b, z + c), offsets), self._gains.magnetometer, TESLA)
@@ -195,7 +200,7 @@ class Gx1Emulator:
             x, y, z = (sum(axis) / len(rates) for axis in zip(*rates, strict=True))
             self._bias = (x, y, z)
         self._capture = None
-        self._reply(Command.CAPTURE_BIAS, (), at_ns)
+        self._reply(CommandByte.CAPTURE_BIAS, (), at_ns)
 
     def _handle(self, request: Request, now: Now) -> None:
         command, data, at_ns = request.command, request.data, now.monotonic_ns
@@ -203,34 +208,34 @@ class Gx1Emulator:
             return
         if command in DATA:
             self._measure(command, at_ns)
-        elif command == Command.TEMPERATURE:
+        elif command == CommandByte.TEMPERATURE:
             self._reply(command, (temperature_word(self.unit.celsius),), at_ns)
-        elif command == Command.CAPTURE_BIAS:
+        elif command == CommandByte.CAPTURE_BIAS:
             self._capture = (at_ns + round(self.unit.bias_capture * 1e9), [])
-        elif command == Command.CONTINUOUS:
+        elif command == CommandByte.CONTINUOUS:
             if data[0] == 0 or data[0] in DATA:
                 self.streamed = data[0]
                 self._reply(command, (data[0], self._clock.ticks(at_ns)), at_ns)
-        elif command in (Command.READ_EEPROM, Command.WRITE_EEPROM):
+        elif command in (CommandByte.READ_EEPROM, CommandByte.WRITE_EEPROM):
             address = int.from_bytes(data[:2], "big")
-            if command == Command.WRITE_EEPROM and address % 2 == 0 and address < 256:
+            if command == CommandByte.WRITE_EEPROM and address % 2 == 0 and address < 256:
                 self._write({address: int.from_bytes(data[2:], "big")})
             self._reply(command, (self.eeprom.word(address),), at_ns)
-        elif command == Command.FIRMWARE:
+        elif command == CommandByte.FIRMWARE:
             self._reply(command, (self.unit.firmware,), at_ns)
-        elif command == Command.SERIAL:
+        elif command == CommandByte.SERIAL:
             self._reply(command, (self.unit.serial,), at_ns)
         else:
             self._hard_iron(command, data, at_ns)
 
     def _hard_iron(self, command: int, data: bytes, at_ns: int) -> None:
-        if command == Command.HARD_IRON_START:
+        if command == CommandByte.HARD_IRON_START:
             self._extremes = ([HIGHEST] * 3, [LOWEST] * 3)
             self._store_offsets((0, 0, 0))
             self._reply(command, (), at_ns)
             return
         low, high = self._extremes
-        if command == Command.HARD_IRON_COLLECT:
+        if command == CommandByte.HARD_IRON_COLLECT:
             instant = self._measured(at_ns)
             if instant is None:
                 return
@@ -253,7 +258,11 @@ class Gx1Emulator:
         self._keep(self.eeprom)
 
     def _reply(self, command: int, words: tuple[int, ...], at_ns: int) -> None:
-        ticks = None if command in (Command.CONTINUOUS, Command.FIRMWARE, Command.SERIAL) else self._clock.ticks(at_ns)
+        ticks = (
+            None
+            if command in (CommandByte.CONTINUOUS, CommandByte.FIRMWARE, CommandByte.SERIAL)
+            else self._clock.ticks(at_ns)
+        )
         raw = Packet(command, words, ticks).to_bytes()
         if self._pending["drop"] > 0:
             self._pending["drop"] -= 1

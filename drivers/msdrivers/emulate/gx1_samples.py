@@ -14,7 +14,7 @@ _NED_FROM_ENU: Quaternion = (0.0, 0.5**0.5, 0.5**0.5, 0.0)
 """Half a turn about the line between east and north."""
 
 
-class Instant(NamedTuple):
+class SensedState(NamedTuple):
     """What is felt, along the sensor's axes in SI units; the orientation in north, east, down."""
 
     rate: Vector3
@@ -34,10 +34,10 @@ class Samples:
     def __init__(self, samples: Iterable[ImuSample]):
         """Take the samples, whose stamps rise."""
         self._rest: Iterator[ImuSample] = iter(samples)
-        self._before: tuple[int, Instant] | None = None
+        self._before: tuple[int, SensedState] | None = None
         self._after = self._next()
 
-    def at(self, utime: int) -> Instant | None:
+    def at(self, utime: int) -> SensedState | None:
         """Return what is felt at an instant; None after the last sample. Instants may not go back."""
         while self._after is not None and self._after[0] <= utime:
             self._before, self._after = self._after, self._next()
@@ -48,22 +48,22 @@ class Samples:
         (begin, a), (end, b) = self._before, self._after
         return _between(a, b, (utime - begin) / (end - begin)) if utime > begin else a
 
-    def _next(self) -> tuple[int, Instant] | None:
+    def _next(self) -> tuple[int, SensedState] | None:
         sample = next(self._rest, None)
         return None if sample is None else (sample.header.utime, _felt(sample))
 
 
-def _felt(sample: ImuSample) -> Instant:
+def _felt(sample: ImuSample) -> SensedState:
     orientation = so3.IDENTITY if sample.orientation is None else sample.orientation
     if sample.orientation_reference is OrientationReference.ENU:
         orientation = so3.normalized(so3.multiply(_NED_FROM_ENU, orientation))
-    return Instant(
+    return SensedState(
         sample.angular_velocity or _ZERO, sample.specific_force or _ZERO, sample.magnetic_field or _ZERO, orientation
     )
 
 
-def _between(a: Instant, b: Instant, share: float) -> Instant:
-    return Instant(
+def _between(a: SensedState, b: SensedState, share: float) -> SensedState:
+    return SensedState(
         _mixed(a.rate, b.rate, share),
         _mixed(a.force, b.force, share),
         _mixed(a.field, b.field, share),

@@ -39,7 +39,7 @@ class Eeprom:
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class UnitFault:
     """Something that goes wrong `at` seconds after the line was first opened.
 
     kind: `drop` or `corrupt` the next `amount` replies, `stall` for `amount` seconds, `restart`, or `jump` by `amount`
@@ -79,11 +79,11 @@ class Gx1Unit:
     force_sign: int = 1
     celsius: float = 23.0
     streams: int = 0
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[UnitFault, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Clock:
+class UnitClock:
     """The device's clock since it was switched on at `started_ns`, monotonic nanoseconds of the host.
 
     tick_s: seconds of a tick by the device. drift: how much faster it runs than the host's clock. offset: ticks that
@@ -96,7 +96,7 @@ class Clock:
     offset: int
 
     @classmethod
-    def of(cls, eeprom: Eeprom, unit: Gx1Unit, started_ns: int, offset: int) -> Clock:
+    def of(cls, eeprom: Eeprom, unit: Gx1Unit, started_ns: int, offset: int) -> UnitClock:
         """Return the clock as the timer words have it; 10 ms a tick where they are zero."""
         return cls(started_ns, tick_seconds(map(eeprom.word, Address.TIMER)) or 0.01, unit.drift, offset)
 

@@ -16,7 +16,7 @@ from msdrivers.protocol.can.database import CanDatabase, FrameError
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.can.mapping import CommandMap, StatusMap
 from msdrivers.protocol.can.vehicle import NUMBERS, BoundCommand, bind_command, bind_status
-from msdrivers.station import Now, Output, Phase, Told
+from msdrivers.station import Now, Output, StationPhase, StationStatus
 
 COUNT_TOP = 255
 
@@ -86,7 +86,7 @@ class VehicleEmulator:
             first = now.utime if self._next is None else self._next.header.utime
             self._begun = (now.monotonic_ns, min(now.utime, first))
             self._moved_ns = self._status_ns = now.monotonic_ns
-        return [Told(Phase.STREAMING, "vehicle controller emulated"), *self.woken(now)]
+        return [StationStatus(StationPhase.STREAMING, "vehicle controller emulated"), *self.woken(now)]
 
     def received(self, unit: CanFrame, now: Now) -> list[Output[CanFrame]]:
         """Take a command."""

@@ -12,7 +12,7 @@ from msdrivers.protocol.can.database import BoundSignal, CanDatabase
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.can.mapping import WheelMap
 from msdrivers.protocol.can.wheels import BoundWheel, bind_wheels
-from msdrivers.station import Now, Output, Phase, Told
+from msdrivers.station import Now, Output, StationPhase, StationStatus
 
 
 class WheelsEmulator:
@@ -54,7 +54,7 @@ class WheelsEmulator:
         self._line.begin(now.monotonic_ns)
         if self._begun is None and self._next is not None:
             self._begun = (now.monotonic_ns, min(now.utime, self._next.header.utime))
-        return [Told(Phase.STREAMING, f"{len(self._wheels)} wheels emulated"), *self.woken(now)]
+        return [StationStatus(StationPhase.STREAMING, f"{len(self._wheels)} wheels emulated"), *self.woken(now)]
 
     def received(self, unit: CanFrame, now: Now) -> list[Output[CanFrame]]:
         """Take no notice: encoders are told nothing."""

@@ -7,7 +7,7 @@ from typing import Generic, TypeVar
 
 from modelserver.errors import RecordingError
 from msdrivers.links import Link, PlayedOutError
-from msdrivers.raw_log import Form, RawReader, RawWriter, Record, Time, Way
+from msdrivers.raw_log import Form, RawReader, RawRecord, RawWriter, RecordDirection, Time
 
 U = TypeVar("U")
 
@@ -47,16 +47,16 @@ class RecordingLink(Generic[U]):
         """Return what came in. Raises LinkError."""
         units = self._link.poll(timeout)
         for unit in units:
-            self._writer.record(Way.RECEIVED, self._time.now(), self._form.pack(unit))
+            self._writer.record(RecordDirection.RECEIVED, self._time.now(), self._form.pack(unit))
         return units
 
     def send(self, unit: U) -> None:
         """Send a unit. Raises LinkError."""
         self._link.send(unit)
-        self._writer.record(Way.SENT, self._time.now(), self._form.pack(unit))
+        self._writer.record(RecordDirection.SENT, self._time.now(), self._form.pack(unit))
 
     def _word(self, text: str) -> None:
-        self._writer.record(Way.WORD, self._time.now(), text.encode())
+        self._writer.record(RecordDirection.WORD, self._time.now(), text.encode())
 
 
 class PlayedLink(Generic[U]):
@@ -70,10 +70,10 @@ class PlayedLink(Generic[U]):
     def __init__(self, reader: RawReader, unpack: Callable[[bytes], U], time: Time):
         self.description = reader.name
         self._reader = reader
-        self._records = (record for record in reader if record.way is Way.RECEIVED)
+        self._records = (record for record in reader if record.way is RecordDirection.RECEIVED)
         self._unpack, self._time = unpack, time
         self._played = self._unfit = 0
-        self._next: Record | None = None
+        self._next: RawRecord | None = None
         self._ahead_ns: int | None = None
 
     def open(self, baud: int | None = None) -> None:

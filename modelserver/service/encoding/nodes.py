@@ -47,7 +47,7 @@ LARGEST_CONSTRUCTED: Final = 5_000_000
 _SWAPS: Final = sys.byteorder != "little"
 
 
-class Node(Protocol):
+class TypeNode(Protocol):
     """How one declared type is stored. `text` is its canonical description, part of the schema."""
 
     @property
@@ -93,7 +93,7 @@ class Scalar:
         return frozenset() if self._values else self._types
 
     def encode(self, value: Any, out: TokenWriter) -> None:
-        """See `Node`."""
+        """See `TypeNode`."""
         # numpy's scalars are stored as Python's, which have the same bits
         plain = value.item() if isinstance(value, (np.bool_, np.integer, np.float64)) else value
         if type(plain) not in self._types or (self._values and plain not in self._values):
@@ -101,7 +101,7 @@ class Scalar:
         out.tokens.append(plain)
 
     def decode(self, head: Any, source: TokenReader) -> Any:
-        """See `Node`."""
+        """See `TypeNode`."""
         return head if type(head) in self._types and not self._values else self.converted(head)
 
     def converted(self, token: Any) -> Any:
@@ -131,13 +131,13 @@ class Complex:
     text = "complex"
 
     def encode(self, value: Any, out: TokenWriter) -> None:
-        """See `Node`."""
+        """See `TypeNode`."""
         if not isinstance(value, complex):
             raise TypeError(f"{_described(value)}, declared as complex")
         out.tokens += (value.real, value.imag)
 
     def decode(self, head: Any, source: TokenReader) -> Any:
-        """See `Node`."""
+        """See `TypeNode`."""
         imag = source.take()
         if type(head) is not float or type(imag) is not float:
             raise ValueError("no complex number")
@@ -155,17 +155,17 @@ class EnumNode:
         return {name: member.value for name, member in sorted(self.cls.__members__.items())}
 
     def encode(self, value: Any, out: TokenWriter) -> None:
-        """See `Node`."""
+        """See `TypeNode`."""
         if type(value) is not self.cls:
             raise TypeError(f"{_described(value)}, declared as {self.text}")
         out.tokens.append(value._value_)
 
     def decode(self, head: Any, source: TokenReader) -> Any:
-        """See `Node`."""
+        """See `TypeNode`."""
         return self.cls(head)
 
 
-class Record:
+class RecordNode:
     """A class with declared fields: a NamedTuple, a dataclass, or a class that `schema` found the fields of.
 
     `parts` returns the values of the fields of an instance, `build` makes an instance of them. `constructed`: by the
@@ -176,19 +176,19 @@ class Record:
         self.cls, self.text = cls, name
         self.index = -1
         self.names: tuple[str, ...] = ()
-        self.nodes: tuple[Node, ...] = ()
+        self.nodes: tuple[TypeNode, ...] = ()
         self.parts: Callable[[Any], Sequence[Any]] = tuple
         self.build: Callable[[list[Any]], Any] = cls
         self.constructed = False
         self._plan: tuple[tuple[str, frozenset[type], Callable[[Any, TokenWriter], None]], ...] = ()
-        self._allowed: dict[int, Record] = {}
+        self._allowed: dict[int, RecordNode] = {}
 
     def number(self, index: int) -> None:
         """Set the index by which bytes name the class."""
         self.index = index
         self._allowed = {index: self}
 
-    def define(self, names: Sequence[str], nodes: Sequence[Node]) -> None:
+    def define(self, names: Sequence[str], nodes: Sequence[TypeNode]) -> None:
         """Set the fields."""
         self.names, self.nodes = tuple(names), tuple(nodes)
         self._plan = tuple(
@@ -201,7 +201,7 @@ class Record:
         return [[name, node.text] for name, node in zip(self.names, self.nodes, strict=True)]
 
     def encode(self, value: Any, out: TokenWriter) -> None:
-        """See `Node`."""
+        """See `TypeNode`."""
         place = out.records.get(id(value))
         if place is not None:
             out.tokens.append(~place)
@@ -229,7 +229,7 @@ class Record:
             raise EncodingError(f"{self.text}.{name} is {error}") from error
 
     def decode(self, head: Any, source: TokenReader) -> Any:
-        """See `Node`."""
+        """See `TypeNode`."""
         return decode_record(head, source, self._allowed)
 
     def decode_fields(self, source: TokenReader) -> Any:
@@ -256,7 +256,7 @@ class Record:
         return values
 
 
-def decode_record(head: Any, source: TokenReader, allowed: Mapping[int, Record]) -> Any:
+def decode_record(head: Any, source: TokenReader, allowed: Mapping[int, RecordNode]) -> Any:
     """Read a record of one of the allowed classes, by their index. Raises ValueError for any other."""
     if type(head) is not int:
         raise ValueError(f"{_described(head)} where a {_names(allowed)} belongs")
@@ -272,7 +272,7 @@ def decode_record(head: Any, source: TokenReader, allowed: Mapping[int, Record])
     return value
 
 
-def _names(allowed: Mapping[int, Record]) -> str:
+def _names(allowed: Mapping[int, RecordNode]) -> str:
     return " | ".join(record.text for record in allowed.values())
 
 
@@ -285,43 +285,43 @@ def _referred(known: Sequence[tuple[Any, int]], head: int) -> tuple[Any, int]:
 class AnyRecord:
     """A union of records, or a protocol with its implementations."""
 
-    def __init__(self, records: Sequence[Record], text: str = ""):
+    def __init__(self, records: Sequence[RecordNode], text: str = ""):
         self._by_class = {record.cls: record for record in records}
         self.records = records
         self.text = text or " | ".join(sorted(record.text for record in records))
 
     def encode(self, value: Any, out: TokenWriter) -> None:
-        """See `Node`."""
+        """See `TypeNode`."""
         record = self._by_class.get(type(value))
         if record is None:
             raise TypeError(f"{_described(value)}, declared as {self.text}")
         record.encode(value, out)
 
     @cached_property
-    def _by_index(self) -> dict[int, Record]:
+    def _by_index(self) -> dict[int, RecordNode]:
         return {record.index: record for record in self.records}
 
     def decode(self, head: Any, source: TokenReader) -> Any:
-        """See `Node`."""
+        """See `TypeNode`."""
         return decode_record(head, source, self._by_index)
 
 
 class ClassNode:
     """One of several classes itself, not an instance."""
 
-    def __init__(self, records: Sequence[Record]):
+    def __init__(self, records: Sequence[RecordNode]):
         self._by_class = {record.cls: record for record in records}
         self.text = f"class of {' | '.join(sorted(record.text for record in records))}"
 
     def encode(self, value: Any, out: TokenWriter) -> None:
-        """See `Node`."""
+        """See `TypeNode`."""
         record = self._by_class.get(value)
         if record is None:
             raise TypeError(f"{value!r:.60}, declared as {self.text}")
         out.tokens.append(record.index)
 
     def decode(self, head: Any, source: TokenReader) -> Any:
-        """See `Node`."""
+        """See `TypeNode`."""
         for cls, record in self._by_class.items():
             if type(head) is int and record.index == head:
                 return cls
@@ -331,19 +331,19 @@ class ClassNode:
 class Optional:
     """X or None."""
 
-    def __init__(self, inner: Node):
+    def __init__(self, inner: TypeNode):
         self.inner = inner
         self.text = f"{inner.text} | None"
 
     def encode(self, value: Any, out: TokenWriter) -> None:
-        """See `Node`."""
+        """See `TypeNode`."""
         if value is None:
             out.tokens.append(None)
         else:
             self.inner.encode(value, out)
 
     def decode(self, head: Any, source: TokenReader) -> Any:
-        """See `Node`."""
+        """See `TypeNode`."""
         return None if head is None else self.inner.decode(head, source)
 
 
@@ -353,12 +353,12 @@ class Choice:
     `types`: for each alternative the type of its values.
     """
 
-    def __init__(self, nodes: Sequence[Node], types: Sequence[type]):
+    def __init__(self, nodes: Sequence[TypeNode], types: Sequence[type]):
         self.nodes, self._types = tuple(nodes), tuple(types)
         self.text = " | ".join(f"({node.text})" for node in nodes)
 
     def encode(self, value: Any, out: TokenWriter) -> None:
-        """See `Node`."""
+        """See `TypeNode`."""
         for number, cls in enumerate(self._types):
             if type(value) is cls:
                 out.tokens.append(number)
@@ -367,7 +367,7 @@ class Choice:
         raise TypeError(f"{_described(value)}, declared as {self.text}")
 
     def decode(self, head: Any, source: TokenReader) -> Any:
-        """See `Node`."""
+        """See `TypeNode`."""
         if type(head) is not int or not 0 <= head < len(self.nodes):
             raise ValueError(f"no {self.text}")
         return self.nodes[head].decode(source.take(), source)
@@ -380,7 +380,7 @@ class _Shared:
     kinds: tuple[type, ...]
 
     def encode(self, value: Any, out: TokenWriter) -> None:
-        """See `Node`."""
+        """See `TypeNode`."""
         places = out.others.setdefault(self, {})
         place = places.get(id(value))
         if place is not None:
@@ -392,7 +392,7 @@ class _Shared:
         out.remember(places, value)
 
     def decode(self, head: Any, source: TokenReader) -> Any:
-        """See `Node`."""
+        """See `TypeNode`."""
         if type(head) is not int:
             raise ValueError(f"{_described(head)} where a {self.text} belongs")
         known = source.others.setdefault(self, [])
@@ -417,7 +417,7 @@ class _Shared:
 class TupleNode(_Shared):
     """A tuple of any length of one type; or a list."""
 
-    def __init__(self, element: Node, cls: type[tuple[Any, ...]] | type[list[Any]] = tuple):
+    def __init__(self, element: TypeNode, cls: type[tuple[Any, ...]] | type[list[Any]] = tuple):
         self._element, self._cls, self.kinds = element, cls, (cls,)
         self.text = f"{cls.__name__} of ({element.text})"
 
@@ -448,7 +448,7 @@ class FixedTuple(_Shared):
 
     kinds = (tuple,)
 
-    def __init__(self, nodes: Sequence[Node]):
+    def __init__(self, nodes: Sequence[TypeNode]):
         self._nodes = tuple(nodes)
         self._count = len(self._nodes)
         scalars = [node for node in nodes if isinstance(node, Scalar)]
@@ -481,7 +481,7 @@ class FixedTuple(_Shared):
 class MappingNode(_Shared):
     """A mapping, in its own order. One that is declared as Mapping is read-only when it is read."""
 
-    def __init__(self, key: Node, element: Node, mutable: bool):
+    def __init__(self, key: TypeNode, element: TypeNode, mutable: bool):
         self._key, self._element, self._mutable = key, element, mutable
         self.kinds = (dict,) if mutable else (dict, MappingProxyType)
         self.text = f"{'dict' if mutable else 'mapping'} of ({key.text}) to ({element.text})"

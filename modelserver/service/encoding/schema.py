@@ -38,12 +38,12 @@ from modelserver.service.encoding.nodes import (
     EnumNode,
     FixedTuple,
     MappingNode,
-    Node,
     NumpyArray,
     Optional,
-    Record,
+    RecordNode,
     Scalar,
     TupleNode,
+    TypeNode,
 )
 from modelserver.service.encoding.tokens import EncodingError, TokenReader, TokenWriter
 
@@ -116,9 +116,9 @@ class Schema:
     ):
         self._implementations = implementations or {}
         self._omitted = omitted or {}
-        self._records: dict[type, Record] = {}
+        self._records: dict[type, RecordNode] = {}
         self._enums: dict[type, EnumNode] = {}
-        self._undefined: list[Record] = []
+        self._undefined: list[RecordNode] = []
         self._roots = {name: self._node(annotation, f"root {name}") for name, annotation in sorted(roots.items())}
         while self._undefined:
             self._define(self._undefined.pop())
@@ -178,7 +178,7 @@ class Schema:
             + ("; ".join(found[:MOST_DIFFERENCES]) + more or "their description is damaged")
         )
 
-    def _description(self, records: Sequence[Record]) -> dict[str, Any]:
+    def _description(self, records: Sequence[RecordNode]) -> dict[str, Any]:
         return {
             "records": {record.text: record.definition() for record in records},
             "enums": {node.text: node.definition() for node in self._enums.values()},
@@ -187,7 +187,7 @@ class Schema:
 
     # --- from annotations to nodes ---
 
-    def _node(self, hint: Any, place: str) -> Node:
+    def _node(self, hint: Any, place: str) -> TypeNode:
         hint = _expand_alias(hint)
         origin, arguments = typing.get_origin(hint), typing.get_args(hint)
         if hint in _SCALARS:
@@ -221,7 +221,7 @@ class Schema:
             return self._record(hint, place)
         raise SchemaError(f"{place}: {hint} cannot be stored")
 
-    def _sequence(self, origin: Any, arguments: tuple[Any, ...], place: str) -> Node:
+    def _sequence(self, origin: Any, arguments: tuple[Any, ...], place: str) -> TypeNode:
         if origin is tuple and arguments[-1:] != (...,):
             return FixedTuple([self._node(each, place) for each in arguments])
         return TupleNode(self._node(arguments[0], place), list if origin is list else tuple)
@@ -234,15 +234,15 @@ class Schema:
             raise SchemaError(f"{place}: type[{hint}] cannot be stored")
         return sorted(found, key=_name)
 
-    def _union(self, arguments: Sequence[Any], place: str) -> Node:
+    def _union(self, arguments: Sequence[Any], place: str) -> TypeNode:
         nodes = [(self._node(each, place), each) for each in arguments if each is not type(None)]
         nodes.sort(key=lambda pair: pair[0].text)
-        inner: Node
+        inner: TypeNode
         if len(nodes) == 1:
             inner = nodes[0][0]
         elif all(isinstance(node, Scalar) for node, _ in nodes):
             return Scalar(sorted({_SCALARS[each] for each in arguments}))
-        elif all(isinstance(node, (Record, AnyRecord)) for node, _ in nodes):
+        elif all(isinstance(node, (RecordNode, AnyRecord)) for node, _ in nodes):
             inner = AnyRecord([record for node, _ in nodes for record in _records_of(node)])
         else:
             inner = Choice([node for node, _ in nodes], [typing.get_origin(each) or each for _, each in nodes])
@@ -252,16 +252,16 @@ class Schema:
             return Scalar(sorted({*inner.names, "None"}))
         return Optional(inner)
 
-    def _record(self, cls: type, place: str) -> Record:
+    def _record(self, cls: type, place: str) -> RecordNode:
         found = self._records.get(cls)
         if found is None:
             if cls.__module__ == "builtins" or getattr(cls, "_is_protocol", False):
                 raise SchemaError(f"{place}: {cls} cannot be stored; declare what it holds")
-            found = self._records[cls] = Record(cls, _name(cls))
+            found = self._records[cls] = RecordNode(cls, _name(cls))
             self._undefined.append(found)
         return found
 
-    def _define(self, record: Record) -> None:
+    def _define(self, record: RecordNode) -> None:
         cls, name = record.cls, record.text
         omitted = self._omitted.get(cls, frozenset())
         slots = _slots(cls)
@@ -293,8 +293,8 @@ class Schema:
         record.define(fields, [self._node(hints[each], f"{name}.{each}") for each in fields])
 
 
-def _records_of(node: Node) -> Sequence[Record]:
-    return node.records if isinstance(node, AnyRecord) else [node] if isinstance(node, Record) else []
+def _records_of(node: TypeNode) -> Sequence[RecordNode]:
+    return node.records if isinstance(node, AnyRecord) else [node] if isinstance(node, RecordNode) else []
 
 
 def _is_function(hint: Any) -> bool:

@@ -99,28 +99,28 @@ def _key_named(name: str, keys: Sequence[Key]) -> Key | None:
     raise RecordingError(f"it is sealed with key {name[:64]!r}, which is not in the key file")
 
 
-class Last(NamedTuple):
+class LastSegment(NamedTuple):
     """The last segment that a directory holds: the number of its run, -1: there is none; its seal, see `Newest`."""
 
     run: int = -1
     seal: str = ""
 
 
-def last_link(directory: Path) -> Last:
+def last_link(directory: Path) -> LastSegment:
     """Return the last segment of a directory, as far as its head and its end can be read. Raises OSError."""
     held = segments(directory)
     if not held:
-        return Last()
+        return LastSegment()
     with open_regular(held[-1]) as file:
         if not file.seek(0, 2):
-            return Last()
+            return LastSegment()
         with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
             head, end = next(iter(read(data)), None), read_end(data)
     run = head.facts.get("run_number") if isinstance(head, Head) else None
-    return Last(run if type(run) is int else -1, "" if end is None else end.seal.hex())
+    return LastSegment(run if type(run) is int else -1, "" if end is None else end.seal.hex())
 
 
-class Finding(NamedTuple):
+class ChainFinding(NamedTuple):
     """Something about the chain. `damage`: segments are missing, exchanged, or not genuine."""
 
     text: str
@@ -145,36 +145,36 @@ class Chain:
         self._before: _Link | None = None
         self._places: dict[int, Path] = {}
 
-    def begin(self, path: Path, facts: dict[str, Any]) -> list[Finding]:
+    def begin(self, path: Path, facts: dict[str, Any]) -> list[ChainFinding]:
         """Check where a segment belongs, by its head."""
         found = []
         number, previous = facts["number"], str(facts["previous"])
         match = SEGMENT_NAME.fullmatch(path.name)
         if match is not None and int(match[1]) != number:
-            found.append(Finding(f"is segment {number} by its own head: renamed, or put in the place of another"))
+            found.append(ChainFinding(f"is segment {number} by its own head: renamed, or put in the place of another"))
         first = self._places.setdefault(number, path)
         before = self._before
         if first != path:
-            found.append(Finding(f"occurs twice: it is {first.name} once more"))
+            found.append(ChainFinding(f"occurs twice: it is {first.name} once more"))
         elif before is None:
             if number > 0 or previous:
                 count = f"{number} earlier segments" if number > 0 else "earlier segments"
-                found.append(Finding(f"{count} were dropped by the ring, or removed", damage=False))
+                found.append(ChainFinding(f"{count} were dropped by the ring, or removed", damage=False))
         elif number <= before.number:
-            found.append(Finding(f"is older than {before.path.name} before it: the order was changed"))
+            found.append(ChainFinding(f"is older than {before.path.name} before it: the order was changed"))
         elif number > before.number + 1:
             missing = number - before.number - 1
             found.append(
-                Finding(f"{missing} segments before it are missing, behind {before.path.name}: removed, or lost")
+                ChainFinding(f"{missing} segments before it are missing, behind {before.path.name}: removed, or lost")
             )
         elif previous and not before.seal:
-            found.append(Finding(f"goes on from {before.path.name}, whose end was cut off after it was written"))
+            found.append(ChainFinding(f"goes on from {before.path.name}, whose end was cut off after it was written"))
         elif previous != before.seal:
-            found.append(Finding(f"does not follow from {before.path.name}: one of the two was exchanged"))
+            found.append(ChainFinding(f"does not follow from {before.path.name}: one of the two was exchanged"))
         self._before = _Link(path, number, "")
         return found
 
-    def end(self, facts: dict[str, Any], end: End | None) -> list[Finding]:
+    def end(self, facts: dict[str, Any], end: End | None) -> list[ChainFinding]:
         """Check the seal of the segment that was begun last; `end` None: it is not closed."""
         before = self._before
         assert before is not None
@@ -190,9 +190,9 @@ class Chain:
         try:
             key = _key_named(name, self._keys)
         except RecordingError as error:
-            return [Finding(f"cannot be proved: {error}")]
+            return [ChainFinding(f"cannot be proved: {error}")]
         if not hmac.compare_digest(seal_segment(key, end.digest), end.mac):
-            return [Finding("its seal is wrong: it was not written by who knows the key")]
+            return [ChainFinding("its seal is wrong: it was not written by who knows the key")]
         self.genuine += key is not None
         return []
 
@@ -203,20 +203,20 @@ class Chain:
         if self._before is not None and match is not None:
             self._before = _Link(path, int(match[1]), "")
 
-    def finish(self, newest: Newest | None) -> list[Finding]:
+    def finish(self, newest: Newest | None) -> list[ChainFinding]:
         """Check that the last segment is the one that `newest` names; None: it is not known."""
         before = self._before
         if newest is None or before is None:
             return []
         if newest.number > before.number:
             count = newest.number - before.number
-            return [Finding(f"{count} segments after {before.path.name} are missing at the end: removed, or lost")]
+            return [ChainFinding(f"{count} segments after {before.path.name} are missing at the end: removed, or lost")]
         if newest.number < before.number:
             # the machine may stop between making a segment and naming it
             if newest.number == before.number - 1 and not before.seal:
                 return []
-            return [Finding(f"the file {NEWEST_NAME} is older than {before.path.name}: it was put back")]
+            return [ChainFinding(f"the file {NEWEST_NAME} is older than {before.path.name}: it was put back")]
         if newest.seal and newest.seal != before.seal:
             why = "was exchanged" if before.seal else "was cut off after it was closed"
-            return [Finding(f"{before.path.name}, the last segment, {why}")]
+            return [ChainFinding(f"{before.path.name}, the last segment, {why}")]
         return []

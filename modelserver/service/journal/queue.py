@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple, Protocol, TypeAlias
 
 from modelserver.core import CoreState, Instant
 from modelserver.messages import Noticed
-from modelserver.wire.journal import Kind
+from modelserver.wire.journal import RecordKind
 
 MOST_WAITING: Final = 100_000
 MOST_BYTES: Final = 64 << 20
@@ -42,7 +42,7 @@ class Journal(Protocol):
         """Note an event that the core is about to take; `heard` is the message that it was read from, if any."""
         ...
 
-    def note(self, kind: Kind, heard: Heard, now: Instant) -> None:
+    def note(self, kind: RecordKind, heard: Heard, now: Instant) -> None:
         """Note a message that is not handed to the core, and what is done with it instead."""
         ...
 
@@ -66,7 +66,7 @@ class NoJournal:
     def step(self, event: object, now: Instant, heard: Heard | None = None) -> None:
         """Do nothing."""
 
-    def note(self, kind: Kind, heard: Heard, now: Instant) -> None:
+    def note(self, kind: RecordKind, heard: Heard, now: Instant) -> None:
         """Do nothing."""
 
     def said(self, channel: str, data: bytes) -> None:
@@ -77,10 +77,10 @@ class NoJournal:
         return ()
 
 
-class Entry(NamedTuple):
+class JournalEntry(NamedTuple):
     """Something to be written: a message, an event, or a state (`event` is a `Beginning`)."""
 
-    kind: Kind
+    kind: RecordKind
     now: Instant
     channel: str
     data: bytes
@@ -108,7 +108,7 @@ class JournalQueue:
         self.wants_state = False
         self.lost = 0
         """Records that were dropped since the last beginning. Written by the loop's thread."""
-        self._entries: deque[Entry] = deque()
+        self._entries: deque[JournalEntry] = deque()
         self._news: deque[Noticed] = deque()
         self._open = False
         self._begun = 0  # 1 from the first beginning on: before that nothing is lost
@@ -122,7 +122,7 @@ class JournalQueue:
         self.wants_state = False
         self._last = now
         lost, self.lost = self.lost, 0
-        self._entries.append(Entry(Kind.EVENT, now, "", b"", Beginning(state, lost)))
+        self._entries.append(JournalEntry(RecordKind.EVENT, now, "", b"", Beginning(state, lost)))
         self._open, self._begun = True, 1
 
     def step(self, event: object, now: Instant, heard: Heard | None = None) -> None:
@@ -131,18 +131,18 @@ class JournalQueue:
         if not self._open:
             self.lost += self._begun
         elif heard is None:
-            self._put(Entry(Kind.EVENT, now, "", b"", event))
+            self._put(JournalEntry(RecordKind.EVENT, now, "", b"", event))
         else:
-            self._put(Entry(Kind.REQUEST, now, heard[0], heard[1], event))
+            self._put(JournalEntry(RecordKind.REQUEST, now, heard[0], heard[1], event))
 
-    def note(self, kind: Kind, heard: Heard, now: Instant) -> None:
+    def note(self, kind: RecordKind, heard: Heard, now: Instant) -> None:
         """See `Journal`."""
         self._last = now
-        self._put(Entry(kind, now, heard[0], heard[1]))
+        self._put(JournalEntry(kind, now, heard[0], heard[1]))
 
     def said(self, channel: str, data: bytes) -> None:
         """See `Journal`."""
-        self._put(Entry(Kind.SAID, self._last, channel, data))
+        self._put(JournalEntry(RecordKind.SAID, self._last, channel, data))
 
     def news(self) -> Sequence[Noticed]:
         """See `Journal`."""
@@ -150,7 +150,7 @@ class JournalQueue:
             return ()
         return [self._news.popleft() for _ in range(len(self._news))]
 
-    def _put(self, entry: Entry) -> None:
+    def _put(self, entry: JournalEntry) -> None:
         if not self._open:
             self.lost += self._begun
             return
@@ -168,7 +168,7 @@ class JournalQueue:
         """Whether what is told is taken; if not, a beginning is to be asked for once there is room."""
         return self._open
 
-    def take(self, most: int) -> list[Entry]:
+    def take(self, most: int) -> list[JournalEntry]:
         """Return what has waited longest."""
         entries = self._entries
         taken = [entries.popleft() for _ in range(min(most, len(entries)))]

@@ -20,14 +20,14 @@ from modelserver.messages import (
 )
 from modelserver.service.bus import Handler
 from modelserver.service.daemon import Vehicle
-from modelserver.service.heard import Heard
+from modelserver.service.heard import SensorChannel
 from modelserver.service.hooks import Hooks
 from modelserver.service.journal import state as journal_state
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.service.requests.handler import request_kind
 from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode
-from modelserver.wire.journal import Kind, Record
+from modelserver.wire.journal import JournalRecord, RecordKind
 from modelserver.wire.requests import request_header
 
 Said = tuple[str, bytes]
@@ -99,32 +99,32 @@ class Rerun(Loop):
         settings = LoopSettings(period_ns=1, channel_prefix=config.lcm.channel_prefix)
         super().__init__(self._ear, self._standing, known, settings, Hooks(snapshot=vehicle.snapshot))
         joints = config.sensors.joints
-        self._heard: Mapping[str, Heard] = {
+        self._heard: Mapping[str, SensorChannel] = {
             # heard on and on where a geometry without joints has taken the place of one that had some
-            f"{config.lcm.channel_prefix}{joints.channel}": Heard("joints_t", round(joints.latency * 1e6)),
+            f"{config.lcm.channel_prefix}{joints.channel}": SensorChannel("joints_t", round(joints.latency * 1e6)),
             **vehicle.sensor_channels(),
         }
         # what went wrong then was logged then
         self._told = _Everything()  # type: ignore[assignment]
 
-    def handle(self, record: Record) -> list[Said]:
+    def handle(self, record: JournalRecord) -> list[Said]:
         """Do again what a record tells of; return what is said to it. Raises RecordingError where it makes no sense."""
         self._ear.said = []
         now = self._standing.instant = Instant(record.monotonic_ns, record.utime)
-        if record.kind is Kind.EVENT:
+        if record.kind is RecordKind.EVENT:
             self._taken(journal_state.decode_event(record.data), now)
-        elif record.kind is Kind.SAMPLE:
+        elif record.kind is RecordKind.SAMPLE:
             heard = self._heard.get(record.channel)
             if heard is None:
                 raise RecordingError(f"{record.channel} is no channel that the vehicle file names")
             self._taken(heard.read(record.data), now)
-        elif record.kind is Kind.PORTION:
+        elif record.kind is RecordKind.PORTION:
             self._requests.send_deferred(int.from_bytes(record.data, "big"))
-        elif record.kind not in (Kind.UNREAD, Kind.IGNORED):
+        elif record.kind not in (RecordKind.UNREAD, RecordKind.IGNORED):
             self._asked_again(record, now)
         return self._ear.said
 
-    def _asked_again(self, record: Record, now: Instant) -> None:
+    def _asked_again(self, record: JournalRecord, now: Instant) -> None:
         channel = BY_NAME.get(record.channel.removeprefix(self.config.lcm.channel_prefix))
         if channel is None:
             raise RecordingError(f"{record.channel} is no channel for requests")
@@ -132,20 +132,20 @@ class Rerun(Loop):
             request: Request = decode(channel.type_name, record.data)
         except WireError as error:
             header = request_header(record.data)
-            if record.kind is Kind.MALFORMED and header is not None:
+            if record.kind is RecordKind.MALFORMED and header is not None:
                 kind = request_kind(channel.type_name)
                 assert kind is not None
                 self.send(core.turn_back(self.state, kind, header, str(error), now))
                 return
             raise RecordingError(f"a request on {record.channel} cannot be read: {error}") from error
-        if record.kind is Kind.REQUEST:
+        if record.kind is RecordKind.REQUEST:
             self._taken(request, now)
-        elif record.kind is Kind.REMEMBERED:
+        elif record.kind is RecordKind.REMEMBERED:
             # an answer that holds for good is the same from the core; it is not to be counted there
             self.send(core.step(self.state, request, now)[1])
-        elif record.kind is Kind.REFUSED:
+        elif record.kind is RecordKind.REFUSED:
             self.send(core.refuse(self.state, request, now))
-        elif record.kind is Kind.FAILED:
+        elif record.kind is RecordKind.FAILED:
             self._requests.drop_deferred()
             self.send(core.fail(self.state, request, now))
 

@@ -29,7 +29,7 @@ KEPT_S: Final = 2.0
 """Seconds of the history of poses that are written: all of it would be fifty times as much."""
 
 
-class Run(NamedTuple):
+class RunState(NamedTuple):
     """All that a run is gone on with from."""
 
     config: VehicleConfig
@@ -44,7 +44,7 @@ def schema() -> Schema:
 @lru_cache(maxsize=4)
 def _schema(measurements: tuple[type[Measurement], ...]) -> Schema:
     return Schema(
-        {"run": Run, "event": Event | ModelLoaded},
+        {"run": RunState, "event": Event | ModelLoaded},
         {
             Localizer: (ModeLocalizer,),
             Later: (Deferred,),
@@ -62,14 +62,14 @@ def detach(state: CoreState) -> CoreState:
     return state._replace(view=replace(view, history=view.history.recent(KEPT_S), joints=view.joints.apart()))
 
 
-def encode_run(run: Run, pause: Callable[[], object] = lambda: None) -> bytes:
+def encode_run(run: RunState, pause: Callable[[], object] = lambda: None) -> bytes:
     """Return a run as bytes, with the description of its types; `pause`: see `Schema.encode`. Raises EncodingError."""
     return write_document(schema(), "run", run, pause)
 
 
-def decode_run(data: bytes) -> Run:
+def decode_run(data: bytes) -> RunState:
     """Return the run in what `encode_run` wrote. Raises RecordingError."""
-    run: Run = read_document(schema(), "run", data)
+    run: RunState = read_document(schema(), "run", data)
     return run
 
 

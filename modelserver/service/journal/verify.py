@@ -26,18 +26,18 @@ from modelserver.messages import GetHistory, GetTransformations, Noticed, Reject
 from modelserver.regular_files import open_regular
 from modelserver.service.journal import build as journal_build
 from modelserver.service.journal import state as journal_state
-from modelserver.service.journal.chain import NEWEST_NAME, Chain, Finding, read_newest
+from modelserver.service.journal.chain import NEWEST_NAME, Chain, ChainFinding, read_newest
 from modelserver.service.journal.comparison import Deviation, deviation
 from modelserver.service.journal.rerun import Rerun, Said
 from modelserver.signing import Key
 from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode
-from modelserver.wire.journal import FORMAT, Broken, End, Head, Kind, Record, State, read
+from modelserver.wire.journal import FORMAT, Broken, End, Head, JournalRecord, RecordKind, State, read
 
 POSES: Final = ("POSE", "POSE_VECTOR", "POSE_ODOM")
 
 
-class Result(IntEnum):
+class VerificationResult(IntEnum):
     """What a verification found; the value is the exit code of `modelserver replay --verify`.
 
     REPRODUCED ends with 0 where no key is given: then nobody asks for more.
@@ -128,13 +128,13 @@ class Verified:
         return self.proved and self.complete and 0 < self.segments == self.genuine and not self.unsealed
 
     @property
-    def result(self) -> Result:
+    def result(self) -> VerificationResult:
         """What was found, in a word."""
         if not self.proved:
-            return Result.DIFFERS
+            return VerificationResult.DIFFERS
         if self.close:
-            return Result.CLOSE
-        return Result.AUTHENTIC if self.authentic else Result.REPRODUCED
+            return VerificationResult.CLOSE
+        return VerificationResult.AUTHENTIC if self.authentic else VerificationResult.REPRODUCED
 
 
 @dataclass(slots=True)
@@ -142,9 +142,9 @@ class _Group:
     """What was handled at a time, with everything that was said to it, then and now."""
 
     segment: Path
-    record: Record
+    record: JournalRecord
     now: list[Said]
-    was: list[Record] = field(default_factory=list)
+    was: list[JournalRecord] = field(default_factory=list)
 
 
 def verify(
@@ -199,7 +199,7 @@ class _Verifier:
             for item in read(data):
                 if found.difference is not None:
                     return
-                if isinstance(item, Record):
+                if isinstance(item, JournalRecord):
                     if found.handled % 512 == 0:
                         self._show(before + item.at)
                     self._take(item)
@@ -276,15 +276,15 @@ class _Verifier:
             if len(history):
                 self._held_until = history.last + round(rerun.state.settings.history_s * 1e6)
 
-    def _take(self, record: Record) -> None:
+    def _take(self, record: JournalRecord) -> None:
         found, rerun = self.found, self._rerun
         found.first_utime = found.first_utime or record.utime
         found.last_utime = record.utime
         if rerun is None:
-            if record.kind is Kind.SAID:
+            if record.kind is RecordKind.SAID:
                 found.skipped[record.channel] += 1
             return
-        if record.kind is Kind.SAID:
+        if record.kind is RecordKind.SAID:
             if self._group is None:
                 self._group = _Group(self._path, record, [])
             self._group.was.append(record)
@@ -310,9 +310,9 @@ class _Verifier:
             self._group.now += said
 
     @staticmethod
-    def _is_refusal(record: Record) -> bool:
+    def _is_refusal(record: JournalRecord) -> bool:
         """Return whether it may stand between two things that are said at once: one could not be sent, or kept."""
-        if record.kind is not Kind.EVENT:
+        if record.kind is not RecordKind.EVENT:
             return False
         try:
             return isinstance(journal_state.decode_event(record.data), (Rejected, Noticed))
@@ -351,7 +351,7 @@ class _Verifier:
             )
             return
 
-    def _is_close(self, was: Record, now: Said) -> bool:
+    def _is_close(self, was: JournalRecord, now: Said) -> bool:
         """Return whether a message is the same to within the tolerance, and take note of how near it is."""
         found = self.found
         off = deviation(was.data, now[1]) if now[0] == was.channel else None
@@ -365,12 +365,18 @@ class _Verifier:
         found.largest = found.largest.largest(off)
         return True
 
-    def _asks_for_the_past(self, record: Record) -> bool:
+    def _asks_for_the_past(self, record: JournalRecord) -> bool:
         """Return whether a reply to a record may rest on poses that the state no longer held, when it was taken up."""
         rerun = self._rerun
         if rerun is None or not len(rerun.state.history) or rerun.state.history.last >= self._held_until:
             return False
-        if record.kind not in (Kind.REQUEST, Kind.REMEMBERED, Kind.MALFORMED, Kind.REFUSED, Kind.FAILED):
+        if record.kind not in (
+            RecordKind.REQUEST,
+            RecordKind.REMEMBERED,
+            RecordKind.MALFORMED,
+            RecordKind.REFUSED,
+            RecordKind.FAILED,
+        ):
             # one that waited is answered later
             return True
         channel = BY_NAME.get(record.channel.removeprefix(rerun.config.lcm.channel_prefix))
@@ -426,7 +432,7 @@ class _Verifier:
         if newest is None:
             self._remark(f"the file {NEWEST_NAME} is not there, so nobody knows whether segments after it are missing")
 
-    def _remark_all(self, findings: Iterable[Finding]) -> None:
+    def _remark_all(self, findings: Iterable[ChainFinding]) -> None:
         for each in findings:
             self._remark(each.text, each.damage)
 
@@ -434,6 +440,6 @@ class _Verifier:
         self.found.remarks.append(Remark(self._path, text, damage))
 
 
-def _paired(was: Sequence[Record], now: Sequence[Said]) -> Iterator[tuple[Record | None, Said | None]]:
+def _paired(was: Sequence[JournalRecord], now: Sequence[Said]) -> Iterator[tuple[JournalRecord | None, Said | None]]:
     for number in range(max(len(was), len(now))):
         yield was[number] if number < len(was) else None, now[number] if number < len(now) else None

@@ -21,7 +21,7 @@ from modelserver.messages import CHANNEL_OF
 from modelserver.service.clock import Clock
 from modelserver.service.journal import state as journal_state
 from modelserver.service.journal.chain import NEWEST_NAME, Newest, last_link, read_newest, seal_segment
-from modelserver.service.journal.queue import Beginning, Entry, JournalQueue
+from modelserver.service.journal.queue import Beginning, JournalEntry, JournalQueue
 from modelserver.service.journal.ring import Ring, Segment
 from modelserver.service.keeping.origin import write_whole
 from modelserver.service.keeping.trouble import words_on
@@ -30,8 +30,8 @@ from modelserver.signing import Key
 from modelserver.wire.journal import (
     FORMAT,
     End,
-    Kind,
-    Record,
+    JournalRecord,
+    RecordKind,
     batch_written,
     end_written,
     file_written,
@@ -164,9 +164,9 @@ class JournalWriter:
         except OSError as error:
             self._fail(error)
 
-    def _write(self, entries: list[Entry]) -> None:
+    def _write(self, entries: list[JournalEntry]) -> None:
         """Write entries, each stretch of them between two beginnings in one batch."""
-        records: list[Record] = []
+        records: list[JournalRecord] = []
         for number, entry in enumerate(entries):
             if isinstance(entry.event, Beginning):
                 try:
@@ -182,15 +182,15 @@ class JournalWriter:
                 records.append(self._record(entry))
         self._seal(records)
 
-    def _record(self, entry: Entry) -> Record:
+    def _record(self, entry: JournalEntry) -> JournalRecord:
         kind, data = entry.kind, entry.data
-        if kind is Kind.EVENT:
+        if kind is RecordKind.EVENT:
             data = journal_state.encode_event(entry.event, self._pause)
-        elif kind is Kind.REQUEST and type(entry.event) not in CHANNEL_OF:
-            kind = Kind.SAMPLE
-        return Record(kind, entry.now.monotonic_ns, entry.now.utime, entry.channel, data)
+        elif kind is RecordKind.REQUEST and type(entry.event) not in CHANNEL_OF:
+            kind = RecordKind.SAMPLE
+        return JournalRecord(kind, entry.now.monotonic_ns, entry.now.utime, entry.channel, data)
 
-    def _seal(self, records: list[Record]) -> None:
+    def _seal(self, records: list[JournalRecord]) -> None:
         if not records or self._segment is None:
             self._lost += len(records)
             return
@@ -207,7 +207,7 @@ class JournalWriter:
         lost = self._lost + beginning.lost
         try:
             self._end()
-            run = journal_state.Run(self._origins.config, journal_state.detach(beginning.state))
+            run = journal_state.RunState(self._origins.config, journal_state.detach(beginning.state))
             state = journal_state.encode_run(run, self._pause)
             segment = self._fresh()
         except OSError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from modelserver.service.probing.findings import Finding, Grade
+from modelserver.service.probing.findings import Diagnosis, DiagnosisLevel
 
 MOST_SLEW = 500e-6
 """By how much a clock is slewed at most (ntp_adjtime(2), the kernel's limit); more between two looks was a step."""
@@ -38,28 +38,36 @@ _KEEP_TIME = {
 }
 
 
-def clock_findings(facts: ClockFacts, shared: bool) -> tuple[Finding, ...]:
+def clock_findings(facts: ClockFacts, shared: bool) -> tuple[Diagnosis, ...]:
     """Return what is to be said of the clock; `shared`: the bus leaves the machine, so that others' clocks matter."""
     subject = "clock"
     command = _KEEP_TIME[facts.tool]
     if facts.utime < FIRST_YEAR_S * 1_000_000:
         why = "stamps, the magnetic field's model and logs go by it; is the battery of the clock empty?"
-        return (Finding(Grade.ERROR, subject, "it was never set: it tells a year before 2023", why, command),)
+        return (
+            Diagnosis(DiagnosisLevel.ERROR, subject, "it was never set: it tells a year before 2023", why, command),
+        )
     found = []
     if abs(facts.slewed) > MOST_SLEW * facts.watched + 1e-3:
         seen = f"it was stepped by {facts.slewed:+.3f} s while it was looked at"
         why = "poses are invalid until time is taken up anew; let it be stepped at boot alone"
-        found.append(Finding(Grade.WARNING, subject, seen, why, _KEEP_TIME["chrony"] if facts.tool else command))
+        found.append(
+            Diagnosis(DiagnosisLevel.WARNING, subject, seen, why, _KEEP_TIME["chrony"] if facts.tool else command)
+        )
     if facts.synchronised is None:
-        found.append(Finding(Grade.NOTE, subject, "whether it is synchronised cannot be read here"))
+        found.append(Diagnosis(DiagnosisLevel.NOTE, subject, "whether it is synchronised cannot be read here"))
     elif facts.synchronised:
         error = "" if facts.error is None else f", to {facts.error * 1e3:.1f} ms or better"
-        found.append(Finding(Grade.OK, subject, f"synchronised{error}"))
+        found.append(Diagnosis(DiagnosisLevel.OK, subject, f"synchronised{error}"))
     else:
         why = (
             "the stamps of several machines do not belong together"
             if shared
             else "stamps belong together on this machine, and tell no true time"
         )
-        found.append(Finding(Grade.WARNING if shared else Grade.NOTE, subject, "not synchronised", why, command))
+        found.append(
+            Diagnosis(
+                DiagnosisLevel.WARNING if shared else DiagnosisLevel.NOTE, subject, "not synchronised", why, command
+            )
+        )
     return tuple(found)

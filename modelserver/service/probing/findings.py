@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 
-class Grade(IntEnum):
+class DiagnosisLevel(IntEnum):
     """How much a finding matters.
 
     ok: as it should be. note: worth knowing, nothing to mend. warning: it works, and may fail or lose something.
@@ -21,13 +21,13 @@ class Grade(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Diagnosis:
     """One thing that was looked at: what was seen, why that matters, and the exact command that mends it.
 
     `subject` names what was looked at, in a word or two. `why` and `command` are empty where there is nothing to mend.
     """
 
-    grade: Grade
+    grade: DiagnosisLevel
     subject: str
     seen: str
     why: str = ""
@@ -40,11 +40,11 @@ class Finding:
         return f"{text}. Mend it with: {self.command}" if self.command else text
 
 
-def worst(findings: Iterable[Finding]) -> Grade:
+def worst(findings: Iterable[Diagnosis]) -> DiagnosisLevel:
     """Return the gravest grade among findings; OK of none."""
-    return max((each.grade for each in findings), default=Grade.OK)
+    return max((each.grade for each in findings), default=DiagnosisLevel.OK)
 
 
-def of_weight(findings: Iterable[Finding], least: Grade = Grade.WARNING) -> tuple[Finding, ...]:
+def of_weight(findings: Iterable[Diagnosis], least: DiagnosisLevel = DiagnosisLevel.WARNING) -> tuple[Diagnosis, ...]:
     """Return the findings that are of a grade or graver."""
     return tuple(each for each in findings if each.grade >= least)

@@ -11,7 +11,7 @@ import lcm
 
 from modelserver.errors import WireError
 from modelserver.messages import GetBodyList, Health, RequestHeader
-from modelserver.service.probing.servers import Answers, Server
+from modelserver.service.probing.servers import DiscoveredServers, Server
 from modelserver.wire.channels import PROBE_CHANNEL, REPLY_PREFIX, literal
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.provider import open_lcm, take_message
@@ -54,7 +54,7 @@ def _returns(speaker: lcm.LCM, ear: lcm.LCM, word: bytes, seconds: float) -> boo
     return False
 
 
-def who_answers(url: str, prefix: str, reply_prefix: str = REPLY_PREFIX, seconds: float = 1.3) -> Answers:
+def who_answers(url: str, prefix: str, reply_prefix: str = REPLY_PREFIX, seconds: float = 1.3) -> DiscoveredServers:
     """Return which daemons are heard on a bus, and how many reply to one question; raises BusError.
 
     It listens for longer than the time between two health reports. A stranger's flood of reports is cut short.
@@ -83,7 +83,7 @@ def who_answers(url: str, prefix: str, reply_prefix: str = REPLY_PREFIX, seconds
     ear.subscribe(literal(request.reply_channel), reply)
     ear.publish(f"{prefix}PLATFORM_GET_BODY_LIST", encode(GetBodyList(request)))
     _listen(ear, seconds, lambda: False)
-    return Answers(tuple(servers), count)
+    return DiscoveredServers(tuple(servers), count)
 
 
 def _listen(ear: lcm.LCM, seconds: float, until: Callable[[], bool]) -> bool:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from urllib.parse import parse_qsl, urlsplit
 
 from modelserver.errors import shown
-from modelserver.service.probing.findings import Finding, Grade
+from modelserver.service.probing.findings import Diagnosis, DiagnosisLevel
 from modelserver.wire.multicast import GROUP, route
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
 
@@ -82,11 +82,11 @@ class BusFacts:
     dropped: int | None = None
 
 
-def bus_findings(facts: BusFacts) -> tuple[Finding, ...]:
+def bus_findings(facts: BusFacts) -> tuple[Diagnosis, ...]:
     """Return what is to be said of the bus."""
     if facts.address is None:
         seen = f"{shown(facts.url)} is no UDP multicast"
-        return (Finding(Grade.NOTE, "bus", seen, "only udpm:// is looked at"),)
+        return (Diagnosis(DiagnosisLevel.NOTE, "bus", seen, "only udpm:// is looked at"),)
     address = facts.address
     return (
         *_route(facts, address),
@@ -96,7 +96,7 @@ def bus_findings(facts: BusFacts) -> tuple[Finding, ...]:
     )
 
 
-def _route(facts: BusFacts, address: UdpAddress) -> tuple[Finding, ...]:
+def _route(facts: BusFacts, address: UdpAddress) -> tuple[Diagnosis, ...]:
     subject = "multicast route"
     lo = next((each.name for each in facts.interfaces if each.loopback), "lo")
     outward = next((each.name for each in facts.interfaces if each.up and each.multicast and not each.loopback), "")
@@ -105,71 +105,81 @@ def _route(facts: BusFacts, address: UdpAddress) -> tuple[Finding, ...]:
     if interface is None:
         command = by_lo if address.ttl == 0 or not outward else f"sudo {route(address.group, outward)}"
         why = "LCM cannot be joined, so nothing is heard or said"
-        return (Finding(Grade.ERROR, subject, f"there is none to {address.group}", why, command),)
+        return (Diagnosis(DiagnosisLevel.ERROR, subject, f"there is none to {address.group}", why, command),)
     if not interface.name:
-        return (Finding(Grade.OK, subject, f"there is one to {address.group}"),)
+        return (Diagnosis(DiagnosisLevel.OK, subject, f"there is one to {address.group}"),)
     seen = f"{address.group} goes by {interface.name}"
     if not interface.up:
         why = "what is said goes nowhere"
-        return (Finding(Grade.ERROR, subject, f"{seen}, which is down", why, f"sudo ip link set {interface.name} up"),)
+        return (
+            Diagnosis(
+                DiagnosisLevel.ERROR, subject, f"{seen}, which is down", why, f"sudo ip link set {interface.name} up"
+            ),
+        )
     if interface.loopback and not interface.multicast:
         why = "some programs skip an interface that does not say it takes multicast"
         command = f"sudo ip link set {interface.name} multicast on"
-        return (Finding(Grade.NOTE, subject, f"{seen}, which is not marked for multicast", why, command),)
+        return (Diagnosis(DiagnosisLevel.NOTE, subject, f"{seen}, which is not marked for multicast", why, command),)
     if address.ttl == 0 and not interface.loopback:
         why = (
             f"nothing leaves the machine (ttl=0), and yet the bus is gone whenever {interface.name} goes down; a route "
             f"by {lo} stays"
         )
-        return (Finding(Grade.NOTE, subject, seen, why, by_lo),)
+        return (Diagnosis(DiagnosisLevel.NOTE, subject, seen, why, by_lo),)
     if address.ttl > 0 and interface.loopback:
         why = f"the URL says ttl={address.ttl}, and yet no other machine hears anything"
         # whichever routes they are that lead the group there
         away = f"sudo ip route flush match {address.group} dev {lo}"
         command = f"sudo {route(address.group, outward)}" if outward else away
-        return (Finding(Grade.WARNING, subject, seen, why, command),)
-    return (Finding(Grade.OK, subject, seen),)
+        return (Diagnosis(DiagnosisLevel.WARNING, subject, seen, why, command),)
+    return (Diagnosis(DiagnosisLevel.OK, subject, seen),)
 
 
-def _delivery(facts: BusFacts, address: UdpAddress) -> tuple[Finding, ...]:
+def _delivery(facts: BusFacts, address: UdpAddress) -> tuple[Diagnosis, ...]:
     subject = "own message"
     if facts.heard is None:
         return ()
     if not facts.heard:
         why = "no program on this machine hears another: a firewall between them, or multicast that is not looped back"
         command = f"sudo nft list ruleset; sudo iptables -I INPUT -d {address.group} -p udp -j ACCEPT"
-        return (Finding(Grade.ERROR, subject, "it does not come back", why, command),)
+        return (Diagnosis(DiagnosisLevel.ERROR, subject, "it does not come back", why, command),)
     if facts.heard_large is False:
         why = "long replies (histories, lists) are cut into packets, and not all of them arrive"
         command = _sysctl("net.core.rmem_max", RECEIVE_BUFFER_BYTES)
-        return (Finding(Grade.WARNING, subject, "a short one comes back, one of 100 kB does not", why, command),)
-    return (Finding(Grade.OK, subject, "it comes back"),)
+        return (
+            Diagnosis(DiagnosisLevel.WARNING, subject, "a short one comes back, one of 100 kB does not", why, command),
+        )
+    return (Diagnosis(DiagnosisLevel.OK, subject, "it comes back"),)
 
 
-def _reach(facts: BusFacts, address: UdpAddress) -> tuple[Finding, ...]:
+def _reach(facts: BusFacts, address: UdpAddress) -> tuple[Diagnosis, ...]:
     subject = "reach"
     if address.ttl == 0:
-        return (Finding(Grade.OK, subject, "nothing leaves the machine (ttl=0)"),)
+        return (Diagnosis(DiagnosisLevel.OK, subject, "nothing leaves the machine (ttl=0)"),)
     by = f" by {facts.interface.name}" if facts.interface is not None and facts.interface.name else ""
     hops = "its network" if address.ttl == 1 else f"and past {address.ttl - 1} routers"
     seen = f"what is said leaves the machine{by}, for {hops} (ttl={address.ttl})"
     why = "whoever is there hears everything, and may ask; write ttl=0 in lcm.url if that is not wanted"
-    return (Finding(Grade.NOTE, subject, seen, why),)
+    return (Diagnosis(DiagnosisLevel.NOTE, subject, seen, why),)
 
 
-def _buffers(facts: BusFacts) -> tuple[Finding, ...]:
+def _buffers(facts: BusFacts) -> tuple[Diagnosis, ...]:
     found = []
     subject = "receive buffer"
     if facts.buffer is not None and facts.buffer < RECEIVE_BUFFER_BYTES:
         seen = f"{_mib(facts.buffer)} of {_mib(RECEIVE_BUFFER_BYTES)} asked for (net.core.rmem_max)"
         why = "messages are lost in bursts"
-        found.append(Finding(Grade.WARNING, subject, seen, why, _sysctl("net.core.rmem_max", RECEIVE_BUFFER_BYTES)))
+        found.append(
+            Diagnosis(DiagnosisLevel.WARNING, subject, seen, why, _sysctl("net.core.rmem_max", RECEIVE_BUFFER_BYTES))
+        )
     elif facts.buffer is not None:
-        found.append(Finding(Grade.OK, subject, f"{_mib(facts.buffer)}, as asked for"))
+        found.append(Diagnosis(DiagnosisLevel.OK, subject, f"{_mib(facts.buffer)}, as asked for"))
     if facts.buffer_default is not None and facts.buffer_default < MIB:
         seen = f"{_mib(facts.buffer_default)} for programs that ask for none (net.core.rmem_default)"
         why = "lcm-spy, lcm-logger and clients without recv_buf_size in their URL lose messages in bursts"
-        found.append(Finding(Grade.NOTE, subject, seen, why, _sysctl("net.core.rmem_default", RECEIVE_BUFFER_BYTES)))
+        found.append(
+            Diagnosis(DiagnosisLevel.NOTE, subject, seen, why, _sysctl("net.core.rmem_default", RECEIVE_BUFFER_BYTES))
+        )
     if facts.dropped:
         seen = f"{facts.dropped} packets were lost so far by programs on this bus that are running"
         why = (
@@ -177,7 +187,7 @@ def _buffers(facts: BusFacts) -> tuple[Finding, ...]:
             "which: d of its skmem"
         )
         command = f"sudo ss -uanmp 'sport = :{facts.address.port if facts.address else 0}'"
-        found.append(Finding(Grade.WARNING, LOST, seen, why, command))
+        found.append(Diagnosis(DiagnosisLevel.WARNING, LOST, seen, why, command))
     return tuple(found)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from modelserver.errors import shown
-from modelserver.service.probing.findings import Finding, Grade
+from modelserver.service.probing.findings import Diagnosis, DiagnosisLevel
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,14 +23,14 @@ class Server:
 
 
 @dataclass(frozen=True, slots=True)
-class Answers:
+class DiscoveredServers:
     """Who was heard: daemons by their reports, and how many replies came to one question; None: nothing was asked."""
 
     servers: tuple[Server, ...] = ()
     replies: int | None = None
 
 
-def server_findings(answers: Answers, prefix: str, version: str) -> tuple[Finding, ...]:
+def server_findings(answers: DiscoveredServers, prefix: str, version: str) -> tuple[Diagnosis, ...]:
     """Return what is to be said of the daemons on the bus; `prefix` is that of the vehicle that is looked at."""
     subject = "daemon"
     ours = [each for each in answers.servers if each.prefix == prefix]
@@ -41,20 +41,24 @@ def server_findings(answers: Answers, prefix: str, version: str) -> tuple[Findin
         seen = f"{max(len(ours), replies)} answer at once{who}"
         why = "clients get the answers of either, and POSE is of both; stop all but one, or give each its own prefix"
         command = f"kill {ours[-1].pid}" if ours else "systemctl stop modelserver, on each machine but one"
-        found.append(Finding(Grade.ERROR, subject, seen, why, command))
+        found.append(Diagnosis(DiagnosisLevel.ERROR, subject, seen, why, command))
     elif ours or replies:
         who = f": {ours[0]}" if ours else ""
-        found.append(Finding(Grade.OK, subject, f"one answers{who}"))
+        found.append(Diagnosis(DiagnosisLevel.OK, subject, f"one answers{who}"))
     else:
         seen = f"none answers{f' with prefix {prefix}' if prefix else ''}"
-        found.append(Finding(Grade.NOTE, subject, seen, "where it is to run", "modelserver run -c vehicle.yaml"))
+        found.append(
+            Diagnosis(DiagnosisLevel.NOTE, subject, seen, "where it is to run", "modelserver run -c vehicle.yaml")
+        )
     for each in ours:
         if each.version != version:
             seen = f"{each} is version {shown(each.version, 40)}, this command {version}"
             why = "messages of the one may be nothing to the other"
-            found.append(Finding(Grade.WARNING, subject, seen, why, "sudo systemctl restart modelserver"))
+            found.append(Diagnosis(DiagnosisLevel.WARNING, subject, seen, why, "sudo systemctl restart modelserver"))
     others = sorted({each.prefix for each in answers.servers} - {prefix})
     if others:
         names = ", ".join(shown(each, 40) if each else "none" for each in others)
-        found.append(Finding(Grade.NOTE, "other vehicles", f"daemons with these prefixes are on the bus: {names}"))
+        found.append(
+            Diagnosis(DiagnosisLevel.NOTE, "other vehicles", f"daemons with these prefixes are on the bus: {names}")
+        )
     return tuple(found)

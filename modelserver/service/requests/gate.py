@@ -9,13 +9,13 @@ from modelserver.core import Instant
 from modelserver.errors import WireError
 from modelserver.messages import (
     CHANNEL_OF,
-    Commanded,
     Denied,
     Envelope,
     ReloadModel,
     Request,
     SetHTransform,
     SetStateVector,
+    SignedCommand,
 )
 from modelserver.signing import Freshness, Key, is_genuine, judged
 from modelserver.wire.channels import BY_NAME
@@ -42,7 +42,7 @@ class Gate:
         self._started_ns = started_ns
         self._known = Freshness()
 
-    def opened(self, data: bytes, now: Instant) -> Commanded | Denied:
+    def opened(self, data: bytes, now: Instant) -> SignedCommand | Denied:
         """Return what an envelope orders, or why it is refused. Raises WireError for what is no envelope."""
         envelope: Envelope = decode("signed_t", data)
         key = self._keys.get(envelope.key_name)
@@ -65,4 +65,4 @@ class Gate:
             order = decode(MODE_TYPE if kind is None else BY_NAME[envelope.channel].type_name, envelope.payload)
         except WireError as error:
             return Denied(source, error.reason, str(error), kind, header, malformed=True)
-        return Commanded(order, envelope.sender)
+        return SignedCommand(order, envelope.sender)

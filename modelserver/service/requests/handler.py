@@ -29,7 +29,6 @@ from modelserver.errors import QueryError, WireError
 from modelserver.geometry import names
 from modelserver.messages import (
     CHANNEL_OF,
-    Commanded,
     Event,
     GetTransformation,
     Noticed,
@@ -38,6 +37,7 @@ from modelserver.messages import (
     Request,
     RequestHeader,
     SendReply,
+    SignedCommand,
     SwitchMode,
     TimeQuery,
 )
@@ -56,7 +56,7 @@ from modelserver.service.requests.scheduler import (
 )
 from modelserver.wire.channels import BY_NAME, REQUESTS
 from modelserver.wire.codec import decode, encode
-from modelserver.wire.journal import Kind
+from modelserver.wire.journal import RecordKind
 from modelserver.wire.reply_cache import CACHED_TYPE, LARGEST_CACHE, StaticReplyCache
 from modelserver.wire.requests import request_header
 from modelserver.wire.signed import SIGNED
@@ -99,7 +99,7 @@ class RequestContext(Protocol):
         """Have the core handle an event and send its outputs; `heard` is the message that it was read from."""
         ...
 
-    def note(self, kind: Kind, channel: str, data: bytes, now: Instant) -> None:
+    def note(self, kind: RecordKind, channel: str, data: bytes, now: Instant) -> None:
         """Record in the journal a message that is not handed to the core."""
         ...
 
@@ -115,7 +115,7 @@ class RequestContext(Protocol):
         """Count and log an error while handling a message."""
         ...
 
-    def obey(self, command: Commanded, now: Instant) -> None:
+    def obey(self, command: SignedCommand, now: Instant) -> None:
         """Execute a signed command."""
         ...
 
@@ -317,7 +317,7 @@ class RequestHandler:
         except Exception:
             return  # counted already: as dropped
         now = self._clock.now()
-        self._context.note(Kind.REFUSED, dropped.channel, dropped.data, now)
+        self._context.note(RecordKind.REFUSED, dropped.channel, dropped.data, now)
         self._context.send(core.refuse(self._context.state, request, now))
 
     def _count_dropped(self) -> None:
@@ -359,7 +359,7 @@ class RequestHandler:
         if deferred.ready:
             count = deferred.portion
             # what is sent later than its request is a record of its own: a rerun of the journal sends it there
-            self._context.note(Kind.PORTION, deferred.channel, count.to_bytes(4, "big"), self._clock.now())
+            self._context.note(RecordKind.PORTION, deferred.channel, count.to_bytes(4, "big"), self._clock.now())
             self.send_deferred(count)
 
     def _answer(self, queued: QueuedRequest) -> None:
@@ -379,7 +379,7 @@ class RequestHandler:
             kind = request_kind(type_name)
             if header is not None and kind is not None:
                 now = self._clock.now()
-                context.note(Kind.MALFORMED, channel, data, now)
+                context.note(RecordKind.MALFORMED, channel, data, now)
                 context.send(core.turn_back(context.state, kind, header, str(error), now))
             return
         effort = effort_of(request)
@@ -410,7 +410,7 @@ class RequestHandler:
         header = RequestHeader(0, client.decode("utf-8", "replace"))
         if not header.is_answerable(context.state.settings.reply_prefix):
             return False
-        context.note(Kind.REMEMBERED, channel, data, now)
+        context.note(RecordKind.REMEMBERED, channel, data, now)
         context.publish(header.reply_channel, reply)
         self._answered += 1
         return True
@@ -428,7 +428,7 @@ class RequestHandler:
         """Reply to a request whose handling failed."""
         context, now = self._context, self._clock.now()
         context.failed(queued.channel, error)
-        context.note(Kind.FAILED, queued.channel, queued.data, now)
+        context.note(RecordKind.FAILED, queued.channel, queued.data, now)
         context.send(core.fail(context.state, request, now))
 
     def _open(self, channel: str, data: bytes) -> None:
@@ -437,7 +437,7 @@ class RequestHandler:
             return
         now = self._clock.now()
         found = self._gate.opened(data, now)
-        if isinstance(found, Commanded):
+        if isinstance(found, SignedCommand):
             # each one, however many: whoever signs is no stranger
             log.info("%s, signed by %s", type(found.order).__name__, plain(found.sender))
             try:
@@ -446,7 +446,7 @@ class RequestHandler:
                 self._context.failed(channel, error)
                 if not isinstance(found.order, SwitchMode):
                     own = f"{self._prefix}{CHANNEL_OF[type(found.order)]}"
-                    self._context.note(Kind.FAILED, own, encode(found.order), now)
+                    self._context.note(RecordKind.FAILED, own, encode(found.order), now)
                     self._context.send(core.fail(self._context.state, found.order, now))
             return
         self._context.step(found, now)

@@ -28,7 +28,7 @@ from msdrivers.protocol.modbus.registers import (
     Written,
 )
 from msdrivers.runner import Runner, RunnerSettings
-from msdrivers.station import Measured, Now, Phase, Reopen, Send
+from msdrivers.station import Measured, Now, Reopen, Send, StationPhase
 
 STEP = 0.072 * DEG
 
@@ -234,7 +234,7 @@ def test_given_silence_then_the_line_is_opened_anew_and_the_axis_set_up_again() 
     assert not [t for t, _ in wire.samples if 2.01 < t < 5.0]
     assert emulator.commanded["nod_rate"] == 45.0
     assert wire.samples[-1][0] > 7.98
-    assert [told.phase for _, told in wire.told][-1] is Phase.STREAMING
+    assert [told.phase for _, told in wire.told][-1] is StationPhase.STREAMING
     # what was found first is what is left
     left = [output.unit for output in driver.leaving(at(8.0)) if isinstance(output, Send)]
     assert all(isinstance(unit, WriteRegisters) for unit in left)

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from msdrivers.protocol.can.assembly import Assembler
+from msdrivers.protocol.can.assembly import CanFrameAssembler
 from msdrivers.protocol.can.counts import Odometer
 from msdrivers.protocol.can.frame import FrameKey
 
@@ -106,7 +106,7 @@ A, B = FrameKey(1), FrameKey(2)
 
 
 def test_given_all_frames_of_an_instant_then_it_ends_at_once_with_the_time_of_the_first() -> None:
-    assembler = Assembler(frozenset((A, B)), 10)
+    assembler = CanFrameAssembler(frozenset((A, B)), 10)
     assert assembler.add(B, {"b": 1}, 100, 7) == []
     (instant,) = assembler.add(A, {"a": 2}, 105, 8)
     assert (instant.monotonic_ns, instant.utime, instant.is_complete) == (100, 7, True)
@@ -115,7 +115,7 @@ def test_given_all_frames_of_an_instant_then_it_ends_at_once_with_the_time_of_th
 
 
 def test_given_a_frame_a_second_time_then_the_instant_before_ends_without_the_lost_one() -> None:
-    assembler = Assembler(frozenset((A, B)), 1000)
+    assembler = CanFrameAssembler(frozenset((A, B)), 1000)
     assembler.add(A, {"a": 1}, 100, 1)
     (lost,) = assembler.add(A, {"a": 2}, 200, 2)
     assert (lost.values, lost.is_complete) == ({A: {"a": 1}}, False)
@@ -124,7 +124,7 @@ def test_given_a_frame_a_second_time_then_the_instant_before_ends_without_the_lo
 
 
 def test_given_a_frame_too_late_then_it_belongs_to_the_next_instant() -> None:
-    assembler = Assembler(frozenset((A, B)), 10)
+    assembler = CanFrameAssembler(frozenset((A, B)), 10)
     assembler.add(A, {"a": 1}, 100, 1)
     assert assembler.due() == 110
     assert assembler.expired(109) == []

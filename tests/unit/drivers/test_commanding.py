@@ -15,7 +15,7 @@ from msdrivers.devices.vehicle_settings import LimitsMap
 from msdrivers.protocol.can.database import CanDatabase, parse_dbc
 from msdrivers.protocol.can.frame import CanFrame, bus_off
 from msdrivers.protocol.can.mapping import CommandMap, SignalMap
-from msdrivers.station import Output, Reopen, Send, Told
+from msdrivers.station import Output, Reopen, Send, StationStatus
 
 DATABASE = raptor_dbc()
 
@@ -37,7 +37,7 @@ def speeds(outputs: Iterable[Output[CanFrame]], database: CanDatabase = DATABASE
 
 
 def texts(outputs: Iterable[Output[CanFrame]]) -> str:
-    return "\n".join(output.text for output in outputs if isinstance(output, Told))
+    return "\n".join(output.text for output in outputs if isinstance(output, StationStatus))
 
 
 # --- late and repeated -----------------------------------------------------------------------------------------
@@ -107,7 +107,7 @@ def test_given_what_came_as_a_command_and_is_none_then_it_is_told_now_and_then_a
     told = [driver.refuse("malformed", "a command refused: nan", at(0.01 * n)) for n in range(2000)]
     words = [output for outputs in told for output in outputs]
     assert len(words) == 2
-    assert all(isinstance(each, Told) and each.is_trouble for each in words)
+    assert all(isinstance(each, StationStatus) and each.is_trouble for each in words)
     assert driver.counts["rejected.malformed"] == 2000
 
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from msdrivers.faults import FAULTS, Fault, parse_fault
+from msdrivers.faults import FAULTS, InjectedFault, parse_fault
 from msdrivers.faulty import FaultyStation, damaged
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.modbus.registers import ReadRegisters, Registers
-from msdrivers.station import Now, Output, Phase, Send, Told
+from msdrivers.station import Now, Output, Send, StationPhase, StationStatus
 
 TENTH_NS = 100_000_000
 
@@ -26,7 +26,7 @@ class Ticker:
 
     def opened(self, now: Now) -> Sequence[Output[bytes]]:
         self.next_ns = now.monotonic_ns + TENTH_NS
-        return [Told(Phase.STREAMING, f"device {self.number}")]
+        return [StationStatus(StationPhase.STREAMING, f"device {self.number}")]
 
     def received(self, unit: bytes, now: Now) -> Sequence[Output[bytes]]:
         self.heard.append(unit)
@@ -50,7 +50,7 @@ class Ticker:
 class Bench:
     """Runs a device with faults, and keeps what it says with the tenth of a second in which it does."""
 
-    def __init__(self, *faults: Fault):
+    def __init__(self, *faults: InjectedFault):
         self.made: list[Ticker] = []
         self.station: FaultyStation[bytes] = FaultyStation(self._make, faults)
         self.said: list[tuple[int, bytes]] = []
@@ -77,7 +77,7 @@ class Bench:
         for output in outputs:
             if isinstance(output, Send):
                 self.said.append((self.now.monotonic_ns // TENTH_NS, output.unit))
-            elif isinstance(output, Told):
+            elif isinstance(output, StationStatus):
                 self.told.append(output.text)
 
 
@@ -94,20 +94,20 @@ def test_given_no_fault_then_the_device_is_as_it_is() -> None:
 
 
 def test_given_drops_then_so_many_units_are_lost() -> None:
-    bench = Bench(Fault(0.25, "drop", 2)).until(7)
+    bench = Bench(InjectedFault(0.25, "drop", 2)).until(7)
     assert bench.said == spoken(1, 2, 5, 6, 7)
     assert bench.station.counts["fault.dropped"] == 2
     assert "fault: drop, 2" in bench.told
 
 
 def test_given_damage_then_so_many_units_differ() -> None:
-    bench = Bench(Fault(0.25, "corrupt", 1)).until(4)
+    bench = Bench(InjectedFault(0.25, "corrupt", 1)).until(4)
     assert bench.said == [*spoken(1, 2), (3, damaged(b"3")), (4, b"4")]
     assert bench.station.counts["fault.corrupted"] == 1
 
 
 def test_given_a_stall_then_nothing_is_said_or_heard_and_the_device_goes_on_afterwards() -> None:
-    bench = Bench(Fault(0.25, "stall", 0.3)).until(4)
+    bench = Bench(InjectedFault(0.25, "stall", 0.3)).until(4)
     bench.hears(b"lost")
     bench.until(8)
     assert bench.said == spoken(1, 2, 6, 7, 8)
@@ -116,7 +116,7 @@ def test_given_a_stall_then_nothing_is_said_or_heard_and_the_device_goes_on_afte
 
 
 def test_given_a_restart_then_the_device_is_made_anew_after_that_time() -> None:
-    bench = Bench(Fault(0.25, "restart", 0.5)).until(4)
+    bench = Bench(InjectedFault(0.25, "restart", 0.5)).until(4)
     bench.hears(b"lost")
     bench.until(10)
     assert len(bench.made) == 2
@@ -127,14 +127,14 @@ def test_given_a_restart_then_the_device_is_made_anew_after_that_time() -> None:
 
 
 def test_given_a_jump_then_its_time_is_ahead_from_then_on() -> None:
-    bench = Bench(Fault(0.25, "jump", 1.0)).until(4)
+    bench = Bench(InjectedFault(0.25, "jump", 1.0)).until(4)
     ahead = [int(unit) - tenth for tenth, unit in bench.said]
     assert ahead[:2] == [0, 0]
     assert set(ahead[2:]) == {10}
 
 
 def test_given_faults_in_any_order_then_each_comes_in_its_time() -> None:
-    bench = Bench(Fault(0.55, "drop"), Fault(0.15, "drop")).until(8)
+    bench = Bench(InjectedFault(0.55, "drop"), InjectedFault(0.15, "drop")).until(8)
     assert bench.said == spoken(1, 3, 4, 5, 7, 8)
 
 
@@ -155,9 +155,9 @@ def test_given_a_unit_without_content_then_it_stays(unit: object) -> None:
 
 @pytest.mark.parametrize(
     ("text", "fault"),
-    [("stall@10:2", Fault(10.0, "stall", 2.0)), ("drop@0.5", Fault(0.5, "drop", 1.0))],
+    [("stall@10:2", InjectedFault(10.0, "stall", 2.0)), ("drop@0.5", InjectedFault(0.5, "drop", 1.0))],
 )
-def test_given_a_text_then_it_is_the_fault(text: str, fault: Fault) -> None:
+def test_given_a_text_then_it_is_the_fault(text: str, fault: InjectedFault) -> None:
     assert parse_fault(text, FAULTS) == fault
 
 

@@ -11,13 +11,13 @@ from support_gps import SECOND, START, Line, drive, halves, noisy, now_at
 from modelserver.messages import FixType, SensorHeader
 from msdrivers.devices.gps import GpsDriver, GpsSettings
 from msdrivers.devices.gps.samples import novatel_sample
-from msdrivers.devices.gps.set_up import Progress, SetUp
+from msdrivers.devices.gps.set_up import SetUp, SetupProgress
 from msdrivers.emulate.gps import GpsEmulator, GpsUnit
 from msdrivers.protocol.nmea.encode import encode as nmea
-from msdrivers.protocol.novatel import Answer, Heading, LogHeader, NovatelLog, Position, PositionType, TimeStatus
+from msdrivers.protocol.novatel import Answer, HeadingLog, LogHeader, NovatelLog, Position, PositionType, TimeStatus
 from msdrivers.protocol.novatel.crc import crc32
 from msdrivers.protocol.novatel.encode import encode
-from msdrivers.station import Measured, Phase, Send, Told
+from msdrivers.station import Measured, Send, StationPhase, StationStatus
 
 NMEA_UNIT = GpsUnit(
     saved=tuple(f"log com1 {name} ontime 0.25" for name in ("gpgga", "gpgsa", "gpgst", "gprmc")), answers=False
@@ -50,7 +50,7 @@ def alone(*data: bytes, **settings) -> Line:
 @pytest.mark.parametrize("rate", [4.0, 10.0, 20.0])
 def test_given_a_receiver_when_set_up_then_every_fix_comes_with_its_velocity(rate: float, log_format: str):
     one = line(GpsSettings("gps", rate_hz=rate, log_format=log_format)).run(5.0)
-    assert one.phases == [Phase.WAITING, Phase.CONFIGURING, Phase.STREAMING], one.words
+    assert one.phases == [StationPhase.WAITING, StationPhase.CONFIGURING, StationPhase.STREAMING], one.words
     assert abs(len(one.samples) - 5.0 * rate) <= 2
     assert one.device.logs == tuple(f"best{what}{log_format[0]}" for what in ("pos", "vel"))
     truth = {each.header.utime: each for each in drive(30.0)}
@@ -92,7 +92,7 @@ def test_given_a_restart_when_the_prompt_comes_then_the_receiver_is_set_up_again
     assert one.device.counts["restarts"] == 1
     assert one.driver.counts["restarts"] == 1
     assert len(one.samples) - before > 10
-    assert one.phases[-2:] == [Phase.CONFIGURING, Phase.STREAMING], one.words
+    assert one.phases[-2:] == [StationPhase.CONFIGURING, StationPhase.STREAMING], one.words
     assert "started anew" in one.words
 
 
@@ -105,7 +105,7 @@ def test_given_a_restart_without_a_prompt_when_the_logs_stay_away_then_the_recei
     before = len(one.samples)
     one.run(6.0)
     assert len(one.samples) - before > 8, one.words
-    assert Phase.SILENT in one.phases
+    assert StationPhase.SILENT in one.phases
     assert "no BESTPOS for 2 s" in one.words
 
 
@@ -132,7 +132,7 @@ def test_given_another_baud_rate_when_nothing_is_understood_then_the_others_are_
     unit = GpsUnit(saved=("log com1 bestposb ontime 0.25",))
     one = line(GpsSettings("gps", bauds=bauds), unit, right_baud=9600, baud=bauds[0]).run(12.0)
     assert one.baud == 9600, one.words
-    assert one.phases[-1] is Phase.STREAMING
+    assert one.phases[-1] is StationPhase.STREAMING
     assert len(one.reopened) == bauds.index(9600)
 
 
@@ -142,7 +142,7 @@ def test_given_a_wrong_device_when_all_rates_are_tried_then_it_says_what_was_hea
     for _ in range(100):
         one.hear(b"\x02LMS200 \x80\x81\x00\x03")
         one.run(0.1)
-    silent = [each.text for each in one.told if each.phase is Phase.SILENT]
+    silent = [each.text for each in one.told if each.phase is StationPhase.SILENT]
     assert silent
     assert "no NovAtel receiver" in silent[0]
     assert "at 9600 baud heard" in silent[0]
@@ -162,7 +162,7 @@ def test_given_a_dead_line_when_nothing_is_heard_then_power_and_cable_are_named(
 def test_given_a_refused_command_when_set_up_then_the_words_of_the_receiver_are_told():
     one = line(GpsSettings("gps", commands=("frobnicate 1",))).run(3.0)
     assert "refused 'frobnicate 1': Invalid Message. Field = frobnicate" in one.words
-    assert one.phases[-1] is Phase.STREAMING
+    assert one.phases[-1] is StationPhase.STREAMING
     assert one.samples
 
 
@@ -194,7 +194,7 @@ def test_given_a_plain_nmea_receiver_when_it_sends_then_epochs_come_with_their_d
     assert last.speed == pytest.approx(2.0, abs=1e-4)
     assert last.position_covariance == pytest.approx((0.04, 0, 0, 0, 0.09, 0, 0, 0, 0.16), abs=1e-9)
     assert last.velocity is None
-    assert one.phases == [Phase.WAITING, Phase.STREAMING]
+    assert one.phases == [StationPhase.WAITING, StationPhase.STREAMING]
 
 
 def test_given_nmea_at_the_wrong_rate_when_nothing_is_understood_then_the_next_rate_is_tried():
@@ -362,7 +362,7 @@ def test_given_a_setting_that_cannot_be_when_made_then_it_is_named(wrong: dict[s
 
 def test_given_outputs_when_opened_then_the_first_word_is_waiting():
     outputs = GpsDriver(GpsSettings("gps", bauds=(9600,))).opened(now_at(START))
-    assert outputs[0] == Told(Phase.WAITING, "listening for a receiver at 9600 baud")
+    assert outputs[0] == StationStatus(StationPhase.WAITING, "listening for a receiver at 9600 baud")
     assert outputs[1] == Send(b"\r\nunlogall thisport\r\n")
     assert not any(isinstance(each, Measured) for each in outputs)
 
@@ -372,7 +372,7 @@ def test_given_a_wrong_device_that_keeps_talking_when_minutes_pass_then_the_word
     for n in range(1300):
         one.hear(b"\x02noise %d\r\n" % n)
         one.run(0.1)
-    assert 2 <= len([each for each in one.told if each.phase is Phase.SILENT]) <= 4, one.words
+    assert 2 <= len([each for each in one.told if each.phase is StationPhase.SILENT]) <= 4, one.words
     assert len(one.reopened) > 20
 
 
@@ -400,7 +400,7 @@ def test_given_sentences_that_make_no_fix_when_heard_then_it_is_said_why_and_the
     data: bytes, says: tuple[str, ...]
 ):
     one = alone(*[data] * 20, protocol="nmea", bauds=(4800, 9600))
-    silent = [each.text for each in one.told if each.phase is Phase.SILENT]
+    silent = [each.text for each in one.told if each.phase is StationPhase.SILENT]
     assert silent, one.words
     assert all(each in silent[0] for each in says), silent[0]
     assert "baud" not in silent[0]
@@ -409,7 +409,7 @@ def test_given_sentences_that_make_no_fix_when_heard_then_it_is_said_why_and_the
 
 def test_given_a_heading_without_a_deviation_when_published_then_there_is_none():
     for sigma, known in ((0.0, False), (-1.0, False), (0.2, True)):
-        heading = Heading(0, 50, 2.0, 90.0, 1.0, sigma, 0.2, "AAAA", 10, 9)
+        heading = HeadingLog(0, 50, 2.0, 90.0, 1.0, sigma, 0.2, "AAAA", 10, 9)
         body = Position(0, PositionType.SINGLE, 50.0, -111.0, 700.0, -20.0, 61, 1.0, 2.0, 3.0, "", 0.0, 0.0, 9, 8)
         sample = novatel_sample(SensorHeader(1, "gps", 0), body, None, heading)
         assert sample.baseline_yaw == pytest.approx(0.0)
@@ -445,7 +445,7 @@ def test_given_answers_that_come_late_or_not_when_set_up_then_each_is_its_own_co
             sent += bool(each)
 
     send(dialogue.begin(now))
-    while dialogue.progress is Progress.ASKING:
+    while dialogue.progress is SetupProgress.ASKING:
         due = dialogue.due()
         assert due is not None
         if coming and coming[0][0] <= due:
@@ -457,5 +457,5 @@ def test_given_answers_that_come_late_or_not_when_set_up_then_each_is_its_own_co
             now = due
             send(dialogue.woken(now))
     answered = dialogue.refused
-    assert dialogue.progress is Progress.DONE
+    assert dialogue.progress is SetupProgress.DONE
     assert answered == [(each, each) for each in commands if int(each[-1]) % 2]

@@ -9,7 +9,7 @@ import pytest
 from msdrivers.protocol.gps_stream import GpsStream
 from msdrivers.protocol.novatel import (
     Answer,
-    Heading,
+    HeadingLog,
     LogHeader,
     NovatelLog,
     Position,
@@ -85,7 +85,7 @@ def test_given_a_real_bestposa_when_read_then_every_field_is_right():
 @pytest.mark.parametrize("name", ["HEADING", "HEADING2"])
 @pytest.mark.parametrize("as_binary", [True, False])
 def test_given_a_heading_when_written_and_read_then_it_is_the_same(name: str, as_binary: bool):
-    body = Heading(0, PositionType.NARROW_INT, 1.0, 82.5, -1.5, 0.25, 0.5, "999", 18, 16)
+    body = HeadingLog(0, PositionType.NARROW_INT, 1.0, 82.5, -1.5, 0.25, 0.5, "999", 18, 16)
     header = LogHeader(name, 2288, 5000, TimeStatus.FINE, "COM1", 0, 0, as_binary)
     assert one(encode(NovatelLog(header, body))).body == body
 
@@ -234,7 +234,7 @@ def test_given_a_number_of_satellites_that_cannot_be_when_read_then_the_log_is_r
 @pytest.mark.parametrize("degrees", [-0.5, 360.5, math.nan, math.inf, 1e30])
 @pytest.mark.parametrize("as_binary", [True, False])
 def test_given_a_heading_that_cannot_be_when_read_then_it_is_refused(degrees: float, as_binary: bool):
-    said = Heading(0, 50, 2.0, degrees, 1.0, 0.1, 0.2, "AAAA", 10, 9)
+    said = HeadingLog(0, 50, 2.0, degrees, 1.0, 0.1, 0.2, "AAAA", 10, 9)
     header = LogHeader("HEADING", 2288, 1000, TimeStatus.FINESTEERING, "32", 0, 0, as_binary)
     stream = GpsStream()
     assert stream.feed(encode(NovatelLog(header, said))) == []

@@ -11,12 +11,12 @@ from support_gx1 import FIELD_NED, GRAVITY, START_UTIME, Line, angle_between, st
 
 from modelserver.messages import ImuSample, OrientationReference, YawSource
 from modelserver.spatial import so3
-from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings, Heading
+from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings, HeadingSource
 from msdrivers.devices.gx1.tick_rate import TickRate
 from msdrivers.emulate.gx1 import Gx1Emulator
-from msdrivers.emulate.gx1_unit import Eeprom, Fault, Gx1Unit
-from msdrivers.protocol.gx1 import Address, Command, Gains, requests
-from msdrivers.station import Phase
+from msdrivers.emulate.gx1_unit import Eeprom, Gx1Unit, UnitFault
+from msdrivers.protocol.gx1 import Address, CommandByte, Gains, requests
+from msdrivers.station import StationPhase
 
 
 def imu_samples(line: Line) -> list[ImuSample]:
@@ -28,8 +28,8 @@ def imu_samples(line: Line) -> list[ImuSample]:
 def test_given_a_device_when_opened_then_it_is_identified_set_up_and_streams_at_100_hz():
     line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(turning()))
     line.run(6.0)
-    assert line.texts(Phase.CONFIGURING) == ["3DM-GX1 serial 1234, firmware 3.1.00 answers at 38400 baud"]
-    assert line.texts(Phase.STREAMING) == ["3DM-GX1 serial 1234, firmware 3.1.00 streams message 49"]
+    assert line.texts(StationPhase.CONFIGURING) == ["3DM-GX1 serial 1234, firmware 3.1.00 answers at 38400 baud"]
+    assert line.texts(StationPhase.STREAMING) == ["3DM-GX1 serial 1234, firmware 3.1.00 streams message 49"]
     headers = [sample.header for sample in imu_samples(line)]
     assert [header.seq for header in headers] == list(range(len(headers)))
     assert {b.device_utime - a.device_utime for a, b in itertools.pairwise(headers)} == {10_000}
@@ -62,16 +62,16 @@ def test_given_a_turning_unit_then_samples_are_what_it_did_at_the_instants_of_it
 @pytest.mark.parametrize(
     ("message", "says"),
     [
-        (Command.STABILISED_VECTORS, "rate force field"),
-        (Command.INSTANTANEOUS_VECTORS, "rate force field"),
-        (Command.QUATERNION_VECTORS, "rate force field orientation"),
-        (Command.INSTANTANEOUS_EULER, "orientation"),
-        (Command.STABILISED_EULER, "orientation"),
-        (Command.EULER_VECTORS, "rate force orientation"),
+        (CommandByte.STABILISED_VECTORS, "rate force field"),
+        (CommandByte.INSTANTANEOUS_VECTORS, "rate force field"),
+        (CommandByte.QUATERNION_VECTORS, "rate force field orientation"),
+        (CommandByte.INSTANTANEOUS_EULER, "orientation"),
+        (CommandByte.STABILISED_EULER, "orientation"),
+        (CommandByte.EULER_VECTORS, "rate force orientation"),
     ],
 )
 def test_given_each_message_then_a_sample_says_what_it_says_and_no_more(message, says):
-    settings = Gx1Settings("imu", message, Heading.MAGNETIC)
+    settings = Gx1Settings("imu", message, HeadingSource.MAGNETIC)
     line = Line(Gx1Driver(settings), Gx1Emulator(turning()))
     line.run(3.0)
     sample = imu_samples(line)[-1]
@@ -109,7 +109,7 @@ def test_given_polls_then_the_temperature_is_told_once_a_period_and_never_repeat
 
 
 def test_given_a_polled_measurement_then_both_are_published_each_with_its_own_tick():
-    settings = Gx1Settings("imu", Command.EULER_VECTORS, polled=Command.STABILISED_VECTORS, poll_period=0.1)
+    settings = Gx1Settings("imu", CommandByte.EULER_VECTORS, polled=CommandByte.STABILISED_VECTORS, poll_period=0.1)
     line = Line(Gx1Driver(settings), Gx1Emulator(turning()))
     line.run(3.4)
     samples = imu_samples(line)
@@ -134,7 +134,7 @@ def test_given_the_default_timer_then_a_tick_is_6553_microseconds_and_a_wrap_goe
 
 def test_given_a_drifting_clock_and_bytes_in_pieces_then_no_sample_is_lost():
     line = Line(
-        Gx1Driver(Gx1Settings("imu", message=Command.QUATERNION_VECTORS, temperature_period=0.5)),
+        Gx1Driver(Gx1Settings("imu", message=CommandByte.QUATERNION_VECTORS, temperature_period=0.5)),
         Gx1Emulator(turning(), unit=Gx1Unit(drift=150e-6)),
         pieces=random.Random(3),
     )
@@ -149,7 +149,7 @@ def test_given_biases_captured_at_start_then_the_rates_are_free_of_them():
     device = Gx1Emulator(standing(), unit=Gx1Unit(gyro_bias=bias))
     line = Line(Gx1Driver(Gx1Settings("imu", capture_bias_at_start=True)), device)
     line.run(8.0)
-    assert "capturing the gyro biases: keep the vehicle still" in line.texts(Phase.CONFIGURING)
+    assert "capturing the gyro biases: keep the vehicle still" in line.texts(StationPhase.CONFIGURING)
     assert imu_samples(line)[-1].angular_velocity == pytest.approx((0.0, 0.0, 0.0), abs=2e-4)
     without = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(standing(), unit=Gx1Unit(gyro_bias=bias)))
     without.run(4.0)
@@ -165,37 +165,37 @@ def test_given_a_capture_that_does_not_end_then_it_is_said_and_the_device_is_use
 
 
 def test_given_a_restart_after_biases_were_captured_then_they_are_not_captured_on_the_move():
-    unit = Gx1Unit(faults=(Fault(8.0, "restart"),))
+    unit = Gx1Unit(faults=(UnitFault(8.0, "restart"),))
     line = Line(Gx1Driver(Gx1Settings("imu", capture_bias_at_start=True)), Gx1Emulator(turning(), unit=unit))
     line.run(14.0)
-    assert line.sent.count(requests.poll(Command.CAPTURE_BIAS)) == 1
+    assert line.sent.count(requests.poll(CommandByte.CAPTURE_BIAS)) == 1
     assert any("not captured again, since the vehicle may be moving" in text for text in line.texts())
 
 
-@pytest.mark.parametrize("found", [0, Command.STABILISED_EULER])
+@pytest.mark.parametrize("found", [0, CommandByte.STABILISED_EULER])
 def test_given_a_device_that_streamed_or_not_when_left_then_it_is_as_it_was_found(found):
     device = Gx1Emulator(turning(), unit=Gx1Unit(streams=found))
     line = Line(Gx1Driver(Gx1Settings("imu")), device)
     line.run(3.0)
-    assert device.streamed == Command.EULER_VECTORS
+    assert device.streamed == CommandByte.EULER_VECTORS
     assert len(line.samples) > 100
     line.leave()
     assert device.streamed == found
 
 
 def test_given_leaving_amid_the_set_up_then_what_was_streamed_is_streamed_again():
-    device = Gx1Emulator(turning(), unit=Gx1Unit(streams=Command.STABILISED_EULER))
+    device = Gx1Emulator(turning(), unit=Gx1Unit(streams=CommandByte.STABILISED_EULER))
     line = Line(Gx1Driver(Gx1Settings("imu")), device)
     line.run(0.8)
     assert device.streamed == 0
     line.leave()
-    assert device.streamed == Command.STABILISED_EULER
+    assert device.streamed == CommandByte.STABILISED_EULER
 
 
 def test_given_a_device_that_gives_the_opposite_of_specific_force_then_it_is_said_which_sign_to_set():
     line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(standing(), unit=Gx1Unit(force_sign=-1)))
     line.run(4.0)
-    assert any("set specific_force_sign to -1 (it is 1)" in text for text in line.texts(Phase.STREAMING))
+    assert any("set specific_force_sign to -1 (it is 1)" in text for text in line.texts(StationPhase.STREAMING))
     mended = Line(
         Gx1Driver(Gx1Settings("imu", specific_force_sign=-1)), Gx1Emulator(standing(), unit=Gx1Unit(force_sign=-1))
     )
@@ -204,13 +204,15 @@ def test_given_a_device_that_gives_the_opposite_of_specific_force_then_it_is_sai
     assert imu_samples(mended)[-1].specific_force == pytest.approx((0.0, 0.0, -GRAVITY), abs=2e-3)
 
 
-@pytest.mark.parametrize("message", [Command.STABILISED_VECTORS, Command.STABILISED_EULER, Command.QUATERNION_VECTORS])
+@pytest.mark.parametrize(
+    "message", [CommandByte.STABILISED_VECTORS, CommandByte.STABILISED_EULER, CommandByte.QUATERNION_VECTORS]
+)
 def test_given_any_message_then_the_sign_of_gravity_is_checked_and_its_poll_is_not_published(message):
     line = Line(Gx1Driver(Gx1Settings("imu", message)), Gx1Emulator(standing(), unit=Gx1Unit(force_sign=-1)))
     line.run(10.0)
     assert sum("set specific_force_sign" in text for text in line.texts()) == 1
-    sent = line.sent.count(requests.poll(Command.EULER_VECTORS))
-    assert sent == (0 if message == Command.QUATERNION_VECTORS else 5)
+    sent = line.sent.count(requests.poll(CommandByte.EULER_VECTORS))
+    assert sent == (0 if message == CommandByte.QUATERNION_VECTORS else 5)
     assert len(line.samples) == line.host.counts[f"message.{message.name.lower()}"]
 
 
@@ -266,7 +268,7 @@ def test_given_a_unit_whose_timer_is_not_documented_then_the_tick_is_inferred_an
     words = dict(zip(Address.TIMER, (8, 10, 250, 10), strict=True))
     line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(turning(), Eeprom.factory().written(words)))
     line.run(12.0)
-    assert any("a tick of 20 ms is inferred" in text for text in line.texts(Phase.CONFIGURING))
+    assert any("a tick of 20 ms is inferred" in text for text in line.texts(StationPhase.CONFIGURING))
     assert line.samples[-1].sample.header.device_utime > 0
 
 
@@ -274,8 +276,8 @@ def test_given_a_unit_whose_timer_is_not_documented_then_the_tick_is_inferred_an
     ("change", "text"),
     [
         ({"message": 0x07}, "message: 7 is no measurement"),
-        ({"polled": Command.EULER_VECTORS}, "polled: 49 is streamed already"),
-        ({"message": Command.INSTANTANEOUS_EULER}, "choose heading magnetic"),
+        ({"polled": CommandByte.EULER_VECTORS}, "polled: 49 is streamed already"),
+        ({"message": CommandByte.INSTANTANEOUS_EULER}, "choose heading magnetic"),
         ({"specific_force_sign": 0}, "must be 1 or -1"),
         ({"bauds": (0,)}, "bauds: must be above 0"),
         ({"silence": 0.0}, "silence: must be at least 0.05 s, got 0"),

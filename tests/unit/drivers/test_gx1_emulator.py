@@ -9,16 +9,16 @@ from support_gx1 import START_UTIME, Line, angle_between, standing, turning
 
 from modelserver.earth.geodesy import Geodesy, origin_at
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
-from modelserver.simulation import ImuModel, Phase, Trajectory
+from modelserver.simulation import DrivePhase, ImuModel, Trajectory
 from modelserver.simulation.imu import readings
 from modelserver.simulation.magnetometer import MagnetometerModel
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
-from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings, Heading
+from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings, HeadingSource
 from msdrivers.emulate.gx1 import Gx1Emulator
 from msdrivers.emulate.gx1_samples import Samples
-from msdrivers.emulate.gx1_unit import Eeprom, Fault, Gx1Unit
-from msdrivers.protocol.gx1 import LAYOUTS, Address, Command, Gx1Parser, Packet, requests
+from msdrivers.emulate.gx1_unit import Eeprom, Gx1Unit, UnitFault
+from msdrivers.protocol.gx1 import LAYOUTS, Address, CommandByte, Gx1Parser, Packet, requests
 from msdrivers.station import Now, Send
 
 S = 1_000_000_000
@@ -78,18 +78,18 @@ def test_given_an_instant_between_samples_then_it_is_interpolated_before_the_fir
 
 
 def test_given_the_end_of_the_samples_then_it_streams_no_more_and_still_tells_its_temperature():
-    hand = Hand(Gx1Emulator(standing(0.5), unit=Gx1Unit(streams=Command.EULER_VECTORS)))
+    hand = Hand(Gx1Emulator(standing(0.5), unit=Gx1Unit(streams=CommandByte.EULER_VECTORS)))
     assert len(hand.ask(wait=0.6)) == 51
-    assert hand.ask(requests.poll(Command.EULER_VECTORS), 0.1) == []
-    assert [packet.command for packet in hand.ask(requests.poll(Command.TEMPERATURE))] == [Command.TEMPERATURE]
+    assert hand.ask(requests.poll(CommandByte.EULER_VECTORS), 0.1) == []
+    assert [packet.command for packet in hand.ask(requests.poll(CommandByte.TEMPERATURE))] == [CommandByte.TEMPERATURE]
 
 
 def test_given_a_stream_and_a_poll_then_replies_come_whole_in_order_with_ticks_that_rise():
     hand = Hand(Gx1Emulator(standing(), unit=Gx1Unit(tick_offset=65_530)))
-    (started,) = hand.ask(requests.stream(Command.STABILISED_EULER))
-    assert started.field("streamed") == (Command.STABILISED_EULER,)
-    found = hand.ask(wait=0.1) + hand.ask(requests.poll(Command.TEMPERATURE), 0.1)
-    assert [packet.command for packet in found].count(Command.TEMPERATURE) == 1
+    (started,) = hand.ask(requests.stream(CommandByte.STABILISED_EULER))
+    assert started.field("streamed") == (CommandByte.STABILISED_EULER,)
+    found = hand.ask(wait=0.1) + hand.ask(requests.poll(CommandByte.TEMPERATURE), 0.1)
+    assert [packet.command for packet in found].count(CommandByte.TEMPERATURE) == 1
     ticks = [(packet.ticks + 6) % 65_536 for packet in found if packet.ticks is not None]
     assert ticks == sorted(ticks)
     assert ticks[-1] == 20
@@ -98,7 +98,7 @@ def test_given_a_stream_and_a_poll_then_replies_come_whole_in_order_with_ticks_t
 
 def test_given_a_command_that_cannot_be_streamed_then_it_is_not_answered():
     device = Gx1Emulator(standing())
-    assert Hand(device).ask(requests.stream(Command.TEMPERATURE)) == []
+    assert Hand(device).ask(requests.stream(CommandByte.TEMPERATURE)) == []
     assert device.streamed == 0
 
 
@@ -108,13 +108,13 @@ def test_given_words_written_then_they_outlive_a_restart_and_the_timer_follows_o
     for address, value in zip(Address.TIMER, (4, 10, 250, 10), strict=True):
         (written,) = hand.ask(requests.write_eeprom(address, value))
         assert written.unsigned == value
-    before = hand.ask(requests.poll(Command.TEMPERATURE), 0.65536)[0].ticks
-    assert hand.ask(requests.poll(Command.TEMPERATURE))[0].ticks == before + 100
-    device.strike(Fault(0.0, "restart"), hand.now())
-    assert hand.ask(requests.poll(Command.TEMPERATURE), 1.5) == []
+    before = hand.ask(requests.poll(CommandByte.TEMPERATURE), 0.65536)[0].ticks
+    assert hand.ask(requests.poll(CommandByte.TEMPERATURE))[0].ticks == before + 100
+    device.strike(UnitFault(0.0, "restart"), hand.now())
+    assert hand.ask(requests.poll(CommandByte.TEMPERATURE), 1.5) == []
     assert hand.ask(requests.read_eeprom(Address.TIMER[0]))[0].unsigned == 4
-    before = hand.ask(requests.poll(Command.TEMPERATURE), 1.0)[0].ticks
-    assert hand.ask(requests.poll(Command.TEMPERATURE))[0].ticks == before + 100
+    before = hand.ask(requests.poll(CommandByte.TEMPERATURE), 1.0)[0].ticks
+    assert hand.ask(requests.poll(CommandByte.TEMPERATURE))[0].ticks == before + 100
 
 
 def test_given_an_address_without_a_word_then_it_reads_zero():
@@ -124,7 +124,7 @@ def test_given_an_address_without_a_word_then_it_reads_zero():
 
 
 def test_given_a_wake_long_after_then_only_the_last_cycles_are_made_up_for():
-    device = Gx1Emulator(standing(), unit=Gx1Unit(streams=Command.STABILISED_EULER))
+    device = Gx1Emulator(standing(), unit=Gx1Unit(streams=CommandByte.STABILISED_EULER))
     hand = Hand(device)
     hand.ns += 20 * S
     outputs = [output for output in device.woken(hand.now()) if isinstance(output, Send)]
@@ -134,11 +134,13 @@ def test_given_a_wake_long_after_then_only_the_last_cycles_are_made_up_for():
 def test_given_a_simulated_drive_then_the_driver_gives_back_what_the_simulated_unit_felt():
     mount = Pose.from_rpy((0.0, 0.0, 0.0), math.pi, 0.0, 0.0)
     geodesy = Geodesy(origin_at(50.27, -111.18, 700.0))
-    drive = Trajectory([Phase(2.0), Phase(4.0, speed=4.0), Phase(6.0, curvature=0.1), Phase(4.0, speed=0.0)])
+    drive = Trajectory(
+        [DrivePhase(2.0), DrivePhase(4.0, speed=4.0), DrivePhase(6.0, curvature=0.1), DrivePhase(4.0, speed=0.0)]
+    )
     model = ImuModel(magnetometer=MagnetometerModel(), yaw_source=YawSource.MAGNETIC)
     made = readings(model, drive, mount, geodesy, START_UTIME, 1, "imu")
     felt = {each.header.utime: each for each, _ in zip(made, range(1500), strict=False)}
-    settings = Gx1Settings("imu", Command.QUATERNION_VECTORS, Heading.MAGNETIC)
+    settings = Gx1Settings("imu", CommandByte.QUATERNION_VECTORS, HeadingSource.MAGNETIC)
     line = Line(Gx1Driver(settings), Gx1Emulator(felt.values()))
     line.run(14.0)
     assert len(line.samples) > 1200

@@ -10,16 +10,16 @@ from support_gx1 import Line, Speaker, turning
 
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
 from msdrivers.emulate.gx1 import Gx1Emulator
-from msdrivers.emulate.gx1_unit import Eeprom, Fault, Gx1Unit
-from msdrivers.protocol.gx1 import Address, Command, Gains, Packet, requests
-from msdrivers.station import Now, Phase, Send
+from msdrivers.emulate.gx1_unit import Eeprom, Gx1Unit, UnitFault
+from msdrivers.protocol.gx1 import Address, CommandByte, Gains, Packet, requests
+from msdrivers.station import Now, Send, StationPhase
 
 
 def device_times(line: Line) -> list[int]:
     return [measured.sample.header.device_utime for measured in line.samples]
 
 
-def line_with(*faults: Fault, settings: Gx1Settings | None = None, **more: object) -> Line:
+def line_with(*faults: UnitFault, settings: Gx1Settings | None = None, **more: object) -> Line:
     device = Gx1Emulator(turning(), unit=Gx1Unit(faults=faults))
     return Line(Gx1Driver(settings or Gx1Settings("imu")), device, **more)  # type: ignore[arg-type]
 
@@ -51,7 +51,7 @@ def test_given_a_line_that_spoils_one_byte_in_a_hundred_then_no_false_value_is_p
 
 
 def test_given_dropped_and_corrupt_replies_then_they_are_missing_and_counted_and_nothing_is_repeated():
-    line = line_with(Fault(4.0, "drop", 3), Fault(5.0, "corrupt", 2))
+    line = line_with(UnitFault(4.0, "drop", 3), UnitFault(5.0, "corrupt", 2))
     line.run(7.0)
     times = device_times(line)
     steps = [b - a for a, b in itertools.pairwise(times) if b - a != 10_000]
@@ -68,11 +68,11 @@ def test_given_replies_that_come_twice_then_each_is_published_once():
 
 
 def test_given_a_restart_then_it_is_noticed_and_the_device_is_set_up_anew():
-    line = line_with(Fault(5.0, "restart"))
+    line = line_with(UnitFault(5.0, "restart"))
     line.run(12.0)
-    (silent,) = line.texts(Phase.SILENT)
+    (silent,) = line.texts(StationPhase.SILENT)
     assert "no message 49 that can be used for 0.5 s" in silent
-    assert line.texts(Phase.STREAMING) == ["3DM-GX1 serial 1234, firmware 3.1.00 streams message 49"] * 2
+    assert line.texts(StationPhase.STREAMING) == ["3DM-GX1 serial 1234, firmware 3.1.00 streams message 49"] * 2
     times = device_times(line)
     assert times == sorted(times)
     gaps = [b - a for a, b in itertools.pairwise(times) if b - a != 10_000]
@@ -83,12 +83,12 @@ def test_given_a_restart_then_it_is_noticed_and_the_device_is_set_up_anew():
 
 
 def test_given_a_jump_of_the_ticks_then_it_is_noticed_and_the_device_is_set_up_anew():
-    line = line_with(Fault(5.0, "jump", 20_000))
+    line = line_with(UnitFault(5.0, "jump", 20_000))
     line.run(9.0)
-    assert any("its ticks jumped" in text for text in line.texts(Phase.SILENT))
+    assert any("its ticks jumped" in text for text in line.texts(StationPhase.SILENT))
     assert line.host.counts["rejected.ticks"] == 2
     assert line.host.counts["restarts"] == 1
-    assert line.texts(Phase.STREAMING)[-1].endswith("streams message 49")
+    assert line.texts(StationPhase.STREAMING)[-1].endswith("streams message 49")
     assert len(line.samples) > 550
 
 
@@ -115,13 +115,13 @@ def test_given_ticks_that_run_backwards_then_nothing_is_published_and_it_is_said
 
 
 def reply_at(ticks: int) -> bytes:
-    return Packet(Command.EULER_VECTORS, (1, 2, 3, 4, 5, 6, 7, 8, 9), ticks).to_bytes()
+    return Packet(CommandByte.EULER_VECTORS, (1, 2, 3, 4, 5, 6, 7, 8, 9), ticks).to_bytes()
 
 
 def test_given_a_stall_then_it_is_silent_and_afterwards_streams_again_without_old_values():
-    line = line_with(Fault(5.0, "stall", 3.0))
+    line = line_with(UnitFault(5.0, "stall", 3.0))
     line.run(14.0)
-    assert line.texts(Phase.SILENT)
+    assert line.texts(StationPhase.SILENT)
     hosts = [measured.sample.header.host_utime for measured in line.samples]
     gaps = [b - a for a, b in itertools.pairwise(hosts) if b - a > 100_000]
     assert len(gaps) == 1
@@ -160,7 +160,7 @@ def test_given_gains_that_scale_nothing_then_nothing_is_published_and_it_is_said
     line = Line(Gx1Driver(Gx1Settings("imu")), device)
     line.run(5.0)
     assert line.samples == []
-    (silent,) = line.texts(Phase.SILENT)
+    (silent,) = line.texts(StationPhase.SILENT)
     assert text in silent
     assert "nothing is published, trying again in 5 s" in silent
     # mended meanwhile: it goes on by itself
@@ -173,14 +173,14 @@ def test_given_timer_words_of_zero_then_it_is_said_what_to_write():
     device = Gx1Emulator(turning(), Eeprom.factory().written(dict.fromkeys(Address.TIMER, 0)))
     line = Line(Gx1Driver(Gx1Settings("imu")), device)
     line.run(6.0)
-    assert "write the defaults 16 16 256 1" in line.texts(Phase.SILENT)[0]
+    assert "write the defaults 16 16 256 1" in line.texts(StationPhase.SILENT)[0]
     assert line.samples == []
 
 
 def test_given_a_gps_on_the_port_then_it_is_said_what_was_heard_at_which_baud_rates():
     line = Line(Gx1Driver(Gx1Settings("imu")), Speaker(b"$GPGGA,123519,4807.038,N*47\r\n"), baud=115200)
     line.run(30.0)
-    silent = line.texts(Phase.SILENT)[0]
+    silent = line.texts(StationPhase.SILENT)[0]
     assert "no 3DM-GX1 answers on this line: at 38400 baud heard " in silent
     assert "at 115200 baud heard " in silent
     assert "'$GPGGA,123519,4807.038,N*47" in silent
@@ -192,7 +192,7 @@ def test_given_a_gps_on_the_port_then_it_is_said_what_was_heard_at_which_baud_ra
 def test_given_nobody_on_the_port_then_it_is_said_that_nothing_was_heard():
     line = Line(Gx1Driver(Gx1Settings("imu")), Speaker(b""))
     line.run(9.0)
-    silent = line.texts(Phase.SILENT)[0]
+    silent = line.texts(StationPhase.SILENT)[0]
     assert "at 38400 baud heard nothing; at 115200 baud heard nothing; check the device's power" in silent
     assert line.host.leaving(line.now()) == []
 
@@ -211,7 +211,7 @@ def test_given_random_bytes_for_a_device_then_nothing_is_published():
     line = Line(Gx1Driver(Gx1Settings("imu")), speaker, spoil=lambda unit: rng.randbytes(len(unit)))
     line.run(30.0)
     assert line.samples == []
-    assert line.texts(Phase.SILENT)
+    assert line.texts(StationPhase.SILENT)
 
 
 def test_given_a_late_answer_to_a_read_that_was_asked_twice_then_it_is_not_taken_for_the_next():
@@ -219,7 +219,7 @@ def test_given_a_late_answer_to_a_read_that_was_asked_twice_then_it_is_not_taken
     late: list[bytes] = []
 
     def spoil(unit: bytes) -> bytes:
-        if unit[0] != Command.READ_EEPROM or late:
+        if unit[0] != CommandByte.READ_EEPROM or late:
             return unit
         # comes just after the same was asked again, and before the reply to that
         late.append(unit)
@@ -236,9 +236,9 @@ def test_given_a_late_answer_to_a_read_that_was_asked_twice_then_it_is_not_taken
 @pytest.mark.parametrize(
     ("message", "words"),
     [
-        (Command.EULER_VECTORS, (0, 16_385, 0, 0, 0, 0, 0, 0, 0)),
-        (Command.QUATERNION_VECTORS, (0,) * 13),
-        (Command.QUATERNION_VECTORS, (8192, 8192, *(0,) * 11)),
+        (CommandByte.EULER_VECTORS, (0, 16_385, 0, 0, 0, 0, 0, 0, 0)),
+        (CommandByte.QUATERNION_VECTORS, (0,) * 13),
+        (CommandByte.QUATERNION_VECTORS, (8192, 8192, *(0,) * 11)),
     ],
 )
 def test_given_an_orientation_that_cannot_be_then_the_reply_is_rejected(message, words):
@@ -264,7 +264,7 @@ def test_given_the_line_opened_anew_after_it_was_lost_then_it_is_set_up_again():
 
 def test_given_a_fault_of_an_unknown_kind_then_it_is_refused():
     with pytest.raises(ValueError, match="there are drop, corrupt, stall"):
-        Fault(1.0, "explode")
+        UnitFault(1.0, "explode")
 
 
 def test_given_an_emulator_woken_before_it_is_opened_then_it_says_nothing():
@@ -294,17 +294,18 @@ def test_given_a_gain_that_no_unit_has_then_it_is_said_and_nothing_is_published(
     line.run(4.0)
     assert not line.samples
     assert (
-        f"the accelerometer gain in its EEPROM (address 230) is {gain}, and no 3DM-GX1" in line.texts(Phase.SILENT)[0]
+        f"the accelerometer gain in its EEPROM (address 230) is {gain}, and no 3DM-GX1"
+        in line.texts(StationPhase.SILENT)[0]
     )
 
 
 def test_given_a_line_without_baud_rates_when_nobody_answers_then_none_is_named_or_tried():
     line = line_with(settings=Gx1Settings("imu", bauds=()), spoil=lambda unit: b"")
     line.run(20.0)
-    silent = line.texts(Phase.SILENT)[0]
+    silent = line.texts(StationPhase.SILENT)[0]
     assert silent.startswith("no 3DM-GX1 answers on this line: heard nothing; check the device's power")
     assert not line.reopened
     heard = line_with(settings=Gx1Settings("imu", bauds=()))
     heard.run(3.0)
     assert heard.samples
-    assert "3DM-GX1 serial 1234, firmware 3.1.00 answers" in heard.texts(Phase.CONFIGURING)
+    assert "3DM-GX1 serial 1234, firmware 3.1.00 answers" in heard.texts(StationPhase.CONFIGURING)

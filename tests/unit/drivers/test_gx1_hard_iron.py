@@ -12,9 +12,9 @@ from modelserver.spatial import so3
 from modelserver.spatial.so3 import Vector3
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings, HardIron, HardIronSettings
 from msdrivers.emulate.gx1 import Gx1Emulator
-from msdrivers.emulate.gx1_unit import Eeprom, Fault, Gx1Unit
-from msdrivers.protocol.gx1 import Address, Command, Packet
-from msdrivers.station import Phase
+from msdrivers.emulate.gx1_unit import Eeprom, Gx1Unit, UnitFault
+from msdrivers.protocol.gx1 import Address, CommandByte, Packet
+from msdrivers.station import StationPhase
 
 IRON: Vector3 = (12e-6, -7e-6, 5e-6)
 OLD = (100, -200, 300)
@@ -30,7 +30,7 @@ def tumbling(seconds: float) -> Iterator[ImuSample]:
         yield ImuSample(SensorHeader(START_UTIME + round(t * 1e6)), magnetic_field=field, orientation=q)
 
 
-def device_with(samples: Iterator[ImuSample], *faults: Fault, streams: int = 0) -> Gx1Emulator:
+def device_with(samples: Iterator[ImuSample], *faults: UnitFault, streams: int = 0) -> Gx1Emulator:
     old = Eeprom.factory().written(dict(zip(Address.HARD_IRON, OLD, strict=True)))
     return Gx1Emulator(samples, old, Gx1Unit(field_offset=IRON, faults=faults, streams=streams))
 
@@ -51,12 +51,12 @@ def test_given_turns_about_all_axes_then_the_devices_own_field_is_found_stored_a
     assert result.spans == pytest.approx((106e-6,) * 3, rel=0.05)
     assert "are stored and were read back" in line.texts()[-1]
     assert stored(device) == pytest.approx([axis / 1e-4 * 16384 for axis in IRON], abs=160)
-    progress = [text for text in line.texts(Phase.CONFIGURING) if "field spans" in text]
+    progress = [text for text in line.texts(StationPhase.CONFIGURING) if "field spans" in text]
     assert len(progress) in (10, 11)
     assert "5 of 60 s" in progress[0]
     # the memory outlives the device that was switched off: its field is the earth's now
     mended = Gx1Emulator(standing(), device.eeprom, device.unit)
-    driver = Line(Gx1Driver(Gx1Settings("imu", Command.QUATERNION_VECTORS)), mended)
+    driver = Line(Gx1Driver(Gx1Settings("imu", CommandByte.QUATERNION_VECTORS)), mended)
     driver.run(3.0)
     assert driver.samples[-1].sample.magnetic_field == pytest.approx(FIELD_NED, abs=1.0e-6)
 
@@ -93,7 +93,7 @@ def test_given_turns_on_level_ground_only_when_all_axes_are_asked_for_then_z_is_
 
 
 def test_given_a_device_that_stalls_amid_the_turns_then_the_offsets_are_written_back():
-    device = device_with(turning((0.0, 0.0, 0.5), 60.0), Fault(10.0, "stall", 2.5))
+    device = device_with(turning((0.0, 0.0, 0.5), 60.0), UnitFault(10.0, "stall", 2.5))
     procedure = HardIron(HardIronSettings(duration=30.0))
     line = Line(procedure, device)
     line.run(40.0)
@@ -104,7 +104,7 @@ def test_given_a_device_that_stalls_amid_the_turns_then_the_offsets_are_written_
 
 
 def test_given_a_device_that_is_gone_when_offsets_are_written_back_then_it_is_said():
-    device = device_with(turning((0.0, 0.0, 0.5), 60.0), Fault(10.0, "stall", 100.0))
+    device = device_with(turning((0.0, 0.0, 0.5), 60.0), UnitFault(10.0, "stall", 100.0))
     procedure = HardIron(HardIronSettings(duration=30.0))
     Line(procedure, device).run(40.0)
     assert procedure.result is not None
@@ -113,7 +113,7 @@ def test_given_a_device_that_is_gone_when_offsets_are_written_back_then_it_is_sa
 
 
 def test_given_an_interruption_then_the_offsets_and_the_stream_are_as_they_were_found():
-    device = device_with(turning((0.0, 0.0, 0.5), 60.0), streams=Command.STABILISED_EULER)
+    device = device_with(turning((0.0, 0.0, 0.5), 60.0), streams=CommandByte.STABILISED_EULER)
     procedure = HardIron(HardIronSettings(duration=30.0))
     line = Line(procedure, device)
     line.run(10.0)
@@ -121,16 +121,16 @@ def test_given_an_interruption_then_the_offsets_and_the_stream_are_as_they_were_
     assert device.streamed == 0
     line.leave()
     assert stored(device) == OLD
-    assert device.streamed == Command.STABILISED_EULER
+    assert device.streamed == CommandByte.STABILISED_EULER
     assert any("interrupted, the offsets from before are written back" in text for text in line.texts())
 
 
 def test_given_a_procedure_that_is_done_then_what_was_streamed_is_streamed_again_and_leaving_does_nothing():
-    device = device_with(turning((0.0, 0.0, 0.5), 60.0), streams=Command.STABILISED_EULER)
+    device = device_with(turning((0.0, 0.0, 0.5), 60.0), streams=CommandByte.STABILISED_EULER)
     procedure = HardIron(HardIronSettings(duration=30.0))
     line = Line(procedure, device)
     line.run(40.0)
-    assert device.streamed == Command.STABILISED_EULER
+    assert device.streamed == CommandByte.STABILISED_EULER
     assert procedure.leaving(line.now()) == []
     assert procedure.due() is None
     assert procedure.opened(line.now()) == []
@@ -153,7 +153,7 @@ def test_given_offsets_that_the_memory_did_not_take_then_the_procedure_has_faile
     line = Line(procedure, device)
 
     def forgetful(unit: bytes) -> bytes:
-        if unit[0] == Command.HARD_IRON_COMPUTE:
+        if unit[0] == CommandByte.HARD_IRON_COMPUTE:
             device.eeprom = device.eeprom.written(dict(zip(Address.HARD_IRON, (7, 7, 7), strict=True)))
         return unit
 
@@ -170,10 +170,10 @@ def test_given_offsets_that_are_not_the_middle_of_the_extremes_then_the_procedur
     line = Line(procedure, device)
 
     def wrong(unit: bytes) -> bytes:
-        if unit[0] != Command.HARD_IRON_COMPUTE:
+        if unit[0] != CommandByte.HARD_IRON_COMPUTE:
             return unit
         device.eeprom = device.eeprom.written(dict(zip(Address.HARD_IRON, (7, 7, 7), strict=True)))
-        return Packet(Command.HARD_IRON_COMPUTE, (7, 7, 7), int.from_bytes(unit[7:9], "big")).to_bytes()
+        return Packet(CommandByte.HARD_IRON_COMPUTE, (7, 7, 7), int.from_bytes(unit[7:9], "big")).to_bytes()
 
     line.spoil = wrong
     line.run(30.0)
@@ -194,7 +194,7 @@ def test_given_nobody_on_the_port_then_it_is_said_and_there_is_no_result():
     procedure = HardIron(HardIronSettings())
     line = Line(procedure, Speaker(b""))
     line.run(20.0)
-    assert "no 3DM-GX1 answers on this line" in line.texts(Phase.SILENT)[0]
+    assert "no 3DM-GX1 answers on this line" in line.texts(StationPhase.SILENT)[0]
     assert procedure.result is None
     assert procedure.leaving(line.now()) == []
 
@@ -204,7 +204,9 @@ def test_given_gains_of_zero_then_it_is_said_that_it_cannot_begin():
     procedure = HardIron(HardIronSettings())
     line = Line(procedure, device)
     line.run(6.0)
-    assert "hard iron: cannot begin: the gyro gain in its EEPROM (address 130) is 0" in line.texts(Phase.SILENT)[0]
+    assert (
+        "hard iron: cannot begin: the gyro gain in its EEPROM (address 130) is 0" in line.texts(StationPhase.SILENT)[0]
+    )
 
 
 @pytest.mark.parametrize("change", [{"period": 0.0}, {"duration": 0.05}, {"bauds": (0,)}])

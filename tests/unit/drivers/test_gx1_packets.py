@@ -8,7 +8,17 @@ import pytest
 from support_gx1 import SHEET
 
 from modelserver.spatial import so3
-from msdrivers.protocol.gx1 import DATA, LENGTHS, Command, Gx1Parser, Packet, Request, RequestParser, requests, scaling
+from msdrivers.protocol.gx1 import (
+    DATA,
+    LENGTHS,
+    CommandByte,
+    Gx1Parser,
+    Packet,
+    Request,
+    RequestParser,
+    requests,
+    scaling,
+)
 from msdrivers.protocol.gx1.checksum import checksum, sealed
 
 
@@ -106,10 +116,10 @@ def test_given_noise_between_requests_when_the_device_reads_then_it_finds_each()
     data = b"\x55\x10" + requests.STOP + b"\x99" + requests.read_eeprom(230) + b"\x07" + requests.write_eeprom(238, 4)
     found = [request for k in range(len(data)) for request in parser.feed(data[k : k + 1])]
     assert found == [
-        Request(Command.CONTINUOUS, b"\0"),
-        Request(Command.READ_EEPROM, b"\0\xe6"),
-        Request(Command.TEMPERATURE),
-        Request(Command.WRITE_EEPROM, b"\0\xee\0\4"),
+        Request(CommandByte.CONTINUOUS, b"\0"),
+        Request(CommandByte.READ_EEPROM, b"\0\xe6"),
+        Request(CommandByte.TEMPERATURE),
+        Request(CommandByte.WRITE_EEPROM, b"\0\xee\0\4"),
     ]
     assert parser.skipped == 3
 

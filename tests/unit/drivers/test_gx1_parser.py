@@ -9,7 +9,7 @@ import tracemalloc
 import pytest
 from support_gx1 import SHEET
 
-from msdrivers.protocol.gx1 import DATA, Command, Gx1Parser, Packet
+from msdrivers.protocol.gx1 import DATA, CommandByte, Gx1Parser, Packet
 
 EULER_VECTORS, TEMPERATURE = SHEET[0x31], SHEET[0x07]
 
@@ -145,7 +145,7 @@ def test_given_nothing_that_was_asked_for_then_every_byte_is_skipped():
 def test_given_clear_then_bytes_that_waited_are_skipped_and_nothing_is_expected():
     parser = Gx1Parser()
     parser.stream(0x31)
-    parser.expect(Command.TEMPERATURE)
+    parser.expect(CommandByte.TEMPERATURE)
     parser.feed(EULER_VECTORS[:-1])
     parser.clear()
     assert parser.feed(EULER_VECTORS[-1:] + EULER_VECTORS + TEMPERATURE) == []

@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modelserver.messages import DriverPhase, Sample, SensorHeader, WheelSample, WheelsSample
-from msdrivers.faults import Fault
+from msdrivers.faults import InjectedFault
 from msdrivers.links.fake import FakeLink, FakeTime
 from msdrivers.protocol.framing import Scanner
 from msdrivers.registry import KINDS, Emulation
@@ -84,7 +84,7 @@ def test_given_driver_and_emulator_on_one_line_then_the_speeds_arrive_with_their
 
 
 def test_given_a_damaged_line_then_it_is_counted_and_the_next_one_taken() -> None:
-    unit = OWN["KIND"].emulate(Emulation(None, ROOT, _samples(1.0, 2.0, 3.0), (Fault(0.15, "corrupt", 1.0),)))
+    unit = OWN["KIND"].emulate(Emulation(None, ROOT, _samples(1.0, 2.0, 3.0), (InjectedFault(0.15, "corrupt", 1.0),)))
     runner, published, time = _driven(_said(unit), 0.5)
     assert _speeds(published) == [1.0, 3.0]
     counters = dict(runner.health(time.now()).counters)

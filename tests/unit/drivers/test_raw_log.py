@@ -17,7 +17,7 @@ from msdrivers.links.fake import FakeLink, FakeTime
 from msdrivers.links.recorded import PlayedLink, RecordingLink
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.modbus.registers import FailureKind, ModbusFailure, ReadRegisters, Registers, Table
-from msdrivers.raw_log import BytesForm, RawReader, RawWriter, Way, open_for_reading, recording
+from msdrivers.raw_log import BytesForm, RawReader, RawWriter, RecordDirection, open_for_reading, recording
 from msdrivers.station import Now
 
 
@@ -43,14 +43,14 @@ def test_given_a_line_when_recorded_then_all_of_it_stands_there_with_times() -> 
     records = list(reader)
     assert (reader.kind, reader.source, reader.device, reader.damaged) == ("bytes", "gps", "novatel", 0)
     assert [(record.way, record.data) for record in records] == [
-        (Way.WORD, b"open fake 38400"),
-        (Way.SENT, b"log"),
-        (Way.RECEIVED, b"one"),
-        (Way.RECEIVED, b"two"),
-        (Way.RECEIVED, b"\x00\xff"),
-        (Way.WORD, b"close"),
+        (RecordDirection.WORD, b"open fake 38400"),
+        (RecordDirection.SENT, b"log"),
+        (RecordDirection.RECEIVED, b"one"),
+        (RecordDirection.RECEIVED, b"two"),
+        (RecordDirection.RECEIVED, b"\x00\xff"),
+        (RecordDirection.WORD, b"close"),
     ]
-    received = [record.now for record in records if record.way is Way.RECEIVED]
+    received = [record.now for record in records if record.way is RecordDirection.RECEIVED]
     assert received[1].utime - received[0].utime == 250_000
     assert received[1].monotonic_ns - received[0].monotonic_ns == 250_000_000
 
@@ -168,7 +168,7 @@ def keep(path: Path, *units: bytes) -> None:
     with recording(path, 1 << 20) as writer:
         writer.begin("bytes", "gps", "novatel")
         for unit in units:
-            writer.record(Way.RECEIVED, Now(1, 2), unit)
+            writer.record(RecordDirection.RECEIVED, Now(1, 2), unit)
 
 
 def test_given_a_recording_of_that_name_then_it_stays_and_the_next_has_a_number(

@@ -15,7 +15,7 @@ from modelserver.messages import DriverHealth, DriverPhase, ImuSample, Sample, S
 from msdrivers.links import LinkError, PlayedOutError
 from msdrivers.links.fake import FakeLink, FakeTime
 from msdrivers.runner import Runner, RunnerSettings
-from msdrivers.station import Measured, Now, Output, Phase, Reopen, Send, Told
+from msdrivers.station import Measured, Now, Output, Reopen, Send, StationPhase, StationStatus
 
 PERIOD_S = 0.1
 
@@ -33,7 +33,7 @@ class Echo:
 
     def opened(self, now: Now) -> Sequence[Output[bytes]]:
         self.calls.append("opened")
-        return [Told(Phase.CONFIGURING, "asks"), Send(b"on")]
+        return [StationStatus(StationPhase.CONFIGURING, "asks"), Send(b"on")]
 
     def received(self, unit: bytes, now: Now) -> Sequence[Output[bytes]]:
         if self.fails(unit):
@@ -42,7 +42,7 @@ class Echo:
         device = now.utime - 1_000_000 if self.device_time else 0
         header = SensorHeader(0, "imu", self.seq, now.utime, device)
         extra, self.extra = self.extra, []
-        return [Told(Phase.STREAMING, "comes"), Measured(ImuSample(header), 0.002, 0.001), *extra]
+        return [StationStatus(StationPhase.STREAMING, "comes"), Measured(ImuSample(header), 0.002, 0.001), *extra]
 
     def woken(self, now: Now) -> Sequence[Output[bytes]]:
         self.calls.append(f"woken {now.monotonic_ns}")
@@ -60,7 +60,7 @@ class Echo:
         return [Send(command.source.encode())]
 
     def refuse(self, reason: str, text: str, now: Now) -> Sequence[Output[bytes]]:
-        return [Told(Phase.STREAMING, text, is_trouble=True)]
+        return [StationStatus(StationPhase.STREAMING, text, is_trouble=True)]
 
     @property
     def counts(self) -> dict[str, int]:

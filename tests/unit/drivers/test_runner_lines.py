@@ -17,7 +17,7 @@ from msdrivers.devices.axis import AxisDriver
 from msdrivers.devices.gps import GpsDriver, GpsSettings
 from msdrivers.devices.wheels import WheelsDriver
 from msdrivers.links import LinkError
-from msdrivers.station import Now, Output, Phase, Quiet, Reopen, Send, Told
+from msdrivers.station import Now, Output, Quiet, Reopen, Send, StationPhase, StationStatus
 
 
 @dataclass
@@ -35,10 +35,10 @@ class Broken(Echo):
 
     def opened(self, now: Now) -> Sequence[Output[bytes]]:
         self.opened_at.append(now.monotonic_ns * 1e-9)
-        return [Told(Phase.WAITING, "asks"), Send(b"on")]
+        return [StationStatus(StationPhase.WAITING, "asks"), Send(b"on")]
 
     def received(self, unit: bytes, now: Now) -> Sequence[Output[bytes]]:
-        return [Told(Phase.SILENT, "that is no answer"), Reopen("that is no answer")]
+        return [StationStatus(StationPhase.SILENT, "that is no answer"), Reopen("that is no answer")]
 
 
 def answering(bench: Bench) -> None:
@@ -137,7 +137,7 @@ def test_given_a_flood_of_words_then_reports_and_log_are_few_and_the_last_is_tol
     received = bench.echo.received
 
     def talks(unit: bytes, now: Now) -> Sequence[Output[bytes]]:
-        return [*received(unit, now), Told(Phase.STREAMING, f"word {next(words)}")]
+        return [*received(unit, now), StationStatus(StationPhase.STREAMING, f"word {next(words)}")]
 
     bench.echo.received = talks  # type: ignore[method-assign]
     with caplog.at_level(logging.INFO):
@@ -204,7 +204,7 @@ def test_given_a_word_of_trouble_then_it_is_a_warning_and_stands_beside_the_sile
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     bench = Bench(0.5)
-    bench.echo.extra = [Told(Phase.CONFIGURING, "the device refuses 'log'", is_trouble=True)]
+    bench.echo.extra = [StationStatus(StationPhase.CONFIGURING, "the device refuses 'log'", is_trouble=True)]
     bench.echo.fails = lambda unit: bench.echo.seq > 0
     said = logged(caplog, lambda: bench.until(5.0))
     assert ("WARNING", "imu: configuring: the device refuses 'log'") in said
@@ -214,7 +214,7 @@ def test_given_a_word_of_trouble_then_it_is_a_warning_and_stands_beside_the_sile
 
 def test_given_a_trouble_that_is_over_then_a_later_silence_does_not_name_it(caplog: pytest.LogCaptureFixture) -> None:
     bench = Bench(1.0)
-    bench.echo.extra = [Told(Phase.STREAMING, "a speed that cannot be", is_trouble=True)]
+    bench.echo.extra = [StationStatus(StationPhase.STREAMING, "a speed that cannot be", is_trouble=True)]
     said = logged(caplog, lambda: bench.until(1.0 + PERIOD_S))
     assert ("WARNING", "imu: streaming: a speed that cannot be") in said
     said = logged(caplog, lambda: bench.until(5.0))

@@ -13,12 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from modelserver.config import config_lines, load_config
-from modelserver.errors import ConfigError, Problem, Severity, Source
+from modelserver.errors import ConfigError, Location, Problem, Severity
 from modelserver.messages import ImuSample
-from msdrivers.faults import Fault, parse_fault
+from msdrivers.faults import InjectedFault, parse_fault
 from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings, TcpSettings, split_group
 from msdrivers.lines import first_baud
-from msdrivers.registry import CHANNELS, KINDS, Kind, Made
+from msdrivers.registry import CHANNELS, KINDS, DeviceKind, DeviceModules
 from msdrivers.settings import DriverSettings, Place, read_driver, read_drivers
 
 
@@ -50,18 +50,18 @@ def never(*_: Any) -> Any:
     raise AssertionError("nothing is made here")
 
 
-ECHO = Kind(
+ECHO = DeviceKind(
     "echo",
     "a device of the tests",
     ImuSample,
     (SerialSettings, TcpSettings),
-    lambda: Made(EchoSettings, never),
+    lambda: DeviceModules(EchoSettings, never),
     never,
     9600,
     presets={"hidden": "preset"},
 )
-CAN = Kind("canner", "another", ImuSample, (CanSettings,), lambda: Made(EchoSettings, never), never)
-MODBUS = Kind("axle", "a third", ImuSample, (ModbusSettings,), lambda: Made(EchoSettings, never), never)
+CAN = DeviceKind("canner", "another", ImuSample, (CanSettings,), lambda: DeviceModules(EchoSettings, never), never)
+MODBUS = DeviceKind("axle", "a third", ImuSample, (ModbusSettings,), lambda: DeviceModules(EchoSettings, never), never)
 KNOWN = {kind.name: kind for kind in (ECHO, CAN, MODBUS)}
 
 
@@ -395,10 +395,10 @@ def test_given_a_name_with_nothing_after_it_then_it_is_told_and_the_others_are_r
 def test_given_problems_of_a_driver_then_they_get_the_lines_of_their_keys(tmp_path: Path) -> None:
     lines = {("drivers",): 4, ("drivers", "w"): 5, ("drivers", "w", "wheels", "front.left"): 7}
     problems = [
-        Problem(Severity.ERROR, "a", Source(element=element))
+        Problem(Severity.ERROR, "a", Location(element=element))
         for element in ("drivers.w.wheels.front.left.count", "wheels.front.left", "drivers.w.dbc")
     ]
-    of_another_file = Problem(Severity.ERROR, "b", Source("x.dbc", 3))
+    of_another_file = Problem(Severity.ERROR, "b", Location("x.dbc", 3))
     told = Place("v.yaml", lines).located("w", [*problems, of_another_file])
     assert [str(each.source) for each in told] == [
         "v.yaml:7 (drivers.w.wheels.front.left.count)",
@@ -420,8 +420,8 @@ def test_given_a_kind_then_its_settings_take_the_drivers_name_and_its_sample_has
 
 
 def test_given_texts_of_faults_then_they_are_read_or_refused_with_what_is_wrong() -> None:
-    assert parse_fault("stall@10:2") == Fault(10.0, "stall", 2.0)
-    assert parse_fault("drop@0.5") == Fault(0.5, "drop", 1.0)
+    assert parse_fault("stall@10:2") == InjectedFault(10.0, "stall", 2.0)
+    assert parse_fault("drop@0.5") == InjectedFault(0.5, "drop", 1.0)
     for text, said in (
         ("stal@10", "did you mean stall"),
         ("stall", "KIND@SECONDS"),

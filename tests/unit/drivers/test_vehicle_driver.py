@@ -27,7 +27,7 @@ from msdrivers.emulate.can_line import CanFault
 from msdrivers.emulate.vehicle import VehicleEmulator, VehicleUnit
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.can.mapping import SignalMap, StatusMap
-from msdrivers.station import Measured, Phase, Send, Told
+from msdrivers.station import Measured, Send, StationPhase, StationStatus
 
 DATABASE = raptor_dbc()
 
@@ -298,7 +298,7 @@ def test_given_bus_off_while_driving_then_nothing_is_sent_and_stop_is_said_when_
     assert driver.counts["rejected.line"] >= 4
     first = next(said(frame) for t, frame in wire.sent if t > 3.4)
     assert first["Enable"] == 0
-    assert [told.phase for _, told in wire.told if "went bus-off" in told.text] == [Phase.SILENT]
+    assert [told.phase for _, told in wire.told if "went bus-off" in told.text] == [StationPhase.SILENT]
 
 
 def test_given_that_the_driver_leaves_then_it_says_stop() -> None:
@@ -348,7 +348,7 @@ def test_given_random_frames_and_commands_then_nothing_is_raised_and_memory_stay
                     assert -1000 <= said(output.unit)["ForwardSpeed"] <= 3000
                     assert abs(said(output.unit)["SteeringAngle"]) <= 2865
                 else:
-                    assert isinstance(output, Measured | Told)
+                    assert isinstance(output, Measured | StationStatus)
 
     flood(0, 1_000)
     tracemalloc.start()

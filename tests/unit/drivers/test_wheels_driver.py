@@ -34,7 +34,7 @@ from msdrivers.emulate.wheels import WheelsEmulator
 from msdrivers.protocol.can.database import parse_dbc
 from msdrivers.protocol.can.frame import MAX_BASE_ID, CanFrame
 from msdrivers.protocol.can.mapping import CountMap, DirectionMap, SignalMap, SpeedMap, WheelMap
-from msdrivers.station import Measured, Phase, Reopen, Send, Told
+from msdrivers.station import Measured, Reopen, Send, StationPhase, StationStatus
 
 BOTH = ("front_left", "front_right")
 
@@ -146,12 +146,12 @@ def test_given_a_controller_that_restarts_then_travel_goes_on_from_where_it_was(
 def test_given_bus_off_then_it_is_told_once_and_the_line_is_opened_anew() -> None:
     wire = wired(4.0, swing, CanFault(2.0, "bus_off", 0.5)).run(4.5)
     assert [reopen.why for _, reopen in wire.reopened] == ["the CAN interface went bus-off: too many frames failed"]
-    (silent,) = [told for _, told in wire.told if told.phase is Phase.SILENT]
+    (silent,) = [told for _, told in wire.told if told.phase is StationPhase.SILENT]
     assert "terminators" in silent.text
     between = [t for t, _ in wire.samples if 2.01 < t < 2.5]
     assert between == []
     assert wire.samples[-1][0] > 4.0
-    assert wire.told[-1][1].phase is Phase.STREAMING
+    assert wire.told[-1][1].phase is StationPhase.STREAMING
 
 
 def test_given_an_interface_that_says_bus_off_again_and_again_then_the_line_is_opened_once() -> None:
@@ -164,11 +164,11 @@ def test_given_an_interface_that_says_bus_off_again_and_again_then_the_line_is_o
 
 def test_given_silence_then_it_is_told_once_and_nothing_is_published() -> None:
     wire = wired(9.0, swing, CanFault(2.0, "stall", 4.0)).run(9.5)
-    silent = [(t, told.text) for t, told in wire.told if told.phase is Phase.SILENT]
+    silent = [(t, told.text) for t, told in wire.told if told.phase is StationPhase.SILENT]
     assert [round(t) for t, _ in silent] == [3]
     assert "nothing else on the bus: check power, wiring" in silent[0][1]
     assert not [t for t, _ in wire.samples if 2.01 < t < 6.0]
-    assert [told.phase for _, told in wire.told][-1] is Phase.STREAMING
+    assert [told.phase for _, told in wire.told][-1] is StationPhase.STREAMING
 
 
 def test_given_another_bus_then_what_is_on_it_is_told() -> None:
@@ -177,7 +177,7 @@ def test_given_another_bus_then_what_is_on_it_is_told() -> None:
     for number in range(1000):
         assert driver.received(CanFrame(0x400 + number % 500, bytes(8)), at(0.0005 * number)) == []
     (told,) = driver.woken(at(1.0))
-    assert isinstance(told, Told)
+    assert isinstance(told, StationStatus)
     assert "on the bus are 0x400, 0x401" in told.text
     assert len(told.text) < 300
 
@@ -270,7 +270,7 @@ def test_given_the_line_opened_anew_then_half_an_instant_from_before_is_not_join
     driver.opened(at(0.101))
     assert driver.received(speeds, at(0.102)) == []
     (told, measured) = driver.received(counts, at(0.103))
-    assert isinstance(told, Told)
+    assert isinstance(told, StationStatus)
     assert isinstance(measured, Measured)
     assert measured.sample.header.utime == START_UTIME + 102_000
 

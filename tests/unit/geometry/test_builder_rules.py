@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from modelserver.errors import GeometryError, Severity, Source
+from modelserver.errors import GeometryError, Location, Severity
 from modelserver.geometry import BodyFrame, ModelBuilder
 from modelserver.spatial import Pose
 
 
 def at(line):
-    return Source("cart.xml", line, f"element {line}")
+    return Location("cart.xml", line, f"element {line}")
 
 
 def cart(strict=False):

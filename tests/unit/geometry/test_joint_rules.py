@@ -7,9 +7,9 @@ import random
 
 import pytest
 
-from modelserver.errors import GeometryError, Severity, Source
+from modelserver.errors import GeometryError, Location, Severity
 from modelserver.geometry import Joint, JointType, Mimic, ModelBuilder
-from modelserver.geometry.drives import Drive
+from modelserver.geometry.drives import JointDrive
 from modelserver.spatial import Pose
 
 X = (1.0, 0.0, 0.0)
@@ -26,8 +26,8 @@ def comb(**joints):
     for number, (name, joint) in enumerate(joints.items(), 10):
         name = name.replace("__", ".")
         body = name.lower().replace(".", "_")
-        builder.body(body, source=Source("comb", number)).frame("o")
-        builder.constraint(name, "Base:O", f"{body}:o", joint=joint, source=Source("comb", number))
+        builder.body(body, source=Location("comb", number)).frame("o")
+        builder.constraint(name, "Base:O", f"{body}:o", joint=joint, source=Location("comb", number))
     return builder
 
 
@@ -51,9 +51,9 @@ def test_given_joints_that_follow_over_two_steps_then_each_drive_is_that_of_the_
     model = comb(C=slide(Mimic("B", 2.0, 0.1)), A=slide(default=(0.5,)), B=slide(Mimic("A", -3.0, 0.25))).build()
     assert model.problems == ()
     assert model.drives == {
-        "C": Drive(("A",), "A", -6.0, 0.6),
-        "A": Drive(("A",), "A"),
-        "B": Drive(("A",), "A", -3.0, 0.25),
+        "C": JointDrive(("A",), "A", -6.0, 0.6),
+        "A": JointDrive(("A",), "A"),
+        "B": JointDrive(("A",), "A", -3.0, 0.25),
     }
 
 
@@ -135,7 +135,7 @@ def test_given_several_faults_then_each_is_reported_once():
 
 def test_given_a_leader_that_is_broken_itself_then_its_followers_are_no_second_fault():
     builder = comb(B=slide(Mimic("A")), C=slide(Mimic("B")))
-    builder.constraint("A", "Base:Nope", "b:o", joint=slide(), source=Source("comb", 9))
+    builder.constraint("A", "Base:Nope", "b:o", joint=slide(), source=Location("comb", 9))
     assert "Nope" in only(builder).message
     model = builder.build(repair=True)
     assert model.get_body_list() == ["Base"]

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2, norm
 
-from modelserver.errors import Severity, Source
+from modelserver.errors import Location, Severity
 from modelserver.geometry import Joint, JointType, ModelBuilder, Sigma
 from modelserver.geometry.loops import MOST_SIGMAS, as_sigmas, closure, improbable
 from modelserver.geometry.topology import Topology
@@ -26,7 +26,7 @@ def ladder(miss, sigma=MILLIMETRE, joint=None, frame_sigma=MILLIMETRE):
     builder.body("A").frame("a").frame("b", Pose((1, 0, 0)), sigma=frame_sigma)
     builder.body("B").frame("a").frame("b", Pose((1 + miss, 0, 0)), sigma=frame_sigma)
     builder.constraint("one", "A:a", "B:a")
-    builder.constraint("two", "A:b", "B:b", sigma=sigma, joint=joint or Joint(), source=Source("ladder", 7))
+    builder.constraint("two", "A:b", "B:b", sigma=sigma, joint=joint or Joint(), source=Location("ladder", 7))
     return builder
 
 
@@ -58,7 +58,7 @@ def test_given_a_mount_turned_the_wrong_way_then_no_survey_excuses_it(degrees):
     builder.body("Bar").frame("L", Pose((0, 0.5, 0)), sigma=survey).frame("R", Pose((0, -0.5, 0)), sigma=survey)
     builder.constraint("BoltL", "Cart:Left", "Bar:L", sigma=survey)
     turned = Pose.from_rpy((0, 0, 0), 0, math.radians(degrees), 0)
-    builder.constraint("BoltR", "Cart:Right", "Bar:R", turned, sigma=survey, source=Source("bar", 7))
+    builder.constraint("BoltR", "Cart:Right", "Bar:R", turned, sigma=survey, source=Location("bar", 7))
     problem = only(builder.build())
     assert problem.severity is Severity.WARNING
     assert "no error at all" not in problem.message
@@ -128,7 +128,9 @@ def test_given_a_doubtful_turn_far_away_then_its_arm_counts():
     builder.body("C").frame("o")
     builder.constraint("AB", "A:turn", "B:o")
     builder.constraint("BC", "B:far", "C:o")
-    builder.constraint("CA", "A:o", "C:o", Pose.from_rpy((10, 0.02, 0.0), yaw=0.002), sigma=exact, source=Source("", 7))
+    builder.constraint(
+        "CA", "A:o", "C:o", Pose.from_rpy((10, 0.02, 0.0), yaw=0.002), sigma=exact, source=Location("", 7)
+    )
     found = round_of(builder.build())
     # turn and arm are one error, so that one degree of freedom has them both: 2 mrad of 1. To the second order it
     # misses ahead as well, by 20 um, which is no contradiction to what the survey says of that direction

@@ -17,7 +17,16 @@ from modelserver.config import load_config
 from modelserver.localization.filter.localizer import FilterLocalizer
 from modelserver.messages import Direction, VehicleStatusSample, Verdict, WheelSample, WheelsSample
 from modelserver.service.daemon import Vehicle, load_vehicle
-from modelserver.simulation import Event, GpsModel, ImuModel, Phase, Simulation, StatusModel, Trajectory, WheelsModel
+from modelserver.simulation import (
+    DrivePhase,
+    Event,
+    GpsModel,
+    ImuModel,
+    Simulation,
+    StatusModel,
+    Trajectory,
+    WheelsModel,
+)
 from modelserver.simulation.scenario import START_UTIME
 from tests.support_filter import GPS_TIMING, IMU_TIMING, ORIGIN, WHEELS_TIMING, Run, Transform, drive, untouched
 from tests.support_restart import longest_wrong
@@ -25,11 +34,25 @@ from tests.support_restart import longest_wrong
 pytestmark = pytest.mark.slow
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor" / "vehicle.yaml"
-AT_ONCE = Phase(1e-3, -2.0)
-STRAIGHT_BACK = (AT_ONCE, Phase(60.0))
-CURVES_BACK = (AT_ONCE, Phase(10.0), Phase(2.0, curvature=0.15), Phase(15.0), Phase(2.0, curvature=-0.1), Phase(20.0))
-BRAKES_BACK = (AT_ONCE, Phase(15.0), Phase(2.0, -0.8), Phase(5.0), Phase(2.0, -2.0), Phase(20.0))
-STOPS_BACK = (AT_ONCE, Phase(15.0), Phase(2.0, 0.0), Phase(5.0), Phase(2.0, -2.0), Phase(20.0))
+AT_ONCE = DrivePhase(1e-3, -2.0)
+STRAIGHT_BACK = (AT_ONCE, DrivePhase(60.0))
+CURVES_BACK = (
+    AT_ONCE,
+    DrivePhase(10.0),
+    DrivePhase(2.0, curvature=0.15),
+    DrivePhase(15.0),
+    DrivePhase(2.0, curvature=-0.1),
+    DrivePhase(20.0),
+)
+BRAKES_BACK = (
+    AT_ONCE,
+    DrivePhase(15.0),
+    DrivePhase(2.0, -0.8),
+    DrivePhase(5.0),
+    DrivePhase(2.0, -2.0),
+    DrivePhase(20.0),
+)
+STOPS_BACK = (AT_ONCE, DrivePhase(15.0), DrivePhase(2.0, 0.0), DrivePhase(5.0), DrivePhase(2.0, -2.0), DrivePhase(20.0))
 
 
 @lru_cache(maxsize=1)
@@ -38,7 +61,7 @@ def raptor() -> Vehicle:
 
 
 def raptor_drive(
-    phases: tuple[Phase, ...],
+    phases: tuple[DrivePhase, ...],
     seconds: float,
     seed: int = 1,
     *,
@@ -55,7 +78,7 @@ def raptor_drive(
     run = Simulation(
         vehicle.model,
         config.rolling_frame,
-        Trajectory((*phases, Phase(2.0, 0.0, 0.0)), yaw=0.7),
+        Trajectory((*phases, DrivePhase(2.0, 0.0, 0.0)), yaw=0.7),
         ORIGIN,
         gps_frame=config.sensors.gps.frame,
         imu_frame=config.sensors.imu.frame,
@@ -140,13 +163,18 @@ def test_given_a_straight_at_steady_speed_without_a_direction_then_no_heading_is
 
 
 def test_given_a_speed_that_no_vehicle_backs_up_with_then_it_drives_forward():
-    run = raptor_drive((Phase(1e-3, 9.0), Phase(60.0)), 12.0, wheels=False, status=False)
+    run = raptor_drive((DrivePhase(1e-3, 9.0), DrivePhase(60.0)), 12.0, wheels=False, status=False)
     assert first_valid(run) < 8.0
     assert longest_wrong(run) <= 1.0
 
 
 def test_given_a_raptor_that_drives_then_a_lost_and_a_wrong_steering_angle_cost_nothing():
-    phases = (Phase(4.0), Phase(2.0, 3.0), *(Phase(4.0, curvature=c) for c in (0.25, -0.25, 0.2, 0.0)), Phase(9.0))
+    phases = (
+        DrivePhase(4.0),
+        DrivePhase(2.0, 3.0),
+        *(DrivePhase(4.0, curvature=c) for c in (0.25, -0.25, 0.2, 0.0)),
+        DrivePhase(9.0),
+    )
 
     def angles(events: Iterable[Event]) -> Iterable[Event]:
         for event in events:

@@ -12,7 +12,7 @@ from modelserver.localization.filter.localizer import FilterLocalizer
 from modelserver.localization.filter.setup import Setup
 from modelserver.messages import Mode, Recalled
 from modelserver.messages import Phase as FilterPhase
-from modelserver.simulation import Phase
+from modelserver.simulation import DrivePhase
 from tests.support_filter import ORIGIN, RIG, drive, simulation
 from tests.support_restart import (
     DRIVES_OFF,
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_given_a_kill_while_standing_then_the_pose_is_valid_at_once_and_within_its_bounds(seed):
-    first, kept = first_run((Phase(60.0), *DRIVES_OFF), seed)
+    first, kept = first_run((DrivePhase(60.0), *DRIVES_OFF), seed)
     assert kept.pose is not None
     lose(first.simulation, GAP)
     warm = second_run(first.simulation, kept, GAP, 70.0)
@@ -50,7 +50,7 @@ def test_given_a_kill_while_standing_then_the_pose_is_valid_at_once_and_within_i
 
 
 def test_given_a_kill_while_standing_when_nothing_is_kept_then_there_is_no_heading_before_it_drives():
-    first, _ = first_run((Phase(26.0), *DRIVES_OFF))
+    first, _ = first_run((DrivePhase(26.0), *DRIVES_OFF))
     lose(first.simulation, GAP)
     cold = second_run(first.simulation, None, GAP, 30.0)
     assert first_valid(cold) > 5.0
@@ -58,7 +58,7 @@ def test_given_a_kill_while_standing_when_nothing_is_kept_then_there_is_no_headi
 
 
 def test_given_a_kill_while_driving_then_only_biases_are_taken_up_and_the_pose_is_right():
-    first, kept = first_run((Phase(8.0), *DRIVES_OFF), seconds=46.0)
+    first, kept = first_run((DrivePhase(8.0), *DRIVES_OFF), seconds=46.0)
     assert kept.pose is None
     lose(first.simulation, GAP)
     warm = second_run(first.simulation, kept, GAP, 30.0)
@@ -70,7 +70,7 @@ def test_given_a_kill_while_driving_then_only_biases_are_taken_up_and_the_pose_i
 
 @pytest.mark.parametrize("gap", [GAP, 8.0, 15.0])
 def test_given_a_kept_pose_when_the_vehicle_has_driven_off_meanwhile_then_the_pose_is_not_used(gap):
-    first, kept = first_run((Phase(12.0), *DRIVES_OFF))
+    first, kept = first_run((DrivePhase(12.0), *DRIVES_OFF))
     assert kept.pose is not None
     lose(first.simulation, gap)
     warm = second_run(first.simulation, kept, gap, 40.0)
@@ -78,7 +78,7 @@ def test_given_a_kept_pose_when_the_vehicle_has_driven_off_meanwhile_then_the_po
     assert longest_wrong(warm) <= 1.0
 
 
-TOWED = (Phase(12.0), *DRIVES_OFF)
+TOWED = (DrivePhase(12.0), *DRIVES_OFF)
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_given_a_vehicle_that_was_towed_or_turned_meanwhile_then_no_wrong_pose_i
 def test_given_a_vehicle_that_was_lifted_and_turned_on_the_spot_then_its_first_metres_put_the_heading_right(turn):
     # what nothing can tell at rest: wheels stood, the place is the same, and so is the lean
     first, kept = first_run()
-    sim = elsewhere(first, GAP, 0.0, turn, (Phase(8.0), *DRIVES_OFF))
+    sim = elsewhere(first, GAP, 0.0, turn, (DrivePhase(8.0), *DRIVES_OFF))
     localizer = FilterLocalizer.start(Setup(RIG), ORIGIN, Mode.FULL, Recalled(kept, GAP))
     warm = drive(sim, 30.0, localizer=localizer, every=0.1, transform=counters_go_on(kept, (0.0, 0.0)))
 
@@ -243,9 +243,9 @@ def test_given_wheels_and_fixes_that_come_late_then_the_resumed_state_is_the_sam
 
 
 def test_given_nothing_recalled_then_the_filter_is_as_it_was_to_the_bit():
-    a = drive(simulation((Phase(4.0), *DRIVES_OFF)), 20.0)
+    a = drive(simulation((DrivePhase(4.0), *DRIVES_OFF)), 20.0)
     start = FilterLocalizer.start(Setup(RIG), ORIGIN, Mode.FULL, Recalled(why="nothing is kept"))
-    b = drive(simulation((Phase(4.0), *DRIVES_OFF)), 20.0, localizer=start)
+    b = drive(simulation((DrivePhase(4.0), *DRIVES_OFF)), 20.0, localizer=start)
     assert [row.estimate.covariance for row in a.rows] == [row.estimate.covariance for row in b.rows]
     assert words(b) == []
 

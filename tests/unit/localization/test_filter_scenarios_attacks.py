@@ -13,8 +13,8 @@ from modelserver.localization.filter.localizer import FilterLocalizer
 from modelserver.localization.filter.nav import ATTITUDE
 from modelserver.localization.filter.setup import Setup
 from modelserver.messages import GpsSample, ImuSample, Phase, Verdict, WheelSample, WheelsSample
+from modelserver.simulation import DrivePhase as Stretch
 from modelserver.simulation import EncoderModel, Event, WheelsModel, figure_eight, stand
-from modelserver.simulation import Phase as Stretch
 from modelserver.simulation.scenario import START_UTIME
 from modelserver.spatial import so3
 from tests.support_filter import IMU, ORIGIN, PLAIN_GPS, RIG, RTK_LIKE, WHEELS_TIMING, drive, simulation

@@ -11,8 +11,8 @@ import pytest
 from modelserver.messages import Invalid, Mode, Verdict
 from modelserver.simulation import (
     AbsolutePoseModel,
+    DrivePhase,
     GpsModel,
-    Phase,
     RangeModel,
     RelativePoseModel,
     faults,
@@ -50,7 +50,7 @@ def test_given_fixes_that_jump_for_good_when_it_stands_then_drives_then_the_pose
     standing_until = 110.0
     ahead = figure_eight(speed=3.0, radius=8.0, stand=4.0)
     driven = sum(phase.duration for phase in ahead)
-    phases = (*ahead, Phase(standing_until - driven), *figure_eight(speed=3.0, radius=8.0, stand=1.0, laps=2))
+    phases = (*ahead, DrivePhase(standing_until - driven), *figure_eight(speed=3.0, radius=8.0, stand=1.0, laps=2))
     gps = replace(PLAIN_GPS, jumps=((driven + 3.0, FOREVER, 30.0, 0.0),))
 
     found = drive(simulation(phases, gps_model=gps), standing_until + 60.0, every=0.1)

@@ -31,7 +31,7 @@ from modelserver.messages import (
     WheelSample,
     WheelsSample,
 )
-from modelserver.simulation import Phase
+from modelserver.simulation import DrivePhase
 from modelserver.simulation.scenario import START_UTIME
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import cross
@@ -283,7 +283,7 @@ def _unmeasured():
 
 
 def test_given_wheels_that_steer_when_the_service_restarts_then_they_vouch_that_the_vehicle_did_not_move():
-    run = drive(simulation((*TO_A_STOP, Phase(200.0))), 40.0, transform=_unmeasured())
+    run = drive(simulation((*TO_A_STOP, DrivePhase(200.0))), 40.0, transform=_unmeasured())
     used = run.said("wheel_speed", Verdict.USED)
     assert len(used) == len(run.said("wheel_speed")) > 50
     kept = run.localizer.kept()

@@ -28,7 +28,7 @@ from modelserver.messages import (
 from modelserver.service.clock import FakeClock
 from modelserver.service.daemon import Vehicle, configured_origin, load_vehicle, log_wish
 from modelserver.service.fake_bus import FakeBus
-from modelserver.service.heard import Heard
+from modelserver.service.heard import SensorChannel
 from modelserver.service.hooks import Hooks
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.wire.codec import encode
@@ -50,13 +50,13 @@ def problems(folder: Path, text: str, geometry: str = GEOMETRY) -> tuple[Problem
 def test_given_the_vehicles_of_this_project_then_they_load_whole(path: Path) -> None:
     loaded = load_vehicle(load_config(path))
     assert loaded.mounts is not None
-    heard = {"GPS": Heard("gps_t"), "IMU": Heard("imu_t"), "WHEELS": Heard("wheels_t")}
+    heard = {"GPS": SensorChannel("gps_t"), "IMU": SensorChannel("imu_t"), "WHEELS": SensorChannel("wheels_t")}
     if loaded.config.sensors.wheels and loaded.config.sensors.wheels.steering:
-        heard["VEHICLE_STATUS"] = Heard("vehicle_status_t")
+        heard["VEHICLE_STATUS"] = SensorChannel("vehicle_status_t")
     if loaded.model.joints:
-        heard["JOINTS"] = Heard("joints_t")
+        heard["JOINTS"] = SensorChannel("joints_t")
     if loaded.config.localization.mode_channel:
-        heard["LOCALIZATION_MODE"] = Heard("localization_mode_t")
+        heard["LOCALIZATION_MODE"] = SensorChannel("localization_mode_t")
     assert loaded.sensor_channels() == heard
     assert (loaded.tick_hz(), loaded.ticks_per_pose(), loaded.ticks_per_state()) == (50.0, 1, 10)
 
@@ -76,12 +76,12 @@ def test_given_further_sources_and_a_channel_for_modes_then_they_are_heard(tmp_p
     text = VEHICLE.replace("frame: Cart:Antenna", "frame: Cart:Antenna, latency: 0.12") + AIDING
     text += f"{KEY}localization: {{mode_channel: LOCALIZATION_MODE}}\nlcm: {{channel_prefix: '{prefix}'}}\n"
     assert vehicle(tmp_path, text).sensor_channels() == {
-        f"{prefix}GPS": Heard("gps_t", 120_000),
-        f"{prefix}IMU": Heard("imu_t"),
-        f"{prefix}VO": Heard("relative_pose_t", 80_000),
-        f"{prefix}ABSOLUTE_POSE": Heard("absolute_pose_t"),
-        f"{prefix}RANGE": Heard("range_t"),
-        f"{prefix}LOCALIZATION_MODE": Heard("localization_mode_t"),
+        f"{prefix}GPS": SensorChannel("gps_t", 120_000),
+        f"{prefix}IMU": SensorChannel("imu_t"),
+        f"{prefix}VO": SensorChannel("relative_pose_t", 80_000),
+        f"{prefix}ABSOLUTE_POSE": SensorChannel("absolute_pose_t"),
+        f"{prefix}RANGE": SensorChannel("range_t"),
+        f"{prefix}LOCALIZATION_MODE": SensorChannel("localization_mode_t"),
     }
 
 
@@ -95,7 +95,7 @@ def test_given_a_channel_for_modes_that_is_used_otherwise_then_it_is_refused(tmp
 @pytest.mark.parametrize("channel", ["LOCALIZATION_MODE", "MODE", "console/mode"])
 def test_given_a_channel_for_modes_of_its_own_then_it_is_taken(tmp_path: Path, channel: str) -> None:
     text = f"{VEHICLE}{KEY}localization: {{mode_channel: {channel}}}\n"
-    assert vehicle(tmp_path, text).sensor_channels()[channel] == Heard("localization_mode_t")
+    assert vehicle(tmp_path, text).sensor_channels()[channel] == SensorChannel("localization_mode_t")
 
 
 def test_given_a_channel_for_modes_without_a_key_then_it_is_refused_with_what_makes_one(tmp_path: Path) -> None:

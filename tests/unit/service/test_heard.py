@@ -9,7 +9,7 @@ from support_wire import EXAMPLES, UTIME, same
 
 from modelserver.errors import WireError
 from modelserver.messages import RelativePoseSample
-from modelserver.service.heard import Heard, earlier
+from modelserver.service.heard import SensorChannel, earlier
 from modelserver.wire.codec import encode
 
 TYPES = ["gps_t", "imu_t", "wheels_t", "absolute_pose_t", "relative_pose_t", "range_t"]
@@ -21,8 +21,8 @@ def test_given_a_latency_then_the_instants_told_of_are_earlier_and_nothing_else(
         wanted = replace(sample, header=replace(sample.header, utime=UTIME - 80_000))
         if isinstance(sample, RelativePoseSample):
             wanted = replace(wanted, since_utime=max(1, sample.since_utime - 80_000))
-        assert same(Heard(type_name, 80_000).read(encode(sample)), wanted)
-        assert same(Heard(type_name).read(encode(sample)), sample)
+        assert same(SensorChannel(type_name, 80_000).read(encode(sample)), wanted)
+        assert same(SensorChannel(type_name).read(encode(sample)), sample)
 
 
 def test_given_a_stamp_shortly_after_1970_then_it_stays_a_time() -> None:
@@ -32,5 +32,5 @@ def test_given_a_stamp_shortly_after_1970_then_it_stays_a_time() -> None:
 
 def test_given_another_type_then_it_is_refused() -> None:
     with pytest.raises(WireError) as caught:
-        Heard("imu_t", 80_000).read(encode(EXAMPLES["gps_t"][0]))
+        SensorChannel("imu_t", 80_000).read(encode(EXAMPLES["gps_t"][0]))
     assert caught.value.reason == "fingerprint"

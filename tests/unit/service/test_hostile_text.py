@@ -17,11 +17,11 @@ from modelserver.messages import Rejected, Sample, SwitchMode
 from modelserver.service.clock import FakeClock
 from modelserver.service.daemon import log_wish
 from modelserver.service.fake_bus import FakeBus
-from modelserver.service.heard import Heard
+from modelserver.service.heard import SensorChannel
 from modelserver.service.hooks import Hooks
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.service.requests.gate import COMMANDS, Gate
-from modelserver.wire.channels import CHANNELS, Way
+from modelserver.wire.channels import CHANNELS, ChannelUse
 from modelserver.wire.codec import decode, encode
 
 HOSTILE = [
@@ -37,7 +37,9 @@ HOSTILE = [
 ]
 """What is put in each field: no valid text, some of it."""
 
-SENSORS = {each.name: each.type_name for each in CHANNELS if each.way is Way.SENSOR and each.name != "VEHICLE_STATUS"}
+SENSORS = {
+    each.name: each.type_name for each in CHANNELS if each.way is ChannelUse.SENSOR and each.name != "VEHICLE_STATUS"
+}
 MODE = "LOCALIZATION_MODE"
 
 
@@ -56,7 +58,9 @@ class Rig:
     def __init__(self) -> None:
         self.clock = FakeClock(START)
         self.bus = FakeBus(self.clock)
-        sensors = {name: Heard(type_name) for name, type_name in SENSORS.items()} | {MODE: Heard("localization_mode_t")}
+        sensors = {name: SensorChannel(type_name) for name, type_name in SENSORS.items()} | {
+            MODE: SensorChannel("localization_mode_t")
+        }
         gate = Gate((KEY,), "", 5.0, MODE, self.clock.monotonic_ns() - 10**13)
         settings = LoopSettings(20_000_000, sensors, second_writer="ignore", shared=frozenset({"JOINTS"}))
         state = started(Telling(), may_reload=True, may_set_pose=True)
@@ -127,7 +131,7 @@ def test_given_hostile_text_in_any_field_on_any_channel_then_the_log_is_clean_an
     monkeypatch.chdir(tmp_path)
     rig = Rig()
     for channel in CHANNELS:
-        heard = rig.bus.sensors if channel.way is Way.SENSOR or channel.name == MODE else rig.bus.requests
+        heard = rig.bus.sensors if channel.way is ChannelUse.SENSOR or channel.name == MODE else rig.bus.requests
         for data in filled(channel.type_name, hostile):
             heard.put(channel.name, data)
         rig.settle()

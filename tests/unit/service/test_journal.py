@@ -22,7 +22,7 @@ from modelserver.service.journal.ring import Ring, Segment
 from modelserver.service.journal.verify import verify
 from modelserver.service.journal.writer import RETRY_S
 from modelserver.service.loop import Loop
-from modelserver.wire.journal import Head, Kind, Record, read
+from modelserver.wire.journal import Head, JournalRecord, RecordKind, read
 
 NOW = Instant(1, 2)
 
@@ -57,14 +57,14 @@ def test_given_a_service_when_it_turns_then_everything_heard_and_said_stands_in_
     kept.send(GetBodyList(RequestHeader(1, "REPLY_ME")))
     kept.turns(3)
     (path,) = kept.finish()
-    found = [each for each in read(path.read_bytes()) if isinstance(each, Record)]
+    found = [each for each in read(path.read_bytes()) if isinstance(each, JournalRecord)]
     heard = [(each.channel, each.data) for each in found if each.channel]
     assert sorted(heard) == sorted(kept.bus.published)
     assert [each.kind for each in found if each.channel in ("PLATFORM_GET_BODY_LIST", "REPLY_ME")] == [
-        Kind.REQUEST,
-        Kind.SAID,
+        RecordKind.REQUEST,
+        RecordKind.SAID,
     ]
-    assert {each.kind for each in found} == {Kind.SAMPLE, Kind.EVENT, Kind.SAID, Kind.REQUEST}
+    assert {each.kind for each in found} == {RecordKind.SAMPLE, RecordKind.EVENT, RecordKind.SAID, RecordKind.REQUEST}
     assert (heads([path])[0]["run"], heads([path])[0]["part"], heads([path])[0]["lost"]) == ("one", 0, 0)
     assert [path.stat().st_mode & 0o777] == [0o640]
 
@@ -72,7 +72,7 @@ def test_given_a_service_when_it_turns_then_everything_heard_and_said_stands_in_
 def test_given_no_journal_then_nothing_is_asked_for_and_nothing_told(tmp_path: Path) -> None:
     none = NoJournal()
     none.step(Tick(), NOW)
-    none.note(Kind.UNREAD, ("GPS", b""), NOW)
+    none.note(RecordKind.UNREAD, ("GPS", b""), NOW)
     none.said("POSE", b"")
     assert (none.wants_state, list(none.news())) == (False, [])
 

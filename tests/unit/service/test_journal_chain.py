@@ -13,9 +13,18 @@ from support_journal import SMALL, Kept
 
 from modelserver.errors import RecordingError
 from modelserver.service.journal.chain import NEWEST_NAME, Newest, read_newest, seal_segment
-from modelserver.service.journal.verify import Result, Verified, verify
+from modelserver.service.journal.verify import VerificationResult, Verified, verify
 from modelserver.signing import Key
-from modelserver.wire.journal import End, Head, Kind, Record, batch_written, end_written, head_written, read
+from modelserver.wire.journal import (
+    End,
+    Head,
+    JournalRecord,
+    RecordKind,
+    batch_written,
+    end_written,
+    head_written,
+    read,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -64,10 +73,10 @@ def test_given_a_whole_journal_then_it_is_authentic_by_its_key_and_reproduced_wi
 ) -> None:
     directory, key = journal
     found = looked_at(directory)
-    assert (found.result, found.genuine, damages(found)) == (Result.REPRODUCED, 0, "")
+    assert (found.result, found.genuine, damages(found)) == (VerificationResult.REPRODUCED, 0, "")
     found = looked_at(directory, STRANGE, KEY) if key else looked_at(directory, KEY)
     assert damages(found) == ""
-    assert found.result is (Result.AUTHENTIC if key else Result.REPRODUCED)
+    assert found.result is (VerificationResult.AUTHENTIC if key else VerificationResult.REPRODUCED)
     assert found.genuine == (found.segments if key else 0)
 
 
@@ -142,7 +151,7 @@ def test_given_segments_that_were_tampered_with_then_it_is_damage_with_and_witho
     for keys in ((), (KEY,)):
         found = looked_at(directory, *keys)
         assert words in damages(found)
-        assert found.result is Result.DIFFERS
+        assert found.result is VerificationResult.DIFFERS
 
 
 def test_given_earlier_segments_that_are_gone_then_that_is_reported_as_the_ring_does_it_too(
@@ -153,7 +162,7 @@ def test_given_earlier_segments_that_are_gone_then_that_is_reported_as_the_ring_
     for path in files[:2]:
         path.unlink()
     found = looked_at(directory, KEY)
-    assert found.result is (Result.AUTHENTIC if key else Result.REPRODUCED)
+    assert found.result is (VerificationResult.AUTHENTIC if key else VerificationResult.REPRODUCED)
     assert "2 earlier segments were dropped by the ring, or removed" in str(found.remarks[0])
 
 
@@ -166,7 +175,7 @@ def test_given_a_segment_of_another_journal_of_the_same_key_then_it_is_found(
     other.drive(0.85)
     shutil.copy(other.finish()[2], sorted(directory.glob("journal-*.lcm"))[2])
     found = looked_at(directory, *([key] if key else []))
-    assert found.result is Result.DIFFERS
+    assert found.result is VerificationResult.DIFFERS
     assert "does not follow from" in damages(found)
 
 
@@ -174,11 +183,11 @@ def without_newest_record(path: Path, key: Key | None, facts: dict[str, object])
     """Forge a segment: leave out its last batches, make all checksums right again, and seal it with `key`."""
     data = path.read_bytes()
     items = list(read(data))
-    records = [each for each in items if isinstance(each, Record)]
+    records = [each for each in items if isinstance(each, JournalRecord)]
     head = next(each for each in items if isinstance(each, Head))
     begin = len(head_written(head.facts, 0))
     body = head_written({**head.facts, **facts}, 0) + data[begin : records[0].at]
-    keep = max(n for n in range(len(records) * 3 // 4) if records[n].kind is not Kind.SAID)
+    keep = max(n for n in range(len(records) * 3 // 4) if records[n].kind is not RecordKind.SAID)
     body += batch_written(0, records[:keep])
     digest = hashlib.sha256(body).digest()
     path.write_bytes(body + end_written(digest, 0, seal_segment(key, digest)))
@@ -194,14 +203,14 @@ def test_given_a_last_segment_that_was_forged_then_only_the_key_tells(copied: tu
     newest = Newest(1, len(heads(directory)) - 1, end.seal.hex())
     (directory / NEWEST_NAME).write_bytes(newest.encode(forger))
     found = looked_at(directory)
-    assert (found.result, damages(found)) == (Result.REPRODUCED, "")
+    assert (found.result, damages(found)) == (VerificationResult.REPRODUCED, "")
     found = looked_at(directory, KEY)
     if key:
-        assert found.result is Result.DIFFERS
+        assert found.result is VerificationResult.DIFFERS
         assert "its seal is wrong: it was not written by who knows the key" in damages(found)
         assert "the file newest is damaged or not genuine" in damages(found)
     else:
-        assert found.result is Result.REPRODUCED
+        assert found.result is VerificationResult.REPRODUCED
         assert not found.authentic
 
 
@@ -213,7 +222,7 @@ def test_given_a_keyed_journal_whose_keys_were_stripped_then_it_is_not_authentic
     end = next(each for each in read(path.read_bytes()) if isinstance(each, End))
     (kept.directory / NEWEST_NAME).write_bytes(Newest(0, 0, end.seal.hex()).encode(None))
     found = looked_at(kept.directory, KEY)
-    assert (found.result, found.genuine, found.unsealed) == (Result.REPRODUCED, 0, 1)
+    assert (found.result, found.genuine, found.unsealed) == (VerificationResult.REPRODUCED, 0, 1)
 
 
 @pytest.mark.parametrize("key", [OTHER, STRANGE], ids=["same name", "other name"])
@@ -222,7 +231,7 @@ def test_given_another_key_then_nothing_is_authentic(tmp_path: Path, key: Key) -
     kept.drive(0.5)
     kept.finish()
     found = looked_at(kept.directory, key)
-    assert found.result is Result.DIFFERS
+    assert found.result is VerificationResult.DIFFERS
     assert ("its seal is wrong" if key is OTHER else "which is not in the key file") in damages(found)
 
 
@@ -234,14 +243,14 @@ def test_given_a_service_that_was_killed_then_what_is_not_closed_is_reproduced_a
     kept.ring.release()
     found = looked_at(kept.directory, KEY)
     assert damages(found) == ""
-    assert (found.result, found.unsealed, found.genuine) == (Result.REPRODUCED, 1, found.segments - 1)
+    assert (found.result, found.unsealed, found.genuine) == (VerificationResult.REPRODUCED, 1, found.segments - 1)
     # the next run begins behind it, and says nothing of a seal that there is not
     second = Kept(tmp_path, SMALL, segment_bytes=57_000, run="two", key=KEY, clock=kept.clock)
     second.drive(0.2)
     second.finish()
     found = looked_at(second.directory, KEY)
     assert damages(found) == ""
-    assert (found.result, found.unsealed) == (Result.REPRODUCED, 1)
+    assert (found.result, found.unsealed) == (VerificationResult.REPRODUCED, 1)
 
 
 def test_given_the_last_segments_deleted_before_the_next_run_then_they_are_still_missed(
@@ -256,7 +265,7 @@ def test_given_the_last_segments_deleted_before_the_next_run_then_they_are_still
     third.finish()
     assert heads(directory)[-1]["run_number"] == 2
     found = looked_at(directory, KEY)
-    assert found.result is Result.DIFFERS
+    assert found.result is VerificationResult.DIFFERS
     assert "2 segments before it are missing" in damages(found)
 
 
@@ -266,14 +275,14 @@ def test_given_no_file_that_names_the_last_segment_then_nobody_says_that_none_is
     directory, _ = copied
     (directory / NEWEST_NAME).unlink()
     found = looked_at(directory, KEY)
-    assert found.result is Result.REPRODUCED
+    assert found.result is VerificationResult.REPRODUCED
     assert "nobody knows whether segments after it are missing" in str(found.remarks[-1])
 
 
 def test_given_a_single_segment_then_it_is_authentic_by_itself(journal: tuple[Path, Key | None]) -> None:
     directory, key = journal
     found = verify([sorted(directory.glob("journal-*.lcm"))[1]], keys=[KEY])
-    assert found.result is (Result.AUTHENTIC if key else Result.REPRODUCED)
+    assert found.result is (VerificationResult.AUTHENTIC if key else VerificationResult.REPRODUCED)
 
 
 @pytest.mark.parametrize(

@@ -12,11 +12,11 @@ from modelserver.messages import PoseAnswer
 from modelserver.service.journal import verify as journal_verify
 from modelserver.service.journal.comparison import Deviation, changes, deviation
 from modelserver.service.journal.rerun import Rerun
-from modelserver.service.journal.verify import Result, verify
+from modelserver.service.journal.verify import VerificationResult, verify
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.transformation import Transformation
 from modelserver.wire.codec import decode, encode
-from modelserver.wire.journal import Record
+from modelserver.wire.journal import JournalRecord
 
 TURNED = 3e-10
 
@@ -92,16 +92,16 @@ def shifted(data: bytes, meters: float) -> bytes:
     return encode(answer._replace(transformation=moved))
 
 
-@pytest.mark.parametrize(("meters", "result"), [(5e-10, Result.CLOSE), (5e-9, Result.DIFFERS)])
+@pytest.mark.parametrize(("meters", "result"), [(5e-10, VerificationResult.CLOSE), (5e-9, VerificationResult.DIFFERS)])
 def test_given_a_run_again_that_sums_in_another_order_then_that_is_a_result_of_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, meters: float, result: Result
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, meters: float, result: VerificationResult
 ) -> None:
     kept = Kept(tmp_path, SMALL)
     kept.drive(1.0)
     files = kept.finish()
 
     class Shifting(Rerun):
-        def handle(self, record: Record) -> list[tuple[str, bytes]]:
+        def handle(self, record: JournalRecord) -> list[tuple[str, bytes]]:
             return [
                 (channel, shifted(data, meters) if channel == "POSE_ODOM" else data)
                 for channel, data in super().handle(record)
@@ -110,7 +110,7 @@ def test_given_a_run_again_that_sums_in_another_order_then_that_is_a_result_of_i
     monkeypatch.setattr(journal_verify, "Rerun", Shifting)
     found = verify(files)
     assert found.result is result
-    if result is Result.CLOSE:
+    if result is VerificationResult.CLOSE:
         assert found.close["POSE_ODOM"] == len(kept.bus.said("POSE_ODOM"))
         assert "POSE_ODOM" not in found.said
         assert found.said["POSE"] > 40

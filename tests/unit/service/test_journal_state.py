@@ -18,7 +18,6 @@ from modelserver.core.reload import ModelLoaded
 from modelserver.errors import RecordingError
 from modelserver.localization.filter.measurements import REGISTRY
 from modelserver.messages import (
-    Commanded,
     Denied,
     GetBodyList,
     GetStateVector,
@@ -30,11 +29,12 @@ from modelserver.messages import (
     ReloadModel,
     SensorHeader,
     SetStateVector,
+    SignedCommand,
     Tick,
     TimeQuery,
 )
 from modelserver.service.journal import state as journal_state
-from modelserver.service.journal.state import Run
+from modelserver.service.journal.state import RunState
 from modelserver.spatial.pose import Pose
 from modelserver.spatial.transformation import Transformation
 
@@ -57,12 +57,12 @@ def test_given_a_state_when_read_back_then_it_goes_on_to_the_same_bits(tmp_path:
     state = kept.loop.state
     assert state.parked
     assert len(state.view.joints.tracks["Mounted"]) > 10
-    run = Run(kept.vehicle.config, journal_state.detach(state))
+    run = RunState(kept.vehicle.config, journal_state.detach(state))
     data = journal_state.encode_run(run)
     config, back = journal_state.decode_run(data)
     assert config == kept.vehicle.config
     # what was read is written to the same bytes
-    assert journal_state.encode_run(Run(config, back)) == data
+    assert journal_state.encode_run(RunState(config, back)) == data
     assert 0 < len(back.history) <= len(state.history)
     for sample in drive(1.5, kept.clock.utime()):
         now = Instant(kept.clock.monotonic_ns(), sample.header.utime)
@@ -76,7 +76,7 @@ def test_given_a_state_when_read_back_then_values_are_shared_as_they_were(tmp_pa
     kept = Kept(tmp_path, OPEN)
     kept.drive(6.0)
     state = journal_state.detach(kept.loop.state)
-    _, back = journal_state.decode_run(journal_state.encode_run(Run(kept.vehicle.config, state)))
+    _, back = journal_state.decode_run(journal_state.encode_run(RunState(kept.vehicle.config, state)))
 
     def counts(state: CoreState) -> tuple[int, int, int, bool]:
         held = state.history._estimates
@@ -98,7 +98,7 @@ def test_given_a_state_that_is_written_while_its_successors_grow_then_only_what_
     kept.send(JointsSample(SensorHeader(kept.clock.utime(), "axis"), (JointSample("Mounted", 0.1),)))
     kept.turns(2)
     state = kept.loop.state
-    run = Run(kept.vehicle.config, journal_state.detach(state))
+    run = RunState(kept.vehicle.config, journal_state.detach(state))
     before = journal_state.encode_run(run)
     kept.send(JointsSample(SensorHeader(kept.clock.utime(), "axis"), (JointSample("Mounted", 0.2),)))
     kept.drive(0.5)
@@ -109,7 +109,7 @@ def test_given_work_that_takes_long_then_it_pauses_again_and_again(tmp_path: Pat
     kept = Kept(tmp_path)
     kept.drive(6.0)
     pauses: list[int] = []
-    run = Run(kept.vehicle.config, journal_state.detach(kept.loop.state))
+    run = RunState(kept.vehicle.config, journal_state.detach(kept.loop.state))
     journal_state.encode_run(run, lambda: pauses.append(1))
     assert len(pauses) > 20
 
@@ -166,7 +166,7 @@ POSE = Transformation("Cart:Base", "World:UTM", Pose.from_rpy((1.0, 2.0, 3.0), 0
         imu(START),
         Tick(float("inf")),
         Denied("MODELSERVER_SIGNED", "window", "too old", GetBodyList, ME),
-        Commanded(SetStateVector(ME, PoseAnswer(POSE)), "operator"),
+        SignedCommand(SetStateVector(ME, PoseAnswer(POSE)), "operator"),
     ],
 )
 def test_given_an_event_of_the_services_own_when_read_back_then_it_is_the_same(event: object) -> None:

@@ -41,7 +41,7 @@ from modelserver.messages import (
 )
 from modelserver.service.clock import FakeClock
 from modelserver.service.fake_bus import FakeBus
-from modelserver.service.heard import Heard
+from modelserver.service.heard import SensorChannel
 from modelserver.service.hooks import Hooks
 from modelserver.service.log import MAX_CAUSES, PERIOD_S, RateLimited
 from modelserver.service.loop import SENSORS_LEAST_NS, SENSORS_NS, SENSORS_PER_PASS, Loop, LoopSettings
@@ -75,8 +75,8 @@ class Rig:
     ):
         self.clock = FakeClock(START, 10_000_000_000)
         self.bus = FakeBus(self.clock)
-        heard = {f"{prefix}GPS": Heard("gps_t", latency_us), f"{prefix}IMU": Heard("imu_t")}
-        heard[f"{prefix}LOCALIZATION_MODE"] = Heard("localization_mode_t")
+        heard = {f"{prefix}GPS": SensorChannel("gps_t", latency_us), f"{prefix}IMU": SensorChannel("imu_t")}
+        heard[f"{prefix}LOCALIZATION_MODE"] = SensorChannel("localization_mode_t")
         names = ("publish", "parked_requests", "ticks_per_state")
         core_settings = {key: settings.pop(key) for key in names if key in settings}
         state = started(localizer, **core_settings)

@@ -31,8 +31,8 @@ from modelserver.messages import (
     SwitchMode,
     Verdict,
 )
-from modelserver.service.heard import Heard
-from modelserver.service.offline import Row, Run
+from modelserver.service.heard import SensorChannel
+from modelserver.service.offline import OfflineRun, TrackRow
 from modelserver.spatial.pose import Pose
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import LogEvent
@@ -87,9 +87,9 @@ def vehicle() -> Any:
         model=model,
         config=SimpleNamespace(base_frame="V:Base"),
         sensor_channels=lambda: {
-            "GPS": Heard("gps_t"),
-            "MAP": Heard("absolute_pose_t", 40),
-            "MODE": Heard("localization_mode_t"),
+            "GPS": SensorChannel("gps_t"),
+            "MAP": SensorChannel("absolute_pose_t", 40),
+            "MODE": SensorChannel("localization_mode_t"),
         },
         core=start,
     )
@@ -101,23 +101,23 @@ def gps(arrival: int, stamp: int | None = None, fix: FixType = FixType.FIX_3D, c
     return LogEvent(0, T0 + arrival, channel, encode(sample), arrival)
 
 
-def taken(run: Run, *times: int) -> list[float]:
+def taken(run: OfflineRun, *times: int) -> list[float]:
     """Return how many samples the estimate for each time rests on."""
     return [row.easting - 1000.0 for row in run.rows([T0 + time for time in times])]
 
 
 def test_given_times_when_replayed_then_an_estimate_rests_on_what_arrived_strictly_before() -> None:
-    run = Run(vehicle(), [gps(100, 0), gps(200, 150), gps(300, 290)], "V:Base")
+    run = OfflineRun(vehicle(), [gps(100, 0), gps(200, 150), gps(300, 290)], "V:Base")
     assert taken(run, 101, 200, 201, 300, 301) == [1, 1, 2, 2, 3]
 
 
 def test_given_a_measurement_before_the_time_that_arrived_after_it_when_replayed_then_it_is_not_used() -> None:
-    run = Run(vehicle(), [gps(100, 0), gps(500, 110)], "V:Base")
+    run = OfflineRun(vehicle(), [gps(100, 0), gps(500, 110)], "V:Base")
     assert taken(run, 400) == [1]
 
 
 def test_given_a_time_before_anything_arrived_when_replayed_then_the_row_says_why_there_is_none() -> None:
-    run = Run(vehicle(), [gps(100), gps(200)], "V:Base")
+    run = OfflineRun(vehicle(), [gps(100), gps(200)], "V:Base")
     first, second, third = run.rows([T0 - 50, T0 + 150, T0 + 250])
     assert math.isnan(first.easting)
     assert (first.valid, first.invalid) == (False, Invalid.NO_FIX | Invalid.NO_IMU)
@@ -126,7 +126,7 @@ def test_given_a_time_before_anything_arrived_when_replayed_then_the_row_says_wh
 
 
 def test_given_times_past_the_end_when_replayed_then_predicted_and_then_none() -> None:
-    run = Run(vehicle(), [gps(100), gps(200)], "V:Base")
+    run = OfflineRun(vehicle(), [gps(100), gps(200)], "V:Base")
     near, far = run.rows([T0 + 1_000_000, T0 + 60_000_000])
     assert near.northing == pytest.approx(2001.0)
     assert math.isnan(far.northing)
@@ -134,7 +134,7 @@ def test_given_times_past_the_end_when_replayed_then_predicted_and_then_none() -
 
 
 def test_given_a_rate_when_replayed_then_rows_stand_at_even_times_of_the_log() -> None:
-    run = Run(vehicle(), [gps(0), gps(50_000), gps(100_000)], "V:Base")
+    run = OfflineRun(vehicle(), [gps(0), gps(50_000), gps(100_000)], "V:Base")
     rows = list(run.rows(None, 30.0))
     assert [row.utime - T0 for row in rows] == [0, 33_333, 66_667, 100_000]
     assert [row.easting - 1000.0 for row in rows[1:]] == [1, 2, 2]
@@ -142,11 +142,11 @@ def test_given_a_rate_when_replayed_then_rows_stand_at_even_times_of_the_log() -
 
 
 def test_given_a_time_asked_twice_when_replayed_then_it_is_answered_twice() -> None:
-    assert taken(Run(vehicle(), [gps(100), gps(300)], "V:Base"), 200, 200, 400) == [1, 1, 2]
+    assert taken(OfflineRun(vehicle(), [gps(100), gps(300)], "V:Base"), 200, 200, 400) == [1, 1, 2]
 
 
 def test_given_a_mounted_frame_when_replayed_then_its_place_is_told_from_the_origin() -> None:
-    run = Run(vehicle(), [gps(0), gps(10)], "V:Mast")
+    run = OfflineRun(vehicle(), [gps(0), gps(10)], "V:Mast")
     (row,) = run.rows([T0 + 1_000_000])
     assert (row.easting, row.northing, row.up) == pytest.approx((1002.0, 2001.0, 32.0))
     assert row.rotation == (1.0, 0.0, 0.0, 0.0)
@@ -154,14 +154,16 @@ def test_given_a_mounted_frame_when_replayed_then_its_place_is_told_from_the_ori
 
 def test_given_an_unknown_frame_when_replayed_then_the_error_comes_before_any_work() -> None:
     with pytest.raises(UnknownFrameError):
-        Run(vehicle(), [], "V:Mats")
+        OfflineRun(vehicle(), [], "V:Mats")
 
 
 def test_given_bad_messages_when_replayed_then_they_are_counted_and_the_rest_is_used() -> None:
     whole = gps(10)
     cut = dataclasses.replace(whole, data=whole.data[:40])
     junk = dataclasses.replace(whole, data=b"junk")
-    run = Run(vehicle(), [cut, junk, gps(20), gps(30, fix=FixType.NONE), gps(40, channel="RADAR"), gps(50)], "V:Base")
+    run = OfflineRun(
+        vehicle(), [cut, junk, gps(20), gps(30, fix=FixType.NONE), gps(40, channel="RADAR"), gps(50)], "V:Base"
+    )
     assert taken(run, 100) == [2]
     assert run.rejected == {("GPS", "truncated"): 1, ("GPS", "fingerprint"): 1, ("sensor:gps", "fix"): 1}
     assert (run.events, run.samples) == (6, 5)
@@ -173,7 +175,7 @@ def test_given_further_sources_and_modes_when_replayed_then_they_are_heard_at_th
     wish = SwitchMode(SensorHeader(T0 + 30, "console"), Mode.NO_GPS)
     told: list[Decision] = []
     log = [gps(10), LogEvent(0, T0 + 20, "MAP", encode(pose), 20), LogEvent(0, T0 + 30, "MODE", encode(wish), 30)]
-    run = Run(vehicle(), log, "V:Base", told.append)
+    run = OfflineRun(vehicle(), log, "V:Base", told.append)
     assert taken(run, 100) == [3]
     assert [(each.source, each.utime - T0) for each in told] == [("gps", 10), ("map", -20), ("console", 30)]
     assert (run.samples, run.unheard) == (3, set())
@@ -186,7 +188,7 @@ def test_given_a_signed_wish_for_a_mode_when_replayed_then_it_is_heard_as_a_plai
     told: list[Decision] = []
     log = [gps(10)]
     log += [LogEvent(0, T0 + 30, "MODELSERVER_SIGNED", data, 30) for data in (sealed, other, b"junk", sealed[:-1])]
-    run = Run(vehicle(), log, "V:Base", told.append)
+    run = OfflineRun(vehicle(), log, "V:Base", told.append)
     assert taken(run, 100) == [2]
     assert [(each.source, each.utime - T0) for each in told] == [("gps", 10), ("console", 30)]
     assert (run.samples, run.unheard) == (2, {"MODELSERVER_SIGNED"})
@@ -195,14 +197,14 @@ def test_given_a_signed_wish_for_a_mode_when_replayed_then_it_is_heard_as_a_plai
 def test_given_nobody_who_wants_decisions_when_replayed_then_the_rows_are_the_same() -> None:
     told: list[Decision] = []
     log = [gps(100), gps(200), gps(300)]
-    with_, without = (list(Run(vehicle(), log, "V:Base", each).rows(None)) for each in (told.append, None))
+    with_, without = (list(OfflineRun(vehicle(), log, "V:Base", each).rows(None)) for each in (told.append, None))
     assert [row.csv() for row in with_] == [row.csv() for row in without]
     assert len(told) == 3
 
 
 def test_given_a_row_when_written_then_tenths_of_a_millimetre_survive() -> None:
-    row = Row(T0, 323204.28072018, 4693737.10237474, -21.00005, (0.5, -0.5, 0.5, -0.5), True, 0)
+    row = TrackRow(T0, 323204.28072018, 4693737.10237474, -21.00005, (0.5, -0.5, 0.5, -0.5), True, 0)
     assert row.csv() == (
         "1700000000000000,323204.28072,4693737.10237,-21.00005,0.500000000,-0.500000000,0.500000000,-0.500000000,1,0"
     )
-    assert Row(T0, invalid=3).csv() == "1700000000000000,nan,nan,nan,nan,nan,nan,nan,0,3"
+    assert TrackRow(T0, invalid=3).csv() == "1700000000000000,nan,nan,nan,nan,nan,nan,nan,0,3"

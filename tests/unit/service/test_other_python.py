@@ -16,7 +16,7 @@ import pytest
 from support_journal import OPEN, Kept
 
 from modelserver.service.journal.comparison import TOLERANCE
-from modelserver.service.journal.verify import Result
+from modelserver.service.journal.verify import VerificationResult
 
 ROOT = Path(__file__).resolve().parents[3]
 OTHER = os.environ.get("MODELSERVER_OTHER_PYTHON", "")
@@ -39,7 +39,7 @@ def ran(python: str, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 def verified(python: str, journal: Path) -> None:
     found = ran(python, "-c", "from mstools.cli import main; main()", "replay", "--verify", str(journal), "--json")
-    assert found.returncode in (0, Result.CLOSE), found.stdout + found.stderr
+    assert found.returncode in (0, VerificationResult.CLOSE), found.stdout + found.stderr
     report = json.loads(found.stdout)
     assert report["difference"] is None
     assert report["poses"] + sum(report["close"].values()) > 800

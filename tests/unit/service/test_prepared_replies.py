@@ -11,12 +11,12 @@ from support_samples import START, Scripted, imu, started
 from modelserver.messages import GetTransformation, RequestHeader, TransformReply
 from modelserver.service.clock import FakeClock
 from modelserver.service.fake_bus import FakeBus
-from modelserver.service.heard import Heard
+from modelserver.service.heard import SensorChannel
 from modelserver.service.hooks import Hooks
 from modelserver.service.journal.queue import NoJournal
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.wire.codec import decode, encode
-from modelserver.wire.journal import Kind
+from modelserver.wire.journal import RecordKind
 
 PERIOD_NS = 20_000_000
 FRAMES = ("Cart:Base", "Cart:Antenna", "Cart:Imu", "Cart:Mast", "Camera:Origin")
@@ -26,9 +26,9 @@ class Noted(NoJournal):
     """A journal that keeps the kinds of what is noted."""
 
     def __init__(self) -> None:
-        self.kinds: list[Kind] = []
+        self.kinds: list[RecordKind] = []
 
-    def note(self, kind: Kind, heard: tuple[str, bytes], now: object) -> None:
+    def note(self, kind: RecordKind, heard: tuple[str, bytes], now: object) -> None:
         """Keep the kind."""
         self.kinds.append(kind)
 
@@ -41,7 +41,7 @@ class Rig:
         self.bus = FakeBus(self.clock)
         self.journal = Noted()
         hooks = Hooks(journal=self.journal, run_delay=run_delay)
-        settings = LoopSettings(PERIOD_NS, {"IMU": Heard("imu_t")})
+        settings = LoopSettings(PERIOD_NS, {"IMU": SensorChannel("imu_t")})
         self.loop = Loop(self.bus, self.clock, started(Scripted()), settings, hooks)
 
     def ask(self, interest: str, reference: str) -> TransformReply:
@@ -67,7 +67,7 @@ def test_given_one_question_and_idle_time_then_other_pairs_are_answered_from_the
     rig.journal.kinds.clear()
     pairs = list(itertools.product(FRAMES, repeat=2))
     replies = [rig.ask(*pair).answer for pair in pairs]
-    assert rig.journal.kinds == [Kind.REMEMBERED] * len(pairs)
+    assert rig.journal.kinds == [RecordKind.REMEMBERED] * len(pairs)
     for pair, found in zip(pairs, replies, strict=True):
         expected = plain.ask(*pair).answer
         assert found is not None

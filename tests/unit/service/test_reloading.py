@@ -17,7 +17,6 @@ from modelserver.errors import Status
 from modelserver.formats.snapshot import read
 from modelserver.localization.modes import ModeLocalizer
 from modelserver.messages import (
-    Commanded,
     GetExplanation,
     JointSample,
     JointsSample,
@@ -25,6 +24,7 @@ from modelserver.messages import (
     ReloadModel,
     ReloadReply,
     SensorHeader,
+    SignedCommand,
     SnapshotPart,
 )
 from modelserver.service.clock import FakeClock
@@ -34,7 +34,7 @@ from modelserver.service.hooks import Hooks
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.service.snapshots import SnapshotWriter
 from modelserver.wire.codec import decode, encode
-from modelserver.wire.snapshot import PART_BYTES, Assembler
+from modelserver.wire.snapshot import PART_BYTES, SnapshotAssembler
 
 S = 1_000_000
 FULL, RAW = VEHICLE, VEHICLE + "localization: {mode: raw}\n"
@@ -226,7 +226,7 @@ def test_given_the_signal_then_the_next_pass_reads_the_file_and_sends_it_out(
     assert new != old
     assert [part.model_revision for part in rig.parts] == [old, new]
     assert caplog.messages[-1] == f"the geometry was read anew: revision {new}, it was {old}"
-    content = Assembler().add(rig.parts[-1])
+    content = SnapshotAssembler().add(rig.parts[-1])
     assert content is not None
     snapshot = read(content)
     assert (snapshot.model.revision, snapshot.vehicle, snapshot.base_frame) == (new, "cart", "Cart:Base")
@@ -249,7 +249,7 @@ def test_given_the_signal_and_a_bad_file_then_the_old_model_answers_and_the_log_
 
 
 def reply_to(rig: Rig, request: Any) -> ReloadReply:
-    rig.loop.obey(Commanded(request), rig.clock.now())
+    rig.loop.obey(SignedCommand(request), rig.clock.now())
     rig.turns()
     (data,) = rig.bus.said("REPLY_TEST")
     reply: ReloadReply = decode("reload_model_reply_t", data)
@@ -330,7 +330,7 @@ def test_given_a_loop_without_a_file_then_a_wish_to_reload_is_rejected_and_says_
     clock = FakeClock(START)
     bus = FakeBus(clock)
     loop = Loop(bus, clock, started(Scripted(), may_reload=True), LoopSettings(20_000_000))
-    loop.obey(Commanded(ReloadModel(ME)), clock.now())
+    loop.obey(SignedCommand(ReloadModel(ME)), clock.now())
     loop.turn()
     loop.turn()
     reply = decode("reload_model_reply_t", bus.said("REPLY_TEST")[0])

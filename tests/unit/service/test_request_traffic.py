@@ -20,7 +20,7 @@ from modelserver.messages import (
 )
 from modelserver.service.clock import FakeClock
 from modelserver.service.fake_bus import FakeBus, FakeInbox
-from modelserver.service.heard import Heard
+from modelserver.service.heard import SensorChannel
 from modelserver.service.hooks import Hooks
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.spatial import chains
@@ -93,7 +93,7 @@ class Rig:
         self.clock = FakeClock(START, BEGIN_NS)
         self.bus = TimedBus(self.clock, answer_s)
         state = started(Scripted())
-        loop_settings = LoopSettings(10 * MS, {"IMU": Heard("imu_t")}, **settings)
+        loop_settings = LoopSettings(10 * MS, {"IMU": SensorChannel("imu_t")}, **settings)
         self.loop = Loop(self.bus, self.clock, state, loop_settings, Hooks(run_delay=run_delay))
         for n in range(90):
             self.bus.sensors.put("IMU", encode(imu(START - 1_000_000 + n * 10_000)))

@@ -25,7 +25,7 @@ from modelserver.messages import (
 )
 from modelserver.service.clock import FakeClock
 from modelserver.service.fake_bus import FakeBus
-from modelserver.service.heard import Heard
+from modelserver.service.heard import SensorChannel
 from modelserver.service.hooks import Hooks
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.service.requests.gate import Gate
@@ -51,7 +51,10 @@ class Rig:
         self.wishes: list[SwitchMode] = []
         gate = Gate(keys, prefix, 5.0, mode_channel, self.clock.monotonic_ns() - 3600 * 10**9)
         state = started(Scripted(newest=START), may_reload=True, may_set_pose=True)
-        sensors = {f"{prefix}IMU": Heard("imu_t"), f"{prefix}{mode_channel}": Heard("localization_mode_t")}
+        sensors = {
+            f"{prefix}IMU": SensorChannel("imu_t"),
+            f"{prefix}{mode_channel}": SensorChannel("localization_mode_t"),
+        }
         self.loop = Loop(
             self.bus,
             self.clock,

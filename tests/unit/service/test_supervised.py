@@ -13,7 +13,7 @@ from modelserver.core.reload import ModelLoaded
 from modelserver.messages import Estimate, Invalid, LoadModel, Noticed, ReloadModel, RequestHeader
 from modelserver.service.clock import FakeClock
 from modelserver.service.fake_bus import FakeBus
-from modelserver.service.heard import Heard
+from modelserver.service.heard import SensorChannel
 from modelserver.service.hooks import Hooks
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.service.supervision.notify import Notifier
@@ -45,7 +45,7 @@ class Watched:
         self.told: list[str] = []
         notifier = Notifier(self._take, 2_000_000_000, self.clock.monotonic_ns)
         self.supervision = Supervision(notifier, self.clock, lambda channel: self.loop.hears(channel))
-        settings = LoopSettings(10**9 // HZ, {"GPS": Heard("gps_t"), "IMU": Heard("imu_t")})
+        settings = LoopSettings(10**9 // HZ, {"GPS": SensorChannel("gps_t"), "IMU": SensorChannel("imu_t")})
         self.loop = Loop(
             self.bus,
             self.clock,

@@ -18,15 +18,15 @@ from modelserver.service.journal.queue import NoJournal
 from modelserver.service.journal.verify import verify
 from modelserver.service.unused import A_SECOND, MOST_NOTED, Budget, Unused
 from modelserver.wire.codec import encode
-from modelserver.wire.journal import Kind, Record, read
+from modelserver.wire.journal import JournalRecord, RecordKind, read
 
 FLOOD = 10_000
 A_NOTE = MOST_NOTED + 100
 """Bytes of a note, at most: with what an event of a log, its record in the seal and its count take."""
 
 
-def records(kept: Kept) -> list[Record]:
-    return [each for path in kept.segments for each in read(path.read_bytes()) if isinstance(each, Record)]
+def records(kept: Kept) -> list[JournalRecord]:
+    return [each for path in kept.segments for each in read(path.read_bytes()) if isinstance(each, JournalRecord)]
 
 
 @pytest.mark.slow
@@ -44,7 +44,7 @@ def test_given_a_flood_of_rubbish_then_the_journal_grows_by_little_and_is_reprod
         kept.finish()
         sizes.append(sum(path.stat().st_size for path in kept.segments))
     assert kept.loop.state.rejected["GPS", "fingerprint"] == FLOOD
-    noted = Counter(each.kind for each in records(kept))[Kind.UNREAD]
+    noted = Counter(each.kind for each in records(kept))[RecordKind.UNREAD]
     assert 2 * A_SECOND <= noted <= 8 * A_SECOND
     assert sizes[1] - sizes[0] < 2 * noted * A_NOTE < FLOOD * 10
     found = verify(kept.segments)
@@ -67,7 +67,7 @@ def test_given_a_second_writer_who_speaks_on_and_on_then_few_of_its_samples_are_
     kept.turns(2)
     assert kept.loop.state.rejected["IMU", "second_writer"] > 250
     kept.finish()
-    noted = Counter(each.kind for each in records(kept))[Kind.IGNORED]
+    noted = Counter(each.kind for each in records(kept))[RecordKind.IGNORED]
     assert A_SECOND <= noted <= A_SECOND * (seconds + 1) < 100
     assert verify(kept.segments).proved
 

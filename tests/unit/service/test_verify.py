@@ -37,7 +37,7 @@ from modelserver.service.journal.verify import Verified, verify
 from modelserver.service.requests.deferred import DeferredReply
 from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import written
-from modelserver.wire.journal import Record, batch_written, read
+from modelserver.wire.journal import JournalRecord, batch_written, read
 
 pytestmark = pytest.mark.slow
 
@@ -227,7 +227,7 @@ def tampered(path: Path, channel: str, number: int, change: Callable[[bytes], by
     """Change one message that was said, with all checksums made right again; return the utime of it."""
     data = path.read_bytes()
     items = list(read(data))
-    records = [each for each in items if isinstance(each, Record)]
+    records = [each for each in items if isinstance(each, JournalRecord)]
     said = [n for n, each in enumerate(records) if each.channel == channel]
     chosen = records[said[number]]
     records[said[number]] = chosen._replace(data=change(chosen.data))
@@ -324,7 +324,7 @@ def test_given_a_journal_that_breaks_off_anywhere_when_verified_then_what_is_sea
     kept.drive(2.0)
     (path,) = kept.finish()
     data, torn = path.read_bytes(), tmp_path / "torn.lcm"
-    begin = next(each.at for each in read(data) if isinstance(each, Record))
+    begin = next(each.at for each in read(data) if isinstance(each, JournalRecord))
     poses = []
     for cut in range(begin, len(data), (len(data) - begin) // 40):
         torn.write_bytes(data[:cut])

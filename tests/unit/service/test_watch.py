@@ -12,7 +12,7 @@ from modelserver.core.writers import RIVAL_NS
 from modelserver.messages import Health, JointSample, JointsSample, SensorHeader
 from modelserver.service.clock import FakeClock
 from modelserver.service.fake_bus import FakeBus
-from modelserver.service.heard import Heard
+from modelserver.service.heard import SensorChannel
 from modelserver.service.loop import Loop, LoopSettings
 from modelserver.wire.codec import decode, encode
 
@@ -23,7 +23,7 @@ class Rig:
     def __init__(self, rule: Any = "ignore"):
         self.clock = FakeClock(START)
         self.bus = FakeBus(self.clock)
-        sensors = {"IMU": Heard("imu_t"), "JOINTS": Heard("joints_t")}
+        sensors = {"IMU": SensorChannel("imu_t"), "JOINTS": SensorChannel("joints_t")}
         settings = LoopSettings(20_000_000, sensors, second_writer=rule, shared=frozenset({"JOINTS"}))
         self.loop = Loop(self.bus, self.clock, started(Scripted()), settings)
         self.number = 0

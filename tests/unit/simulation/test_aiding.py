@@ -11,9 +11,9 @@ import pytest
 from modelserver.messages import AbsolutePoseSample, RangeSample, RelativePoseSample
 from modelserver.simulation import (
     AbsolutePoseModel,
+    DrivePhase,
     GpsModel,
     ImuModel,
-    Phase,
     RangeModel,
     RelativePoseModel,
     SideSlip,
@@ -49,7 +49,7 @@ def test_poses_from_elsewhere_are_the_frame_itself(simulate, hills, camera, worl
 
 def test_the_noise_of_poses_is_along_the_world_and_as_stated(simulate, camera):
     model = AbsolutePoseModel(position_sigma=0.1, orientation_sigma=0.02)
-    run = simulate(Trajectory([Phase(1.0)]), pose_frame="Car:Camera", pose_model=model)
+    run = simulate(Trajectory([DrivePhase(1.0)]), pose_frame="Car:Camera", pose_model=model)
     true = run.truth(0).enu @ camera
     samples = list(run.events(300.0))
     moved = np.array([sample.position for sample in samples]) - true.position
@@ -89,7 +89,7 @@ def test_odometry_chained_gives_the_way(simulate, hills, camera):
 
 def test_odometry_errs_as_stated_and_in_its_scale(simulate):
     standing = simulate(
-        Trajectory([Phase(1.0)]), odometry_frame="Car:Camera", odometry_model=RelativePoseModel(scale_sigma=0.1)
+        Trajectory([DrivePhase(1.0)]), odometry_frame="Car:Camera", odometry_model=RelativePoseModel(scale_sigma=0.1)
     )
     samples = list(standing.events(300.0))
     np.testing.assert_allclose(np.std([each.position for each in samples], axis=0), 0.01, rtol=0.08)
@@ -120,7 +120,7 @@ def test_ranges_are_distances_within_reach(simulate, hills, camera):
 
 def test_ranges_err_as_stated(simulate):
     model = RangeModel(sigma=0.2)
-    run = simulate(Trajectory([Phase(1.0)]), range_frame="Car:CG", beacons=BEACONS, range_model=model)
+    run = simulate(Trajectory([DrivePhase(1.0)]), range_frame="Car:CG", beacons=BEACONS, range_model=model)
     samples = list(run.events(200.0))
     for name, place in BEACONS.items():
         errors = [each.distance - math.dist(run.truth(0).enu.xyz, place) for each in samples if each.beacon == name]
@@ -128,7 +128,7 @@ def test_ranges_err_as_stated(simulate):
         assert np.mean(errors) == pytest.approx(0.0, abs=0.03)
     assert samples[0].sigma == 0.2
     biased = simulate(
-        Trajectory([Phase(1.0)]),
+        Trajectory([DrivePhase(1.0)]),
         range_frame="Car:CG",
         beacons=BEACONS,
         range_model=RangeModel(sigma=0.0, bias_sigma=1.0),

@@ -7,12 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from modelserver.simulation import Phase, SideSlip, Terrain, Trajectory, Wave, figure_eight, ride, rigid
+from modelserver.simulation import DrivePhase, SideSlip, Terrain, Trajectory, Wave, figure_eight, ride, rigid
 from modelserver.spatial import so3
 from modelserver.spatial.pose import Pose
 
 PLAN = Trajectory(
-    (*figure_eight(speed=3.0, radius=6.0, stand=2.0, stop=1.0, reverse=4.0), Phase(2.0, -2.0, 0.1), Phase(3.0, 0.0)),
+    (
+        *figure_eight(speed=3.0, radius=6.0, stand=2.0, stop=1.0, reverse=4.0),
+        DrivePhase(2.0, -2.0, 0.1),
+        DrivePhase(3.0, 0.0),
+    ),
     start=(20.0, -10.0),
     yaw=0.4,
 )
@@ -114,7 +118,7 @@ def test_sliding_leaves_the_path_and_stops_where_the_vehicle_stands():
 
 @pytest.mark.parametrize(("speed", "curvature"), [(3.0, 0.15), (3.0, -0.15), (-3.0, 0.15), (-3.0, -0.15)])
 def test_a_vehicle_slides_out_of_its_turn(speed, curvature):
-    turn = Trajectory((Phase(2.0, speed, curvature), Phase(6.0), Phase(2.0, 0.0)))
+    turn = Trajectory((DrivePhase(2.0, speed, curvature), DrivePhase(6.0), DrivePhase(2.0, 0.0)))
     motion = ride(turn, None, SideSlip(cornering=0.02)).at(5.0)
     lateral_acceleration = curvature * speed**2
     assert motion.lateral_speed * curvature < 0
@@ -123,7 +127,7 @@ def test_a_vehicle_slides_out_of_its_turn(speed, curvature):
 
 
 def test_the_random_lateral_velocity_is_as_large_as_said_and_of_the_seed():
-    long = Trajectory((Phase(2.0, 5.0), Phase(600.0), Phase(2.0, 0.0)))
+    long = Trajectory((DrivePhase(2.0, 5.0), DrivePhase(600.0), DrivePhase(2.0, 0.0)))
 
     def lateral(seed):
         drive = ride(long, None, SideSlip(wander_sigma=0.1), seed)

@@ -12,11 +12,11 @@ import pytest
 from modelserver.earth.geodesy import Geodesy
 from modelserver.messages import Direction, OrientationReference, YawSource
 from modelserver.simulation import (
+    DrivePhase,
     EncoderModel,
     GpsModel,
     ImuModel,
     MagnetometerModel,
-    Phase,
     Timing,
     Trajectory,
     TriadModel,
@@ -25,7 +25,7 @@ from modelserver.simulation import (
 )
 from modelserver.spatial import so3
 
-STANDING = Trajectory([Phase(1.0)])
+STANDING = Trajectory([DrivePhase(1.0)])
 RUN = Trajectory(straight(speed=3.0, length=60.0, stand=2.0))
 
 

@@ -22,9 +22,9 @@ from modelserver.messages import (
     WheelsSample,
 )
 from modelserver.simulation import (
+    DrivePhase,
     GpsModel,
     ImuModel,
-    Phase,
     Simulation,
     StatusModel,
     Trajectory,
@@ -120,7 +120,7 @@ def test_integrating_the_inertial_unit_gives_the_drive_back():
 
 
 def test_at_rest_it_feels_gravity_and_the_earth_turning():
-    run = simulation(Trajectory([Phase(10.0)]), gps_frame=None, wheel_frames=None)
+    run = simulation(Trajectory([DrivePhase(10.0)]), gps_frame=None, wheel_frames=None)
     sample = next(run.events(1.0))
     X_ES = run.truth(sample.header.utime).enu @ CAR.get_transformation("Imu:Sensor", "Car:CG").pose
     np.testing.assert_allclose(X_ES.rotation @ sample.specific_force, (0.0, 0.0, 9.8085), atol=1e-3)
@@ -155,7 +155,9 @@ def test_its_own_orientation_is_the_truth_turned_by_where_its_yaw_began(referenc
 
 def test_its_yaw_drifts_by_what_its_gyros_say_too_much():
     """A vertical gyro: its yaw is the integral of its rates, bias and earth's rotation included."""
-    run = simulation(Trajectory([Phase(60.0)]), imu_model=ImuModel(gyro_walk=0.0), gps_frame=None, wheel_frames=None)
+    run = simulation(
+        Trajectory([DrivePhase(60.0)]), imu_model=ImuModel(gyro_walk=0.0), gps_frame=None, wheel_frames=None
+    )
     samples = list(run.events(60.0))
     X_ES = run.truth(run.start_utime).enu @ CAR.get_transformation("Imu:Sensor", "Car:CG").pose
 
@@ -173,7 +175,7 @@ def test_its_yaw_drifts_by_what_its_gyros_say_too_much():
 
 def test_its_noise_is_what_the_model_says():
     imu = ImuModel(gyro_bias_sigma=0.0, gyro_walk=0.0, accelerometer_bias_sigma=0.0)
-    run = simulation(Trajectory([Phase(100.0)]), imu_model=imu, gps_frame=None, wheel_frames=None)
+    run = simulation(Trajectory([DrivePhase(100.0)]), imu_model=imu, gps_frame=None, wheel_frames=None)
     samples = list(run.events(100.0))
     gyro = np.array([sample.angular_velocity for sample in samples])
     force = np.array([sample.specific_force for sample in samples])
@@ -215,7 +217,9 @@ def test_fixes_without_noise_are_the_antenna_itself():
 
 @pytest.mark.slow
 def test_the_error_of_fixes_lingers_and_is_as_large_as_stated():
-    run = simulation(Trajectory([Phase(1.0)]), imu_frame=None, wheel_frames=None, gps_model=GpsModel(time_constant=5.0))
+    run = simulation(
+        Trajectory([DrivePhase(1.0)]), imu_frame=None, wheel_frames=None, gps_model=GpsModel(time_constant=5.0)
+    )
     geodesy = Geodesy(ORIGIN)
     X_BA = CAR.get_transformation("Antenna:Phase", "Car:CG").pose
     truth = (run.truth(0).enu @ X_BA).position

@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from modelserver.simulation import Phase, Trajectory, figure_eight, straight, there_and_back
+from modelserver.simulation import DrivePhase, Trajectory, figure_eight, straight, there_and_back
 
 DRIVES = {
     "straight": straight(),
     "eight": figure_eight(speed=2.0, radius=6.0),
     "eight with stop and reverse": figure_eight(speed=3.0, radius=8.0, stop=2.0, reverse=4.0, laps=2),
     "there and back": there_and_back(),
-    "backing in a bend": (Phase(1.0), Phase(2.0, -1.0, 0.2), Phase(5.0), Phase(2.0, 0.0)),
+    "backing in a bend": (DrivePhase(1.0), DrivePhase(2.0, -1.0, 0.2), DrivePhase(5.0), DrivePhase(2.0, 0.0)),
 }
 
 
@@ -95,9 +95,9 @@ def test_an_eight_with_reverse_backs_up():
     ("phases", "said"),
     [
         ([], "needs a phase"),
-        ([Phase(0.0, 1.0)], "takes time"),
-        ([Phase(1.0, math.nan)], "finite"),
-        ([Phase(1.0, 1.0)], "ends at rest"),
+        ([DrivePhase(0.0, 1.0)], "takes time"),
+        ([DrivePhase(1.0, math.nan)], "finite"),
+        ([DrivePhase(1.0, 1.0)], "ends at rest"),
     ],
 )
 def test_a_drive_that_makes_no_sense_is_refused(phases, said):

@@ -10,7 +10,7 @@ import pytest
 from modelserver.geometry.joint import left_jacobian
 from modelserver.spatial import arrays, chain, chains, so3
 from modelserver.spatial.arrays import Poses
-from modelserver.spatial.chain import Link
+from modelserver.spatial.chain import ChainLink
 from modelserver.spatial.chains import Links
 from modelserver.spatial.pose import Pose
 
@@ -92,9 +92,9 @@ def links() -> list[Links]:
     ]
 
 
-def rows(some: list[Links], number: int) -> list[Link]:
+def rows(some: list[Links], number: int) -> list[ChainLink]:
     return [
-        Link(
+        ChainLink(
             row(each.X_FT, number),
             each.forward,
             each.factor if each.factor is None or each.factor.ndim == 2 else each.factor[number],
@@ -128,7 +128,7 @@ def test_given_no_rows_then_there_are_no_covariances() -> None:
 
 
 def test_given_out_and_back_by_one_source_then_nothing_is_unsure() -> None:
-    there = Link(Pose.from_rpy((1, 2, 3), 0.1, 0.2, 0.3), True, np.eye(6), ("survey",))
+    there = ChainLink(Pose.from_rpy((1, 2, 3), 0.1, 0.2, 0.3), True, np.eye(6), ("survey",))
     found = chain.covariance([there, there._replace(forward=False)])
     assert found is not None
     assert np.abs(found).max() < 1e-14

@@ -445,6 +445,6 @@ def test_given_axes_then_ticks_at_even_places() -> None:
 
 def test_given_names_with_markup_then_they_stay_words() -> None:
     axis = svg.Axis("<x>", 0.0, 1.0)
-    drawing = svg.chart("a & b", axis, axis, [svg.Line("<script>", [0.0], [1.0], svg.COLOURS[0], dots=True)])
+    drawing = svg.chart("a & b", axis, axis, [svg.PlotLine("<script>", [0.0], [1.0], svg.COLOURS[0], dots=True)])
     assert ElementTree.fromstring(drawing).get("aria-label") == "a & b"
     assert "<script>" not in svg.page("<script>", ["<script>"], [drawing])

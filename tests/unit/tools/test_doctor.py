@@ -16,9 +16,9 @@ from modelserver.config import load_config
 from modelserver.errors import Problem, Severity
 from modelserver.service.probing import listening, machine
 from modelserver.service.probing.clock import ClockFacts
-from modelserver.service.probing.findings import Finding, Grade, worst
+from modelserver.service.probing.findings import Diagnosis, DiagnosisLevel, worst
 from modelserver.service.probing.probe import BusFacts, Interface, UdpAddress
-from modelserver.service.probing.servers import Answers, Server
+from modelserver.service.probing.servers import DiscoveredServers, Server
 from modelserver.wire.channels import DEFAULT_URL
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
 from msdrivers.settings import read_drivers
@@ -36,10 +36,12 @@ Run = Callable[..., tuple[int, str, str]]
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
     """The command on a machine that is well, but for what `facts` and `answers` say."""
 
-    def command(*arguments: object, facts: BusFacts = WELL, answers: Answers | None = None) -> tuple[int, str, str]:
+    def command(
+        *arguments: object, facts: BusFacts = WELL, answers: DiscoveredServers | None = None
+    ) -> tuple[int, str, str]:
         from modelserver.version import __version__
 
-        answers = answers or Answers((Server("pc", 1, "cart", __version__),), 1)
+        answers = answers or DiscoveredServers((Server("pc", 1, "cart", __version__),), 1)
         monkeypatch.setattr(machine, "bus_facts", lambda url, delivery=None: facts)
         monkeypatch.setattr(listening, "who_answers", lambda *_: answers)
         monkeypatch.setattr(machine.ClockWatch, "facts", lambda self: ClockFacts(1_800_000_000_000_000, True, 0.01))
@@ -75,7 +77,7 @@ def test_given_something_to_mend_then_command_and_exit_code_tell(
 
 
 def test_given_two_daemons_then_it_is_an_error(run: Run) -> None:
-    code, out, _ = run(answers=Answers((Server("a", 1), Server("b", 2)), 2))
+    code, out, _ = run(answers=DiscoveredServers((Server("a", 1), Server("b", 2)), 2))
     assert code == 3
     assert "2 answer at once: process 1 on 'a', process 2 on 'b'" in out
     assert "$ kill 2" in out
@@ -156,7 +158,7 @@ def test_given_a_vehicle_file_that_may_not_be_read_then_it_is_a_finding(
 
 
 def test_given_findings_with_odd_words_then_they_are_escaped() -> None:
-    text = doctor.describe([Finding(Grade.ERROR, "x\x1b", "y\n\x1b[2J", "z\x07", "rm\r")])
+    text = doctor.describe([Diagnosis(DiagnosisLevel.ERROR, "x\x1b", "y\n\x1b[2J", "z\x07", "rm\r")])
     assert all(line.isprintable() for line in text.split("\n"))
 
 
@@ -167,25 +169,25 @@ def test_given_a_geometry_that_is_missing_then_the_vehicle_file_is_an_error(tmp_
     path = write_vehicle(tmp_path, VEHICLE, GEOMETRY)
     config = load_config(path)
     Path(config.geometry).unlink()
-    assert worst(vehicle_findings(config, path)) is Grade.ERROR
+    assert worst(vehicle_findings(config, path)) is DiagnosisLevel.ERROR
 
 
 @pytest.mark.parametrize(
     ("severities", "grade"),
     [
-        ([], Grade.OK),
-        ([Severity.NOTE], Grade.OK),
-        ([Severity.NOTE, Severity.WARNING], Grade.WARNING),
-        ([Severity.WARNING, Severity.ERROR, Severity.ERROR], Grade.ERROR),
+        ([], DiagnosisLevel.OK),
+        ([Severity.NOTE], DiagnosisLevel.OK),
+        ([Severity.NOTE, Severity.WARNING], DiagnosisLevel.WARNING),
+        ([Severity.WARNING, Severity.ERROR, Severity.ERROR], DiagnosisLevel.ERROR),
     ],
 )
-def test_given_problems_of_a_file_then_the_gravest_counts(severities: list[Severity], grade: Grade) -> None:
+def test_given_problems_of_a_file_then_the_gravest_counts(severities: list[Severity], grade: DiagnosisLevel) -> None:
     found = file_finding([Problem(each, f"it is {each}") for each in severities], Path("v.yaml"))
     assert found.grade is grade
-    assert bool(found.command) == (grade is not Grade.OK)
+    assert bool(found.command) == (grade is not DiagnosisLevel.OK)
 
 
-def lines(sections: dict[str, dict[str, Any]], networks: Sequence[Interface] = ()) -> list[Finding]:
+def lines(sections: dict[str, dict[str, Any]], networks: Sequence[Interface] = ()) -> list[Diagnosis]:
     drivers, problems = read_drivers(sections)
     assert not problems
     return list(line_findings(drivers.values(), networks))
@@ -197,14 +199,18 @@ def test_given_a_serial_port_then_who_may_use_it_is_told(tmp_path: Path, monkeyp
     port = tmp_path / "ttyX"
     sections = {"gps": {"device": "nmea", "port": str(port)}}
     (found,) = lines(sections)
-    assert (found.grade, found.subject, found.command) == (Grade.WARNING, "driver gps", "modelserver driver --list")
+    assert (found.grade, found.subject, found.command) == (
+        DiagnosisLevel.WARNING,
+        "driver gps",
+        "modelserver driver --list",
+    )
     port.write_text("")
-    assert lines(sections)[0].grade is Grade.OK
+    assert lines(sections)[0].grade is DiagnosisLevel.OK
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     hint = "it belongs to group dialout: sudo usermod -aG dialout ann, then log in again"
     monkeypatch.setattr(ports, "permission_fix", lambda path: hint)
     (found,) = lines(sections)
-    assert (found.grade, found.command) == (Grade.ERROR, "sudo usermod -aG dialout ann")
+    assert (found.grade, found.command) == (DiagnosisLevel.ERROR, "sudo usermod -aG dialout ann")
     monkeypatch.setattr(ports, "permission_fix", lambda path: "give this user access")
     assert lines(sections)[0].command == f"ls -l {port}"
 
@@ -216,7 +222,7 @@ def test_given_a_port_in_use_then_it_is_worth_knowing(tmp_path: Path, monkeypatc
     port.write_text("")
     monkeypatch.setattr(ports, "hint_for", lambda path: "in use by process 3 (minicom)")
     (found,) = lines({"gps": {"device": "nmea", "port": str(port)}})
-    assert (found.grade, "minicom" in found.seen) == (Grade.NOTE, True)
+    assert (found.grade, "minicom" in found.seen) == (DiagnosisLevel.NOTE, True)
 
 
 def test_given_a_can_network_then_it_must_be_there_and_up() -> None:
@@ -226,7 +232,7 @@ def test_given_a_can_network_then_it_must_be_there_and_up() -> None:
     grades = [
         lines(section, networks)[0].grade for networks in ((), (Interface("can0", up=False),), (Interface("can0"), LO))
     ]
-    assert grades == [Grade.WARNING, Grade.ERROR, Grade.OK]
+    assert grades == [DiagnosisLevel.WARNING, DiagnosisLevel.ERROR, DiagnosisLevel.OK]
     assert lines(section, (Interface("can0", up=False),))[0].command.startswith("sudo ip link set can0 up type can")
     trying = {"wheels": {**config.drivers["wheels"], "can": "239.74.163.2:4000", "interface": "udp_multicast"}}
-    assert lines(trying)[0].grade is Grade.OK
+    assert lines(trying)[0].grade is DiagnosisLevel.OK

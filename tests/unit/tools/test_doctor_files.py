@@ -14,7 +14,7 @@ from support_signing import ALLOWED, write_test_key
 
 from modelserver.config import VehicleConfig, load_config
 from modelserver.keys import read_keys
-from modelserver.service.probing.findings import Finding, Grade
+from modelserver.service.probing.findings import Diagnosis, DiagnosisLevel
 from mstools.deployment import doctor_files
 from mstools.deployment.doctor_files import file_findings, kept_findings, key_findings, state_findings
 
@@ -52,12 +52,12 @@ def configured(folder: Path, more: str) -> VehicleConfig:
     return load_config(write_vehicle(folder, VEHICLE + more))
 
 
-def journal(config: VehicleConfig, given: str = "") -> Finding:
+def journal(config: VehicleConfig, given: str = "") -> Diagnosis:
     (found,) = [each for each in kept_findings(config, given) if each.subject == "journal"]
     return found
 
 
-def key(config: VehicleConfig, unit: bool = False) -> Finding:
+def key(config: VehicleConfig, unit: bool = False) -> Diagnosis:
     (found,) = key_findings(config, unit)
     return found
 
@@ -65,7 +65,7 @@ def key(config: VehicleConfig, unit: bool = False) -> Finding:
 # --- state ----------------------------------------------------------------------------------------------------------
 
 
-def state(directory: Path | None) -> Finding:
+def state(directory: Path | None) -> Diagnosis:
     (found,) = state_findings(directory)
     return found
 
@@ -73,17 +73,17 @@ def state(directory: Path | None) -> Finding:
 def test_given_a_place_for_the_state_then_it_is_found_out_whether_it_can_be_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, roomy: Callable[[int], None]
 ) -> None:
-    assert state(tmp_path / "new" / "deeper").grade is Grade.OK
+    assert state(tmp_path / "new" / "deeper").grade is DiagnosisLevel.OK
     assert not (tmp_path / "new").exists()
-    assert state(None).grade is Grade.WARNING
+    assert state(None).grade is DiagnosisLevel.WARNING
     (tmp_path / "file").write_text("")
-    assert (state(tmp_path / "file" / "x").grade, state(tmp_path / "file").grade) == (Grade.WARNING,) * 2
+    assert (state(tmp_path / "file" / "x").grade, state(tmp_path / "file").grade) == (DiagnosisLevel.WARNING,) * 2
     with monkeypatch.context() as patch:
         closed(patch, tmp_path / "mine")
         found = state(tmp_path / "mine")
-    assert (found.grade, f"sudo mkdir -p {tmp_path / 'mine'}" in found.command) == (Grade.WARNING, True)
+    assert (found.grade, f"sudo mkdir -p {tmp_path / 'mine'}" in found.command) == (DiagnosisLevel.WARNING, True)
     roomy(10**6)
-    assert (state(tmp_path).grade, "1 MB of room" in state(tmp_path).seen) == (Grade.WARNING, True)
+    assert (state(tmp_path).grade, "1 MB of room" in state(tmp_path).seen) == (DiagnosisLevel.WARNING, True)
 
 
 def test_given_a_file_system_that_is_read_only_then_that_is_what_is_mended(
@@ -104,9 +104,9 @@ def test_given_a_file_system_that_is_read_only_then_that_is_what_is_mended(
 
 def test_given_no_journal_then_it_is_said_why(tmp_path: Path) -> None:
     found = journal(configured(tmp_path, ""))
-    assert (found.grade, "on a desk; under systemd one is" in found.seen) == (Grade.OK, True)
+    assert (found.grade, "on a desk; under systemd one is" in found.seen) == (DiagnosisLevel.OK, True)
     found = journal(configured(tmp_path, "journal: {megabytes: 0}\n"))
-    assert (found.grade, found.seen) == (Grade.OK, "none is kept (journal.megabytes: 0)")
+    assert (found.grade, found.seen) == (DiagnosisLevel.OK, "none is kept (journal.megabytes: 0)")
 
 
 def test_given_a_journals_directory_then_it_is_found_out_whether_it_can_be_made_and_written(
@@ -117,14 +117,14 @@ def test_given_a_journals_directory_then_it_is_found_out_whether_it_can_be_made_
     config = configured(tmp_path, "journal: {directory: black box, megabytes: 100}\n")
     found = journal(config)
     assert (found.grade, found.seen) == (
-        Grade.OK,
+        DiagnosisLevel.OK,
         f"{box} may be written; 0 of 100 MB are used, 100.0 GB free",
     )
     assert not box.exists()
     with monkeypatch.context() as patch:
         closed(patch, tmp_path)
         found = journal(config)
-    assert (found.grade, found.seen) == (Grade.WARNING, f"{box} may not be written by this user")
+    assert (found.grade, found.seen) == (DiagnosisLevel.WARNING, f"{box} may not be written by this user")
     assert found.command == f"sudo mkdir -p '{box}' && sudo chown -R {os.geteuid()} '{box}'"
     assert found.why == "nothing is recorded of what happens"
     box.mkdir()
@@ -140,7 +140,7 @@ def test_given_a_journals_directory_then_it_is_found_out_whether_it_can_be_made_
     assert (found.seen, found.command) == (f"{box} is no folder", f"mv '{box}' '{box}'.aside")
     # the command mends it
     subprocess.run(["sh", "-c", found.command], check=True)
-    assert journal(config).grade is Grade.OK
+    assert journal(config).grade is DiagnosisLevel.OK
 
 
 def test_given_less_room_than_the_journal_may_take_then_that_is_told(
@@ -152,7 +152,7 @@ def test_given_less_room_than_the_journal_may_take_then_that_is_told(
     roomy(800_000_000)
     found = journal(config)
     assert (found.grade, found.seen) == (
-        Grade.WARNING,
+        DiagnosisLevel.WARNING,
         f"{box} has 800 MB of room left, and may take 1049 MB more",
     )
     assert found.why.endswith("make room, or write megabytes: 572 under journal")
@@ -160,7 +160,7 @@ def test_given_less_room_than_the_journal_may_take_then_that_is_told(
     # what it has taken already needs no more room
     with (box / "journal-00000000.lcm").open("wb") as file:
         file.truncate(900_000_000)
-    assert journal(config).grade is Grade.OK
+    assert journal(config).grade is DiagnosisLevel.OK
     roomy(100_000_000)
     (box / "journal-00000000.lcm").unlink()
     assert journal(config).why.endswith("make room")
@@ -183,7 +183,7 @@ def test_given_the_units_vehicle_file_then_its_own_state_directory_is_looked_at(
 def test_given_a_place_where_the_unit_may_not_write_then_it_is_said_though_this_user_may(tmp_path: Path) -> None:
     config = configured(tmp_path, "journal: {directory: box}\n")
     found = {each.subject: each for each in kept_findings(config, str(tmp_path / "var"))}
-    assert [each.grade for each in found.values()] == [Grade.WARNING] * 2
+    assert [each.grade for each in found.values()] == [DiagnosisLevel.WARNING] * 2
     assert found["journal"].seen == f"{tmp_path / 'box'} lies where the unit may not write"
     assert "leave journal.directory out of the vehicle file" in found["journal"].why
     assert "state_directory" in found["state"].why
@@ -196,7 +196,10 @@ def test_given_a_user_who_may_not_look_into_the_units_state_then_the_command_is_
     closed(monkeypatch, tmp_path / "var")
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     (found,) = kept_findings(config, str(tmp_path / "var"))
-    assert (found.grade, found.command) == (Grade.NOTE, "sudo modelserver doctor -c /etc/modelserver/vehicle.yaml")
+    assert (found.grade, found.command) == (
+        DiagnosisLevel.NOTE,
+        "sudo modelserver doctor -c /etc/modelserver/vehicle.yaml",
+    )
 
 
 def test_given_a_vehicle_file_then_it_is_the_units_where_that_is_installed_and_not_what_runs_here(
@@ -225,13 +228,13 @@ def test_given_a_key_file_that_is_well_then_it_is_said_and_no_secret_with_it(tmp
     config = configured(tmp_path, ALLOWED)
     secret = read_keys(write_test_key(tmp_path))[0].secret.hex()
     found = key(config)
-    assert (found.grade, "1 key" in found.seen) == (Grade.OK, True)
+    assert (found.grade, "1 key" in found.seen) == (DiagnosisLevel.OK, True)
     assert secret not in str(found)
 
 
 def test_given_no_file_of_that_name_then_the_command_makes_one(tmp_path: Path) -> None:
     found = key(configured(tmp_path, ALLOWED))
-    assert (found.grade, "there is no key file" in found.seen) == (Grade.ERROR, True)
+    assert (found.grade, "there is no key file" in found.seen) == (DiagnosisLevel.ERROR, True)
     assert found.command == f"sudo modelserver key new {tmp_path / 'commands.key'}"
 
 
@@ -240,7 +243,7 @@ def test_given_a_key_that_is_open_to_others_then_the_command_closes_it(tmp_path:
     path = write_test_key(tmp_path)
     path.chmod(mode)
     found = key(configured(tmp_path, ALLOWED))
-    assert (found.grade, found.command) == (Grade.ERROR, f"sudo chmod 600 {path}")
+    assert (found.grade, found.command) == (DiagnosisLevel.ERROR, f"sudo chmod 600 {path}")
     assert "is open to others" in found.seen
 
 
@@ -249,12 +252,12 @@ def test_given_a_key_in_a_folder_that_others_may_write_then_the_command_closes_t
     config = configured(tmp_path, ALLOWED)
     tmp_path.chmod(0o777)
     found = key(config)
-    assert (found.grade, found.command) == (Grade.ERROR, f"sudo chmod o-w {tmp_path}")
+    assert (found.grade, found.command) == (DiagnosisLevel.ERROR, f"sudo chmod o-w {tmp_path}")
     tmp_path.chmod(0o770)
     found = key(config)
-    assert (found.grade, found.command) == (Grade.WARNING, f"sudo chmod g-w {tmp_path}")
+    assert (found.grade, found.command) == (DiagnosisLevel.WARNING, f"sudo chmod g-w {tmp_path}")
     tmp_path.chmod(0o700)
-    assert key(config).grade is Grade.OK
+    assert key(config).grade is DiagnosisLevel.OK
 
 
 @pytest.mark.parametrize("content", ["", "name\n", "name zz\n", "a 00\n", "# nothing\n"])
@@ -263,7 +266,7 @@ def test_given_a_file_that_holds_no_key_then_another_is_made_beside_it(tmp_path:
     path.write_text(content)
     found = key(configured(tmp_path, ALLOWED))
     assert (found.grade, found.command) == (
-        Grade.ERROR,
+        DiagnosisLevel.ERROR,
         f"sudo mv {path} {path}.aside && sudo modelserver key new {path}",
     )
 
@@ -287,10 +290,10 @@ def test_given_a_key_that_this_user_may_not_read_then_who_runs_the_service_is_to
     closed(monkeypatch, path)
     monkeypatch.setattr(doctor_files, "read_keys", refused)
     found = key(config)
-    assert (found.grade, found.command) == (Grade.ERROR, f"sudo chown {os.geteuid()} {path}")
+    assert (found.grade, found.command) == (DiagnosisLevel.ERROR, f"sudo chown {os.geteuid()} {path}")
     # but for the one whom systemd hands it to
     Path(doctor_files.CREDENTIAL).write_text(f"[Service]\nLoadCredential=commands.key:{path}\n")
-    assert (key(config).grade, "handed to the service by systemd" in key(config).seen) == (Grade.OK, True)
+    assert (key(config).grade, "handed to the service by systemd" in key(config).seen) == (DiagnosisLevel.OK, True)
 
 
 def test_given_the_unit_then_its_key_must_be_handed_over(tmp_path: Path) -> None:
@@ -298,8 +301,8 @@ def test_given_the_unit_then_its_key_must_be_handed_over(tmp_path: Path) -> None
     config = configured(tmp_path, ALLOWED)
     found = key(config, unit=True)
     assert (found.grade, found.command) == (
-        Grade.ERROR,
+        DiagnosisLevel.ERROR,
         f"sudo modelserver install  # writes LoadCredential=commands.key:{path}",
     )
     Path(doctor_files.CREDENTIAL).write_text(f"[Service]\nLoadCredential=commands.key:{path}\n")
-    assert key(config, unit=True).grade is Grade.OK
+    assert key(config, unit=True).grade is DiagnosisLevel.OK

@@ -17,7 +17,7 @@ from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools import cli
 from mstools.commands.import_bag import import_bag
-from mstools.recordings.bag_messages import DEFAULTS, Altitude, ImuOrientation, Kind, Options
+from mstools.recordings.bag_messages import DEFAULTS, Altitude, ImuOrientation, Options, TopicKind
 
 TYPE_NAMES = {"GPS": "gps_t", "IMU": "imu_t", "WHEELS": "wheels_t", "JOINTS": "joints_t"}
 
@@ -128,20 +128,20 @@ def test_given_two_inertial_units_when_imported_then_the_busier_is_taken_and_the
     assert by_topic["/two"].written == 2
     assert "--topic /one=imu" in by_topic["/one"].skipped
     assert by_topic["/chatter"].skipped == "nothing in this project takes this type"
-    chosen = import_bag(bag, tmp_path / "b.lcm", kinds={"/one": Kind.IMU})
+    chosen = import_bag(bag, tmp_path / "b.lcm", kinds={"/one": TopicKind.IMU})
     assert {each.topic: each.written for each in chosen.topics} == {"/one": 1, "/two": 0, "/chatter": 0}
 
 
 @pytest.mark.parametrize(
     ("kinds", "words"),
     [
-        ({"/fixx": Kind.GPS}, "no topic '/fixx'. Nearest: /fix"),
-        ({"/fix": Kind.IMU}, "topic /fix is of type sensor_msgs/msg/NavSatFix, which is no imu"),
-        ({"/fix": Kind.GPS, "/fix2": Kind.GPS}, "two topics are to be gps"),
+        ({"/fixx": TopicKind.GPS}, "no topic '/fixx'. Nearest: /fix"),
+        ({"/fix": TopicKind.IMU}, "topic /fix is of type sensor_msgs/msg/NavSatFix, which is no imu"),
+        ({"/fix": TopicKind.GPS, "/fix2": TopicKind.GPS}, "two topics are to be gps"),
     ],
 )
 def test_given_a_wrong_topic_when_imported_then_the_error_helps(
-    tmp_path: Path, ros: Ros, kinds: dict[str, Kind], words: str
+    tmp_path: Path, ros: Ros, kinds: dict[str, TopicKind], words: str
 ) -> None:
     bag = ros.write(tmp_path / "a.bag", [("/fix", START_NS, ros.fix()), ("/fix2", START_NS, ros.fix())])
     with pytest.raises(RecordingError, match=words):

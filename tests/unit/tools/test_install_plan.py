@@ -19,12 +19,12 @@ from mstools.deployment.plan import (
     SYSCTL,
     UNITS,
     VEHICLE,
-    Command,
     Facts,
     Keep,
     Manifest,
     Plan,
     Remove,
+    RunProgram,
     Write,
     digest,
     folders_around,
@@ -65,7 +65,7 @@ class Disk:
                 if step.whole or not held:
                     self.files.pop(step.path, None)
                     self.folders.discard(step.path)
-            elif isinstance(step, Command):
+            elif isinstance(step, RunProgram):
                 self.ran.append(" ".join(step.arguments))
 
     def installs(self, contents: Mapping[str, bytes], units: tuple[str, ...] = ("modelserver.service",)) -> Plan:
@@ -161,7 +161,7 @@ def test_given_a_purge_then_what_was_edited_and_the_state_go_too() -> None:
 def test_given_another_system_then_nothing_is_started_and_systemctl_works_on_it() -> None:
     facts = Facts(programs=PROGRAMS, is_live=False, root="/mnt/image")
     plan = plan_install([Write(RULES, b"x", "rules")], ("modelserver.service",), facts, start=True, notes=())
-    commands = [" ".join(step.arguments) for step in plan.steps if isinstance(step, Command)]
+    commands = [" ".join(step.arguments) for step in plan.steps if isinstance(step, RunProgram)]
     assert commands == ["/usr/bin/systemctl --root=/mnt/image enable modelserver.service"]
 
 

@@ -9,7 +9,7 @@ import pytest
 import typer
 from support_samples import VEHICLE, write_vehicle
 
-from modelserver.errors import BusError, ConfigError, ModelServerError, Problem, Severity, Source
+from modelserver.errors import BusError, ConfigError, Location, ModelServerError, Problem, Severity
 from modelserver.service.supervision.notify import Notifier
 from modelserver.service.supervision.patience import Files
 from mstools.cli import main
@@ -18,8 +18,8 @@ from mstools.deployment.refusal import Start, status_of
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 CONFIG = Path("/none/vehicle.yaml")
 PROBLEMS = [
-    Problem(Severity.WARNING, "hardly meant", Source("v.yaml", 1)),
-    Problem(Severity.ERROR, "sensers is no key", Source("v.yaml", 4), "write sensors"),
+    Problem(Severity.WARNING, "hardly meant", Location("v.yaml", 1)),
+    Problem(Severity.ERROR, "sensers is no key", Location("v.yaml", 4), "write sensors"),
     Problem(Severity.ERROR, "no frame"),
 ]
 

@@ -162,6 +162,6 @@ def test_given_many_dots_then_a_pixel_has_one() -> None:
 
 
 def test_given_a_name_with_marks_of_html_then_it_is_written_as_text() -> None:
-    drawn = panels.strip("<b>", 0.0, 1.0, [panels.Row("<i>", [(0.0, 1.0, '"&<')], panels.RED)])
+    drawn = panels.strip("<b>", 0.0, 1.0, [panels.StripRow("<i>", [(0.0, 1.0, '"&<')], panels.RED)])
     assert "<b>" not in drawn
     assert "<i>" not in drawn

@@ -12,9 +12,9 @@ from support_samples import gps
 
 from modelserver.keys import new_key, write_key
 from modelserver.service.journal.chain import NEWEST_NAME, Newest
-from modelserver.service.journal.verify import Result
+from modelserver.service.journal.verify import VerificationResult
 from modelserver.wire.codec import encode
-from modelserver.wire.journal import Record, batch_written, read
+from modelserver.wire.journal import JournalRecord, batch_written, read
 from mstools import cli
 from mstools.commands.replay_verify import differing
 
@@ -52,7 +52,7 @@ def folder(tmp_path: Path, journal: bytes) -> Path:
 
 def changed(path: Path) -> None:
     data = path.read_bytes()
-    records = [each for each in read(data) if isinstance(each, Record)]
+    records = [each for each in read(data) if isinstance(each, JournalRecord)]
     at = next(n for n, each in enumerate(records) if each.channel == "POSE" and n > 60)
     other = records[at].data
     records[at] = records[at]._replace(data=other[:48] + bytes([other[48] ^ 1]) + other[49:])
@@ -116,7 +116,7 @@ def test_given_damage_then_its_place_is_told_and_the_code_is_1(run: Run, folder:
 def test_given_a_key_and_a_journal_that_is_not_sealed_with_one_then_that_is_reported(run: Run, folder: Path) -> None:
     write_key(folder / "k.key", new_key("rover"))
     code, out, _ = run("--verify", folder, "--key", folder / "k.key")
-    assert code == Result.REPRODUCED
+    assert code == VerificationResult.REPRODUCED
     assert "not proved authentic: 1 segment of 1 not closed, or not sealed with a key" in out
     code, _, err = run(folder / "journal-00000000.lcm", "--key", folder / "k.key")
     assert (code, "--key goes with --verify" in err) == (2, True)

@@ -10,8 +10,8 @@ import pytest
 
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.messages import VALID, Decision, FixType, GpsSample, ImuSample, Mode, Phase, SensorHeader, Verdict
-from mstools.report.data import Replayed, Sensor, Snapshot
-from mstools.report.finding import Finding, Grade
+from mstools.report.data import Replayed, Sensor, StateSample
+from mstools.report.finding import FindingLevel, ReportFinding
 from mstools.report.findings import findings
 from mstools.report.raw import RawCollector, RawMotion
 
@@ -51,7 +51,7 @@ def driven(
 
 def replayed(**more: object) -> Replayed:
     states = tuple(
-        Snapshot(t, VALID, 0, (t, 0.0, 0.0), 0.0, 0.1, 0.01, speed=1.0, side=0.0, turn=0.0, phase=Phase.ALIGNED)
+        StateSample(t, VALID, 0, (t, 0.0, 0.0), 0.0, 0.1, 0.01, speed=1.0, side=0.0, turn=0.0, phase=Phase.ALIGNED)
         for t in range(100)
     )
     given = Replayed("cart", "drive.lcm", START * 1_000_000, 100.0, FilterSettings(), states, raw=driven())
@@ -62,12 +62,12 @@ def refused(reason: str, source: str = "wheels", kind: str = "wheel_speed") -> t
     return tuple(Decision(START + n, source, n, kind, Verdict.REJECTED, reason) for n in range(100))
 
 
-def only(given: Replayed) -> Finding:
+def only(given: Replayed) -> ReportFinding:
     (found,) = findings(given)
     return found
 
 
-def titles(found: Iterable[Finding]) -> list[str]:
+def titles(found: Iterable[ReportFinding]) -> list[str]:
     return [each.title for each in found]
 
 
@@ -80,14 +80,14 @@ def test_given_a_good_drive_then_nothing_is_found() -> None:
 @pytest.mark.parametrize("name", ["left", "right"])
 def test_given_one_wheel_whose_sign_is_swapped_then_it_is_named(name: str, with_gyro: bool) -> None:
     found = only(replayed(raw=driven(**{name: -1.0}, with_gyro=with_gyro)))  # type: ignore[arg-type]
-    assert (found.grade, found.title) == (Grade.WRONG, f"Wheel {name} counts backward")
+    assert (found.grade, found.title) == (FindingLevel.WRONG, f"Wheel {name} counts backward")
     assert ("gyro" if with_gyro else "course") in found.seen
 
 
 @pytest.mark.parametrize("with_gyro", [True, False])
 def test_given_wheels_whose_names_are_swapped_then_that_is_told(with_gyro: bool) -> None:
     found = only(replayed(raw=driven(swapped=True, with_gyro=with_gyro)))
-    assert (found.grade, found.title) == (Grade.WRONG, "Left and right wheels are swapped")
+    assert (found.grade, found.title) == (FindingLevel.WRONG, "Left and right wheels are swapped")
 
 
 def test_given_a_gyro_that_turns_against_wheels_and_fixes_then_it_is_the_gyro() -> None:

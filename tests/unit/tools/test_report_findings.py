@@ -11,14 +11,14 @@ import pytest
 from modelserver.localization.filter.settings import FilterSettings
 from modelserver.messages import VALID, Decision, Invalid, Phase, Verdict
 from mstools.report import consistency
-from mstools.report.data import Fix, Replayed, Sensor, Snapshot, WheelTurn
-from mstools.report.findings import Grade, findings, fix_latency
+from mstools.report.data import FixRecord, Replayed, Sensor, StateSample, WheelTurn
+from mstools.report.findings import FindingLevel, findings, fix_latency
 
 START = 1_700_000_000_000_000
 
 
-def snapshot(t: float, **more: object) -> Snapshot:
-    given = Snapshot(t, VALID, 0, (t, 0.0, 0.0), 0.0, 0.1, 0.01, speed=1.0, side=0.0, turn=0.0, phase=Phase.ALIGNED)
+def snapshot(t: float, **more: object) -> StateSample:
+    given = StateSample(t, VALID, 0, (t, 0.0, 0.0), 0.0, 0.1, 0.01, speed=1.0, side=0.0, turn=0.0, phase=Phase.ALIGNED)
     return replace(given, **more)  # type: ignore[arg-type]
 
 
@@ -56,7 +56,7 @@ def test_given_nothing_wrong_then_nothing_is_found() -> None:
 def test_given_a_wheel_that_counts_backward_then_it_is_named_and_the_other_is_not() -> None:
     found = findings(replayed(wheels=(*turns("left", -1.01), *turns("right", 1.0))))
     assert [each.title for each in found] == ["Wheel left counts backward"]
-    assert found[0].grade is Grade.WRONG
+    assert found[0].grade is FindingLevel.WRONG
     assert "sign" in found[0].advice
 
 
@@ -94,7 +94,7 @@ def test_given_fixes_that_lie_behind_by_a_time_then_that_is_told(tau: float) -> 
         t = 0.25 * n
         v = (2.0 * math.cos(0.3 * t), 2.0 * math.sin(0.3 * t))
         off = (-tau * v[0] + 3.0 + noise[n, 0], -tau * v[1] + noise[n, 1])
-        fixes.append(Fix(t, (0.0, 0.0, 0.0), 0.5, "used", "", off, v))
+        fixes.append(FixRecord(t, (0.0, 0.0, 0.0), 0.5, "used", "", off, v))
     given = replayed(fixes=tuple(fixes))
     found = fix_latency(given)
     assert found is not None
@@ -106,7 +106,7 @@ def test_given_fixes_that_lie_behind_by_a_time_then_that_is_told(tau: float) -> 
 
 
 def test_given_a_straight_drive_then_no_latency_can_be_told() -> None:
-    fixes = tuple(Fix(0.25 * n, None, 0.5, "used", "", (-1.0, 0.0), (2.0, 0.0)) for n in range(400))
+    fixes = tuple(FixRecord(0.25 * n, None, 0.5, "used", "", (-1.0, 0.0), (2.0, 0.0)) for n in range(400))
     assert fix_latency(replayed(fixes=fixes)) is None
 
 
@@ -147,7 +147,7 @@ def test_given_a_vehicle_that_always_backs_up_then_front_and_rear_are_doubted() 
 
 
 def test_given_refused_and_late_samples_and_gaps_then_all_are_found_worst_first() -> None:
-    fixes = tuple(Fix(n, None, 1.0, "rejected" if n % 2 else "used", "gate") for n in range(40))
+    fixes = tuple(FixRecord(n, None, 1.0, "rejected" if n % 2 else "used", "gate") for n in range(40))
     found = findings(
         replayed(
             fixes=fixes,
@@ -166,7 +166,9 @@ def test_given_refused_and_late_samples_and_gaps_then_all_are_found_worst_first(
 
 
 def test_given_fixes_without_numbers_then_only_that_word_is_explained() -> None:
-    fixes = tuple(Fix(n, None, math.nan, "rejected" if n % 2 else "used", "nan" if n % 2 else "") for n in range(40))
+    fixes = tuple(
+        FixRecord(n, None, math.nan, "rejected" if n % 2 else "used", "nan" if n % 2 else "") for n in range(40)
+    )
     (found,) = findings(replayed(fixes=fixes))
     assert found.seen == "Of 40 fixes as positions: 20 nan."
     assert "nan: " in found.advice

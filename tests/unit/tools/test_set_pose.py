@@ -17,7 +17,7 @@ from modelserver.messages import Decision, PoseAnswer, PublishDecisions, Verdict
 from modelserver.spatial import Pose, Transformation
 from modelserver.wire.codec import encode
 from mstools.cli import main
-from mstools.commands.set_pose import Listener, Result, Target, as_data, describe, to_covariance, to_pose
+from mstools.commands.set_pose import Listener, SetPoseResult, Target, as_data, describe, to_covariance, to_pose
 
 CURRENT = Pose.from_rpy((100.0, 50.0, 5.0), 0.1, -0.2, 1.0)
 UTM = (ORIGIN.easting + 30.0, ORIGIN.northing + 40.0, ORIGIN.height + 2.0)
@@ -135,10 +135,10 @@ def test_given_messages_of_another_type_then_they_are_passed_over() -> None:
 USED = Decision(5, "operator", 1, "absolute_pose", Verdict.USED, "", (0.0,) * 6, statistic=3.25, limit=22.5)
 
 
-def result(decision: Decision | None, has_decisions: bool = True, reasons: int = 0) -> Result:
+def result(decision: Decision | None, has_decisions: bool = True, reasons: int = 0) -> SetPoseResult:
     request = Transformation("Cart:Base", "World:UTM", Pose((30.0, 40.0, 2.0)))
     after = PoseAnswer(Transformation("Cart:Base", "World:UTM", Pose((30.5, 40.0, 2.0)), None, 9, reasons))
-    return Result(request, GEODESY, (1.0, 5.0), decision, has_decisions, after)
+    return SetPoseResult(request, GEODESY, (1.0, 5.0), decision, has_decisions, after)
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def result(decision: Decision | None, has_decisions: bool = True, reasons: int =
         ),
     ],
 )
-def test_given_a_result_then_people_see_where_it_is_and_the_decision(shown: Result, line: str) -> None:
+def test_given_a_result_then_people_see_where_it_is_and_the_decision(shown: SetPoseResult, line: str) -> None:
     lines = describe(shown).splitlines()
     assert lines[0].startswith("Cart:Base in World:UTM: position (30.000, 40.000, 2.000) m")
     assert f"easting {UTM[0]:.3f} m, northing {UTM[1]:.3f} m, height {UTM[2]:.3f} m, zone 12 north" in lines[1]

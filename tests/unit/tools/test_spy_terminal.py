@@ -20,17 +20,17 @@ from modelserver.wire.kinds import type_name_of
 from mstools.spy import terminal as spy_terminal
 from mstools.spy import types as spy_types
 from mstools.spy.fields import ENTRIES, MAX_LINES, NUMBERS, TEXT, fields, told
-from mstools.spy.keys import Key, keys
-from mstools.spy.terminal import Ear, View, is_whole, message_lines, picture, print_once, rows, summary
-from mstools.spy.traffic import CHECKED_PER_S, MAX_CHANNELS, Seen, Traffic
+from mstools.spy.keys import KeyBinding, keys
+from mstools.spy.terminal import BusListener, View, is_whole, message_lines, picture, print_once, rows, summary
+from mstools.spy.traffic import CHECKED_PER_S, MAX_CHANNELS, BusTraffic, Seen
 from mstools.spy.types import Constants, constants_of, known_constants
 
 POSE = encode(EXAMPLES["pose_transform_t"][0])
 HEALTH = encode(EXAMPLES["health_t"][1])
 
 
-def traffic() -> Traffic:
-    return Traffic(100.0, type_name_of, is_whole)
+def traffic() -> BusTraffic:
+    return BusTraffic(100.0, type_name_of, is_whole)
 
 
 # --- counting -----------------------------------------------------------------------------------------------
@@ -86,7 +86,7 @@ def test_given_damaged_messages_of_ours_and_strangers_then_only_ours_count_as_ba
 
 def test_given_a_flood_then_only_so_many_messages_a_second_are_decoded() -> None:
     checked = []
-    heard = Traffic(100.0, type_name_of, lambda name, data: checked.append(name) is not None)
+    heard = BusTraffic(100.0, type_name_of, lambda name, data: checked.append(name) is not None)
     for n in range(5 * CHECKED_PER_S):
         heard.heard("POSE", POSE, 100.0 + n * 1e-5)
     assert len(checked) == CHECKED_PER_S
@@ -239,7 +239,7 @@ def test_given_any_bytes_then_what_is_shown_of_them_is_bounded_and_printable(dat
 # --- pictures -----------------------------------------------------------------------------------------------
 
 
-def busy() -> Traffic:
+def busy() -> BusTraffic:
     heard = traffic()
     for n in range(30):
         heard.heard("POSE", POSE, 100.0 + n * 0.02)
@@ -282,44 +282,44 @@ NAMES = ["A", "B", "C", "D"]
 @pytest.mark.parametrize(
     ("view", "key", "expected"),
     [
-        (View("B"), Key.DOWN, View("C")),
-        (View("B"), Key.UP, View("A")),
-        (View("A"), Key.UP, View("A")),
-        (View("D"), Key.DOWN, View("D")),
-        (View("A"), Key.PAGE_DOWN, View("C")),
-        (View("D"), Key.PAGE_UP, View("B")),
-        (View("B"), Key.END, View("D")),
-        (View("B"), Key.HOME, View("A")),
-        (View("B"), Key.ENTER, View("B", True)),
-        (View("B", True), Key.ENTER, View("B")),
-        (View("B", True), Key.BACK, View("B")),
-        (View("GONE"), Key.DOWN, View("B")),
-        (View("B"), Key.QUIT, None),
+        (View("B"), KeyBinding.DOWN, View("C")),
+        (View("B"), KeyBinding.UP, View("A")),
+        (View("A"), KeyBinding.UP, View("A")),
+        (View("D"), KeyBinding.DOWN, View("D")),
+        (View("A"), KeyBinding.PAGE_DOWN, View("C")),
+        (View("D"), KeyBinding.PAGE_UP, View("B")),
+        (View("B"), KeyBinding.END, View("D")),
+        (View("B"), KeyBinding.HOME, View("A")),
+        (View("B"), KeyBinding.ENTER, View("B", True)),
+        (View("B", True), KeyBinding.ENTER, View("B")),
+        (View("B", True), KeyBinding.BACK, View("B")),
+        (View("GONE"), KeyBinding.DOWN, View("B")),
+        (View("B"), KeyBinding.QUIT, None),
     ],
 )
-def test_given_a_key_then_the_view_follows(view: View, key: Key, expected: View | None) -> None:
+def test_given_a_key_then_the_view_follows(view: View, key: KeyBinding, expected: View | None) -> None:
     assert view.after(key, NAMES, 2) == expected
 
 
 def test_given_no_channels_then_keys_do_no_harm() -> None:
-    assert all(View().after(key, [], 3) is not None for key in Key if key is not Key.QUIT)
+    assert all(View().after(key, [], 3) is not None for key in KeyBinding if key is not KeyBinding.QUIT)
 
 
 @pytest.mark.parametrize(
     ("data", "expected"),
     [
-        (b"\x1b[A\x1b[B", [Key.UP, Key.DOWN]),
-        (b"\x1bOA", [Key.UP]),
-        (b"\r", [Key.ENTER]),
-        (b"q", [Key.QUIT]),
-        (b"jjk", [Key.DOWN, Key.DOWN, Key.UP]),
-        (b"\x1b", [Key.BACK]),
-        (b"\x1b[5~\x1b[6~\x1b[1~\x1b[F", [Key.PAGE_UP, Key.PAGE_DOWN, Key.HOME, Key.END]),
+        (b"\x1b[A\x1b[B", [KeyBinding.UP, KeyBinding.DOWN]),
+        (b"\x1bOA", [KeyBinding.UP]),
+        (b"\r", [KeyBinding.ENTER]),
+        (b"q", [KeyBinding.QUIT]),
+        (b"jjk", [KeyBinding.DOWN, KeyBinding.DOWN, KeyBinding.UP]),
+        (b"\x1b", [KeyBinding.BACK]),
+        (b"\x1b[5~\x1b[6~\x1b[1~\x1b[F", [KeyBinding.PAGE_UP, KeyBinding.PAGE_DOWN, KeyBinding.HOME, KeyBinding.END]),
         (b"xyz\x1b[99;5u", []),
         (b"", []),
     ],
 )
-def test_given_bytes_of_a_terminal_then_the_keys_in_them_are_found(data: bytes, expected: list[Key]) -> None:
+def test_given_bytes_of_a_terminal_then_the_keys_in_them_are_found(data: bytes, expected: list[KeyBinding]) -> None:
     assert list(keys(data)) == expected
 
 
@@ -357,7 +357,7 @@ class FakeLcm:
 
 
 def test_given_messages_when_printed_once_then_table_and_fields_come(capsys: pytest.CaptureFixture[str]) -> None:
-    ear = Ear(FakeLcm(("POSE", POSE), ("\x1b[2J", b"x")))  # type: ignore[arg-type]
+    ear = BusListener(FakeLcm(("POSE", POSE), ("\x1b[2J", b"x")))  # type: ignore[arg-type]
     ear.take(math.inf)
     print_once(ear, 0.0, "POSE")
     out = capsys.readouterr().out
@@ -367,18 +367,18 @@ def test_given_messages_when_printed_once_then_table_and_fields_come(capsys: pyt
 
 
 def test_given_a_channel_that_is_silent_when_printed_once_then_the_nearest_is_offered() -> None:
-    ear = Ear(FakeLcm(("POSE", POSE)))  # type: ignore[arg-type]
+    ear = BusListener(FakeLcm(("POSE", POSE)))  # type: ignore[arg-type]
     ear.take(math.inf)
     with pytest.raises(ModelServerError, match="nothing came on 'POZE'; nearest: 'POSE'"):
         print_once(ear, 0.0, "POZE")
 
 
 def test_given_a_flood_then_taking_ends_with_its_time() -> None:
-    ear = Ear(FakeLcm(*[("X", b"")] * 1000))  # type: ignore[arg-type]
+    ear = BusListener(FakeLcm(*[("X", b"")] * 1000))  # type: ignore[arg-type]
     ear.take(time.monotonic() - 1.0)
     assert ear.traffic.channels["X"].count == 1
 
 
 def test_given_nothing_when_printed_once_then_it_says_what_to_look_at(capsys: pytest.CaptureFixture[str]) -> None:
-    print_once(Ear(FakeLcm()), 0.0)  # type: ignore[arg-type]
+    print_once(BusListener(FakeLcm()), 0.0)  # type: ignore[arg-type]
     assert "modelserver doctor" in capsys.readouterr().out

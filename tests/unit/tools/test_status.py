@@ -299,7 +299,7 @@ def test_given_reports_then_the_ear_knows_the_last_ones_and_passes_over_what_is_
         ("A_DRIVER_HEALTH", encode(driver)),
         ("MODELSERVER_HEALTH", encode(BARE)),
     )
-    ear = status.Ear(bus, "A_")  # type: ignore[arg-type]
+    ear = status.HealthListener(bus, "A_")  # type: ignore[arg-type]
     assert ear.listen(10.0, lambda: ear.knows(("gps",)))
     assert ear.health is not None
     assert (ear.health.state, ear.reports) == (RUNNING, 1)
@@ -311,7 +311,7 @@ def test_given_endless_drivers_of_a_stranger_then_so_many_are_kept() -> None:
     driver: Any = DRIVERS[1]
     reports = [("DRIVER_HEALTH", encode(replace(driver, source=f"d{n}"))) for n in range(status.MAX_NAMES + 9)]
     bus = FakeLcm(*reports)
-    ear = status.Ear(bus, "")  # type: ignore[arg-type]
+    ear = status.HealthListener(bus, "")  # type: ignore[arg-type]
     assert ear.listen(60.0, lambda: not bus.queue)
     assert len(ear.drivers) == status.MAX_NAMES
 

@@ -13,7 +13,7 @@ from support_lcm import reserved_url
 from support_samples import START, VEHICLE, write_vehicle
 
 from modelserver.formats import load_model
-from modelserver.formats.snapshot import Snapshot, written
+from modelserver.formats.snapshot import ModelSnapshot, written
 from modelserver.geometry import ModelBuilder
 from modelserver.geometry.model import Model
 from modelserver.spatial import Pose
@@ -170,7 +170,7 @@ class Telling:
     """A daemon that broadcasts a geometry in parts, every 20 ms, until it is left."""
 
     def __init__(self, url: str, model: Model):
-        content = written(Snapshot("arm", model, "Base:Mount", "Base:Mount", 60.0, "JOINTS"))
+        content = written(ModelSnapshot("arm", model, "Base:Mount", "Base:Mount", 60.0, "JOINTS"))
         self.parts = [encode(part) for part in reversed(in_parts(content, model.revision, START))]
         self.bus = lcm.LCM(url)
         self.ended = threading.Event()

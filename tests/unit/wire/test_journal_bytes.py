@@ -16,8 +16,8 @@ from modelserver.wire.journal import (
     File,
     Head,
     Item,
-    Kind,
-    Record,
+    JournalRecord,
+    RecordKind,
     State,
     batch_written,
     end_written,
@@ -30,23 +30,23 @@ from modelserver.wire.journal import (
 from modelserver.wire.kinds import is_of_service
 
 RECORDS = (
-    Record(Kind.SAMPLE, 7_000_000_001, 1_700_000_000_000_001, "IMU", b"\x01\x02"),
-    Record(Kind.EVENT, 7_000_000_002, 1_700_000_000_000_002, "", b'["Tick", 0.25, 0, 0]'),
-    Record(Kind.SAID, 0, 1_700_000_000_000_002, "POSE", b"\x03" * 40),
-    Record(Kind.REQUEST, 7_000_000_003, 1_700_000_000_000_003, "PLATFORM_GET_BODY_LIST", b""),
-    Record(Kind.SAID, 0, 1_700_000_000_000_003, "REPLY_ME", b"\x04" * 9),
+    JournalRecord(RecordKind.SAMPLE, 7_000_000_001, 1_700_000_000_000_001, "IMU", b"\x01\x02"),
+    JournalRecord(RecordKind.EVENT, 7_000_000_002, 1_700_000_000_000_002, "", b'["Tick", 0.25, 0, 0]'),
+    JournalRecord(RecordKind.SAID, 0, 1_700_000_000_000_002, "POSE", b"\x03" * 40),
+    JournalRecord(RecordKind.REQUEST, 7_000_000_003, 1_700_000_000_000_003, "PLATFORM_GET_BODY_LIST", b""),
+    JournalRecord(RecordKind.SAID, 0, 1_700_000_000_000_003, "REPLY_ME", b"\x04" * 9),
 )
 
 
-def segment(*batches: tuple[Record, ...]) -> bytes:
+def segment(*batches: tuple[JournalRecord, ...]) -> bytes:
     """A whole segment."""
     data = head_written({"format": 1, "run": "x"}, 5) + file_written("a.yaml", b"a\0b", 5) + state_written(b"known", 5)
     data += b"".join(batch_written(number, batch) for number, batch in enumerate(batches))
     return data + end_written(hashlib.sha256(data).digest(), 6)
 
 
-def records(items: list[Item]) -> list[Record]:
-    return [each._replace(at=0) for each in items if isinstance(each, Record)]
+def records(items: list[Item]) -> list[JournalRecord]:
+    return [each._replace(at=0) for each in items if isinstance(each, JournalRecord)]
 
 
 def test_given_a_segment_when_read_then_everything_comes_back_in_order() -> None:
@@ -71,18 +71,18 @@ def test_given_a_segment_when_read_by_lcm_then_what_was_on_the_bus_stands_there_
     # each record is found at the place that is told of it
     data = path.read_bytes()
     for each in read(data):
-        if isinstance(each, Record) and each.kind is not Kind.EVENT:
+        if isinstance(each, JournalRecord) and each.kind is not RecordKind.EVENT:
             assert data[each.at + 28 :].startswith(each.channel.encode() + each.data)
 
 
 @pytest.mark.parametrize("channel", ["", CHANNEL, "Ä", "X" * 64, "\0"], ids=["none", "own", "umlaut", "long", "nul"])
 def test_given_a_channel_that_a_log_cannot_hold_when_read_then_the_record_comes_back(channel: str) -> None:
-    record = Record(Kind.SAMPLE, 1, 2, channel, MAGIC + bytes(20))
+    record = JournalRecord(RecordKind.SAMPLE, 1, 2, channel, MAGIC + bytes(20))
     assert records(list(read(batch_written(0, [record])))) == [record]
 
 
 def test_given_a_time_before_1970_when_read_then_the_record_comes_back() -> None:
-    record = Record(Kind.SAMPLE, 1, -2, "IMU", b"x")
+    record = JournalRecord(RecordKind.SAMPLE, 1, -2, "IMU", b"x")
     assert records(list(read(batch_written(0, [record])))) == [record]
 
 

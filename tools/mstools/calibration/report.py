@@ -29,7 +29,7 @@ class AxisNoise:
 
 
 @dataclass(frozen=True, slots=True)
-class Noise:
+class ImuNoise:
     """What a standing unit's samples tell. begin, end: seconds into the log of the stretch used, `seconds` long.
 
     samples: read; dropped: of them not finite. gyro, accelerometer: axes x, y, z.
@@ -52,26 +52,26 @@ class _Quantity:
     setting: str
     words: str
     unit: str
-    axes: Callable[[Noise], tuple[AxisNoise, ...]]
+    axes: Callable[[ImuNoise], tuple[AxisNoise, ...]]
     figure: Callable[[NoiseFigures], Figure | None]
     limit: Callable[[NoiseFigures], float]
 
-    def proposed(self, noise: Noise) -> float:
+    def proposed(self, noise: ImuNoise) -> float:
         """Return the noisiest axis' value, NaN where no axis tells."""
         found = [each for axis in self.axes(noise) if (each := self.figure(axis.figures)) is not None]
         return max((each.value for each in found), default=math.nan)
 
-    def at_most(self, noise: Noise) -> float:
+    def at_most(self, noise: ImuNoise) -> float:
         """Return what it is at most on every axis, NaN where that is open."""
         limits = [self.limit(axis.figures) for axis in self.axes(noise)]
         return max(limits) if all(map(math.isfinite, limits)) else math.nan
 
 
-def _gyro(noise: Noise) -> tuple[AxisNoise, ...]:
+def _gyro(noise: ImuNoise) -> tuple[AxisNoise, ...]:
     return noise.gyro
 
 
-def _accelerometer(noise: Noise) -> tuple[AxisNoise, ...]:
+def _accelerometer(noise: ImuNoise) -> tuple[AxisNoise, ...]:
     return noise.accelerometer
 
 
@@ -111,7 +111,7 @@ QUANTITIES = (
 )
 
 
-def proposal(noise: Noise) -> dict[str, float]:
+def proposal(noise: ImuNoise) -> dict[str, float]:
     """Return the settings of the filter that can be told."""
     return {each.setting: value for each in QUANTITIES if each.setting and math.isfinite(value := each.proposed(noise))}
 
@@ -119,7 +119,7 @@ def proposal(noise: Noise) -> dict[str, float]:
 SHAKING = "of the standing unit: what the engine and the road shake comes on top"
 
 
-def noise_lines(log: str, noise: Noise, advice: MountAdvice | None) -> list[str]:
+def noise_lines(log: str, noise: ImuNoise, advice: MountAdvice | None) -> list[str]:
     """Return the report on noise, one line each."""
     lines = [
         f"{log}: {counted(noise.samples, 'sample')}, {noise.rate_hz:.1f} Hz; stood and used: {noise.begin:.1f} to "
@@ -160,7 +160,7 @@ def _figure_words(quantity: _Quantity, axis: AxisNoise) -> str:
     return f"{figure.value:.3g} +- {figure.sigma / figure.value:.1%} ({where})"
 
 
-def noise_data(noise: Noise, advice: MountAdvice | None) -> dict[str, Any]:
+def noise_data(noise: ImuNoise, advice: MountAdvice | None) -> dict[str, Any]:
     """Return the report on noise for scripts; what is not determined is null."""
     return {
         "samples": noise.samples,
@@ -202,7 +202,7 @@ def _axis_data(axis: AxisNoise) -> dict[str, Any]:
     }
 
 
-def noise_yaml(log: str, noise: Noise) -> str:
+def noise_yaml(log: str, noise: ImuNoise) -> str:
     """Return the settings that are proposed, as part of a vehicle file; what is not determined stands in a comment."""
     lines = [
         *_proposal_head(log, f"{noise.seconds:.0f} s of standing"),
@@ -223,7 +223,7 @@ def noise_yaml(log: str, noise: Noise) -> str:
     return "\n".join(lines) + "\n"
 
 
-def noise_page(log: str, noise: Noise) -> str:
+def noise_page(log: str, noise: ImuNoise) -> str:
     """Return the Allan deviations, drawn, as an HTML page."""
     charts = [
         _allan_chart("Gyro", "rad/s", noise.gyro, QUANTITIES[0].proposed(noise)),
@@ -238,18 +238,20 @@ def _allan_chart(name: str, unit: str, axes: Sequence[AxisNoise], white: float) 
         for axis, each in zip("xyz", axes, strict=True)
     ]
     lines = [
-        svg.Line(axis, [t for t, _ in points], [d for _, d in points], colour)
+        svg.PlotLine(axis, [t for t, _ in points], [d for _, d in points], colour)
         for (axis, points), colour in zip(drawn, svg.COLOURS, strict=False)
         if points
     ]
     taus = axes[0].curve.taus
     if math.isfinite(white):
         ends = [taus[0], taus[-1]]
-        lines.append(svg.Line("noise / √τ", ends, [white / math.sqrt(t) for t in ends], svg.COLOURS[3], dashed=True))
+        lines.append(
+            svg.PlotLine("noise / √τ", ends, [white / math.sqrt(t) for t in ends], svg.COLOURS[3], dashed=True)
+        )
     floors = [each.figures.instability for each in axes if each.figures.instability is not None]
     if floors:
         level = max(each.value for each in floors) * FLOOR
-        lines.append(svg.Line("0.664 B", [taus[0], taus[-1]], [level, level], "#cc79a7", dashed=True))
+        lines.append(svg.PlotLine("0.664 B", [taus[0], taus[-1]], [level, level], "#cc79a7", dashed=True))
     values = [value for line in lines for value in line.y] or [0.1, 1.0]
     x = svg.decades("averaging time τ, s", taus)
     return svg.chart(name, x, svg.decades(f"Allan deviation, {unit}", values), lines)
@@ -334,9 +336,9 @@ def magnetometer_page(log: str, found: MagnetometerFit, fields: Array, up: Vecto
     angle = np.linspace(0.0, 2.0 * np.pi, 121)
     radius = found.strength * 1e6
     lines = [
-        svg.Line("as felt", before[:, 0].tolist(), before[:, 1].tolist(), svg.COLOURS[1], dots=True),
-        svg.Line("calibrated", after[:, 0].tolist(), after[:, 1].tolist(), svg.COLOURS[0], dots=True),
-        svg.Line(
+        svg.PlotLine("as felt", before[:, 0].tolist(), before[:, 1].tolist(), svg.COLOURS[1], dots=True),
+        svg.PlotLine("calibrated", after[:, 0].tolist(), after[:, 1].tolist(), svg.COLOURS[0], dots=True),
+        svg.PlotLine(
             "earth's field" if found.strength_known else "mean radius",
             (radius * np.cos(angle)).tolist(),
             (radius * np.sin(angle)).tolist(),

@@ -60,7 +60,7 @@ def handle_until(bus: lcm.LCM, seconds: float, is_done: Callable[[], bool]) -> b
     return True
 
 
-class Answers(Protocol):
+class AnswerSource(Protocol):
     """Where answers come from: a file, or the daemon."""
 
     def get_pose(
@@ -155,7 +155,7 @@ def log_answers(log: Path, model: Path | None, settings: list[str] | None, prefi
     """Return what answers from a log, with `model` for its geometry. Raises RecordingError, GeometryError, OSError."""
     from modelserver.client.knowledge import HISTORY_S
     from modelserver.formats import load_model
-    from modelserver.formats.snapshot import Snapshot
+    from modelserver.formats.snapshot import ModelSnapshot
     from mstools.recordings.log_answers import LogAnswers
 
     if model is None:
@@ -164,7 +164,7 @@ def log_answers(log: Path, model: Path | None, settings: list[str] | None, prefi
     for problem in given.problems:
         print_problem(problem, err=True)
     root = f"{given.root.name}:{given.root.frames[0].name}"
-    source = LogAnswers(log, prefix, Snapshot("", given, root, root, HISTORY_S, f"{prefix}JOINTS"))
+    source = LogAnswers(log, prefix, ModelSnapshot("", given, root, root, HISTORY_S, f"{prefix}JOINTS"))
     if source.revision not in ("", given.revision):
         typer.echo(
             f"modelserver: note: {model} is of revision {given.revision}, and the poses in {log} "
@@ -174,7 +174,7 @@ def log_answers(log: Path, model: Path | None, settings: list[str] | None, prefi
     return source
 
 
-def answers(model: Path | None, settings: list[str] | None, url: str, prefix: str, timeout: float) -> Answers:
+def answers(model: Path | None, settings: list[str] | None, url: str, prefix: str, timeout: float) -> AnswerSource:
     """Return where answers come from, as the options say."""
     if model is not None:
         return FileAnswers(model, settings)

@@ -23,7 +23,7 @@ from modelserver.spatial.so3 import Vector3
 from mstools.calibration import log as calibrate_log
 from mstools.calibration import report as calibrate_report
 from mstools.calibration.log import Recorded
-from mstools.calibration.report import AxisNoise, Noise
+from mstools.calibration.report import AxisNoise, ImuNoise
 from mstools.terminal.output import check_target, counted, safe, write_file
 
 LEAST_STANDING = 60.0
@@ -176,13 +176,13 @@ def magnetometer(
     _write_proposal(output, calibrate_report.magnetometer_yaml(str(log), found), force)
 
 
-def _noise(recorded: Recorded, used: Stretch, samples: int) -> Noise:
+def _noise(recorded: Recorded, used: Stretch, samples: int) -> ImuNoise:
     def axis(values: Any) -> AxisNoise:
         curve = allan_deviation(values, used.rate_hz)
         return AxisNoise(curve, _of_enough(noise_figures(curve), used.seconds))
 
     rows = slice(used.start, used.stop)
-    return Noise(
+    return ImuNoise(
         samples=samples,
         dropped=samples - len(recorded.utimes),
         begin=float(recorded.at[used.start]),

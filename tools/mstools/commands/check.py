@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from modelserver.errors import ConfigError, Problem, Severity, Source
+from modelserver.errors import ConfigError, Location, Problem, Severity
 from modelserver.file_kinds import LOOKED_AT, FileKind, file_kind
 from modelserver.formats import check_file
 from modelserver.geometry.model import Model
@@ -62,13 +62,13 @@ def _checked(file: str, variables: dict[str, str], strict: bool) -> tuple[Model 
             return checked_vehicle(file, strict)
         if os.path.isfile(file) and not read_start(file, 1):
             fix = "see docs/geometry-files.md, or docs/vehicle-file.md for a vehicle file, for an example to begin with"
-            return None, (Problem(Severity.ERROR, "the file is empty", Source(file), fix),)
+            return None, (Problem(Severity.ERROR, "the file is empty", Location(file), fix),)
         return check_file(file, variables, strict=strict)
     except OSError as error:
         message = f"the file cannot be read: {error.strerror or error}"
         near = nearest_path(file) if isinstance(error, FileNotFoundError) else ""
         fix = f"did you mean {near}?" if near else "look at the path and its permissions"
-        return None, (Problem(Severity.ERROR, message, Source(file), fix),)
+        return None, (Problem(Severity.ERROR, message, Location(file), fix),)
 
 
 def is_vehicle_file(file: str) -> bool:
@@ -123,7 +123,7 @@ def _worth_knowing(config: VehicleConfig, file: str) -> Iterator[Problem]:
     sensors = config.sensors
     if sensors.gps is None and sensors.imu is None and sensors.wheels is None:
         words = "no sensors: there will never be a pose"
-        yield Problem(Severity.NOTE, words, Source(file, element="sensors"), "see docs/vehicle-file.md")
+        yield Problem(Severity.NOTE, words, Location(file, element="sensors"), "see docs/vehicle-file.md")
 
 
 def _unusable(vehicle: Vehicle, file: str) -> Iterator[Problem]:
@@ -131,7 +131,7 @@ def _unusable(vehicle: Vehicle, file: str) -> Iterator[Problem]:
     for found in vehicle.unusable():
         severity = Severity.NOTE if found.is_choice else Severity.WARNING
         text = f"sensors.{found.sensor}: {found.text}" if found.is_choice else found.text
-        yield Problem(severity, text, Source(file, element=found.element), found.fix)
+        yield Problem(severity, text, Location(file, element=found.element), found.fix)
 
 
 def _is_unclean(problems: tuple[Problem, ...]) -> bool:

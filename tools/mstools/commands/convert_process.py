@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Union, get_ar
 import yaml
 
 from modelserver.config import VehicleConfig, parse_partly
-from modelserver.errors import ConfigError, GeometryError, Problem, QueryError, Severity, Source, shown
+from modelserver.errors import ConfigError, GeometryError, Location, Problem, QueryError, Severity, shown
 from modelserver.file_kinds import LOOKED_AT
 from modelserver.formats import check_file, xml_document
 from modelserver.geometry.builder import ModelBuilder
@@ -111,7 +111,7 @@ def convert_process(file: str, target: str, variables: Mapping[str, str] | None 
         content = stream.read(LOOKED_AT + 1)
     if len(content) > LOOKED_AT:
         problem = f"the file is larger than {LOOKED_AT >> 20} MiB", "is this the process configuration?"
-        raise ConfigError([Problem(Severity.ERROR, problem[0], Source(file), problem[1])])
+        raise ConfigError([Problem(Severity.ERROR, problem[0], Location(file), problem[1])])
     builder = ModelBuilder()
     root = xml_document.parse(content, builder, file)
     if root is None:
@@ -138,7 +138,7 @@ def read_settings(root: Element, file: str) -> Iterator[Setting]:
         if count > MAX_SETTINGS:
             why = f"the file has more than {MAX_SETTINGS} parameters"
             fix = "remove the sections of other processes"
-            raise ConfigError([Problem(Severity.ERROR, why, Source(file, setting.line), fix)])
+            raise ConfigError([Problem(Severity.ERROR, why, Location(file, setting.line), fix)])
         yield setting
 
 
@@ -196,7 +196,7 @@ class _Matching:
         )
         message = f"{shown(setting.label, 80)} is not converted: {why}"
         self.problems.append(
-            Problem(Severity.WARNING, message, Source(self.file, setting.line, setting.label), fix, nearest)
+            Problem(Severity.WARNING, message, Location(self.file, setting.line, setting.label), fix, nearest)
         )
 
     def put(self, key: Key, value: Any, note: str = "") -> None:
@@ -234,7 +234,7 @@ class _Matching:
         if not any(key[0] == "sensors" for key in self.values):
             fix = "add sensors to the vehicle file: docs/vehicle-file.md has an example"
             why = "no parameter names a sensor's channel and frame, so there will be no pose"
-            self.problems.append(Problem(Severity.WARNING, why, Source(self.file), fix))
+            self.problems.append(Problem(Severity.WARNING, why, Location(self.file), fix))
 
     def _drop_wrong(self, problem: Problem) -> bool:
         """Take back the keys that a problem of the vehicle file is about; return whether there was any."""
@@ -341,7 +341,7 @@ def _find_geometry(matching: _Matching, file: str) -> str:
             known = ", ".join(each.label for each in files[:5])
             why = "no parameter names the geometry file" + (f"; it may be one of {known}" if files else "")
             fix = 'add <parameter name="GeometryFile" value="geometry.xml"/> to its section'
-            raise ConfigError([Problem(Severity.ERROR, why, Source(file), fix)])
+            raise ConfigError([Problem(Severity.ERROR, why, Location(file), fix)])
         (found,) = files
         matching.left = [each for each in matching.left if each[0] is not found]
         matching.problems = [each for each in matching.problems if each.element != found.label]
@@ -353,7 +353,7 @@ def _find_geometry(matching: _Matching, file: str) -> str:
         near = nearest_path(path)
         fix = f"did you mean {near}?" if near else "paths are taken relative to the process configuration; correct it"
         why = f"the geometry file {shown(named, 100)} is not there"
-        raise ConfigError([Problem(Severity.ERROR, why, Source(file, setting.line, setting.label), fix)])
+        raise ConfigError([Problem(Severity.ERROR, why, Location(file, setting.line, setting.label), fix)])
     return str(path)
 
 

@@ -80,7 +80,7 @@ def show(lines: Lines, seconds: float, children: Children) -> None:
 
     vehicle = load_config(lines.vehicle)
     prefix = vehicle.lcm.channel_prefix
-    ear = Ear(lines.url, prefix)
+    ear = PoseListener(lines.url, prefix)
     with Platform(lines.url, channel_prefix=prefix, name="demo", timeout=0.25, retries=0) as platform:
         bodies = first_answer(platform.get_body_list, children)
         wait_for_drivers(ear, lines, children)
@@ -164,7 +164,7 @@ def usage(service: Health | None) -> list[str]:
     return [f"{name}: {used} of {measured} measurements used" for name, used, measured in counts] + notices
 
 
-class Ear:
+class PoseListener:
     """Receives the poses, and the health reports of the service and the drivers."""
 
     def __init__(self, url: str, prefix: str):
@@ -207,7 +207,7 @@ def first_answer(ask: Callable[[], list[str]], children: Children) -> list[str]:
                 ) from None
 
 
-def wait_for_drivers(ear: Ear, lines: Lines, children: Children) -> None:
+def wait_for_drivers(ear: PoseListener, lines: Lines, children: Children) -> None:
     """Wait until every driver has said how it is. Raises DemoError where one fails or takes too long."""
     deadline = time.monotonic() + START_LIMIT
     while unheard := [name for name in lines.devices if name not in ear.health]:
@@ -226,7 +226,7 @@ def missing(health: dict[str, DriverHealth], lines: Lines) -> list[str]:
     ]
 
 
-def poses(ear: Ear, start_utime: int, seconds: float, children: Children) -> Iterator[PoseAnswer]:
+def poses(ear: PoseListener, start_utime: int, seconds: float, children: Children) -> Iterator[PoseAnswer]:
     """Yield what is broadcast from the start of the drive on, until its end."""
     end = time.monotonic() + start_utime * 1e-6 - time.time() + seconds
     while time.monotonic() < end:

@@ -18,7 +18,7 @@ from mstools.terminal.output import counted, safe
 
 if TYPE_CHECKING:
     from modelserver.config import VehicleConfig
-    from modelserver.service.probing.findings import Finding
+    from modelserver.service.probing.findings import Diagnosis
 
 EXIT_WARNINGS = 1
 EXIT_ERRORS = 3
@@ -74,11 +74,11 @@ def check_there(config: Path) -> None:
         raise typer.BadParameter(safe(wrong), param_hint="--config")
 
 
-def examine(config: Path | None, url: str, prefix: str) -> tuple[Finding, ...]:
+def examine(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...]:
     """Return all that is found. Takes two seconds, most of it waiting for who answers."""
     from modelserver.config import NOT_ONE
     from modelserver.service.probing.clock import clock_findings
-    from modelserver.service.probing.findings import Finding, Grade
+    from modelserver.service.probing.findings import Diagnosis, DiagnosisLevel
     from modelserver.service.probing.listening import hears_itself, who_answers
     from modelserver.service.probing.machine import ClockWatch, bus_facts
     from modelserver.service.probing.probe import bus_findings
@@ -90,7 +90,7 @@ def examine(config: Path | None, url: str, prefix: str) -> tuple[Finding, ...]:
     from mstools.deployment.doctor_vehicle import read_vehicle, vehicle_findings, versions
 
     vehicle: VehicleConfig | None = None
-    found: list[Finding] = [versions()]
+    found: list[Diagnosis] = [versions()]
     reply_prefix = REPLY_PREFIX
     if config is not None:
         try:
@@ -99,14 +99,16 @@ def examine(config: Path | None, url: str, prefix: str) -> tuple[Finding, ...]:
             seen = f"{safe(str(config))} cannot be read: {error.strerror}"
             # which of the folders around it is closed, if it is not the file
             command = f"{'sudo chmod a+r' if os.path.exists(config) else 'sudo namei -l'} {shlex.quote(str(config))}"
-            found.append(Finding(Grade.ERROR, "vehicle file", seen, "the service does not start without it", command))
+            found.append(
+                Diagnosis(DiagnosisLevel.ERROR, "vehicle file", seen, "the service does not start without it", command)
+            )
         except ConfigError as error:
             first = error.problems[0]
             seen, why = f"{safe(str(config))} is wrong: {safe(first.message)}", "the service does not start with it"
             command = f"modelserver check {shlex.quote(str(config))}"
             if first.message.endswith(NOT_ONE):
                 why, command = safe(f"{why}; {first.fix}"), ""  # check might find it to be a good geometry
-            found.append(Finding(Grade.ERROR, "vehicle file", seen, why, command))
+            found.append(Diagnosis(DiagnosisLevel.ERROR, "vehicle file", seen, why, command))
     if vehicle is not None:
         url, prefix = url or vehicle.lcm.url, prefix or vehicle.lcm.channel_prefix
         reply_prefix = vehicle.lcm.reply_prefix
@@ -114,16 +116,16 @@ def examine(config: Path | None, url: str, prefix: str) -> tuple[Finding, ...]:
     watch = ClockWatch()
     wrong, leaves = url_problem(provider), False
     if wrong:
-        found.append(Finding(Grade.ERROR, "bus", f"{provider}: {wrong}", "LCM cannot be joined there"))
+        found.append(Diagnosis(DiagnosisLevel.ERROR, "bus", f"{provider}: {wrong}", "LCM cannot be joined there"))
     else:
         facts = bus_facts(provider, hears_itself)
-        found.append(Finding(Grade.OK, "bus", safe(provider)))
+        found.append(Diagnosis(DiagnosisLevel.OK, "bus", safe(provider)))
         found += bus_findings(facts)
         if facts.address is None or facts.heard:
             try:
                 found += server_findings(who_answers(provider, prefix, reply_prefix), prefix, __version__)
             except BusError as error:
-                found.append(Finding(Grade.ERROR, "bus", str(error), "nothing is heard or said"))
+                found.append(Diagnosis(DiagnosisLevel.ERROR, "bus", str(error), "nothing is heard or said"))
         leaves = facts.address is not None and facts.address.ttl > 0
     found += clock_findings(watch.facts(), leaves)
     if config is not None and vehicle is not None:
@@ -131,14 +133,14 @@ def examine(config: Path | None, url: str, prefix: str) -> tuple[Finding, ...]:
     return tuple(found)
 
 
-def exit_code(findings: Sequence[Finding]) -> int:
+def exit_code(findings: Sequence[Diagnosis]) -> int:
     """Return the exit code that findings make."""
-    from modelserver.service.probing.findings import Grade, worst
+    from modelserver.service.probing.findings import DiagnosisLevel, worst
 
-    return {Grade.WARNING: EXIT_WARNINGS, Grade.ERROR: EXIT_ERRORS}.get(worst(findings), 0)
+    return {DiagnosisLevel.WARNING: EXIT_WARNINGS, DiagnosisLevel.ERROR: EXIT_ERRORS}.get(worst(findings), 0)
 
 
-def describe(findings: Sequence[Finding]) -> str:
+def describe(findings: Sequence[Diagnosis]) -> str:
     """Return findings for people to read: the grade, what was seen, and below it why it matters and what mends it."""
     width = max(len(each.subject) for each in findings)
     lines = []
@@ -153,7 +155,7 @@ def describe(findings: Sequence[Finding]) -> str:
     return "\n".join([*lines, ", ".join(said) or "all is well"])
 
 
-def as_data(findings: Sequence[Finding]) -> dict[str, object]:
+def as_data(findings: Sequence[Diagnosis]) -> dict[str, object]:
     """Return findings for scripts."""
     return {
         "exit_code": exit_code(findings),

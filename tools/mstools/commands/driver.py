@@ -21,7 +21,7 @@ from mstools.terminal.output import print_problem, safe
 if TYPE_CHECKING:
     from modelserver.config import VehicleConfig
     from msdrivers.links import Link
-    from msdrivers.registry import Kind
+    from msdrivers.registry import DeviceKind
     from msdrivers.settings import DriverSettings
     from mstools.deployment.refusal import Start
 
@@ -141,7 +141,7 @@ def load_drivers(config: Path) -> tuple[VehicleConfig, dict[str, DriverSettings]
 
 
 def load_driver(
-    name: str, config: Path, kinds: Mapping[str, Kind] | None = None
+    name: str, config: Path, kinds: Mapping[str, DeviceKind] | None = None
 ) -> tuple[VehicleConfig, DriverSettings]:
     """Return a vehicle file and the settings of one of its drivers, of these kinds, else of all that are known here.
 

@@ -23,8 +23,8 @@ from mstools.recordings.bag_messages import (
     Altitude,
     Converter,
     ImuOrientation,
-    Kind,
     Options,
+    TopicKind,
     converter,
 )
 from mstools.recordings.bag_reader import Bag, Topic, open_bag
@@ -82,13 +82,13 @@ def command(
     typer.echo(json.dumps(dataclasses.asdict(report), indent=2) if as_json else report.text())
 
 
-def _kinds(pairs: Iterable[str]) -> dict[str, Kind]:
-    wanted: dict[str, Kind] = {}
+def _kinds(pairs: Iterable[str]) -> dict[str, TopicKind]:
+    wanted: dict[str, TopicKind] = {}
     for pair in pairs:
         name, _, kind = pair.rpartition("=")
-        if not name or kind not in list(Kind):
+        if not name or kind not in list(TopicKind):
             raise typer.BadParameter(f"--topic takes TOPIC=gps, imu, wheels or joints, got {shown(pair)}")
-        wanted[name] = Kind(kind)
+        wanted[name] = TopicKind(kind)
     return wanted
 
 
@@ -127,7 +127,7 @@ def import_bag(
     bag_path: Path,
     log_path: Path,
     options: Options = DEFAULTS,
-    kinds: Mapping[str, Kind] | None = None,
+    kinds: Mapping[str, TopicKind] | None = None,
     prefix: str = "",
     force: bool = False,
 ) -> Report:
@@ -154,15 +154,15 @@ def import_bag(
 
 
 def choose_topics(
-    topics: Iterable[Topic], kinds: dict[str, Kind], bag: str
-) -> tuple[dict[str, Kind], dict[str, TopicReport]]:
+    topics: Iterable[Topic], kinds: dict[str, TopicKind], bag: str
+) -> tuple[dict[str, TopicKind], dict[str, TopicReport]]:
     """Return what each chosen topic becomes, and the beginning of the report on every topic.
 
     Topics named in `kinds` go first; for the other kinds the busiest topic of the right type is taken.
     Raises RecordingError where a named topic is missing or of another type, or nothing is left to convert.
     """
     known = {each.name: each for each in topics}
-    chosen: dict[str, Kind] = {}
+    chosen: dict[str, TopicKind] = {}
     for name, kind in kinds.items():
         if name not in known:
             near = nearest_names(name, known)
@@ -196,7 +196,7 @@ def choose_topics(
 def _write(
     bag: Bag,
     path: Path,
-    chosen: Mapping[str, Kind],
+    chosen: Mapping[str, TopicKind],
     reports: Mapping[str, TopicReport],
     options: Options,
     prefix: str,

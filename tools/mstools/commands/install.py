@@ -129,10 +129,10 @@ def planned(vehicle: Path | None, drivers: str, serial: Mapping[str, str], start
     return _plan(copied, made, names, serial, start, facts)
 
 
-def _made(vehicle: Path, gathered: Gathered) -> Made | None:
-    made: list[Made] = []
+def _made(vehicle: Path, gathered: Gathered) -> CheckedVehicle | None:
+    made: list[CheckedVehicle] = []
     with gathered.of(str(vehicle)):
-        made.append(Made.of(vehicle))
+        made.append(CheckedVehicle.of(vehicle))
     return made[0] if made else None
 
 
@@ -146,7 +146,7 @@ def _names_in(vehicle: Path | None) -> Iterable[str] | None:
     return None
 
 
-def _check_geometry(made: Made | None, root: Path) -> None:
+def _check_geometry(made: CheckedVehicle | None, root: Path) -> None:
     if made is not None:
         geometry = Path(made.config.geometry).resolve()
         inside = Path("/") / geometry.relative_to(root) if geometry.is_relative_to(root) else geometry
@@ -154,7 +154,12 @@ def _check_geometry(made: Made | None, root: Path) -> None:
 
 
 def _plan(
-    copied: Iterable[Write], made: Made, names: tuple[str, ...], serial: Mapping[str, str], start: bool, facts: Facts
+    copied: Iterable[Write],
+    made: CheckedVehicle,
+    names: tuple[str, ...],
+    serial: Mapping[str, str],
+    start: bool,
+    facts: Facts,
 ) -> Plan:
     from modelserver.wire.channels import DEFAULT_URL
     from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
@@ -192,7 +197,7 @@ def _plan(
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class CheckedVehicle:
     """A vehicle file that was found well, and those of its drivers that are."""
 
     path: Path
@@ -200,7 +205,7 @@ class Made:
     drivers: Mapping[str, DriverSettings]
 
     @classmethod
-    def of(cls, vehicle: Path) -> Made:
+    def of(cls, vehicle: Path) -> CheckedVehicle:
         """Return a vehicle file with everything in it checked. Raises ConfigError, GeometryError, OSError."""
         from modelserver.config import load_config
         from msdrivers.settings import Place, read_drivers
@@ -232,7 +237,7 @@ class Made:
         return [install_files.SerialDriver(name, port) for name, port in ports if port]
 
 
-def sources_of(made: Made) -> dict[str, bytes]:
+def sources_of(made: CheckedVehicle) -> dict[str, bytes]:
     """Return a vehicle's files by their paths relative to the vehicle file, which itself is vehicle.yaml.
 
     Raises ConfigError for those outside the folder of the vehicle file, which would not be found again, and those that
@@ -270,7 +275,7 @@ def sources_of(made: Made) -> dict[str, bytes]:
     return found
 
 
-def key_of(made: Made) -> str:
+def key_of(made: CheckedVehicle) -> str:
     """Return the key file that a vehicle file names, as it stands there; empty for none."""
     import yaml
 
@@ -278,7 +283,7 @@ def key_of(made: Made) -> str:
     return str(commands.get("key_file") or "")
 
 
-def installed_key(made: Made) -> str:
+def installed_key(made: CheckedVehicle) -> str:
     """Return where the key file is once it is installed; empty for none."""
     key = key_of(made)
     return os.path.normpath(os.path.join(CONFIGURATION, key)) if key else ""

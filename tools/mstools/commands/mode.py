@@ -12,11 +12,11 @@ import typer
 
 from modelserver.errors import (
     ConfigError,
+    Location,
     ModelServerError,
     NoServerError,
     Problem,
     Severity,
-    Source,
     nearest_names,
     shown,
 )
@@ -62,7 +62,7 @@ def command(
     if not vehicle.localization.mode_channel:
         why = "the vehicle file names no channel for wishes about the mode, so the daemon hears none"
         fix = "write mode_channel: LOCALIZATION_MODE under localization, and start the daemon anew"
-        source = Source(str(config), element="localization.mode_channel")
+        source = Location(str(config), element="localization.mode_channel")
         raise ConfigError([Problem(Severity.ERROR, why, source, fix)])
     prefix, state_hz = vehicle.lcm.channel_prefix, vehicle.publish.state_hz
     channel = f"{prefix}{vehicle.localization.mode_channel}"
@@ -72,7 +72,7 @@ def command(
         raise ModelServerError(f"the wish must be signed: name the daemon's key with --key or ${ENVIRONMENT}")
     provider = resolve_url(url or vehicle.lcm.url)
     bus = open_lcm(provider)
-    ear = Ear(bus, prefix, vehicle.localization.mode_channel)
+    ear = ModeListener(bus, prefix, vehicle.localization.mode_channel)
     if state_hz:
         ear.listen(min(PATIENCE_S, 2.5 / state_hz), lambda: ear.mode is not None)
     was = ear.mode
@@ -100,7 +100,7 @@ def command(
         typer.echo(f"{told}; not confirmed: LOCALIZATION_STATE is silent, as in raw mode and before the first samples")
 
 
-class Ear:
+class ModeListener:
     """Hears what a daemon says of its mode: `mode` by its state, `decided` by its decisions, `heard` anything at all.
 
     `since`: wishes of before count for nothing. `refusal`: why a wish was refused, by the health report.

@@ -12,7 +12,7 @@ import typer
 
 from modelserver.messages import Invalid, Policy, PoseAnswer, Quality, TimeQuery
 from mstools.commands.asking import (
-    Answers,
+    AnswerSource,
     JsonOption,
     ModelOption,
     PrefixOption,
@@ -92,7 +92,7 @@ def command(
         raise typer.BadParameter(f"{policy!r} is not one of {', '.join(POLICIES)}", param_hint="--policy")
     if inverse:
         frame_of_interest, frame_of_reference = frame_of_reference, frame_of_interest
-    source: Answers
+    source: AnswerSource
     utime = None
     if log is not None:
         recorded = source = log_answers(log, model, settings, prefix)

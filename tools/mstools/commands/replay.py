@@ -27,7 +27,7 @@ from mstools.terminal.output import check_target, counted, safe, written_whole
 from mstools.terminal.progress import progress
 
 if TYPE_CHECKING:
-    from modelserver.service.offline import Row, Run
+    from modelserver.service.offline import OfflineRun, TrackRow
     from mstools.report.data import Collector
 
 RATE_HZ = 50.0
@@ -207,7 +207,7 @@ def offline(
     # loaded here, with what it needs, as it is long: the speed that is told is that of the replay
     from modelserver.config import load_config
     from modelserver.service.daemon import load_vehicle
-    from modelserver.service.offline import CSV_HEADER, Run
+    from modelserver.service.offline import CSV_HEADER, OfflineRun
 
     vehicle = load_vehicle(load_config(config), str(config))
     if vehicle.rig is None:
@@ -227,7 +227,7 @@ def offline(
     if not poses:
         times = []
     with LogFile(log) as recording:
-        run = Run(vehicle, _only(recording, channels), frame or vehicle.config.base_frame)
+        run = OfflineRun(vehicle, _only(recording, channels), frame or vehicle.config.base_frame)
         collector = None
         if report:
             from mstools.report.data import Collector
@@ -239,7 +239,7 @@ def offline(
         gc.freeze()
         gc.set_threshold(50_000, 20, 100)
         started = time.monotonic()
-        poses_told = Poses()
+        poses_told = PoseCounts()
         refused: Counter[tuple[str, str, str]] = Counter()
         with (
             _output(poses) if poses else nullcontext() as out,
@@ -290,14 +290,14 @@ def _tell(listeners: Iterable[Callable[[Decision], object]], decision: Decision)
 
 
 @dataclass
-class Poses:
+class PoseCounts:
     """How many poses were written, how many are valid, and for how many each reason holds not to be."""
 
     written: int = 0
     valid: int = 0
     reasons: Counter[Invalid] = field(default_factory=Counter)
 
-    def count(self, row: Row) -> None:
+    def count(self, row: TrackRow) -> None:
         """Count one."""
         self.written += 1
         self.valid += row.valid
@@ -319,8 +319,8 @@ def _count_refused(refused: Counter[tuple[str, str, str]], decision: Decision) -
 
 
 def _print_counts(
-    run: Run,
-    poses: Poses | None,
+    run: OfflineRun,
+    poses: PoseCounts | None,
     refused: Counter[tuple[str, str, str]],
     wall: float,
     as_json: bool,
@@ -359,7 +359,7 @@ UNITS = (("seconds", 1_000_000.0), ("milliseconds", 1_000.0), ("nanoseconds", 0.
 """What times may be in by mistake, and what makes microseconds of it."""
 
 
-def _warn_of_times(times: list[int], run: Run, path: Path | None) -> None:
+def _warn_of_times(times: list[int], run: OfflineRun, path: Path | None) -> None:
     """Say that no time lies within the log, where that is so, and what the times may be."""
     if any(run.first_utime <= each <= run.last_utime for each in times):
         return
@@ -371,7 +371,9 @@ def _warn_of_times(times: list[int], run: Run, path: Path | None) -> None:
     typer.echo(f"modelserver: {path}: none of {counted(len(times), 'time')} lies within the log: {hint}", err=True)
 
 
-def _write_report(collector: Collector, run: Run, log: Path, report: str, channels: set[str], quiet: bool) -> None:
+def _write_report(
+    collector: Collector, run: OfflineRun, log: Path, report: str, channels: set[str], quiet: bool
+) -> None:
     """Write the page, and print the headlines of what it found."""
     from mstools.report import replay_report
     from mstools.report.findings import findings

@@ -23,7 +23,7 @@ MOST_REMARKS = 20
 
 
 def verified(journal: Path, as_json: bool, key: Path | None = None) -> None:
-    """Verify a journal and print what was found; the exit code is the `Result`.
+    """Verify a journal and print what was found; the exit code is the `VerificationResult`.
 
     `key`: the vehicle's key file. Without one nobody asks for proof that the journal is authentic, and what is
     reproduced bit for bit ends with 0.
@@ -33,7 +33,7 @@ def verified(journal: Path, as_json: bool, key: Path | None = None) -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     from modelserver.keys import read_keys
     from modelserver.service.journal.files import files_of
-    from modelserver.service.journal.verify import Result, verify
+    from modelserver.service.journal.verify import VerificationResult, verify
 
     keys = () if key is None else read_keys(key)
     files = files_of(journal)
@@ -50,7 +50,9 @@ def verified(journal: Path, as_json: bool, key: Path | None = None) -> None:
             typer.echo(f"modelserver: {len(found.remarks) - MOST_REMARKS} remarks more (--json has all)", err=True)
         if found.other:
             typer.echo(safe(f"modelserver: bits may differ: {'; '.join(found.other)}"), err=True)
-    is_done = found.result is Result.AUTHENTIC or (found.result is Result.REPRODUCED and not keys)
+    is_done = found.result is VerificationResult.AUTHENTIC or (
+        found.result is VerificationResult.REPRODUCED and not keys
+    )
     if not is_done:
         raise typer.Exit(found.result)
 

@@ -148,7 +148,7 @@ def command(
     decision = listener.decision(accepted.header.utime)
     listener.pose = None
     listener.wait(timeout, lambda: listener.pose is not None)
-    result = Result(request, geodesy, (sigma, sigma_deg), decision, listener.has_decisions, listener.pose)
+    result = SetPoseResult(request, geodesy, (sigma, sigma_deg), decision, listener.has_decisions, listener.pose)
     typer.echo(json.dumps(as_data(result), indent=2) if as_json else describe(result))
     if decision is not None and decision.verdict is Verdict.REJECTED:
         raise ModelServerError(
@@ -157,7 +157,7 @@ def command(
         )
 
 
-class Result(NamedTuple):
+class SetPoseResult(NamedTuple):
     """The pose that was set, `decision` on it if one was received, and the next pose that the daemon published."""
 
     request: Transformation
@@ -304,7 +304,7 @@ _VERDICTS = {
 }
 
 
-def describe(result: Result) -> str:
+def describe(result: SetPoseResult) -> str:
     """Return the result for people to read."""
     pose = result.request.pose
     origin = result.geodesy.origin
@@ -337,7 +337,7 @@ def describe(result: Result) -> str:
     return "\n".join(lines)
 
 
-def as_data(result: Result) -> dict[str, Any]:
+def as_data(result: SetPoseResult) -> dict[str, Any]:
     """Return the result for scripts to read; angles in radians, a pose as its 7-vector."""
     origin, decision, after = result.geodesy.origin, result.decision, result.after
     sigma, sigma_deg = result.sigmas

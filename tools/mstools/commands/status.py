@@ -79,7 +79,7 @@ def command(
         url, prefix = url or vehicle.lcm.url, prefix or vehicle.lcm.channel_prefix
         drivers = tuple(vehicle.drivers)
     provider = resolve_url(url)
-    ear = Ear(open_lcm(provider), prefix)
+    ear = HealthListener(open_lcm(provider), prefix)
     began = time.monotonic()
     if not ear.listen(timeout, lambda: ear.health is not None):
         raise NoServerError(nobody(provider, prefix, timeout, heard_instead(open_lcm(provider))))
@@ -97,7 +97,7 @@ def command(
         raise typer.Exit(EXIT_NOT_WELL)
 
 
-class Ear:
+class HealthListener:
     """Hears the reports of one daemon and of the drivers beside it; `reports` counts the daemon's."""
 
     def __init__(self, bus: lcm.LCM, prefix: str):
@@ -185,7 +185,7 @@ def nobody(provider: str, prefix: str, timeout: float, instead: dict[str, bool])
     )
 
 
-def go_on(ear: Ear, drivers: tuple[str, ...], as_json: bool) -> None:
+def go_on(ear: HealthListener, drivers: tuple[str, ...], as_json: bool) -> None:
     """Show each report until Ctrl-C; what stays out is told too."""
     if as_json or not sys.stdout.isatty():
         _lines(ear, as_json)
@@ -207,7 +207,7 @@ def go_on(ear: Ear, drivers: tuple[str, ...], as_json: bool) -> None:
                 last = time.monotonic()
 
 
-def _lines(ear: Ear, as_json: bool) -> None:
+def _lines(ear: HealthListener, as_json: bool) -> None:
     with Interrupts() as stop:
         while not stop.came:
             assert ear.health is not None
@@ -219,7 +219,7 @@ def _lines(ear: Ear, as_json: bool) -> None:
                 typer.echo(f"nothing heard for {time.monotonic() - began:.0f} s", err=True)
 
 
-def _next(ear: Ear, seconds: float, stop: Interrupts) -> bool:
+def _next(ear: HealthListener, seconds: float, stop: Interrupts) -> bool:
     """Return whether another report came, in so many seconds at most."""
     before = ear.reports
     ear.listen(seconds, lambda: stop.came or ear.reports > before)

@@ -12,13 +12,13 @@ from modelserver.errors import NoServerError
 from modelserver.geometry.model import Model
 from modelserver.wire.provider import open_lcm, resolve_url, take_message
 from mstools.commands.asking import PrefixOption, UrlOption
-from mstools.terminal.graph import Node, crossing_words, nodes
+from mstools.terminal.graph import BodyNode, crossing_words, nodes
 from mstools.terminal.options import Variables, parse_variables
 from mstools.terminal.output import check_target, counted, print_problem, safe, size_of, write_file
 from mstools.terminal.table import drawable
 
 if TYPE_CHECKING:
-    from modelserver.formats.snapshot import Snapshot
+    from modelserver.formats.snapshot import ModelSnapshot
 
 PATIENCE_S = 11.0
 """How long MODEL_SNAPSHOT is waited for, seconds: it comes every 5 s unless the vehicle file says otherwise."""
@@ -85,16 +85,16 @@ def read(file: str, variables: dict[str, str]) -> Model:
     return model
 
 
-def heard(url: str, prefix: str, seconds: float) -> Snapshot:
+def heard(url: str, prefix: str, seconds: float) -> ModelSnapshot:
     """Return the geometry that a daemon broadcasts. Raises NoServerError where none comes in time."""
     from modelserver.errors import WireError
     from modelserver.formats.snapshot import read as read_snapshot
     from modelserver.wire.channels import literal
     from modelserver.wire.codec import decode
-    from modelserver.wire.snapshot import Assembler
+    from modelserver.wire.snapshot import SnapshotAssembler
 
     provider = resolve_url(url)
-    bus, assembler, whole = open_lcm(provider), Assembler(), []
+    bus, assembler, whole = open_lcm(provider), SnapshotAssembler(), []
 
     def take(_: str, data: bytes) -> None:
         try:
@@ -120,7 +120,7 @@ def heard(url: str, prefix: str, seconds: float) -> Snapshot:
     return whole[0]
 
 
-def lines(assemblies: Sequence[Sequence[Node]], with_frames: bool = False) -> Iterator[str]:
+def lines(assemblies: Sequence[Sequence[BodyNode]], with_frames: bool = False) -> Iterator[str]:
     """Yield the drawing line by line; assemblies that nothing joins to the root's come below it."""
     for number, assembly in enumerate(assemblies):
         if number == 1:
@@ -130,7 +130,7 @@ def lines(assemblies: Sequence[Sequence[Node]], with_frames: bool = False) -> It
             yield from _node(node, with_frames)
 
 
-def _node(node: Node, with_frames: bool) -> Iterator[str]:
+def _node(node: BodyNode, with_frames: bool) -> Iterator[str]:
     trunk = "".join("   " if last else "│  " for last in node.last[:-1])
     elbow = ("└─ " if node.last[-1] else "├─ ") if node.last else ""
     told = f"  ({crossing_words(node.crossing)})" if node.crossing is not None else ""

@@ -19,7 +19,7 @@ import typer
 from modelserver.errors import ModelServerError, RecordingError
 from mstools.terminal.output import check_target, counted, safe, write_file
 from mstools.terminal.progress import progress
-from mstools.tuning.search import Found, Parameter, Score, Settings, Step, search
+from mstools.tuning.search import Parameter, Score, SearchResult, SearchStep, Settings, search
 
 if TYPE_CHECKING:
     from modelserver.service.daemon import Vehicle
@@ -115,7 +115,7 @@ def command(
             )
         found = search(begin, first, chosen, trials, rounds, _told)
         after = trials.outcomes(found.settings)
-    result = Result(begin, first, before, found, after, trials.count)
+    result = TuningResult(begin, first, before, found, after, trials.count)
     if as_json:
         typer.echo(json.dumps(data(result), indent=2, allow_nan=False))
     else:
@@ -164,18 +164,18 @@ class Trials:
 
 
 @dataclass(frozen=True)
-class Result:
+class TuningResult:
     """What was found: the values begun with, and scores and runs before and after."""
 
     begin: Settings
     first: Score
     before: Sequence[Outcome]
-    found: Found
+    found: SearchResult
     after: Sequence[Outcome]
     runs: int
 
 
-def lines(log: str, result: Result) -> list[str]:
+def lines(log: str, result: TuningResult) -> list[str]:
     """Return the report, one line each."""
     found = result.found
     told = [
@@ -207,7 +207,7 @@ def _nis(before: Consistency, after: Consistency | None) -> str:
     return f"{'NIS, ' + before.kind:34}{before.mean:10.2f}{later}{beyond}"
 
 
-def data(result: Result) -> dict[str, object]:
+def data(result: TuningResult) -> dict[str, object]:
     """Return the report for scripts; what is not known is null."""
 
     def side(score: Score, outcomes: Sequence[Outcome]) -> dict[str, object]:
@@ -228,7 +228,7 @@ def data(result: Result) -> dict[str, object]:
     }
 
 
-def proposal(log: str, result: Result) -> str:
+def proposal(log: str, result: TuningResult) -> str:
     """Return the settings that are proposed, as part of a vehicle file."""
     found = result.found
     head = [
@@ -305,7 +305,7 @@ def _has(vehicle: Vehicle, needs: str) -> bool:
     return getattr(sensors, needs) is not None
 
 
-def _told(step: Step) -> None:
+def _told(step: SearchStep) -> None:
     typer.echo(
         f"  {step.name}: {step.before:g} -> {step.after:g}, log-likelihood {step.score.likelihood:.3f}, "
         f"RMSE {step.score.rmse:.3f} m",

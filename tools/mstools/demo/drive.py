@@ -11,7 +11,7 @@ from modelserver.formats import load_model
 from modelserver.geometry import Model
 from modelserver.messages import GpsSample, ImuSample, Sample, VehicleStatusSample, WheelsSample
 from modelserver.simulation import GpsModel, ImuModel, Simulation, StatusModel, Timing, Trajectory, WheelsModel, figures
-from modelserver.simulation.trajectory import Phase
+from modelserver.simulation.trajectory import DrivePhase
 
 SUFFIELD = (50.27, -111.18, 700.0)
 """Where the report's vehicle was tried, roughly: latitude and longitude in degrees, height in metres."""
@@ -75,12 +75,12 @@ def _wheelbase(config: VehicleConfig, model: Model) -> float:
     return sum(ahead) / len(ahead) if ahead else TYPICAL_WHEELBASE
 
 
-def _phases(scenario: str, seconds: float, seed: int) -> tuple[Phase, ...]:
+def _phases(scenario: str, seconds: float, seed: int) -> tuple[DrivePhase, ...]:
     if scenario == "stand":
         return figures.stand(seconds)
     if scenario == "circle":
         # as for finding the offsets of a magnetometer
-        return (Phase(3.0, 4.0, 0.25), Phase(seconds), Phase(3.0, 0.0))
+        return (DrivePhase(3.0, 4.0, 0.25), DrivePhase(seconds), DrivePhase(3.0, 0.0))
     if scenario == "straight":
         return figures.straight()
     if scenario == "city":

@@ -16,7 +16,7 @@ from modelserver.keys import read_keys, shared_folder
 from modelserver.service.journal.place import bound, journal_directory
 from modelserver.service.journal.ring import LOCK_NAME, segments
 from modelserver.service.keeping.origin import state_directory
-from modelserver.service.probing.findings import Finding, Grade
+from modelserver.service.probing.findings import Diagnosis, DiagnosisLevel
 from mstools.deployment.files import CREDENTIAL
 from mstools.deployment.plan import SERVICE, STATE, UNITS, VEHICLE
 from mstools.terminal.output import counted
@@ -31,7 +31,7 @@ NO_STATE: Final = "the origin is lost with every restart"
 NO_JOURNAL: Final = "nothing is recorded of what happens"
 
 
-def file_findings(vehicle: VehicleConfig, file: Path) -> tuple[Finding, ...]:
+def file_findings(vehicle: VehicleConfig, file: Path) -> tuple[Diagnosis, ...]:
     """Return what is to be said of a vehicle's state, journal and key, for its unit where it is the one installed."""
     unit = is_of_unit(file)
     return (*kept_findings(vehicle, STATE[0] if unit else ""), *key_findings(vehicle, unit))
@@ -46,7 +46,7 @@ def is_of_unit(file: Path) -> bool:
     )
 
 
-def kept_findings(vehicle: VehicleConfig, given: str = "") -> Iterator[Finding]:
+def kept_findings(vehicle: VehicleConfig, given: str = "") -> Iterator[Diagnosis]:
     """Yield what is to be said of where state and journal are kept; `given`: the state directory of the unit, if any.
 
     The unit may write nowhere else.
@@ -58,7 +58,7 @@ def kept_findings(vehicle: VehicleConfig, given: str = "") -> Iterator[Finding]:
     elif given and os.geteuid() != 0 and not os.access(given, os.W_OK | os.X_OK):
         why = "what the unit keeps there is not for this user's eyes"
         command = f"sudo modelserver doctor -c {VEHICLE}"
-        yield Finding(Grade.NOTE, "state", f"{given} is looked into by root alone", why, command)
+        yield Diagnosis(DiagnosisLevel.NOTE, "state", f"{given} is looked into by root alone", why, command)
         return
     else:
         yield from state_findings(state)
@@ -68,11 +68,11 @@ def kept_findings(vehicle: VehicleConfig, given: str = "") -> Iterator[Finding]:
         yield from journal_findings(vehicle, journal)
 
 
-def state_findings(directory: Path | None) -> Iterator[Finding]:
+def state_findings(directory: Path | None) -> Iterator[Diagnosis]:
     """Yield what is to be said of the place where state is kept; None: there is no home to keep it in."""
     if directory is None:
         command = "set state_directory: /var/lib/..."
-        yield Finding(Grade.WARNING, "state", "there is no home directory", NO_STATE, command)
+        yield Diagnosis(DiagnosisLevel.WARNING, "state", "there is no home directory", NO_STATE, command)
         return
     trouble = _trouble("state", directory, NO_STATE)
     if trouble is not None:
@@ -83,18 +83,18 @@ def state_findings(directory: Path | None) -> Iterator[Finding]:
     if free < LEAST_FREE:
         seen = f"{directory} has {free / 1e6:.0f} MB of room left"
         why = "a full disk keeps neither origin nor journal"
-        yield Finding(Grade.WARNING, "state", seen, why, _largest(there))
+        yield Diagnosis(DiagnosisLevel.WARNING, "state", seen, why, _largest(there))
         return
-    yield Finding(Grade.OK, "state", f"{directory} may be written, {free / 1e9:.1f} GB free")
+    yield Diagnosis(DiagnosisLevel.OK, "state", f"{directory} may be written, {free / 1e9:.1f} GB free")
 
 
-def journal_findings(vehicle: VehicleConfig, directory: Path | None) -> Iterator[Finding]:
+def journal_findings(vehicle: VehicleConfig, directory: Path | None) -> Iterator[Diagnosis]:
     """Yield what is to be said of the place where the journal is kept; None: none is kept here."""
     subject = "journal"
     if directory is None:
         off = vehicle.journal.megabytes == 0
         why = "journal.megabytes: 0" if off else "on a desk; under systemd one is, or with journal.directory"
-        yield Finding(Grade.OK, subject, f"none is kept ({why})")
+        yield Diagnosis(DiagnosisLevel.OK, subject, f"none is kept ({why})")
         return
     trouble = _trouble(subject, directory, NO_JOURNAL)
     if trouble is not None:
@@ -109,16 +109,16 @@ def journal_findings(vehicle: VehicleConfig, directory: Path | None) -> Iterator
     free = shutil.disk_usage(there).free
     seen = f"{directory} may be written; {used / 1e6:.0f} of {most >> 20} MB are used, {free / 1e9:.1f} GB free"
     if free >= left + LEAST_FREE:
-        yield Finding(Grade.OK, subject, seen)
+        yield Diagnosis(DiagnosisLevel.OK, subject, seen)
         return
     fits = int(used + free - LEAST_FREE) >> 20
     smaller = f", or write megabytes: {fits} under journal" if fits >= 32 else ""
     seen = f"{directory} has {free / 1e6:.0f} MB of room left, and may take {left / 1e6:.0f} MB more"
     why = f"a full disk keeps neither origin nor journal; make room{smaller}"
-    yield Finding(Grade.WARNING, subject, seen, why, _largest(there))
+    yield Diagnosis(DiagnosisLevel.WARNING, subject, seen, why, _largest(there))
 
 
-def key_findings(vehicle: VehicleConfig, unit: bool = False) -> Iterator[Finding]:
+def key_findings(vehicle: VehicleConfig, unit: bool = False) -> Iterator[Diagnosis]:
     """Yield what is to be said of the file of keys; `unit`: the installed unit is to read it, as a user of its own."""
     if not vehicle.commands.key_file:
         return
@@ -130,22 +130,26 @@ def key_findings(vehicle: VehicleConfig, unit: bool = False) -> Iterator[Finding
         keys = read_keys(path)
     except KeyFileError as error:
         if os.path.exists(path) and not os.access(path, os.R_OK) and handed:
-            yield Finding(Grade.OK, subject, f"{path} is handed to the service by systemd, and not for this user")
+            yield Diagnosis(
+                DiagnosisLevel.OK, subject, f"{path} is handed to the service by systemd, and not for this user"
+            )
             return
-        yield Finding(Grade.ERROR, subject, str(error), why, _key_command(path))
+        yield Diagnosis(DiagnosisLevel.ERROR, subject, str(error), why, _key_command(path))
         return
     if unit and not handed:
         seen = f"{path} is well, and systemd does not hand it to the service, whose user may not read it"
         command = f"sudo modelserver install  # writes LoadCredential={os.path.basename(quoted)}:{quoted}"
-        yield Finding(Grade.ERROR, subject, seen, why, command)
+        yield Diagnosis(DiagnosisLevel.ERROR, subject, seen, why, command)
         return
     shared = "" if handed else shared_folder(path)
     if shared:
         seen = f"{path} is reached by {shared}, which a group may write"
         danger = "who is in the group can put another key in its place, and command the vehicle with that"
-        yield Finding(Grade.WARNING, subject, seen, danger, f"sudo chmod g-w {shlex.quote(shared)}")
+        yield Diagnosis(DiagnosisLevel.WARNING, subject, seen, danger, f"sudo chmod g-w {shlex.quote(shared)}")
         return
-    yield Finding(Grade.OK, subject, f"{path} may be read by this user alone or its group, {counted(len(keys), 'key')}")
+    yield Diagnosis(
+        DiagnosisLevel.OK, subject, f"{path} may be read by this user alone or its group, {counted(len(keys), 'key')}"
+    )
 
 
 def _key_command(path: str) -> str:
@@ -185,10 +189,12 @@ def _is_outside(directory: Path, given: str) -> bool:
     return bool(given) and not any(directory.is_relative_to(each) for each in (given, *STATE))
 
 
-def _outside(subject: str, directory: Path, given: str, why: str, key: str) -> Finding:
+def _outside(subject: str, directory: Path, given: str, why: str, key: str) -> Diagnosis:
     seen = f"{directory} lies where the unit may not write"
     why = f"{why}; leave {key} out of the vehicle file, or name a folder in {given}"
-    return Finding(Grade.WARNING, subject, seen, why, f"sudoedit {VEHICLE} && sudo systemctl restart {SERVICE}")
+    return Diagnosis(
+        DiagnosisLevel.WARNING, subject, seen, why, f"sudoedit {VEHICLE} && sudo systemctl restart {SERVICE}"
+    )
 
 
 def _first_there(directory: Path) -> Path:
@@ -196,21 +202,23 @@ def _first_there(directory: Path) -> Path:
     return next((each for each in (directory, *directory.parents) if os.path.exists(each)), Path("/"))
 
 
-def _trouble(subject: str, directory: Path, why: str) -> Finding | None:
+def _trouble(subject: str, directory: Path, why: str) -> Diagnosis | None:
     """Return why nothing can be written in a directory, None where it can."""
     there = _first_there(directory)
     quoted = shlex.quote(str(there))
     if not there.is_dir():
-        return Finding(Grade.WARNING, subject, f"{there} is no folder", why, f"mv {quoted} {quoted}.aside")
+        return Diagnosis(DiagnosisLevel.WARNING, subject, f"{there} is no folder", why, f"mv {quoted} {quoted}.aside")
     lock = directory / LOCK_NAME
     if os.access(there, os.W_OK | os.X_OK) and (not os.path.exists(lock) or os.access(lock, os.R_OK | os.W_OK)):
         return None
     if os.statvfs(there).f_flag & os.ST_RDONLY:
         command = f'sudo mount -o remount,rw "$(findmnt -no TARGET -T {quoted})"'
-        return Finding(Grade.WARNING, subject, f"{directory} is on a file system that is read-only", why, command)
+        return Diagnosis(
+            DiagnosisLevel.WARNING, subject, f"{directory} is on a file system that is read-only", why, command
+        )
     quoted = shlex.quote(str(directory))
     command = f"sudo mkdir -p {quoted} && sudo chown -R {os.geteuid()} {quoted}"
-    return Finding(Grade.WARNING, subject, f"{directory} may not be written by this user", why, command)
+    return Diagnosis(DiagnosisLevel.WARNING, subject, f"{directory} may not be written by this user", why, command)
 
 
 def _largest(directory: Path) -> str:

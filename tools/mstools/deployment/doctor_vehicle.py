@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from modelserver.config import VehicleConfig, load_config
 from modelserver.errors import Problem, Severity
-from modelserver.service.probing.findings import Finding, Grade
+from modelserver.service.probing.findings import Diagnosis, DiagnosisLevel
 from modelserver.service.probing.probe import Interface
 from modelserver.version import __version__
 from mstools.deployment.doctor_files import file_findings
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from msdrivers.settings import DriverSettings
 
 
-def versions() -> Finding:
+def versions() -> Diagnosis:
     """Return what runs here."""
     seen = f"modelserver {__version__}, lcm {version('lcm')}, Python {platform.python_version()}"
-    return Finding(Grade.OK, "versions", seen)
+    return Diagnosis(DiagnosisLevel.OK, "versions", seen)
 
 
 def read_vehicle(file: Path) -> VehicleConfig:
@@ -34,7 +34,7 @@ def read_vehicle(file: Path) -> VehicleConfig:
     return load_config(file)
 
 
-def vehicle_findings(vehicle: VehicleConfig, file: Path) -> tuple[Finding, ...]:
+def vehicle_findings(vehicle: VehicleConfig, file: Path) -> tuple[Diagnosis, ...]:
     """Return what is to be said of a vehicle file on this machine."""
     from modelserver.service.probing.machine import interfaces
 
@@ -58,7 +58,7 @@ def _read(vehicle: VehicleConfig, file: Path) -> tuple[tuple[Problem, ...], Iter
     return (*problems, *drivers_problems(vehicle, str(file), geometry.constraints)), drivers.values()
 
 
-def file_finding(problems: Iterable[Problem], file: Path) -> Finding:
+def file_finding(problems: Iterable[Problem], file: Path) -> Diagnosis:
     """Return what is to be said of a vehicle file with these problems."""
     problems = tuple(problems)
     command = f"modelserver check {shlex.quote(str(file))}"
@@ -66,14 +66,16 @@ def file_finding(problems: Iterable[Problem], file: Path) -> Finding:
     warnings = [each for each in problems if each.severity is Severity.WARNING]
     if errors:
         seen = f"{file} has {counted(len(errors), 'error')}, the first: {errors[0].message}"
-        return Finding(Grade.ERROR, "vehicle file", seen, "the service or a driver does not start with it", command)
+        return Diagnosis(
+            DiagnosisLevel.ERROR, "vehicle file", seen, "the service or a driver does not start with it", command
+        )
     if warnings:
         seen = f"{file} loads, with {counted(len(warnings), 'warning')}, the first: {warnings[0].message}"
-        return Finding(Grade.WARNING, "vehicle file", seen, "it may not be what is meant", command)
-    return Finding(Grade.OK, "vehicle file", f"{file} loads, and its geometry")
+        return Diagnosis(DiagnosisLevel.WARNING, "vehicle file", seen, "it may not be what is meant", command)
+    return Diagnosis(DiagnosisLevel.OK, "vehicle file", f"{file} loads, and its geometry")
 
 
-def line_findings(drivers: Iterable[DriverSettings], networks: Iterable[Interface]) -> Iterator[Finding]:
+def line_findings(drivers: Iterable[DriverSettings], networks: Iterable[Interface]) -> Iterator[Diagnosis]:
     """Yield what is to be said of the lines of drivers; `networks` are the network interfaces of this machine."""
     from msdrivers.line_settings import CanSettings, SerialSettings
 
@@ -85,34 +87,38 @@ def line_findings(drivers: Iterable[DriverSettings], networks: Iterable[Interfac
         elif isinstance(driver.line, CanSettings) and driver.line.interface == "socketcan":
             yield _can(subject, driver.line.can, by_name)
         else:
-            yield Finding(Grade.OK, subject, f"{driver.line}: only trying it tells")
+            yield Diagnosis(DiagnosisLevel.OK, subject, f"{driver.line}: only trying it tells")
 
 
-def _serial(subject: str, port: str) -> Finding:
+def _serial(subject: str, port: str) -> Diagnosis:
     from msdrivers.links.ports import hint_for, near_ports, permission_fix
 
     if not os.path.exists(port):
         near = near_ports(port)
         seen = f"{port} is not there" + (f"; there are: {', '.join(near[:3])}" if near else "")
         why = "the driver waits until it is"
-        return Finding(Grade.WARNING, subject, seen, why, "modelserver driver --list")
+        return Diagnosis(DiagnosisLevel.WARNING, subject, seen, why, "modelserver driver --list")
     if not os.access(port, os.R_OK | os.W_OK):
         why = permission_fix(port)
         joining = re.search(r"sudo usermod -aG \S+ [^\s,]+", why)
         command = joining.group() if joining else f"ls -l {port}"
-        return Finding(Grade.ERROR, subject, f"{port} may not be opened by this user", why, command)
+        return Diagnosis(DiagnosisLevel.ERROR, subject, f"{port} may not be opened by this user", why, command)
     hint = hint_for(port)
-    return Finding(Grade.NOTE, subject, f"{port} is {hint}") if hint else Finding(Grade.OK, subject, f"{port} is free")
+    return (
+        Diagnosis(DiagnosisLevel.NOTE, subject, f"{port} is {hint}")
+        if hint
+        else Diagnosis(DiagnosisLevel.OK, subject, f"{port} is free")
+    )
 
 
-def _can(subject: str, name: str, networks: dict[str, Interface]) -> Finding:
+def _can(subject: str, name: str, networks: dict[str, Interface]) -> Diagnosis:
     bring_up = f"sudo ip link set {name} up type can bitrate 500000"
     network = networks.get(name)
     if network is None:
         why = "the driver waits until it is"
         command = f"modelserver driver --list; {bring_up}"
-        return Finding(Grade.WARNING, subject, f"network interface {name} is not there", why, command)
+        return Diagnosis(DiagnosisLevel.WARNING, subject, f"network interface {name} is not there", why, command)
     if not network.up:
         why = "no frame comes or goes; the bitrate is the bus's own"
-        return Finding(Grade.ERROR, subject, f"network interface {name} is down", why, bring_up)
-    return Finding(Grade.OK, subject, f"network interface {name} is up")
+        return Diagnosis(DiagnosisLevel.ERROR, subject, f"network interface {name} is down", why, bring_up)
+    return Diagnosis(DiagnosisLevel.OK, subject, f"network interface {name} is up")

@@ -9,7 +9,7 @@ from ipaddress import ip_address
 from typing import Final, NoReturn
 from urllib.parse import parse_qs, urlsplit
 
-from modelserver.errors import ConfigError, ModelServerError, Problem, Severity, Source, nearest_names, shown
+from modelserver.errors import ConfigError, Location, ModelServerError, Problem, Severity, nearest_names, shown
 from modelserver.wire.multicast import group_of
 from mstools.deployment.plan import CONFIGURATION, DRIVER, LOOPBACK, RULES, SERVICE, SYSCTL, UNITS, Facts, Write
 
@@ -104,7 +104,7 @@ def _refuse(why: str, whose: str, fix: str = "") -> NoReturn:
 
 
 def _problem(why: str, whose: str, fix: str = "") -> Problem:
-    return Problem(Severity.ERROR, why, Source(whose), fix)
+    return Problem(Severity.ERROR, why, Location(whose), fix)
 
 
 def loopback_group(url: str) -> str:

@@ -69,7 +69,7 @@ class Remove:
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class RunProgram:
     """Run a program. Where it `may_fail`, the rest is done all the same."""
 
     arguments: tuple[str, ...]
@@ -80,7 +80,7 @@ class Command:
         return f"run     {' '.join(self.arguments)}: {self.what}"
 
 
-Step: TypeAlias = Write | Keep | Remove | Command
+Step: TypeAlias = Write | Keep | Remove | RunProgram
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +221,7 @@ def plan_uninstall(facts: Facts, *, purge: bool) -> Plan:
     steps: list[Step] = []
     if manifest.units:
         ended = _systemctl(facts, "they end, and start no more", "disable", *_now(facts), *manifest.units)
-        steps.append(Command(ended.arguments, ended.what, may_fail=True))
+        steps.append(RunProgram(ended.arguments, ended.what, may_fail=True))
     removed = set()
     for path, hashes in sorted(manifest.files.items()):
         there = facts.files.get(path)
@@ -255,12 +255,12 @@ def _after_files(facts: Facts, changed: Iterable[str]) -> list[Step]:
     steps: list[Step] = []
     if RULES in changed and "udevadm" in facts.programs:
         udevadm = facts.programs["udevadm"]
-        steps.append(Command((udevadm, "control", "--reload"), "the rules for serial ports count", may_fail=True))
+        steps.append(RunProgram((udevadm, "control", "--reload"), "the rules for serial ports count", may_fail=True))
         trigger = (udevadm, "trigger", "--subsystem-match=tty", "--action=change")
-        steps.append(Command(trigger, "also for what is plugged in", may_fail=True))
+        steps.append(RunProgram(trigger, "also for what is plugged in", may_fail=True))
     if SYSCTL in changed and "sysctl" in facts.programs and SYSCTL not in facts.files:
         load = (facts.programs["sysctl"], "--quiet", "--load", SYSCTL)
-        steps.append(Command(load, "the limit counts from now on", may_fail=True))
+        steps.append(RunProgram(load, "the limit counts from now on", may_fail=True))
     if any(path.startswith(f"{UNITS}/") for path in changed):
         steps.append(_systemctl(facts, "systemd reads the units", "daemon-reload"))
     return steps
@@ -272,9 +272,9 @@ def folders_around(path: str) -> list[str]:
     return ["/".join(parts[:n]) for n in range(2, len(parts) + 1)]
 
 
-def _systemctl(facts: Facts, what: str, *arguments: str) -> Command:
+def _systemctl(facts: Facts, what: str, *arguments: str) -> RunProgram:
     program = facts.programs.get("systemctl", "systemctl")
-    return Command((program, *(() if facts.root == "/" else (f"--root={facts.root}",)), *arguments), what)
+    return RunProgram((program, *(() if facts.root == "/" else (f"--root={facts.root}",)), *arguments), what)
 
 
 def _now(facts: Facts) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from typing import NoReturn
 
 import typer
 
-from modelserver.errors import ConfigError, GeometryError, ModelServerError, Problem, Severity, Source
+from modelserver.errors import ConfigError, GeometryError, Location, ModelServerError, Problem, Severity
 from modelserver.service.supervision.notify import Notifier
 from modelserver.service.supervision.patience import Files
 from mstools.terminal.output import print_problem
@@ -72,4 +72,4 @@ def status_of(problems: Iterable[Problem]) -> str:
 
 
 def _problem(why: str, config: Path) -> Problem:
-    return Problem(Severity.ERROR, why, Source(str(config)))
+    return Problem(Severity.ERROR, why, Location(str(config)))

@@ -20,12 +20,12 @@ from mstools.deployment.plan import (
     MANIFEST,
     RULES,
     VEHICLE,
-    Command,
     Facts,
     Keep,
     Manifest,
     Plan,
     Remove,
+    RunProgram,
     Step,
     Write,
     digest,
@@ -104,7 +104,7 @@ def carry_out(plan: Plan, root: Path) -> None:
 
 def _words(step: Step, root: Path) -> str:
     """Return a step for people, with the path that is touched."""
-    return str(step if isinstance(step, Command) else replace(step, path=str(below(root, step.path))))
+    return str(step if isinstance(step, RunProgram) else replace(step, path=str(below(root, step.path))))
 
 
 def _carry_out(step: Step, root: Path) -> None:
@@ -112,7 +112,7 @@ def _carry_out(step: Step, root: Path) -> None:
         _write(step, root)
     elif isinstance(step, Remove):
         _remove(step, root)
-    elif isinstance(step, Command):
+    elif isinstance(step, RunProgram):
         _run(step)
     else:
         assert isinstance(step, Keep)
@@ -151,7 +151,7 @@ def _remove(step: Remove, root: Path) -> None:
             path.rmdir()
 
 
-def _run(step: Command) -> None:
+def _run(step: RunProgram) -> None:
     said = ""
     try:
         done = subprocess.run(step.arguments, capture_output=True, text=True, timeout=COMMAND_S, check=False)

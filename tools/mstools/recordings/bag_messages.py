@@ -36,7 +36,7 @@ STANDSTILL = 1e-3
 """Speeds below, m/s, count as standing: controllers average, and leave dust of 1e-15."""
 
 
-class Kind(StrEnum):
+class TopicKind(StrEnum):
     """What a topic becomes: also the source's name, and in capitals the channel's."""
 
     GPS = "gps"
@@ -46,10 +46,10 @@ class Kind(StrEnum):
 
 
 ROS_TYPES = {
-    "sensor_msgs/msg/NavSatFix": Kind.GPS,
-    "sensor_msgs/msg/Imu": Kind.IMU,
-    "nav_msgs/msg/Odometry": Kind.WHEELS,
-    "sensor_msgs/msg/JointState": Kind.JOINTS,
+    "sensor_msgs/msg/NavSatFix": TopicKind.GPS,
+    "sensor_msgs/msg/Imu": TopicKind.IMU,
+    "nav_msgs/msg/Odometry": TopicKind.WHEELS,
+    "sensor_msgs/msg/JointState": TopicKind.JOINTS,
 }
 
 
@@ -93,16 +93,16 @@ class Converter(Protocol):
         ...
 
 
-def converter(kind: Kind, options: Options) -> Converter:
+def converter(kind: TopicKind, options: Options) -> Converter:
     """Return a new converter."""
     match kind:
-        case Kind.GPS:
+        case TopicKind.GPS:
             return GpsConverter(options.altitude, options.undulation)
-        case Kind.IMU:
+        case TopicKind.IMU:
             return ImuConverter(options.imu_orientation)
-        case Kind.WHEELS:
+        case TopicKind.WHEELS:
             return WheelsConverter(options.track_width)
-        case Kind.JOINTS:
+        case TopicKind.JOINTS:
             return JointsConverter()
 
 

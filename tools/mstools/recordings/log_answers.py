@@ -9,11 +9,11 @@ from typing import Final, NamedTuple
 from modelserver.client.knowledge import HISTORY_S, Knowledge, Known
 from modelserver.client.local import LocalPlatform
 from modelserver.errors import QueryError, RecordingError, WireError
-from modelserver.formats.snapshot import Snapshot, read
+from modelserver.formats.snapshot import ModelSnapshot, read
 from modelserver.messages import Explanation, MotionAnswer, Policy, PoseAnswer, SnapshotPart
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent, LogFile
-from modelserver.wire.snapshot import Assembler
+from modelserver.wire.snapshot import SnapshotAssembler
 
 CORRECTED_US: Final = 2_000_000
 """So long after an instant what is told of it may still be bettered: by samples that come late."""
@@ -32,7 +32,7 @@ class Contents(NamedTuple):
     `revision` are what the first pose says; `parts` tells of a snapshot that is not whole.
     """
 
-    snapshot: Snapshot | None
+    snapshot: ModelSnapshot | None
     begin: int
     end: int
     base_frame: str
@@ -47,7 +47,7 @@ class LogAnswers(LocalPlatform):
     missing, OSError.
     """
 
-    def __init__(self, path: Path, prefix: str = "", model: Snapshot | None = None):
+    def __init__(self, path: Path, prefix: str = "", model: ModelSnapshot | None = None):
         self.where = f"in {path}"
         self._path = path
         self._prefix = prefix
@@ -56,7 +56,7 @@ class LogAnswers(LocalPlatform):
             self._contents = contents(log, prefix, wanted=model is None)
         if model is not None and self._contents.base_frame:
             base = self._contents.base_frame
-            self._given = Snapshot(model.vehicle, model.model, base, base, model.history_s, model.joints_channel)
+            self._given = ModelSnapshot(model.vehicle, model.model, base, base, model.history_s, model.joints_channel)
         elif model is None and self._contents.snapshot is None:
             raise RecordingError(self._no_geometry())
         self._read: tuple[Known, int] = (Known(), 0)
@@ -195,8 +195,8 @@ def contents(log: LogFile, prefix: str, wanted: bool = True) -> Contents:
     poses: list[int] = []
     sent: list[int] = []
     parts = ""
-    snapshot: Snapshot | None = None
-    assembler, heard = Assembler(), set[tuple[str, int]]()
+    snapshot: ModelSnapshot | None = None
+    assembler, heard = SnapshotAssembler(), set[tuple[str, int]]()
     for event in log:
         try:
             if event.channel == f"{prefix}POSE":

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from modelserver.messages import Mode, Verdict
 from mstools.report.data import Replayed
-from mstools.report.finding import Finding, Grade
+from mstools.report.finding import FindingLevel, ReportFinding
 from mstools.report.raw import Turning, turning
 from mstools.terminal.output import counted
 
@@ -32,7 +32,7 @@ DEGREES = math.degrees(1.0)
 # --- sensors that say nothing, or nothing that can be used ---------------------------------------------------
 
 
-def missing(replayed: Replayed) -> Iterable[Finding]:
+def missing(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for sensors of the vehicle file of which the log has nothing."""
     for key, channel in replayed.silent:
         if replayed.mode in WITHOUT.get(key, ()):
@@ -46,8 +46,8 @@ def missing(replayed: Replayed) -> Iterable[Finding]:
                 f"sensors.{key}"
             )
         )
-        yield Finding(
-            Grade.WRONG,
+        yield ReportFinding(
+            FindingLevel.WRONG,
             f"Nothing on channel {channel} (sensors.{key})",
             f"{there[0].upper()}{there[1:]}.",
             f"{remedy[0].upper()}{remedy[1:]}.",
@@ -83,13 +83,13 @@ def _unused(replayed: Replayed) -> Iterable[_Unused]:
             yield _Unused(key, source, len(reasons), reason)
 
 
-def unused(replayed: Replayed) -> Iterable[Finding]:
+def unused(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for sensors whose samples are there and are not used, nearly all of them."""
     for each in _unused(replayed):
         if each.reason == "gate":
             continue  # fixes and motion contradict each other: which of them is wrong the other rules say
-        yield Finding(
-            Grade.WRONG,
+        yield ReportFinding(
+            FindingLevel.WRONG,
             f"Nothing of sensors.{each.key} is used: {each.reason}",
             f"Of {counted(each.decided, 'sample')} of {each.source} that could have been used, nearly all were "
             f"refused. {_seen(replayed, each)}".strip(),
@@ -143,7 +143,7 @@ def _advice(replayed: Replayed, each: _Unused) -> str:
 # --- units, signs and names: one sensor beside another --------------------------------------------------------
 
 
-def gyro_unit(replayed: Replayed) -> Iterable[Finding]:
+def gyro_unit(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for a gyro in degrees a second: it turns 57 times as fast as wheels or fixes."""
     found = _beside_gyro(replayed)
     if found is None:
@@ -151,8 +151,8 @@ def gyro_unit(replayed: Replayed) -> Iterable[Finding]:
     compared, what = found
     # wheels that are dragged through a turn tell up to twice of it
     if abs(compared.correlation) > 0.5 and 0.4 * DEGREES < compared.ratio < 1.6 * DEGREES:
-        yield Finding(
-            Grade.WRONG,
+        yield ReportFinding(
+            FindingLevel.WRONG,
             "The gyro is in degrees a second",
             f"It turns {compared.ratio:.0f} times as fast as the {what}; a radian is 57.3 degrees.",
             "Give angular_velocity in rad/s: look at the unit in its driver.",
@@ -168,7 +168,7 @@ def _beside_gyro(replayed: Replayed) -> tuple[Turning, str] | None:
     return None
 
 
-def wheel_signs(replayed: Replayed) -> Iterable[Finding]:
+def wheel_signs(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for wheels whose sign, or whose side, is swapped."""
     raw = replayed.raw
     by_gyro = bool(raw.gyro)
@@ -179,8 +179,8 @@ def wheel_signs(replayed: Replayed) -> Iterable[Finding]:
     if straight >= 5 and against > 0.8 * straight:
         backward = raw.backward_wheels()
         names = ", ".join(backward)
-        yield Finding(
-            Grade.WRONG,
+        yield ReportFinding(
+            FindingLevel.WRONG,
             f"Wheel {names} counts backward" if backward else "The wheels of one side count backward",
             f"In {against} of {straight} s straight ahead by the {what} the two sides rolled against each other.",
             "Turn the sign of this wheel in its driver, or swap its encoder's two channels.",
@@ -191,15 +191,15 @@ def wheel_signs(replayed: Replayed) -> Iterable[Finding]:
     if compared is None or compared.correlation > -0.6:
         return
     if by_gyro and course is not None and course.correlation > 0.6:
-        yield Finding(
-            Grade.WRONG,
+        yield ReportFinding(
+            FindingLevel.WRONG,
             "The gyro turns against the wheels and the fixes",
             f"Its turns are opposite to the wheels' (correlation {compared.correlation:.2f}).",
             "Look at the inertial unit's mount in the geometry, and at the signs in its driver.",
         )
         return
-    yield Finding(
-        Grade.WRONG,
+    yield ReportFinding(
+        FindingLevel.WRONG,
         "Left and right wheels are swapped",
         f"By the wheels it turns against the {what} (correlation {compared.correlation:.2f}).",
         "Swap the names in sensors.wheels.frames, or the frames' places in the geometry; where all wheels count "
@@ -211,7 +211,7 @@ def _is_degrees(replayed: Replayed) -> bool:
     return any(True for _ in gyro_unit(replayed))
 
 
-def ways(replayed: Replayed) -> Iterable[Finding]:
+def ways(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for fixes that move another distance than the wheels roll: one of them is in another unit."""
     found = replayed.raw.ways()
     if found.wheels < 20.0:
@@ -225,15 +225,15 @@ def ways(replayed: Replayed) -> Iterable[Finding]:
         advice = "1000 is mm for m: give travel in m and speed in m/s in the wheels' driver."
     else:
         advice = "Look at the units in both drivers (m and m/s; degrees), and at the wheels' radius."
-    yield Finding(
-        Grade.WRONG,
+    yield ReportFinding(
+        FindingLevel.WRONG,
         f"Fixes moved {found.fixes:.1f} m while the wheels rolled {found.wheels:.0f} m",
         f"The wheels tell {ratio:.3g} times the way of the fixes.",
         advice,
     )
 
 
-def gravity(replayed: Replayed) -> Iterable[Finding]:
+def gravity(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for gravity of another strength than the Earth's, or that does not come from below."""
     if replayed.felt_up is None:
         return
@@ -241,30 +241,30 @@ def gravity(replayed: Replayed) -> Iterable[Finding]:
     angle = math.atan2(math.hypot(x, y), z)
     size = math.sqrt(x * x + y * y + z * z)
     if angle > 0.3 and size > 0.5:
-        yield Finding(
-            Grade.WRONG,
+        yield ReportFinding(
+            FindingLevel.WRONG,
             "The inertial unit is mounted otherwise than the geometry says",
             f"The mean specific force points {math.degrees(angle):.0f} degrees away from the vehicle's up "
             f"({x:+.1f}, {y:+.1f}, {z:+.1f} m/s2 along x, y, z).",
             "Run modelserver calibrate imu LOG -c VEHICLE: it says which mount fits.",
         )
     if 0.9 < size < 1.1:
-        yield Finding(
-            Grade.WRONG,
+        yield ReportFinding(
+            FindingLevel.WRONG,
             "Specific force is in g, not in m/s2",
             f"Its mean is {size:.2f}, and gravity is 9.81 m/s2.",
             "Give specific_force in m/s2: look at the unit in its driver.",
         )
     elif not 9.0 < size < 10.6:
-        yield Finding(
-            Grade.WRONG,
+        yield ReportFinding(
+            FindingLevel.WRONG,
             f"The inertial unit feels {size:.2f} m/s2 in the mean",
             "Whatever the vehicle does, the mean of its specific force is near 9.8 m/s2.",
             "Look at the unit of acceleration in the driver, and whether gravity is taken off there.",
         )
 
 
-CAUSES: tuple[Callable[[Replayed], Iterable[Finding]], ...] = (
+CAUSES: tuple[Callable[[Replayed], Iterable[ReportFinding]], ...] = (
     missing,
     unused,
     gravity,

@@ -41,7 +41,7 @@ FROZEN_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Snapshot:
+class StateSample:
     """What was known at an instant, `t` seconds from the log's first event. What is not known is nan, None or empty.
 
     `place` is the antenna's (without a receiver the rolling frame's) east, north, up of the origin in World:UTM, `yaw`
@@ -70,7 +70,7 @@ class Snapshot:
 
 
 @dataclass(frozen=True, slots=True)
-class Fix:
+class FixRecord:
     """A fix beside what became of it. `place` as a snapshot's; None: no place, or no origin.
 
     `off` is how far it lay from the antenna, east and north, metres, what lingers in fixes left in; `velocity` the
@@ -131,8 +131,8 @@ class Replayed:
     first_utime: int
     seconds: float
     settings: FilterSettings
-    snapshots: tuple[Snapshot, ...] = ()
-    fixes: tuple[Fix, ...] = ()
+    snapshots: tuple[StateSample, ...] = ()
+    fixes: tuple[FixRecord, ...] = ()
     decisions: tuple[Decision, ...] = ()
     wheels: tuple[WheelTurn, ...] = ()
     sensors: tuple[Sensor, ...] = ()
@@ -167,7 +167,7 @@ class Collector:
         gps = self._rig.gps_frame
         self._X_rolling_antenna = self._rig.pose(gps) if gps else Pose.identity()
         self._decisions: list[Decision] = []
-        self._states: list[tuple[int, Snapshot]] = []
+        self._states: list[tuple[int, StateSample]] = []
         self._fixes: list[GpsSample] = []
         self._turns: list[tuple[int, str, float, float]] = []
         self._before: dict[str, WheelsSample] = {}
@@ -265,7 +265,7 @@ class Collector:
 
     # --- what is noted --------------------------------------------------------------------------------------
 
-    def _snapshot(self, utime: int, localizer: Localizer) -> Snapshot:
+    def _snapshot(self, utime: int, localizer: Localizer) -> StateSample:
         estimate = localizer.estimate(utime)
         if estimate.origin is not None:
             self._origin = estimate.origin
@@ -277,7 +277,7 @@ class Collector:
                 P = np.array(estimate.covariance).reshape(6, 6)
                 sigma = math.sqrt(max(float(np.linalg.eigvalsh(P[:2, :2])[-1]), 0.0))
                 yaw_sigma = math.sqrt(max(float(P[5, 5]), 0.0))
-        known = Snapshot(
+        known = StateSample(
             t=0.0,
             invalid=estimate.invalid,
             epoch=estimate.pose_epoch,
@@ -333,7 +333,7 @@ class Collector:
 
     # --- put together at the end ----------------------------------------------------------------------------
 
-    def _judged(self, first_utime: int, snapshots: tuple[Snapshot, ...]) -> tuple[Fix, ...]:
+    def _judged(self, first_utime: int, snapshots: tuple[StateSample, ...]) -> tuple[FixRecord, ...]:
         settings = self._vehicle.config.localization.filter
         decided = {(d.source, d.utime, d.seq): d for d in self._decisions if d.kind == "gps_position"}
         geodesy = None if self._origin is None else Geodesy(self._origin)
@@ -366,10 +366,10 @@ class Collector:
             # where nothing is decided, as in raw mode, it is the gate that tells
             if not decided and isinstance(fix, str):
                 verdict, reason = "rejected", fix
-            found.append(Fix(t, place, sigma, verdict, reason, off, velocity))
+            found.append(FixRecord(t, place, sigma, verdict, reason, off, velocity))
         return tuple(found)
 
-    def _wheel_turns(self, first_utime: int, snapshots: tuple[Snapshot, ...]) -> tuple[WheelTurn, ...]:
+    def _wheel_turns(self, first_utime: int, snapshots: tuple[StateSample, ...]) -> tuple[WheelTurn, ...]:
         known = [each for each in snapshots if math.isfinite(each.speed)]
         if not known or not self._turns:
             return ()
@@ -392,7 +392,7 @@ class Collector:
         return tuple(found)
 
 
-def _with_state(snapshot: Snapshot, state: NavigationState) -> Snapshot:
+def _with_state(snapshot: StateSample, state: NavigationState) -> StateSample:
     variances = np.diagonal(np.array(state.covariance).reshape(len(state.names), -1))
     return replace(
         snapshot,
@@ -407,12 +407,12 @@ def _with_state(snapshot: Snapshot, state: NavigationState) -> Snapshot:
     )
 
 
-def _velocity(snapshot: Snapshot) -> tuple[float, float]:
+def _velocity(snapshot: StateSample) -> tuple[float, float]:
     c, s = math.cos(snapshot.yaw), math.sin(snapshot.yaw)
     return (c * snapshot.speed - s * snapshot.side, s * snapshot.speed + c * snapshot.side)
 
 
-def _latest(snapshots: tuple[Snapshot, ...], times: Array, t: float) -> Snapshot | None:
+def _latest(snapshots: tuple[StateSample, ...], times: Array, t: float) -> StateSample | None:
     """Return the newest snapshot that is not newer than `t`, and not older than a second."""
     index = int(np.searchsorted(times, t, side="right")) - 1
     return snapshots[index] if index >= 0 and t - times[index] < 1.0 else None
@@ -423,4 +423,4 @@ def _yaw(pose: Pose) -> float:
     return math.atan2(y, x)
 
 
-__all__ = ["Collector", "Fix", "Replayed", "Sensor", "Snapshot", "WheelTurn"]
+__all__ = ["Collector", "FixRecord", "Replayed", "Sensor", "StateSample", "WheelTurn"]

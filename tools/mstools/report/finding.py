@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 
-class Grade(IntEnum):
+class FindingLevel(IntEnum):
     """How much a finding matters, worst first."""
 
     WRONG = 0
@@ -15,10 +15,10 @@ class Grade(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class ReportFinding:
     """One finding: a headline, what was seen, and what to do about it."""
 
-    grade: Grade
+    grade: FindingLevel
     title: str
     seen: str
     advice: str

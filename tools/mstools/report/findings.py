@@ -16,8 +16,8 @@ from modelserver.messages import Decision, Invalid, Verdict
 from modelserver.spatial.so3 import Array
 from mstools.report import consistency
 from mstools.report.causes import CAUSES
-from mstools.report.data import Replayed, Snapshot, WheelTurn
-from mstools.report.finding import Finding, Grade
+from mstools.report.data import Replayed, StateSample, WheelTurn
+from mstools.report.finding import FindingLevel, ReportFinding
 from mstools.terminal.output import counted
 
 MOVING = 0.3
@@ -27,7 +27,7 @@ LEAST_TURNS = 20
 """Fewest wheel samples on the move that a wheel is judged by."""
 
 
-def findings(replayed: Replayed) -> list[Finding]:
+def findings(replayed: Replayed) -> list[ReportFinding]:
     """Return all findings, worst first, and of equals the causes first.
 
     What only follows from a sensor that is wrong, or from a filter that had to begin anew, is left out.
@@ -47,7 +47,7 @@ def findings(replayed: Replayed) -> list[Finding]:
 # --- wheels -------------------------------------------------------------------------------------------------
 
 
-def wheels_reversed(replayed: Replayed) -> Iterable[Finding]:
+def wheels_reversed(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for wheels that tell the negative of what is expected of them, and for wheels that tell nothing."""
     for name, turns in sorted(_by_wheel(replayed.wheels).items()):
         moving = [each for each in turns if abs(each.expected) > MOVING]
@@ -55,8 +55,8 @@ def wheels_reversed(replayed: Replayed) -> Iterable[Finding]:
             continue
         against = [each for each in moving if abs(each.measured + each.expected) < 0.3 * abs(each.expected)]
         if len(against) > 0.5 * len(moving):
-            yield Finding(
-                Grade.WRONG,
+            yield ReportFinding(
+                FindingLevel.WRONG,
                 f"Wheel {name} counts backward",
                 f"In {len(against)} of {len(moving)} samples on the move it told the negative of what was expected.",
                 "Turn the sign of this wheel in its driver, or swap its encoder's two channels.",
@@ -65,8 +65,8 @@ def wheels_reversed(replayed: Replayed) -> Iterable[Finding]:
         silent = [each for each in moving if abs(each.measured) < 0.02]
         longest = _longest(silent, moving)
         if len(silent) > 0.5 * len(moving) or longest > 5.0:
-            yield Finding(
-                Grade.WRONG,
+            yield ReportFinding(
+                FindingLevel.WRONG,
                 f"Wheel {name} stands while the vehicle drives",
                 f"It told no motion in {len(silent)} of {len(moving)} samples on the move, for up to {longest:.0f} s.",
                 "Look at its encoder, cable and plug; a wheel without encoder is left out of sensors.wheels.frames.",
@@ -93,36 +93,36 @@ def _longest(marked: list[WheelTurn], among: list[WheelTurn]) -> float:
     return longest
 
 
-def always_backward(replayed: Replayed) -> Iterable[Finding]:
+def always_backward(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for a vehicle that drives backward nearly all the time: then front and rear are mistaken."""
     moving = [each for each in replayed.snapshots if abs(each.speed) > MOVING]
     backward = sum(each.speed < 0.0 for each in moving)
     if len(moving) >= 2 * LEAST_TURNS and backward > 0.8 * len(moving):
-        yield Finding(
-            Grade.DOUBTFUL,
+        yield ReportFinding(
+            FindingLevel.DOUBTFUL,
             "The vehicle drives backward nearly all the time",
             f"Forward speed is negative in {backward / len(moving):.0%} of the time on the move.",
             "If it drove forward: all wheels count backward, or the inertial unit's mount is turned by 180 degrees.",
         )
 
 
-def wheel_scale(replayed: Replayed) -> Iterable[Finding]:
+def wheel_scale(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for wheels of another size than their driver takes them for, or at another angle than in the geometry."""
     last = _last(replayed)
     settings = replayed.settings
     scale, sigma = _state(last, "wheel_scale")
     if math.isfinite(scale) and abs(scale) > max(2.0 * settings.wheel_scale_sigma, 3.0 * sigma):
         word = "too far" if scale > 0.0 else "too short"
-        yield Finding(
-            Grade.DOUBTFUL,
+        yield ReportFinding(
+            FindingLevel.DOUBTFUL,
             f"The wheels tell {abs(scale):.1%} {word}",
             f"wheel_scale ended at {scale:+.3f} +- {sigma:.3f}; {settings.wheel_scale_sigma:.3f} was expected of it.",
             f"Set the wheels' radius in their driver to {1.0 / (1.0 + scale):.3f} of what it is.",
         )
     yaw, sigma = _state(last, "wheel_yaw")
     if math.isfinite(yaw) and abs(yaw) > max(3.0 * settings.wheel_yaw_sigma, 3.0 * sigma):
-        yield Finding(
-            Grade.DOUBTFUL,
+        yield ReportFinding(
+            FindingLevel.DOUBTFUL,
             f"The wheels roll {abs(math.degrees(yaw)):.1f} degrees to the {'left' if yaw > 0.0 else 'right'}",
             f"wheel_yaw ended at {math.degrees(yaw):+.2f} +- {math.degrees(sigma):.2f} degrees from the geometry's x.",
             "Survey the rolling frame's yaw, or the inertial unit's: gravity and wheels cannot tell the two apart.",
@@ -132,13 +132,13 @@ def wheel_scale(replayed: Replayed) -> Iterable[Finding]:
 # --- the inertial unit --------------------------------------------------------------------------------------
 
 
-def frozen_unit(replayed: Replayed) -> Iterable[Finding]:
+def frozen_unit(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for an inertial unit that repeats one value."""
     if replayed.frozen:
         total = sum(b - a for a, b in replayed.frozen)
         begin = replayed.frozen[0][0]
-        yield Finding(
-            Grade.WRONG,
+        yield ReportFinding(
+            FindingLevel.WRONG,
             "The inertial unit froze",
             f"It repeated one value {counted(len(replayed.frozen), 'time')}, {total:.1f} s in all, first at "
             f"{begin:.0f} s.",
@@ -147,7 +147,7 @@ def frozen_unit(replayed: Replayed) -> Iterable[Finding]:
         )
 
 
-def biases(replayed: Replayed) -> Iterable[Finding]:
+def biases(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for biases far outside the data sheet's."""
     last, settings = _last(replayed), replayed.settings
     for kind, limit, unit, factor in (
@@ -157,8 +157,8 @@ def biases(replayed: Replayed) -> Iterable[Finding]:
         for axis in "xyz":
             value, sigma = _state(last, f"{kind}_{axis}")
             if math.isfinite(value) and abs(value) > 3.0 * limit and abs(value) > 3.0 * sigma:
-                yield Finding(
-                    Grade.DOUBTFUL,
+                yield ReportFinding(
+                    FindingLevel.DOUBTFUL,
                     f"{kind.replace('_', ' ').capitalize()} about {axis} is far outside its data sheet"
                     if kind == "gyro_bias"
                     else f"Accelerometer bias along {axis} is far outside its data sheet",
@@ -189,7 +189,7 @@ ADVICE = {
 GENERAL = "Take its stated sigma for what it is worth; look for a mount, a latency or a sensor's place."
 
 
-def stated_sigma(replayed: Replayed) -> Iterable[Finding]:
+def stated_sigma(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for kinds of measurement whose innovations are far from what is expected of them."""
     # what is known without a sensor has its noise widened on purpose
     constraints = {each.kind for each in replayed.decisions if each.source == "filter"}
@@ -202,17 +202,17 @@ def stated_sigma(replayed: Replayed) -> Iterable[Finding]:
         )
         if each.mean > 2.5:
             advice = ADVICE.get(each.kind, GENERAL)
-            yield Finding(Grade.DOUBTFUL, f"{each.kind} errs more than its sigma says", seen, advice)
+            yield ReportFinding(FindingLevel.DOUBTFUL, f"{each.kind} errs more than its sigma says", seen, advice)
         elif each.mean < 0.15 and each.kind not in constraints:
-            yield Finding(
-                Grade.NOTE,
+            yield ReportFinding(
+                FindingLevel.NOTE,
                 f"{each.kind} errs less than its sigma says",
                 seen,
                 "Nothing is wrong; it could count for more. modelserver tune says whether it is worth it.",
             )
 
 
-def latency(replayed: Replayed) -> Iterable[Finding]:
+def latency(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for fixes that lie behind the vehicle by a constant time."""
     found = fix_latency(replayed)
     if found is None:
@@ -220,8 +220,8 @@ def latency(replayed: Replayed) -> Iterable[Finding]:
     seconds, sigma = found
     if abs(seconds) > max(0.1, 4.0 * sigma):
         where = "behind" if seconds > 0.0 else "ahead of"
-        yield Finding(
-            Grade.DOUBTFUL,
+        yield ReportFinding(
+            FindingLevel.DOUBTFUL,
             f"Fixes lie {abs(seconds):.2f} s {where} the vehicle",
             f"Their residuals along the way go with the speed: {seconds:+.2f} +- {sigma:.2f} s.",
             f"If the receiver's stamps are late, set sensors.gps.latency: {seconds:.2f} and see whether NIS falls."
@@ -281,15 +281,15 @@ WORDS = {
 """What to know of the reasons for which fixes are refused."""
 
 
-def refused_fixes(replayed: Replayed) -> Iterable[Finding]:
+def refused_fixes(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for a large share of fixes that were refused, and why."""
     reasons = Counter(each.reason or each.verdict for each in replayed.fixes if each.verdict == "rejected")
     refused, total = sum(reasons.values()), len(replayed.fixes)
     if total >= 20 and refused > 0.2 * total:
         words = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common(3))
         known = [WORDS.get(reason, f"{reason}: docs/localization.md") for reason, _ in reasons.most_common(3)]
-        yield Finding(
-            Grade.DOUBTFUL,
+        yield ReportFinding(
+            FindingLevel.DOUBTFUL,
             f"{refused / total:.0%} of the fixes were refused",
             f"Of {counted(total, 'fix', 'fixes')} as positions: {words}.",
             f"{'; '.join(known)}.",
@@ -299,7 +299,7 @@ def refused_fixes(replayed: Replayed) -> Iterable[Finding]:
 # --- all ----------------------------------------------------------------------------------------------------
 
 
-def stamps(replayed: Replayed) -> Iterable[Finding]:
+def stamps(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for samples that came too late, twice, or out of order."""
     for reason, advice in (
         ("late", "They arrive longer after their stamps than localization.filter.horizon: look at the clock or link."),
@@ -312,33 +312,36 @@ def stamps(replayed: Replayed) -> Iterable[Finding]:
                 by_source[source] += count
         for source, count in sorted(by_source.items()):
             if count >= 5:
-                yield Finding(
-                    Grade.DOUBTFUL, f"{source}: {counted(count, 'sample')} {reason}", "They were not used.", advice
+                yield ReportFinding(
+                    FindingLevel.DOUBTFUL,
+                    f"{source}: {counted(count, 'sample')} {reason}",
+                    "They were not used.",
+                    advice,
                 )
 
 
-def gaps(replayed: Replayed) -> Iterable[Finding]:
+def gaps(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for sensors with gaps that cost accuracy."""
     for sensor in replayed.sensors:
         found = [(a, b) for a, b in sensor.gaps() if b - a > max(1.0, 5.0 * sensor.period)]
         if found:
             longest = max(b - a for a, b in found)
-            yield Finding(
-                Grade.NOTE,
+            yield ReportFinding(
+                FindingLevel.NOTE,
                 f"{sensor.name}: {counted(len(found), 'gap')}, the longest {longest:.1f} s",
                 f"It speaks every {sensor.period:.3g} s otherwise; the first gap begins at {found[0][0]:.0f} s.",
                 "See what the position's sigma does meanwhile; look at the device's link if it was not meant.",
             )
 
 
-def validity(replayed: Replayed, explained: bool = False) -> Iterable[Finding]:
+def validity(replayed: Replayed, explained: bool = False) -> Iterable[ReportFinding]:
     """Look for poses that were not valid for long after the start, and for headings that were never found.
 
     `explained`: other findings say why; then the reasons given with poses, which only follow, are not repeated.
     """
     if not replayed.snapshots:
-        yield Finding(
-            Grade.WRONG,
+        yield ReportFinding(
+            FindingLevel.WRONG,
             "There was never a state",
             "It may follow from what stands above."
             if explained
@@ -349,8 +352,8 @@ def validity(replayed: Replayed, explained: bool = False) -> Iterable[Finding]:
     first = next((n for n, each in enumerate(replayed.snapshots) if not each.invalid), None)
     if first is None:
         words = replayed.snapshots[-1].invalid.explain()
-        yield Finding(
-            Grade.WRONG,
+        yield ReportFinding(
+            FindingLevel.WRONG,
             "The pose was never valid",
             "It may follow from what stands above." if explained else f"At the end: {words}.",
             "Put that right first."
@@ -364,8 +367,8 @@ def validity(replayed: Replayed, explained: bool = False) -> Iterable[Finding]:
     if len(bad) > 0.05 * len(after):
         reasons = Counter(flag for each in bad for flag in Invalid if flag in each.invalid)
         words = "; ".join(flag.explain() for flag, _ in reasons.most_common(2))
-        yield Finding(
-            Grade.DOUBTFUL,
+        yield ReportFinding(
+            FindingLevel.DOUBTFUL,
             f"The pose was not valid in {len(bad) / len(after):.0%} of the time after it first was",
             f"Mostly: {words}.",
             "See the strip of reasons below.",
@@ -376,7 +379,7 @@ def _has_diverged(decision: Decision) -> bool:
     return decision.verdict is Verdict.TOOK_UP and "diverged" in decision.reason
 
 
-def diverged(replayed: Replayed) -> Iterable[Finding]:
+def diverged(replayed: Replayed) -> Iterable[ReportFinding]:
     """Look for a filter that had to begin anew, or that took its position up anew."""
     anew = [each for each in replayed.decisions if _has_diverged(each)]
     taken = [each for each in replayed.decisions if each.verdict is Verdict.TOOK_UP and "agree" in each.reason]
@@ -384,15 +387,15 @@ def diverged(replayed: Replayed) -> Iterable[Finding]:
         if found:
             first = found[0]
             times = "" if len(found) == 1 else f", first of {len(found)} times"
-            yield Finding(
-                Grade.DOUBTFUL,
+            yield ReportFinding(
+                FindingLevel.DOUBTFUL,
                 title,
                 f"At {replayed.t(first.utime):.0f} s{times}: {first.reason}.",
                 "See the innovations before it: which kind went wrong first?",
             )
 
 
-Check = Callable[[Replayed], Iterable[Finding]]
+Check = Callable[[Replayed], Iterable[ReportFinding]]
 
 CHECKS: tuple[Check, ...] = (frozen_unit, diverged)
 
@@ -403,11 +406,11 @@ OF_A_SOUND_STATE: tuple[Check, ...] = (wheel_scale, biases, latency, stated_sigm
 """Those that take the filter's state for good."""
 
 
-def _last(replayed: Replayed) -> Snapshot | None:
+def _last(replayed: Replayed) -> StateSample | None:
     return next((each for each in reversed(replayed.snapshots) if each.values), None)
 
 
-def _state(snapshot: Snapshot | None, name: str) -> tuple[float, float]:
+def _state(snapshot: StateSample | None, name: str) -> tuple[float, float]:
     """Return a state's value and sigma, nan where it is not there."""
     if snapshot is None or name not in snapshot.values:
         return math.nan, math.nan

@@ -89,7 +89,7 @@ class Panel:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class StripRow:
     """A row of a strip: stretches (from, to, what is said where the pointer rests) on a line with a name."""
 
     name: str
@@ -124,7 +124,9 @@ def stack(
     return "\n".join(parts)
 
 
-def strip(label: str, begin: float, end: float, rows: Sequence[Row], events: Sequence[tuple[float, str]] = ()) -> str:
+def strip(
+    label: str, begin: float, end: float, rows: Sequence[StripRow], events: Sequence[tuple[float, str]] = ()
+) -> str:
     """Return an SVG of rows with stretches over seconds."""
     x = Axis("seconds from the log's first event", begin, max(end, begin + 1e-3))
     pitch, left = 24.0, 190.0

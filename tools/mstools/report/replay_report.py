@@ -12,10 +12,10 @@ from itertools import pairwise
 from modelserver.messages import Decision, Invalid, Mode, Verdict
 from modelserver.version import __version__
 from mstools.report import consistency, panels
-from mstools.report.data import Replayed, Snapshot
-from mstools.report.finding import Finding, Grade
+from mstools.report.data import Replayed, StateSample
+from mstools.report.finding import FindingLevel, ReportFinding
 from mstools.report.findings import findings
-from mstools.report.panels import Band, Curve, Dots, Level, Panel, Row
+from mstools.report.panels import Band, Curve, Dots, Level, Panel, StripRow
 from mstools.report.svg import Axis, decades
 from mstools.terminal.output import counted, safe
 
@@ -42,7 +42,7 @@ COMPONENTS: dict[str, tuple[str, ...]] = {
 }
 """What the numbers of each kind of measurement are; those of other kinds are numbered."""
 
-GRADES = {Grade.WRONG: "wrong", Grade.DOUBTFUL: "doubtful", Grade.NOTE: "note"}
+GRADES = {FindingLevel.WRONG: "wrong", FindingLevel.DOUBTFUL: "doubtful", FindingLevel.NOTE: "note"}
 
 
 def page(replayed: Replayed) -> str:
@@ -143,7 +143,7 @@ def _figure_words(replayed: Replayed) -> str:
     return " ".join(words)
 
 
-def _findings(found: Sequence[Finding]) -> str:
+def _findings(found: Sequence[ReportFinding]) -> str:
     if not found:
         return '<p class="good">Nothing suspicious was found. The drawings below may still know more.</p>'
     return "\n".join(
@@ -190,7 +190,7 @@ def _track(replayed: Replayed) -> str:
     return f"<figure>{chart}<figcaption>{words}</figcaption></figure>"
 
 
-def _pieces(placed: Sequence[Snapshot], bad: bool) -> tuple[list[float], list[float]]:
+def _pieces(placed: Sequence[StateSample], bad: bool) -> tuple[list[float], list[float]]:
     """Return the track where states are valid, or not (`bad`); nan interrupts it elsewhere, at gaps and new epochs."""
     x: list[float] = []
     y: list[float] = []
@@ -218,9 +218,9 @@ def _validity(replayed: Replayed) -> str:
     states = replayed.snapshots
     if not states:
         return "<p>No sample could be used.</p>"
-    rows = [Row("valid", _stretches(states, [not each.invalid for each in states]), panels.GREEN)]
+    rows = [StripRow("valid", _stretches(states, [not each.invalid for each in states]), panels.GREEN)]
     rows += [
-        Row(
+        StripRow(
             (flag.name or "").lower(),
             _stretches(states, [flag in each.invalid for each in states], flag.explain()),
             panels.RED,
@@ -228,16 +228,18 @@ def _validity(replayed: Replayed) -> str:
         for flag in Invalid
         if any(flag in each.invalid for each in states)
     ]
-    rows.append(Row("standing", _stretches(states, [each.standing for each in states]), panels.SKY))
+    rows.append(StripRow("standing", _stretches(states, [each.standing for each in states]), panels.SKY))
     for phase in dict.fromkeys(each.phase for each in states if each.phase is not None):
         rows.append(
-            Row(
+            StripRow(
                 f"phase {phase.name.lower()}", _stretches(states, [each.phase is phase for each in states]), panels.GREY
             )
         )
     for mode in dict.fromkeys(each.mode for each in states if each.mode is not None):
         rows.append(
-            Row(f"mode {mode.name.lower()}", _stretches(states, [each.mode is mode for each in states]), panels.AMBER)
+            StripRow(
+                f"mode {mode.name.lower()}", _stretches(states, [each.mode is mode for each in states]), panels.AMBER
+            )
         )
     events = _events(replayed)
     chart = panels.strip("Validity over time", 0.0, replayed.seconds, rows, events)
@@ -249,7 +251,9 @@ def _validity(replayed: Replayed) -> str:
     )
 
 
-def _stretches(states: Sequence[Snapshot], chosen: Sequence[bool], words: str = "") -> list[tuple[float, float, str]]:
+def _stretches(
+    states: Sequence[StateSample], chosen: Sequence[bool], words: str = ""
+) -> list[tuple[float, float, str]]:
     """Return from when to when a state is chosen; each counts until the next, for `HELD_S` at most."""
     found: list[tuple[float, float, str]] = []
     for n, each in enumerate(states):
@@ -456,7 +460,7 @@ def _states(replayed: Replayed) -> str:
     )
 
 
-def _state_panel(states: Sequence[Snapshot], title: str, names: Sequence[str], unit: str, factor: float) -> Panel:
+def _state_panel(states: Sequence[StateSample], title: str, names: Sequence[str], unit: str, factor: float) -> Panel:
     marks: list[panels.Mark] = [Level("", 0.0)]
     lines: list[panels.Mark] = []
     reach: list[float] = [0.0]
@@ -481,7 +485,7 @@ def _sensors(replayed: Replayed) -> str:
     rows, table = [], []
     for sensor in replayed.sensors:
         gaps = sensor.gaps()
-        rows.append(Row(sensor.name, _present(sensor.times, gaps), panels.GREEN))
+        rows.append(StripRow(sensor.name, _present(sensor.times, gaps), panels.GREEN))
         longest = max((b - a for a, b in gaps), default=0.0)
         table.append(
             (
@@ -494,7 +498,7 @@ def _sensors(replayed: Replayed) -> str:
             )
         )
     if replayed.frozen:
-        rows.append(Row("unit frozen", [(a, b, "it repeats one value") for a, b in replayed.frozen], panels.RED))
+        rows.append(StripRow("unit frozen", [(a, b, "it repeats one value") for a, b in replayed.frozen], panels.RED))
     if not rows:
         return "<p>No sample could be used.</p>"
     chart = panels.strip("Sensors over time", 0.0, replayed.seconds, rows)
@@ -546,7 +550,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Iterable
     return f"<table><thead><tr>{cells(head, 'th')}</tr></thead>\n<tbody>{body}</tbody></table>"
 
 
-def summary(found: Sequence[Finding], path: str) -> list[str]:
+def summary(found: Sequence[ReportFinding], path: str) -> list[str]:
     """Return what is printed when the page is written: where it is, and the headlines of its findings."""
     lines = [f"report: {safe(path)}, {counted(len(found), 'finding')}"]
     return lines + [f"  {GRADES[each.grade]}: {safe(each.title)}" for each in found]

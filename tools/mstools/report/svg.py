@@ -15,7 +15,7 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#666666")
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class PlotLine:
     """A curve or a cloud of points in the data's units, with its name in the legend."""
 
     name: str
@@ -62,7 +62,7 @@ def decades(label: str, values: Iterable[float]) -> Axis:
     return Axis(label, 10.0**low, 10.0 ** max(high, low + 1), logarithmic=True)
 
 
-def chart(title: str, x: Axis, y: Axis, lines: Sequence[Line], square: bool = False) -> str:
+def chart(title: str, x: Axis, y: Axis, lines: Sequence[PlotLine], square: bool = False) -> str:
     """Return an SVG element: title, axes, grid, lines and their legend. `square`: equal lengths on both axes."""
     width = HEIGHT - TOP - BOTTOM if square else WIDTH - LEFT - RIGHT
     height = HEIGHT - TOP - BOTTOM
@@ -133,21 +133,21 @@ def _grid(x1: float, y1: float, x2: float, y2: float) -> str:
     return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="#ddd"/>'
 
 
-def _style(line: Line) -> str:
+def _style(line: PlotLine) -> str:
     dashes = ' stroke-dasharray="5 4"' if line.dashed else ""
     return f'stroke="{line.colour}" stroke-width="1.6"{dashes}'
 
 
-def _curve(points: Sequence[tuple[float, float]], line: Line) -> str:
+def _curve(points: Sequence[tuple[float, float]], line: PlotLine) -> str:
     path = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
     return f'<polyline points="{path}" fill="none" {_style(line)}/>'
 
 
-def _key(x: float, y: float, line: Line) -> str:
+def _key(x: float, y: float, line: PlotLine) -> str:
     return f'<line x1="{x}" y1="{y}" x2="{x + 22}" y2="{y}" {_style(line)}/>'
 
 
-def _dots(points: Sequence[tuple[float, float]], line: Line) -> str:
+def _dots(points: Sequence[tuple[float, float]], line: PlotLine) -> str:
     # strokes of no length with round ends: one element for thousands of points
     path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
     return f'<path d="{path}" stroke="{line.colour}" stroke-width="3" stroke-linecap="round" fill="none"/>'

@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Any, Final
 
 
-class Key(Enum):
+class KeyBinding(Enum):
     """A key that does something."""
 
     UP = auto()
@@ -28,36 +28,36 @@ class Key(Enum):
 
 
 _KEYS: Final = {
-    b"\x1b[A": Key.UP,
-    b"\x1bOA": Key.UP,
-    b"k": Key.UP,
-    b"\x1b[B": Key.DOWN,
-    b"\x1bOB": Key.DOWN,
-    b"j": Key.DOWN,
-    b"\x1b[5~": Key.PAGE_UP,
-    b"\x1b[6~": Key.PAGE_DOWN,
-    b" ": Key.PAGE_DOWN,
-    b"\x1b[H": Key.HOME,
-    b"\x1b[1~": Key.HOME,
-    b"\x1b[F": Key.END,
-    b"\x1b[4~": Key.END,
-    b"\r": Key.ENTER,
-    b"\n": Key.ENTER,
-    b"\x1b[C": Key.ENTER,
-    b"\x1b[D": Key.BACK,
-    b"\x7f": Key.BACK,
-    b"\x1b": Key.BACK,
-    b"q": Key.QUIT,
-    b"Q": Key.QUIT,
-    b"\x03": Key.QUIT,
-    b"\x04": Key.QUIT,
+    b"\x1b[A": KeyBinding.UP,
+    b"\x1bOA": KeyBinding.UP,
+    b"k": KeyBinding.UP,
+    b"\x1b[B": KeyBinding.DOWN,
+    b"\x1bOB": KeyBinding.DOWN,
+    b"j": KeyBinding.DOWN,
+    b"\x1b[5~": KeyBinding.PAGE_UP,
+    b"\x1b[6~": KeyBinding.PAGE_DOWN,
+    b" ": KeyBinding.PAGE_DOWN,
+    b"\x1b[H": KeyBinding.HOME,
+    b"\x1b[1~": KeyBinding.HOME,
+    b"\x1b[F": KeyBinding.END,
+    b"\x1b[4~": KeyBinding.END,
+    b"\r": KeyBinding.ENTER,
+    b"\n": KeyBinding.ENTER,
+    b"\x1b[C": KeyBinding.ENTER,
+    b"\x1b[D": KeyBinding.BACK,
+    b"\x7f": KeyBinding.BACK,
+    b"\x1b": KeyBinding.BACK,
+    b"q": KeyBinding.QUIT,
+    b"Q": KeyBinding.QUIT,
+    b"\x03": KeyBinding.QUIT,
+    b"\x04": KeyBinding.QUIT,
 }
 
 _PIECE: Final = re.compile(rb"\x1b\[[0-9;]*[A-Za-z~]|\x1bO[A-Za-z]|.", re.DOTALL)
 """A key as terminals send it: an escape sequence (ECMA-48, and xterm's), or a byte."""
 
 
-def keys(data: bytes) -> Sequence[Key]:
+def keys(data: bytes) -> Sequence[KeyBinding]:
     """Return the keys in what a terminal has sent; others are left out."""
     return [_KEYS[piece] for piece in _PIECE.findall(data) if piece in _KEYS]
 
@@ -79,8 +79,8 @@ class Keyboard:
         if self._before is not None:
             termios.tcsetattr(self.fileno, termios.TCSADRAIN, self._before)
 
-    def read(self) -> Sequence[Key]:
+    def read(self) -> Sequence[KeyBinding]:
         """Return the keys that were pressed; to be called when there is something to read."""
         data = os.read(self.fileno, 1024)
         # the terminal is gone: nobody looks any more
-        return keys(data) if data else [Key.QUIT]
+        return keys(data) if data else [KeyBinding.QUIT]

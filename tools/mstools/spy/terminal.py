@@ -18,8 +18,8 @@ from modelserver.wire.codec import decode, type_names
 from modelserver.wire.kinds import type_name_of
 from modelserver.wire.provider import take_message
 from mstools.spy.fields import fields
-from mstools.spy.keys import Key, Keyboard
-from mstools.spy.traffic import Seen, Traffic
+from mstools.spy.keys import KeyBinding, Keyboard
+from mstools.spy.traffic import BusTraffic, Seen
 from mstools.spy.types import known_constants
 from mstools.terminal.interrupts import Interrupts
 from mstools.terminal.output import safe
@@ -43,11 +43,11 @@ NUMBERS: Final = tuple(range(2, 9))
 HELP: Final = "up/down choose, enter shows the fields, left goes back, q ends"
 
 
-class Ear:
+class BusListener:
     """Hears everything on a bus."""
 
     def __init__(self, bus: lcm.LCM, clock: Callable[[], float] = time.monotonic):
-        self.traffic = Traffic(clock(), type_name_of, is_whole)
+        self.traffic = BusTraffic(clock(), type_name_of, is_whole)
         self._bus = bus
         self._clock = clock
         self.fileno = bus.fileno()
@@ -88,12 +88,12 @@ def is_whole(type_name: str, data: bytes) -> bool:
 _TOP: Final = frozenset(type_names())
 
 
-def rows(traffic: Traffic, now: float) -> list[tuple[str, ...]]:
+def rows(traffic: BusTraffic, now: float) -> list[tuple[str, ...]]:
     """Return the rows of the table."""
     return [_row(traffic, seen, now) for seen in traffic.ordered()]
 
 
-def _row(traffic: Traffic, seen: Seen, now: float) -> tuple[str, ...]:
+def _row(traffic: BusTraffic, seen: Seen, now: float) -> tuple[str, ...]:
     rate, flow = traffic.rates(seen, now)
     return (
         shorter(safe(seen.channel), 40),
@@ -113,7 +113,7 @@ def shorter(text: str, width: int) -> str:
     return text if len(text) <= width else f"{text[: width - 3]}..."
 
 
-def summary(traffic: Traffic, now: float) -> str:
+def summary(traffic: BusTraffic, now: float) -> str:
     """Return in a line what came altogether."""
     every = [traffic.rates(seen, now) for seen in traffic.channels.values()]
     text = f"{len(traffic.channels)} channels, {sum(each for each, _ in every):.0f} messages/s, "
@@ -135,7 +135,7 @@ def message_lines(seen: Seen) -> list[str]:
     return fields(message, known_constants())
 
 
-def print_once(ear: Ear, seconds: float, channel: str = "") -> None:
+def print_once(ear: BusListener, seconds: float, channel: str = "") -> None:
     """Listen for a while, print the table and the fields of a channel. Raises ModelServerError where that is silent."""
     ear.listen(time.monotonic() + seconds)
     now, traffic = time.monotonic(), ear.traffic
@@ -149,7 +149,7 @@ def print_once(ear: Ear, seconds: float, channel: str = "") -> None:
         typer.echo("\n".join([safe(channel), *(f"  {each}" for each in message_lines(_chosen(traffic, channel)))]))
 
 
-def _chosen(traffic: Traffic, channel: str) -> Seen:
+def _chosen(traffic: BusTraffic, channel: str) -> Seen:
     if channel in traffic.channels:
         return traffic.channels[channel]
     near = nearest_names(channel, traffic.channels)
@@ -164,23 +164,25 @@ class View:
     channel: str = ""
     is_open: bool = False
 
-    def after(self, key: Key, names: list[str], page: int) -> View | None:
+    def after(self, key: KeyBinding, names: list[str], page: int) -> View | None:
         """Return the view after a key, None where it ends; `names` are the channels in their order."""
-        if key is Key.QUIT:
+        if key is KeyBinding.QUIT:
             return None
-        if key is Key.ENTER:
+        if key is KeyBinding.ENTER:
             return replace(self, is_open=not self.is_open)
-        if key is Key.BACK:
+        if key is KeyBinding.BACK:
             return replace(self, is_open=False)
         if not names:
             return self
         at = names.index(self.channel) if self.channel in names else 0
-        step = {Key.UP: -1, Key.DOWN: 1, Key.PAGE_UP: -page, Key.PAGE_DOWN: page}.get(key, 0)
-        to = {Key.HOME: 0, Key.END: len(names) - 1}.get(key, at + step)
+        step = {KeyBinding.UP: -1, KeyBinding.DOWN: 1, KeyBinding.PAGE_UP: -page, KeyBinding.PAGE_DOWN: page}.get(
+            key, 0
+        )
+        to = {KeyBinding.HOME: 0, KeyBinding.END: len(names) - 1}.get(key, at + step)
         return replace(self, channel=names[max(0, min(to, len(names) - 1))])
 
 
-def picture(traffic: Traffic, view: View, now: float, height: int, note: str = HELP) -> Text:
+def picture(traffic: BusTraffic, view: View, now: float, height: int, note: str = HELP) -> Text:
     """Return what is shown: the table around the chosen channel, its fields below where they are open, and a note."""
     from rich.text import Text
 
@@ -213,7 +215,7 @@ def picture(traffic: Traffic, view: View, now: float, height: int, note: str = H
     return text
 
 
-def watch(ear: Ear, channel: str = "") -> None:
+def watch(ear: BusListener, channel: str = "") -> None:
     """Show the table until q, Ctrl-C, or the order to end."""
     from rich.console import Console
     from rich.live import Live
@@ -239,7 +241,7 @@ def watch(ear: Ear, channel: str = "") -> None:
 
 def show(bus: lcm.LCM, channel: str, seconds: float) -> None:
     """Show the table: live in a terminal, else, or where `seconds` are given, once."""
-    ear = Ear(bus)
+    ear = BusListener(bus)
     if seconds or not sys.stdout.isatty():
         print_once(ear, seconds or LISTEN_S, channel)
     else:

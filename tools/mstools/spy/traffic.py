@@ -46,7 +46,7 @@ class Seen:
         return math.sqrt(self.scatter) if not math.isnan(self.interval) else math.nan
 
 
-class Traffic:
+class BusTraffic:
     """All that was heard since `began` (seconds, any clock); `heard` takes a message, the rest tells.
 
     `type_of` gives the type of a message, empty for a stranger's; `is_whole` whether one of a known type is sound.

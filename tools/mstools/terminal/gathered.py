@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from modelserver.errors import ConfigError, GeometryError, ModelServerError, Problem, Severity, Source
+from modelserver.errors import ConfigError, GeometryError, Location, ModelServerError, Problem, Severity
 
 
 class Gathered:
@@ -16,7 +16,7 @@ class Gathered:
 
     def add(self, what: str, why: str, fix: str = "") -> None:
         """Take an error of something: a file, an option."""
-        self._errors.append(Problem(Severity.ERROR, why, Source(what), fix))
+        self._errors.append(Problem(Severity.ERROR, why, Location(what), fix))
 
     @contextmanager
     def of(self, what: str) -> Iterator[None]:

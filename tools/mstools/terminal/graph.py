@@ -15,7 +15,7 @@ from modelserver.geometry.topology import Crossing, LoopClosure, Topology
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
+class BodyNode:
     """A body in the drawing: how deep it hangs, what joins it to the body above, and what closes a loop at it.
 
     `last` says for each level from the second on whether the branch there is the last one of its body.
@@ -33,7 +33,7 @@ class Node:
     """Whether bodies hang below it."""
 
 
-def nodes(model: Model) -> list[list[Node]]:
+def nodes(model: Model) -> list[list[BodyNode]]:
     """Return the bodies of each assembly in the order in which they are drawn; the root's assembly comes first."""
     topology = Topology(model.bodies, model.constraints)
     loops: dict[str, list[str]] = {}
@@ -42,11 +42,11 @@ def nodes(model: Model) -> list[list[Node]]:
     return [_assembly(model, topology, assembly[0], loops) for assembly in topology.assemblies]
 
 
-def _assembly(model: Model, topology: Topology, root: str, loops: dict[str, list[str]]) -> list[Node]:
+def _assembly(model: Model, topology: Topology, root: str, loops: dict[str, list[str]]) -> list[BodyNode]:
     below: dict[str, list[Crossing]] = {}
     for body, onward in topology.spread(root):
         below.setdefault(body, []).append(onward)
-    drawn: list[Node] = []
+    drawn: list[BodyNode] = []
     # a list, not recursion: a chain may be longer than Python's stack
     waiting: list[tuple[str, tuple[bool, ...], Crossing | None, int]] = [(root, (), None, -1)]
     while waiting:
@@ -54,7 +54,7 @@ def _assembly(model: Model, topology: Topology, root: str, loops: dict[str, list
         hanging = below.get(body, [])
         frames = tuple(model.get_body_frame_list(body))
         told = tuple(loops.get(body, ()))
-        drawn.append(Node(body, len(last), last, crossing, frames, told, parent, bool(hanging)))
+        drawn.append(BodyNode(body, len(last), last, crossing, frames, told, parent, bool(hanging)))
         number = len(drawn) - 1
         for place, each in reversed(list(enumerate(hanging))):
             waiting.append((names.split(each.leaves)[0], (*last, place == len(hanging) - 1), each, number))

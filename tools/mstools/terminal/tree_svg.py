@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Sequence
 
 from mstools.report.svg import COLOURS
-from mstools.terminal.graph import Node, crossing_words
+from mstools.terminal.graph import BodyNode, crossing_words
 
 ROW, STEP, MARGIN, GAP = 24, 26, 16, 14
 """Pixels: between rows, to the right for each level, around, and between assemblies."""
@@ -21,7 +21,7 @@ LINE = 100
 FIXED, MOVING, LOOP = COLOURS[3], COLOURS[0], COLOURS[1]
 
 
-def drawing(title: str, assemblies: Sequence[Sequence[Node]], with_frames: bool = False) -> str:
+def drawing(title: str, assemblies: Sequence[Sequence[BodyNode]], with_frames: bool = False) -> str:
     """Return the image. Joints that move are drawn in blue, loops dashed in orange, orphans below the rest."""
     parts: list[str] = []
     y, width = MARGIN + ROW, MARGIN * 2 + LETTER * len(title) * 1.2
@@ -61,7 +61,7 @@ def drawing(title: str, assemblies: Sequence[Sequence[Node]], with_frames: bool 
     )
 
 
-def _colour(node: Node) -> str:
+def _colour(node: BodyNode) -> str:
     return MOVING if node.crossing is not None and node.crossing.constraint.joint.moves else FIXED
 
 
@@ -69,7 +69,7 @@ def _branch(x1: int, y1: int, x2: int, y2: int, colour: str) -> str:
     return f'<path d="M{x1} {y1 + 6}V{y2}H{x2 - 4}" fill="none" stroke="{colour}" stroke-width="1.4"/>'
 
 
-def _body(x: int, y: int, node: Node, told: tuple[str, str]) -> str:
+def _body(x: int, y: int, node: BodyNode, told: tuple[str, str]) -> str:
     words, colour = told
     dashed = ' stroke-dasharray="3 2"' if node.loops else ""
     ring = LOOP if node.loops else colour

@@ -35,7 +35,7 @@ from modelserver.localization.interface import Localizer
 from modelserver.localization.modes import ModeLocalizer
 from modelserver.messages import Decision, GpsSample, Phase
 from modelserver.service.daemon import Vehicle, load_vehicle
-from modelserver.service.offline import Row, Run
+from modelserver.service.offline import OfflineRun, TrackRow
 from modelserver.spatial.so3 import Array
 from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools.report.consistency import Consistency, by_kind
@@ -85,7 +85,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Fixes:
+class UsableFixes:
     """The fixes of a log that are good enough, by their order on the channel (`numbers`)."""
 
     samples: tuple[GpsSample, ...]
@@ -141,7 +141,7 @@ def stated_sigma(sample: GpsSample, vehicle: Vehicle) -> float:
 
 
 @lru_cache(maxsize=4)
-def read_fixes(log: Path, config: Path) -> Fixes:
+def read_fixes(log: Path, config: Path) -> UsableFixes:
     """Return the good fixes of a log. Raises RecordingError where there are too few, OSError."""
     vehicle = load(config)
     channel = gps_channel(vehicle)
@@ -166,7 +166,7 @@ def read_fixes(log: Path, config: Path) -> Fixes:
             "withhold some of them; record a drive of a few minutes"
         )
     order = sorted(range(len(samples)), key=lambda n: samples[n].header.utime)
-    return Fixes(tuple(samples[n] for n in order), tuple(numbers[n] for n in order))
+    return UsableFixes(tuple(samples[n] for n in order), tuple(numbers[n] for n in order))
 
 
 def run(job: Job) -> Outcome:
@@ -183,7 +183,7 @@ def run(job: Job) -> Outcome:
     assert gps is not None
     with LogFile(job.log) as recording:
         events = _given(recording, gps_channel(vehicle), {known.numbers[n] for n in withheld})
-        replay = Run(vehicle, events, gps.frame, on_decision=decisions.append)
+        replay = OfflineRun(vehicle, events, gps.frame, on_decision=decisions.append)
         scored = [known.samples[n] for n in withheld]
         errors, densities, marks = [], [], []
         for sample, row in zip(scored, replay.rows([s.header.utime for s in scored]), strict=True):
@@ -223,7 +223,7 @@ def _given(events: Iterable[LogEvent], channel: str, withheld: set[int]) -> Iter
         yield event
 
 
-def _error(row: Row, sample: GpsSample, localizer: Localizer | None) -> float:
+def _error(row: TrackRow, sample: GpsSample, localizer: Localizer | None) -> float:
     if localizer is None or not math.isfinite(row.easting):
         return math.nan
     origin = localizer.estimate(sample.header.utime).origin
@@ -273,7 +273,7 @@ def _normal(residual: Array, S: Array) -> float:
     return -0.5 * (kalman.statistic(residual, S) + float(size) + len(residual) * math.log(2.0 * math.pi))
 
 
-def _gap_ends(known: Fixes, marks: list[GpsSample], errors: list[float]) -> tuple[float, ...]:
+def _gap_ends(known: UsableFixes, marks: list[GpsSample], errors: list[float]) -> tuple[float, ...]:
     """Return the mean error over the last 2 s of each gap; a gap without an estimate at its end is left out."""
     ends = []
     for number, start in enumerate(STARTS):
@@ -288,4 +288,4 @@ def _gap_ends(known: Fixes, marks: list[GpsSample], errors: list[float]) -> tupl
     return tuple(ends)
 
 
-__all__ = ["Fixes", "Job", "Outcome", "changed", "load", "mixed", "read_fixes", "run", "stated_sigma"]
+__all__ = ["Job", "Outcome", "UsableFixes", "changed", "load", "mixed", "read_fixes", "run", "stated_sigma"]

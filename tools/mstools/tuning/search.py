@@ -46,7 +46,7 @@ class Parameter:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class SearchStep:
     """A step that was taken."""
 
     name: str
@@ -56,12 +56,12 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class SearchResult:
     """Where the search came to: the settings that changed, the steps there, and what did nothing on this recording."""
 
     settings: Settings
     score: Score
-    steps: tuple[Step, ...]
+    steps: tuple[SearchStep, ...]
     unseen: tuple[str, ...]
 
 
@@ -75,15 +75,15 @@ def search(
     parameters: Sequence[Parameter],
     evaluate: Evaluate,
     rounds: int = 2,
-    told: Callable[[Step], object] | None = None,
-) -> Found:
+    told: Callable[[SearchStep], object] | None = None,
+) -> SearchResult:
     """Step each parameter up and down by `FACTOR` while that helps, round after round while anything moves.
 
     `begin` has the values of all parameters, `first` their score. `told` is called with each step taken.
     """
     values = dict(begin)
     best = first
-    steps: list[Step] = []
+    steps: list[SearchStep] = []
     unseen: list[str] = []
 
     def change(trial: Settings) -> dict[str, float]:
@@ -104,7 +104,7 @@ def search(
             while taken is not None:
                 trial, score = taken
                 up = trial > values[name]
-                step = Step(name, values[name], trial, score)
+                step = SearchStep(name, values[name], trial, score)
                 values[name], best, moved = trial, score, True
                 steps.append(step)
                 if told is not None:
@@ -115,7 +115,7 @@ def search(
                     taken = _best(best, [farther], evaluate([change({**values, name: farther})]))
         if not moved:
             break
-    return Found(change(values), best, tuple(steps), tuple(unseen))
+    return SearchResult(change(values), best, tuple(steps), tuple(unseen))
 
 
 def _stepped(parameter: Parameter, value: float, begin: float, up: bool) -> float | None:

@@ -6,13 +6,13 @@ from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 
 from modelserver.messages import SensorHeader
-from msdrivers.devices.gps.fixes import Fix, Fixes
-from msdrivers.devices.gps.heard import Heard, wrong_device
-from msdrivers.devices.gps.set_up import Progress, SetUp
+from msdrivers.devices.gps.fixes import FixAssembler, GpsFix
+from msdrivers.devices.gps.heard import LineMonitor, wrong_device
+from msdrivers.devices.gps.set_up import SetUp, SetupProgress
 from msdrivers.devices.gps.settings import GpsSettings
 from msdrivers.protocol.gps_stream import GpsMessage, GpsStream
 from msdrivers.protocol.novatel import Answer, NovatelLog, Prompt
-from msdrivers.station import Measured, Now, Output, Phase, Reopen, Send, Told
+from msdrivers.station import Measured, Now, Output, Reopen, Send, StationPhase, StationStatus
 
 _SECOND_NS = 1_000_000_000
 _SAY_AGAIN_NS = 60 * _SECOND_NS
@@ -28,13 +28,13 @@ class GpsDriver:
         self._settings = settings
         self._novatel = settings.protocol == "novatel"
         self._stream = GpsStream()
-        self._fixes = Fixes(settings.logs, round(settings.hold * _SECOND_NS), self._silence_ns)
+        self._fixes = FixAssembler(settings.logs, round(settings.hold * _SECOND_NS), self._silence_ns)
         self._set_up = SetUp(settings.set_up(), round(settings.answer * _SECOND_NS), settings.attempts)
-        self._heard = Heard()
+        self._heard = LineMonitor()
         self._attempts: list[tuple[int | None, str]] = []
         self._baud_index = 0
         self._arrivals: deque[tuple[int, int]] = deque(maxlen=_ARRIVALS)
-        self._phase = Phase.WAITING
+        self._phase = StationPhase.WAITING
         self._told = ""
         self._origin = ""
         self._sequence = 0
@@ -57,9 +57,9 @@ class GpsDriver:
         self._last_byte_ns = None
         self._heard.forget(self._stream.counts)
         # amid a round of baud rates there is nothing new to say
-        searching = self._attempts or (self._phase is Phase.SILENT and len(self._settings.bauds) > 1)
+        searching = self._attempts or (self._phase is StationPhase.SILENT and len(self._settings.bauds) > 1)
         at = f" at {self._baud} baud" if self._baud else ""
-        told = [] if searching else self._tell(Phase.WAITING, f"listening for a receiver{at}")
+        told = [] if searching else self._tell(StationPhase.WAITING, f"listening for a receiver{at}")
         return [*told, *self._begin(now)]
 
     def received(self, unit: bytes, now: Now) -> Sequence[Output[bytes]]:
@@ -83,15 +83,15 @@ class GpsDriver:
         again = self._set_up.woken(now.monotonic_ns)
         if again:
             out.append(Send(again))
-        elif self._set_up.progress is Progress.UNANSWERED:
+        elif self._set_up.progress is SetupProgress.UNANSWERED:
             out += self._unanswered(now)
-        elif self._set_up.progress is not Progress.ASKING and now.monotonic_ns >= self._patient_until_ns:
+        elif self._set_up.progress is not SetupProgress.ASKING and now.monotonic_ns >= self._patient_until_ns:
             out += self._silent(now)
         return out
 
     def due(self) -> int | None:
         """Return when to be woken."""
-        asking = self._set_up.progress is Progress.ASKING
+        asking = self._set_up.progress is SetupProgress.ASKING
         patience = None if asking else self._patient_until_ns
         times = (self._gap_ns, self._fixes.due(), self._set_up.due(), patience)
         return min((each for each in times if each is not None), default=None)
@@ -120,12 +120,12 @@ class GpsDriver:
     def _gap_ns(self) -> int | None:
         return None if self._last_byte_ns is None else self._last_byte_ns + round(self._settings.gap * _SECOND_NS)
 
-    def _tell(self, phase: Phase, text: str, *, is_trouble: bool = False) -> list[Output[bytes]]:
+    def _tell(self, phase: StationPhase, text: str, *, is_trouble: bool = False) -> list[Output[bytes]]:
         """Say a word, once: not again as long as nothing else is to be said."""
         if (phase, text) == (self._phase, self._told):
             return []
         self._phase, self._told = phase, text
-        return [Told(phase, text, is_trouble)]
+        return [StationStatus(phase, text, is_trouble)]
 
     def _begin(self, now: Now) -> list[Output[bytes]]:
         """Set the receiver up from the first command; a plain NMEA receiver is only told what the settings say."""
@@ -148,7 +148,7 @@ class GpsDriver:
         """Return the host's time when the byte at `start` of the stream came in."""
         return next((utime for offset, utime in reversed(self._arrivals) if offset <= start), self._arrivals[0][1])
 
-    def _publish(self, fixes: Sequence[Fix], now: Now) -> list[Output[bytes]]:
+    def _publish(self, fixes: Sequence[GpsFix], now: Now) -> list[Output[bytes]]:
         out: list[Output[bytes]] = []
         for fix in fixes:
             header = SensorHeader(0, self._settings.source, self._sequence, fix.host_utime, fix.device_utime)
@@ -159,39 +159,39 @@ class GpsDriver:
             self._attempts = []
             delay = self._settings.delay + fix.delay
             out.append(Measured(fix.sample(header), delay, self._settings.delay_sigma))
-            if self._set_up.progress is not Progress.ASKING and (self._phase, self._origin) != (
-                Phase.STREAMING,
+            if self._set_up.progress is not SetupProgress.ASKING and (self._phase, self._origin) != (
+                StationPhase.STREAMING,
                 fix.origin,
             ):
-                out += self._tell(Phase.STREAMING, f"{fix.origin} comes")
+                out += self._tell(StationPhase.STREAMING, f"{fix.origin} comes")
             self._origin = fix.origin
         for problem in self._fixes.problems():
             out += self._tell(self._phase, problem)
         return out
 
     def _answered(self, answer: Answer, now: Now) -> list[Output[bytes]]:
-        asked = self._set_up.progress is Progress.ASKING
+        asked = self._set_up.progress is SetupProgress.ASKING
         refused = len(self._set_up.refused)
         following = self._set_up.answered(answer, now.monotonic_ns)
         if not asked:
             return []
         out: list[Output[bytes]] = []
-        if self._phase is not Phase.CONFIGURING:
-            out += self._tell(Phase.CONFIGURING, "a NovAtel receiver answers, setting it up")
+        if self._phase is not StationPhase.CONFIGURING:
+            out += self._tell(StationPhase.CONFIGURING, "a NovAtel receiver answers, setting it up")
         if len(self._set_up.refused) > refused:
             command, words = self._set_up.refused[-1]
             text = (
                 f"the receiver refused '{command}': {words}; check the settings `commands`, `device_port` and the logs"
             )
-            out += self._tell(Phase.CONFIGURING, text, is_trouble=True)
+            out += self._tell(StationPhase.CONFIGURING, text, is_trouble=True)
         if following:
             return [*out, Send(following)]
-        if self._set_up.progress is Progress.ASKING:
+        if self._set_up.progress is SetupProgress.ASKING:
             return out
         # set up: from now on its logs must come
         self._patient_until_ns = now.monotonic_ns + self._silence_ns
         if not self._set_up.refused:
-            out += self._tell(Phase.CONFIGURING, f"set up, waiting for {self._settings.position_log}")
+            out += self._tell(StationPhase.CONFIGURING, f"set up, waiting for {self._settings.position_log}")
         return out
 
     def _prompted(self, prompt: Prompt, now: Now) -> list[Output[bytes]]:
@@ -200,14 +200,14 @@ class GpsDriver:
         self._counts["restarts"] += 1
         self._fixes.clear()
         text = f"the receiver has started anew (prompt [{prompt.port}] without a command), setting it up again"
-        return [*self._tell(Phase.CONFIGURING, text), *self._begin(now)]
+        return [*self._tell(StationPhase.CONFIGURING, text), *self._begin(now)]
 
     def _unanswered(self, now: Now) -> list[Output[bytes]]:
         """No answer to a command. Stay with a receiver that speaks all the same, else try the next baud rate."""
         self._set_up.stop()
         if self._counts["samples"] > self._samples_before:
             return self._tell(
-                Phase.STREAMING,
+                StationPhase.STREAMING,
                 "the receiver sends fixes but does not answer commands: using what it sends unasked; "
                 "check that the line can send to it",
             )
@@ -216,7 +216,7 @@ class GpsDriver:
     def _silent(self, now: Now) -> list[Output[bytes]]:
         """No fix for too long: it has stopped, or its logs were lost with a restart, or it is no receiver at all."""
         heard, counts = self._heard.words(self._stream.counts), self._stream.counts
-        if self._phase is Phase.STREAMING or self._heard.good(counts) or self._heard.flaw(counts):
+        if self._phase is StationPhase.STREAMING or self._heard.good(counts) or self._heard.flaw(counts):
             if self._novatel:
                 text = (
                     f"no {self._settings.position_log} for {self._settings.silence:g} s, heard {heard} since, setting "
@@ -224,7 +224,7 @@ class GpsDriver:
                 )
             else:
                 text = self._heard.no_epoch(counts, self._settings.silence)
-            out = self._tell(Phase.SILENT, text)
+            out = self._tell(StationPhase.SILENT, text)
             self._heard.forget(self._stream.counts)
             return [*out, *self._begin(now)]
         return self._next_baud(now)
@@ -237,9 +237,9 @@ class GpsDriver:
         if len(self._attempts) >= max(1, len(self._settings.bauds)):
             wanted = "NovAtel receiver" if self._novatel else "NMEA receiver"
             # what noise looks like differs each time: not a new word for each round
-            if self._phase is not Phase.SILENT or now.monotonic_ns >= self._say_again_ns:
+            if self._phase is not StationPhase.SILENT or now.monotonic_ns >= self._say_again_ns:
                 self._say_again_ns = now.monotonic_ns + _SAY_AGAIN_NS
-                out += self._tell(Phase.SILENT, wrong_device(wanted, self._attempts))
+                out += self._tell(StationPhase.SILENT, wrong_device(wanted, self._attempts))
             self._attempts = []
         self._heard.forget(self._stream.counts)
         if len(self._settings.bauds) < 2:

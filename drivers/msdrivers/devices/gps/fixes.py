@@ -10,14 +10,14 @@ from modelserver.messages import GpsSample, SensorHeader
 from msdrivers.devices.gps.samples import USABLE_TIME, nmea_sample, novatel_sample
 from msdrivers.protocol import gps_time
 from msdrivers.protocol.nmea import NmeaEpoch
-from msdrivers.protocol.novatel import Heading, LogHeader, NovatelLog, Position, PositionType, Velocity
+from msdrivers.protocol.novatel import HeadingLog, LogHeader, NovatelLog, Position, PositionType, Velocity
 from msdrivers.station import Now
 
 WGS84 = 61
 
 
 @dataclass(frozen=True, slots=True)
-class Fix:
+class GpsFix:
     """A fix to publish. device_utime: 0 where the receiver's time cannot be used. delay: seconds by which the fix is
     older than that. origin: the log or sentences it is from, for people."""
 
@@ -26,7 +26,7 @@ class Fix:
     origin: str
     said: NmeaEpoch | Position
     velocity: Velocity | None = None
-    heading: Heading | None = None
+    heading: HeadingLog | None = None
     delay: float = 0.0
 
     def sample(self, header: SensorHeader) -> GpsSample:
@@ -36,7 +36,7 @@ class Fix:
         return novatel_sample(header, self.said, self.velocity, self.heading)
 
 
-class Fixes:
+class FixAssembler:
     """Takes logs and epochs; gives fixes, each instant once.
 
     logs: the names of the position log and of what belongs to it; empty for NMEA only.
@@ -46,8 +46,8 @@ class Fixes:
         self._logs = tuple(logs)
         self._hold_ns = hold_ns
         self._silence_ns = silence_ns
-        self._parts: dict[str, tuple[tuple[int, int], Velocity | Heading]] = {}
-        self._waiting: tuple[Fix, tuple[int, int], int] | None = None
+        self._parts: dict[str, tuple[tuple[int, int], Velocity | HeadingLog]] = {}
+        self._waiting: tuple[GpsFix, tuple[int, int], int] | None = None
         self._last_log: tuple[int, int] | None = None
         self._last_log_ns: int | None = None
         self._last_epoch: tuple[int, int | None] | None = None
@@ -79,11 +79,11 @@ class Fixes:
         """Return the monotonic nanoseconds at which a position has waited long enough."""
         return self._waiting[2] if self._waiting else None
 
-    def woken(self, now: Now) -> list[Fix]:
+    def woken(self, now: Now) -> list[GpsFix]:
         """Return the position that has waited long enough."""
         return self._release() if self._waiting and now.monotonic_ns >= self._waiting[2] else []
 
-    def epoch(self, epoch: NmeaEpoch, host_utime: int, now: Now) -> list[Fix]:
+    def epoch(self, epoch: NmeaEpoch, host_utime: int, now: Now) -> list[GpsFix]:
         """Take an NMEA epoch that began to come in at `host_utime`."""
         if self._last_log_ns is not None and now.monotonic_ns - self._last_log_ns < self._silence_ns:
             self.counts["superseded"] += 1
@@ -93,9 +93,9 @@ class Fixes:
             self.counts["repeated"] += 1
             return []
         self._last_epoch = instant
-        return [Fix(host_utime, _device_utime(epoch, now.utime), "NMEA", epoch)]
+        return [GpsFix(host_utime, _device_utime(epoch, now.utime), "NMEA", epoch)]
 
-    def log(self, log: NovatelLog, host_utime: int, now: Now) -> list[Fix]:
+    def log(self, log: NovatelLog, host_utime: int, now: Now) -> list[GpsFix]:
         """Take a log that began to come in at `host_utime`."""
         if log.header.name not in self._logs or log.body is None:
             return []
@@ -107,7 +107,7 @@ class Fixes:
             return []
         instant = (log.header.week, log.header.milliseconds)
         if not isinstance(log.body, Position):
-            assert isinstance(log.body, (Velocity, Heading))
+            assert isinstance(log.body, (Velocity, HeadingLog))
             self._parts[log.header.name] = (instant, log.body)
             return self._complete(instant)
         solution = instant[0] * gps_time.WEEK // 1000 + instant[1] - round(log.body.solution_age * 1000.0)
@@ -125,18 +125,18 @@ class Fixes:
         fixes = self._release()
         self._last_log, self._last_log_ns = instant, now.monotonic_ns
         device = device_utime(log.header, now.utime)
-        fix = Fix(host_utime, device, log.header.name, log.body, delay=max(0.0, log.body.solution_age))
+        fix = GpsFix(host_utime, device, log.header.name, log.body, delay=max(0.0, log.body.solution_age))
         self._waiting = (fix, instant, now.monotonic_ns + self._hold_ns)
         return fixes + self._complete(instant)
 
-    def _complete(self, instant: tuple[int, int]) -> list[Fix]:
+    def _complete(self, instant: tuple[int, int]) -> list[GpsFix]:
         """Release the position that waits if all that belongs to it is there."""
         if self._waiting is None or self._waiting[1] != instant:
             return []
         here = {name for name, (when, _) in self._parts.items() if when == instant}
         return self._release() if here.issuperset(self._logs[1:]) else []
 
-    def _release(self) -> list[Fix]:
+    def _release(self) -> list[GpsFix]:
         if self._waiting is None:
             return []
         fix, instant, _ = self._waiting

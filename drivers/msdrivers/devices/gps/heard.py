@@ -23,7 +23,7 @@ _REMEDIES = {
 }
 
 
-class Heard:
+class LineMonitor:
     """Remembers the beginning of what came, how much it was, and what counters said before."""
 
     def __init__(self) -> None:

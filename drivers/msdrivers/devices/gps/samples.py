@@ -9,7 +9,7 @@ from modelserver.messages.flags import NAN
 from modelserver.messages.samples import Matrix3
 from modelserver.spatial.so3 import Vector3
 from msdrivers.protocol.nmea import NmeaEpoch
-from msdrivers.protocol.novatel import Heading, Position, PositionType, SolutionStatus, TimeStatus, Velocity
+from msdrivers.protocol.novatel import HeadingLog, Position, PositionType, SolutionStatus, TimeStatus, Velocity
 
 USABLE_TIME = frozenset(
     {
@@ -88,7 +88,7 @@ def nmea_sample(header: SensorHeader, epoch: NmeaEpoch) -> GpsSample:
 
 
 def novatel_sample(
-    header: SensorHeader, position: Position, velocity: Velocity | None = None, heading: Heading | None = None
+    header: SensorHeader, position: Position, velocity: Velocity | None = None, heading: HeadingLog | None = None
 ) -> GpsSample:
     """Return the sample of a position log, with the velocity and the heading of the same instant where they are."""
     # without a solution the receiver fills in zeros, which say nothing
@@ -126,7 +126,7 @@ def covariance(east: float, north: float, up: float) -> Matrix3 | None:
     return (east * east, 0.0, 0.0, 0.0, north * north, 0.0, 0.0, 0.0, up * up)
 
 
-def _solved(said: Position | Velocity | Heading) -> bool:
+def _solved(said: Position | Velocity | HeadingLog) -> bool:
     return said.status == SolutionStatus.SOL_COMPUTED and said.type != PositionType.NONE
 
 

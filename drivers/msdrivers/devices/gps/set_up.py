@@ -8,7 +8,7 @@ from enum import Enum
 from msdrivers.protocol.novatel import Answer
 
 
-class Progress(Enum):
+class SetupProgress(Enum):
     """How far the dialogue is."""
 
     IDLE = "idle"
@@ -30,7 +30,7 @@ class SetUp:
         """A command was sent more than once, and the other answers may come yet."""
         self._due: int | None = None
         self._last_answer_ns: int | None = None
-        self.progress = Progress.IDLE
+        self.progress = SetupProgress.IDLE
         self.refused: list[tuple[str, str]] = []
         """Commands that were refused, and the receiver's words."""
 
@@ -44,7 +44,7 @@ class SetUp:
 
     def stop(self) -> None:
         """Await nothing any more."""
-        self.progress = Progress.IDLE
+        self.progress = SetupProgress.IDLE
         self._due = None
 
     def due(self) -> int | None:
@@ -54,14 +54,14 @@ class SetUp:
     def answered(self, answer: Answer, now_ns: int) -> bytes:
         """Take an answer; return what to send next, empty where nothing is."""
         self._last_answer_ns = now_ns
-        if self.progress is not Progress.ASKING or self._settling:
+        if self.progress is not SetupProgress.ASKING or self._settling:
             return b""
         if not answer.ok:
             self.refused.append((self._commands[self._index], answer.error))
         self._index += 1
         tries, self._tries = self._tries, 0
         if self._index == len(self._commands):
-            self.progress = Progress.DONE
+            self.progress = SetupProgress.DONE
             self._due = None
             return b""
         if tries > 1:
@@ -77,19 +77,19 @@ class SetUp:
             return b""
         self._settling = False
         if self._tries >= self._attempts:
-            self.progress = Progress.UNANSWERED
+            self.progress = SetupProgress.UNANSWERED
             self._due = None
             return b""
         return self._ask(now_ns)
 
     def expects_prompt(self, now_ns: int) -> bool:
         """Return whether a prompt belongs to an answer, and is not that of a receiver that has just started."""
-        return self.progress is Progress.ASKING or (
+        return self.progress is SetupProgress.ASKING or (
             self._last_answer_ns is not None and now_ns - self._last_answer_ns < self._answer_ns
         )
 
     def _ask(self, now_ns: int) -> bytes:
-        self.progress = Progress.ASKING
+        self.progress = SetupProgress.ASKING
         self._tries += 1
         self._due = now_ns + self._answer_ns
         return self._commands[self._index].encode("ascii") + b"\r\n"

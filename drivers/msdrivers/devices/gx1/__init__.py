@@ -2,6 +2,6 @@
 
 from msdrivers.devices.gx1.driver import Gx1Driver
 from msdrivers.devices.gx1.hard_iron import HardIron, HardIronResult, HardIronSettings
-from msdrivers.devices.gx1.settings import Gx1Settings, Heading
+from msdrivers.devices.gx1.settings import Gx1Settings, HeadingSource
 
-__all__ = ["Gx1Driver", "Gx1Settings", "HardIron", "HardIronResult", "HardIronSettings", "Heading"]
+__all__ = ["Gx1Driver", "Gx1Settings", "HardIron", "HardIronResult", "HardIronSettings", "HeadingSource"]

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import TypeAlias, TypeVar
 
 from msdrivers.devices.gx1.dialogue import Ask, Listen, NoReplyError, Pause, Step
-from msdrivers.devices.gx1.link import Link
-from msdrivers.protocol.gx1 import DATA, Address, Command, Gains, Packet, requests
+from msdrivers.devices.gx1.link import Gx1Link
+from msdrivers.protocol.gx1 import DATA, Address, CommandByte, Gains, Packet, requests
 from msdrivers.protocol.gx1.scaling import version_text
-from msdrivers.station import Phase, Reopen, Send, Told
+from msdrivers.station import Reopen, Send, StationPhase, StationStatus
 
 T = TypeVar("T")
 Part: TypeAlias = Generator[Step, tuple[Packet, ...], T]
@@ -42,7 +42,7 @@ class UnusableError(Exception):
 
 
 @dataclass(slots=True)
-class Found:
+class ContactState:
     """What is known of the line: the baud rates in the order to try, what the device streamed when it was found.
 
     `streamed` is None until that is known, and 0 for a device that streamed nothing. `known`: a device has answered at
@@ -64,7 +64,7 @@ class Found:
         return requests.stream(self.streamed) if self.streamed else requests.STOP
 
 
-def contact(link: Link, found: Found) -> Part[str]:
+def contact(link: Gx1Link, found: ContactState) -> Part[str]:
     """Find the device: stop what it streams at one baud rate after the other. Return its serial number and firmware.
 
     Returns once one answers. The line is taken to be open at the first of the baud rates.
@@ -87,14 +87,14 @@ def contact(link: Link, found: Found) -> Part[str]:
                 return device
             found.known = False
             heard.append(link.heard())
-        yield Told(Phase.SILENT, _nobody(found.bauds, heard))
+        yield StationStatus(StationPhase.SILENT, _nobody(found.bauds, heard))
         yield Pause(RETRY_S)
         if len(found.bauds) > 1:
             found.bauds.append(found.bauds.pop(0))
             yield Reopen("no 3DM-GX1 found, trying again", found.bauds[0])
 
 
-def _hail(link: Link, found: Found, flush: float) -> Part[None]:
+def _hail(link: Gx1Link, found: ContactState, flush: float) -> Part[None]:
     """Note what the device streams and stop it, within `flush` seconds. Two replies of one kind say that it streams."""
     listened = yield Listen(LISTEN_S, frozenset(DATA))
     kinds = [packet.command for packet in listened]
@@ -112,8 +112,8 @@ def _hail(link: Link, found: Found, flush: float) -> Part[None]:
 
 
 def _identity() -> Part[str]:
-    (serial,) = yield Ask(requests.poll(Command.SERIAL))
-    (firmware,) = yield Ask(requests.poll(Command.FIRMWARE))
+    (serial,) = yield Ask(requests.poll(CommandByte.SERIAL))
+    (firmware,) = yield Ask(requests.poll(CommandByte.FIRMWARE))
     return f"3DM-GX1 serial {serial.unsigned}, firmware {version_text(firmware.unsigned)}"
 
 

@@ -7,7 +7,7 @@ import math
 from modelserver.messages import NAN, ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.spatial import so3
 from modelserver.spatial.so3 import Quaternion, Vector3
-from msdrivers.devices.gx1.settings import Heading
+from msdrivers.devices.gx1.settings import HeadingSource
 from msdrivers.protocol.gx1 import Gains, Packet
 from msdrivers.protocol.gx1.scaling import (
     G0,
@@ -30,7 +30,7 @@ def saturated_fields(packet: Packet) -> tuple[str, ...]:
 
 
 def imu_sample(
-    packet: Packet, gains: Gains, force_sign: int, heading: Heading, header: SensorHeader, celsius: float = NAN
+    packet: Packet, gains: Gains, force_sign: int, heading: HeadingSource, header: SensorHeader, celsius: float = NAN
 ) -> ImuSample:
     """Return what a measurement says; what it does not say, or says saturated, is None.
 
@@ -50,7 +50,7 @@ def imu_sample(
         magnetic_field=told("field", gains.magnetometer, TESLA),
         orientation=orientation,
         orientation_reference=OrientationReference.NED if orientation else OrientationReference.NONE,
-        yaw_source=YawSource.MAGNETIC if orientation and heading is Heading.MAGNETIC else YawSource.NONE,
+        yaw_source=YawSource.MAGNETIC if orientation and heading is HeadingSource.MAGNETIC else YawSource.NONE,
         temperature_celsius=celsius,
     )
 

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias
 
-from msdrivers.devices.gx1.link import Link, Reply
-from msdrivers.protocol.gx1 import Command, Packet
-from msdrivers.station import Now, Output, Reopen, Send, Told
+from msdrivers.devices.gx1.link import Gx1Link, Reply
+from msdrivers.protocol.gx1 import CommandByte, Packet
+from msdrivers.station import Now, Output, Reopen, Send, StationStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Listen:
     commands: frozenset[int]
 
 
-Step: TypeAlias = Ask | Pause | Listen | Send[bytes] | Told | Reopen
+Step: TypeAlias = Ask | Pause | Listen | Send[bytes] | StationStatus | Reopen
 Script: TypeAlias = Generator[Step, tuple[Packet, ...], None]
 
 
@@ -61,14 +61,14 @@ class NoReplyError(Exception):
 
     def __init__(self, command: int, tries: int):
         self.command = command
-        name = Command(command).name.lower().replace("_", " ")
+        name = CommandByte(command).name.lower().replace("_", " ")
         super().__init__(f"the request '{name}' was sent {tries} times and not answered")
 
 
 class Dialogue:
     """Carries a script forward. `running` until it ends."""
 
-    def __init__(self, link: Link, script: Callable[[], Script]):
+    def __init__(self, link: Gx1Link, script: Callable[[], Script]):
         """Take the line, and what begins the script from its start."""
         self._link = link
         self._begin = script
@@ -150,9 +150,9 @@ class Dialogue:
             except StopIteration:
                 self._script = None
                 return outputs
-            if isinstance(step, Send | Told | Reopen):
+            if isinstance(step, Send | StationStatus | Reopen):
                 outputs.append(step)
-            if isinstance(step, Send | Told):
+            if isinstance(step, Send | StationStatus):
                 assert self._script is not None
                 resume = partial(self._script.send, ())
                 continue

@@ -6,22 +6,22 @@ from collections import Counter
 from collections.abc import Mapping
 
 from modelserver.messages import NAN, SensorHeader
-from msdrivers.devices.gx1.contact import RETRY_S, Found, Part, UnusableError, contact, read_gains, read_words
+from msdrivers.devices.gx1.contact import RETRY_S, ContactState, Part, UnusableError, contact, read_gains, read_words
 from msdrivers.devices.gx1.conversion import GravityCheck, imu_sample, saturated_fields
 from msdrivers.devices.gx1.dialogue import Ask, Dialogue, NoReplyError, Pause, Script
-from msdrivers.devices.gx1.link import Link, Reply
+from msdrivers.devices.gx1.link import Gx1Link, Reply
 from msdrivers.devices.gx1.polls import Polls
 from msdrivers.devices.gx1.settings import Gx1Settings
 from msdrivers.devices.gx1.tick_rate import TickRate
-from msdrivers.protocol.gx1 import DATA, LENGTHS, Address, Command, Gains, requests
+from msdrivers.protocol.gx1 import DATA, LENGTHS, Address, CommandByte, Gains, requests
 from msdrivers.protocol.gx1.scaling import DOCUMENTED_TIMERS, temperature_celsius, tick_seconds
-from msdrivers.station import Measured, Now, Output, Phase, Send, Told
+from msdrivers.station import Measured, Now, Output, Send, StationPhase, StationStatus
 
 BIAS_S = 9.0
 """How long a capture of the gyros' biases may take: less than until a line that brings nothing is opened anew."""
 
 GRAVITY_POLL_S = 1.0
-_POSTURE = (Command.EULER_VECTORS, Command.QUATERNION_VECTORS)
+_POSTURE = (CommandByte.EULER_VECTORS, CommandByte.QUATERNION_VECTORS)
 """Messages that tell whether specific force points up: with it, rates and orientation."""
 
 
@@ -37,9 +37,9 @@ class Gx1Driver:
         self.settings = settings
         self.tick_s = settings.tick or 0.0
         """Seconds of a tick; 0 before that is known."""
-        self._link = Link()
+        self._link = Gx1Link()
         self._dialogue = Dialogue(self._link, self._set_up)
-        self._found = Found(list(settings.bauds))
+        self._found = ContactState(list(settings.bauds))
         self._gains = Gains(1, 1, 1)
         self._device = "3DM-GX1"
         self._bias_pending = settings.capture_bias_at_start
@@ -75,7 +75,7 @@ class Gx1Driver:
             return self._restarted(now, self._why_silent())
         for command in self._polls.overdue(now.monotonic_ns):
             self._link.parser.give_up(command)
-            self._counts[f"unanswered.{Command(command).name.lower()}"] += 1
+            self._counts[f"unanswered.{CommandByte(command).name.lower()}"] += 1
         outputs: list[Output[bytes]] = []
         for command in self._polls.take_due(now.monotonic_ns):
             self._link.parser.expect(command)
@@ -103,7 +103,7 @@ class Gx1Driver:
         while True:
             try:
                 self._device = yield from contact(self._link, self._found)
-                yield Told(Phase.CONFIGURING, f"{self._device} answers{self._found.at}")
+                yield StationStatus(StationPhase.CONFIGURING, f"{self._device} answers{self._found.at}")
                 self._gains = yield from read_gains()
                 yield from self._read_timer()
                 if self.settings.capture_bias_at_start:
@@ -114,7 +114,7 @@ class Gx1Driver:
                 why = f"{self._device} fell silent while it was set up: {silence}; check its cable and power"
             except UnusableError as unusable:
                 why = f"{self._device} cannot be used: {unusable}"
-            yield Told(Phase.SILENT, f"{why}; nothing is published, trying again in {RETRY_S:g} s")
+            yield StationStatus(StationPhase.SILENT, f"{why}; nothing is published, trying again in {RETRY_S:g} s")
             yield Pause(RETRY_S)
 
     def _read_timer(self) -> Part[None]:
@@ -127,8 +127,8 @@ class Gx1Driver:
                     f"{list(Address.TIMER)}); write the defaults 16 16 256 1 to them, or set tick in the settings"
                 )
             if words not in DOCUMENTED_TIMERS:
-                yield Told(
-                    Phase.CONFIGURING,
+                yield StationStatus(
+                    StationPhase.CONFIGURING,
                     f"the timer words {list(words)} are not documented; a tick of {self.tick_s * 1e3:g} ms is "
                     "inferred from them and will be compared with the host's clock",
                 )
@@ -137,23 +137,23 @@ class Gx1Driver:
 
     def _capture_bias(self) -> Part[None]:
         if not self._bias_pending:
-            yield Told(
-                Phase.CONFIGURING,
+            yield StationStatus(
+                StationPhase.CONFIGURING,
                 "the gyro biases are not captured again, since the vehicle may be moving; for that restart the driver "
                 "at rest",
             )
             return
-        yield Told(Phase.CONFIGURING, "capturing the gyro biases: keep the vehicle still")
+        yield StationStatus(StationPhase.CONFIGURING, "capturing the gyro biases: keep the vehicle still")
         self._bias_pending = False
         try:
-            yield Ask(requests.poll(Command.CAPTURE_BIAS), timeout=BIAS_S, tries=1)
+            yield Ask(requests.poll(CommandByte.CAPTURE_BIAS), timeout=BIAS_S, tries=1)
         except NoReplyError:
             text = (
                 f"the capture of the gyro biases did not end within {BIAS_S:g} s; going on with the biases from before"
             )
         else:
             text = "the gyro biases are captured"
-        yield Told(Phase.CONFIGURING, text)
+        yield StationStatus(StationPhase.CONFIGURING, text)
 
     def _start(self) -> Part[None]:
         message = self.settings.message
@@ -167,11 +167,11 @@ class Gx1Driver:
         self._gravity = GravityCheck()
         self._polls = Polls()
         if self.settings.temperature_period:
-            self._polls.add(Command.TEMPERATURE, self.settings.temperature_period, now_ns)
+            self._polls.add(CommandByte.TEMPERATURE, self.settings.temperature_period, now_ns)
         if self.settings.polled is not None:
             self._polls.add(self.settings.polled, self.settings.poll_period, now_ns)
         if message not in _POSTURE and self.settings.polled not in _POSTURE:
-            self._polls.add(Command.EULER_VECTORS, GRAVITY_POLL_S, now_ns)
+            self._polls.add(CommandByte.EULER_VECTORS, GRAVITY_POLL_S, now_ns)
 
     def _streamed(self, reply: Reply, now: Now) -> list[Output[bytes]]:
         """Take a reply while the device streams."""
@@ -180,7 +180,7 @@ class Gx1Driver:
         packet, count = reply
         command = packet.command
         self._polls.answered(command)
-        if command == Command.TEMPERATURE:
+        if command == CommandByte.TEMPERATURE:
             self._celsius = temperature_celsius(packet.unsigned)
         if command not in DATA:
             return []
@@ -190,9 +190,9 @@ class Gx1Driver:
             self._link.mark()
             if not self._streams:
                 self._streams = True
-                outputs.append(Told(Phase.STREAMING, f"{self._device} streams message {int(command)}"))
+                outputs.append(StationStatus(StationPhase.STREAMING, f"{self._device} streams message {int(command)}"))
             if self._rate.take(count, now.monotonic_ns):
-                outputs.append(Told(Phase.STREAMING, self._rate.text()))
+                outputs.append(StationStatus(StationPhase.STREAMING, self._rate.text()))
         device_utime = round(count * self.tick_s * 1e6) if self._rate.agrees else 0
         header = SensorHeader(0, self.settings.source, self._seq, now.utime, device_utime)
         sample = imu_sample(
@@ -211,16 +211,16 @@ class Gx1Driver:
         return [*outputs, Measured(sample, self.settings.delay + line, self.settings.delay_sigma, self.tick_s)]
 
     def _gravity_found(self) -> list[Output[bytes]]:
-        if Command.EULER_VECTORS not in (self.settings.message, self.settings.polled):
+        if CommandByte.EULER_VECTORS not in (self.settings.message, self.settings.polled):
             # it was polled for this only
-            self._polls.remove(Command.EULER_VECTORS)
-            self._link.parser.give_up(Command.EULER_VECTORS)
+            self._polls.remove(CommandByte.EULER_VECTORS)
+            self._link.parser.give_up(CommandByte.EULER_VECTORS)
         if self._gravity.upwards:
             return []
         sign = self.settings.specific_force_sign
         return [
-            Told(
-                Phase.STREAMING,
+            StationStatus(
+                StationPhase.STREAMING,
                 "at rest the specific force points down by the device's own orientation, and must point up: this "
                 f"device gives the opposite of specific force; set specific_force_sign to {-sign} (it is {sign})",
             )
@@ -237,5 +237,5 @@ class Gx1Driver:
 
     def _restarted(self, now: Now, why: str) -> list[Output[bytes]]:
         self._counts["restarts"] += 1
-        told = Told(Phase.SILENT, f"{self._device}: {why}; setting it up anew")
+        told = StationStatus(StationPhase.SILENT, f"{self._device}: {why}; setting it up anew")
         return [told, *self._dialogue.start(now)]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from modelserver.spatial.so3 import Vector3
 from msdrivers.devices.gx1.contact import (
     RETRY_S,
-    Found,
+    ContactState,
     Part,
     UnusableError,
     contact,
@@ -23,10 +23,10 @@ from msdrivers.devices.gx1.contact import (
     write_word,
 )
 from msdrivers.devices.gx1.dialogue import Ask, Dialogue, NoReplyError, Pause, Script
-from msdrivers.devices.gx1.link import Link
-from msdrivers.protocol.gx1 import Address, Command, Packet, requests
+from msdrivers.devices.gx1.link import Gx1Link
+from msdrivers.protocol.gx1 import Address, CommandByte, Packet, requests
 from msdrivers.protocol.gx1.scaling import TESLA, is_saturated, vector
-from msdrivers.station import Now, Output, Phase, Send, Told
+from msdrivers.station import Now, Output, Send, StationPhase, StationStatus
 
 PROGRESS_S = 5.0
 AGREE = 0.02
@@ -85,9 +85,9 @@ class HardIron:
         """Take the settings."""
         self.settings = settings
         self.result: HardIronResult | None = None
-        self._link = Link()
+        self._link = Gx1Link()
         self._dialogue = Dialogue(self._link, self._procedure)
-        self._found = Found(list(settings.bauds))
+        self._found = ContactState(list(settings.bauds))
         self._gain = 1
         self._before: tuple[int, ...] = ()
         self._begun = False
@@ -122,7 +122,11 @@ class HardIron:
                 Send(requests.write_eeprom(address, value))
                 for address, value in zip(Address.HARD_IRON, self._before, strict=True)
             ]
-            outputs.append(Told(Phase.CONFIGURING, "hard iron: interrupted, the offsets from before are written back"))
+            outputs.append(
+                StationStatus(
+                    StationPhase.CONFIGURING, "hard iron: interrupted, the offsets from before are written back"
+                )
+            )
         if self._found.streamed is not None and self.result is None:
             outputs.append(Send(self._found.restored()))
         return outputs
@@ -142,7 +146,7 @@ class HardIron:
                 why = str(unusable)
             else:
                 break
-            yield Told(Phase.SILENT, f"hard iron: cannot begin: {why}; trying again in {RETRY_S:g} s")
+            yield StationStatus(StationPhase.SILENT, f"hard iron: cannot begin: {why}; trying again in {RETRY_S:g} s")
             yield Pause(RETRY_S)
         try:
             offsets = yield from self._find()
@@ -152,7 +156,7 @@ class HardIron:
             text = yield from self._undo(str(failure))
             self.result = HardIronResult(False, text, spans=self._spans() if self._extremes[0] else None)
         yield Send(self._found.restored())
-        yield Told(Phase.CONFIGURING, text)
+        yield StationStatus(StationPhase.CONFIGURING, text)
 
     def _prepare(self) -> Part[None]:
         device = yield from contact(self._link, self._found)
@@ -160,13 +164,17 @@ class HardIron:
         # begun before and the line lost: the device has no offsets now
         if not self._begun:
             self._before = yield from read_words(Address.HARD_IRON)
-        yield Told(Phase.CONFIGURING, f"hard iron: {device}, offsets before {_signed(self._before)} counts")
+        yield StationStatus(
+            StationPhase.CONFIGURING, f"hard iron: {device}, offsets before {_signed(self._before)} counts"
+        )
 
     def _find(self) -> Part[Vector3]:
         self._begun = True
         yield Ask(requests.hard_iron_start())
         how = "on level ground through full circles" if self.settings.two_dimensional else "about all its axes"
-        yield Told(Phase.CONFIGURING, f"hard iron: turn the vehicle {how}, for {self.settings.duration:g} s")
+        yield StationStatus(
+            StationPhase.CONFIGURING, f"hard iron: turn the vehicle {how}, for {self.settings.duration:g} s"
+        )
         yield from self._collect()
         self._check_turns()
         kind = self.settings.two_dimensional
@@ -178,13 +186,13 @@ class HardIron:
         link, seconds = self._link, 1e9
         begin = told = link.now.monotonic_ns
         while link.now.monotonic_ns - begin < self.settings.duration * seconds:
-            (reply,) = yield Ask(requests.poll(Command.HARD_IRON_COLLECT))
+            (reply,) = yield Ask(requests.poll(CommandByte.HARD_IRON_COLLECT))
             self._extremes = (reply.field("minimum"), reply.field("maximum"))
             if link.now.monotonic_ns - told >= PROGRESS_S * seconds:
                 told = link.now.monotonic_ns
                 done = (told - begin) / seconds
-                yield Told(
-                    Phase.CONFIGURING,
+                yield StationStatus(
+                    StationPhase.CONFIGURING,
                     f"hard iron: {done:.0f} of {self.settings.duration:g} s, field spans {_microtesla(self._spans())}",
                 )
             yield Pause(self.settings.period)

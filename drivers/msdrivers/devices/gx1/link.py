@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import NamedTuple
 
-from msdrivers.protocol.gx1 import DATA, LAYOUTS, Command, Gx1Parser, Packet, TickWatch
+from msdrivers.protocol.gx1 import DATA, LAYOUTS, CommandByte, Gx1Parser, Packet, TickWatch
 from msdrivers.protocol.gx1.scaling import QUARTER_TURN, is_unit
 from msdrivers.station import Now
 
@@ -20,7 +20,7 @@ class Reply(NamedTuple):
     ticks: int
 
 
-class Link:
+class Gx1Link:
     """Bytes in, replies that count out: asked for, checksum right, ticks after those before, content possible."""
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class Link:
         replies = [Reply(packet, count) for packet, count in zip(packets, self._counts, strict=True)]
         self._counts.clear()
         for packet in packets:
-            self.messages[f"message.{Command(packet.command).name.lower()}"] += 1
+            self.messages[f"message.{CommandByte(packet.command).name.lower()}"] += 1
         return replies
 
     def stream(self, command: int) -> None:
@@ -105,7 +105,7 @@ def _possible(packet: Packet) -> bool:
         return abs(packet.field("euler")[1]) <= QUARTER_TURN
     if packet.has("quaternion"):
         return is_unit(packet.field("quaternion"))
-    if packet.command == Command.CONTINUOUS:
+    if packet.command == CommandByte.CONTINUOUS:
         # a command byte behind a zero
         return packet.words[0] == 0 or packet.words[0] in LAYOUTS
     return True

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from msdrivers.protocol.gx1 import DATA, Command
+from msdrivers.protocol.gx1 import DATA, CommandByte
 
 
-class Heading(Enum):
+class HeadingSource(Enum):
     """Where the yaw of the device's own orientation comes from, as it is set up."""
 
     VERTICAL_GYRO = "vertical_gyro"
@@ -34,8 +34,8 @@ class Gx1Settings:
     """
 
     source: str
-    message: int = Command.EULER_VECTORS
-    heading: Heading = Heading.VERTICAL_GYRO
+    message: int = CommandByte.EULER_VECTORS
+    heading: HeadingSource = HeadingSource.VERTICAL_GYRO
     polled: int | None = None
     poll_period: float = 0.1
     temperature_period: float = 10.0
@@ -54,7 +54,10 @@ class Gx1Settings:
                 raise ValueError(f"{name}: {command} is no measurement of a 3DM-GX1; there are {known}")
         if self.polled == self.message:
             raise ValueError(f"polled: {int(self.message)} is streamed already; leave it out or choose another")
-        if Command.INSTANTANEOUS_EULER in (self.message, self.polled) and self.heading is Heading.VERTICAL_GYRO:
+        if (
+            CommandByte.INSTANTANEOUS_EULER in (self.message, self.polled)
+            and self.heading is HeadingSource.VERTICAL_GYRO
+        ):
             raise ValueError(
                 "heading: the instantaneous orientation (13) has its yaw from the magnetometers, which a vertical "
                 "gyro does not use; choose heading magnetic, or the stabilised orientation (14)"

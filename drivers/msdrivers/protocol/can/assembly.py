@@ -8,7 +8,7 @@ from msdrivers.protocol.can.database import BoundSignal
 from msdrivers.protocol.can.frame import FrameKey
 
 
-class Instant(NamedTuple):
+class CanFrameSet(NamedTuple):
     """What the frames of one instant hold: when the first came, and the bits of each signal by frame and name."""
 
     monotonic_ns: int
@@ -28,7 +28,7 @@ class Instant(NamedTuple):
         return None if raw is None or signal is None else signal.physical(raw)
 
 
-class Assembler:
+class CanFrameAssembler:
     """Waits for the frames that make an instant, for at most `window_ns` after the first.
 
     A frame that comes a second time begins the next instant: what was missing of the last one was lost.
@@ -48,7 +48,7 @@ class Assembler:
         self._begun_ns = 0
         self._utime = 0
 
-    def add(self, key: FrameKey, values: dict[str, float], monotonic_ns: int, utime: int) -> list[Instant]:
+    def add(self, key: FrameKey, values: dict[str, float], monotonic_ns: int, utime: int) -> list[CanFrameSet]:
         """Take a frame's values; return the instants that end with it: the one it completes, the one it ends."""
         ended = self.expired(monotonic_ns)
         if key in self._pending:
@@ -60,7 +60,7 @@ class Assembler:
             ended.append(self._end(True))
         return ended
 
-    def expired(self, monotonic_ns: int) -> list[Instant]:
+    def expired(self, monotonic_ns: int) -> list[CanFrameSet]:
         """Return the instant that has waited long enough for its missing frames, if there is one."""
         due = self.due()
         return [self._end(False)] if due is not None and monotonic_ns >= due else []
@@ -69,7 +69,7 @@ class Assembler:
         """Return when an instant will have waited long enough; None where none is begun."""
         return self._begun_ns + self._window_ns if self._pending else None
 
-    def _end(self, is_complete: bool) -> Instant:
-        ended = Instant(self._begun_ns, self._utime, self._pending, is_complete)
+    def _end(self, is_complete: bool) -> CanFrameSet:
+        ended = CanFrameSet(self._begun_ns, self._utime, self._pending, is_complete)
         self._pending = {}
         return ended

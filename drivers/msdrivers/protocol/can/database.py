@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from modelserver.errors import ConfigError, ModelServerError, Problem, Severity, Source, Suggested, shown, suggestions
+from modelserver.errors import ConfigError, Location, ModelServerError, Problem, Severity, Suggested, shown, suggestions
 from msdrivers.protocol.can.frame import CanFrame, FrameKey
 
 if TYPE_CHECKING:
@@ -127,13 +127,13 @@ def parse_dbc(text: str, name: str) -> CanDatabase:
     from cantools.database.errors import UnsupportedDatabaseFormatError
 
     if len(text) > MAX_TEXT:
-        raise ConfigError([Problem(Severity.ERROR, "larger than 8 MiB", Source(name), _UNFIT)])
+        raise ConfigError([Problem(Severity.ERROR, "larger than 8 MiB", Location(name), _UNFIT)])
     try:
         database = load_string(text, "dbc")
     except UnsupportedDatabaseFormatError as error:
         line = _LINE.search(str(error))
         said = f"not a DBC file that can be read: {shown(str(error.e_dbc or error), 100)}"
-        problem = Problem(Severity.ERROR, said, Source(name, int(line[1]) if line else 0), _UNFIT)
+        problem = Problem(Severity.ERROR, said, Location(name, int(line[1]) if line else 0), _UNFIT)
         raise ConfigError([problem]) from None
     assert isinstance(database, Database)
     messages = {message.name: message for message in database.messages}
@@ -145,7 +145,7 @@ def parse_dbc(text: str, name: str) -> CanDatabase:
         if other is not found:
             fix = "keep the one that the controller speaks"
             said = f"messages {other.name} and {found.name} have one identifier, {key}"
-            problems.append(Problem(Severity.ERROR, said, Source(name), fix))
+            problems.append(Problem(Severity.ERROR, said, Location(name), fix))
     if problems:
         raise ConfigError(problems)
     return CanDatabase(name, messages, by_key)
@@ -193,7 +193,7 @@ class Binder:
 
     def problem(self, key: str, message: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
         """Note something wrong with the setting at `key`: there it is mended, not in the DBC file."""
-        source = Source(element=f"{self._place}.{key}")
+        source = Location(element=f"{self._place}.{key}")
         said = f"{self._database.name}: {message}"
         self.problems.append(Problem(Severity.ERROR, said, source, fix, nearest))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from modelserver.messages import NAN, VehicleMode
-from msdrivers.protocol.can.assembly import Instant
+from msdrivers.protocol.can.assembly import CanFrameSet
 from msdrivers.protocol.can.database import Binder, BoundSignal, CanDatabase
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.can.mapping import CommandMap, SignalMap, StatusMap
@@ -21,19 +21,19 @@ class BoundStatus:
     map: StatusMap
     signals: dict[str, BoundSignal]
 
-    def mode(self, instant: Instant) -> VehicleMode:
+    def mode(self, instant: CanFrameSet) -> VehicleMode:
         """Return who drives; UNKNOWN where it is not said, or with a number that the mapping does not have."""
         raw = instant.raw(self.signals.get("mode"))
         numbers = {number: VehicleMode[name.upper()] for name, number in self.map.modes.items()}
         return VehicleMode.UNKNOWN if raw is None else numbers.get(int(raw), VehicleMode.UNKNOWN)
 
-    def number(self, name: str, instant: Instant) -> float:
+    def number(self, name: str, instant: CanFrameSet) -> float:
         """Return one of `NUMBERS`, in SI units; nan where it is not said."""
         physical = instant.physical(self.signals.get(name))
         mapped: SignalMap | None = getattr(self.map, name)
         return NAN if physical is None or mapped is None else physical * mapped.scale + mapped.offset
 
-    def word(self, name: str, instant: Instant) -> int | None:
+    def word(self, name: str, instant: CanFrameSet) -> int | None:
         """Return `fault_bits` or `commands_refused`: 0 where the controller has none, None where it did not come."""
         if name not in self.signals:
             return 0

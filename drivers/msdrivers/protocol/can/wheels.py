@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from modelserver.messages import NAN, Direction
-from msdrivers.protocol.can.assembly import Instant
+from msdrivers.protocol.can.assembly import CanFrameSet
 from msdrivers.protocol.can.counts import Odometer
 from msdrivers.protocol.can.database import Binder, BoundSignal, CanDatabase
 from msdrivers.protocol.can.mapping import SpeedMap, WheelMap
@@ -35,7 +35,7 @@ class BoundWheel:
         wrap = self.map.count.wrap or 1 << self.count.length
         return Odometer(wrap, self.map.count.metres_per_count, max_speed, delay, self.map.count.up_only)
 
-    def turning(self, instant: Instant) -> Direction:
+    def turning(self, instant: CanFrameSet) -> Direction:
         """Return which way the wheel turns, as the encoder tells."""
         if self.map.is_unsigned:
             return Direction.UNSIGNED
@@ -49,7 +49,7 @@ class BoundWheel:
         }
         return numbers.get(int(raw), Direction.UNKNOWN) if raw == raw and abs(raw) < 1e18 else Direction.UNKNOWN
 
-    def speed_of(self, instant: Instant, direction: Direction) -> float:
+    def speed_of(self, instant: CanFrameSet, direction: Direction) -> float:
         """Return the speed, m/s, forward positive (UNSIGNED: its size); nan where it or its sign did not come."""
         physical = instant.physical(self.speed)
         if physical is None or self.map.speed is None:
@@ -61,7 +61,7 @@ class BoundWheel:
             return abs(speed)
         return {Direction.FORWARD: speed, Direction.BACKWARD: -speed}.get(direction, NAN)
 
-    def steering_of(self, instant: Instant) -> float:
+    def steering_of(self, instant: CanFrameSet) -> float:
         """Return the steering angle, radians; 0 for a wheel that does not steer, nan where it is not measured."""
         if self.map.steering is None:
             return NAN if self.map.steers else 0.0

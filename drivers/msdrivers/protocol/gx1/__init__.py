@@ -1,6 +1,6 @@
 """The serial protocol of the MicroStrain 3DM-GX1, from both sides. Pure."""
 
-from msdrivers.protocol.gx1.packets import DATA, LAYOUTS, LENGTHS, Command, Packet
+from msdrivers.protocol.gx1.packets import DATA, LAYOUTS, LENGTHS, CommandByte, Packet
 from msdrivers.protocol.gx1.parser import Gx1Parser
 from msdrivers.protocol.gx1.requests import Request, RequestParser
 from msdrivers.protocol.gx1.scaling import Address, Gains
@@ -11,7 +11,7 @@ __all__ = [
     "LAYOUTS",
     "LENGTHS",
     "Address",
-    "Command",
+    "CommandByte",
     "Gains",
     "Gx1Parser",
     "Packet",

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from msdrivers.protocol.gx1.checksum import sealed
 
 
-class Command(IntEnum):
+class CommandByte(IntEnum):
     """The command byte of a request, and of the reply to it."""
 
     STABILISED_VECTORS = 0x02
@@ -35,7 +35,7 @@ class Command(IntEnum):
     SERIAL = 0xF1
 
 
-class Layout(NamedTuple):
+class ReplyLayout(NamedTuple):
     """What stands in a reply between the command byte and the checksum, in order.
 
     `fields` are names and numbers of words; `ticks`: whether the timer's ticks follow them.
@@ -57,36 +57,36 @@ class Layout(NamedTuple):
 
 _VECTORS = (("field", 3), ("acceleration", 3), ("rate", 3))
 
-LAYOUTS: dict[int, Layout] = {
-    Command.STABILISED_VECTORS: Layout(_VECTORS),
-    Command.INSTANTANEOUS_VECTORS: Layout(_VECTORS),
-    Command.CAPTURE_BIAS: Layout(()),
-    Command.TEMPERATURE: Layout((("temperature", 1),)),
-    Command.QUATERNION_VECTORS: Layout((("quaternion", 4), *_VECTORS)),
-    Command.INSTANTANEOUS_EULER: Layout((("euler", 3),)),
-    Command.STABILISED_EULER: Layout((("euler", 3),)),
+LAYOUTS: dict[int, ReplyLayout] = {
+    CommandByte.STABILISED_VECTORS: ReplyLayout(_VECTORS),
+    CommandByte.INSTANTANEOUS_VECTORS: ReplyLayout(_VECTORS),
+    CommandByte.CAPTURE_BIAS: ReplyLayout(()),
+    CommandByte.TEMPERATURE: ReplyLayout((("temperature", 1),)),
+    CommandByte.QUATERNION_VECTORS: ReplyLayout((("quaternion", 4), *_VECTORS)),
+    CommandByte.INSTANTANEOUS_EULER: ReplyLayout((("euler", 3),)),
+    CommandByte.STABILISED_EULER: ReplyLayout((("euler", 3),)),
     # a zero byte and the command now streamed; the second word is zero or the ticks, sources differ: not read as ticks
-    Command.CONTINUOUS: Layout((("streamed", 1), ("unsettled", 1)), ticks=False),
-    Command.READ_EEPROM: Layout((("value", 1),)),
-    Command.WRITE_EEPROM: Layout((("value", 1),)),
-    Command.EULER_VECTORS: Layout((("euler", 3), ("acceleration", 3), ("rate", 3))),
-    Command.HARD_IRON_START: Layout(()),
-    Command.HARD_IRON_COLLECT: Layout((("field", 3), ("minimum", 3), ("maximum", 3))),
-    Command.HARD_IRON_COMPUTE: Layout((("offset", 3),)),
-    Command.FIRMWARE: Layout((("version", 1),), ticks=False),
-    Command.SERIAL: Layout((("serial", 1),), ticks=False),
+    CommandByte.CONTINUOUS: ReplyLayout((("streamed", 1), ("unsettled", 1)), ticks=False),
+    CommandByte.READ_EEPROM: ReplyLayout((("value", 1),)),
+    CommandByte.WRITE_EEPROM: ReplyLayout((("value", 1),)),
+    CommandByte.EULER_VECTORS: ReplyLayout((("euler", 3), ("acceleration", 3), ("rate", 3))),
+    CommandByte.HARD_IRON_START: ReplyLayout(()),
+    CommandByte.HARD_IRON_COLLECT: ReplyLayout((("field", 3), ("minimum", 3), ("maximum", 3))),
+    CommandByte.HARD_IRON_COMPUTE: ReplyLayout((("offset", 3),)),
+    CommandByte.FIRMWARE: ReplyLayout((("version", 1),), ticks=False),
+    CommandByte.SERIAL: ReplyLayout((("serial", 1),), ticks=False),
 }
 
 LENGTHS: dict[int, int] = {command: layout.length for command, layout in LAYOUTS.items()}
 
 DATA = frozenset(
     {
-        Command.STABILISED_VECTORS,
-        Command.INSTANTANEOUS_VECTORS,
-        Command.QUATERNION_VECTORS,
-        Command.INSTANTANEOUS_EULER,
-        Command.STABILISED_EULER,
-        Command.EULER_VECTORS,
+        CommandByte.STABILISED_VECTORS,
+        CommandByte.INSTANTANEOUS_VECTORS,
+        CommandByte.QUATERNION_VECTORS,
+        CommandByte.INSTANTANEOUS_EULER,
+        CommandByte.STABILISED_EULER,
+        CommandByte.EULER_VECTORS,
     }
 )
 """Measurements: what may be streamed."""

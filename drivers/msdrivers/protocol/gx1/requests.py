@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from msdrivers.protocol.gx1.packets import LAYOUTS, Command
+from msdrivers.protocol.gx1.packets import LAYOUTS, CommandByte
 
-STOP = bytes((Command.CONTINUOUS, 0, 0))
+STOP = bytes((CommandByte.CONTINUOUS, 0, 0))
 """Stop the continuous mode."""
 
 HARD_IRON_KEY = b"\x71\x3e"
@@ -21,23 +21,23 @@ def poll(command: int) -> bytes:
 
 def stream(command: int) -> bytes:
     """Return the request to stream a reply."""
-    return bytes((Command.CONTINUOUS, 0, command))
+    return bytes((CommandByte.CONTINUOUS, 0, command))
 
 
 def read_eeprom(address: int) -> bytes:
     """Return the request for a word of the EEPROM, at an even address up to 254."""
-    return bytes((Command.READ_EEPROM, *_address(address)))
+    return bytes((CommandByte.READ_EEPROM, *_address(address)))
 
 
 def write_eeprom(address: int, value: int) -> bytes:
     """Return the request to write a word, signed or unsigned 16 bit, to the EEPROM."""
     word = (value & 0xFFFF).to_bytes(2, "big")
-    return bytes((Command.WRITE_EEPROM, _WRITE_KEY, *_address(address), *word, _WRITE_END))
+    return bytes((CommandByte.WRITE_EEPROM, _WRITE_KEY, *_address(address), *word, _WRITE_END))
 
 
 def hard_iron_start() -> bytes:
     """Return the request to begin the collection of the magnetic field's extremes."""
-    return bytes((Command.HARD_IRON_START,)) + HARD_IRON_KEY
+    return bytes((CommandByte.HARD_IRON_START,)) + HARD_IRON_KEY
 
 
 def hard_iron_compute(two_dimensional: bool, magnitude_z: int) -> bytes:
@@ -48,7 +48,7 @@ def hard_iron_compute(two_dimensional: bool, magnitude_z: int) -> bytes:
     """
     kind = 1 if two_dimensional else 0
     word = (magnitude_z & 0xFFFF).to_bytes(2, "big")
-    return bytes((Command.HARD_IRON_COMPUTE,)) + HARD_IRON_KEY + bytes((kind,)) + word
+    return bytes((CommandByte.HARD_IRON_COMPUTE,)) + HARD_IRON_KEY + bytes((kind,)) + word
 
 
 def _address(address: int) -> bytes:
@@ -65,11 +65,11 @@ class Request(NamedTuple):
 
 
 _LENGTHS = dict.fromkeys(LAYOUTS, 1) | {
-    Command.CONTINUOUS: 3,
-    Command.READ_EEPROM: 3,
-    Command.WRITE_EEPROM: 7,
-    Command.HARD_IRON_START: 3,
-    Command.HARD_IRON_COMPUTE: 6,
+    CommandByte.CONTINUOUS: 3,
+    CommandByte.READ_EEPROM: 3,
+    CommandByte.WRITE_EEPROM: 7,
+    CommandByte.HARD_IRON_START: 3,
+    CommandByte.HARD_IRON_COMPUTE: 6,
 }
 
 
@@ -108,12 +108,12 @@ class RequestParser:
 def _request(raw: bytes) -> Request | None:
     """Return the request that the bytes are; None if a key or a fixed byte in it is wrong."""
     command = raw[0]
-    if command == Command.CONTINUOUS:
+    if command == CommandByte.CONTINUOUS:
         return Request(command, raw[2:]) if raw[1] == 0 else None
-    if command == Command.READ_EEPROM:
+    if command == CommandByte.READ_EEPROM:
         return Request(command, raw[1:])
-    if command == Command.WRITE_EEPROM:
+    if command == CommandByte.WRITE_EEPROM:
         return Request(command, raw[2:6]) if (raw[1], raw[6]) == (_WRITE_KEY, _WRITE_END) else None
-    if command in (Command.HARD_IRON_START, Command.HARD_IRON_COMPUTE):
+    if command in (CommandByte.HARD_IRON_START, CommandByte.HARD_IRON_COMPUTE):
         return Request(command, raw[3:]) if raw[1:3] == HARD_IRON_KEY else None
     return Request(command)

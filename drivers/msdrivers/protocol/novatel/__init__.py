@@ -2,7 +2,7 @@
 
 from msdrivers.protocol.novatel.frames import Answer, AsciiFormat, BinaryFormat, Prompt, PromptFormat, TextFormat
 from msdrivers.protocol.novatel.logs import (
-    Heading,
+    HeadingLog,
     LogHeader,
     NovatelLog,
     Position,
@@ -17,7 +17,7 @@ __all__ = [
     "Answer",
     "AsciiFormat",
     "BinaryFormat",
-    "Heading",
+    "HeadingLog",
     "LogHeader",
     "NovatelLog",
     "Position",

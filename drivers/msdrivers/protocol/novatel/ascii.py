@@ -12,7 +12,7 @@ from msdrivers.protocol.novatel.logs import (
     DATUMS,
     GREATEST_ANTENNA,
     Body,
-    Heading,
+    HeadingLog,
     LogHeader,
     Position,
     PositionType,
@@ -168,13 +168,13 @@ def _utm(f: Sequence[str]) -> UtmPosition:
     )
 
 
-def _heading(stations: int) -> Callable[[Sequence[str]], Heading]:
-    def read_heading(f: Sequence[str]) -> Heading:
+def _heading(stations: int) -> Callable[[Sequence[str]], HeadingLog]:
+    def read_heading(f: Sequence[str]) -> HeadingLog:
         if len(f) != 16 + stations:
             raise ValueError(f"{len(f)} fields where {16 + stations} belong")
         if not 0.0 <= float(f[3]) <= 360.0:
             raise ValueError(f"{f[3]} is no heading")
-        return Heading(
+        return HeadingLog(
             _word(SolutionStatus, f[0]),
             _word(PositionType, f[1]),
             float(f[2]),

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from struct import Struct
 
-from msdrivers.protocol.novatel.logs import Body, Heading, Position, UtmPosition, Velocity
+from msdrivers.protocol.novatel.logs import Body, HeadingLog, Position, UtmPosition, Velocity
 
 LONG_HEADER = Struct("<3sBHBBHHBBHIIHH")
 """Sync, header length, id, type, port, body length, sequence, idle, time status, week, ms, receiver status, reserved,
@@ -48,12 +48,12 @@ def _utm(body: bytes | bytearray) -> UtmPosition | None:
     return UtmPosition._make((*f[:3], chr(f[3]), *f[4:12], _station(f[12]), *f[13:]))
 
 
-def _heading(layout: Struct) -> Callable[[bytes | bytearray], Heading | None]:
-    def read(body: bytes | bytearray) -> Heading | None:
+def _heading(layout: Struct) -> Callable[[bytes | bytearray], HeadingLog | None]:
+    def read(body: bytes | bytearray) -> HeadingLog | None:
         f = layout.unpack(body)
         if not math.isfinite(sum(f[2:7])) or not 0.0 <= f[3] <= 360.0:
             return None
-        return Heading._make((*f[:7], _station(f[7]), *f[8:]))
+        return HeadingLog._make((*f[:7], _station(f[7]), *f[8:]))
 
     return read
 

@@ -11,7 +11,7 @@ from msdrivers.protocol.novatel.logs import (
     DATUMS,
     MESSAGE_IDS,
     Body,
-    Heading,
+    HeadingLog,
     NovatelLog,
     Position,
     PositionType,
@@ -70,7 +70,7 @@ def _pack(name: str, body: Body) -> bytes:
         case UtmPosition():
             head = (body.status, body.type, body.zone, ord(body.letter), *body[4:12])
             return binary.UTM.pack(*head, body.station.encode("ascii"), *body[13:])
-        case Heading():
+        case HeadingLog():
             layout = binary.HEADING if name == "HEADING" else binary.HEADING2
             return layout.pack(*body[:7], body.station.encode("ascii"), *body[8:])
 
@@ -99,7 +99,7 @@ def _fields(name: str, body: Body) -> Sequence[str]:
         case Velocity():
             ages = (f"{body.latency:.3f}", f"{body.age:.3f}")
             return (*solution, *ages, f"{body.horizontal:.4f}", f"{body.track:.6f}", f"{body.vertical:.4f}", "0.0")
-        case Heading():
+        case HeadingLog():
             angles = (f"{body.length:.4f}", f"{body.heading:.6f}", f"{body.pitch:.6f}", "0.0")
             sigmas = (f"{body.sigma_heading:.4f}", f"{body.sigma_pitch:.4f}")
             stations = (f'"{body.station}"',) if name == "HEADING" else (f'"{body.station}"', '""')

@@ -165,7 +165,7 @@ class UtmPosition(NamedTuple):
     used: int
 
 
-class Heading(NamedTuple):
+class HeadingLog(NamedTuple):
     """Body of HEADING and HEADING2: from the antenna whose position is given to the other one.
 
     length: metres, -1 where it is not known. Degrees; heading clockwise from true north.
@@ -183,7 +183,7 @@ class Heading(NamedTuple):
     used: int
 
 
-Body: TypeAlias = Position | Velocity | UtmPosition | Heading
+Body: TypeAlias = Position | Velocity | UtmPosition | HeadingLog
 
 
 class NovatelLog(NamedTuple):
