@@ -8,7 +8,9 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -199,8 +201,11 @@ def test_given_a_proposal_that_exists_then_it_stays(tmp_path: Path, run: Run) ->
 
 INTERRUPTED = """
 import sys
+import time
 from pathlib import Path
-from mstools import cli, tune, tune_runs
+from mstools import cli
+from mstools.commands import tune
+from mstools.tuning import runs as tune_runs
 from mstools.tuning.runs import Job
 
 def read_pipe(job: Job) -> None:
@@ -218,6 +223,17 @@ if __name__ == "__main__":
 """
 
 
+def opened_for_writing(pipe: Path, process: subprocess.Popen[str]) -> int:
+    """Open a pipe once a process reads it, and fail where that ends before."""
+    end = time.monotonic() + PATIENCE_S
+    while True:
+        with suppress(OSError):  # nobody reads yet
+            return os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
 @pytest.mark.slow
 def test_given_ctrl_c_while_workers_run_then_all_end_at_once_with_130(tmp_path: Path) -> None:
     # a worker that reads a pipe which nobody writes never ends by itself
@@ -231,8 +247,8 @@ def test_given_ctrl_c_while_workers_run_then_all_end_at_once_with_130(tmp_path: 
             stderr=subprocess.PIPE,
             text=True,
         ) as process,
-        config.open("wb", buffering=0) as pipe,
-    ):  # opens when a worker reads
+        os.fdopen(opened_for_writing(config, process), "wb", buffering=0) as pipe,
+    ):
         os.killpg(process.pid, signal.SIGINT)
         try:
             _, err = process.communicate(timeout=PATIENCE_S)
