@@ -146,7 +146,7 @@ class RequestHandler:
         self._scheduler = RequestScheduler(limits, clock.monotonic_ns())
         self.contention = ContentionDetector()
         self._cache = StaticReplyCache()
-        self._unprepared: Iterator[tuple[str, str]] = iter(())
+        self._unprepared: Iterator[tuple[str, str]] | None = None
         self._answered = 0
         self._dropped: dict[str, int] = {}
         self._rejections: deque[QueuedRequest] = deque()
@@ -223,6 +223,8 @@ class RequestHandler:
 
         It begins with the first request for a transformation, and again with the first one after a change of model.
         """
+        if self._unprepared is None:
+            return False  # first, since every idle pass asks
         now = self._clock.now()
         view = self._context.state.view
         if (
@@ -234,6 +236,7 @@ class RequestHandler:
         for _ in range(PREPARED_MOST):
             pair = next(self._unprepared, None)
             if pair is None:
+                self._unprepared = None
                 return False
             with suppress(QueryError):
                 if view.model.rigid_transformation(*pair) is None:
