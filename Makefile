@@ -2,7 +2,7 @@
 #   make demo     makes its own environment, installs, runs the demo
 #   make test     the same for the tests
 # and: make test-quick (without processes and long drives, for the inner loop: 50 seconds on two cores),
-#      make check (format, lint, types), make bench (ratio benchmarks), make clean.
+#      make check (format, lint, types), make docs (the site in build/site), make bench (ratio benchmarks), make clean.
 
 PYTHON ?= python3
 VENV   ?= .venv
@@ -12,8 +12,9 @@ BIN    := $(VENV)/bin
 # A changed pyproject.toml installs again; a failed install leaves no stamp behind.
 RUN_STAMP := $(VENV)/.installed-run
 DEV_STAMP := $(VENV)/.installed-dev
+DOCS_STAMP := $(VENV)/.installed-docs
 
-.PHONY: demo test test-quick check format bench types clean help
+.PHONY: demo test test-quick check format docs bench types clean help
 
 help:
 	@sed -n 's/^# \{0,1\}//p' Makefile | head -5
@@ -31,6 +32,10 @@ $(RUN_STAMP): pyproject.toml | $(BIN)/python
 
 $(DEV_STAMP): pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $(RUN_STAMP) $@
+
+$(DOCS_STAMP): pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[docs]'
 	@touch $(RUN_STAMP) $@
 
 demo: $(RUN_STAMP)
@@ -51,9 +56,12 @@ format: $(DEV_STAMP)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
+# The variable silences an announcement of the theme about a later mkdocs; it is no warning about these pages.
+docs: $(DOCS_STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+
 types: $(DEV_STAMP)
 	$(BIN)/python tools/generate_types.py
-	$(BIN)/python tools/settings_page.py
 
 bench: $(DEV_STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,bench]'

@@ -1,11 +1,11 @@
-"""Lists and runs the benchmarks.
+"""List and run the benchmarks.
 
     python -m benchmarks              run them all
     python -m benchmarks NAME ...     run some
-    python -m benchmarks --list       say what there is
+    python -m benchmarks --list       list them
 
-Each is a module of this package with a function `main() -> int`: 0 = run and within its bounds, 1 = run and out
-of bounds, 77 = skipped, with the reason printed. Its docstring's first line says what it measures.
+Each is a module of this package with a function `main() -> int`: 0 = within its bounds, 1 = out of bounds, 77 =
+skipped, with the reason printed. The first line of its docstring states what it measures.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from pathlib import Path
 SKIPPED = 77
 
 
-def names() -> list[str]:
+def list_benchmarks() -> list[str]:
     return sorted(path.stem for path in Path(__file__).parent.glob("[a-z]*.py") if _has_main(path))
 
 
 def _has_main(path: Path) -> bool:
-    return any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in _tree(path).body) and (
+    return any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in _parse(path).body) and (
         path.stem != "__main__"
     )
 
 
-def _tree(path: Path) -> ast.Module:
+def _parse(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def summary(name: str) -> str:
-    doc = ast.get_docstring(_tree(Path(__file__).with_name(f"{name}.py"))) or ""
+    doc = ast.get_docstring(_parse(Path(__file__).with_name(f"{name}.py"))) or ""
     return doc.partition("\n")[0]
 
 
 def main(arguments: Sequence[str]) -> int:
-    known = names()
+    known = list_benchmarks()
     if "--list" in arguments:
         print("\n".join(f"{name:20} {summary(name)}" for name in known))
         return 0

@@ -1,12 +1,12 @@
-"""Accuracy on the recordings against fixes that were withheld, beside required figures and other systems' figures.
+"""Accuracy on recordings against withheld fixes, beside required values and other systems' values.
 
     python -m benchmarks accuracy                        the whole table
     python -m benchmarks.accuracy husky half             one line of it
     python -m benchmarks.accuracy husky p2x --verbose    with every gap
     python -m benchmarks.accuracy kitti half --set gyro_noise=0.001 --mode filter
 
-What the lines mean stands in `benchmarks.protocols`, where the recordings come from in `benchmarks.recordings`.
-Exit code 1 where a required figure is missed or estimates diverge, 77 where no recording is there.
+`benchmarks.protocols` defines the lines, `benchmarks.recordings` the sources of the recordings.
+Exit code 1 where a required value is missed or estimates diverge, 77 without recordings.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks import plaza_ranges, protocols
-from benchmarks.protocols import SHIFTS, Job, Outcome
+from benchmarks.protocols import SHIFTS, ReplayJob, ReplayScore
 from benchmarks.recordings import dresden, husky, kitti, plaza
 from benchmarks.support import ROOT
-from benchmarks.withheld import common_scorer, data_directory
+from benchmarks.withheld import data_directory, load_scorer
 
 SKIPPED = 77
 PROTOCOLS = ("half", "outage", "p2x")
@@ -35,8 +35,8 @@ DIVERGED_M = 100.0
 
 
 @dataclass(frozen=True)
-class Figures:
-    """What a line is held against: metres, nan = nothing is asked. `peers` in words, as they were measured."""
+class AccuracyTarget:
+    """Target of a line, meters; nan = none. `peers`: values of other systems, as text."""
 
     required: float = math.nan
     aim: float = math.nan
@@ -45,13 +45,13 @@ class Figures:
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording that is scored by its own fixes, and what is asked of it by protocol."""
+    """A recording that is scored by its own fixes, with its targets by protocol."""
 
     name: str
     file: Callable[[Path], Path]
     convert: Callable[[Path, Path], Mapping[str, int]]
     vehicle: Path
-    figures: Mapping[str, Figures] = field(default_factory=dict)
+    targets: Mapping[str, AccuracyTarget] = field(default_factory=dict)
 
 
 RECORDINGS = (
@@ -61,8 +61,8 @@ RECORDINGS = (
         husky.convert,
         ROOT / "config" / "husky" / "vehicle.yaml",
         {
-            "half": Figures(0.45, 0.33, "robot_localization 0.37 (UKF 0.34), 6-state EKF 1.65, FusionCore 0.45"),
-            "p2x": Figures(3.4, 3.0, "robot_localization 3.4 (UKF 4.1), 6-state EKF 3.9, FusionCore 4.8 to 5.6"),
+            "half": AccuracyTarget(0.45, 0.33, "robot_localization 0.37 (UKF 0.34), 6-state EKF 1.65, FusionCore 0.45"),
+            "p2x": AccuracyTarget(3.4, 3.0, "robot_localization 3.4 (UKF 4.1), 6-state EKF 3.9, FusionCore 4.8 to 5.6"),
         },
     ),
     Recording(
@@ -71,8 +71,8 @@ RECORDINGS = (
         kitti.convert,
         ROOT / "benchmarks" / "vehicles" / "kitti" / "vehicle.yaml",
         {
-            "half": Figures(0.35, 0.27, "robot_localization 0.25, 6-state EKF 0.32, KF-GINS 0.93, pyins 0.91"),
-            "p2x": Figures(25.0, 15.0, "robot_localization 25, 6-state EKF 25, KF-GINS 90, pyins 74 (4 gaps)"),
+            "half": AccuracyTarget(0.35, 0.27, "robot_localization 0.25, 6-state EKF 0.32, KF-GINS 0.93, pyins 0.91"),
+            "p2x": AccuracyTarget(25.0, 15.0, "robot_localization 25, 6-state EKF 25, KF-GINS 90, pyins 74 (4 gaps)"),
         },
     ),
     Recording(
@@ -80,55 +80,55 @@ RECORDINGS = (
         dresden.file,
         dresden.convert,
         ROOT / "benchmarks" / "vehicles" / "dresden" / "vehicle.yaml",
-        {"half": Figures()},
+        {"half": AccuracyTarget()},
     ),
 )
 PLAZA = ("plaza1", "plaza2")
 
 
 @dataclass(frozen=True)
-class Line:
+class ResultLine:
     """One line of the table."""
 
     recording: Recording
     protocol: str
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[ReplayScore, ...]
 
     @property
-    def ours(self) -> float:
-        """The figure: RMSE for `half`, the mean gap-end error for the others."""
+    def measured(self) -> float:
+        """The measured value: RMSE for `half`, the mean gap-end error for the others, meters."""
         return self.outcomes[0].rmse if self.protocol == "half" else protocols.mean_gap_end(self.outcomes)
 
     @property
-    def figures(self) -> Figures:
-        """What is asked."""
-        return self.recording.figures.get(self.protocol, Figures())
+    def target(self) -> AccuracyTarget:
+        """Target of the line."""
+        return self.recording.targets.get(self.protocol, AccuracyTarget())
 
     @property
-    def holds(self) -> bool:
-        """Whether the required figure is met; in `half` also that nothing diverged, and no estimate is missing."""
-        if not math.isfinite(self.ours):
+    def is_met(self) -> bool:
+        """Whether the required value is met; in `half` also that nothing diverged, and no estimate is missing."""
+        if not math.isfinite(self.measured):
             return False
         if self.protocol == "half" and (self.outcomes[0].missing or not self.outcomes[0].max < DIVERGED_M):
             return False
-        required = self.figures.required
-        return math.isnan(required) or self.ours <= required
+        required = self.target.required
+        return math.isnan(required) or self.measured <= required
 
-    def text(self) -> str:
-        """Return the line."""
+    def format(self) -> str:
+        """Return the line as text."""
         n = (
             sum(each.n for each in self.outcomes)
             if self.protocol == "half"
             else sum(len(o.gaps) for o in self.outcomes)
         )
         missing = sum(each.missing for each in self.outcomes)
-        asked = "".join(f"{'' if math.isnan(x) else f'{x:.2f}':>10}" for x in (self.figures.required, self.figures.aim))
-        bad = "" if self.holds else "  <-- OUT OF BOUNDS"
+        asked = "".join(f"{'' if math.isnan(x) else f'{x:.2f}':>10}" for x in (self.target.required, self.target.aim))
+        bad = "" if self.is_met else "  <-- OUT OF BOUNDS"
         name = f"{self.recording.name} {self.protocol}"
-        return f"{name:16}{self.ours:9.3f}{asked}{n:7}{missing:9}   {self.figures.peers}{bad}"
+        return f"{name:16}{self.measured:9.3f}{asked}{n:7}{missing:9}   {self.target.peers}{bad}"
 
-    def details(self) -> list[str]:
-        """Return what --verbose adds."""
+    def format_details(self) -> list[str]:
+        """Return the details for --verbose."""
         lines = []
         for shift, each in zip(SHIFTS, self.outcomes, strict=False):
             if self.protocol == "half":
@@ -141,9 +141,9 @@ class Line:
 
 
 def main(arguments: Sequence[str] = ()) -> int:
-    options = _options(arguments)
+    options = _parse_options(arguments)
     data = data_directory()
-    if common_scorer(data) is None:
+    if load_scorer(data) is None:
         print(f"skipped: no tools/score_trajectory.py beside {data}; set MODELSERVER_DATA to the folder of recordings")
         return SKIPPED
     present = [each for each in RECORDINGS if each.name in options.names and each.file(data).is_file()]
@@ -158,16 +158,16 @@ def main(arguments: Sequence[str] = ()) -> int:
         cache.mkdir(parents=True, exist_ok=True)
         if present:
             print(f"{'':16}{'ours m':>9}{'required':>10}{'aim':>10}{'n':>7}{'missing':>9}   others, m")
-            for line in _lines(present, options, data, cache):
-                holds = holds and line.holds
-                print("\n".join([line.text(), *(line.details() if options.verbose else ())]), flush=True)
+            for line in _run_all(present, options, data, cache):
+                holds = holds and line.is_met
+                print("\n".join([line.format(), *(line.format_details() if options.verbose else ())]), flush=True)
         for name in ranges:
             print(plaza_ranges.report(name, data, options.settings, options.mode), flush=True)
     return 0 if holds else 1
 
 
-def _lines(present: Iterable[Recording], options: Options, data: Path, cache: Path) -> Iterator[Line]:
-    """Run everything that was asked for, in as many processes as there are cores, and yield the lines in order."""
+def _run_all(present: Iterable[Recording], options: AccuracyOptions, data: Path, cache: Path) -> Iterator[ResultLine]:
+    """Run all requested lines, in as many processes as there are cores, and yield them in order."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(options.processes, mp_context=context) as pool:
         logs = {}
@@ -175,29 +175,29 @@ def _lines(present: Iterable[Recording], options: Options, data: Path, cache: Pa
             logs[each.name] = cache / f"{each.name}.lcm"
             if not logs[each.name].is_file():
                 each.convert(data, logs[each.name])
-        waiting: list[tuple[Recording, str, list[Future[Outcome]]]] = []
+        waiting: list[tuple[Recording, str, list[Future[ReplayScore]]]] = []
         for each in present:
             for protocol in options.protocols:
-                # one recording that is named alone is run with whatever is asked, the whole table with what is held
-                if protocol not in each.figures and len(options.names) > 1:
+                # a single recording runs with every requested protocol, the whole table only with targets
+                if protocol not in each.targets and len(options.names) > 1:
                     continue
                 shifts: tuple[str | float, ...] = SHIFTS if protocol == "p2x" else SHIFTS[:1]
                 shifts = ("half",) if protocol == "half" else shifts
                 futures = [
                     pool.submit(
                         protocols.run,
-                        Job(logs[each.name], each.vehicle, data, shift, options.settings, options.mode),
+                        ReplayJob(logs[each.name], each.vehicle, data, shift, options.settings, options.mode),
                     )
                     for shift in shifts
                 ]
                 waiting.append((each, protocol, futures))
         for recording, protocol, futures in waiting:
-            yield Line(recording, protocol, tuple(future.result() for future in futures))
+            yield ResultLine(recording, protocol, tuple(future.result() for future in futures))
 
 
 @dataclass(frozen=True)
-class Options:
-    """The command line."""
+class AccuracyOptions:
+    """Command line options."""
 
     names: frozenset[str]
     protocols: tuple[str, ...]
@@ -208,7 +208,7 @@ class Options:
     processes: int
 
 
-def _options(arguments: Sequence[str]) -> Options:
+def _parse_options(arguments: Sequence[str]) -> AccuracyOptions:
     known = [*(each.name for each in RECORDINGS), *PLAZA]
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.accuracy", description=(__doc__ or "").partition("\n")[0]
@@ -233,7 +233,7 @@ def _options(arguments: Sequence[str]) -> Options:
         parser.error(f"no recording or protocol {', '.join(unknown)}; there are {', '.join([*known, *PROTOCOLS])}")
     if any("=" not in pair for pair in given.set):
         parser.error("--set takes KEY=VALUE")
-    return Options(
+    return AccuracyOptions(
         frozenset(word for word in given.what if word in known) or frozenset(known),
         tuple(word for word in PROTOCOLS if word in given.what) or PROTOCOLS,
         dict(pair.split("=", 1) for pair in given.set),

@@ -1,18 +1,18 @@
-"""Whether the filter is as sure as it says: errors beside their covariances and bounds, over simulated drives.
+"""Consistency of the filter: errors against covariances and protection levels, over simulated drives.
 
     python -m benchmarks consistency
     python -m benchmarks.consistency --seeds 10 --only matched
 
 Three kinds of drives, each with as many seeds:
 
-matched    every error of every sensor is what the settings say it is, and no other: here too careful counts as wrong.
-stronger   slip, slopes and fixes whose errors are larger and last longer than stated, default settings.
-faults     the same, with outages of the fixes, jumps of them, and wheels that spin.
+matched    every sensor error is as the settings model it, and there is no other: here too large a sigma also fails.
+stronger   slip, slopes and fixes whose errors are larger and correlated for longer than stated, default settings.
+faults     the same, with outages and jumps of the fixes, and wheel spin.
 
 Coverage is the share of errors within 95 % of the stated normal distribution; NEES is e' P^-1 e of east, north and
-heading, whose mean is 3 where P is true. Its interval is the two-sided 99 % one of the mean of as many independent
-drives as there are seeds: samples of one drive are not independent, for what lingers in fixes lasts a minute.
-A bound may be passed for a second at most while the pose is valid.
+heading, with mean 3 for a true P (Bar-Shalom 5.4). Its bounds are the two-sided 99 % interval of the mean of as many
+independent drives as there are seeds: samples of one drive are not independent, since the GNSS error is correlated over
+a minute. A protection level may be exceeded for at most a second while the pose is valid.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from scipy.stats import chi2
 
 from benchmarks import husky_nis
 from modelserver.earth.geodesy import origin_at
+from modelserver.estimation.filter.localizer import FilterLocalizer
+from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.sensor_rig import SensorRig
 from modelserver.geometry import ModelBuilder
-from modelserver.localization.filter.localizer import FilterLocalizer
-from modelserver.localization.filter.settings import FilterSettings
-from modelserver.localization.filter.setup import Setup
-from modelserver.localization.rig import Rig
 from modelserver.messages import Estimate, FixType, OrientationReference, WheelsSample
 from modelserver.simulation import (
     DrivePhase,
     EncoderModel,
     Event,
     GpsModel,
+    GroundMotion,
     ImuModel,
-    Ride,
     SideSlip,
     Simulation,
     Terrain,
@@ -57,14 +57,14 @@ from modelserver.simulation import (
     city,
 )
 from modelserver.simulation.noise import NoiseSource
-from modelserver.spatial.pose import Pose
-from modelserver.spatial.so3 import Vector3
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Vector3
 
 SECONDS = 150.0
-FIRST, EVERY = 30.0, 10.0
-"""When errors are taken, seconds: heading is known by the first, and most of a drive lies behind the last."""
-BOUND_EVERY = 0.2
-LONGEST_BREACH = 1.0
+FIRST_SAMPLE, SAMPLE_PERIOD = 30.0, 10.0
+"""Sampling times of the errors, seconds: the first after heading alignment."""
+BOUND_PERIOD = 0.2
+MAX_BREACH_S = 1.0
 NORMAL_95 = 1.959964
 ORIGIN = origin_at(50.27, -111.18, 700.0)
 WHEELS = {"left": "Car:Left", "right": "Car:Right"}
@@ -81,50 +81,50 @@ MATCHED = FilterSettings(
     wheel_scale_walk=1e-7,
     wheel_yaw_sigma=0.01,
     wheel_yaw_walk=1e-8,
-    # nothing slips but what wanders sideways
-    slip_share=1e-5,
+    # no slip except the random lateral speed
+    slip_ratio=1e-5,
     slip_acceleration=1e-5,
     side_slip=1e-6,
     roll_point_sigma=1e-4,
     side_sigma=0.02,
     up_sigma=0.005,
     up_share=1e-4,
-    standing_sigma=1e-3,
-    standing_rate=0.01,
-    standing_force=0.05,
+    stationary_sigma=1e-3,
+    stationary_rate=0.01,
+    stationary_force=0.05,
 )
 FIX_SIGMA = 0.6
-"""Of a matched fix, metres: above what the range error of its kind is at least taken for."""
+"""Of a matched fix, meters: above the smallest range error of its kind."""
 TRAVEL_SIGMA = 0.002
 
 
-class Drive(NamedTuple):
-    """What a drive showed: a row for each instant (error over sigma of east, north, heading; NEES), and breaches.
+class DriveResult(NamedTuple):
+    """Result of a drive: rows of error over sigma (east, north, heading) and NEES per instant, and breaches.
 
-    `taken` is how many instants there were, `breach` the longest time for which a bound was passed while the pose was
-    valid, seconds, horizontal and of heading; `valid` the share of time after `FIRST` that it was.
+    `instants` is their number, `breach` the longest time for which a protection level was exceeded while the pose was
+    valid, seconds, horizontal and heading; `valid` the valid share of the time after `FIRST_SAMPLE`.
     """
 
     rows: list[tuple[float, float, float, float]]
-    taken: int
+    instants: int
     breach: tuple[float, float]
     valid: float
 
 
 @dataclass(frozen=True)
-class Kind:
-    """A kind of drive, and what is asked: least and most coverage, the mean NEES (None: as the seeds' interval)."""
+class DriveKind:
+    """A kind of drive with its bounds: coverage, and mean NEES (None: the interval for the number of seeds)."""
 
     name: str
-    run: Callable[[int], Drive]
+    run: Callable[[int], DriveResult]
     coverage: tuple[float, float] | None
     nees: tuple[float, float] | None
 
 
-class _Wandering:
-    """A lateral speed that is white up to a frequency of 1 / (2 `lasting`): mean over T has variance s^2 lasting / T.
+class _RandomSideSlip:
+    """Lateral speed, white up to a frequency of 1 / (2 `lasting`): its mean over T has variance s^2 lasting / T.
 
-    That is what the filter takes errors for that last `lasting` seconds. Same face as the simulator's slip angle.
+    The filter models errors of correlation time `lasting` so. Same interface as the simulator's slip angle.
     """
 
     def __init__(self, sigma: float, lasting: float, seed: int, count: int = 60):
@@ -143,7 +143,7 @@ class _Wandering:
         for amplitude, omega, phase in self._sines:
             sine, cosine = amplitude * math.sin(omega * t + phase), amplitude * math.cos(omega * t + phase)
             w, w1, w2 = w + sine, w1 + omega * cosine, w2 - omega * omega * sine
-        # what stands neither slides nor turns: the angle is w g with g = v^3 / (v^2 + fade)^2, flat and smooth at rest
+        # no slip while stationary: the angle is w g with g = v^3 / (v^2 + fade)^2, smooth at v = 0
         fade = 0.09
         below = v * v + fade
         g, gv = v**3 / below**2, v * v * (3.0 * fade - v * v) / below**3
@@ -152,8 +152,8 @@ class _Wandering:
         return (w * g, w1 * g + w * g1, w2 * g + 2.0 * w1 * g1 + w * g2)
 
 
-class _Wheels:
-    """Wheels with one error of scale, and with a way that errs anew over each period that is compared."""
+class _TravelNoise:
+    """Wheels with one scale error, and with travel noise that is redrawn in each compared period."""
 
     def __init__(self, settings: FilterSettings, seed: int):
         self._noise = NoiseSource(seed, "matched wheels")
@@ -164,9 +164,9 @@ class _Wheels:
 
     def __call__(self, events: Iterable[Event]) -> Iterator[Event]:
         for event in events:
-            yield self._erring(event) if isinstance(event, WheelsSample) else event
+            yield self._add_noise(event) if isinstance(event, WheelsSample) else event
 
-    def _erring(self, sample: WheelsSample) -> WheelsSample:
+    def _add_noise(self, sample: WheelsSample) -> WheelsSample:
         wheels = []
         for wheel in sample.wheels:
             utime = sample.header.utime
@@ -181,32 +181,32 @@ class _Wheels:
         return replace(sample, wheels=tuple(wheels))
 
 
-def _rig(turned: float) -> Rig:
+def _build_rig(turned: float) -> SensorRig:
     """Return a vehicle whose wheels roll to the left of its x axis by an angle, radians."""
     builder = ModelBuilder("car")
-    car = builder.body("Car")
+    car = builder.add_body("Car")
     X = Pose.from_rpy((0.0, 0.0, 0.0), 0.0, 0.0, -turned)
-    car.frame("Rolling")
-    car.frame("Base", X)
-    car.frame("Imu", Pose.from_rpy((0.3, -0.3, 0.5), math.pi / 2, 0.0, -math.pi / 2))
-    car.frame("Antenna", Pose((0.25, 0.1, 1.0)))
-    car.frame("Left", Pose((0.0, 0.3, -0.1)))
-    car.frame("Right", Pose((0.0, -0.3, -0.1)))
-    return Rig(builder.build(), "Car:Base", "Car:Imu", "Car:Antenna", "", WHEELS, "differential")
+    car.add_frame("Rolling")
+    car.add_frame("Base", X)
+    car.add_frame("Imu", Pose.from_rpy((0.3, -0.3, 0.5), math.pi / 2, 0.0, -math.pi / 2))
+    car.add_frame("Antenna", Pose((0.25, 0.1, 1.0)))
+    car.add_frame("Left", Pose((0.0, 0.3, -0.1)))
+    car.add_frame("Right", Pose((0.0, -0.3, -0.1)))
+    return SensorRig(builder.build(), "Car:Base", "Car:Imu", "Car:Antenna", "", WHEELS, "differential")
 
 
-def matched(seed: int) -> Drive:
+def run_matched(seed: int) -> DriveResult:
     settings = MATCHED
-    rig = _rig(NoiseSource(seed, "wheel yaw").normal(settings.wheel_yaw_sigma))
+    rig = _build_rig(NoiseSource(seed, "wheel yaw").normal(settings.wheel_yaw_sigma))
     share = settings.gps_white_share
-    # it stands first: levelling on the move rests on a guess of how hard vehicles accelerate
+    # stationary at first: leveling on the move assumes typical accelerations
     trajectory = Trajectory((DrivePhase(5.0), *city(seed, SECONDS - 5.0, speed=5.0)), yaw=0.7)
-    ride = Ride(trajectory, None, SideSlip(), seed)
-    ride._slip = _Wandering(settings.side_sigma, settings.slip_time, seed)  # type: ignore[assignment]
+    motion = GroundMotion(trajectory, None, SideSlip(), seed)
+    motion._slip = _RandomSideSlip(settings.side_sigma, settings.slip_time, seed)  # type: ignore[assignment]
     simulation = Simulation(
         rig.model,
         "Car:Base",
-        ride,  # type: ignore[arg-type]  # whatever tells the motion serves
+        motion,  # type: ignore[arg-type]  # any MotionModel
         ORIGIN,
         rolling_frame="Car:Rolling",
         gps_frame="Car:Antenna",
@@ -214,9 +214,9 @@ def matched(seed: int) -> Drive:
         wheel_frames=WHEELS,
         seed=seed,
         gps_model=GpsModel(
-            lingering_sigma=FIX_SIGMA * math.sqrt(1.0 - share * share),
+            correlated_sigma=FIX_SIGMA * math.sqrt(1.0 - share * share),
             white_sigma=FIX_SIGMA * share,
-            time_constant=settings.gps_wander_time,
+            time_constant=settings.gps_correlation_time,
             velocity_sigma=0.05,
             fix_type=FixType.DIFFERENTIAL,
         ),
@@ -232,11 +232,11 @@ def matched(seed: int) -> Drive:
         ),
         wheels_model=WheelsModel(Timing(10.0, 0.01, 0.002), scale_sigma=0.0, speed_sigma=0.01, travel_step=0.0),
     )
-    return _driven(simulation, rig, settings, _Wheels(settings, seed))
+    return _run_drive(simulation, rig, settings, _TravelNoise(settings, seed))
 
 
-def _rough(seed: int, gps: GpsModel, encoder: EncoderModel) -> Drive:
-    rig = _rig(0.0)
+def _simulate_rough(seed: int, gps: GpsModel, encoder: EncoderModel) -> DriveResult:
+    rig = _build_rig(0.0)
     simulation = Simulation(
         rig.model,
         "Car:Base",
@@ -254,74 +254,77 @@ def _rough(seed: int, gps: GpsModel, encoder: EncoderModel) -> Drive:
         ),
         wheels_model=WheelsModel(Timing(10.0, 0.01, 0.002), scale_sigma=0.02, slip=0.1, encoder=encoder),
         terrain=Terrain.hills(seed, steepness=0.06),
-        # as large as the settings say, but lasting for up to half a minute instead of a second
-        side_slip=SideSlip(cornering=0.006, wander_sigma=0.02),
+        # as large as in the settings, but correlated for up to half a minute instead of a second
+        side_slip=SideSlip(cornering=0.006, random_sigma=0.02),
     )
-    return _driven(simulation, rig, FilterSettings(), lambda events: events)
+    return _run_drive(simulation, rig, FilterSettings(), lambda events: events)
 
 
-COLOURED = GpsModel(lingering_sigma=0.7, white_sigma=0.1, time_constant=30.0, stated_factor=0.9)
-"""Fixes that err by a tenth more than they state, and wander twice as fast as the settings say.
+COLORED = GpsModel(correlated_sigma=0.7, white_sigma=0.1, time_constant=30.0, sigma_factor=0.9)
+"""Fixes with errors 10 % larger than stated, with half the correlation time of the settings.
 
 By a fifth more, and no filter without another source could hold 90 %: then 1.96 stated sigmas are 1.63 true ones.
 """
 
 
-def stronger(seed: int) -> Drive:
-    return _rough(seed, COLOURED, EncoderModel())
+def run_stronger(seed: int) -> DriveResult:
+    return _simulate_rough(seed, COLORED, EncoderModel())
 
 
-def faults(seed: int) -> Drive:
+def run_faults(seed: int) -> DriveResult:
     chance = NoiseSource(seed, "faults")
     angle = chance.uniform(-math.pi, math.pi)
     far = (5.0, 20.0, 700.0)[seed % 3]
     jumped = chance.uniform(95.0, 105.0)
     lost = chance.uniform(45.0, 55.0)
     gps = replace(
-        COLOURED,
+        COLORED,
         outages=((lost, lost + 30.0),),
         jumps=((jumped, jumped + 10.0, far * math.cos(angle), far * math.sin(angle)),),
     )
-    return _rough(seed, gps, EncoderModel(burst_rate=0.05, burst_seconds=1.0, burst_excess=0.5))
+    return _simulate_rough(seed, gps, EncoderModel(burst_rate=0.05, burst_seconds=1.0, burst_excess=0.5))
 
 
-def _driven(
-    simulation: Simulation, rig: Rig, settings: FilterSettings, transform: Callable[[Iterable[Event]], Iterable[Event]]
-) -> Drive:
+def _run_drive(
+    simulation: Simulation,
+    rig: SensorRig,
+    settings: FilterSettings,
+    transform: Callable[[Iterable[Event]], Iterable[Event]],
+) -> DriveResult:
     localizer = FilterLocalizer.start(Setup(rig, settings), ORIGIN)
     begin = simulation.start_utime
-    due, look = begin + round(FIRST * 1e6), begin
-    rows, taken = [], 0
+    due, look = begin + round(FIRST_SAMPLE * 1e6), begin
+    rows, instants = [], 0
     breaches = (_Breach(), _Breach())
     looks = valid = 0
     for event in transform(simulation.events(SECONDS)):
-        localizer, _ = localizer.take(event)
+        localizer, _ = localizer.process(event)
         utime = localizer.utime
         if utime < look:
             continue
-        look = utime + round(BOUND_EVERY * 1e6)
+        look = utime + round(BOUND_PERIOD * 1e6)
         estimate = localizer.estimate(utime)
         good = estimate.enu is not None and not estimate.invalid
-        if utime >= begin + round(FIRST * 1e6):
+        if utime >= begin + round(FIRST_SAMPLE * 1e6):
             looks, valid = looks + 1, valid + good
         if not good:
             for breach in breaches:
-                breach.ended()
-            taken, due = (taken + 1, due + round(EVERY * 1e6)) if utime >= due else (taken, due)
+                breach.stop()
+            instants, due = (instants + 1, due + round(SAMPLE_PERIOD * 1e6)) if utime >= due else (instants, due)
             continue
-        e = _error(simulation, estimate)
-        breaches[0].seen(utime, math.hypot(e[0], e[1]) > estimate.horizontal_bound)
-        breaches[1].seen(utime, abs(e[2]) > estimate.heading_bound)
+        e = _compute_error(simulation, estimate)
+        breaches[0].update(utime, math.hypot(e[0], e[1]) > estimate.horizontal_protection_level)
+        breaches[1].update(utime, abs(e[2]) > estimate.heading_protection_level)
         if utime >= due:
-            taken, due = taken + 1, due + round(EVERY * 1e6)
+            instants, due = instants + 1, due + round(SAMPLE_PERIOD * 1e6)
             keep = [0, 1, 5]
             P = np.array(estimate.covariance).reshape(6, 6)[np.ix_(keep, keep)]
             z = np.array(e) / np.sqrt(np.diagonal(P))
             rows.append((*z.tolist(), float(np.array(e) @ np.linalg.solve(P, np.array(e)))))
-    return Drive(rows, taken, (breaches[0].longest, breaches[1].longest), valid / looks)
+    return DriveResult(rows, instants, (breaches[0].longest, breaches[1].longest), valid / looks)
 
 
-def _error(simulation: Simulation, estimate: Estimate) -> tuple[float, float, float]:
+def _compute_error(simulation: Simulation, estimate: Estimate) -> tuple[float, float, float]:
     """Return the errors east, north, and of heading."""
     assert estimate.enu is not None
     true = simulation.truth(estimate.utime).enu
@@ -330,60 +333,60 @@ def _error(simulation: Simulation, estimate: Estimate) -> tuple[float, float, fl
 
 
 class _Breach:
-    """For how long a bound is passed without a break."""
+    """Longest uninterrupted time for which a bound is exceeded."""
 
     def __init__(self) -> None:
         self.since = 0
         self.longest = 0.0
 
-    def seen(self, utime: int, passed: bool) -> None:
+    def update(self, utime: int, passed: bool) -> None:
         if not passed:
             self.since = 0
             return
         self.since = self.since or utime
         self.longest = max(self.longest, (utime - self.since) * 1e-6)
 
-    def ended(self) -> None:
+    def stop(self) -> None:
         self.since = 0
 
 
 KINDS = (
-    Kind("matched", matched, (0.92, 0.98), None),
-    Kind("stronger", stronger, (0.90, 1.0), (0.0, 6.0)),
-    Kind("faults", faults, None, None),
+    DriveKind("matched", run_matched, (0.92, 0.98), None),
+    DriveKind("stronger", run_stronger, (0.90, 1.0), (0.0, 6.0)),
+    DriveKind("faults", run_faults, None, None),
 )
 
 
-def interval(seeds: int, dof: int = 3, risk: float = 0.01) -> tuple[float, float]:
-    """Return where the mean NEES of so many independent drives lies with a probability of 1 - risk."""
+def nees_interval(seeds: int, dof: int = 3, risk: float = 0.01) -> tuple[float, float]:
+    """Return the interval of the mean NEES of independent drives at a probability of 1 - risk."""
     n = seeds * dof
     return float(chi2.ppf(0.5 * risk, n)) / seeds, float(chi2.ppf(1.0 - 0.5 * risk, n)) / seeds
 
 
-def line(what: str, measured: float, least: float, most: float) -> bool:
-    holds = least <= measured <= most
-    asked = f"{least:g} to {most:.4g}" if math.isfinite(most) else f"at least {least:g}"
+def print_line(what: str, measured: float, low: float, high: float) -> bool:
+    holds = low <= measured <= high
+    asked = f"{low:g} to {high:.4g}" if math.isfinite(high) else f"at least {low:g}"
     print(f"  {what:44} {measured:9.3f}   ({asked}){'' if holds else '  <-- OUT OF BOUNDS'}")
     return holds
 
 
-def judged(kind: Kind, drives: list[Drive]) -> bool:
-    """Print what a kind of drives showed; return whether it is as asked."""
+def evaluate(kind: DriveKind, drives: list[DriveResult]) -> bool:
+    """Print the results of a kind of drives; return whether they are within bounds."""
     rows = np.array([row for drive in drives for row in drive.rows])
-    taken = sum(drive.taken for drive in drives)
-    print(f" {kind.name}: {len(drives)} drives, {len(rows)} of {taken} instants valid")
-    holds = [line("share of instants valid", len(rows) / taken, 0.9 if kind.coverage else 0.0, 1.0)]
+    instants = sum(drive.instants for drive in drives)
+    print(f" {kind.name}: {len(drives)} drives, {len(rows)} of {instants} instants valid")
+    holds = [print_line("share of instants valid", len(rows) / instants, 0.9 if kind.coverage else 0.0, 1.0)]
     inside = np.abs(rows[:, :3]) <= NORMAL_95
     coverage = kind.coverage or (0.0, 1.0)
-    holds.append(line("position within 95 %, each axis", float(inside[:, :2].mean()), *coverage))
-    holds.append(line("heading within 95 %", float(inside[:, 2].mean()), *coverage))
+    holds.append(print_line("position within 95 %, each axis", float(inside[:, :2].mean()), *coverage))
+    holds.append(print_line("heading within 95 %", float(inside[:, 2].mean()), *coverage))
     if kind.coverage is not None:
-        nees = kind.nees or interval(len(drives))
-        holds.append(line("mean NEES of east, north, heading", float(rows[:, 3].mean()), *nees))
+        nees = kind.nees or nees_interval(len(drives))
+        holds.append(print_line("mean NEES of east, north, heading", float(rows[:, 3].mean()), *nees))
         print(f"    of it, (error / sigma)^2: {', '.join(f'{x:.2f}' for x in (rows[:, :3] ** 2).mean(axis=0))}")
     for k, name in enumerate(("horizontal", "heading")):
         worst = max(drive.breach[k] for drive in drives)
-        holds.append(line(f"{name} bound passed while valid, at most, s", worst, 0.0, LONGEST_BREACH))
+        holds.append(print_line(f"{name} bound passed while valid, at most, s", worst, 0.0, MAX_BREACH_S))
     return all(holds)
 
 
@@ -399,15 +402,15 @@ def main(arguments: list[str] | None = None) -> int:
     with ProcessPoolExecutor(options.jobs) as pool:
         for kind in KINDS:
             if options.only in (None, kind.name):
-                holds &= judged(kind, list(pool.map(kind.run, seeds, chunksize=2)))
+                holds &= evaluate(kind, list(pool.map(kind.run, seeds, chunksize=2)))
     if options.only is None:
-        nis = husky_nis.mean_statistics()
+        nis = husky_nis.compute_mean_nis()
         if nis is None:
             print(" recording skipped: no husky/test1.bag; set MODELSERVER_DATA to the folder of recordings")
         else:
             print(" Husky recording")
             for name, mean in nis.items():
-                holds &= line(f"mean NIS of {name} / its degrees of freedom", mean, 0.5, 2.0)
+                holds &= print_line(f"mean NIS of {name} / its degrees of freedom", mean, 0.5, 2.0)
     return 0 if holds else 1
 
 

@@ -20,14 +20,14 @@ from pathlib import Path
 
 import lcm
 
-from benchmarks.support import RAPTOR, free_url, process, verdict
+from benchmarks.support import RAPTOR, free_url, print_verdict, run_process
 from modelserver.messages import DriverHealth
 from modelserver.wire.codec import decode
 
 SECONDS = 20.0
-WARM = 20
+WARM_UP = 20
 """Samples before the measurement begins."""
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 BOUND = 15.0
 """Percent of a core."""
 
@@ -44,10 +44,10 @@ drivers:
     dbc: raptor.dbc
     wheels:
       front_left:
-        count: {{signal: WheelCounts.FrontLeftCount, metres_per_count: 0.0125}}
+        count: {{signal: WheelCounts.FrontLeftCount, meters_per_count: 0.0125}}
         direction: {{signal: WheelCounts.FrontLeftDirection}}
       front_right:
-        count: {{signal: WheelCounts.FrontRightCount, metres_per_count: 0.0125}}
+        count: {{signal: WheelCounts.FrontRightCount, meters_per_count: 0.0125}}
         direction: {{signal: WheelCounts.FrontRightDirection}}
   vehicle:
     device: vehicle
@@ -81,7 +81,7 @@ _RUN = "import sys; sys.stdout = open('/dev/null', 'w'); from mstools.cli import
 
 
 def cpu_seconds(pid: int) -> float:
-    """Return what a process has used of the processors so far, in user and kernel mode."""
+    """Return the CPU time of a process in user and kernel mode."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
@@ -94,42 +94,42 @@ def free_port() -> int:
 
 
 @contextlib.contextmanager
-def vehicle_file(port: int) -> Iterator[Path]:
+def write_vehicle_file(port: int) -> Iterator[Path]:
     """Yield a vehicle file in a folder of its own."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for file in ("vehicle.yaml", "geometry.yaml", "raptor.dbc"):
             shutil.copy(RAPTOR / file, folder)
         path = folder / "vehicle.yaml"
-        # what the file says of drivers comes last in it
+        # section drivers is the last one of the file
         rest, _, _ = path.read_text().partition("\ndrivers:")
         path.write_text(rest + DRIVERS.format(folder=folder, port=port, group=GROUP))
         yield path
 
 
-def measured(name: str, line: str) -> tuple[float, float]:
-    """Return a driver's CPU, percent of a core, and the samples a second that it published meanwhile."""
+def measure(name: str, line: str) -> tuple[float, float]:
+    """Return a driver's CPU, percent of a core, and the samples per second that it published."""
     url, port = free_url(), free_port()
     reports: list[DriverHealth] = []
     bus = lcm.LCM(url)
     bus.subscribe("DRIVER_HEALTH", lambda _, data: reports.append(decode("driver_health_t", data)))
 
     def wait(enough: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while not enough():
             if time.monotonic() > deadline:
                 raise RuntimeError(f"{name} does not stream: {reports[-1:]}")
             bus.handle_timeout(100)
 
-    with vehicle_file(port) as path, contextlib.ExitStack() as stack:
+    with write_vehicle_file(port) as path, contextlib.ExitStack() as stack:
         lines = {
             "pty": ("--pty", "--link", str(path.parent / name)),
             "tcp": ("--tcp", str(port)),
             "can": ("--can", f"{GROUP}:{port}"),
         }
-        stack.enter_context(process("-c", _RUN, "emulate", name, "-c", str(path), *lines[line], url=url))
-        driver = stack.enter_context(process("-c", _RUN, "driver", name, "-c", str(path), url=url))
-        wait(lambda: bool(reports) and reports[-1].samples >= WARM)
+        stack.enter_context(run_process("-c", _RUN, "emulate", name, "-c", str(path), *lines[line], url=url))
+        driver = stack.enter_context(run_process("-c", _RUN, "driver", name, "-c", str(path), url=url))
+        wait(lambda: bool(reports) and reports[-1].samples >= WARM_UP)
         first, begin, used = reports[-1], time.monotonic(), cpu_seconds(driver.pid)
         wait(lambda: time.monotonic() >= begin + SECONDS)
         used, spent = cpu_seconds(driver.pid) - used, time.monotonic() - begin
@@ -141,8 +141,8 @@ def measured(name: str, line: str) -> tuple[float, float]:
 def main() -> int:
     holds = True
     for name, (line, nominal) in KINDS.items():
-        percent, rate = measured(name, line)
-        holds &= verdict(f"{name} on {line}, {rate:.1f} samples/s of {nominal:g}", percent, BOUND, "%")
+        percent, rate = measure(name, line)
+        holds &= print_verdict(f"{name} on {line}, {rate:.1f} samples/s of {nominal:g}", percent, BOUND, "%")
         if abs(rate / nominal - 1.0) > 0.05:
             print(f"  {name} did not bring its nominal rate  <-- OUT OF BOUNDS")
             holds = False

@@ -1,6 +1,6 @@
-"""What the filter costs: an inertial sample through the core to a bare predict, a replay, a day's memory.
+"""Cost of the filter: an IMU sample through the core relative to a bare predict, a replay, memory over a day.
 
-The day is driven in circles, at rates low enough that it takes minutes: what could grow grows with samples and seconds.
+The day is driven in circles, at low rates so that it takes minutes: growth depends on samples and seconds.
 """
 
 from __future__ import annotations
@@ -21,29 +21,31 @@ from pathlib import Path
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from benchmarks.support import verdict
+from benchmarks.support import print_verdict
 from benchmarks.withheld import data_directory
 from modelserver import core
-from modelserver.config import load_config
+from modelserver.config.vehicle_file import load_config
 from modelserver.core import Instant
 from modelserver.earth.geodesy import Geodesy, origin_at
-from modelserver.localization.modes import ModeLocalizer
+from modelserver.estimation.modes import ModeLocalizer
 from modelserver.messages import FixType, GpsSample, ImuSample, Sample, SensorHeader, WheelSample, WheelsSample
-from modelserver.service.daemon import Vehicle, load_vehicle
+from modelserver.server.vehicle import Vehicle, load_vehicle
 from mstools.commands.import_bag import import_bag
 
 ROOT = Path(__file__).resolve().parent.parent
 HUSKY = ROOT / "config" / "husky" / "vehicle.yaml"
 START = 1_750_000_000_000_000
-MOST_PREDICTS = 12.0
-LEAST_REAL_TIME = 100.0
-MOST_GROWTH_MB = 16.0
+MAX_PREDICTS = 12.0
+MIN_REAL_TIME = 100.0
+MAX_GROWTH_MB = 16.0
 RATES = (10.0, 50.0)
-"""Poses a second: what the report asks for, and what `replay` writes unless told otherwise."""
+"""Poses per second: the required rate, and the default of `replay`."""
 
 
-def circles(seconds: float, imu_hz: float, wheels_hz: float, gps_hz: float, seed: int = 1) -> Iterator[Sample]:
-    """Yield what a Husky's sensors say on circles of 20 m at 1 m/s, after standing for 5 s, in order of time."""
+def simulate_circular_drive(
+    seconds: float, imu_hz: float, wheels_hz: float, gps_hz: float, seed: int = 1
+) -> Iterator[Sample]:
+    """Yield a Husky's samples on circles of 20 m at 1 m/s, after 5 stationary seconds, in order of time."""
     rng = random.Random(seed)
     geodesy = Geodesy(origin_at(42.0, -71.0, 20.0))
     radius, stand = 20.0, 5.0
@@ -53,7 +55,7 @@ def circles(seconds: float, imu_hz: float, wheels_hz: float, gps_hz: float, seed
         utime = START + round(t * 1e6)
         way = max(t - stand, 0.0)
         turn = 1.0 / radius if t > stand else 0.0
-        # the unit stands on the Husky with x to the right, y up, z to the rear
+        # the Husky's IMU is mounted with x to the right, y up, z to the rear
         rate = (rng.gauss(0, 0.002), turn + rng.gauss(0, 0.002), rng.gauss(0, 0.002))
         force = (-turn + rng.gauss(0, 0.02), 9.8 + rng.gauss(0, 0.02), rng.gauss(0, 0.02))
         yield ImuSample(SensorHeader(utime, "imu", n + 1), rate, force)
@@ -80,26 +82,26 @@ def circles(seconds: float, imu_hz: float, wheels_hz: float, gps_hz: float, seed
             )
 
 
-def instant(utime: int) -> Instant:
+def instant_at(utime: int) -> Instant:
     return Instant(utime * 1000, utime)
 
 
-def event_cost(vehicle: Vehicle) -> float:
-    """Return the median over rounds of an inertial event's mean cost to a bare predict's, of the same size."""
-    state = vehicle.core(instant(START))
-    samples = list(circles(90.0, 100.0, 10.0, 2.5))
+def measure_event_cost(vehicle: Vehicle) -> float:
+    """Return the median over rounds of an IMU event's mean cost relative to a bare predict of the same size."""
+    state = vehicle.start_core(instant_at(START))
+    samples = list(simulate_circular_drive(90.0, 100.0, 10.0, 2.5))
     warm = 60 * 113
     for sample in samples[:warm]:
-        state, _ = core.step(state, sample, instant(sample.header.utime))
+        state, _ = core.step(state, sample, instant_at(sample.header.utime))
     assert isinstance(state.localizer, ModeLocalizer)
-    n = state.localizer.makings.setup.layout.size
+    n = state.localizer.config.setup.layout.size
     bare = KalmanFilter(n, 1)
     bare.x, F, Q, P = np.zeros(n), np.eye(n), np.eye(n) * 1e-6, np.eye(n)
     ratios, costs = [], []
     for begin in range(warm, len(samples) - 300, 300):
         events, spent = 0, 0.0
         for sample in samples[begin : begin + 300]:
-            now = instant(sample.header.utime)
+            now = instant_at(sample.header.utime)
             start = time.perf_counter()
             state, _ = core.step(state, sample, now)
             if isinstance(sample, ImuSample):
@@ -112,14 +114,15 @@ def event_cost(vehicle: Vehicle) -> float:
         floor = (time.perf_counter() - start) / 300
         ratios.append(spent / events / floor)
         costs.append(spent / events * 1e6)
-    print(f"  an inertial event {statistics.median(costs):.0f} us, {n} states")
+    print(f"  an IMU event {statistics.median(costs):.0f} us, {n} states")
     return statistics.median(ratios)
 
 
-def replay_factor(rate_hz: float) -> float | None:
-    """Return the seconds of the Husky recording that `modelserver replay --poses` does in one; the best of three.
+def measure_replay_factor(rate_hz: float) -> float | None:
+    """Return the real-time factor of `modelserver replay --poses` on the Husky recording; the best of three.
 
-    By its own report: without the interpreter's start, with reading the log and writing poses at `rate_hz`.
+    As the command reports it: without the interpreter's start, including reading the log and writing poses at
+    `rate_hz`.
     """
     bag = data_directory() / "husky" / "test1.bag"
     if not bag.is_file():
@@ -137,21 +140,21 @@ def replay_factor(rate_hz: float) -> float | None:
     return max(factors)
 
 
-def resident_mb() -> float:
-    """Return the memory of this process that is in use now, MB."""
+def get_resident_mb() -> float:
+    """Return the resident memory of this process, MB."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() / 1e6
 
 
-def growth(vehicle: Vehicle, hours: float) -> float:
-    """Return by how many MB memory grows between the first hour and the last of a drive."""
-    state = vehicle.core(instant(START))
+def measure_growth(vehicle: Vehicle, hours: float) -> float:
+    """Return the growth of memory between the first and the last hour of a drive, MB."""
+    state = vehicle.start_core(instant_at(START))
     first = 0.0
-    for sample in circles(hours * 3600.0, 10.0, 2.0, 0.5):
-        state, _ = core.step(state, sample, instant(sample.header.utime))
+    for sample in simulate_circular_drive(hours * 3600.0, 10.0, 2.0, 0.5):
+        state, _ = core.step(state, sample, instant_at(sample.header.utime))
         if not first and sample.header.utime > START + 3_600_000_000:
-            first = resident_mb()
-    return resident_mb() - first
+            first = get_resident_mb()
+    return get_resident_mb() - first
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -161,18 +164,18 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--hours", type=float, default=24.0, help="of the simulated drive")
     options = parser.parse_args(arguments or [])
     vehicle = load_vehicle(load_config(HUSKY))
-    holds = verdict(
-        "an inertial event through core.step to filterpy's predict", event_cost(vehicle), MOST_PREDICTS, "x"
+    holds = print_verdict(
+        "an inertial event through core.step to filterpy's predict", measure_event_cost(vehicle), MAX_PREDICTS, "x"
     )
     for rate in RATES:
-        factor = replay_factor(rate)
+        factor = measure_replay_factor(rate)
         if factor is None:
             print("  replay skipped: no husky/test1.bag; set MODELSERVER_DATA to the folder of recordings")
             break
         print(f"  replay of the Husky recording, poses at {rate:g} Hz: {factor:.0f} times real time")
-        holds &= verdict("seconds to replay 100 s", 100.0 / factor, 100.0 / LEAST_REAL_TIME, "s")
-    grown = growth(vehicle, options.hours)
-    holds &= verdict(f"memory grown over {options.hours:g} simulated hours", grown, MOST_GROWTH_MB, "MB")
+        holds &= print_verdict("seconds to replay 100 s", 100.0 / factor, 100.0 / MIN_REAL_TIME, "s")
+    grown = measure_growth(vehicle, options.hours)
+    holds &= print_verdict(f"memory grown over {options.hours:g} simulated hours", grown, MAX_GROWTH_MB, "MB")
     return 0 if holds else 1
 
 

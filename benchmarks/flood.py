@@ -1,4 +1,4 @@
-"""POSE beside 10,000 queries a second from one client, against the same without; and another client's answers."""
+"""POSE beside 10,000 queries per second from one client, relative to the same without; and another client's replies."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from pathlib import Path
 
 import lcm
 
-from benchmarks.support import free_url, process, verdict
+from benchmarks.support import free_url, print_verdict, run_process
 from modelserver.client.remote import Platform
-from modelserver.errors import NoPoseError, NoServerError, RefusedError
+from modelserver.errors import NoPoseError, NoServerError, OverloadedError
 from modelserver.messages import (
     GetTransformation,
     GpsSample,
@@ -30,7 +30,7 @@ from modelserver.messages import (
     WheelSample,
     WheelsSample,
 )
-from modelserver.messages.flags import FixType
+from modelserver.messages import FixType
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.provider import resolve_url
 
@@ -40,8 +40,8 @@ SECONDS = float(sys.argv[2]) if sys.argv[1:2] == ["seconds"] else 10.0
 
 POSE_HZ = 100.0
 FLOOD_HZ = 10_000.0
-LATER = 0.5
-"""Seconds at the begin of a part that do not count: processes start."""
+WARM_UP_S = 0.5
+"""Seconds at the start of a part that are not measured: processes start."""
 
 GEOMETRY = """\
 modelserver: geometry/1
@@ -63,10 +63,10 @@ sensors:
 """
 
 
-def sensors(hz: float = 200.0, wheel_names: tuple[str, ...] = ("left", "right"), up: float = 1.0) -> None:
-    """Be an inertial unit at `hz`, wheels at half of it and a receiver at 5 Hz, on a level drive.
+def publish_sensors(hz: float = 200.0, wheel_names: tuple[str, ...] = ("left", "right"), up: float = 1.0) -> None:
+    """Publish an IMU at `hz`, wheels at half of it and a receiver at 5 Hz, on a level drive.
 
-    `up` is 1 where the unit's z axis points up, -1 where it points down.
+    `up` is 1 where the IMU's z axis points up, -1 where it points down.
     """
     bus = lcm.LCM(resolve_url())
     begin, shaken = time.monotonic(), random.Random(1).gauss
@@ -94,8 +94,8 @@ def sensors(hz: float = 200.0, wheel_names: tuple[str, ...] = ("left", "right"),
             bus.publish("GPS", encode(fix))
 
 
-def flood(seconds: float) -> None:
-    """Ask at the flood's rate, without waiting for replies; say how often."""
+def run_flood(seconds: float) -> None:
+    """Send requests at the flood's rate without waiting for replies; write their number."""
     bus = lcm.LCM(resolve_url())
     requests = [
         encode(GetTransformation(RequestHeader(n, "REPLY_FLOOD"), "Cart:Base", "World:UTM")) for n in range(1000)
@@ -110,8 +110,8 @@ def flood(seconds: float) -> None:
     Path(sys.argv[3]).write_text(str(sent))
 
 
-def beat(seconds: float) -> None:
-    """Be the least that can be late: a bare loop that sleeps until absolute deadlines at the rate of POSE."""
+def run_baseline(seconds: float) -> None:
+    """Write the delays of a bare loop that sleeps until absolute deadlines at the rate of POSE."""
     late, begin = [], time.monotonic()
     for n in range(1, round(seconds * POSE_HZ)):
         due = begin + n / POSE_HZ
@@ -120,11 +120,11 @@ def beat(seconds: float) -> None:
     Path(sys.argv[3]).write_text(json.dumps(late))
 
 
-class Ear:
-    """Hears POSE and health in a thread of its own, with the instant of arrival."""
+class PoseDelayRecorder:
+    """Receives POSE and health in a thread, and records the delay of each pose."""
 
     def __init__(self, url: str):
-        self.late: list[float] = []
+        self.delays: list[float] = []
         self.health: list[Health] = []
         self._bus = lcm.LCM(resolve_url(url))
         self._bus.subscribe("POSE", self._pose)
@@ -134,21 +134,21 @@ class Ear:
         threading.Thread(target=self._listen, daemon=True).start()
 
     def _pose(self, _: str, data: bytes) -> None:
-        # in timer mode a pose is stamped with its deadline: arrival behind it is lateness, the way over the bus too
+        # in timer mode a pose is stamped with its deadline: the delay includes the transport over the bus
         arrived = time.time()
-        self.late.append(arrived - decode("pose_transform_t", data).transformation.utime * 1e-6)
+        self.delays.append(arrived - decode("pose_transform_t", data).transformation.utime * 1e-6)
 
     def _listen(self) -> None:
         while not self._end.is_set():
             self._bus.handle_timeout(100)
 
     def close(self) -> None:
-        """Stop listening."""
+        """Stop receiving."""
         self._end.set()
 
 
 def cpu_seconds(pid: int) -> float:
-    """Return the processor time that a process has used."""
+    """Return the CPU time of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
@@ -158,19 +158,19 @@ def p99(values: list[float]) -> float:
 
 
 @contextmanager
-def polite(url: str, replies: list[float], lost: list[str]) -> Iterator[None]:
-    """Ask ten times a second beside whatever goes on."""
+def query_sequentially(url: str, replies: list[float], lost: list[str]) -> Iterator[None]:
+    """Query ten times per second in a thread, recording reply times and losses."""
     end = threading.Event()
 
     def ask() -> None:
-        with Platform(url, timeout=0.5, retries=0, name="polite") as platform:
+        with Platform(url, timeout=0.5, retries=0, name="sequential") as platform:
             while not end.wait(0.1):
                 begin = time.perf_counter()
                 try:
                     with suppress(NoPoseError):
                         platform.get_pose("Cart:Base", "World:UTM")
                     replies.append(time.perf_counter() - begin)
-                except (NoServerError, RefusedError) as error:
+                except (NoServerError, OverloadedError) as error:
                     lost.append(type(error).__name__)
 
     thread = threading.Thread(target=ask)
@@ -196,66 +196,68 @@ def main() -> int:
         (Path(folder) / "geometry.yaml").write_text(GEOMETRY)
         count, bare_file = Path(folder) / "sent", Path(folder) / "bare"
         run = ("-c", "from mstools.cli import main; main()", "run", "-c", str(config), "--log-level", "error")
-        with process(*run, url=url) as served, process("-m", "benchmarks.flood", "sensors", url=url):
-            ear = Ear(url)
+        with run_process(*run, url=url) as served, run_process("-m", "benchmarks.flood", "sensors", url=url):
+            recorder = PoseDelayRecorder(url)
             time.sleep(5.0)
             for number in range(2 * ROUNDS):
                 flooded = bool(number % 2)
                 count.write_text("0")
                 before = cpu_seconds(served.pid)
                 with (
-                    polite(url, replies[flooded], lost[flooded]),
-                    process("-m", "benchmarks.flood", "beat", str(SECONDS), str(bare_file), url=url) as bare_loop,
+                    query_sequentially(url, replies[flooded], lost[flooded]),
+                    run_process(
+                        "-m", "benchmarks.flood", "baseline", str(SECONDS), str(bare_file), url=url
+                    ) as bare_loop,
                 ):
                     if flooded:
-                        with process("-m", "benchmarks.flood", "flood", str(SECONDS), str(count), url=url):
-                            time.sleep(LATER)
-                            ear.late.clear()
+                        with run_process("-m", "benchmarks.flood", "flood", str(SECONDS), str(count), url=url):
+                            time.sleep(WARM_UP_S)
+                            recorder.delays.clear()
                             time.sleep(SECONDS)
-                            heard = list(ear.late)
-                            time.sleep(LATER)
+                            delays = list(recorder.delays)
+                            time.sleep(WARM_UP_S)
                     else:
-                        ear.late.clear()
+                        recorder.delays.clear()
                         time.sleep(SECONDS)
-                        heard = list(ear.late)
+                        delays = list(recorder.delays)
                     bare_loop.wait()
                 bare[flooded] += json.loads(bare_file.read_text())
                 busy[flooded] += cpu_seconds(served.pid) - before
                 sent += int(count.read_text())
-                late[flooded] += heard
+                late[flooded] += delays
                 time.sleep(2.0)
-            health = ear.health[-1]
-            ear.close()
-    refused = sum(each for _, why, each in health.rejected if why == "load")
-    notices = sorted({text for each in ear.health for subject, text in each.notices if subject == "requests"})
+            health = recorder.health[-1]
+            recorder.close()
+    rejected = sum(each for _, why, each in health.rejected if why == "overload")
+    warnings = sorted({text for each in recorder.health for subject, text in each.warnings if subject == "requests"})
     for flooded, name in ((False, "quiet"), (True, "flood")):
         times, asked = late[flooded], replies[flooded]
         print(
-            f"  {name}: {len(times)} poses, lateness p50 {statistics.median(times) * 1e3:.2f} ms, "
-            f"p99 {p99(times) * 1e3:.2f} ms, most {max(times) * 1e3:.2f} ms; polite client at 10 Hz: "
+            f"  {name}: {len(times)} poses, delay p50 {statistics.median(times) * 1e3:.2f} ms, "
+            f"p99 {p99(times) * 1e3:.2f} ms, max {max(times) * 1e3:.2f} ms; sequential client at 10 Hz: "
             f"{len(asked)} answers, p50 {statistics.median(asked) * 1e3:.2f} ms, p99 {p99(asked) * 1e3:.2f} ms, "
             f"{len(lost[flooded])} not answered; the daemon's CPU {busy[flooded] / ROUNDS / SECONDS:.0%} of a core"
         )
     print(
         f"  a bare loop at the same rate beside it: p99 {p99(bare[False]) * 1e3:.2f} ms quiet, "
-        f"{p99(bare[True]) * 1e3:.2f} ms with the flood: so much is the machine's"
+        f"{p99(bare[True]) * 1e3:.2f} ms with the flood: the machine's own jitter"
     )
-    print(f"  sent {sent}; answered {health.requests_answered}, refused and counted {refused}")
-    print(f"  ticks missed {health.ticks_missed}; last notice: {notices[-1] if notices else 'none'}")
-    unseen = sent - refused - health.requests_answered
-    print(f"  neither answered nor counted (lost before they were seen; polite ones count against it): {unseen}")
-    holds = verdict("POSE's p99 lateness with the flood, more than without", (p99(late[True]) - p99(late[False])) * 1e3,
-                    2.0, "ms")  # fmt: skip
-    holds &= verdict("requests of the polite client not answered", len(lost[True]), 0, "")
-    return 0 if holds and refused else 1
+    print(f"  sent {sent}; answered {health.requests_answered}, rejected and counted {rejected}")
+    print(f"  ticks missed {health.ticks_missed}; last warning: {warnings[-1] if warnings else 'none'}")
+    unaccounted = sent - rejected - health.requests_answered
+    print(f"  neither answered nor counted (lost before; includes the sequential client's): {unaccounted}")
+    more = (p99(late[True]) - p99(late[False])) * 1e3
+    holds = print_verdict("POSE's p99 delay with the flood, more than without", more, 2.0, "ms")
+    holds &= print_verdict("requests of the sequential client not answered", len(lost[True]), 0, "")
+    return 0 if holds and rejected else 1
 
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["sensors"]:
-        sensors()
-    elif sys.argv[1:2] == ["beat"]:
-        beat(float(sys.argv[2]))
+        publish_sensors()
+    elif sys.argv[1:2] == ["baseline"]:
+        run_baseline(float(sys.argv[2]))
     elif sys.argv[1:2] == ["flood"]:
-        flood(float(sys.argv[2]))
+        run_flood(float(sys.argv[2]))
     else:
         sys.exit(main())

@@ -1,4 +1,4 @@
-"""How many NovAtel messages one process parses a second: BESTPOSB and BESTVELB, as a serial line brings them.
+"""NovAtel messages (BESTPOSB and BESTVELB) parsed per second by one process, in chunks of a serial port.
 
 python -m benchmarks gps_parse
 """
@@ -22,7 +22,9 @@ _START = 1_700_000_000_000_000
 
 
 def stream_of(names: tuple[str, ...], instants: int) -> bytes:
-    return b"".join(gps_logs.write(name, _sample(n), _START + n * 50_000) for n in range(instants) for name in names)
+    return b"".join(
+        gps_logs.encode_sample(name, _sample(n), _START + n * 50_000) for n in range(instants) for name in names
+    )
 
 
 def _sample(n: int) -> GpsSample:
@@ -41,15 +43,15 @@ def _sample(n: int) -> GpsSample:
     )
 
 
-def rate(data: bytes, expected: int) -> float:
-    """Return messages a second, the best of some rounds; checks that each message was read."""
+def measure_rate(data: bytes, expected: int) -> float:
+    """Return messages per second, the best of some rounds; checks that each message was parsed."""
     best = 0.0
     for _ in range(ROUNDS):
         stream = GpsStream()
-        begun = time.perf_counter()
+        start = time.perf_counter()
         read = sum(len(stream.feed(data[at : at + CHUNK])) for at in range(0, len(data), CHUNK))
-        best = max(best, expected / (time.perf_counter() - begun))
-        read += len(stream.idle())
+        best = max(best, expected / (time.perf_counter() - start))
+        read += len(stream.flush())
         if read != expected:
             raise RuntimeError(f"{read} messages read of {expected}")
     return best
@@ -61,10 +63,10 @@ def main() -> int:
     nmea = stream_of(("gpgga", "gprmc"), INSTANTS // 10)
     sentences = 2 * (INSTANTS // 10)
     assert isinstance(GpsStream().feed(binary)[0], NovatelLog)
-    measured = rate(binary, 2 * INSTANTS)
+    measured = measure_rate(binary, 2 * INSTANTS)
     print(f"BESTPOSB and BESTVELB  {measured:9,.0f} messages/s, required {REQUIRED:,}")
-    print(f"BESTPOSA and BESTVELA  {rate(text, sentences):9,.0f} messages/s")
-    print(f"GPGGA and GPRMC        {2 * rate(nmea, sentences // 2):9,.0f} sentences/s")
+    print(f"BESTPOSA and BESTVELA  {measure_rate(text, sentences):9,.0f} messages/s")
+    print(f"GPGGA and GPRMC        {2 * measure_rate(nmea, sentences // 2):9,.0f} sentences/s")
     return 0 if measured >= REQUIRED else 1
 
 

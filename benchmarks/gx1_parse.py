@@ -1,4 +1,4 @@
-"""Replies of the 3DM-GX1 a second in one process: parsed alone, amid noise, and made into samples by the driver."""
+"""Replies of the 3DM-GX1 per second in one process: parsed alone, within noise, and converted by the driver."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import resource
 import time
 from collections.abc import Callable
 
-from benchmarks.support import verdict
+from benchmarks.support import print_verdict
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
 from msdrivers.emulate.gx1_unit import Eeprom
-from msdrivers.protocol.gx1 import DATA, CommandByte, Gx1Parser, Packet, RequestParser
-from msdrivers.station import Measured, Now, Send
+from msdrivers.endpoint import HostTime, MeasuredSample, Send
+from msdrivers.protocol.gx1 import MEASUREMENTS, CommandByte, Gx1Packet, Gx1Parser, RequestParser
 
 REPLIES = 50_000
 ROUNDS = 3
@@ -26,27 +26,27 @@ FUZZ_BYTES = 10_000_000
 
 
 def _reply(number: int) -> bytes:
-    return Packet(CommandByte.EULER_VECTORS, (number % 1000, 2, 3, 4, 5, 6, 7, 8, -4681), number % 65_536).to_bytes()
+    return Gx1Packet(CommandByte.EULER_VECTORS, (number % 1000, 2, 3, 4, 5, 6, 7, 8, -4681), number % 65_536).to_bytes()
 
 
-def parser() -> Gx1Parser:
-    """Return a parser that lets through as much as it ever may: every measurement, by the checksum alone."""
+def make_parser() -> Gx1Parser:
+    """Return the most permissive parser: it accepts every measurement by its checksum alone."""
     made = Gx1Parser()
-    made.stream(*DATA)
+    made.set_streamed(*MEASUREMENTS)
     return made
 
 
-def expected_false(count: int) -> float:
-    """Return how many of so many random bytes begin what passes for a reply to `parser`."""
-    return count * len(DATA) / 256 / 65_536
+def expected_false_replies(count: int) -> float:
+    """Return the expected number of false replies in so many random bytes."""
+    return count * len(MEASUREMENTS) / 256 / 65_536
 
 
 def _chunks(data: bytes) -> list[bytes]:
     return [data[at : at + CHUNK] for at in range(0, len(data), CHUNK)]
 
 
-def _fastest(run: Callable[[], int]) -> float:
-    """Return replies a second of the fastest round."""
+def _measure_fastest(run: Callable[[], int]) -> float:
+    """Return replies per second of the fastest round."""
     best = 0.0
     for _ in range(ROUNDS):
         begin = time.perf_counter()
@@ -56,16 +56,16 @@ def _fastest(run: Callable[[], int]) -> float:
     return best
 
 
-def _parsed(chunks: list[bytes]) -> int:
-    made = parser()
+def _count_parsed(chunks: list[bytes]) -> int:
+    made = make_parser()
     return sum(len(made.feed(chunk)) for chunk in chunks)
 
 
-def _driven(chunks: list[bytes], per_chunk: float) -> int:
-    """Set a driver up by hand, then give it the stream; return the number of samples."""
-    driver, now = Gx1Driver(Gx1Settings("imu")), Now(0, 1)
-    requests, eeprom, streamed = RequestParser(), Eeprom.factory(), 0
-    outputs = driver.opened(now)
+def _count_samples(chunks: list[bytes], per_chunk: float) -> int:
+    """Start a driver, feed it the stream, and return the number of samples."""
+    driver, now = Gx1Driver(Gx1Settings("imu")), HostTime(0, 1)
+    requests, eeprom, streamed = RequestParser(), Eeprom.make_factory(), 0
+    outputs = driver.on_open(now)
     while streamed == 0:
         replies = b""
         for output in outputs:
@@ -75,16 +75,18 @@ def _driven(chunks: list[bytes], per_chunk: float) -> int:
                     streamed = request.data[0]
                     words = (streamed, 0)
                 elif request.command == CommandByte.READ_EEPROM:
-                    words = (eeprom.word(request.data[1]),)
+                    words = (eeprom.read_word(request.data[1]),)
                 ticks = 65_535 if request.command == CommandByte.READ_EEPROM else None
-                replies += Packet(request.command, words, ticks).to_bytes()
-        due = driver.due()
-        now = Now(max(now.monotonic_ns, due or 0), 1)
-        outputs = driver.received(replies, now) if replies else driver.woken(now)
+                replies += Gx1Packet(request.command, words, ticks).to_bytes()
+        due = driver.get_deadline()
+        now = HostTime(max(now.monotonic_ns, due or 0), 1)
+        outputs = driver.on_receive(replies, now) if replies else driver.on_timer(now)
     count, at_ns = 0, float(now.monotonic_ns)
     for chunk in chunks:
         at_ns += per_chunk * 1e7
-        count += sum(isinstance(output, Measured) for output in driver.received(chunk, Now(round(at_ns), 1)))
+        count += sum(
+            isinstance(output, MeasuredSample) for output in driver.on_receive(chunk, HostTime(round(at_ns), 1))
+        )
     return count
 
 
@@ -95,20 +97,20 @@ def main() -> int:
     noisy = _chunks(b"".join(reply + rng.randbytes(rng.randrange(20)) for reply in replies))
     holds = True
     for name, run in (
-        ("parser, good bytes", lambda: _parsed(clean)),
-        ("parser, 10 bytes of noise between two replies", lambda: _parsed(noisy)),
-        ("driver, from bytes to samples", lambda: _driven(clean, CHUNK / len(replies[0]))),
+        ("parser, good bytes", lambda: _count_parsed(clean)),
+        ("parser, 10 bytes of noise between two replies", lambda: _count_parsed(noisy)),
+        ("driver, from bytes to samples", lambda: _count_samples(clean, CHUNK / len(replies[0]))),
     ):
-        rate = _fastest(run)
+        rate = _measure_fastest(run)
         print(f"  {name}: {rate:,.0f} replies/s")
-        holds &= verdict(f"{name}: required rate to its own", REQUIRED / rate, 1.0, "x")
+        holds &= print_verdict(f"{name}: required rate to its own", REQUIRED / rate, 1.0, "x")
 
-    made, found, before = parser(), 0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    made, found, before = make_parser(), 0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for _ in range(FUZZ_BYTES // 10_000):
         found += len(made.feed(rng.randbytes(10_000)))
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-    mean = expected_false(FUZZ_BYTES)
+    mean = expected_false_replies(FUZZ_BYTES)
     print(f"  {FUZZ_BYTES:,} random bytes: {found} pass for replies, {mean:.1f} expected of a 16-bit checksum")
-    holds &= verdict("false replies in them", found, mean + 4 * math.sqrt(mean), "")
-    holds &= verdict("memory that they took", grown, 1024, "kB")
+    holds &= print_verdict("false replies in them", found, mean + 4 * math.sqrt(mean), "")
+    holds &= print_verdict("memory that they took", grown, 1024, "kB")
     return 0 if holds else 1

@@ -1,4 +1,4 @@
-"""How the Husky recording's innovations compare with what the filter expects of them: mean statistic by its freedom."""
+"""Mean NIS per degree of freedom of wheels and fixes on the Husky recording."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from pathlib import Path
 
 from benchmarks.support import ROOT
 from benchmarks.withheld import data_directory
-from modelserver.config import load_config
+from modelserver.config.vehicle_file import load_config
 from modelserver.messages import Decision, Verdict
-from modelserver.service.daemon import load_vehicle
-from modelserver.service.offline import OfflineRun
+from modelserver.server.offline import OfflineRun
+from modelserver.server.vehicle import load_vehicle
 from modelserver.wire.eventlog import LogFile
 from mstools.commands.import_bag import import_bag
 
 KINDS = ("gps_position", "wheel_speed")
 
 
-def mean_statistics() -> dict[str, float] | None:
-    """Return for wheels and fixes the mean of statistic / dof over all used; None where there is no recording."""
+def compute_mean_nis() -> dict[str, float] | None:
+    """Return the mean NIS per degree of freedom of the used wheels and fixes; None without the recording."""
     bag = data_directory() / "husky" / "test1.bag"
     if not bag.is_file():
         return None
     found: dict[str, list[float]] = {kind: [] for kind in KINDS}
 
-    def noted(decision: Decision) -> None:
+    def on_decision(decision: Decision) -> None:
         if decision.kind in found and decision.verdict is Verdict.USED:
             found[decision.kind].append(decision.statistic / decision.dof)
 
@@ -34,6 +34,6 @@ def mean_statistics() -> dict[str, float] | None:
         log = Path(directory) / "husky.lcm"
         import_bag(bag, log)
         with LogFile(log) as recording:
-            for _ in OfflineRun(vehicle, recording, vehicle.config.base_frame, noted).rows(None, 0.1):
+            for _ in OfflineRun(vehicle, recording, vehicle.config.base_frame, on_decision).rows(None, 0.1):
                 pass
     return {kind: statistics.mean(values) for kind, values in found.items()}

@@ -1,4 +1,4 @@
-"""Loading a geometry file of 10,000 frames, checks included, beside the bare parser on the same bytes."""
+"""Loading a geometry file of 10,000 frames, including checks, relative to the bare parser on the same bytes."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from pathlib import Path
 import yaml
 from lxml import etree
 
-from benchmarks.support import interleaved, ratio, verdict
-from benchmarks.support import large_model as large
+from benchmarks.support import build_large_model, measure_interleaved, print_verdict, ratio
 from modelserver.formats import load_model, save_model
 
 
 def main() -> int:
-    model = large().build()
+    model = build_large_model().build()
     holds = True
     with tempfile.TemporaryDirectory() as folder:
         for form, name, parse in (
@@ -26,7 +25,9 @@ def main() -> int:
             path = Path(folder) / name
             path.write_text(save_model(model, form).text, encoding="utf-8")
             data = path.read_bytes()
-            times = interleaved(5, 1, {"load": lambda p=path: load_model(p), "parse": lambda d=data, f=parse: f(d)})
+            times = measure_interleaved(
+                5, 1, {"load": lambda p=path: load_model(p), "parse": lambda d=data, f=parse: f(d)}
+            )
             print(f"  {name}: {len(data) / 1e6:.1f} MB, {ratio(times['load'], times['parse']):.1f}x the bare parser")
-            holds &= verdict(f"{name}: load of 10,000 frames", statistics.median(times["load"]), 3.0, "s")
+            holds &= print_verdict(f"{name}: load of 10,000 frames", statistics.median(times["load"]), 3.0, "s")
     return 0 if holds else 1

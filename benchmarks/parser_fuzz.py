@@ -1,11 +1,11 @@
-"""Ten million bytes of noise into each parser: no exception, flat memory, no false message, and good ones afterwards.
+"""Ten million bytes of noise into each parser: no exception, constant memory, no false message.
 
     python -m benchmarks parser_fuzz
     python -m benchmarks.parser_fuzz gps --bytes 1000000
 
-Four kinds of noise: random bytes; random bytes rich in the beginnings of frames; good messages with damaged bytes;
-good messages cut and joined anywhere. In the last two messages may come that are left whole, and no other.
-A parser is registered in PARSERS.
+Good messages after the noise must be parsed again. Four kinds of noise: random bytes; random bytes rich in frame
+preambles; good messages with damaged bytes; good messages cut and joined anywhere. In the last two, only undamaged
+messages may be parsed. Parsers are registered in PARSERS.
 """
 
 from __future__ import annotations
@@ -26,29 +26,33 @@ from msdrivers.protocol.novatel import NovatelLog
 
 SIZE = 10_000_000
 CHUNK = 4096
-FLAT = 262_144
+MAX_GROWTH = 262_144
 """Bytes by which memory may grow from the first tenth of the noise to its end."""
 
 
 NOISE = ("random", "beginnings")
-MADE_OF_MESSAGES = ("damaged", "cut")
+CORRUPTED = ("damaged", "cut")
 
 
 @dataclass(frozen=True)
-class Parser:
+class ParserCase:
     """A parser under test.
 
-    make: a fresh one, as its feed function. messages: good bytes, one message each, all different.
-    key: what a message says, None for what carries no checksum and may come out of noise.
-    leads: what its frames begin with.
-    weak: whether a message's checksum is so short that damage now and then passes it: such are not counted among
-    what damaged and cut messages may not make. Noise may make none of them either.
+    Attributes
+    ----------
+    make : returns the feed function of a new parser
+    messages : good messages, all different
+    key : identity of a message, None for one without a checksum, which may come from noise
+    preambles : first bytes of its frames
+    weak : whether a message's checksum is so short that damage may pass it: such messages are not counted in damaged
+        and cut
+        messages. Random noise may make none of them
     """
 
     make: Callable[[], Callable[[bytes], Sequence[Any]]]
     messages: Sequence[bytes]
     key: Callable[[Any], object]
-    leads: Sequence[bytes]
+    preambles: Sequence[bytes]
     weak: Callable[[Any], bool] = lambda message: False
 
 
@@ -58,7 +62,7 @@ def _gps_key(message: object) -> object:
     return (message.time_of_day, message.latitude) if isinstance(message, NmeaEpoch) else None
 
 
-def _each(name: str, number: int = 400) -> list[bytes]:
+def _split_messages(name: str, number: int = 400) -> list[bytes]:
     whole = stream_of((name,), number)
     if name.endswith("b"):
         size = len(whole) // number
@@ -66,28 +70,28 @@ def _each(name: str, number: int = 400) -> list[bytes]:
     return [line + b"\r\n" for line in whole.split(b"\r\n")[:-1]]
 
 
-PARSERS: dict[str, Parser] = {
-    "gps": Parser(
+PARSERS: dict[str, ParserCase] = {
+    "gps": ParserCase(
         lambda: GpsStream().feed,
-        [each for name in ("bestposb", "bestvelb", "bestposa", "gpgga") for each in _each(name)],
+        [each for name in ("bestposb", "bestvelb", "bestposa", "gpgga") for each in _split_messages(name)],
         _gps_key,
         (b"\xaa\x44\x12\x1c", b"\xaa\x44\x13", b"#BESTPOSA,", b"%INSPVASA,", b"$GPGGA,", b"<", b"[COM", b"*"),
-        # two flips of one bit cancel out in NMEA's sum, and an epoch may lack a sentence that was lost
+        # two flips of one bit cancel out in NMEA's checksum, and an epoch may lack a lost sentence
         weak=lambda message: isinstance(message, NmeaEpoch),
     ),
 }
 
 
-def said(parser: Parser, messages: Sequence[Any]) -> list[object]:
+def collect_keys(parser: ParserCase, messages: Sequence[Any]) -> list[object]:
     return [key for key in map(parser.key, messages) if key is not None]
 
 
-def noise(parser: Parser, kind: str, chance: random.Random) -> bytes:
+def make_noise(parser: ParserCase, kind: str, chance: random.Random) -> bytes:
     """Return some thousand bytes of noise."""
     if kind == "random":
         return chance.randbytes(CHUNK)
     if kind == "beginnings":
-        return b"".join(chance.choice(parser.leads) + chance.randbytes(chance.randrange(40)) for _ in range(150))
+        return b"".join(chance.choice(parser.preambles) + chance.randbytes(chance.randrange(40)) for _ in range(150))
     if kind == "damaged":
         data = bytearray(b"".join(chance.choices(parser.messages, k=20)))
         for _ in range(40):
@@ -100,31 +104,31 @@ def noise(parser: Parser, kind: str, chance: random.Random) -> bytes:
     return b"".join(pieces)
 
 
-def fuzz(name: str, parser: Parser, kind: str, size: int) -> list[str]:
-    """Feed noise, then good messages; return what is wrong."""
+def fuzz(name: str, parser: ParserCase, kind: str, size: int) -> list[str]:
+    """Feed noise, then good messages; return the errors."""
     chance = random.Random(f"{name} {kind}")
-    good = {key for message in parser.messages for key in said(parser, parser.make()(message))}
+    good = {key for message in parser.messages for key in collect_keys(parser, parser.make()(message))}
     feed = parser.make()
     false = 0
     fed = 0
     early = None
-    begun = time.perf_counter()
+    start = time.perf_counter()
     tracemalloc.start()
     while fed < size:
-        data = noise(parser, kind, chance)
+        data = make_noise(parser, kind, chance)
         fed += len(data)
         messages = [each for each in feed(data) if kind in NOISE or not parser.weak(each)]
-        false += sum(key not in good for key in said(parser, messages))
+        false += sum(key not in good for key in collect_keys(parser, messages))
         if early is None and fed >= size // 10:
             early = tracemalloc.get_traced_memory()[0]
     grown = tracemalloc.get_traced_memory()[0] - (early or 0)
     tracemalloc.stop()
-    after = said(parser, feed(b"".join(parser.messages[:100])))
-    took = time.perf_counter() - begun
+    after = collect_keys(parser, feed(b"".join(parser.messages[:100])))
+    took = time.perf_counter() - start
     problems = []
     if false:
         problems.append(f"{false} false messages")
-    if grown > FLAT:
+    if grown > MAX_GROWTH:
         problems.append(f"memory grew by {grown:,} bytes")
     followed = sum(key in good for key in after)
     if followed < 99:
@@ -144,10 +148,10 @@ def main(arguments: Sequence[str] = ()) -> int:
     problems = [
         f"{name}, {kind}: {problem}"
         for name in given.parser or PARSERS
-        for kind in (*NOISE, *MADE_OF_MESSAGES)
+        for kind in (*NOISE, *CORRUPTED)
         for problem in fuzz(name, PARSERS[name], kind, given.bytes)
     ]
-    print("\n".join(problems) or "no exception, no false message, memory flat, good streams followed")
+    print("\n".join(problems) or "no exception, no false message, memory constant, good messages parsed")
     return 1 if problems else 0
 
 

@@ -1,8 +1,8 @@
-"""What a query costs in-process on both sides, for each pair of the Raptor's frames when it is first seen.
+"""Cost of a query in-process on both sides, for each pair of the Raptor's frames at its first lookup.
 
-All pairs of frames in random order, on a model that was just loaded: decoding the request, `core.step`, encoding the
-reply with its covariance, and decoding the reply in the client, each by itself. Once with joints that were never
-reported, once with both nodding axes moving at 50 Hz. The floor is to pack and unpack the same bytes with `struct`.
+All pairs of frames in random order, on a new model: decoding the request, `core.step`, encoding the reply with its
+covariance, and decoding the reply in the client, each by itself. Once with joints without samples, once with both
+nodding axes at 50 Hz. The floor is to pack and unpack the same bytes with `struct`.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from benchmarks.support import RAPTOR, verdict
+from benchmarks.support import RAPTOR, print_verdict
 from modelserver import core
-from modelserver.client.remote import opened_pose
+from modelserver.client.remote import decode_pose_reply
 from modelserver.core import CoreSettings, CoreState, Instant
 from modelserver.formats import load_model
 from modelserver.messages import JointSample, JointsSample, SensorHeader
 from modelserver.wire import queries
 from modelserver.wire.codec import decode, encode
-from modelserver.wire.queries import write_question
+from modelserver.wire.queries import pack_get_transformation
 
 START_UTIME: Final = 1_700_000_000_000_000
 STEP_US, SAMPLES = 20_000, 100
@@ -39,10 +39,10 @@ _NUMBERS: Final = struct.Struct(">3q55d")
 """About the numbers of a request and its reply: ids, times, pose, covariance, bounds."""
 
 
-def loaded(moving: bool) -> tuple[CoreState, list[str], Instant]:
-    """Return the core with a model that was just loaded, the full names of all frames, and the time after the samples.
+def load_core(moving: bool) -> tuple[CoreState, list[str], Instant]:
+    """Return a core with a new model, the full names of all frames, and the time after the samples.
 
-    With `moving` both nodding axes have been reported at 50 Hz.
+    With `moving` both nodding axes have samples at 50 Hz.
     """
     model = load_model(RAPTOR / "geometry.yaml")
     state = core.start(CoreSettings(BASE_FRAME), model, None, Instant(0, START_UTIME))
@@ -57,10 +57,10 @@ def loaded(moving: bool) -> tuple[CoreState, list[str], Instant]:
     return state, names, now
 
 
-def measured(moving: bool, seed: int) -> tuple[dict[str, list[float]], list[bool]]:
-    """Return the seconds that each part of each query took, every pair once in random order; and which pass a joint."""
-    queries._KNOWN.clear()
-    state, names, now = loaded(moving)
+def measure(moving: bool, seed: int) -> tuple[dict[str, list[float]], list[bool]]:
+    """Return the seconds of each part of each query, every pair once in random order; and which pass a joint."""
+    queries._ANSWER_CACHE.clear()
+    state, names, now = load_core(moving)
     pairs = list(itertools.product(names, repeat=2))
     random.Random(seed).shuffle(pairs)
     times: dict[str, list[float]] = {part: [] for part in (*SERVER, *CLIENT, "floor")}
@@ -69,7 +69,7 @@ def measured(moving: bool, seed: int) -> tuple[dict[str, list[float]], list[bool
     through_joint = []
     for number, (interest, reference) in enumerate(pairs):
         begin = clock()
-        question = write_question(number, "REPLY_BENCHMARK", interest, reference, 0, 0, 0)
+        question = pack_get_transformation(number, "REPLY_BENCHMARK", interest, reference, 0, 0, 0)
         asked = clock()
         request = decode(_REQUEST, question)
         decoded = clock()
@@ -77,7 +77,7 @@ def measured(moving: bool, seed: int) -> tuple[dict[str, list[float]], list[bool
         stepped = clock()
         reply = encode(outputs[0].reply)
         encoded = clock()
-        opened_pose(reply, interest, reference)
+        decode_pose_reply(reply, interest, reference)
         opened = clock()
         _NUMBERS.unpack(_NUMBERS.pack(*numbers))
         end = clock()
@@ -89,15 +89,15 @@ def measured(moving: bool, seed: int) -> tuple[dict[str, list[float]], list[bool
 
 
 def quantile(values: Sequence[float], share: float) -> float:
-    """Return the value below which a share of the values lies."""
+    """Return the `share` quantile of the values."""
     return sorted(values)[min(int(share * len(values)), len(values) - 1)]
 
 
 def main() -> int:
     holds = True
     for moving in (False, True):
-        measured(moving, 0)  # warm up: the interpreter specializes what runs often
-        runs = [measured(moving, seed) for seed in range(1, RUNS + 1)]
+        measure(moving, 0)  # warm up: the interpreter specializes what runs often
+        runs = [measure(moving, seed) for seed in range(1, RUNS + 1)]
         print(f"  joints {'moving at 50 Hz' if moving else 'never reported'}; median of {RUNS} runs, us:")
         print(f"    {'':12} {'p50':>7} {'p99':>7}")
         for part in (*SERVER, *CLIENT, "floor"):
@@ -116,6 +116,6 @@ def main() -> int:
         for kind, totals in kinds.items():
             p50, p99 = (statistics.median(quantile(each, share) for each in totals) for share in (0.5, 0.99))
             print(f"    server, {kind} ({len(totals[0])}): {p50 * 1e6:.1f} us, p99 {p99 * 1e6:.1f} us")
-            holds &= verdict(f"server, {kind}, p50", p50 * 1e6, BOUND_US, "us")
-            holds &= verdict(f"server, {kind}, p50 to the floor", p50 / floor, RATIO_BOUND, "x")
+            holds &= print_verdict(f"server, {kind}, p50", p50 * 1e6, BOUND_US, "us")
+            holds &= print_verdict(f"server, {kind}, p50 to the floor", p50 / floor, RATIO_BOUND, "x")
     return 0 if holds else 1

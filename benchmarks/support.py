@@ -1,4 +1,4 @@
-"""What the benchmarks share: a large model, a daemon as a process, interleaved rounds."""
+"""Common parts of the benchmarks: a large model, a daemon as a process, interleaved rounds."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ from pathlib import Path
 from modelserver.client.remote import Platform
 from modelserver.errors import NoServerError
 from modelserver.geometry.builder import ModelBuilder
-from modelserver.spatial.pose import Pose
+from modelserver.transforms.pose import Pose
 
 ROOT = Path(__file__).resolve().parent.parent
 RAPTOR = ROOT / "config" / "raptor"
 
 
-def large_model(frames: int = 10_000, per_body: int = 20) -> ModelBuilder:
-    """Return a vehicle of `frames` frames: bodies of `per_body` frames, ten on each other in a tree."""
+def build_large_model(frames: int = 10_000, per_body: int = 20) -> ModelBuilder:
+    """Return a vehicle of `frames` frames: bodies of `per_body` frames in a tree of ten per level."""
     builder = ModelBuilder("large")
     for number in range(frames // per_body):
-        body = builder.body(f"Body{number}")
+        body = builder.add_body(f"Body{number}")
         for frame in range(per_body):
-            body.frame(f"Frame{frame}", Pose.from_rpy((0.01 * frame, 0.1, -0.2), 0.1, 0.01 * frame, 0.3))
+            body.add_frame(f"Frame{frame}", Pose.from_rpy((0.01 * frame, 0.1, -0.2), 0.1, 0.01 * frame, 0.3))
         if number:
-            # each body carries ten others by its frames 1 to 10, and stands on its frame 0
+            # frames 1 to 10 of a body connect to frame 0 of ten others
             parent, place = divmod(number - 1, 10)
-            builder.constraint(
+            builder.add_constraint(
                 f"Joint{number}", f"Body{parent}:Frame{place + 1}", f"Body{number}:Frame0", Pose((0, 0, 1))
             )
     return builder
 
 
 def free_url() -> str:
-    """Return an LCM provider on loopback with a port that nobody uses."""
+    """Return an LCM provider on loopback with an unused port."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return f"udpm://239.255.76.67:{probe.getsockname()[1]}?ttl=0"
 
 
 @contextlib.contextmanager
-def process(*arguments: str, url: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Run Python with arguments beside this process, and end it by its pid."""
+def run_process(*arguments: str, url: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Run Python with arguments in a child process, and end it by its pid."""
     environment = {**os.environ, "LCM_DEFAULT_URL": url, "PYTHONPATH": str(ROOT)}
     child = subprocess.Popen([sys.executable, *arguments], env=environment, stderr=subprocess.DEVNULL)
     try:
@@ -62,16 +62,16 @@ def process(*arguments: str, url: str) -> Iterator[subprocess.Popen[bytes]]:
 
 
 @contextlib.contextmanager
-def daemon(url: str, config: Path) -> Iterator[Platform]:
+def run_daemon(url: str, config: Path) -> Iterator[Platform]:
     """Run the daemon and return a client that it has answered."""
     run = "from mstools.cli import main; main()"
-    with process("-c", run, "run", "-c", str(config), "--log-level", "error", url=url), Platform(url) as platform:
-        until_answered(platform)
+    with run_process("-c", run, "run", "-c", str(config), "--log-level", "error", url=url), Platform(url) as platform:
+        wait_until_answered(platform)
         yield platform
 
 
-def until_answered(platform: Platform) -> None:
-    """Return when the daemon has answered. Raises NoServerError where it has not within 20 s."""
+def wait_until_answered(platform: Platform) -> None:
+    """Wait until the daemon answers. Raises NoServerError after 20 s."""
     deadline = time.monotonic() + 20.0
     while True:
         try:
@@ -82,10 +82,10 @@ def until_answered(platform: Platform) -> None:
                 raise
 
 
-def interleaved(rounds: int, calls: int, actions: Mapping[str, Callable[[], object]]) -> dict[str, list[float]]:
-    """Return for each action the median seconds of a call in each round; within a round all take their turn.
+def measure_interleaved(rounds: int, calls: int, actions: Mapping[str, Callable[[], object]]) -> dict[str, list[float]]:
+    """Return for each action the median seconds of a call per round; the actions alternate within a round.
 
-    A machine that slows down slows them all down; the ratio of a round stays.
+    A slower machine slows all of them; the ratio of a round stays.
     """
     medians: dict[str, list[float]] = {name: [] for name in actions}
     for _ in range(rounds):
@@ -100,12 +100,12 @@ def interleaved(rounds: int, calls: int, actions: Mapping[str, Callable[[], obje
 
 
 def ratio(of: Sequence[float], to: Sequence[float]) -> float:
-    """Return the median over the rounds of one figure to the other."""
+    """Return the median over the rounds of the ratio of two times."""
     return statistics.median(a / b for a, b in zip(of, to, strict=True))
 
 
-def verdict(what: str, measured: float, bound: float, unit: str) -> bool:
-    """Print a figure beside its bound; return whether it holds."""
+def print_verdict(what: str, measured: float, bound: float, unit: str) -> bool:
+    """Print a value beside its bound; return whether it is met."""
     holds = measured <= bound
     print(f"  {what:58} {measured:9.2f} {unit:4} (at most {bound:g}) {'' if holds else '  <-- OUT OF BOUNDS'}")
     return holds

@@ -1,4 +1,4 @@
-"""The fixes of a log, where the recordings are, and the scorer that stands beside them."""
+"""Fixes of a log, the folder of the recordings, and the common scorer."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Fixes:
-    """The fixes of a log: stamps (microseconds), UTM easting and northing (n, 2)."""
+class FixTable:
+    """Fixes of a log: stamps (microseconds), UTM easting and northing (n, 2)."""
 
     utime: npt.NDArray[np.int64]
-    place: Array
+    positions: Array
 
     @property
     def withheld(self) -> npt.NDArray[np.bool_]:
-        """Which fixes are withheld: every second one."""
+        """Mask of the withheld fixes: every second one."""
         return np.arange(len(self.utime)) % 2 == 1
 
 
@@ -38,12 +38,12 @@ def data_directory() -> Path:
     return Path(os.environ.get("MODELSERVER_DATA", ROOT.parent / "shared" / "data"))
 
 
-def read_fixes(events: Iterable[LogEvent]) -> Fixes:
+def read_fixes(events: Iterable[LogEvent]) -> FixTable:
     samples = [sample for event in events if (sample := _fix(event)) is not None]
     zone = int((samples[0].longitude_deg + 180) // 6) + 1
     to_utm = pyproj.Transformer.from_crs(4326, f"+proj=utm +zone={zone} +datum=WGS84", always_xy=True)
     east, north = to_utm.transform([s.longitude_deg for s in samples], [s.latitude_deg for s in samples])
-    return Fixes(np.array([s.header.utime for s in samples]), np.column_stack([east, north]))
+    return FixTable(np.array([s.header.utime for s in samples]), np.column_stack([east, north]))
 
 
 def _fix(event: LogEvent) -> GpsSample | None:
@@ -53,8 +53,8 @@ def _fix(event: LogEvent) -> GpsSample | None:
     return sample
 
 
-def common_scorer(data: Path) -> Callable[..., dict[str, Any]] | None:
-    """Return the scorer that stands beside the recordings, None where there is none."""
+def load_scorer(data: Path) -> Callable[..., dict[str, Any]] | None:
+    """Return the scorer beside the recordings, None where there is none."""
     path = data.parent / "tools" / "score_trajectory.py"
     if not path.is_file():
         return None

@@ -1,8 +1,14 @@
-"""The exception tree, and the scenario each member is for.
+"""Exceptions, problems of files, and suggestions for misspelled names.
 
-Every error says what is wrong, where, why, and what to do; where a name was mistyped it offers the
-nearest known ones. Errors that travel on the bus carry a `Status`, so that a client raises the very
-class that the server meant.
+A message states what is wrong, where, what was expected, and what to do. `Problem` is one finding in a file;
+ConfigError and GeometryError hold all of them. A QueryError has a `Status`, the wire's code, from which the client
+raises the same class again.
+
+Suggestions have two strengths. `find_nearest_names` lists similar names for a person (difflib's ratio, 2 M / (a + b),
+at least 0.6). `find_suggestion` returns the one name that is meant, or none: the optimal string alignment distance (one
+insertion, deletion, substitution, or transposition of neighbors per step) is at most 1 for names of up to six
+characters, else 2, and the nearest name is unique. Names come from strangers too, so the cost is bounded: from many
+known names those that share the most bigrams with the wanted one are compared.
 """
 
 from __future__ import annotations
@@ -28,7 +34,7 @@ class Status(IntEnum):
     TOO_OLD = 5
     TOO_NEW = 6
     MALFORMED = 7
-    REFUSED_LOAD = 8
+    OVERLOADED = 8
     LIMIT = 9
     INTERNAL = 10
     FORBIDDEN = 11
@@ -36,21 +42,19 @@ class Status(IntEnum):
 
 
 class Severity(StrEnum):
-    """How much a problem matters.
-
-    error: load raises, and a daemon keeps its old model or refuses to start.
-    warning: loads; `modelserver check` lists it and exits 1.
-    note: worth knowing, changes no exit code.
-    """
+    """Severity of a problem in a file."""
 
     ERROR = "error"
+    """Loading raises; a running service retains its old model, a new one does not start."""
     WARNING = "warning"
+    """The file loads; `modelserver check` lists the problem and exits with 1."""
     NOTE = "note"
+    """For information; does not change the exit code."""
 
 
 @dataclass(frozen=True, slots=True)
 class Location:
-    """The place in a file that a value came from."""
+    """The place in a file from which a value was read."""
 
     file: str = ""
     line: int = 0
@@ -74,8 +78,8 @@ class Edit:
     def apply(self, text: str) -> str:
         """Return the text of the file with the change.
 
-        Raises ValueError where it is not clear which occurrence is meant: `old` is not exactly once on the line, as a
-        whole word, and not exactly once in the file.
+        Raises ValueError if the occurrence is ambiguous: `old` is not exactly once, as a whole word, on the line, or
+        else in the file.
         """
         word = re.compile(rf"(?<![\w./:-]){re.escape(self.old)}(?![\w./-])")
         lines = text.split("\n")
@@ -87,17 +91,17 @@ class Edit:
                 return "\n".join(lines)
             if found:
                 break
-        raise ValueError(f"{shown(self.old)} is not clear on line {self.line}")
+        raise ValueError(f"{quote(self.old)} on line {self.line} is ambiguous")
 
 
-class Suggested(tuple[str, ...]):
-    """Names proposed in place of one that is misspelled, `replaced`; how `Problem` takes them in."""
+class Suggestion(tuple[str, ...]):
+    """Names suggested in place of a misspelled one, `replaced`; an argument of `Problem`."""
 
     replaced = ""
 
     @classmethod
-    def of(cls, replaced: str, *names: str) -> Suggested:
-        """Return the proposal of `names` for `replaced`."""
+    def of(cls, replaced: str, *names: str) -> Suggestion:
+        """Return the suggestion of `names` for `replaced`."""
         found = cls(name for name in names if name)
         found.replaced = replaced
         return found
@@ -105,10 +109,10 @@ class Suggested(tuple[str, ...]):
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One thing that is wrong with a file: where, what, and what to do about it.
+    """One finding in a file: what is wrong, where, and the fix.
 
-    `nearest` holds the known names closest to a mistyped one, best first; `replaced` is the mistyped one as it stands
-    in the file, where writing the first of `nearest` in its place is known to be right (`suggestion`).
+    `nearest` holds the known names closest to a misspelled one, best first. `replaced` is the misspelled name in the
+    file if the first of `nearest` is certain to be meant (`find_suggestion`), else empty.
     """
 
     severity: Severity
@@ -119,14 +123,14 @@ class Problem:
     replaced: str = ""
 
     def __post_init__(self) -> None:
-        if isinstance(self.nearest, Suggested):
-            # stored as plain values: a problem is compared, kept and sent
+        if isinstance(self.nearest, Suggestion):
+            # stored as plain values: a problem is compared and encoded
             object.__setattr__(self, "replaced", self.nearest.replaced if self.nearest else "")
             object.__setattr__(self, "nearest", tuple(self.nearest))
 
     @property
     def edit(self) -> Edit | None:
-        """The change of the file that fixes the problem; None where no single one is known to."""
+        """The change of the file that fixes the problem; None without a certain one."""
         return Edit(self.line, self.replaced, self.nearest[0]) if self.replaced and self.nearest else None
 
     @property
@@ -136,7 +140,7 @@ class Problem:
 
     @property
     def line(self) -> int:
-        """Line in the file, counted from 1; 0 where there is none."""
+        """Line in the file, counted from 1; 0 if unknown."""
         return self.source.line
 
     @property
@@ -151,96 +155,94 @@ class Problem:
         return f"{head}{self.severity}: {self.message}{tail}{fix}"
 
 
-KNOWN_NAMES = 20_000
-COMPARED_LENGTH = 100
-COMPARED_NAMES = 16
-COMPARED_PAIRS = 12
-"""Bounds of `nearest_names`: names it looks at, their length, those compared in full, pairs of letters looked for."""
+MAX_KNOWN_NAMES = 20_000
+MAX_COMPARED_LENGTH = 100
+MAX_COMPARED_NAMES = 16
+MAX_COMPARED_PAIRS = 12
+"""Bounds of the search: known names, length of a name, names compared in full, bigrams of the wanted name."""
 
 
-def nearest_names(name: str, known: Iterable[str], count: int = 3) -> tuple[str, ...]:
-    """Return the known names most like `name`, best first; case is no difference.
+def find_nearest_names(name: str, known: Iterable[str], count: int = 3) -> tuple[str, ...]:
+    """Return the known names most similar to `name`, best first, without regard to case.
 
-    The cost is bounded, since mistyped names come from strangers too: names longer than 100 characters are
-    not compared, and of many known names only those that share most pairs of letters with `name` are
-    compared in full. 10,000 known names take about 10 ms.
+    Names longer than 100 characters are not compared. 10,000 known names take about 10 ms.
     """
-    if not name or len(name) > COMPARED_LENGTH:
+    if not name or len(name) > MAX_COMPARED_LENGTH:
         return ()
     wanted = name.casefold()
     by_folded: dict[str, str] = {}
-    for candidate in islice(known, KNOWN_NAMES):
+    for candidate in islice(known, MAX_KNOWN_NAMES):
         by_folded.setdefault(candidate.casefold(), candidate)
-    # a similarity of 0.6, 2 M / (a + b), cannot be reached by names that differ more than this in length
+    # names that differ more than this in length cannot reach a ratio of 0.6
     shortest, longest = len(wanted) * 3 / 7, len(wanted) * 7 / 3
     candidates = [each for each in by_folded if shortest <= len(each) <= longest]
-    if len(candidates) > COMPARED_NAMES:
-        candidates = _sharing_most(wanted, candidates)
+    if len(candidates) > MAX_COMPARED_NAMES:
+        candidates = _select_by_bigrams(wanted, candidates)
     return tuple(by_folded[key] for key in difflib.get_close_matches(wanted, candidates, n=count, cutoff=0.6))
 
 
-def _sharing_most(wanted: str, candidates: list[str]) -> list[str]:
-    """Return the few candidates that hold most of the pairs of letters in `wanted`; of equals, those nearest in length.
+def _select_by_bigrams(wanted: str, candidates: list[str]) -> list[str]:
+    """Return the candidates with the most bigrams of `wanted`; of equals, those nearest in length.
 
     The loops over the candidates run in C.
     """
     pairs = list(dict.fromkeys(wanted[i : i + 2] for i in range(max(1, len(wanted) - 1))))
-    # evenly spread over the name where there are too many
-    pairs = pairs[:: -(-len(pairs) // COMPARED_PAIRS)]
+    # spread evenly over a long name
+    pairs = pairs[:: -(-len(pairs) // MAX_COMPARED_PAIRS)]
     shared = map(sum, zip(*(map(operator.contains, candidates, repeat(pair)) for pair in pairs), strict=True))
     lengths = map(abs, map(operator.sub, map(len, candidates), repeat(len(wanted))))
     ranked = zip(map(operator.neg, shared), lengths, range(len(candidates)), strict=True)
-    return [candidates[index] for _, _, index in heapq.nsmallest(COMPARED_NAMES, ranked)]
+    return [candidates[index] for _, _, index in heapq.nsmallest(MAX_COMPARED_NAMES, ranked)]
 
 
 _WORD = re.compile(r"\d+|[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[^\W\d_]+")
 """The words of a name: `UtmGrid10S` has Utm, Grid, 10, S."""
 
 
-def suggestion(name: str, known: Iterable[str], *, is_family: bool = True) -> str:
-    """Return the known name that `name` is a misspelling of; empty where that is not clear.
+def find_suggestion(name: str, known: Iterable[str], *, is_family: bool = True) -> str:
+    """Return the known name of which `name` is a misspelling, without regard to case; empty if that is ambiguous.
 
-    Clear is a single nearest name by the optimal string alignment distance (a letter more, less or other, or two
-    neighbors exchanged): at most one such step for up to six characters, two for more. Numbers and single letters
-    tell names of a family apart (`Wheel1`, `CameraL`, `UtmGrid10S`), so they must be the same where `is_family`:
-    another of the family is another thing. Case is no difference.
+    With `is_family`, numbers and single letters must be equal: they distinguish the members of a family (`Wheel1`,
+    `CameraL`, `UtmGrid10S`), and another member is another thing.
     """
     wanted = name.casefold()
-    if not 3 <= len(wanted) <= COMPARED_LENGTH:
-        exact = [each for each in islice(known, KNOWN_NAMES) if each.casefold() == wanted and name]
+    if not 3 <= len(wanted) <= MAX_COMPARED_LENGTH:
+        exact = [each for each in islice(known, MAX_KNOWN_NAMES) if each.casefold() == wanted and name]
         return exact[0] if len(exact) == 1 else ""
     most = 1 if len(wanted) <= 6 else 2
-    names = [each for each in islice(known, KNOWN_NAMES) if abs(len(each) - len(wanted)) <= most]
-    if len(names) > COMPARED_NAMES:
+    names = [each for each in islice(known, MAX_KNOWN_NAMES) if abs(len(each) - len(wanted)) <= most]
+    if len(names) > MAX_COMPARED_NAMES:
         folded = [each.casefold() for each in names]
-        chosen = set(_sharing_most(wanted, folded))
+        chosen = set(_select_by_bigrams(wanted, folded))
         names = [each for each, key in zip(names, folded, strict=True) if key in chosen]
-    found = sorted((distance, each) for each in names if (distance := _distance(wanted, each.casefold(), most)) <= most)
+    found = sorted(
+        (distance, each) for each in names if (distance := _alignment_distance(wanted, each.casefold(), most)) <= most
+    )
     if not found or (len(found) > 1 and found[0][0] == found[1][0]):
         return ""
     best = found[0][1]
-    return best if not is_family or _codes(best) == _codes(name) else ""
+    return best if not is_family or _find_codes(best) == _find_codes(name) else ""
 
 
-def suggestions(name: str, known: Iterable[str]) -> Suggested:
-    """Return the `suggestion` for a name as a problem takes it: none, or one."""
-    return Suggested.of(name, suggestion(name, known))
+def suggest_name(name: str, known: Iterable[str]) -> Suggestion:
+    """Return `find_suggestion` as an argument of a problem: no name, or one."""
+    return Suggestion.of(name, find_suggestion(name, known))
 
 
-def suggest_key(key: str, known: Iterable[str]) -> Suggested:
-    """Return the key of a schema that `key` misspells, or is without its unit (`rate` for `rate_hz`): none, or one."""
+def suggest_key(key: str, known: Iterable[str]) -> Suggestion:
+    """Return the key of a schema that `key` misspells, or lacks the unit of (`rate` for `rate_hz`): none, or one."""
     known = list(known)
     longer = [each for each in known if each.startswith(f"{key}_")] if key else []
-    return Suggested.of(key, longer[0] if len(longer) == 1 else suggestion(key, known, is_family=False))
+    return Suggestion.of(key, longer[0] if len(longer) == 1 else find_suggestion(key, known, is_family=False))
 
 
-def _codes(name: str) -> list[str]:
+def _find_codes(name: str) -> list[str]:
     """Return the numbers and single letters among the words of a name."""
     words = [word.casefold() for word in _WORD.findall(name)]
     return [word for word in words if len(word) == 1 or word.isdecimal()]
 
 
-def _distance(a: str, b: str, most: int) -> int:
+def _alignment_distance(a: str, b: str, most: int) -> int:
     """Return the optimal string alignment distance of two words, or more than `most`."""
     two_above: list[int] = []
     above = list(range(len(b) + 1))
@@ -257,23 +259,23 @@ def _distance(a: str, b: str, most: int) -> int:
     return above[-1]
 
 
-def shown(name: str, limit: int = 80) -> str:
-    """Return `name` fit for a message: escaped, quoted, and cut where a stranger sent kilobytes."""
+def quote(name: str, limit: int = 80) -> str:
+    """Return `name` for a message: escaped, quoted, and truncated."""
     if len(name) > limit:
         return f"{name[:limit]!r}... ({len(name)} characters)"
     return repr(name)
 
 
 class ModelServerError(Exception):
-    """Base of everything this package raises on purpose."""
+    """Base of the exceptions that this package raises."""
 
 
 class KeyFileError(ModelServerError):
-    """A file of keys that commands are signed with cannot be used."""
+    """A file of keys for signed commands cannot be used."""
 
 
 class FrameMismatchError(ModelServerError, ValueError):
-    """Two transformations were multiplied whose adjacent frames differ."""
+    """The adjacent frames of two multiplied transformations differ."""
 
 
 class ConfigError(ModelServerError):
@@ -300,7 +302,7 @@ class GeometryError(ModelServerError):
 
 
 class WireError(ModelServerError, ValueError):
-    """Bytes from the bus are no message of the type that the channel carries. `reason` is one word."""
+    """Bytes from the bus are not a message of the channel's type. `reason` is one word."""
 
     def __init__(self, reason: str, message: str):
         self.reason = reason
@@ -311,9 +313,9 @@ class WireError(ModelServerError, ValueError):
 
 
 class QueryError(ModelServerError):
-    """A question that cannot be answered; `status` is what a reply on the bus carries.
+    """A query that cannot be answered; `status` is the code in the reply on the bus.
 
-    `nearest` holds known names close to a mistyped one.
+    `nearest` holds known names close to a misspelled one.
     """
 
     status = Status.INTERNAL
@@ -324,67 +326,67 @@ class QueryError(ModelServerError):
 
 
 class UnknownBodyError(QueryError, LookupError):
-    """The model has no body of that name."""
+    """The model has no body of this name."""
 
     status = Status.UNKNOWN_BODY
 
 
 class UnknownFrameError(QueryError, LookupError):
-    """The body exists but has no frame of that name, or the name is not of the form Body:Frame."""
+    """The body has no frame of this name, or the name is not of the form Body:Frame."""
 
     status = Status.UNKNOWN_FRAME
 
 
 class NotConnectedError(QueryError):
-    """Both frames exist but no chain of constraints joins them."""
+    """No chain of constraints connects the two frames."""
 
     status = Status.NOT_CONNECTED
 
 
 class NoPoseError(QueryError):
-    """A world frame was asked for before the vehicle's pose is known."""
+    """A world frame was queried before the vehicle's pose is known."""
 
     status = Status.NO_POSE
 
 
 class TooOldError(QueryError):
-    """The time asked for lies before what is held."""
+    """The queried time is before the stored history."""
 
     status = Status.TOO_OLD
 
 
 class TooNewError(QueryError):
-    """The time asked for lies after what is held, and the policy forbids to predict."""
+    """The queried time is after the newest data, and the policy does not allow prediction."""
 
     status = Status.TOO_NEW
 
 
 class MalformedRequestError(QueryError, ValueError):
-    """The request makes no sense: an unknown policy, a negative wait, a range that ends before it starts."""
+    """The request is invalid: an unknown policy, a negative wait, a range that ends before it starts."""
 
     status = Status.MALFORMED
 
 
-class RefusedError(QueryError):
-    """The server is loaded and did not take the request; ask again later."""
+class OverloadedError(QueryError):
+    """The server is overloaded and dropped the request; retry later."""
 
-    status = Status.REFUSED_LOAD
+    status = Status.OVERLOADED
 
 
 class LimitError(QueryError):
-    """The request asks for more than the server gives at once; the message names the limit."""
+    """The request exceeds a limit, which the message names."""
 
     status = Status.LIMIT
 
 
 class ForbiddenError(QueryError):
-    """The vehicle file does not allow it; the message names the setting."""
+    """The vehicle file does not permit the command; the message names the setting."""
 
     status = Status.FORBIDDEN
 
 
 class RejectedError(QueryError):
-    """What was given was looked at and not taken: a geometry that does not suit, a pose that cannot be; all stays."""
+    """The command was examined and rejected, e.g. an unsuitable geometry or an impossible pose; nothing has changed."""
 
     status = Status.REJECTED
 
@@ -400,15 +402,15 @@ class BusError(ModelServerError):
 
 
 class RecordingError(ModelServerError):
-    """A recording cannot be read, or is none."""
+    """A file is not a recording, or cannot be read."""
 
 
 class NoServerError(ModelServerError, TimeoutError):
-    """No reply came in time: no server on this bus, or a bus that drops everything."""
+    """No reply before the timeout: there is no server on this bus, or the bus drops everything."""
 
 
 class OutOfDateError(NoServerError):
-    """A mirror has not heard enough of the service, or not for longer than its limit: it knows no more than then."""
+    """A mirror has not received the messages it needs, or none within its timeout."""
 
 
 _BY_STATUS: dict[int, type[QueryError]] = {
@@ -421,7 +423,7 @@ _BY_STATUS: dict[int, type[QueryError]] = {
         TooOldError,
         TooNewError,
         MalformedRequestError,
-        RefusedError,
+        OverloadedError,
         LimitError,
         ForbiddenError,
         RejectedError,
@@ -430,6 +432,6 @@ _BY_STATUS: dict[int, type[QueryError]] = {
 }
 
 
-def error_for_status(status: int, message: str, nearest: Iterable[str] = ()) -> QueryError:
-    """Return the error that a reply's `status` stands for."""
+def make_status_error(status: int, message: str, nearest: Iterable[str] = ()) -> QueryError:
+    """Return the exception for the status of a reply."""
     return _BY_STATUS.get(status, ServerError)(message, nearest)

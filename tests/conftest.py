@@ -1,4 +1,4 @@
-"""What every test may use."""
+"""Fixtures of all tests, and the order in which test files run."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ settings.load_profile("repeatable")
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Run more workers than processors: half of the scenario tests' time is real time that has to pass."""
+    """Run more workers than processors: the scenario tests spend half of their time waiting."""
     return len(os.sched_getaffinity(0)) + 2
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Order the files, which are what workers take (`--dist loadfile`): those that last go first.
+    """Order the files, the units of `--dist loadfile`: the slowest first.
 
-    Scenario files, which mostly wait, alternate with files that compute, so that neither kind runs all at once.
+    Scenario files, which mostly wait, alternate with files that compute.
     """
     files: dict[Path, list[pytest.Item]] = {}
     for item in items:
@@ -59,14 +59,14 @@ def _is_slow(item: pytest.Item) -> bool:
 
 
 def pytest_collection_finish() -> None:
-    """Keep the garbage collector from walking through what was collected, each time again."""
+    """Exclude the collected tests from garbage collection."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000, 50, 50)
 
 
 LONGEST = ("drivers", "service", "monitoring", "systemd", "demo", "faults_data", "faults_processes", "faults_drivers")
-"""Scenario files that take longest, the longest first."""
+"""The slowest scenario files, slowest first."""
 
 
 def _rank(path: Path) -> int:
@@ -76,7 +76,7 @@ def _rank(path: Path) -> int:
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """The folder of recorded real data; the test is skipped where it is absent."""
+    """Return the folder of recorded real data; skip the test where it is absent."""
     given = os.environ.get("MODELSERVER_DATA")
     place = Path(given) if given else Path(__file__).resolve().parents[1] / "../shared/data"
     if not place.is_dir():
@@ -86,6 +86,6 @@ def data_dir() -> Path:
 
 @pytest.fixture
 def lcm_url() -> Iterator[str]:
-    """An LCM provider on loopback that no other test uses."""
+    """Yield an LCM provider on loopback that no other test uses."""
     with reserved_url() as url:
         yield url

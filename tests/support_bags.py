@@ -28,36 +28,36 @@ class Ros:
         self.version = version
         self.store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
 
-    def of(self, type_name: str, /, **fields: Any) -> Any:
+    def make(self, type_name: str, /, **fields: Any) -> Any:
         return self.store.types[type_name](**fields)
 
     def header(self, stamp_ns: int) -> Any:
-        time = self.of("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+        time = self.make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
         more = {"seq": 0} if self.version == 1 else {}
-        return self.of("std_msgs/msg/Header", stamp=time, frame_id="x", **more)
+        return self.make("std_msgs/msg/Header", stamp=time, frame_id="x", **more)
 
     def vector(self, values: Sequence[float], name: str = "Vector3") -> Any:
-        return self.of(f"geometry_msgs/msg/{name}", **dict(zip("xyz", map(float, values), strict=True)))
+        return self.make(f"geometry_msgs/msg/{name}", **dict(zip("xyz", map(float, values), strict=True)))
 
     def quaternion(self, wxyz: Sequence[float]) -> Any:
-        return self.of("geometry_msgs/msg/Quaternion", **dict(zip("wxyz", map(float, wxyz), strict=True)))
+        return self.make("geometry_msgs/msg/Quaternion", **dict(zip("wxyz", map(float, wxyz), strict=True)))
 
     def fix(
         self,
         stamp_ns: int = START_NS,
-        place: tuple[float, float, float] = (42.0, -71.0, -20.0),
+        position: tuple[float, float, float] = (42.0, -71.0, -20.0),
         status: int = 1,
         covariance: Sequence[float] = (0.81, 0, 0, 0, 0.81, 0, 0, 0, 3.24),
         covariance_type: int = 1,
     ) -> Any:
-        state = self.of("sensor_msgs/msg/NavSatStatus", status=status, service=1)
-        return self.of(
+        state = self.make("sensor_msgs/msg/NavSatStatus", status=status, service=1)
+        return self.make(
             TYPES["fix"],
             header=self.header(stamp_ns),
             status=state,
-            latitude=place[0],
-            longitude=place[1],
-            altitude=place[2],
+            latitude=position[0],
+            longitude=position[1],
+            altitude=position[2],
             position_covariance=np.array(covariance, float),
             position_covariance_type=covariance_type,
         )
@@ -76,7 +76,7 @@ class Ros:
             return np.array([first, 0, 0, 0, 1, 0, 0, 0, 1], float)
 
         orientation, turn, push = map(covariance, first_covariances)
-        return self.of(
+        return self.make(
             TYPES["imu"],
             header=self.header(stamp_ns),
             orientation=self.quaternion(wxyz),
@@ -90,7 +90,7 @@ class Ros:
     def odom(
         self,
         stamp_ns: int = START_NS,
-        place: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        position: tuple[float, float, float] = (0.0, 0.0, 0.0),
         yaw: float = 0.0,
         speed: float = 0.0,
         turn: float = 0.0,
@@ -99,26 +99,26 @@ class Ros:
     ) -> Any:
         covariance = np.zeros(36)
         covariance[0], covariance[35] = variances
-        pose = self.of(
+        pose = self.make(
             "geometry_msgs/msg/Pose",
-            position=self.vector(place, "Point"),
+            position=self.vector(position, "Point"),
             orientation=self.quaternion((np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))),
         )
-        twist = self.of(
+        twist = self.make(
             "geometry_msgs/msg/Twist",
             linear=self.vector((speed, sideways, 0.0)),
             angular=self.vector((0.0, 0.0, turn)),
         )
-        return self.of(
+        return self.make(
             TYPES["odom"],
             header=self.header(stamp_ns),
             child_frame_id="base_link",
-            pose=self.of("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance),
-            twist=self.of("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=covariance),
+            pose=self.make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance),
+            twist=self.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=covariance),
         )
 
     def joints(self, stamp_ns: int, names: list[str], position: list[float], velocity: list[float]) -> Any:
-        return self.of(
+        return self.make(
             TYPES["joints"],
             header=self.header(stamp_ns),
             name=names,
@@ -128,10 +128,10 @@ class Ros:
         )
 
     def text(self, words: str) -> Any:
-        return self.of(TYPES["text"], data=words)
+        return self.make(TYPES["text"], data=words)
 
     def write(self, path: Path, messages: Iterable[tuple[str, int, Any]]) -> Path:
-        """Write a bag of messages: topic, time of reception in nanoseconds, message. Returns its path."""
+        """Write a bag of messages (topic, receive time in ns, message) and return its path."""
         if self.version == 1:
             from rosbags.rosbag1 import Writer as Writer1
 

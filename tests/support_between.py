@@ -12,20 +12,20 @@ import numpy as np
 
 from modelserver.errors import NoPoseError
 from modelserver.geometry import names
-from modelserver.geometry.edges import Edge, EdgeKind
+from modelserver.geometry.topology import Edge, EdgeKind
 from modelserver.messages import NO_FLAGS, Estimate, Invalid, Policy, PoseAnswer, Quality, TimeQuery
-from modelserver.platform.path import PathState, PathStep, way
-from modelserver.platform.view import PlatformView
-from modelserver.platform.worlds import is_absolute
-from modelserver.spatial import chain, so3
-from modelserver.spatial.so3 import Array
-from modelserver.spatial.transformation import Transformation
+from modelserver.query.path import PathState, PathStep, lookup_path
+from modelserver.query.view import PlatformView
+from modelserver.query.world_frames import is_absolute
+from modelserver.transforms import chain, so3
+from modelserver.transforms.so3 import Array
+from modelserver.transforms.transformation import Transformation
 
 TILT_TIME_S: Final = 1.0
-"""Over which the tilt of a pose in Odom may change by as much as it is unsure."""
+"""Time over which the tilt of a pose in Odom may change by its own uncertainty."""
 
 
-def between(
+def lookup_between(
     view: PlatformView,
     interest: str,
     at: int,
@@ -37,16 +37,16 @@ def between(
 ) -> PoseAnswer:
     """Return the pose of `interest` at `at` in `reference` at `reference_at`; 0 is the latest time for each.
 
-    `fixed` is what is taken to stand still between the two times. Odom drifts and does not jump: between times near
-    each other it is surer by far than the world, whose errors at two times hang together in a way that nobody knows;
-    their covariance is then an upper bound, and flagged. Raises QueryError as `PlatformView.transformation`, and
-    NoPoseError where the world pose was taken up anew between the two times.
+    `fixed` is the frame assumed not to move between the two times. Odom drifts and does not jump: between near times it
+    is far more certain than the world, whose correlation between two times is unknown: the covariance is then an upper
+    bound, and flagged. Raises QueryError as `PlatformView.transformation`, and
+    NoPoseError where the world pose was reset between the two times.
     """
-    there = way(view, fixed, reference, TimeQuery(reference_at, policy), now)
-    here = way(view, interest, fixed, TimeQuery(at, policy), now)
-    steps, quality = _joined(there, here, fixed)
+    there = lookup_path(view, fixed, reference, TimeQuery(reference_at, policy), now)
+    here = lookup_path(view, interest, fixed, TimeQuery(at, policy), now)
+    steps, quality = _join_steps(there, here, fixed)
     links = [step.link for step in steps]
-    invalid = int(view.doubt & Invalid.CLOCK_STEPPED | there.invalid | here.invalid)
+    invalid = int(view.invalid & Invalid.CLOCK_STEPPED | there.invalid | here.invalid)
     origins = {step.estimate.origin for step in steps if step.estimate is not None and is_absolute(step.edge.name)}
     origin = origins.pop() if origins else None
     epochs = [step.estimate.pose_epoch for step in (*here.steps, *there.steps) if step.estimate is not None]
@@ -54,7 +54,7 @@ def between(
         Transformation(
             interest,
             reference,
-            chain.product(links),
+            chain.compose(links),
             lambda: chain.covariance(links),
             here.utime,
             invalid,
@@ -67,8 +67,8 @@ def between(
     )
 
 
-def _joined(there: PathState, here: PathState, fixed: str) -> tuple[list[PathStep], Quality]:
-    """Return the steps of both ways as one, the vehicle's at the two times put together where they meet."""
+def _join_steps(there: PathState, here: PathState, fixed: str) -> tuple[list[PathStep], Quality]:
+    """Return the steps of both paths as one, with the vehicle's at the two times combined where they meet."""
     if not (there.steps and here.steps):
         return [*there.steps, *here.steps], NO_FLAGS
     last, first = there.steps[-1], here.steps[0]
@@ -80,16 +80,16 @@ def _joined(there: PathState, here: PathState, fixed: str) -> tuple[list[PathSte
         # out to the fixed frame and back at one time: both cancel
         return [*rest[0], *rest[1]], NO_FLAGS
     if last.edge.name == names.ODOM:
-        return [*rest[0], _travelled(last.estimate, first.estimate), *rest[1]], NO_FLAGS
+        return [*rest[0], _odom_step(last.estimate, first.estimate), *rest[1]], NO_FLAGS
     _check_same_world(last.estimate, first.estimate, last.edge.name)
-    # |a + b|^2 <= 2 |a|^2 + 2 |b|^2, however the errors at the two times hang together
+    # |a + b|^2 <= 2 |a|^2 + 2 |b|^2, whatever the correlation of the two times
     doubled = [
         step._replace(factor=None if step.factor is None else step.factor * math.sqrt(2.0)) for step in (last, first)
     ]
     return [*rest[0], *doubled, *rest[1]], Quality.CORRELATION_UNKNOWN
 
 
-def _travelled(before: Estimate, after: Estimate) -> PathStep:
+def _odom_step(before: Estimate, after: Estimate) -> PathStep:
     """Return the step from the vehicle at one time to itself at another, by Odom."""
     X_FT = before.odom.inverse() @ after.odom
     edge = Edge(EdgeKind.VEHICLE, names.ODOM, True, X_FT)
@@ -106,7 +106,7 @@ def _drift(before: Estimate, after: Estimate) -> Array | None:
     if before.odom_covariance is None or after.odom_covariance is None:
         return None
     variances = np.array(before.odom_covariance)[::7], np.array(after.odom_covariance)[::7]
-    if before.odom_walks or after.odom_walks:
+    if before.is_odom_random_walk or after.is_odom_random_walk:
         sigma = np.sqrt(np.abs(variances[1] - variances[0]))
     else:
         sigma = np.abs(np.sqrt(variances[1]) - np.sqrt(variances[0]))
@@ -120,6 +120,6 @@ def _drift(before: Estimate, after: Estimate) -> Array | None:
 def _check_same_world(before: Estimate, after: Estimate, world: str) -> None:
     if before.pose_epoch != after.pose_epoch or before.origin != after.origin:
         raise NoPoseError(
-            f"the pose in {world} was taken up anew between {before.utime} and {after.utime} (epoch "
+            f"the pose in {world} was reset between {before.utime} and {after.utime} (epoch "
             f"{before.pose_epoch} and {after.pose_epoch}), so the two do not compare; ask through {names.ODOM}"
         )

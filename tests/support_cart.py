@@ -8,17 +8,16 @@ from functools import lru_cache
 import numpy as np
 
 from modelserver.earth.geodesy import Geodesy, LocalFrame, origin_at
+from modelserver.estimation.filter.localizer import FilterLocalizer
+from modelserver.estimation.filter.measurements.gps import LATENCY
+from modelserver.estimation.filter.nav import Nav
+from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.sensor_rig import Kinematics, Mounts, SensorRig
 from modelserver.geometry import Model, ModelBuilder
-from modelserver.localization.filter.localizer import FilterLocalizer
-from modelserver.localization.filter.measurements.gps import LATENCY
-from modelserver.localization.filter.nav import Nav
-from modelserver.localization.filter.settings import FilterSettings
-from modelserver.localization.filter.setup import Setup
-from modelserver.localization.mounts import Mounts
-from modelserver.localization.rig import Kinematics, Rig
 from modelserver.simulation import Event, GpsModel, ImuModel, Simulation, Timing, Trajectory, WheelsModel, figure_eight
 from modelserver.simulation.scenario import START_UTIME
-from modelserver.spatial import Pose, so3
+from modelserver.transforms import Pose, so3
 
 BASE, IMU, ANTENNA, SECOND, CAMERA = (f"Cart:{name}" for name in ("Base", "Imu", "Antenna", "Second", "Camera"))
 WHEELS = {name: f"Cart:{name}" for name in ("FL", "FR", "RL", "RR")}
@@ -26,19 +25,19 @@ STEERED = frozenset(("FL", "FR"))
 ORIGIN = origin_at(50.27, -111.1, 700.0)
 GEODESY = Geodesy(ORIGIN)
 SITE = LocalFrame.at(50.2705, -111.1004, 702.0)
-"""Some fifty metres from the origin: N's axes are not World:ENU's."""
+"""Some fifty meters from the origin: N's axes are not World:ENU's."""
 
 
 @lru_cache
 def model() -> Model:
     builder = ModelBuilder("cart")
-    body = builder.body("Cart").frame("Base")
-    body.frame("Imu", Pose.from_rpy((0.3, -0.1, 0.4), math.pi, 0.1, 0.5))
-    body.frame("Antenna", Pose((-0.4, 0.25, 1.2)))
-    body.frame("Second", Pose((0.6, 0.35, 1.1)))
-    body.frame("Camera", Pose.from_rpy((0.5, 0.1, 0.8), 0.2, -0.3, 0.4))
+    body = builder.add_body("Cart").add_frame("Base")
+    body.add_frame("Imu", Pose.from_rpy((0.3, -0.1, 0.4), math.pi, 0.1, 0.5))
+    body.add_frame("Antenna", Pose((-0.4, 0.25, 1.2)))
+    body.add_frame("Second", Pose((0.6, 0.35, 1.1)))
+    body.add_frame("Camera", Pose.from_rpy((0.5, 0.1, 0.8), 0.2, -0.3, 0.4))
     for name, x, y in (("FL", 1.2, 0.5), ("FR", 1.2, -0.5), ("RL", 0.0, 0.5), ("RR", 0.0, -0.5)):
-        body.frame(name, Pose((x, y, -0.3)))
+        body.add_frame(name, Pose((x, y, -0.3)))
     return builder.build()
 
 
@@ -51,8 +50,8 @@ def rig(
     *,
     imu: bool = True,
     gps: bool = True,
-) -> Rig:
-    return Rig(
+) -> SensorRig:
+    return SensorRig(
         model(),
         BASE,
         IMU if imu else "",
@@ -98,7 +97,7 @@ def drive(seconds: float, seed: int = 3, imu_hz: float = 50.0, **given: object) 
         "gps_model": GpsModel(Timing(5.0, latency=0.05)),
         "wheels_model": WheelsModel(Timing(10.0, latency=0.01)),
         "seed": seed,
-        "trajectory": Trajectory(figure_eight(3.0, 8.0, stand=3.0, ramp=2.0, laps=3), yaw=0.7),
+        "trajectory": Trajectory(figure_eight(3.0, 8.0, stationary=3.0, ramp=2.0, laps=3), yaw=0.7),
         **given,
     }
     trajectory = options.pop("trajectory")
@@ -106,13 +105,13 @@ def drive(seconds: float, seed: int = 3, imu_hz: float = 50.0, **given: object) 
     return simulation, list(simulation.events(seconds))
 
 
-def localizer(settings: FilterSettings | None = None, the_rig: Rig | None = None) -> FilterLocalizer:
+def localizer(settings: FilterSettings | None = None, the_rig: SensorRig | None = None) -> FilterLocalizer:
     return FilterLocalizer.start(Setup(the_rig or rig(), settings), ORIGIN)
 
 
-def taken(localizer: FilterLocalizer, samples: list[Event]) -> FilterLocalizer:
+def process_all(localizer: FilterLocalizer, samples: list[Event]) -> FilterLocalizer:
     for sample in samples:
-        localizer, _ = localizer.take(sample)
+        localizer, _ = localizer.process(sample)
     return localizer
 
 

@@ -1,4 +1,4 @@
-"""What sensors tell that is not so: each fault once, for the real daemon and for the core at full speed."""
+"""False data from sensors: each fault once, for the real daemon and for the core at full speed."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def clock_off(seconds: float) -> Transform:
     """The receiver's stamps are off by so much from the start of the fault on; its fixes come as before."""
 
     def transform(events: Iterable[Event], begin: int) -> Iterator[Event]:
-        return faults.step_back(events, begin + round(FROM_S * 1e6), -seconds, "gps")
+        return faults.step_clock_back(events, begin + round(FROM_S * 1e6), -seconds, "gps")
 
     return transform
 
 
 def without_numbers(events: Iterable[Event], begin: int) -> Iterator[Event]:
-    """The inertial unit tells nan."""
+    """The inertial unit publishes nan."""
     for event in events:
         if isinstance(event, ImuSample) and event.header.utime >= begin + FROM_S * 1e6:
             event = replace(event, angular_velocity=NAN, specific_force=NAN)
@@ -52,10 +52,10 @@ def without_numbers(events: Iterable[Event], begin: int) -> Iterator[Event]:
 
 def twice_and_mixed(events: Iterable[Event], begin: int) -> Iterator[Event]:
     """All sensors' messages overtake each other by 0.1 s, and three in ten come again within 0.2 s."""
-    return faults.duplicate(faults.late(events, 3, None, 0.1), 4, 0.3, delay=0.2)
+    return faults.duplicate(faults.delay(events, 3, None, 0.1), 4, 0.3, max_delay=0.2)
 
 
-def looped(events: Iterable[Event], begin: int) -> Iterator[Event]:
+def loop_log(events: Iterable[Event], begin: int) -> Iterator[Event]:
     """The log of the first seconds comes again, stamps and all, while the drive goes on."""
     every = list(events)
     shift = round(FROM_S * 1e6)
@@ -81,7 +81,7 @@ FAULTS = {
         counted=frozenset({("sensor:gps", "gate")}),
     ),
     "gps_1_s_ahead": Fault(transform=clock_off(1.0), counted=frozenset({("sensor:gps", "future")})),
-    "gps_1_s_behind": Fault(transform=clock_off(-1.0), counted=frozenset({("sensor:gps", "late")})),
+    "gps_1_s_behind": Fault(transform=clock_off(-1.0), counted=frozenset({("sensor:gps", "too_old")})),
     "duplicated_and_reordered": Fault(
         transform=twice_and_mixed,
         counted=frozenset((f"sensor:{name}", "duplicate") for name in ("gps", "imu", "wheels")),
@@ -95,6 +95,7 @@ FAULTS = {
     "one_wheel_stuck": Fault(_stuck("front_left")),
     "both_wheels_stuck": Fault(_stuck("front_left", "front_right"), counted=frozenset({("sensor:wheels", "gate")})),
     "looped_log": Fault(
-        transform=looped, counted=frozenset((f"sensor:{name}", "order") for name in ("gps", "imu", "wheels"))
+        transform=loop_log,
+        counted=frozenset((f"sensor:{name}", "out_of_sequence") for name in ("gps", "imu", "wheels")),
     ),
 }

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from modelserver.earth.geodesy import origin_at
+from modelserver.estimation.filter.localizer import FilterLocalizer
+from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.modes import ModeLocalizer
+from modelserver.estimation.sensor_rig import SensorRig
 from modelserver.geometry import ModelBuilder
-from modelserver.localization.filter.localizer import FilterLocalizer
-from modelserver.localization.filter.settings import FilterSettings
-from modelserver.localization.filter.setup import Setup
-from modelserver.localization.modes import ModeLocalizer
-from modelserver.localization.rig import Rig
 from modelserver.messages import Decision, Estimate, FixType, Mode, Sample, SwitchMode, Verdict
 from modelserver.simulation import (
     DrivePhase,
@@ -28,7 +28,7 @@ from modelserver.simulation import (
     Trajectory,
     WheelsModel,
 )
-from modelserver.spatial.pose import Pose
+from modelserver.transforms.pose import Pose
 
 ORIGIN = origin_at(50.27, -111.18, 700.0)
 WHEELS = {"left": "Car:Left", "right": "Car:Right"}
@@ -37,8 +37,8 @@ IMU_TIMING = Timing(IMU_HZ, 0.004, 0.001)
 GPS_TIMING = Timing(GPS_HZ, 0.06, 0.01)
 WHEELS_TIMING = Timing(WHEELS_HZ, 0.01, 0.002)
 
-PLAIN_GPS = GpsModel(GPS_TIMING, lingering_sigma=0.3, white_sigma=0.05)
-RTK_LIKE = GpsModel(GPS_TIMING, lingering_sigma=0.01, white_sigma=0.01, fix_type=FixType.RTK_FIXED)
+PLAIN_GPS = GpsModel(GPS_TIMING, correlated_sigma=0.3, white_sigma=0.05)
+RTK_LIKE = GpsModel(GPS_TIMING, correlated_sigma=0.01, white_sigma=0.01, fix_type=FixType.RTK_FIXED)
 IMU = ImuModel(IMU_TIMING)
 WHEELS_MODEL = WheelsModel(WHEELS_TIMING)
 
@@ -47,12 +47,12 @@ MOUNT = Pose.from_rpy((0.3, -0.3, 0.5), math.pi / 2, 0.0, -math.pi / 2)
 Transform = Callable[[Iterable[Event]], Iterable[Event]]
 
 
-def rig(turned: float = 0.0, imu: Pose = MOUNT, kinematics: Any = "differential", *, wheels: bool = True) -> Rig:
+def rig(turned: float = 0.0, imu: Pose = MOUNT, kinematics: Any = "differential", *, wheels: bool = True) -> SensorRig:
     """The vehicle; `turned` is the yaw of its body on the ground: sensors stay where they are on the body."""
     builder = ModelBuilder("car")
-    car = builder.body("Car")
+    car = builder.add_body("Car")
     X = Pose.from_rpy((0.0, 0.0, 0.0), 0.0, 0.0, turned)
-    car.frame("Base")
+    car.add_frame("Base")
     for name, pose in (
         ("Imu", imu),
         ("Antenna", Pose((0.25, 0.1, 1.0))),
@@ -62,8 +62,8 @@ def rig(turned: float = 0.0, imu: Pose = MOUNT, kinematics: Any = "differential"
         ("Camera", Pose.from_rpy((0.5, 0.0, 0.8), 0.0, 0.1, 0.2)),
     ):
         turned_pose = X @ pose if name not in ("Left", "Right") else pose
-        car.frame(name, turned_pose)
-    return Rig(
+        car.add_frame(name, turned_pose)
+    return SensorRig(
         builder.build(),
         "Car:Base",
         "Car:Imu",
@@ -78,7 +78,7 @@ RIG = rig()
 
 
 def simulation(
-    phases: Sequence[DrivePhase], on: Rig = RIG, *, yaw: float = 0.7, seed: int = 1, **more: Any
+    phases: Sequence[DrivePhase], on: SensorRig = RIG, *, yaw: float = 0.7, seed: int = 1, **more: Any
 ) -> Simulation:
     """A drive of the vehicle; `more` goes to the simulator, over what stands here."""
     arguments: dict[str, Any] = {
@@ -147,7 +147,7 @@ class Run:
     def last(self) -> Row:
         return self.rows[-1]
 
-    def said(self, kind: str, verdict: Verdict | None = None, reason: str | None = None) -> list[Decision]:
+    def decisions(self, kind: str, verdict: Verdict | None = None, reason: str | None = None) -> list[Decision]:
         return [
             word
             for word in self.ledger
@@ -161,7 +161,7 @@ class Run:
 
     @property
     def odom_steps(self) -> list[float]:
-        """By how much Odom moved between neighbouring rows beyond what the true speed explains, metres."""
+        """By how much Odom moved between neighboring rows beyond what the true speed explains, meters."""
         steps = []
         for a, b in zip(self.rows, self.rows[1:], strict=False):
             moved = math.dist(a.estimate.odom.xyz, b.estimate.odom.xyz)
@@ -181,7 +181,7 @@ def row(run: Simulation | SharedDrive, estimate: Estimate) -> Row:
     )
 
 
-def untouched(events: Iterable[Event]) -> Iterable[Event]:
+def leave_unchanged(events: Iterable[Event]) -> Iterable[Event]:
     return events
 
 
@@ -190,9 +190,9 @@ def drive(
     seconds: float,
     *,
     settings: FilterSettings | None = None,
-    on: Rig = RIG,
+    on: SensorRig = RIG,
     every: float = 0.5,
-    transform: Transform = untouched,
+    transform: Transform = leave_unchanged,
     mode: Mode = Mode.FULL,
     localizer: FilterLocalizer | ModeLocalizer | None = None,
     switches: Sequence[tuple[float, SwitchMode]] = (),
@@ -205,9 +205,9 @@ def drive(
     for event in transform(run.events(seconds)):
         sample: Sample = event
         if waiting and sample.header.host_utime >= run.start_utime + round(waiting[0][0] * 1e6):
-            found, notes = found.take(waiting.pop(0)[1])
+            found, notes = found.process(waiting.pop(0)[1])
             shown.ledger += [note for note in notes if isinstance(note, Decision)]
-        found, notes = found.take(sample)
+        found, notes = found.process(sample)
         shown.ledger += [note for note in notes if isinstance(note, Decision)]
         utime = found.utime
         if utime >= due and utime:

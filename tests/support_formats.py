@@ -112,7 +112,7 @@ def all_frames(model):
 
 
 def assert_same_transforms(one: Model, other: Model, tolerance=1e-12):
-    """Compare every pair of frames: position to `tolerance` metres, rotation to `tolerance` radians."""
+    """Compare every pair of frames: position to `tolerance` meters, rotation to `tolerance` radians."""
     assert all_frames(one) == all_frames(other)
     for a, b in product(all_frames(one), repeat=2):
         moved, turned = one.get_transformation(a, b).pose.distance(other.get_transformation(a, b).pose)
@@ -140,15 +140,15 @@ def models(draw):
     leaders: list[str] = []
     inertia = st.none() | st.just(tuple(tuple(float(6 * i + j) / 3 for j in range(6)) for i in range(6)))
     for number, name in enumerate(bodies):
-        body = builder.body(name, draw(descriptions), draw(st.none() | poses), draw(inertia))
+        body = builder.add_body(name, draw(descriptions), draw(st.none() | poses), draw(inertia))
         frames = draw(st.lists(names, min_size=1, max_size=3, unique=True))
         for frame in [*frames, *(f"on{each}" for each in range(number + 1, len(bodies))), "base"]:
-            body.frame(frame, draw(poses), draw(descriptions), draw(sigmas))
+            body.add_frame(frame, draw(poses), draw(descriptions), draw(sigmas))
         if number:
             parent = draw(st.sampled_from(bodies[:number]))
             joint = draw(joints(leaders))
             if joint.count == 1:
                 leaders.append(f"c{number}")
             ends = (f"{parent}:on{number}", f"{name}:base")
-            builder.constraint(f"c{number}", *ends, draw(poses), draw(descriptions), draw(sigmas), joint)
+            builder.add_constraint(f"c{number}", *ends, draw(poses), draw(descriptions), draw(sigmas), joint)
     return builder.build()

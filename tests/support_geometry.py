@@ -1,4 +1,4 @@
-"""Models to try things on, and searches written another way than the package's."""
+"""Test models, and searches implemented independently of the package's."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import random
 import numpy as np
 
 from modelserver.geometry import Model, ModelBuilder, Sigma
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 
 def random_pose(rng: random.Random) -> Pose:
@@ -41,11 +41,11 @@ def random_builder(rng: random.Random, bodies: int, extra: int = 0, assemblies: 
     builder = ModelBuilder("random")
     for body in range(bodies):
         rng.shuffle(frames[body])
-        draft = builder.body(f"B{body}")
+        draft = builder.add_body(f"B{body}")
         for frame in frames[body]:
-            draft.frame(frame, random_pose(rng), sigma=random_sigma(rng) if sigmas else None)
+            draft.add_frame(frame, random_pose(rng), sigma=random_sigma(rng) if sigmas else None)
     for number, (start, end) in enumerate(ends):
-        builder.constraint(f"C{number}", start, end, random_pose(rng), sigma=random_sigma(rng) if sigmas else None)
+        builder.add_constraint(f"C{number}", start, end, random_pose(rng), sigma=random_sigma(rng) if sigmas else None)
     return builder
 
 
@@ -53,23 +53,23 @@ def chain(count: int) -> ModelBuilder:
     """Return a builder of bodies B0, B1, ... in a row, each with frames In and Out."""
     builder = ModelBuilder("chain")
     for number in range(count):
-        body = builder.body(f"B{number}")
-        body.frame("In", Pose.from_rpy((0.1, 0.0, 0.0), 0.0, 0.1, 0.0))
-        body.frame("Out", Pose.from_rpy((0.2, 0.1, 0.0), 0.0, 0.0, 0.3))
+        body = builder.add_body(f"B{number}")
+        body.add_frame("In", Pose.from_rpy((0.1, 0.0, 0.0), 0.0, 0.1, 0.0))
+        body.add_frame("Out", Pose.from_rpy((0.2, 0.1, 0.0), 0.0, 0.0, 0.3))
     for number in range(count - 1):
-        builder.constraint(f"C{number}", f"B{number}:Out", f"B{number + 1}:In", Pose((0.0, 0.0, 0.01)))
+        builder.add_constraint(f"C{number}", f"B{number}:Out", f"B{number + 1}:In", Pose((0.0, 0.0, 0.01)))
     return builder
 
 
 def star(count: int) -> ModelBuilder:
     """Return a builder of one hub with half of `count` frames, and a device on each, with one frame."""
     builder = ModelBuilder("star")
-    hub = builder.body("Hub")
+    hub = builder.add_body("Hub")
     for number in range(count // 2):
-        hub.frame(f"Mount{number:05d}", Pose.from_rpy((0.01 * number, 0.2, 0.3), 0.1, 0.2, 0.3 * number))
+        hub.add_frame(f"Mount{number:05d}", Pose.from_rpy((0.01 * number, 0.2, 0.3), 0.1, 0.2, 0.3 * number))
     for number in range(count // 2):
-        builder.body(f"Device{number:05d}").frame("Origin", Pose((0.1, 0.2, 0.3)))
-        builder.constraint(f"C{number}", f"Hub:Mount{number:05d}", f"Device{number:05d}:Origin")
+        builder.add_body(f"Device{number:05d}").add_frame("Origin", Pose((0.1, 0.2, 0.3)))
+        builder.add_constraint(f"C{number}", f"Hub:Mount{number:05d}", f"Device{number:05d}:Origin")
     return builder
 
 

@@ -1,4 +1,4 @@
-"""A receiver in software and its driver on one line, with instants that a test tells: no port, no clock."""
+"""An emulated receiver and its driver on one line with scripted instants: no port, no clock."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from modelserver.messages import FixType, GpsSample, SensorHeader
 from msdrivers.devices.gps import GpsDriver
 from msdrivers.emulate.gps import GpsEmulator
-from msdrivers.station import Measured, Now, Output, Reopen, Send, StationPhase, StationStatus
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
 
 START = 1_700_000_000_000_000
 SECOND = 1_000_000
@@ -18,8 +18,8 @@ BOOT_NS = 5_000_000_000
 """Monotonic nanoseconds at START."""
 
 
-def now_at(utime: int) -> Now:
-    return Now(BOOT_NS + (utime - START) * 1000, utime)
+def now_at(utime: int) -> HostTime:
+    return HostTime(BOOT_NS + (utime - START) * 1000, utime)
 
 
 def drive(seconds: float, rate: float = 20.0, fix_type: FixType = FixType.DIFFERENTIAL) -> Iterator[GpsSample]:
@@ -48,26 +48,26 @@ def drive(seconds: float, rate: float = 20.0, fix_type: FixType = FixType.DIFFER
 
 @dataclass
 class Line:
-    """Carries what one says to the other.
+    """Passes the output of one to the other.
 
     to_host: what the line makes of the bytes to the driver, e.g. noise between them; one chunk to any number.
-    dead: nothing passes. right_baud: at another rate what the driver hears is garbage, and it is not heard.
+    is_broken: nothing passes. device_baud: at another rate the driver receives garbage and the device nothing.
     """
 
     driver: GpsDriver
     device: GpsEmulator
     to_host: Callable[[bytes], Sequence[bytes]] = lambda data: [data]
     utime: int = START
-    dead: bool = False
-    right_baud: int | None = None
+    is_broken: bool = False
+    device_baud: int | None = None
     baud: int | None = None
-    measured: list[Measured] = field(default_factory=list)
-    told: list[StationStatus] = field(default_factory=list)
-    reopened: list[Reopen] = field(default_factory=list)
+    measured: list[MeasuredSample] = field(default_factory=list)
+    statuses: list[EndpointStatus] = field(default_factory=list)
+    reopens: list[Reopen] = field(default_factory=list)
     sent: list[bytes] = field(default_factory=list)
 
     @property
-    def now(self) -> Now:
+    def now(self) -> HostTime:
         return now_at(self.utime)
 
     @property
@@ -77,72 +77,75 @@ class Line:
         return found  # type: ignore[return-value]
 
     @property
-    def words(self) -> str:
-        return "\n".join(f"{each.phase.value}: {each.text}" for each in self.told)
+    def status_text(self) -> str:
+        return "\n".join(f"{each.phase.value}: {each.text}" for each in self.statuses)
 
     @property
-    def phases(self) -> list[StationPhase]:
-        phases = [each.phase for each in self.told]
+    def phases(self) -> list[EndpointPhase]:
+        phases = [each.phase for each in self.statuses]
         return [each for n, each in enumerate(phases) if n == 0 or each is not phases[n - 1]]
 
     def open(self) -> Line:
-        self.from_driver(self.driver.opened(self.now))
-        self.from_device(self.device.opened(self.now))
+        self.from_driver(self.driver.on_open(self.now))
+        self.from_device(self.device.on_open(self.now))
         return self
 
     def run(self, seconds: float) -> Line:
-        """Let time pass: both are woken when they asked for it, to the millisecond."""
+        """Let time pass; fire the timers of both at their deadlines."""
         end = self.utime + round(seconds * SECOND)
         for _ in range(1_000_000):
-            due = min((each for each in (self.driver.due(), self.device.due()) if each is not None), default=None)
+            due = min(
+                (each for each in (self.driver.get_deadline(), self.device.get_deadline()) if each is not None),
+                default=None,
+            )
             wake = end if due is None else max(self.utime, START + -(-(due - BOOT_NS) // 1000))
             if wake >= end:
                 self.utime = end
                 return self
             self.utime = wake
             for station, carry in ((self.device, self.from_device), (self.driver, self.from_driver)):
-                asked = station.due()
+                asked = station.get_deadline()
                 if asked is not None and asked <= self.now.monotonic_ns:
-                    carry(station.woken(self.now))
-                    asked = station.due()
-                    assert asked is None or asked > self.now.monotonic_ns, f"{station} wants to be woken forever"
-        raise AssertionError("woken a million times")
+                    carry(station.on_timer(self.now))
+                    asked = station.get_deadline()
+                    assert asked is None or asked > self.now.monotonic_ns, f"{station}: deadline does not advance"
+        raise AssertionError("a million timer events")
 
     def from_device(self, outputs: Sequence[Output[bytes]]) -> None:
         for each in outputs:
-            if isinstance(each, Send) and not self.dead:
+            if isinstance(each, Send) and not self.is_broken:
                 unit = each.unit
-                if self.baud != self.right_baud:
+                if self.baud != self.device_baud:
                     unit = bytes((byte * 7 + 128) & 0xFF | 0x80 for byte in unit)
                 for chunk in self.to_host(unit):
-                    self.hear(chunk)
+                    self.deliver(chunk)
 
-    def hear(self, data: bytes) -> None:
-        """The driver hears some bytes."""
-        self.from_driver(self.driver.received(data, self.now))
+    def deliver(self, data: bytes) -> None:
+        """Deliver bytes to the driver."""
+        self.from_driver(self.driver.on_receive(data, self.now))
 
     def from_driver(self, outputs: Sequence[Output[bytes]]) -> None:
         for each in outputs:
             match each:
                 case Send(unit):
                     self.sent.append(unit)
-                    if not self.dead and self.baud == self.right_baud:
-                        self.from_device(self.device.received(unit, self.now))
-                case Measured():
+                    if not self.is_broken and self.baud == self.device_baud:
+                        self.from_device(self.device.on_receive(unit, self.now))
+                case MeasuredSample():
                     self.measured.append(each)
-                case StationStatus():
-                    self.told.append(each)
+                case EndpointStatus():
+                    self.statuses.append(each)
                 case Reopen():
-                    self.reopened.append(each)
+                    self.reopens.append(each)
                     self.baud = each.baud
-                    self.from_driver(self.driver.opened(self.now))
+                    self.from_driver(self.driver.on_open(self.now))
 
 
-def halves(data: bytes) -> Sequence[bytes]:
+def split_in_half(data: bytes) -> Sequence[bytes]:
     return [data[: len(data) // 2], data[len(data) // 2 :]]
 
 
-def noisy(seed: int, most: int = 40) -> Callable[[bytes], Sequence[bytes]]:
+def add_noise(seed: int, most: int = 40) -> Callable[[bytes], Sequence[bytes]]:
     """Noise between the chunks, and one byte in 2000 damaged."""
     chance = random.Random(seed)
 
@@ -153,7 +156,7 @@ def noisy(seed: int, most: int = 40) -> Callable[[bytes], Sequence[bytes]]:
     return line
 
 
-def split(data: bytes, seed: int) -> list[bytes]:
+def split_randomly(data: bytes, seed: int) -> list[bytes]:
     chance = random.Random(seed)
     parts = []
     at = 0

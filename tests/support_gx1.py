@@ -8,16 +8,16 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader
-from modelserver.spatial import so3
-from modelserver.spatial.so3 import Vector3
+from modelserver.transforms import so3
+from modelserver.transforms.so3 import Vector3
 from msdrivers.emulate.gx1 import Gx1Emulator
-from msdrivers.station import Measured, Now, Output, Reopen, Send, Station, StationPhase, StationStatus
+from msdrivers.endpoint import Endpoint, EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
 
 START_UTIME = 1_700_000_000_000_000
 FIELD_NED: Vector3 = (18e-6, 0.0, 50e-6)
 GRAVITY = 9.80665
 
-SHEET = {
+DOCUMENTED_REPLIES = {
     0x31: bytes.fromhex("31 00b6 fe94 4000 0000 0000 edb7 0027 ffd9 0182 03e8 329c"),
     0x07: bytes.fromhex("07 2560 03e8 294f"),
     0x0E: bytes.fromhex("0e 2000 2000 2000 ffff 600d"),
@@ -25,7 +25,7 @@ SHEET = {
 """Worked replies of the protocol's description."""
 
 
-def turning(rate: Vector3 = (0.0, 0.0, 0.2), seconds: float = 60.0, hz: float = 100.0) -> Iterator[ImuSample]:
+def rotating_samples(rate: Vector3 = (0.0, 0.0, 0.2), seconds: float = 60.0, hz: float = 100.0) -> Iterator[ImuSample]:
     """Yield samples of a unit that turns at a constant rate about its own axes, where it begins level and north."""
     for k in range(round(seconds * hz) + 1):
         t = k / hz
@@ -41,9 +41,9 @@ def turning(rate: Vector3 = (0.0, 0.0, 0.2), seconds: float = 60.0, hz: float = 
         )
 
 
-def standing(seconds: float = 60.0) -> Iterator[ImuSample]:
+def stationary_samples(seconds: float = 60.0) -> Iterator[ImuSample]:
     """Yield samples of a unit at rest."""
-    return turning((0.0, 0.0, 0.0), seconds)
+    return rotating_samples((0.0, 0.0, 0.0), seconds)
 
 
 @dataclass
@@ -53,32 +53,32 @@ class Line:
     `baud`: the device's; at another one it is not understood. `spoil` changes what comes to the host.
     """
 
-    host: Station[bytes]
-    device: Station[bytes]
+    host: Endpoint[bytes]
+    device: Endpoint[bytes]
     baud: int = 38400
     flight_s: float = 0.002
     pieces: random.Random | None = None
-    spoil: Callable[[bytes], bytes] = bytes
+    corrupt: Callable[[bytes], bytes] = bytes
     now_ns: int = 5_000_000_000
-    samples: list[Measured] = field(default_factory=list)
-    told: list[StationStatus] = field(default_factory=list)
-    reopened: list[Reopen] = field(default_factory=list)
+    samples: list[MeasuredSample] = field(default_factory=list)
+    statuses: list[EndpointStatus] = field(default_factory=list)
+    reopens: list[Reopen] = field(default_factory=list)
     sent: list[bytes] = field(default_factory=list)
     host_baud: int = 38400
     _to_host: list[tuple[int, bytes]] = field(default_factory=list)
     _to_device: list[tuple[int, bytes]] = field(default_factory=list)
-    _began: bool = False
+    _is_started: bool = False
 
-    def now(self) -> Now:
-        return Now(self.now_ns, START_UTIME + (self.now_ns - 5_000_000_000) // 1000)
+    def now(self) -> HostTime:
+        return HostTime(self.now_ns, START_UTIME + (self.now_ns - 5_000_000_000) // 1000)
 
     def run(self, seconds: float) -> None:
         """Let time pass."""
         until = self.now_ns + round(seconds * 1e9)
-        if not self._began:
-            self._began = True
-            self._from_device(self.device.opened(self.now()))
-            self._from_host(self.host.opened(self.now()))
+        if not self._is_started:
+            self._is_started = True
+            self._from_device(self.device.on_open(self.now()))
+            self._from_host(self.host.on_open(self.now()))
         turns = 0
         while (at := self._next()) <= until:
             turns = turns + 1 if at <= self.now_ns else 0
@@ -87,37 +87,37 @@ class Line:
             self._step()
         self.now_ns = until
 
-    def leave(self) -> None:
+    def close(self) -> None:
         """Close the line in order."""
-        self._from_host(self.host.leaving(self.now()))
+        self._from_host(self.host.on_close(self.now()))
         for _, unit in self._to_device:
-            self.device.received(unit, self.now())
+            self.device.on_receive(unit, self.now())
         self._to_device.clear()
 
-    def texts(self, phase: StationPhase | None = None) -> list[str]:
-        return [told.text for told in self.told if phase in (None, told.phase)]
+    def status_texts(self, phase: EndpointPhase | None = None) -> list[str]:
+        return [status.text for status in self.statuses if phase in (None, status.phase)]
 
     def _next(self) -> int:
-        instants = [due for due in (self.host.due(), self.device.due()) if due is not None]
+        instants = [due for due in (self.host.get_deadline(), self.device.get_deadline()) if due is not None]
         return min([*instants, *(at for at, _ in self._to_host[:1] + self._to_device[:1])], default=1 << 62)
 
     def _step(self) -> None:
         now = self.now()
         while self._to_device and self._to_device[0][0] <= self.now_ns:
             unit = self._to_device.pop(0)[1]
-            self._from_device(self.device.received(unit, now))
+            self._from_device(self.device.on_receive(unit, now))
         while self._to_host and self._to_host[0][0] <= self.now_ns:
-            self._from_host(self.host.received(self._to_host.pop(0)[1], now))
+            self._from_host(self.host.on_receive(self._to_host.pop(0)[1], now))
         for station, take in ((self.device, self._from_device), (self.host, self._from_host)):
-            due = station.due()
+            due = station.get_deadline()
             if due is not None and due <= self.now_ns:
-                take(station.woken(now))
+                take(station.on_timer(now))
 
     def _from_device(self, outputs: object) -> None:
         for output in outputs:  # type: ignore[attr-defined]
             if not isinstance(output, Send):
                 continue
-            unit = self.spoil(output.unit)
+            unit = self.corrupt(output.unit)
             if self.host_baud != self.baud:
                 unit = bytes(byte ^ 0xA5 for byte in unit[::3])
             for piece in self._cut(unit):
@@ -131,15 +131,15 @@ class Line:
                 self.sent.append(output.unit)
                 if self.host_baud == self.baud:
                     self._to_device.append((self.now_ns + round(self.flight_s * 1e9), output.unit))
-            elif isinstance(output, Measured):
+            elif isinstance(output, MeasuredSample):
                 self.samples.append(output)
-            elif isinstance(output, StationStatus):
-                self.told.append(output)
+            elif isinstance(output, EndpointStatus):
+                self.statuses.append(output)
             else:
-                self.reopened.append(output)
+                self.reopens.append(output)
                 self.host_baud = output.baud or self.host_baud
                 self._to_host.clear()
-                pending += self.host.opened(self.now())
+                pending += self.host.on_open(self.now())
 
     def _cut(self, unit: bytes) -> list[bytes]:
         if self.pieces is None or len(unit) < 2:
@@ -148,28 +148,28 @@ class Line:
         return [unit[:at], unit[at:]]
 
 
-class Speaker:
-    """Another device on the line: says one text over and over, whatever it hears."""
+class RepeatingDevice:
+    """Another device on the line: repeats one text, whatever it receives."""
 
     def __init__(self, unit: bytes, period_s: float = 0.1):
         self.unit, self.period_ns, self.next_ns = unit, round(period_s * 1e9), 0
         self.counts: dict[str, int] = {}
 
-    def opened(self, now: Now) -> list[Output[bytes]]:
+    def on_open(self, now: HostTime) -> list[Output[bytes]]:
         self.next_ns = now.monotonic_ns
         return []
 
-    def received(self, unit: bytes, now: Now) -> list[Output[bytes]]:
+    def on_receive(self, unit: bytes, now: HostTime) -> list[Output[bytes]]:
         return []
 
-    def woken(self, now: Now) -> list[Output[bytes]]:
+    def on_timer(self, now: HostTime) -> list[Output[bytes]]:
         self.next_ns += self.period_ns
         return [Send(self.unit)] if self.unit else []
 
-    def due(self) -> int | None:
+    def get_deadline(self) -> int | None:
         return self.next_ns
 
-    def leaving(self, now: Now) -> list[Output[bytes]]:
+    def on_close(self, now: HostTime) -> list[Output[bytes]]:
         return []
 
 
@@ -177,4 +177,14 @@ def angle_between(a: so3.Quaternion, b: so3.Quaternion) -> float:
     return math.hypot(*so3.logarithm(so3.multiply(so3.conjugate(a), b)))
 
 
-__all__ = ["FIELD_NED", "GRAVITY", "SHEET", "Gx1Emulator", "Line", "Speaker", "angle_between", "standing", "turning"]
+__all__ = [
+    "DOCUMENTED_REPLIES",
+    "FIELD_NED",
+    "GRAVITY",
+    "Gx1Emulator",
+    "Line",
+    "RepeatingDevice",
+    "angle_between",
+    "rotating_samples",
+    "stationary_samples",
+]

@@ -1,4 +1,4 @@
-"""Joints to try things on, of every type and with whatever a joint may state."""
+"""Random joints of every type."""
 
 from __future__ import annotations
 

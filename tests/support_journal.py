@@ -1,4 +1,4 @@
-"""A service with a journal on a fake bus and a fake clock: no thread, and the disk is the test's folder."""
+"""A service with a journal on a fake bus and a fake clock, without threads, writing to the folder of the test."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import Any, Literal
 from support_samples import FORWARD, GEOMETRY, VEHICLE, drive, write_vehicle
 from support_signing import ALLOWED, KEY, envelope, write_test_key
 
-from modelserver.config import load_config
+from modelserver.config.vehicle_file import load_config
 from modelserver.messages import CHANNEL_OF
-from modelserver.service.clock import FakeClock
-from modelserver.service.daemon import load_vehicle
-from modelserver.service.fake_bus import FakeBus
-from modelserver.service.hooks import Hooks
-from modelserver.service.journal import build as journal_build
-from modelserver.service.journal.queue import JournalQueue
-from modelserver.service.journal.ring import Ring, segments
-from modelserver.service.journal.writer import JournalWriter, Origins
-from modelserver.service.loop import Loop, LoopSettings
-from modelserver.signing import Key
+from modelserver.server.clock import FakeClock
+from modelserver.server.fake_bus import FakeBus
+from modelserver.server.journal import environment
+from modelserver.server.journal.queue import JournalQueue
+from modelserver.server.journal.segments import Ring, list_segments
+from modelserver.server.journal.writer import JournalContext, JournalWriter
+from modelserver.server.loop import Hooks, Loop, LoopSettings
+from modelserver.server.requests.scheduler import RequestLimits
+from modelserver.server.vehicle import load_vehicle
+from modelserver.signing.signatures import Key
 from modelserver.wire.codec import encode
 
 START = 1_700_000_000_000_000
@@ -28,95 +28,92 @@ START = 1_700_000_000_000_000
 OPEN = VEHICLE + (
     f"localization: {{mode_channel: LOCALIZATION_MODE, {FORWARD}}}\n"
     f"{ALLOWED}"
-    "limits: {history_s: 20, parked_requests: 4, queued_requests: 4}\n"
+    "limits: {history_s: 20, waiting_requests: 4, queued_requests: 4}\n"
 )
-"""A vehicle of which everything may be asked."""
+"""A vehicle that allows all requests."""
 
 SMALL = OPEN.replace("{mode_channel", "{mode: raw, mode_channel")
-"""The same in raw mode, whose state is small: for many segments."""
+"""The same in raw mode, which has a small state: for many segments."""
 
 
-class Kept:
-    """A loop of a small vehicle and the journal of it, in `folder`/journal."""
+class JournalRig:
+    """A loop of a small vehicle with its journal in `folder`/journal."""
 
     def __init__(
         self,
         folder: Path,
         vehicle: str = OPEN,
         geometry: str = GEOMETRY,
-        most_bytes: int = 1 << 30,
+        max_bytes: int = 1 << 30,
         segment_bytes: int = 1 << 20,
         clock: FakeClock | None = None,
         run: str = "one",
         facts: dict[str, Any] | None = None,
         ring: Callable[..., Ring] = Ring,
-        second_writer: Literal["", "ignore", "use"] = "",
+        publisher_conflict: Literal["", "ignore", "use"] = "",
         key: Key | None = None,
     ):
         path = write_vehicle(folder, vehicle, geometry)
         write_test_key(folder)
-        self.orders = 0
+        self.commands = 0
         self.folder, self.directory = folder, folder / "journal"
         self.vehicle = load_vehicle(load_config(path), str(path))
         self.clock = clock or FakeClock(START, 10_000_000_000)
         self.bus = FakeBus(self.clock)
         self.queue = JournalQueue()
-        self.ring = ring(self.directory, most_bytes, segment_bytes)
-        known = {**journal_build.facts(), "run": run, **(facts or {})}
-        files = [(str(path), path.read_bytes())]
-        origins = Origins(known, files, self.vehicle.config)
-        self.writer = JournalWriter(self.queue, self.ring, origins, self.clock, pause=lambda: None, key=key)
+        self.ring = ring(self.directory, max_bytes, segment_bytes)
+        known = {**environment.collect_facts(), "run": run, **(facts or {})}
+        context = JournalContext(known, [(str(path), path.read_bytes())], self.vehicle.config)
+        self.writer = JournalWriter(self.queue, self.ring, context, self.clock, pause=lambda: None, key=key)
         self.loop = Loop(
             self.bus,
             self.clock,
-            self.vehicle.core(self.clock.now()),
+            self.vehicle.start_core(self.clock.now()),
             LoopSettings(
                 20_000_000,
                 self.vehicle.sensor_channels(),
-                queued_requests=4,
                 requests_per_pass=2,
-                second_writer=second_writer,
+                limits=RequestLimits(queued=4),
+                publisher_conflict=publisher_conflict,
             ),
             Hooks(
-                on_load=lambda wish, state: self.vehicle.reloaded(wish, state, str(path)),
-                snapshot=self.vehicle.snapshot,
+                on_load=lambda load, state: self.vehicle.reload_model(load, state, str(path)),
+                snapshot=self.vehicle.encode_snapshot,
                 channels=lambda state: self.vehicle.sensor_channels(state.model),
-                gate=self.vehicle.gate(self.clock.monotonic_ns(), str(path)),
+                verifier=self.vehicle.make_command_verifier(self.clock.monotonic_ns(), str(path)),
                 journal=self.queue,
             ),
         )
 
-    def turns(self, count: int = 1) -> None:
-        """Let the loop turn, and the writer after each."""
+    def run_cycles(self, count: int = 1) -> None:
+        """Run the loop and the writer for some cycles."""
         for _ in range(count):
-            self.loop.turn()
-            self.writer.work()
+            self.loop.run_once()
+            self.writer.run_once()
 
     def drive(self, seconds: float = 6.0) -> None:
-        """Hear a drive that begins now, each sample as it is measured."""
+        """Receive the samples of a drive that begins now, each as it is measured."""
         for sample in drive(seconds, self.clock.utime()):
-            ahead = (sample.header.utime - self.clock.utime()) * 1e-6
-            while ahead > 0:
-                self.turns()
-                ahead = (sample.header.utime - self.clock.utime()) * 1e-6
+            while sample.header.utime > self.clock.utime():
+                self.run_cycles()
             self.send(sample)
 
     def send(self, value: Any, channel: str = "") -> None:
-        """Put a message on the bus."""
+        """Publish a message."""
         kinds = {"GpsSample": "GPS", "ImuSample": "IMU", "SwitchMode": "LOCALIZATION_MODE", "JointsSample": "JOINTS"}
         self.bus.publish(channel or CHANNEL_OF.get(type(value)) or kinds[type(value).__name__], encode(value))
 
-    def order(self, value: Any, key: Key = KEY, late: float = 0.0) -> None:
-        """Put a signed command on the bus, stamped `late` seconds ago."""
-        self.orders += 1
-        utime = self.clock.utime() - round(late * 1e6)
-        self.bus.publish("MODELSERVER_SIGNED", encode(envelope(value, utime, key, counter=self.orders)))
+    def send_command(self, value: Any, key: Key = KEY, age: float = 0.0) -> None:
+        """Publish a signed command, stamped `age` seconds ago."""
+        self.commands += 1
+        utime = self.clock.utime() - round(age * 1e6)
+        self.bus.publish("MODELSERVER_SIGNED", encode(envelope(value, utime, key, counter=self.commands)))
 
     def finish(self) -> list[Path]:
-        """End the service; return the segments."""
+        """Stop the service; return the segments."""
         self.writer.finish()
         return self.segments
 
     @property
     def segments(self) -> list[Path]:
-        return segments(self.directory)
+        return list_segments(self.directory)

@@ -20,8 +20,8 @@ import pytest
 
 from mstools.cli import main
 
-PATIENCE_S = 60.0
-"""How long a test waits for what must come; only a failing one waits so long."""
+TIMEOUT_S = 60.0
+"""Seconds that a test waits for a message or process; only a failing test waits that long."""
 
 
 @contextmanager
@@ -42,10 +42,10 @@ def reserved_url() -> Iterator[str]:
     raise RuntimeError("no free port")
 
 
-def wait_until(bus: lcm.LCM, arrived: Callable[[], bool], seconds: float = PATIENCE_S) -> bool:
-    """Handle messages until `arrived`; return whether it did in time."""
+def wait_until(bus: lcm.LCM, is_done: Callable[[], bool], seconds: float = TIMEOUT_S) -> bool:
+    """Handle messages until `is_done`; return whether that was in time."""
     deadline = time.monotonic() + seconds
-    while not arrived():
+    while not is_done():
         left = deadline - time.monotonic()
         if left <= 0:
             return False
@@ -54,20 +54,20 @@ def wait_until(bus: lcm.LCM, arrived: Callable[[], bool], seconds: float = PATIE
 
 
 class Listener:
-    """Hears one channel; `heard` fills while messages are waited for."""
+    """Subscriber of one channel; `received` fills while the bus is handled."""
 
     def __init__(self, url: str, channel: str):
-        self.heard: list[bytes] = []
+        self.received: list[bytes] = []
         self.bus = lcm.LCM(url)
-        self.bus.subscribe(re.escape(channel), lambda _, data: self.heard.append(data))
+        self.bus.subscribe(re.escape(channel), lambda _, data: self.received.append(data))
 
-    def wait(self, count: int = 1, seconds: float = PATIENCE_S) -> bool:
-        """Return whether `count` messages have been heard in time."""
-        return wait_until(self.bus, lambda: len(self.heard) >= count, seconds)
+    def wait(self, count: int = 1, seconds: float = TIMEOUT_S) -> bool:
+        """Return whether `count` messages were received in time."""
+        return wait_until(self.bus, lambda: len(self.received) >= count, seconds)
 
 
 @contextmanager
-def started(arguments: Sequence[str | Path], url: str, **options: object) -> Iterator[subprocess.Popen[str]]:
+def run_process(arguments: Sequence[str | Path], url: str, **options: object) -> Iterator[subprocess.Popen[str]]:
     """Run a program on the bus at `url` until the block ends, then end it by its pid."""
     environment = os.environ | {"LCM_DEFAULT_URL": url}
     process: subprocess.Popen[str] = subprocess.Popen(
@@ -82,7 +82,7 @@ def started(arguments: Sequence[str | Path], url: str, **options: object) -> Ite
         if process.poll() is None:
             process.terminate()
         try:
-            process.wait(PATIENCE_S)
+            process.wait(TIMEOUT_S)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
@@ -121,7 +121,9 @@ def running_daemon(vehicle_file: Path, folder: Path) -> Iterator[str]:
     with reserved_url() as url, log.open("w") as errors:
         listener = Listener(url, "MODELSERVER_HEALTH")
         arguments = ("env", f"XDG_STATE_HOME={folder}", *MODELSERVER, "run", "-c", vehicle_file)
-        with started(arguments, url, stderr=errors) as process:
-            assert wait_until(listener.bus, lambda: bool(listener.heard) or process.poll() is not None), log.read_text()
+        with run_process(arguments, url, stderr=errors) as process:
+            assert wait_until(listener.bus, lambda: bool(listener.received) or process.poll() is not None), (
+                log.read_text()
+            )
             assert process.poll() is None, log.read_text()
             yield url

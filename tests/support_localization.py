@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from modelserver.earth.geodesy import Geodesy, origin_at
-from modelserver.localization.mounts import Mounts
-from modelserver.localization.raw.localizer import RawLocalizer
+from modelserver.estimation.raw.localizer import RawLocalizer
+from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import FixType, GpsSample, ImuSample, OrientationReference, SensorHeader
-from modelserver.spatial import Pose, so3
+from modelserver.transforms import Pose, so3
 
 START = 1_700_000_000_000_000
 ORIGIN = origin_at(50.27, -111.1, 700.0)
@@ -69,7 +69,7 @@ class Drive:
 
     def pose(self, t: float) -> Pose:
         """The true pose in the tangent plane, `t` seconds after START."""
-        # a sample needs the poses around it too, which are those of its neighbours
+        # a sample needs the poses around it too, which are those of its neighbors
         nanoseconds = round(t * 1e9)
         found = self._poses.get(nanoseconds)
         if found is None:
@@ -86,7 +86,7 @@ class Drive:
 
 @dataclass
 class Sensors:
-    """Noise and rates of the sensors; sigma in metres, m/s, rad/s, m/s2."""
+    """Noise and rates of the sensors; sigma in meters, m/s, rad/s, m/s2."""
 
     gps_hz: float = 5.0
     gps_sigma: float = 0.5
@@ -110,7 +110,7 @@ class Sensors:
     def imu(self, drive: Drive, t: float, seq: int, rng: random.Random, mounts: Mounts = MOUNTS) -> ImuSample:
         h = 0.02
         before, now, after = ((drive.pose(t + d) @ mounts.X_base_imu) for d in (-h, 0.0, h))
-        turn = so3.logarithm(so3.normalized(so3.multiply(so3.conjugate(before.wxyz), after.wxyz)))
+        turn = so3.logarithm(so3.normalize(so3.multiply(so3.conjugate(before.wxyz), after.wxyz)))
         rate = [angle / (2 * h) for angle in turn]
         bias = so3.rotate(so3.conjugate(mounts.X_base_imu.wxyz), self.gyro_bias)
         a = [(p - 2 * q + r) / h**2 for p, q, r in zip(before.xyz, now.xyz, after.xyz, strict=True)]
@@ -159,13 +159,13 @@ class Sensors:
 def run(localizer: RawLocalizer, samples):
     """Yield (sample, localizer after it, notes) for each sample."""
     for sample in samples:
-        localizer, notes = localizer.take(sample)
+        localizer, notes = localizer.process(sample)
         yield sample, localizer, notes
 
 
 def final(localizer: RawLocalizer, samples) -> RawLocalizer:
     for sample in samples:
-        localizer, _ = localizer.take(sample)
+        localizer, _ = localizer.process(sample)
     return localizer
 
 

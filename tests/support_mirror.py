@@ -1,4 +1,4 @@
-"""What the service would say on the bus of the vehicle in support_moving: for those who only listen."""
+"""The messages that a server would publish for the vehicle in support_moving, as input for mirrors."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import replace
 from support_moving import BASE, ODOM, T0, UTM, S, estimate, joints_at, rover
 from support_moving import view as exact_view
 
-from modelserver.client.knowledge import Knowledge, Known
 from modelserver.client.local import LocalPlatform
-from modelserver.formats.snapshot import ModelSnapshot, written
+from modelserver.client.mirror_state import MirrorReceiver, MirrorState
+from modelserver.formats.snapshot import ModelSnapshot, encode_snapshot
 from modelserver.geometry.model import Model
 from modelserver.messages import Estimate, SnapshotPart
-from modelserver.platform import PlatformView
+from modelserver.query import PlatformView
 from modelserver.wire.codec import encode
 from modelserver.wire.snapshot import PART_BYTES
 
@@ -30,7 +30,7 @@ def snapshot(model: Model | None = None, latency_us: int = 0, channel: str = "JO
 
 
 def parts(of: ModelSnapshot, utime: int = T0, size: int = PART_BYTES) -> list[Message]:
-    data, revision = written(of), of.model.revision
+    data, revision = encode_snapshot(of), of.model.revision
     pieces = [data[start : start + size] for start in range(0, len(data), size)]
     return [
         ("MODEL_SNAPSHOT", encode(SnapshotPart(utime, revision, number, len(pieces), piece)))
@@ -38,12 +38,12 @@ def parts(of: ModelSnapshot, utime: int = T0, size: int = PART_BYTES) -> list[Me
     ]
 
 
-def pose(told: Estimate, model: Model | None = None) -> list[Message]:
+def pose(published: Estimate, model: Model | None = None) -> list[Message]:
     """POSE and POSE_ODOM of an estimate."""
     view = PlatformView(rover() if model is None else model, BASE, None, exact_view(0.0).history)
     return [
-        ("POSE", encode(view.broadcast(told, UTM))),
-        ("POSE_ODOM", encode(view.broadcast(told, ODOM))),
+        ("POSE", encode(view.get_published_pose(published, UTM))),
+        ("POSE_ODOM", encode(view.get_published_pose(published, ODOM))),
     ]
 
 
@@ -55,7 +55,7 @@ def joints(seconds: float, latency_us: int = 0) -> Message:
 def drive(
     seconds: float = 4.0, start: float = 0.0, pose_hz: float = 100.0, joint_hz: float = 50.0, every_s: float = 1.0
 ) -> Iterator[Event]:
-    """Yield what is said from `start` on, the snapshot first and then every so often."""
+    """Yield the messages from `start` on, the snapshot first and then every `every_s` seconds."""
     model = rover()
     geometry = snapshot(model)
     view = PlatformView(model, BASE, None, exact_view(0.0).history)
@@ -65,28 +65,28 @@ def drive(
         if n % round(every_s * pose_hz) == 0:
             for number, (channel, data) in enumerate(parts(geometry, at)):
                 yield at + number, channel, data
-        told = estimate(t)
-        yield at + DELAY, "POSE", encode(view.broadcast(told, UTM))
-        yield at + DELAY + 1, "POSE_ODOM", encode(view.broadcast(told, ODOM))
+        published = estimate(t)
+        yield at + DELAY, "POSE", encode(view.get_published_pose(published, UTM))
+        yield at + DELAY + 1, "POSE_ODOM", encode(view.get_published_pose(published, ODOM))
         if n % round(pose_hz / joint_hz) == 0:
             yield at + DELAY + 2, *joints(t)
 
 
-def fed(events: Iterable[Event], knowledge: Knowledge | None = None) -> Knowledge:
-    """Return who has heard them all."""
-    knowledge = Knowledge() if knowledge is None else knowledge
+def feed_messages(events: Iterable[Event], receiver: MirrorReceiver | None = None) -> MirrorReceiver:
+    """Feed all messages to a receiver and return it."""
+    receiver = MirrorReceiver() if receiver is None else receiver
     for at, channel, data in events:
-        knowledge.feed(channel, data, at)
-    return knowledge
+        receiver.feed(channel, data, at)
+    return receiver
 
 
-class Told(LocalPlatform):
-    """Answers from a knowledge at an instant that a test sets."""
+class FedPlatform(LocalPlatform):
+    """A platform with a receiver and a time that the test sets."""
 
-    def __init__(self, knowledge: Knowledge, now: int, limit: float = 10.0):
-        self.knowledge = knowledge
+    def __init__(self, receiver: MirrorReceiver, now: int, limit: float = 10.0):
+        self.receiver = receiver
         self.now = now
         self.limit = limit
 
-    def known(self) -> tuple[Known, int]:
-        return self.knowledge.known, self.now
+    def read_state(self) -> tuple[MirrorState, int]:
+        return self.receiver.state, self.now

@@ -12,11 +12,11 @@ from modelserver.geometry.joint import Joint, JointType, Mimic
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Sigma
 from modelserver.history import History
-from modelserver.joints.joints import Joints
+from modelserver.joints.history import JointHistory
 from modelserver.messages import Estimate, JointSample, JointsSample, Origin, SensorHeader, VehicleMotion
-from modelserver.platform import PlatformView
-from modelserver.spatial import so3
-from modelserver.spatial.pose import Pose
+from modelserver.query import PlatformView
+from modelserver.transforms import so3
+from modelserver.transforms.pose import Pose
 
 T0 = 1_700_000_000_000_000
 S = 1_000_000
@@ -34,26 +34,26 @@ NOD_RATE = math.radians(30.0) / NOD
 def rover(sigma: Sigma | None = SURVEY) -> Model:
     """A rover with a nodding laser, an arm of three further joints, and a follower."""
     builder = ModelBuilder("rover")
-    rover = builder.body("Rover")
-    rover.frame("Base").frame("Mast", Pose.from_rpy((0.8, 0.1, 1.2), 0.0, 0.2, 0.1), sigma=sigma)
-    rover.frame("Shoulder", Pose.from_rpy((-0.4, 0.3, 0.6), 0.1, 0.0, -0.3), sigma=sigma)
-    laser = builder.body("Laser")
-    laser.frame("Axle").frame("Scan", Pose.from_rpy((0.05, 0.0, 0.1), 0.0, 0.0, 0.02), sigma=sigma)
+    rover = builder.add_body("Rover")
+    rover.add_frame("Base").add_frame("Mast", Pose.from_rpy((0.8, 0.1, 1.2), 0.0, 0.2, 0.1), sigma=sigma)
+    rover.add_frame("Shoulder", Pose.from_rpy((-0.4, 0.3, 0.6), 0.1, 0.0, -0.3), sigma=sigma)
+    laser = builder.add_body("Laser")
+    laser.add_frame("Axle").add_frame("Scan", Pose.from_rpy((0.05, 0.0, 0.1), 0.0, 0.0, 0.02), sigma=sigma)
     for name in ("Upper", "Fore", "Deep", "Finger"):
-        body = builder.body(name)
-        body.frame("Root")
-        body.frame("Tip", Pose.from_rpy((0.3, 0.02, -0.01), 0.05, -0.1, 0.2), sigma=sigma)
+        body = builder.add_body(name)
+        body.add_frame("Root")
+        body.add_frame("Tip", Pose.from_rpy((0.3, 0.02, -0.01), 0.05, -0.1, 0.2), sigma=sigma)
     nod = Joint(JointType.REVOLUTE, (0.0, 1.0, 0.0), (-0.6,), (0.6,), (2.0,), sigma=(0.001,))
-    builder.constraint("Nod", "Rover:Mast", "Laser:Axle", Pose((0.0, 0.0, 0.1)), sigma=sigma, joint=nod)
+    builder.add_constraint("Nod", "Rover:Mast", "Laser:Axle", Pose((0.0, 0.0, 0.1)), sigma=sigma, joint=nod)
     slide = Joint(JointType.PRISMATIC, (1.0, 0.0, 0.0), rate_limit=(1.0,), default=(0.1,), sigma=(0.001,))
-    builder.constraint("Slide", "Rover:Shoulder", "Upper:Root", sigma=sigma, joint=slide)
+    builder.add_constraint("Slide", "Rover:Shoulder", "Upper:Root", sigma=sigma, joint=slide)
     ball = Joint(JointType.SPHERICAL, sigma=(0.002, 0.002, 0.002))
-    # passed the other way round
-    builder.constraint("Ball", "Fore:Root", "Upper:Tip", Pose((0.02, 0.0, 0.0)), sigma=sigma, joint=ball)
+    # passed backward
+    builder.add_constraint("Ball", "Fore:Root", "Upper:Tip", Pose((0.02, 0.0, 0.0)), sigma=sigma, joint=ball)
     table = Joint(JointType.PLANAR, (0.0, 0.6, 0.8), sigma=(0.001, 0.001, 0.002))
-    builder.constraint("Table", "Fore:Tip", "Deep:Root", sigma=sigma, joint=table)
+    builder.add_constraint("Table", "Fore:Tip", "Deep:Root", sigma=sigma, joint=table)
     follow = Joint(JointType.REVOLUTE, (0.0, 0.0, 1.0), mimic=Mimic("Nod", -0.5, 0.1))
-    builder.constraint("Finger", "Deep:Tip", "Finger:Root", sigma=sigma, joint=follow)
+    builder.add_constraint("Finger", "Deep:Tip", "Finger:Root", sigma=sigma, joint=follow)
     return builder.build()
 
 
@@ -88,7 +88,7 @@ def twist(seconds: float, step: float = 1e-5) -> tuple[tuple[float, float, float
     before, here, after = vehicle(seconds - step), vehicle(seconds), vehicle(seconds + step)
     v = (after.position - before.position) / (2.0 * step)
     turned = before.wxyz[0], -before.wxyz[1], -before.wxyz[2], -before.wxyz[3]
-    w = np.array(so3.logarithm(so3.normalized(so3.multiply(after.wxyz, turned)))) / (2.0 * step)
+    w = np.array(so3.logarithm(so3.normalize(so3.multiply(after.wxyz, turned)))) / (2.0 * step)
     back = here.rotation.T
     a, b, c = (back @ v).tolist()
     d, e, f = (back @ w).tolist()
@@ -103,7 +103,7 @@ def acceleration(seconds: float, step: float = 1e-3) -> tuple[float, float, floa
 
 
 def estimate(seconds: float, sigma: float = 0.05) -> Estimate:
-    """Return what localization would say without any error."""
+    """Return the estimate without any error."""
     pose = vehicle(seconds)
     v, w = twist(seconds)
     numbers = tuple(np.diag([sigma**2] * 3 + [(0.2 * sigma) ** 2] * 3).ravel().tolist())
@@ -123,7 +123,7 @@ def estimate(seconds: float, sigma: float = 0.05) -> Estimate:
 
 
 def joints_at(seconds: float) -> JointsSample:
-    """Return what the joints say, without any error."""
+    """Return the sample of all joints, without any error."""
     header = SensorHeader(T0 + round(seconds * S), "arm")
     return JointsSample(header, tuple(JointSample(n, q, 0.001, r, 0.002) for n, (q, r) in positions(seconds).items()))
 
@@ -133,26 +133,26 @@ def view(
 ) -> PlatformView:
     """Return the platform after so many seconds of exact poses and joints."""
     model = rover(sigma)
-    joints, history = Joints(model.joints.values(), 60.0), History(60.0)
+    joints, history = JointHistory(model.joints.values(), 60.0), History(60.0)
     for n in range(int(seconds * joint_hz) + 1):
-        joints, refused = joints.taken(joints_at(n / joint_hz), T0 + round(n / joint_hz * S))
-        assert not refused
+        joints, rejected = joints.update(joints_at(n / joint_hz), T0 + round(n / joint_hz * S))
+        assert not rejected
     for n in range(int(seconds * pose_hz) + 1):
-        history = history.extended(estimate(n / pose_hz))
+        history = history.append(estimate(n / pose_hz))
 
-    class Said:
-        """A localizer that has said all it will."""
+    class TrueEstimates:
+        """A localizer with exact estimates."""
 
         utime = history.last
 
         def estimate(self, utime: int) -> Estimate:
             return estimate((utime - T0) / S)
 
-    return PlatformView(model, BASE, Said(), history, joints=joints)  # type: ignore[arg-type]
+    return PlatformView(model, BASE, TrueEstimates(), history, joints=joints)  # type: ignore[arg-type]
 
 
 def truth(interest: str, reference: str, at: float, reference_at: float | None = None, fixed: str = UTM) -> Pose:
-    """Return the true pose of a frame in another, by the product of everything on the way."""
+    """Return the true pose of a frame in another, by the product of everything on the path."""
     there = _in_world(reference, at if reference_at is None else reference_at)
     return there.inverse() @ _in_world(interest, at)
 
@@ -163,10 +163,10 @@ _MODEL = rover(None)
 def _in_world(frame: str, seconds: float) -> Pose:
     if frame == UTM:
         return Pose.identity()
-    route = _MODEL.route(frame, BASE)
+    route = _MODEL.get_kinematic_path(frame, BASE)
     where = positions(seconds)
     placed = []
-    for leg in route.legs:
+    for leg in route.joints:
         drive = _MODEL.drives[leg.name]
         placed.append(tuple(drive.multiplier * where[name][0] + drive.offset for name in drive.names))
-    return vehicle(seconds) @ route.pose(placed)
+    return vehicle(seconds) @ route.compute_pose(placed)

@@ -1,4 +1,4 @@
-"""A machine with a real systemd for tests: this host's /usr booted in a container, with a wheel of this project in it.
+"""A machine with a real systemd for tests: this host's /usr booted in a container, with a wheel of this project.
 
 Nothing of the host is written: the container's root is a tmpfs of its own (`--volatile`), its network a loopback of its
 own, and all of it goes with its processes. What a test puts there comes through one folder.
@@ -45,7 +45,7 @@ def interpreter() -> str:
 
 
 @cache
-def why_not() -> str:
+def skip_reason() -> str:
     """Return why no container can be booted here, empty where one can."""
     if sys.platform != "linux":
         return "systemd is Linux's"
@@ -80,19 +80,19 @@ class Machine:
     def run(self, *command: str, check: bool = True, timeout: float = 30.0) -> subprocess.CompletedProcess[str]:
         """Run a command in the container."""
         done = subprocess.run(
-            self.inside(*command), capture_output=True, text=True, timeout=timeout, env=ENVIRONMENT, check=False
+            self.command_line(*command), capture_output=True, text=True, timeout=timeout, env=ENVIRONMENT, check=False
         )
         assert not check or done.returncode == 0, f"{command}: {done.stdout}\n{done.stderr}"
         return done
 
-    def inside(self, *command: str) -> list[str]:
+    def command_line(self, *command: str) -> list[str]:
         """Return the arguments that run a command in the container."""
         return ["nsenter", f"--target={self.leader}", "--all", *command]
 
     def systemctl(self, *arguments: str, check: bool = True) -> str:
         return self.run("systemctl", "--no-pager", *arguments, check=check).stdout.strip()
 
-    def shown(self, unit: str, name: str) -> str:
+    def get_property(self, unit: str, name: str) -> str:
         """Return a property of a unit."""
         return self.systemctl("show", "--value", f"--property={name}", unit)
 
@@ -103,7 +103,7 @@ class Machine:
 ENVIRONMENT = {"PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin", "LC_ALL": "C.UTF-8"}
 
 
-def built_wheel(folder: Path) -> Path:
+def build_wheel(folder: Path) -> Path:
     """Return a wheel of this project, built from its source."""
     command = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
@@ -113,7 +113,7 @@ def built_wheel(folder: Path) -> Path:
 
 
 @contextmanager
-def machine(folder: Path) -> Iterator[Machine]:
+def boot_machine(folder: Path) -> Iterator[Machine]:
     """Boot a container that sees `folder` as SHARED; it ends with the block."""
     name = f"modelserver-test-{os.getpid()}"
     console = folder / "console.log"

@@ -1,4 +1,4 @@
-"""Small recordings, made for a test: a straight drive to the east, as the sensors of config/husky would tell it."""
+"""Small synthetic recordings: a straight drive to the east with the sensors of config/husky."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LATENCY = 5_000
 
 
 def write_log(path: Path, events: Iterable[tuple[int, str, bytes]]) -> Path:
-    """Write events: arrival, channel, bytes. Returns the path."""
+    """Write events (time of arrival, channel, bytes) and return the path."""
     log = lcm.EventLog(str(path), "w", overwrite=True)
     for utime, channel, data in events:
         log.write_event(utime, channel, data)
@@ -34,7 +34,7 @@ def write_log(path: Path, events: Iterable[tuple[int, str, bytes]]) -> Path:
 def drive(seconds: float, prefix: str = "") -> list[tuple[int, str, bytes]]:
     """Return the events of a drive along grid east: IMU at 50 Hz, fixes at 5 Hz, by order of arrival.
 
-    The vehicle drives from the first sample on, and shakes as vehicles do.
+    The vehicle drives from the first sample on, with vibration.
     """
     to_geodetic = pyproj.Transformer.from_crs(32619, 4326, always_xy=True)
     shaken = random.Random(20050901).gauss

@@ -1,4 +1,4 @@
-"""A drive that is broken off and begun again by a localizer that recalls the first one's state."""
+"""A drive that is interrupted and continued by a localizer with the persisted state of the first run."""
 
 from __future__ import annotations
 
@@ -9,65 +9,73 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cache
 
-from modelserver.localization.filter.localizer import FilterLocalizer
-from modelserver.localization.filter.setup import Setup
-from modelserver.messages import Kept, Mode, Recalled, WheelsSample
+from modelserver.estimation.filter.localizer import FilterLocalizer
+from modelserver.estimation.filter.setup import Setup
+from modelserver.messages import Mode, PersistedState, RestoredState, WheelsSample
 from modelserver.simulation import DrivePhase, Event, Simulation, Trajectory
 from tests.support_filter import IMU, ORIGIN, PLAIN_GPS, RIG, WHEELS, WHEELS_MODEL, Run, drive, simulation
 
 FIRST, GAP = 40.0, 4.0
-"""Seconds of the first run, and until the second one hears its first sample."""
+"""Seconds of the first run, and until the second one receives its first sample."""
 
 TO_A_STOP = (DrivePhase(4.0), DrivePhase(2.0, 2.0, 0.0), DrivePhase(20.0, 2.0, 0.1), DrivePhase(2.0, 0.0))
-"""28 s: a vehicle that drove and stands; it stands on until what follows."""
+"""28 s: a vehicle that drove and stays stationary until what follows."""
 
 DRIVES_OFF = (DrivePhase(2.0, 2.0, 0.0), DrivePhase(20.0, 2.0, 0.1), DrivePhase(2.0, 0.0))
 
 
-def first_run(after: Sequence[DrivePhase] = (), seed: int = 1, seconds: float = FIRST) -> tuple[Run, Kept]:
-    """The run that is broken off, and what it kept."""
-    run, kept = _first_run(tuple(after), seed, seconds)
-    return replace(run, simulation=_fork(run.simulation)), kept
+def simulate_first_run(
+    after: Sequence[DrivePhase] = (), seed: int = 1, seconds: float = FIRST
+) -> tuple[Run, PersistedState]:
+    """Return the interrupted run and its persisted state."""
+    run, persisted = _simulate_first_run(tuple(after), seed, seconds)
+    return replace(run, simulation=_fork(run.simulation)), persisted
 
 
 @cache
-def _first_run(after: tuple[DrivePhase, ...], seed: int, seconds: float) -> tuple[Run, Kept]:
-    """Simulate a first run once for all tests of it; nobody may draw from its simulation but through `_fork`."""
+def _simulate_first_run(after: tuple[DrivePhase, ...], seed: int, seconds: float) -> tuple[Run, PersistedState]:
+    """Simulate a first run once for all tests of it; draw from its simulation only through `_fork`."""
     sim = simulation((*TO_A_STOP, *after, DrivePhase(200.0)), seed=seed)
     (sim._arrivals,) = itertools.tee(sim._arrivals, 1)
     run = drive(sim, seconds)
-    kept = run.localizer.kept()
-    assert kept is not None
-    return run, kept
+    persisted = run.localizer.get_state_to_persist()
+    assert persisted is not None
+    return run, persisted
 
 
 def _fork(sim: Simulation) -> Simulation:
-    """Return a simulation that continues like `sim`, which stays where it is."""
+    """Return a simulation that continues like `sim`, which does not advance."""
     fork = copy.copy(sim)
     fork._arrivals = copy.copy(sim._arrivals)
     return fork
 
 
-def second_run(
-    sim: Simulation, kept: Kept | None, gap: float, seconds: float, transform=None, age: float | None = None, **more
+def simulate_second_run(
+    sim: Simulation,
+    persisted: PersistedState | None,
+    gap: float,
+    seconds: float,
+    transform=None,
+    age: float | None = None,
+    **more,
 ) -> Run:
-    """The run that comes after; without `kept` it starts cold."""
-    recalled = None if kept is None else Recalled(kept, gap if age is None else age)
-    localizer = FilterLocalizer.start(Setup(RIG), ORIGIN, Mode.FULL, recalled)
+    """Simulate the next run; without `persisted` it starts cold."""
+    restored = None if persisted is None else RestoredState(persisted, gap if age is None else age)
+    localizer = FilterLocalizer.start(Setup(RIG), ORIGIN, Mode.FULL, restored)
     passed = {} if transform is None else {"transform": transform}
     return drive(sim, seconds, localizer=localizer, every=0.1, **passed, **more)
 
 
-def lose(sim: Simulation, seconds: float) -> None:
-    """Let samples pass that nobody hears."""
+def skip_samples(sim: Simulation, seconds: float) -> None:
+    """Skip the samples of some seconds."""
     for _ in sim.events(seconds):
         pass
 
 
-def elsewhere(
+def simulate_elsewhere(
     run: Run, gap: float, east: float, turn: float, phases: Sequence[DrivePhase], seed: int = 1
 ) -> Simulation:
-    """The vehicle of a run again, `east` metres away and turned by `turn` radians when the gap is over."""
+    """Simulate the vehicle of a run, `east` meters away and turned by `turn` radians when the gap is over."""
     true = run.simulation.truth(run.simulation.start_utime + round(FIRST * 1e6))
     x, y, _ = true.enu.xyz
     start = run.simulation.start_utime + round((FIRST + gap) * 1e6)
@@ -87,16 +95,16 @@ def elsewhere(
     )
 
 
-def counters_go_on(kept: Kept, rolled: tuple[float, float]):
-    """The wheels' driver has run on: numbers and ways go on from what was kept, and have rolled meanwhile."""
-    assert kept.pose is not None
-    ways = dict(kept.pose.wheels)
-    more = {"left": ways["left"] + rolled[0], "right": ways["right"] + rolled[1]}
+def continue_wheel_counters(persisted: PersistedState, rolled: tuple[float, float]):
+    """Continue sequence numbers and distances of the wheels' driver from the persisted ones, and roll meanwhile."""
+    assert persisted.pose is not None
+    distances = dict(persisted.pose.wheels)
+    more = {"left": distances["left"] + rolled[0], "right": distances["right"] + rolled[1]}
 
     def transform(events: Iterable[Event]) -> Iterable[Event]:
         for event in events:
             if isinstance(event, WheelsSample):
-                header = replace(event.header, seq=event.header.seq + kept.pose.wheels_seq + 40)
+                header = replace(event.header, seq=event.header.seq + persisted.pose.wheels_seq + 40)
                 wheels = tuple(replace(each, travel=each.travel + more[each.name]) for each in event.wheels)
                 yield replace(event, header=header, wheels=wheels)
             else:
@@ -105,24 +113,26 @@ def counters_go_on(kept: Kept, rolled: tuple[float, float]):
     return transform
 
 
-def first_valid(run: Run) -> float:
-    """Seconds from the first sample of the second run to its first valid pose, infinite where there is none."""
+def find_first_valid(run: Run) -> float:
+    """Return the seconds from the first sample of the second run to its first valid pose, infinite without one."""
     begin = run.rows[0].t
     return next((row.t - begin for row in run.rows if row.valid), math.inf)
 
 
-def longest_wrong(run: Run) -> float:
-    """The longest time, seconds, that a valid pose was off by more than its bound."""
+def find_longest_misleading(run: Run) -> float:
+    """Return the longest time, seconds, that the error of a valid pose exceeded its protection level."""
     longest, since = 0.0, None
     for row in run.rows:
         estimate = row.estimate
-        wrong = row.valid and (row.off > estimate.horizontal_bound or abs(row.heading) > estimate.heading_bound)
+        wrong = row.valid and (
+            row.off > estimate.horizontal_protection_level or abs(row.heading) > estimate.heading_protection_level
+        )
         since = (row.t if since is None else since) if wrong else None
         if since is not None:
             longest = max(longest, row.t - since)
     return longest
 
 
-def words(run: Run) -> list[str]:
-    """What the ledger says of what was kept."""
-    return [word.reason for word in run.said("kept")]
+def list_reasons(run: Run) -> list[str]:
+    """Return the reasons of the ledger entries about the warm start."""
+    return [word.reason for word in run.decisions("warm_start")]

@@ -1,4 +1,4 @@
-"""A small vehicle for tests of the service: its files, samples of a straight drive, and a localizer by script."""
+"""A small vehicle for tests of the server: its files, samples of a straight drive, and a scripted localizer."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import numpy as np
 
 from modelserver.core import CoreSettings, CoreState, Instant, start
 from modelserver.earth.geodesy import Geodesy, origin_at
+from modelserver.estimation.interface import LocalizerEvent
 from modelserver.geometry import Model, ModelBuilder, Sigma
-from modelserver.localization.interface import Note
 from modelserver.messages import (
-    SILENCE,
+    STALE_SENSORS,
     VALID,
     Decision,
     Estimate,
@@ -28,7 +28,7 @@ from modelserver.messages import (
     Mode,
     NavigationState,
     Origin,
-    OriginLatched,
+    PersistOrigin,
     Phase,
     Quality,
     Rejected,
@@ -38,7 +38,7 @@ from modelserver.messages import (
     SwitchMode,
     Verdict,
 )
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 START = 1_700_000_000_000_000
 ORIGIN = origin_at(50.27, -111.1, 700.0)
@@ -51,17 +51,19 @@ Fix: TypeAlias = GpsSample | ImuSample
 
 
 def cart(sigma: bool = False) -> Model:
-    """A cart with an antenna, an inertial unit and a camera, and a lamp that nothing joins to it."""
+    """Return a cart with antenna, IMU and camera, and a lamp that is not connected to it."""
     survey = Sigma((0.01, 0.02, 0.03), (0.001, 0.002, 0.003)) if sigma else None
     builder = ModelBuilder("cart")
-    body = builder.body("Cart")
-    body.frame("Base")
-    body.frame("Antenna", Pose((-0.4, 0.2, 1.2)))
-    body.frame("Imu", Pose((0.1, 0.0, 0.3)))
-    body.frame("Mast", Pose.from_rpy((0.5, 0.1, 1.0), 0.0, 0.2, 0.3), sigma=survey)
-    builder.body("Camera").frame("Origin")
-    builder.constraint("Mounted", "Cart:Mast", "Camera:Origin", Pose.from_rpy((0, 0, 0.1), 0.1, 0, 0.5), sigma=survey)
-    builder.body("Lamp").frame("Origin")
+    body = builder.add_body("Cart")
+    body.add_frame("Base")
+    body.add_frame("Antenna", Pose((-0.4, 0.2, 1.2)))
+    body.add_frame("Imu", Pose((0.1, 0.0, 0.3)))
+    body.add_frame("Mast", Pose.from_rpy((0.5, 0.1, 1.0), 0.0, 0.2, 0.3), sigma=survey)
+    builder.add_body("Camera").add_frame("Origin")
+    builder.add_constraint(
+        "Mounted", "Cart:Mast", "Camera:Origin", Pose.from_rpy((0, 0, 0.1), 0.1, 0, 0.5), sigma=survey
+    )
+    builder.add_body("Lamp").add_frame("Origin")
     return builder.build()
 
 
@@ -94,7 +96,7 @@ sensors:
 
 
 FORWARD = "filter: {reverse_speed: 1.5}"
-"""What the vehicle file says for `drive`: it starts at 2 m/s without wheels, so only this says that it is forward."""
+"""Setting for `drive`, which starts at 2 m/s without wheels: only this makes its direction forward."""
 
 
 def write_vehicle(folder: Path, vehicle: str = VEHICLE, geometry: str = GEOMETRY) -> Path:
@@ -109,7 +111,7 @@ def write_vehicle(folder: Path, vehicle: str = VEHICLE, geometry: str = GEOMETRY
 
 
 def gps(utime: int, east: float = 0.0, speed: float = 2.0, source: str = "gps") -> GpsSample:
-    """A fix with the receiver's own velocity, `east` metres from the origin, driving east."""
+    """Return a fix with velocity, `east` meters from the origin, driving east."""
     latitude, longitude, height = GEODESY.geodetic_from_enu((east, 0.0, 0.0))
     variance = 0.25
     return GpsSample(
@@ -125,15 +127,15 @@ def gps(utime: int, east: float = 0.0, speed: float = 2.0, source: str = "gps") 
 
 
 def imu(utime: int, source: str = "imu") -> ImuSample:
-    """What the inertial unit says on a level straight drive, shaken as on a vehicle; the same for the same instant."""
-    shaken = random.Random(utime).gauss
-    rate = (shaken(0.0, 0.02), shaken(0.0, 0.02), shaken(0.0, 0.02))
-    force = (shaken(0.0, 0.3), shaken(0.0, 0.3), 9.80665 + shaken(0.0, 0.3))
+    """Return the IMU sample of a level straight drive with vibration; the same for the same instant."""
+    noise = random.Random(utime).gauss
+    rate = (noise(0.0, 0.02), noise(0.0, 0.02), noise(0.0, 0.02))
+    force = (noise(0.0, 0.3), noise(0.0, 0.3), 9.80665 + noise(0.0, 0.3))
     return ImuSample(SensorHeader(utime, source), rate, force)
 
 
 def drive(seconds: float, start_utime: int = START, imu_hz: float = 50.0, gps_hz: float = 10.0) -> Iterator[Fix]:
-    """Samples of a drive due east at 2 m/s, by their stamps."""
+    """Yield the samples of a drive due east at 2 m/s, by their stamps."""
     every = round(imu_hz / gps_hz)
     for n in range(round(seconds * imu_hz)):
         t = n / imu_hz
@@ -143,59 +145,60 @@ def drive(seconds: float, start_utime: int = START, imu_hz: float = 50.0, gps_hz
             yield gps(utime, 2.0 * t)
 
 
-# --- a localizer by script ----------------------------------------------------------------------------------
+# --- a scripted localizer -----------------------------------------------------------------------------------
 
 
 _COVARIANCE = tuple(np.diag([0.04, 0.09, 0.16, 1e-4, 4e-4, 9e-4]).ravel().tolist())
 
 
 @dataclass(frozen=True)
-class Scripted:
-    """A localizer that does what a sample's source says.
+class ScriptedLocalizer:
+    """A localizer that is controlled by the source name of each sample.
 
-    `refuse:REASON` is refused; `reject:REASON` is rejected with a decision; `decide:N` is taken with N decisions;
-    `late` is taken and moves no time; `latch` sets the origin; `ignore` changes nothing; `break` raises; anything else
-    is taken. A wish for a mode is granted at its instant. It moves at 1 m/s and has a pose in the world from its first
-    sample. `stale_s` after the newest sample its estimates are invalid. With `filtering` it has a state.
+    `refuse:REASON` rejects the sample; `reject:REASON` rejects it with a decision; `decide:N` accepts it with N
+    decisions; `late` accepts it without a step in time; `latch` sets the origin; `ignore` changes nothing; `break`
+    raises; any other source is accepted. Mode requests are applied at once. The vehicle moves at 1 m/s and has a pose
+    in the world from its first sample. `stale_s` after the newest sample estimates are invalid. With `has_state` there
+    is a navigation state.
     """
 
     newest: int = 0
-    taken: int = 0
-    known: Origin | None = ORIGIN
+    count: int = 0
+    origin: Origin | None = ORIGIN
     epoch: int = 0
     stale_s: float = 1.0
     invalid: Invalid = VALID
     covariance: tuple[float, ...] = _COVARIANCE
     mode: Mode = Mode.FULL
-    filtering: bool = False
+    has_state: bool = False
 
     @property
     def utime(self) -> int:
         return self.newest
 
-    def take(self, sample: Sample | SwitchMode) -> tuple[Scripted, tuple[Note, ...]]:
-        order, _, word = sample.header.source.partition(":")
+    def process(self, sample: Sample | SwitchMode) -> tuple[ScriptedLocalizer, tuple[LocalizerEvent, ...]]:
+        command, _, argument = sample.header.source.partition(":")
         if isinstance(sample, SwitchMode):
             return replace(self, mode=sample.mode), ()
-        if order == "break":
+        if command == "break":
             raise RuntimeError("an error of the localizer's own:\nFORGED line \x1b[31m")
-        if order == "ignore":
+        if command == "ignore":
             return self, ()
-        if order == "refuse":
-            return replace(self, taken=self.taken), (Rejected(f"sensor:{sample.header.source}", word),)
-        if order == "reject":
-            return replace(self, taken=self.taken), (decided(sample, Verdict.REJECTED, word),)
-        if order == "late":
-            return replace(self, taken=self.taken + 1), ()
-        taken = replace(self, newest=sample.header.utime, taken=self.taken + 1)
-        if order == "latch":
-            return replace(taken, known=ORIGIN), (OriginLatched(ORIGIN),)
-        if order == "decide":
-            return taken, tuple(decided(sample, Verdict.USED, "", n) for n in range(int(word)))
-        return taken, ()
+        if command == "refuse":
+            return replace(self, count=self.count), (Rejected(f"sensor:{sample.header.source}", argument),)
+        if command == "reject":
+            return replace(self, count=self.count), (make_decision(sample, Verdict.REJECTED, argument),)
+        if command == "late":
+            return replace(self, count=self.count + 1), ()
+        accepted = replace(self, newest=sample.header.utime, count=self.count + 1)
+        if command == "latch":
+            return replace(accepted, origin=ORIGIN), (PersistOrigin(ORIGIN),)
+        if command == "decide":
+            return accepted, tuple(make_decision(sample, Verdict.USED, "", n) for n in range(int(argument)))
+        return accepted, ()
 
     def navigation(self, utime: int) -> NavigationState | None:
-        if not self.filtering:
+        if not self.has_state:
             return None
         return NavigationState(
             utime,
@@ -207,7 +210,7 @@ class Scripted:
             50.27,
             -111.1,
             700.0,
-            Pose((float(self.taken), 0.0, 0.0)),
+            Pose((float(self.count), 0.0, 0.0)),
             (1.0, 0.0, 0.0),
             (0.0, 0.0, 0.01),
             (),
@@ -216,13 +219,13 @@ class Scripted:
             (0.25,),
         )
 
-    def silence(self, utime: int) -> Invalid:
-        return self.estimate(utime).invalid & SILENCE
+    def find_stale_sensors(self, utime: int) -> Invalid:
+        return self.estimate(utime).invalid & STALE_SENSORS
 
     def summary(self, utime: int) -> LocalizerSummary:
-        return LocalizerSummary(self.mode, Phase.ALIGNED if self.filtering else None, False, self.newest)
+        return LocalizerSummary(self.mode, Phase.ALIGNED if self.has_state else None, False, self.newest)
 
-    def deferred(self, utime: int) -> Estimate:
+    def defer_estimate(self, utime: int) -> Estimate:
         return self.estimate(utime)
 
     def estimate(self, utime: int) -> Estimate:
@@ -232,7 +235,7 @@ class Scripted:
         invalid = self.invalid
         if utime > self.newest + self.stale_s * 1e6:
             invalid |= Invalid.STALE_IMU | Invalid.STALE_GPS
-        if self.known is None:
+        if self.origin is None:
             return Estimate(utime, Pose((x, 0, 0)), invalid=invalid | Invalid.NO_ORIGIN, pose_epoch=self.epoch)
         yaw = 0.01 * x
         return Estimate(
@@ -245,24 +248,24 @@ class Scripted:
             invalid,
             Quality.PREDICTED if utime > self.newest else Quality(0),
             self.epoch,
-            self.known,
+            self.origin,
             1.5,
             0.1,
             math.nan,
         )
 
 
-def decided(sample: Sample, verdict: Verdict, reason: str = "", number: int = 0) -> Decision:
-    """What became of a sample's one measurement."""
+def make_decision(sample: Sample, verdict: Verdict, reason: str = "", number: int = 0) -> Decision:
+    """Return the decision on a sample's one measurement."""
     header = sample.header
     return Decision(header.utime, header.source, header.seq, f"speed_{number}", verdict, reason, (0.5,), (1.0,), (0.5,))
 
 
-def now_at(utime: int) -> Instant:
-    """The instant at which the host's clock says `utime`."""
+def instant_at(utime: int) -> Instant:
+    """Return the instant at which the host's clock reads `utime`."""
     return Instant((utime - START) * 1000 + 10_000_000_000, utime)
 
 
-def started(localizer: Scripted | None = Scripted(), **settings: object) -> CoreState:
-    """The core of the cart in its first state, at START."""
-    return start(CoreSettings("Cart:Base", vehicle="cart", **settings), cart(), localizer, now_at(START))  # type: ignore[arg-type]
+def start_core(localizer: ScriptedLocalizer | None = ScriptedLocalizer(), **settings: object) -> CoreState:
+    """Return the initial core state of the cart at START."""
+    return start(CoreSettings("Cart:Base", vehicle="cart", **settings), cart(), localizer, instant_at(START))  # type: ignore[arg-type]

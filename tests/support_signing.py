@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from modelserver.keys import write_key
 from modelserver.messages import CHANNEL_OF, Envelope
-from modelserver.signing import Key, sealed
+from modelserver.signing.key_files import write_key
+from modelserver.signing.signatures import Key, sign
 from modelserver.wire.codec import encode
 
 KEY = Key("test", bytes(range(32)))
@@ -35,4 +35,4 @@ def envelope(
     """Return a signed envelope with a message."""
     channel = channel or CHANNEL_OF.get(type(payload), "LOCALIZATION_MODE")
     data = payload if isinstance(payload, bytes) else encode(payload)
-    return sealed(key, prefix, Envelope("", sender, utime, counter, channel, data))
+    return sign(key, prefix, Envelope("", sender, utime, counter, channel, data))

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from modelserver.spatial import Pose, so3
+from modelserver.transforms import Pose, so3
 
 TINY = (0.0, 5e-324, 1e-300, 1e-160, 1e-16, 1e-12, 1e-8, 1e-6, 0.99e-4, 1.01e-4, 1e-3)
 
@@ -24,7 +24,7 @@ _angle = st.one_of(
 def _about(axis, angle):
     n = math.hypot(*axis)
     s = math.sin(angle / 2) / n
-    return so3.normalized((math.cos(angle / 2), axis[0] * s, axis[1] * s, axis[2] * s))
+    return so3.normalize((math.cos(angle / 2), axis[0] * s, axis[1] * s, axis[2] * s))
 
 
 axes = st.one_of(_unit, st.sampled_from([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)]))

@@ -1,4 +1,4 @@
-"""A simulated drive of the Raptor as a log with its vehicle file, for tests of tools that look at a whole drive."""
+"""A simulated drive of the Raptor as a log with its vehicle file, for tests of tools that process a whole drive."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import Any
 import yaml
 from support_recordings import REPOSITORY, write_log
 
-from modelserver.config import load_config
+from modelserver.config.vehicle_file import load_config
 from modelserver.earth.geodesy import origin_at
 from modelserver.messages import GpsSample, ImuSample, WheelsSample
-from modelserver.service.daemon import load_vehicle
+from modelserver.server.vehicle import load_vehicle
 from modelserver.simulation import ImuModel, Simulation, Timing, Trajectory, figure_eight
 from modelserver.wire.codec import encode
 
 RAPTOR = REPOSITORY / "config" / "raptor" / "vehicle.yaml"
 
 
-def simulated(folder: Path, seconds: float, **models: Any) -> tuple[Path, Path]:
-    """Write the log of a drive round eights; `models` go to the `Simulation`. Return it and the vehicle file."""
+def write_simulated_log(folder: Path, seconds: float, **models: Any) -> tuple[Path, Path]:
+    """Write the log of a figure-eight drive; `models` go to the `Simulation`. Return log and vehicle file."""
     config = load_config(RAPTOR)
     vehicle = load_vehicle(config, str(RAPTOR))
     sensors = config.sensors
@@ -30,7 +30,7 @@ def simulated(folder: Path, seconds: float, **models: Any) -> tuple[Path, Path]:
     drive = Simulation(
         vehicle.model,
         config.base_frame,
-        Trajectory(figure_eight(speed=3.0, radius=8.0, stand=4.0, ramp=2.0, laps=8)),
+        Trajectory(figure_eight(speed=3.0, radius=8.0, stationary=4.0, ramp=2.0, laps=8)),
         origin_at(50.27, -111.18, 700.0),
         gps_frame=sensors.gps.frame,
         imu_frame=sensors.imu.frame,
@@ -44,8 +44,8 @@ def simulated(folder: Path, seconds: float, **models: Any) -> tuple[Path, Path]:
     return write_log(folder / "drive.lcm", events), RAPTOR
 
 
-def in_raw_mode(vehicle: Path, folder: Path) -> Path:
-    """Write a vehicle file as another one, in raw mode."""
+def write_raw_mode_vehicle(vehicle: Path, folder: Path) -> Path:
+    """Write a copy of a vehicle file with raw mode; return its path."""
     content = yaml.safe_load(vehicle.read_text(encoding="utf-8"))
     content["geometry"] = str((vehicle.parent / content["geometry"]).resolve())
     content.setdefault("localization", {})["mode"] = "raw"

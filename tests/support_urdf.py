@@ -10,7 +10,7 @@ from support_spatial import axes, poses
 
 from modelserver.geometry import Joint, JointType, Material, Mimic, Model, ModelBuilder, Shape, ShapeKind
 from modelserver.geometry.inertia import RigidInertia
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 URDF = """\
 <?xml version="1.0"?>
@@ -70,7 +70,7 @@ coordinate_frames {
   laser {
     relative_to = "body";
     initial_transform {
-      translation = [ 0.5, 0, 0.25 ];  # metres
+      translation = [ 0.5, 0, 0.25 ];  # meters
       rpy = [ 0, 90, 0 ];
     }
   }
@@ -80,12 +80,12 @@ coordinate_frames {
 
 def pose_at(model: Model, interest: str, reference: str, values: dict[str, float]) -> Pose:
     """Return where a frame is in another with each coordinate at its value; joints that follow are taken along."""
-    route = model.route(interest, reference)
+    route = model.get_kinematic_path(interest, reference)
     positions = []
-    for leg in route.legs:
+    for leg in route.joints:
         drive = model.drives[leg.name]
         positions.append(tuple(drive.multiplier * values[name] + drive.offset for name in drive.names))
-    return route.pose(positions)
+    return route.compute_pose(positions)
 
 
 def coordinates_of(model: Model) -> list[str]:
@@ -95,8 +95,8 @@ def coordinates_of(model: Model) -> list[str]:
 
 texts = st.text(st.characters(exclude_categories=("C", "Z")), min_size=1, max_size=12)
 sizes = st.floats(0, 10)
-colours = st.tuples(*[st.floats(0, 1)] * 4)
-materials = st.builds(Material, texts, st.none() | colours, st.just("") | texts)
+colors = st.tuples(*[st.floats(0, 1)] * 4)
+materials = st.builds(Material, texts, st.none() | colors, st.just("") | texts)
 _looks = {"name": st.just("") | texts, "material": st.none() | materials}
 shapes = st.one_of(
     st.builds(Shape, st.just(ShapeKind.BOX), st.tuples(sizes, sizes, sizes), poses, **_looks),
@@ -117,7 +117,7 @@ def inertias(draw):
         (0, mass * (x * x + z * z) / 12, 0),
         (0, 0, mass * (x * x + y * y) / 12),
     )
-    return RigidInertia.turned(mass, draw(poses), moments)
+    return RigidInertia.from_moments(mass, draw(poses), moments)
 
 
 limits = (
@@ -150,18 +150,18 @@ def jointed_models(draw):
     leaders: list[str] = []
     for number, name in enumerate(bodies):
         inertia = draw(st.none() | inertias())
-        body = builder.body(name, inertia=None if inertia is None else inertia.matrix())
+        body = builder.add_body(name, inertia=None if inertia is None else inertia.matrix())
         body.visuals = tuple(draw(st.lists(shapes, max_size=2)))
         body.collisions = tuple(draw(st.lists(colourless, max_size=2)))
         some_pose = st.just(Pose()) | poses
         for frame in [f"on{each}" for each in range(number + 1, len(bodies))]:
-            body.frame(frame, draw(some_pose))
-        body.frame("Origin", draw(some_pose)).frame("base", draw(some_pose))
+            body.add_frame(frame, draw(some_pose))
+        body.add_frame("Origin", draw(some_pose)).add_frame("base", draw(some_pose))
         if number:
             ends = (f"{draw(st.sampled_from(bodies[:number]))}:on{number}", f"{name}:base")
             forward = draw(st.booleans())
             joint = draw(joints(forward, leaders))
-            builder.constraint(f"c{number}", *(ends if forward else ends[::-1]), draw(some_pose), joint=joint)
+            builder.add_constraint(f"c{number}", *(ends if forward else ends[::-1]), draw(some_pose), joint=joint)
             if joint.count == 1:
                 leaders.append(f"c{number}")
     return builder.build()

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from modelserver.messages import Direction, JointsSample, SensorHeader, VehicleStatusSample, WheelSample, WheelsSample
-from msdrivers.devices.axis_settings import AxisSettings, NodMap
-from msdrivers.devices.vehicle_settings import LimitsMap, VehicleSettings
+from msdrivers.devices.axis_settings import AxisSettings, NodSettings
+from msdrivers.devices.vehicle_settings import CommandLimits, VehicleSettings
 from msdrivers.devices.wheels import WheelsSettings
+from msdrivers.endpoint import Endpoint, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
 from msdrivers.protocol.can.database import CanDatabase, parse_dbc
 from msdrivers.protocol.can.mapping import (
     CommandMap,
@@ -23,21 +24,20 @@ from msdrivers.protocol.can.mapping import (
     WheelMap,
 )
 from msdrivers.protocol.modbus.axis_map import AxisRegisters
-from msdrivers.protocol.modbus.numbers import RegisterMap
-from msdrivers.station import Measured, Now, Output, Reopen, Send, Station, StationStatus
+from msdrivers.protocol.modbus.registers import RegisterMap
 
 START_UTIME = 1_750_000_000_000_000
 START_NS = 5_000_000_000
 DBC = Path(__file__).parents[1] / "config" / "raptor" / "raptor.dbc"
-METRES_PER_COUNT = 0.0125
+METERS_PER_COUNT = 0.0125
 DEG = math.pi / 180.0
 
 U = TypeVar("U")
 
 
-def at(seconds: float) -> Now:
+def at(seconds: float) -> HostTime:
     """Return the instant `seconds` after the start."""
-    return Now(START_NS + round(seconds * 1e9), START_UTIME + round(seconds * 1e6))
+    return HostTime(START_NS + round(seconds * 1e9), START_UTIME + round(seconds * 1e6))
 
 
 def raptor_dbc() -> CanDatabase:
@@ -46,10 +46,10 @@ def raptor_dbc() -> CanDatabase:
 
 def wheel(side: str, **changes: object) -> WheelMap:
     parts = {
-        "count": CountMap(f"WheelCounts.Front{side}Count", METRES_PER_COUNT),
+        "count": CountMap(f"WheelCounts.Front{side}Count", METERS_PER_COUNT),
         "speed": SpeedMap(f"WheelSpeeds.Front{side}Speed", is_magnitude=True, sigma=0.05),
         "direction": DirectionMap(f"WheelCounts.Front{side}Direction"),
-        "steers": True,
+        "is_steered": True,
     }
     return WheelMap(**{**parts, **changes})  # type: ignore[arg-type]
 
@@ -68,14 +68,14 @@ RAPTOR_STATUS = StatusMap(
     supply_voltage=SignalMap("VehiclePower.SupplyVoltage"),
     engine_speed=SignalMap("VehiclePower.EngineSpeed", math.pi / 30.0),
     fault_bits="VehicleStatus.FaultBits",
-    commands_refused="VehicleStatus.CommandsRefused",
+    commands_rejected="VehicleStatus.CommandsRefused",
 )
 RAPTOR_COMMAND = CommandMap(
     forward_speed=SignalMap("VehicleCommand.ForwardSpeed"),
     steering_angle=SignalMap("VehicleCommand.SteeringAngle", DEG),
     alive="VehicleCommand.Alive",
-    driving={"Enable": 1},
-    stopping={"Enable": 0},
+    drive_signals={"Enable": 1},
+    stop_signals={"Enable": 0},
 )
 
 
@@ -85,7 +85,7 @@ def vehicle_settings(**changes: object) -> VehicleSettings:
         "dbc": "raptor.dbc",
         "status": RAPTOR_STATUS,
         "command": RAPTOR_COMMAND,
-        "limits": LimitsMap(forward_speed=3.0, reverse_speed=1.0, steering_angle=0.5),
+        "limits": CommandLimits(forward_speed=3.0, reverse_speed=1.0, steering_angle=0.5),
     }
     return VehicleSettings(**{**values, **changes})  # type: ignore[arg-type]
 
@@ -93,7 +93,7 @@ def vehicle_settings(**changes: object) -> VehicleSettings:
 AXIS_REGISTERS = AxisRegisters(
     angle=RegisterMap(0, 2, scale_deg=0.072),
     rate=RegisterMap(2, scale_deg=0.01),
-    number=RegisterMap(3, is_signed=False),
+    sequence=RegisterMap(3, is_signed=False),
     lower_limit=RegisterMap(16, 2, scale_deg=0.072),
     upper_limit=RegisterMap(18, 2, scale_deg=0.072),
     nod_rate=RegisterMap(20, is_signed=False, scale_deg=0.01),
@@ -105,15 +105,15 @@ def axis_settings(**changes: object) -> AxisSettings:
         "source": "front_axis",
         "joint": "FrontNodding",
         "registers": AXIS_REGISTERS,
-        "nod": NodMap(-30.24, 20.16, 45.0),
+        "nod": NodSettings(-30.24, 20.16, 45.0),
     }
     return AxisSettings(**{**values, **changes})  # type: ignore[arg-type]
 
 
-def rolling(
+def rolling_samples(
     seconds: float, speed: Callable[[float], float], hz: float = 100.0, names: tuple[str, ...] = ("front_left",)
 ) -> Iterator[WheelsSample]:
-    """Yield what wheels say that all roll at `speed(t)`, m/s; travel is its sum."""
+    """Yield samples of wheels that all roll at `speed(t)`, m/s; travel is its integral."""
     travel = 0.0
     for k in range(round(seconds * hz) + 1):
         t = k / hz
@@ -129,35 +129,35 @@ def rolling(
 
 @dataclass
 class Wire(Generic[U]):
-    """Carries units between a host's and a device's station; each takes `flight_s`. A line that breaks is opened anew
+    """Carries units between a host's and a device's station; each takes `flight_s`. A line that breaks is reopened
     after `reopen_s`. `spoil` may change, drop or add to what comes to the host."""
 
-    host: Station[U]
-    device: Station[U]
+    host: Endpoint[U]
+    device: Endpoint[U]
     flight_s: float = 0.001
     reopen_s: float = 0.1
-    spoil: Callable[[U, float], list[U]] = lambda unit, t: [unit]
+    corrupt: Callable[[U, float], list[U]] = lambda unit, t: [unit]
     t: float = 0.0
-    samples: list[tuple[float, Measured]] = field(default_factory=list)
-    told: list[tuple[float, StationStatus]] = field(default_factory=list)
-    reopened: list[tuple[float, Reopen]] = field(default_factory=list)
+    samples: list[tuple[float, MeasuredSample]] = field(default_factory=list)
+    statuses: list[tuple[float, EndpointStatus]] = field(default_factory=list)
+    reopens: list[tuple[float, Reopen]] = field(default_factory=list)
     to_host: list[tuple[float, U]] = field(default_factory=list)
     to_device: list[tuple[float, U]] = field(default_factory=list)
     sent: list[tuple[float, U]] = field(default_factory=list)
     _open_at: float | None = 0.0
-    _begun: bool = False
+    _is_started: bool = False
 
     def run(self, until: float) -> Wire[U]:
         """Carry on until an instant, in seconds after the start."""
-        if not self._begun:
-            self._begun = True
-            self._from_device(self.device.opened(at(self.t)))
+        if not self._is_started:
+            self._is_started = True
+            self._from_device(self.device.on_open(at(self.t)))
         while True:
             nexts = [each[0] for each in (self.to_host[:1] + self.to_device[:1])]
             if self._open_at is not None:
                 nexts.append(self._open_at)
             for station, is_open in ((self.host, self._open_at is None), (self.device, True)):
-                due = station.due()
+                due = station.get_deadline()
                 if due is not None and is_open:
                     nexts.append(max(self.t, (due - START_NS) * 1e-9))
             if not nexts or min(nexts) > until:
@@ -166,47 +166,47 @@ class Wire(Generic[U]):
             self.t = min(nexts)
             self._step()
 
-    def command(self, ask: Callable[[Now], list[Output[U]]]) -> None:
-        """Let the host do what it does on a wish."""
+    def send_command(self, ask: Callable[[HostTime], list[Output[U]]]) -> None:
+        """Execute the host's outputs for a command."""
         self._from_host(ask(at(self.t)))
 
     def values(self, begin: float = 0.0) -> list[WheelsSample | VehicleStatusSample | JointsSample]:
         """Return the samples since an instant."""
         return [each.sample for t, each in self.samples if t >= begin]  # type: ignore[misc]
 
-    def texts(self) -> str:
-        return "\n".join(f"{told.phase.value}: {told.text}" for _, told in self.told)
+    def status_text(self) -> str:
+        return "\n".join(f"{status.phase.value}: {status.text}" for _, status in self.statuses)
 
     def _step(self) -> None:
         now = at(self.t)
         if self._open_at is not None and self._open_at <= self.t:
             self._open_at = None
-            self._from_host(self.host.opened(now))
+            self._from_host(self.host.on_open(now))
         while self.to_host and self.to_host[0][0] <= self.t:
             _, unit = self.to_host.pop(0)
-            for each in self.spoil(unit, self.t) if self._open_at is None else []:
-                self._from_host(self.host.received(each, now))
+            for each in self.corrupt(unit, self.t) if self._open_at is None else []:
+                self._from_host(self.host.on_receive(each, now))
         while self.to_device and self.to_device[0][0] <= self.t:
             _, unit = self.to_device.pop(0)
-            self._from_device(self.device.received(unit, now))
-        due = self.host.due()
+            self._from_device(self.device.on_receive(unit, now))
+        due = self.host.get_deadline()
         if due is not None and self._open_at is None and due <= now.monotonic_ns:
-            self._from_host(self.host.woken(now))
-        due = self.device.due()
+            self._from_host(self.host.on_timer(now))
+        due = self.device.get_deadline()
         if due is not None and due <= now.monotonic_ns:
-            self._from_device(self.device.woken(now))
+            self._from_device(self.device.on_timer(now))
 
     def _from_host(self, outputs: object) -> None:
         for output in outputs:  # type: ignore[attr-defined]
             if isinstance(output, Send):
                 self.sent.append((self.t, output.unit))
                 self.to_device.append((self.t + self.flight_s, output.unit))
-            elif isinstance(output, Measured):
+            elif isinstance(output, MeasuredSample):
                 self.samples.append((self.t, output))
-            elif isinstance(output, StationStatus):
-                self.told.append((self.t, output))
+            elif isinstance(output, EndpointStatus):
+                self.statuses.append((self.t, output))
             elif isinstance(output, Reopen):
-                self.reopened.append((self.t, output))
+                self.reopens.append((self.t, output))
                 self._open_at = self.t + self.reopen_s
                 self.to_host.clear()
                 return

@@ -39,8 +39,6 @@ from modelserver.messages import (
     JointSample,
     JointsSample,
     LocalizationHealth,
-    ManyPoses,
-    ManyReply,
     Mode,
     MotionAnswer,
     MotionReply,
@@ -51,9 +49,12 @@ from modelserver.messages import (
     Phase,
     Policy,
     PoseAnswer,
+    PoseBatch,
+    PoseBatchReply,
     PublishDecisions,
     Quality,
     RangeSample,
+    RejectedCount,
     RelativePoseSample,
     ReloadModel,
     ReloadReply,
@@ -75,8 +76,8 @@ from modelserver.messages import (
     WheelsSample,
     YawSource,
 )
-from modelserver.spatial.pose import Pose
-from modelserver.spatial.transformation import Transformation
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.transformation import Transformation
 
 UTIME = 1_700_000_000_123_456
 _SENSOR = SensorHeader(UTIME, "front", 7, UTIME + 900, 123_456, 1e-4)
@@ -87,12 +88,12 @@ _TIME = TimeQuery(UTIME, Policy.PREDICTED, 250)
 _NINE = (1.0, 0.1, 0.2, 0.1, 2.0, 0.3, 0.2, 0.3, 3.0)
 
 
-def many_poses(covariances: bool) -> ManyPoses:
-    """Return some poses at three instants, the last without an answer; names and instants are left to the question."""
+def many_poses(covariances: bool) -> PoseBatch:
+    """Return some poses at three instants, the last without an answer; names and instants are those of the request."""
     vectors = np.arange(21.0).reshape(3, 7)
     vectors[2] = math.nan
     number = np.array([0, 0, 5], dtype=np.int32)
-    return ManyPoses(
+    return PoseBatch(
         "", "", np.zeros(3, dtype=np.int64), vectors, number, number + 1, number + 2, number - 7,
         np.arange(108.0).reshape(3, 36) if covariances else None,
         answer().origin if covariances else None,
@@ -101,7 +102,7 @@ def many_poses(covariances: bool) -> ManyPoses:
 
 
 def answer(epoch: int = 3) -> PoseAnswer:
-    """Return a pose with all that can stand beside it."""
+    """Return a pose with all fields."""
     return PoseAnswer(
         Transformation(
             "Raptor:CG",
@@ -123,7 +124,7 @@ def answer(epoch: int = 3) -> PoseAnswer:
 
 
 def bare_answer() -> PoseAnswer:
-    """Return a pose that does not change, with nothing beside it."""
+    """Return a static pose without optional fields."""
     return PoseAnswer(Transformation("Camera:Image", "Raptor:CG", Pose((0.299, -0.056, 0.433))))
 
 
@@ -167,7 +168,7 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
             _SENSOR, (0.1, 0.2, 0.3), (0.0, 0.0, 9.81), (1e-5, 2e-5, -4e-5), (1.0, 0.0, 0.0, 0.0),
             OrientationReference.NED, YawSource.MAGNETIC, _NINE, _NINE, _NINE, 36.5,
         ),
-        # all zeros is a measurement, not silence
+        # all zeros is a measurement, not a missing value
         ImuSample(_SENSOR, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
     ),
     "wheels_t": (
@@ -213,7 +214,7 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
     ),
     "navigation_state_t": (
         NavigationState(
-            UTIME, Mode.FULL, Phase.LEVELLING, False, Invalid.NO_FIX, 0, math.nan, math.nan, math.nan, Pose(),
+            UTIME, Mode.FULL, Phase.LEVELING, False, Invalid.NO_FIX, 0, math.nan, math.nan, math.nan, Pose(),
             (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (), (), (), (),
         ),
         state(),
@@ -243,9 +244,9 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
         GetTransformations(_REQUEST, (("a:b", "c:d"), ("Räptor:CG", "")), (UTIME, 0, 5), "Odom:Origin", 7, False),
     ),
     "get_transformations_reply_t": (
-        ManyReply(_UNKNOWN),
-        ManyReply(_OK, 2, 3, 1, 600, many_poses(True)),
-        ManyReply(_OK, 0, 1, 0, 0, many_poses(False)),
+        PoseBatchReply(_UNKNOWN),
+        PoseBatchReply(_OK, 2, 3, 1, 600, many_poses(True)),
+        PoseBatchReply(_OK, 0, 1, 0, 0, many_poses(False)),
     ),
     "get_motion_request_t": (
         GetMotion(_REQUEST, "Raptor:CG", "World:UTM"),
@@ -276,8 +277,8 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
                 (
                     EdgeReport("vehicle", "World:UTM", False, ("World:UTM", "Raptor:CG"), Pose((1.0, 2.0, 3.0)),
                                "predicted", UTIME, -0.25, "localization", (), 0.75, 1.0),
-                    EdgeReport("joint", "Nod", True, ("a:b", "c:d"), Pose.from_rpy((0, 0, 0), 0.1, 0.2, 0.3), "at_rest",
-                               coordinates=(0.1, 0.2, 0.3), doubt="never heard"),
+                    EdgeReport("joint", "Nod", True, ("a:b", "c:d"), Pose.from_rpy((0, 0, 0), 0.1, 0.2, 0.3), "default",
+                               coordinates=(0.1, 0.2, 0.3), warning="no sample received"),
                 ),
             ),
         ),
@@ -298,12 +299,12 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
             math.nan, math.nan,
         ),
         Health(
-            UTIME, 99.5, "0.1.0", "raptor", "ab12", 1, Invalid(0), 2, -77, 4950, 12, 1, 3, 1, 1e-4, 2e-3,
-            (ChannelHealth("sensor:gps", 99, 1.0, 0.4, 2e-3), ChannelHealth("IMU", 0, 0.0, math.nan, math.nan, True)),
-            (("GPS", "truncated", 4), ("sensor:gps", "stale", 1)),
-            (("journal", "the disk is full"),),
-            5e-4, 1e-3, "raptor-pc", 4711, 3, 150_000_000, 0.125,
+            UTIME, 99.5, "0.1.0", "raptor", "ab12", 1, Invalid(0), 2, -77, 4950, 12, 1, 3, 1, 1e-4, 5e-4, 1e-3, 2e-3,
+            "no GPS", "raptor-pc", 4711, 3, 150_000_000, 0.125,
             LocalizationHealth(Mode.NO_GPS, Phase.ALIGNED, True, 1.5, 0.05, 12.0, 0.3),
+            (ChannelHealth("sensor:gps", 99, 1.0, 0.4, 2e-3), ChannelHealth("IMU", 0, 0.0, math.nan, math.nan, True)),
+            (RejectedCount("GPS", "truncated", 4), RejectedCount("sensor:gps", "stale", 1)),
+            (("journal", "the disk is full"),),
         ),
     ),
     "vehicle_status_t": (
@@ -321,7 +322,7 @@ EXAMPLES: dict[str, tuple[Any, ...]] = {
     "pose_transform_t": (answer(), bare_answer()),
     "pose_vector_t": (answer(), bare_answer()),
 }  # fmt: skip
-"""Values of each type: with everything that can be left out left out, and with everything given."""
+"""Values of each type, without and with the optional fields."""
 
 
 def same(left: Any, right: Any) -> bool:

@@ -1,8 +1,7 @@
 #!/usr/bin/env python3
-"""Write what follows from the wire contract anew: `make types`.
+"""Regenerate what follows from the wire contract: `make types`.
 
-lcmtypes/mslcm and lcmtypes/contract.lock come from lcmtypes/*.lcm, the table of channels in docs/wire.md from
-modelserver/wire/channels.py.
+lcmtypes/mslcm and lcmtypes/contract.lock come from lcmtypes/*.lcm.
 """
 
 from __future__ import annotations
@@ -15,27 +14,16 @@ import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from modelserver.wire.channels import CHANNELS, ChannelUse
-from mstools.spy.lcm_wheel import binary
+import message_generator
+
+from mstools.spy.lcm_wheel import find_binary
 
 ROOT = Path(__file__).resolve().parent.parent
 TYPES = ROOT / "lcmtypes"
-WIRE_PAGE = ROOT / "docs" / "wire.md"
-
-SPEAKERS = {
-    ChannelUse.SENSOR: "driver",
-    ChannelUse.REQUEST: "client",
-    ChannelUse.BROADCAST: "service",
-    ChannelUse.COMMAND: "whoever commands",
-    ChannelUse.REPORT: "driver",
-}
-
-TABLE_BEGIN = "<!-- channels: written by `make types` -->\n"
-TABLE_END = "<!-- end of channels -->\n"
 
 LOCK_HEADER = """\
-# The wire contract: every type and its fingerprint, which lcm-gen works out from the names, types and sizes of
-# the fields (not from comments and constants), and from those of the types that it nests.
+# The wire contract: every type and its fingerprint, which lcm-gen computes from the names, types and sizes of
+# the fields (not from comments and constants), and from those of the nested types.
 #
 # A changed fingerprint means that programs built before and after do not understand each other on that channel.
 # Until version 1.0 a change is free: edit the .lcm file, `make types`, commit both, note it in CHANGELOG.md.
@@ -47,7 +35,7 @@ LOCK_HEADER = """\
 def generate(types: Path, folder: Path) -> None:
     """Write the Python package mslcm of the .lcm files in `types` into `folder`."""
     files = sorted(types.glob("*.lcm"))
-    subprocess.run([binary("lcm-gen"), "--python", "--ppath", folder, *files], check=True)
+    subprocess.run([find_binary("lcm-gen"), "--python", "--ppath", folder, *files], check=True)
 
 
 def read_fingerprints(folder: Path, names: Iterable[str]) -> dict[str, str]:
@@ -63,7 +51,7 @@ def read_fingerprints(folder: Path, names: Iterable[str]) -> dict[str, str]:
     return dict(line.split() for line in done.stdout.splitlines())
 
 
-def lock_text(fingerprints: Mapping[str, str]) -> str:
+def format_lock(fingerprints: Mapping[str, str]) -> str:
     """Return the text of contract.lock."""
     return LOCK_HEADER + "".join(f"{name} 0x{fingerprints[name]}\n" for name in sorted(fingerprints))
 
@@ -73,20 +61,28 @@ def read_lock(text: str) -> dict[str, str]:
     return dict(re.findall(r"^(\w+) 0x([0-9a-f]{16})$", text, re.MULTILINE))
 
 
-def with_table(page: str) -> str:
-    """Return a page with the table of channels between its two marks written anew."""
-    before, _, rest = page.partition(TABLE_BEGIN)
-    _, _, after = rest.partition(TABLE_END)
-    rows = ["| channel | type | who speaks | how often | what |", "|---|---|---|---|---|"]
-    rows += [
-        f"| `{each.name}` | `{each.type_name}` | {SPEAKERS[each.way]} | {each.rate} | {each.about} |"
-        for each in CHANNELS
-    ]
-    return before + TABLE_BEGIN + "\n".join(rows) + "\n" + TABLE_END + after
+def generate_modules(types: Path, fingerprints: Mapping[str, str]) -> dict[str, str]:
+    """Return the formatted text of each generated Python module by its path in the repository."""
+    texts = message_generator.generate(types, fingerprints)
+    messages = "modelserver/messages"
+    texts[f"{messages}/__init__.py"] = message_generator.index_of(
+        ROOT / messages,
+        message_generator.ABOUT_MESSAGES,
+        {Path(path).name: text for path, text in texts.items() if path.startswith(messages)},
+    )
+    return {path: format_python(text, path) for path, text in texts.items()}
+
+
+def format_python(text: str, path: str) -> str:
+    """Return Python code without unused imports, with sorted ones, formatted."""
+    for command in (("check", "--fix-only", "--quiet"), ("format", "--quiet")):
+        ruff = [sys.executable, "-m", "ruff", *command, "--stdin-filename", str(ROOT / path), "-"]
+        text = subprocess.run(ruff, input=text, capture_output=True, text=True, check=True).stdout
+    return text
 
 
 def main() -> int:
-    """Write all of it, and say what changed in the contract."""
+    """Write all files, and print the changes of the contract."""
     names = [path.stem for path in sorted(TYPES.glob("*.lcm"))]
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
@@ -100,11 +96,12 @@ def main() -> int:
             shutil.copyfile(folder / "mslcm" / name, TYPES / "mslcm" / name)
     lock = TYPES / "contract.lock"
     before = read_lock(lock.read_text(encoding="utf-8")) if lock.exists() else {}
-    lock.write_text(lock_text(fingerprints), encoding="utf-8")
-    WIRE_PAGE.write_text(with_table(WIRE_PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    lock.write_text(format_lock(fingerprints), encoding="utf-8")
+    for path, text in generate_modules(TYPES, fingerprints).items():
+        (ROOT / path).write_text(text, encoding="utf-8")
     for name in sorted(before.keys() | fingerprints.keys()):
         if before.get(name) != fingerprints.get(name):
-            print(f"{name}: {before.get(name, 'new')} -> {fingerprints.get(name, 'gone')}")
+            print(f"{name}: {before.get(name, 'new')} -> {fingerprints.get(name, 'removed')}")
     return 0
 
 

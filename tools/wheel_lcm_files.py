@@ -1,4 +1,4 @@
-"""Build hook of hatch: a wheel has the .lcm files in the package of the Python that is generated from them."""
+"""Build hook of hatch: a wheel contains the .lcm files in the package of the generated Python."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ class LcmFilesHook(BuildHookInterface):
     """Adds every lcmtypes/NAME.lcm as mslcm/lcm/NAME.lcm."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Tell hatch of the files before it builds a wheel."""
+        """Add the files to hatch's build data."""
         for file in sorted(Path(self.root, "lcmtypes").glob("*.lcm")):
             build_data["force_include"][str(file)] = f"mslcm/lcm/{file.name}"

@@ -7,14 +7,14 @@ the delay where it is largest (the tests hold them):
   accelerations m/s2 (their mean has length 9.78).
 - **The accelerometer has the other sign than the gyro.** `ax, ay, az` are the reaction turned round (gravity's own
   direction: az = -9.6): -ax goes with the change of speed (0.83), -ay with speed times turning to the left (0.67), and
-  the yaw rate with turning to the left (0.79). No mount can mend that, for no rotation turns the one and not the
+  the yaw rate with turning to the left (0.79). No mount can fix that, since no rotation turns the one and not the
   other. So the specific force is -(ax, ay, az), and then all axes are forward, left, up.
 - Gravity lies 10.3 degrees off in pitch and 1.4 in roll, with the sensor's x axis pointing down; the file's own pitch
-  says the same (mean 10.2, correlation with the force 0.89). The street rises by 0.7 degrees on the whole. It is the
+  agrees (mean 10.2, correlation with the force 0.89). The street rises by 0.7 degrees on the whole. It is the
   mount, and stands in the vehicle's geometry.
 - Time: `millis` is the logging computer's clock, and stamps the inertial rows. `time` is the receiver's clock; it runs
   0.2 to 0.3 s *ahead* of the computer's when it shows up, so the computer's is slow by that and more, and the two
-  cannot tell how old a fix is. Motion can: position follows the inertial unit by 0.5 s (force against the
+  do not give the age of a fix. Motion does: position follows the inertial unit by 0.5 s (force against the
   change of the speed over the positions 0.54 s, yaw rate against their turning 0.46 s), speed and course by 1.0 s
   (0.96 and 1.04 s). A fix's `utime` is therefore its arrival minus POSITION_LATENCY, and its `velocity_latency` is
   VELOCITY_LATENCY; `host_utime` is the arrival, `device_utime` the receiver's clock. Without, a car at 8 m/s is 4 m
@@ -24,9 +24,9 @@ the delay where it is largest (the tests hold them):
 - `altitude` is above mean sea level: 112 m, as the Elbe's bank is there; 44 m less than the ellipsoid's. The undulation
   is not in the file and none is claimed.
 - `epe` is the receiver's own figure, 2.4 to 7.7 m, and does not follow the dilutions (correlation with HDOP -0.36).
-  Whether it is meant for 68 or 95 % and in the plane or in space is not said; it is taken for one standard deviation in
-  the plane, the larger reading: `epe`/sqrt(2) on each horizontal axis, and VDOP/HDOP times `epe` upward. No fix is
-  differential.
+  Whether it is meant for 68 or 95 % and in the plane or in space is not documented; it is taken for one standard
+  deviation in the plane, the larger reading: `epe`/sqrt(2) on each horizontal axis, and VDOP/HDOP times `epe` upward.
+  No fix is differential.
 - The course is compass degrees (from north, clockwise): it agrees with the direction of the positions (median 0.4
   degrees). Speed is km/h: 1.03 of the speed over the positions is 1.
 """
@@ -39,8 +39,9 @@ import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from benchmarks.recordings.writing import Arrival, write_samples
-from modelserver.messages import FixType, GpsSample, ImuSample, Matrix3, SensorHeader
+from benchmarks.recordings.log_writer import Arrival, write_samples
+from modelserver.messages import FixType, GpsSample, ImuSample, SensorHeader
+from modelserver.transforms.so3 import Matrix3
 
 POSITION_LATENCY = 0.5
 """Seconds from the instant a position holds for to the row it shows up in, by the computer's clock; see above."""
@@ -85,7 +86,7 @@ def _gps(rows: list[dict[str, str]], latency: float) -> Iterator[Arrival]:
     for row in rows:
         before, place = place, (row["latitude"], row["longitude"])
         if before is None or place == before:
-            continue  # the first row's position may have been there for long
+            continue  # the age of the first row's position is unknown
         arrival = _arrival(row)
         header = SensorHeader(arrival - round(latency * 1e6), "gps", number, arrival, device_utime=_receiver_utime(row))
         number += 1

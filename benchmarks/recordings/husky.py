@@ -41,48 +41,48 @@ def convert(data: Path, log: Path) -> dict[str, int]:
     return {each.channel: each.written for each in report.topics if each.channel}
 
 
-def turned_vehicle(
+def write_turned_vehicle(
     vehicle: Path, directory: Path, body: str = "Husky", mounts: Collection[str] = ("ImuMount",)
 ) -> Path:
-    """Write a vehicle file and its geometry with one body turned by 180 degrees about z; return the vehicle file.
+    """Write a vehicle file and its geometry with one body rotated by 180 degrees about z; return the vehicle file.
 
-    `mounts` are the frames of the body that carry something with an orientation of its own. The others keep their
-    axes along the body's, as a wheel's contact frame and the base frame must: their x is the new front.
+    `mounts` are the frames of the body that carry something with an orientation of its own. The others keep their axes
+    along the body's, as a wheel's contact frame and the base frame must: their x is the new front.
     """
     settings = yaml.safe_load(vehicle.read_text(encoding="utf-8"))
     given = yaml.safe_load((vehicle.parent / settings["geometry"]).read_text(encoding="utf-8"))
-    (directory / "turned_geometry.yaml").write_text(yaml.safe_dump(turned_geometry(given, body, mounts)), "utf-8")
+    (directory / "turned_geometry.yaml").write_text(yaml.safe_dump(turn_geometry(given, body, mounts)), "utf-8")
     settings["geometry"] = "turned_geometry.yaml"
     path = directory / "turned_vehicle.yaml"
     path.write_text(yaml.safe_dump(settings, sort_keys=False), "utf-8")
     return path
 
 
-def turned_geometry(given: dict[str, Any], body: str, mounts: Collection[str]) -> dict[str, Any]:
-    """Return a geometry file's content with one body turned; see `turned_vehicle`."""
+def turn_geometry(given: dict[str, Any], body: str, mounts: Collection[str]) -> dict[str, Any]:
+    """Return a geometry file's content with one body rotated; see `write_turned_vehicle`."""
     frames = {}
     for name, frame in given["bodies"][body]["frames"].items():
         x, y, z = frame.get("xyz", (0.0, 0.0, 0.0))
         frames[name] = {**frame, "xyz": [-x, -y, z]}
         if name in mounts:
             roll, pitch, yaw = frame.get("rpy_deg", (0.0, 0.0, 0.0))
-            # about fixed axes the yaw comes last: turning the whole adds to it
+            # fixed-axis angles apply yaw last: a rotation of the body adds to it
             frames[name]["rpy_deg"] = [roll, pitch, math.remainder(yaw + 180.0, 360.0)]
     bodies = {**given["bodies"], body: {**given["bodies"][body], "frames": frames}}
     return {**given, "bodies": bodies}
 
 
-def turned_events(events: Iterable[LogEvent], channel: str = "WHEELS") -> Iterator[LogEvent]:
-    """Yield the events with the wheels' travel, speed and direction the other way round."""
+def reverse_wheels(events: Iterable[LogEvent], channel: str = "WHEELS") -> Iterator[LogEvent]:
+    """Yield the events with reversed travel, speed and direction of the wheels."""
     for event in events:
         if event.channel == channel:
             sample: WheelsSample = codec.decode("wheels_t", event.data)
-            wheels = tuple(_turned(each) for each in sample.wheels)
+            wheels = tuple(_reverse(each) for each in sample.wheels)
             yield replace(event, data=codec.encode(replace(sample, wheels=wheels)))
         else:
             yield event
 
 
-def _turned(wheel: WheelSample) -> WheelSample:
+def _reverse(wheel: WheelSample) -> WheelSample:
     direction = _BACK.get(wheel.direction, wheel.direction)
     return replace(wheel, travel=-wheel.travel, speed=-wheel.speed, direction=direction)

@@ -1,6 +1,6 @@
 """KITTI, as GTSAM carries it: a car in Karlsruhe, 471 s, 3.7 km; IMU 100 Hz, GPS 1 Hz.
 
-What the files say, and what the data say about it (the tests hold these):
+Conventions of the files, verified with the data (the tests check these):
 
 - Time is seconds of the day; both files count alike. The day is not in the files: the epoch below is the day of the
   drive, 2011-09-30, and no figure rests on it. By cross-correlation the IMU's stamps lie 0.02 s (rate about z against
@@ -11,7 +11,7 @@ What the files say, and what the data say about it (the tests hold these):
   with speed times turning (0.96). Gyros rad/s, force m/s2.
 - Its first row lies 1.9 s before the second, with a `dt` of the whole time of day. It is a sample like any other;
   after it 1.9 s are missing, and so are they in the log. The first fixes are 2.9 s apart for the same reason.
-- GPS: x east, y north, z up, metres, from an origin that the files do not name. They are put on the tangent plane of a
+- GPS: x east, y north, z up, meters, from an origin that the files do not name. They are put on the tangent plane of a
   place in Karlsruhe, so that latitudes and longitudes come out; distances are those of the file.
 - The antenna: positions are those of the unit itself (OXTS RT 3003), no lever arm.
 - How good a fix is: GTSAM's example for this file weighs it by "0.07 m". It writes `Precisions(1.0/0.07)`, which is a
@@ -31,17 +31,18 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.recordings.writing import Arrival, write_samples
+from benchmarks.recordings.log_writer import Arrival, write_samples
 from modelserver.earth.geodesy import LocalFrame, geodetic_from_ecef
-from modelserver.messages import FixType, GpsSample, ImuSample, Matrix3, SensorHeader
+from modelserver.messages import FixType, GpsSample, ImuSample, SensorHeader
+from modelserver.transforms.so3 import Matrix3
 
 Array = npt.NDArray[np.float64]
 
 MIDNIGHT = calendar.timegm((2011, 9, 30, 0, 0, 0)) * 1_000_000
 ORIGIN = (49.0, 8.4, 110.0)
-"""Latitude and longitude in degrees, height above the ellipsoid in metres: Karlsruhe, roughly."""
+"""Latitude and longitude in degrees, height above the ellipsoid in meters: Karlsruhe, roughly."""
 GPS_SIGMA = 0.07
-"""Metres on each axis; see above."""
+"""Meters on each axis; see above."""
 ACCELEROMETER_DENSITY = 0.01
 GYROSCOPE_DENSITY = 0.000175
 """Metadata: AccelerometerSigma m/s2/sqrt(Hz), GyroscopeSigma rad/s/sqrt(Hz)."""

@@ -34,7 +34,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.recordings.writing import Arrival, write_samples
+from benchmarks.recordings.log_writer import Arrival, write_samples
 from modelserver.messages import AbsolutePoseSample, ImuSample, RangeSample, SensorHeader, WheelSample, WheelsSample
 
 Array = npt.NDArray[np.float64]
@@ -48,7 +48,7 @@ RANGE_SIGMA = 1.0
 SURVEY_SCALE = 1.0714
 BEACONS = (0, 1, 5, 6)
 SURVEYED = np.array([(-33.6205, 26.9678), (-68.9265, 18.3778), (1.7095, -5.8122), (-37.5805, 69.2278)])
-"""Plaza 2: places of BEACONS, metres, x and y."""
+"""Plaza 2: positions of BEACONS, meters, x and y."""
 SURVEYED_START = (-34.2086, 45.3008, math.pi - 2.021089)
 """Plaza 2: x, y and heading at the beginning, as quoted."""
 CALIBRATION_SHARE = 0.25
@@ -58,12 +58,9 @@ KNOT_S = 60.0
 
 @dataclass(frozen=True)
 class Beacons:
-    """Where the beacons are: `places` (4, 2) in the order of BEACONS, metres; ranges are `scale` times the distance.
+    """Beacon positions (4, 2) in the order of BEACONS, meters; ranges are `scale` times the distance."""
 
-    `start` is x, y and heading at the beginning; `until` the time up to which ranges were used to find them.
-    """
-
-    places: Array
+    positions: Array
     scale: float
     start: tuple[float, float, float]
     until: float = -math.inf
@@ -84,14 +81,14 @@ def read(data: Path, name: str) -> tuple[Array, Array]:
     return increments, np.column_stack([ranges[:, 0], index, ranges[:, 3]])
 
 
-def beacons(data: Path, name: str) -> Beacons:
+def find_beacons(data: Path, name: str) -> Beacons:
     """Return where the beacons are: surveyed for Plaza 2, calibrated for Plaza 1 (needs scipy)."""
     if name == "plaza2":
         return Beacons(SURVEYED, SURVEY_SCALE, SURVEYED_START)
     return calibrate(*read(data, name))
 
 
-def way(increments: Array, start: tuple[float, float, float], extra_heading: Array | float = 0.0) -> Array:
+def dead_reckon(increments: Array, start: tuple[float, float, float], extra_heading: Array | float = 0.0) -> Array:
     """Return x, y and heading after each increment (n, 3): dead reckoning from a start."""
     heading = start[2] + np.cumsum(increments[:, 2]) + extra_heading
     middle = heading - increments[:, 2] / 2
@@ -116,12 +113,12 @@ def calibrate(increments: Array, ranges: Array, share: float = CALIBRATION_SHARE
     def residuals(p: Array) -> Array:
         scale, places, steps = p[0], p[1:9].reshape(4, 2), p[9:]
         drift = np.interp(t, knots, np.concatenate([[0.0], np.cumsum(steps)]))
-        mower = way(increments, (0.0, 0.0, 0.0), drift)
+        mower = dead_reckon(increments, (0.0, 0.0, 0.0), drift)
         x, y = (np.interp(used[:, 0], t, mower[:, k]) for k in (0, 1))
         left = used[:, 2] - scale * np.hypot(x - places[which, 0], y - places[which, 1])
         return np.concatenate([left, steps / 0.1])
 
-    # any guess that puts the beacons apart from each other; its solution is that of nearly all others
+    # any guess with separate beacons; nearly all give the same solution
     guess = np.random.default_rng(0).normal(0.0, 40.0, 8)
     found = least_squares(
         residuals, np.concatenate([[1.05], guess, np.zeros(len(knots) - 1)]), loss="soft_l1", x_scale="jac", max_nfev=80
@@ -133,7 +130,7 @@ def calibrate(increments: Array, ranges: Array, share: float = CALIBRATION_SHARE
 def convert(data: Path, log: Path, name: str = "plaza2", given: Beacons | None = None) -> dict[str, int]:
     """Write the log; return the number of messages by channel: START (once), WHEELS, IMU, RANGE."""
     increments, ranges = read(data, name)
-    where = given or beacons(data, name)
+    where = given or find_beacons(data, name)
     return write_samples(log, [*_start(increments, where), *_odometry(increments), *_ranges(ranges, where)])
 
 
@@ -177,7 +174,7 @@ def _odometry(increments: Array) -> Iterator[Arrival]:
 def _ranges(ranges: Array, where: Beacons) -> Iterator[Arrival]:
     for number, (t, which, distance) in enumerate(ranges.tolist()):
         utime = utime_of(t)
-        x, y = where.places[int(which)].tolist()
+        x, y = where.positions[int(which)].tolist()
         yield (
             utime,
             "RANGE",
@@ -193,15 +190,15 @@ def _ranges(ranges: Array, where: Beacons) -> Iterator[Arrival]:
         )
 
 
-def misses(mower: Array, t: Array, ranges: Array, where: Beacons) -> Array:
-    """Return distance from a way, x and y at times t, to the beacons minus that by the ranges, metres."""
+def range_residuals(mower: Array, t: Array, ranges: Array, where: Beacons) -> Array:
+    """Return the distance from a path, x and y at times t, to the beacons minus the range, meters."""
     which = ranges[:, 1].astype(int)
     x, y = (np.interp(ranges[:, 0], t, mower[:, k]) for k in (0, 1))
-    result: Array = np.hypot(x - where.places[which, 0], y - where.places[which, 1]) - ranges[:, 2] / where.scale
+    result: Array = np.hypot(x - where.positions[which, 0], y - where.positions[which, 1]) - ranges[:, 2] / where.scale
     return result
 
 
-def scored(increments: Array, ranges: Array, where: Beacons) -> npt.NDArray[np.bool_]:
+def scored_ranges(increments: Array, ranges: Array, where: Beacons) -> npt.NDArray[np.bool_]:
     """Return which ranges are withheld and scored: every second one, after 30 s and after the calibration's."""
     odd = np.arange(len(ranges)) % 2 == 1
     chosen: npt.NDArray[np.bool_] = odd & (ranges[:, 0] > max(increments[0, 0] + 30.0, where.until))
@@ -213,9 +210,9 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def dead_reckoned(data: Path, name: str, where: Beacons) -> Mapping[str, float]:
-    """Return the RMS of the misses at the scored ranges by dead reckoning from the start, metres."""
+def dead_reckoning_rms(data: Path, name: str, where: Beacons) -> Mapping[str, float]:
+    """Return the RMS of the misses at the scored ranges by dead reckoning from the start, meters."""
     increments, ranges = read(data, name)
-    chosen = scored(increments, ranges, where)
-    mower = way(increments, where.start)
-    return {"n": int(chosen.sum()), "rms": rms(misses(mower, increments[:, 0], ranges[chosen], where))}
+    chosen = scored_ranges(increments, ranges, where)
+    mower = dead_reckon(increments, where.start)
+    return {"n": int(chosen.sum()), "rms": rms(range_residuals(mower, increments[:, 0], ranges[chosen], where))}

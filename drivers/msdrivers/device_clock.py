@@ -1,177 +1,338 @@
-"""The instant of a measurement from a device's clock: offset and drift against the host's clock, and their doubt.
+"""Time stamps from a device's clock: offset and drift against the host's monotonic clock, with their uncertainty.
 
-A sample is measured at the device's time and received later by a delay that varies: host minus device time is the
-offset of the two clocks plus that delay. The delay is never negative, so the offset is the lower envelope of the
-differences, a line whose slope is the drift (Moon, Skelly and Towsley, "Estimation and removal of clock skew from
-network delay measurements", INFOCOM 1999). Here the line is not only found but averaged over all that the samples
-allow (`clock_line`). That gives the offset's standard deviation with it, from the first sample on.
+A device measures at its own time t_d; the host receives the sample at t_h = t_d + offset(t_d) + delay with delay >= 0.
+The offset is therefore the lower envelope of t_h - t_d, a line whose slope is the drift (Moon, Skelly and Towsley,
+"Estimation and removal of clock skew from network delay measurements", INFOCOM 1999).
 
-The shortest delay of the way itself cannot be told from an offset: it is configured, not estimated. Nor can a way that
-has become longer from a device's clock that was set back: the line stays while older samples hold it, follows then,
-and the standard deviation covers both. It does so for a window longer; for good, until samples come as early as before,
-where the line had to be set up anew; and for a window where that was by half a second and more, for no way is so long.
+Fit (`fit_lower_envelope`): for each candidate drift b the envelope touches the lowest sample. With n delays spread
+uniformly over D (the jitter) the offset lies D / (n + 1) below the envelope on average, and the likelihood of b is
+exp(n * (envelope at the mean time) / D). The average over all b gives offset, drift and their covariance from the
+first sample on. Blocks of 2 s keep the lowest samples of the last 120 s, so cost and memory are bounded.
+
+Step detection (`DeviceClock.update`): a sample far below the line, or a second of samples far above it, means that one
+clock stepped; the fit restarts and `restarts` counts.
+
+Limits: the minimum delay cannot be observed; it is configured (`delay`). A delay that grows for good cannot be
+distinguished from a device clock that was set back; half the difference is added to sigma: for one more window while
+the fit still follows it, until samples arrive as early as before where the fit restarted, and for one window where the
+step is half a second or more, because no transport delay is that long.
+
+`Stamper` applies the clock to the samples of one device.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
-from msdrivers.clock_line import ClockLine, Point, SampleBlock, fitted
+import numpy as np
+
+from modelserver.messages import NAN, Sample
+from msdrivers.endpoint import HostTime, MeasuredSample
+
+PRIOR_JITTER_US = 20_000.0
+PRIOR_JITTER_WEIGHT = 4.0
+"""Prior of the jitter, and its weight in samples."""
+
+DRIFT_RATE = 3e-8
+"""Random change of the drift per second: a crystal that warms by 10 K within minutes."""
+
+STEP_THRESHOLD = 4.0
+"""The lowest of n samples lies D / (n + 1) above the line on average; this many times that is a step."""
+
+MIN_STEP_SAMPLES = 4
+"""Fewer samples do not determine a minimum."""
+
+DRIFT_CANDIDATES = 24
+"""Drifts evaluated in each refinement of the grid."""
+
+BOUND_MARGIN = 0.95
+
+MIN_LOG_WEIGHT = 9.0
+"""The grid is narrowed to drifts whose weight is above exp(-9) of the best."""
+
+
+class ClockOffsetSample(NamedTuple):
+    """Device time and host minus device time, microseconds."""
+
+    device: int
+    offset: int
+
+
+class SampleBlock(NamedTuple):
+    """Two seconds of samples: the lowest for the smallest and for the largest drift, and sums. Microseconds."""
+
+    start: int
+    lowest_falling: ClockOffsetSample
+    lowest_rising: ClockOffsetSample
+    samples: int
+    device_sum: int
+    offset_sum: int
+
+    @classmethod
+    def start_block(cls, point: ClockOffsetSample, clipped: int) -> SampleBlock:
+        """Start a block with one sample; `clipped` is its offset as it enters the mean."""
+        return cls(point.device, point, point, 1, point.device, clipped)
+
+    def add(self, point: ClockOffsetSample, clipped: int, max_drift: float) -> SampleBlock:
+        """Return the block with one more sample."""
+        return SampleBlock(
+            self.start,
+            point if _is_lower(point, self.lowest_falling, -max_drift) else self.lowest_falling,
+            point if _is_lower(point, self.lowest_rising, max_drift) else self.lowest_rising,
+            self.samples + 1,
+            self.device_sum + point.device,
+            self.offset_sum + clipped,
+        )
+
+
+def _is_lower(point: ClockOffsetSample, other: ClockOffsetSample, drift: float) -> bool:
+    return point.offset - other.offset < drift * (point.device - other.device)
+
+
+class ClockFit(NamedTuple):
+    """Linear clock model at device time `reference`. Microseconds.
+
+    jitter: spread of the delays. step: how far the lower edge of the latest samples lies above what the jitter
+    explains. is_at_bound: the most likely drift is the largest allowed.
+    """
+
+    reference: int
+    offset: float
+    drift: float
+    offset_variance: float
+    covariance: float
+    drift_variance: float
+    jitter: float
+    step: float
+    is_at_bound: bool
+    samples_since_fit: int = 0
+
+    def predict(self, device_us: int) -> tuple[float, float]:
+        """Predict the offset and its variance at a device time."""
+        after = device_us - self.reference
+        variance = self.offset_variance + after * (2.0 * self.covariance + after * self.drift_variance)
+        return self.offset + self.drift * after, max(variance, 0.0)
+
+
+def fit_lower_envelope(blocks: tuple[SampleBlock, ...], at: int, drift: float, max_drift: float) -> ClockFit:
+    """Fit the lower envelope of the blocks at device time `at`; `drift` is the first guess of the slope."""
+    points = [point for block in blocks for point in block[1:3]]
+    base = points[-1].offset
+    times = np.array([point.device - at for point in points], float)
+    lows = np.array([point.offset - base for point in points], float)
+    count = sum(block.samples for block in blocks)
+    mean_time = sum(block.device_sum - block.samples * at for block in blocks) / count
+    mean = sum(block.offset_sum - block.samples * base for block in blocks) / count
+
+    # the mean of delays uniform over D is D / 2, the mean of the smallest of n is D / (n + 1)
+    above = max(0.0, mean - drift * mean_time - float(np.min(lows - drift * times)))
+    jitter = (PRIOR_JITTER_WEIGHT * PRIOR_JITTER_US + 2.0 * count * above) / (PRIOR_JITTER_WEIGHT + count - 1)
+
+    low, high = -max_drift, max_drift
+    while True:
+        drifts = np.linspace(low, high, DRIFT_CANDIDATES)
+        edges = np.min(lows[None, :] - drifts[:, None] * times[None, :], axis=1)
+        weights = count * (edges + drifts * mean_time) / jitter
+        weights -= weights.max()
+        likely = np.flatnonzero(weights > -MIN_LOG_WEIGHT)
+        step = (high - low) / (DRIFT_CANDIDATES - 1)
+        if len(likely) > DRIFT_CANDIDATES // 3 or step < 1e-10:
+            break
+        low, high = max(low, drifts[likely[0]] - step), min(high, drifts[likely[-1]] + step)
+    weights = np.exp(weights)
+    weights /= weights.sum()
+    below = jitter / (count + 1)
+    mean_drift, mean_edge = float(weights @ drifts), float(weights @ edges)
+    edge_off, drift_off = edges - mean_edge, drifts - mean_drift
+    # deviation of a line from a curve with this bend at its end
+    span = (blocks[-1].start - blocks[0].start) * 1e-6
+    spread = below**2 * count / (count + 2) + (DRIFT_RATE * span**2 / 8.0 * 1e6) ** 2
+    raised = _estimate_step(blocks, lows - mean_drift * times - mean_edge, jitter)
+    return ClockFit(
+        at,
+        base + mean_edge - below,
+        mean_drift,
+        float(weights @ edge_off**2) + spread,
+        float(weights @ (edge_off * drift_off)),
+        float(weights @ drift_off**2) + 1e-20,
+        jitter,
+        raised,
+        float(weights @ (np.abs(drifts) > BOUND_MARGIN * max_drift)) > 0.5,
+    )
+
+
+def _estimate_step(blocks: tuple[SampleBlock, ...], above: np.ndarray, jitter: float) -> float:
+    """Return the largest amount by which the minimum since some block is too high. Microseconds."""
+    floors = np.minimum.accumulate(np.minimum(above[0::2], above[1::2])[::-1])
+    numbers = np.cumsum([block.samples for block in reversed(blocks)])
+    is_raised = (floors > STEP_THRESHOLD * jitter / (numbers + 1)) & (numbers >= MIN_STEP_SAMPLES)
+    return float(np.max(floors, where=is_raised, initial=0.0))
+
 
 BLOCK_US = 2_000_000
 WINDOW_US = 120_000_000
-"""The envelope is kept for two minutes, as the lowest samples of every two seconds: drifts change slowly, but do."""
+"""Length of a block and of the window of blocks: drifts change slowly."""
 
-LARGEST_DRIFT = 1e-2
-"""Beyond any crystal: a tick whose length was told wrongly may still be so far off."""
+MAX_DRIFT = 1e-2
+"""Beyond any crystal; a tick whose length is configured wrongly may be off by this much."""
 
 SLACK_US = 5_000.0
-"""By how much a sample must leave the band of the delays before the clocks are suspected."""
+"""Margin around the band of delays before a clock step is suspected."""
 
-LATE_SAMPLES = 8
-LATE_US = 1_000_000
-"""A sample that is too late is taken for delayed, until so many in a row have been, for so long on the host's clock."""
+MIN_DELAYED_SAMPLES = 8
+MIN_DELAYED_US = 1_000_000
+"""A late sample counts as delayed until this many in a row were late, over this long on the host's clock."""
 
-LOST_US = 60_000_000
-"""No delay is so long: a clock has stepped."""
+MAX_DELAY_US = 60_000_000
+"""No delay is longer; a clock has stepped."""
 
 STEP_US = 500_000.0
-"""A way that became longer by so much and stays so is no way: receivers that learn of leap seconds step so."""
+"""A delay that grows by this much for good is a clock step, e.g. of a receiver that learns the leap seconds."""
 
-BEGIN_US = 1_000_000
-BEGIN_DOUBT_US = 150_000.0
-"""In its first second all that came may have been held up: the doubt falls from this to nothing."""
+STARTUP_US = 1_000_000
+STARTUP_SIGMA_US = 150_000.0
+"""In the first second all samples may have been delayed: an extra sigma falls from this to zero."""
 
-CLIP = 3.0
-"""A delay counts as at most this many times the usual spread, so that one long stall does not widen it."""
+JITTER_CLIP = 3.0
+"""Delays enter the jitter clipped at this multiple, so that one long stall does not inflate it."""
 
-HOST_US = 50.0
-"""What the host's own stamp is good for, standard deviation."""
+HOST_SIGMA_US = 50.0
+"""Standard deviation of the host's own stamp."""
 
 INFLATION = 1.4
-"""On the standard deviation: the doubt is one-sided, and within two deviations of it lie 95 % only just."""
+"""Inflation of the standard deviation: the error is one-sided and its two-sigma coverage only just 95 %."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceClock:
-    """What is known of a device's clock. Every sample gives a new one; cost and size are bounded.
+    """Immutable estimator of a device's clock; each update returns a new one of bounded size.
 
-    tick_us: the device's time goes in steps so long, rounded down. max_drift: by so much a clock is off at most, as a
-    fraction; more is thought of once the samples ask for it.
-    restarts: how often a clock was seen to step.
+    tick_us: resolution of the device's time, which is rounded down. max_drift: largest drift as a fraction, enlarged
+    when the samples demand it. restarts: detected clock steps.
     """
 
     tick_us: float = 1.0
     max_drift: float = 200e-6
     restarts: int = 0
     _blocks: tuple[SampleBlock, ...] = ()
-    _line: ClockLine | None = None
+    _fit: ClockFit | None = None
     _last_us: int | None = None
-    _begun_us: int = 0
-    _late: int = 0
-    _late_since_us: int = 0
-    _risen: float = 0.0
-    """By how much the line was set up anew too high if it was the way that became longer, microseconds."""
-    _believed_us: int | None = None
-    """The device's time from which on that is taken for its clock's."""
-    _raised: float = 0.0
-    _raised_until_us: int = 0
-    """The most by which the lower edge left the line, within the window."""
+    _started_us: int = 0
+    _delayed_count: int = 0
+    _delayed_since_us: int = 0
+    _step_us: float = 0.0
+    """Error of the restarted fit if the delay grew instead of the clock stepping, microseconds."""
+    _step_until_us: int | None = None
+    """Device time after which that possibility is dropped."""
+    _edge_step_us: float = 0.0
+    _edge_step_until_us: int = 0
+    """Largest recent step of the lower edge above the line."""
 
     @property
     def offset(self) -> float:
         """Host minus device time at the last sample, seconds; nan before the first."""
-        if self._line is None or self._last_us is None:
+        if self._fit is None or self._last_us is None:
             return math.nan
-        return self._line.predict(self._last_us)[0] * 1e-6
+        return self._fit.predict(self._last_us)[0] * 1e-6
 
     @property
     def drift(self) -> float:
-        """How much faster the host's clock runs than the device's, as a fraction; nan before the first sample."""
-        return math.nan if self._line is None else self._line.drift
+        """Rate of the host's clock relative to the device's, minus 1; nan before the first sample."""
+        return math.nan if self._fit is None else self._fit.drift
 
-    def take(self, device_us: int, host_us: int) -> tuple[DeviceClock, int, float]:
-        """Take a sample; return the clock after it, the sample's instant on the host's clock, and its sigma.
+    def update(self, device_us: int, host_us: int) -> tuple[DeviceClock, int, float]:
+        """Process a sample and estimate when it was measured.
 
-        `device_us` is the device's time without wraps, `host_us` when the host received it on a clock that nobody
-        sets: microseconds. The instant is in microseconds too, its standard deviation in seconds.
+        Parameters
+        ----------
+        device_us : int
+            The device's time without wraps, microseconds.
+        host_us : int
+            Receive time on the host's monotonic clock, microseconds.
+
+        Returns
+        -------
+        The updated clock, the instant on the host's clock in microseconds, and its standard deviation in seconds.
         """
         difference = host_us - device_us
-        if self._line is None:
-            return self._restarted(device_us, difference, 0.0)
-        offset, variance = self._line.predict(device_us)
+        if self._fit is None:
+            return self._restart(device_us, difference, 0.0)
+        offset, variance = self._fit.predict(device_us)
         excess = difference - offset
-        usual = self.tick_us + self._line.jitter + 3.0 * math.sqrt(variance)
-        if excess > LOST_US:
-            return replace(self, restarts=self.restarts + 1)._restarted(device_us, difference, 0.0)
+        usual = self.tick_us + self._fit.jitter + 3.0 * math.sqrt(variance)
+        if excess > MAX_DELAY_US:
+            return replace(self, restarts=self.restarts + 1)._restart(device_us, difference, 0.0)
         if excess < -usual - SLACK_US:
-            return replace(self, restarts=self.restarts + 1)._restarted(device_us, difference, self._risen + excess)
+            return replace(self, restarts=self.restarts + 1)._restart(device_us, difference, self._step_us + excess)
         if excess > usual + SLACK_US:
-            since = self._late_since_us if self._late else host_us
-            late = self._late + 1
-            if late >= LATE_SAMPLES and host_us - since >= LATE_US:
+            since = self._delayed_since_us if self._delayed_count else host_us
+            late = self._delayed_count + 1
+            if late >= MIN_DELAYED_SAMPLES and host_us - since >= MIN_DELAYED_US:
                 clock = replace(self, restarts=self.restarts + 1)
-                return clock._restarted(device_us, difference, self._risen + excess)
-            clock = replace(self, _late=late, _late_since_us=since, _last_us=device_us)
-            return clock._answer(device_us, excess)
+                return clock._restart(device_us, difference, self._step_us + excess)
+            clock = replace(self, _delayed_count=late, _delayed_since_us=since, _last_us=device_us)
+            return clock._estimate(device_us, excess)
         clock = self
         if device_us != self._last_us:
-            counted = min(difference, round(offset + CLIP * self._line.jitter))
-            clock = self._absorbed(device_us, difference, counted)
-        elif self._late:
-            clock = replace(self, _late=0)
-        return clock._answer(device_us, excess if excess > CLIP * usual else 0.0)
+            clipped = min(difference, round(offset + JITTER_CLIP * self._fit.jitter))
+            clock = self._add_sample(device_us, difference, clipped)
+        elif self._delayed_count:
+            clock = replace(self, _delayed_count=0)
+        return clock._estimate(device_us, excess if excess > JITTER_CLIP * usual else 0.0)
 
-    def _restarted(self, device_us: int, difference: int, risen: float) -> tuple[DeviceClock, int, float]:
-        block = SampleBlock.begun(Point(device_us, difference), difference)
+    def _restart(self, device_us: int, difference: int, step_us: float) -> tuple[DeviceClock, int, float]:
+        block = SampleBlock.start_block(ClockOffsetSample(device_us, difference), difference)
         clock = replace(
             self,
             _blocks=(block,),
-            _line=fitted((block,), device_us, 0.0, self.max_drift),
+            _fit=fit_lower_envelope((block,), device_us, 0.0, self.max_drift),
             _last_us=device_us,
-            _begun_us=device_us,
-            _late=0,
-            _raised=0.0,
-            _risen=max(0.0, risen),
-            _believed_us=device_us + WINDOW_US if risen >= STEP_US else None,
+            _started_us=device_us,
+            _delayed_count=0,
+            _edge_step_us=0.0,
+            _step_us=max(0.0, step_us),
+            _step_until_us=device_us + WINDOW_US if step_us >= STEP_US else None,
         )
-        return clock._answer(device_us, 0.0)
+        return clock._estimate(device_us, 0.0)
 
-    def _absorbed(self, device_us: int, difference: int, counted: int) -> DeviceClock:
-        assert self._line is not None
-        last, point = self._blocks[-1], Point(device_us, difference)
+    def _add_sample(self, device_us: int, difference: int, clipped: int) -> DeviceClock:
+        assert self._fit is not None
+        last, point = self._blocks[-1], ClockOffsetSample(device_us, difference)
         if device_us - last.start >= BLOCK_US:
-            block = SampleBlock.begun(point, counted)
+            block = SampleBlock.start_block(point, clipped)
             recent = (each for each in self._blocks if abs(device_us - each.start) < WINDOW_US)
             blocks = (*recent, block)
         else:
-            block = last.taken(point, counted, self.max_drift)
+            block = last.add(point, clipped, self.max_drift)
             blocks = (*self._blocks[:-1], block)
-        # a sample above the envelope changes only how many there were, which tells little more each time
-        if point in (block.falling, block.rising) or (self._line.since + 1) * 20 >= sum(each.number for each in blocks):
-            return self._refitted(blocks, device_us)
-        line = self._line._replace(since=self._line.since + 1)
-        return replace(self, _blocks=blocks, _line=line, _last_us=device_us, _late=0)
+        # a sample above the envelope changes only the count: refit after 5 % more
+        if point in (block.lowest_falling, block.lowest_rising) or (self._fit.samples_since_fit + 1) * 20 >= sum(
+            each.samples for each in blocks
+        ):
+            return self._refit(blocks, device_us)
+        line = self._fit._replace(samples_since_fit=self._fit.samples_since_fit + 1)
+        return replace(self, _blocks=blocks, _fit=line, _last_us=device_us, _delayed_count=0)
 
-    def _refitted(self, blocks: tuple[SampleBlock, ...], device_us: int) -> DeviceClock:
-        assert self._line is not None
+    def _refit(self, blocks: tuple[SampleBlock, ...], device_us: int) -> DeviceClock:
+        assert self._fit is not None
         max_drift = self.max_drift
-        line = fitted(blocks, device_us, self._line.drift, max_drift)
-        if line.at_bound and max_drift < LARGEST_DRIFT:
-            max_drift = min(5.0 * max_drift, LARGEST_DRIFT)
-            line = fitted(blocks, device_us, line.drift, max_drift)
-        before, variance = self._line.predict(device_us)
-        risen, believed_us = self._risen, self._believed_us
+        line = fit_lower_envelope(blocks, device_us, self._fit.drift, max_drift)
+        if line.is_at_bound and max_drift < MAX_DRIFT:
+            max_drift = min(5.0 * max_drift, MAX_DRIFT)
+            line = fit_lower_envelope(blocks, device_us, line.drift, max_drift)
+        before, variance = self._fit.predict(device_us)
+        step_us, step_until_us = self._step_us, self._step_until_us
         if before - line.offset > math.sqrt(variance):
-            risen = max(0.0, risen - (before - line.offset))
-        if believed_us is not None and device_us >= believed_us:
-            risen, believed_us = 0.0, None
-        raised, until_us = self._raised, self._raised_until_us
-        if device_us >= until_us:
-            raised = 0.0
-        if line.raised >= 0.5 * raised:
-            raised, until_us = max(line.raised, raised), device_us + WINDOW_US
+            step_us = max(0.0, step_us - (before - line.offset))
+        if step_until_us is not None and device_us >= step_until_us:
+            step_us, step_until_us = 0.0, None
+        edge_us, edge_until_us = self._edge_step_us, self._edge_step_until_us
+        if device_us >= edge_until_us:
+            edge_us = 0.0
+        if line.step >= 0.5 * edge_us:
+            edge_us, edge_until_us = max(line.step, edge_us), device_us + WINDOW_US
         return DeviceClock(
             self.tick_us,
             max_drift,
@@ -179,20 +340,57 @@ class DeviceClock:
             blocks,
             line,
             device_us,
-            self._begun_us,
-            _risen=risen,
-            _believed_us=believed_us,
-            _raised=raised,
-            _raised_until_us=until_us,
+            self._started_us,
+            _step_us=step_us,
+            _step_until_us=step_until_us,
+            _edge_step_us=edge_us,
+            _edge_step_until_us=edge_until_us,
         )
 
-    def _answer(self, device_us: int, excess: float) -> tuple[DeviceClock, int, float]:
-        """Answer for a sample that lies `excess` too high: delayed, or its clock was set back."""
-        assert self._line is not None
-        offset, variance = self._line.predict(device_us)
-        # a time rounded down is early by up to a tick: its mean square
-        sigma = math.sqrt(INFLATION**2 * variance + self.tick_us**2 / 3.0 + HOST_US**2)
-        begin = BEGIN_DOUBT_US * max(0.0, 1.0 - abs(device_us - self._begun_us) / BEGIN_US)
-        # what may be of the way as well as of the clock stands within two deviations of either
-        sigma_us = max(sigma, begin, math.hypot(sigma, 0.5 * max(excess, self._raised, self._risen)))
+    def _estimate(self, device_us: int, excess: float) -> tuple[DeviceClock, int, float]:
+        """Estimate instant and sigma of a sample `excess` above the line: delayed, or its clock was set back."""
+        assert self._fit is not None
+        offset, variance = self._fit.predict(device_us)
+        # mean square of the error of a time rounded down to a tick
+        sigma = math.sqrt(INFLATION**2 * variance + self.tick_us**2 / 3.0 + HOST_SIGMA_US**2)
+        startup = STARTUP_SIGMA_US * max(0.0, 1.0 - abs(device_us - self._started_us) / STARTUP_US)
+        # an ambiguity between delay and clock lies within two sigma of both
+        sigma_us = max(sigma, startup, math.hypot(sigma, 0.5 * max(excess, self._edge_step_us, self._step_us)))
         return self, device_us + round(offset), sigma_us * 1e-6
+
+
+@dataclass(slots=True)
+class Stamper:
+    """Stamps the samples of one device; `sigma` is that of the last stamp in seconds, nan before the first.
+
+    The device's clock is compared with the host's monotonic clock, which is never set: when the host's date steps, the
+    stamps step with it and the fit is not disturbed.
+    """
+
+    clock: DeviceClock
+    sigma: float = NAN
+    _utc_minus_monotonic_us: int = 0
+
+    @property
+    def offset(self) -> float:
+        """Host's UTC minus the device's time at the last stamp, seconds; nan before the first."""
+        return self.clock.offset + self._utc_minus_monotonic_us * 1e-6
+
+    def stamp(self, measured: MeasuredSample, now: HostTime) -> Sample:
+        """Fill in utime and utime_sigma: from the device's time if the sample has one, else from the receive time."""
+        header = measured.sample.header
+        if header.device_utime:
+            tick_us = measured.tick * 1e6
+            clock = self.clock if self.clock.tick_us == tick_us else replace(self.clock, tick_us=tick_us)
+            self._utc_minus_monotonic_us = now.utime - now.monotonic_ns // 1000
+            self.clock, instant, sigma = clock.update(
+                header.device_utime, header.host_utime - self._utc_minus_monotonic_us
+            )
+            utime = instant + self._utc_minus_monotonic_us
+            self.sigma = math.hypot(sigma, measured.delay_sigma)
+        else:
+            utime = header.host_utime
+            # without delay_sigma the uncertainty is unknown
+            self.sigma = measured.delay_sigma or NAN
+        stamped = replace(header, utime=max(1, utime - round(measured.delay * 1e6)), utime_sigma=self.sigma)
+        return replace(measured.sample, header=stamped)

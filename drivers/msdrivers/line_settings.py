@@ -1,4 +1,4 @@
-"""What the vehicle file says of a driver's line."""
+"""Settings of a driver's line in the vehicle file: serial port, TCP, CAN bus, Modbus/TCP."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import ClassVar, TypeAlias
 
-from modelserver.errors import shown, suggestions
+from modelserver.errors import quote, suggest_name
 
 
 @dataclass(frozen=True, slots=True)
 class SerialSettings:
     """A serial port: its path, and symbols a second; 0: what the device has from its maker."""
 
-    about: ClassVar[str] = "a serial port"
+    description: ClassVar[str] = "a serial port"
     port: str
     baud: int = 0
 
@@ -33,7 +33,7 @@ class SerialSettings:
 class TcpSettings:
     """A device server: `HOST:PORT`."""
 
-    about: ClassVar[str] = "a server"
+    description: ClassVar[str] = "a server"
     address: str
 
     def __post_init__(self) -> None:
@@ -50,16 +50,16 @@ class CanSettings:
     bitrate 0: the interface is set up already, as socketcan's are by `ip link`.
     """
 
-    about: ClassVar[str] = "a CAN bus"
+    description: ClassVar[str] = "a CAN bus"
     can: str
     interface: str = "socketcan"
     bitrate: int = 0
 
     def __post_init__(self) -> None:
-        why = against_interface(self.interface)
+        why = find_interface_problem(self.interface)
         if why:
             raise ValueError(f"interface {why}")
-        why = against_channel(self.can, self.interface)
+        why = find_channel_problem(self.can, self.interface)
         if why:
             raise ValueError(f"can {why}")
         if not 0 <= self.bitrate <= 10_000_000:
@@ -73,7 +73,7 @@ class CanSettings:
 class ModbusSettings:
     """A Modbus/TCP server: `HOST:PORT`, the port customarily 502, and the number of the device behind it."""
 
-    about: ClassVar[str] = "a server"
+    description: ClassVar[str] = "a server"
     address: str
     unit_id: int = 1
 
@@ -89,7 +89,7 @@ class ModbusSettings:
 LineSettings: TypeAlias = SerialSettings | TcpSettings | CanSettings | ModbusSettings
 
 
-def first_key(kind: type[LineSettings]) -> str:
+def get_line_key(kind: type[LineSettings]) -> str:
     """Return the key by which a section names this kind of line."""
     return dataclasses.fields(kind)[0].name
 
@@ -98,7 +98,7 @@ def split_address(address: str) -> tuple[str, int]:
     """Return host and port of `HOST:PORT`. Raises ValueError."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
-        raise ValueError(f"address is HOST:PORT, e.g. 192.168.1.10:3001, got {shown(address)}")
+        raise ValueError(f"address is HOST:PORT, e.g. 192.168.1.10:3001, got {quote(address)}")
     return host.strip("[]"), int(port)
 
 
@@ -108,22 +108,22 @@ MULTICAST = "udp_multicast"
 MULTICAST_PORT = 43113
 """python-can's own, where a channel names none."""
 
-LONGEST_NETWORK = 15
+MAX_INTERFACE_NAME = 15
 """Characters in the name of a network interface, IFNAMSIZ - 1 in linux/if.h."""
 
 
-def against_interface(interface: str) -> str:
+def find_interface_problem(interface: str) -> str:
     """Return why python-can has no interface of a name; empty where it has one."""
     from can import VALID_INTERFACES
 
     if interface in VALID_INTERFACES:
         return ""
-    near = suggestions(interface, VALID_INTERFACES)
+    near = suggest_name(interface, VALID_INTERFACES)
     fix = f"write {near[0]}" if near else f"known: {', '.join(sorted(VALID_INTERFACES))}"
-    return f"{shown(interface)} is no interface of python-can's; {fix}"
+    return f"{quote(interface)} is no interface of python-can's; {fix}"
 
 
-def against_channel(channel: str, interface: str) -> str:
+def find_channel_problem(channel: str, interface: str) -> str:
     """Return why a CAN interface cannot have a channel; empty where it can, or nothing is known of its channels."""
     if interface == MULTICAST:
         try:
@@ -134,9 +134,9 @@ def against_channel(channel: str, interface: str) -> str:
         return "" if channel else "is the channel as the interface names it, got nothing"
     elif _is_group(channel):
         fix = f"add interface: {MULTICAST}, or to modelserver emulate --interface {MULTICAST}"
-        return f"{shown(channel)} is a group of IP multicast; {fix}"
-    elif not 0 < len(channel) <= LONGEST_NETWORK or not channel.isprintable() or set(channel) & set("/: "):
-        return f"is the name of a network interface, e.g. can0, got {shown(channel)}"
+        return f"{quote(channel)} is a group of IP multicast; {fix}"
+    elif not 0 < len(channel) <= MAX_INTERFACE_NAME or not channel.isprintable() or set(channel) & set("/: "):
+        return f"is the name of a network interface, e.g. can0, got {quote(channel)}"
     return ""
 
 
@@ -149,7 +149,7 @@ def split_group(channel: str) -> tuple[str, int]:
     except ValueError:
         is_group = False
     if not is_group or not 0 < port < 65536:
-        raise ValueError(f"is GROUP:PORT with {MULTICAST}, e.g. 239.74.163.2:{MULTICAST_PORT}, got {shown(channel)}")
+        raise ValueError(f"is GROUP:PORT with {MULTICAST}, e.g. 239.74.163.2:{MULTICAST_PORT}, got {quote(channel)}")
     return group, port
 
 

@@ -1,13 +1,13 @@
-"""Recordings of what came and went on a line, unit by unit, with their times: one line of text for each.
+"""Record and replay the traffic of a link, one line of text per unit.
 
     # modelserver raw 1 bytes gps novatel
     = 1750000000000000 81234567890 open /dev/ttyUSB0 38400
     > 1750000000001200 81235767890 6c6f67...
     < 1750000000010500 81245067890 aa44121c...
 
-The first line names the version, the kind of unit, the driver and the device. Then stand, in this order: the direction
-(`<` received, `>` sent, `=` a word on the line itself), the host's clock in microseconds since 1970, the monotonic
-clock in nanoseconds, and the unit in hexadecimal. A last line that breaks off is left out, and a damaged one skipped.
+The first line has the version, the kind of unit, the driver and the device. Each further line has the direction (`<`
+received, `>` sent, `=` event of the line), the host's clock in microseconds since 1970, the monotonic clock in
+nanoseconds, and the unit in hexadecimal. An incomplete last line is ignored, a damaged line is skipped and counted.
 """
 
 from __future__ import annotations
@@ -16,15 +16,16 @@ import contextlib
 import io
 import itertools
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import NamedTuple, Protocol, TextIO, TypeVar
+from typing import Generic, NamedTuple, Protocol, TextIO, TypeVar
 
 from modelserver.errors import RecordingError
-from modelserver.regular_files import NotRegularFileError, open_regular
-from msdrivers.station import Now
+from modelserver.files.regular import NotRegularFileError, open_regular
+from msdrivers.endpoint import HostTime
+from msdrivers.links import EndOfRecordingError, Link, LinkWrapper
 
 log = logging.getLogger(__name__)
 
@@ -36,8 +37,8 @@ MAX_LINE = 1 << 20
 """Characters; longer lines are damage."""
 
 
-class Form(Protocol[U]):
-    """How a kind of unit is written: its name, and the way to bytes and back."""
+class UnitCodec(Protocol[U]):
+    """Codec of a kind of unit."""
 
     name: str
 
@@ -50,7 +51,7 @@ class Form(Protocol[U]):
         ...
 
 
-class BytesForm:
+class BytesCodec:
     """Bytes as they are."""
 
     name = "bytes"
@@ -69,21 +70,21 @@ class RecordDirection(StrEnum):
 
     RECEIVED = "<"
     SENT = ">"
-    WORD = "="
+    EVENT = "="
 
 
 class RawRecord(NamedTuple):
     """One line of a recording."""
 
-    way: RecordDirection
-    now: Now
+    direction: RecordDirection
+    time: HostTime
     data: bytes
 
 
-class Time(Protocol):
+class TimeSource(Protocol):
     """A clock, and a way to wait."""
 
-    def now(self) -> Now:
+    def now(self) -> HostTime:
         """Return the instant."""
         ...
 
@@ -96,51 +97,51 @@ class Time(Protocol):
 class RawWriter:
     """Writes records to the file called `name`, up to a number of bytes or until the disk is full.
 
-    That the recording has ended then is told once, and `full` says so; `lost` counts the records that came after.
+    The end of the recording is logged once and sets `is_full`; `dropped` counts the records after it.
     """
 
     stream: TextIO
     limit: int
     name: str = ""
-    written: int = 0
-    full: bool = False
-    lost: int = 0
+    bytes_written: int = 0
+    is_full: bool = False
+    dropped: int = 0
 
     def begin(self, kind: str, source: str, device: str) -> None:
         """Write the first line."""
         self._put(f"{MAGIC}{kind} {source} {device}\n")
 
-    def record(self, way: RecordDirection, now: Now, data: bytes) -> None:
-        """Write a record; the text of a word is written as it is."""
-        said = data.decode() if way is RecordDirection.WORD else data.hex()
-        self._put(f"{way} {now.utime} {now.monotonic_ns} {said}\n")
+    def record(self, way: RecordDirection, now: HostTime, data: bytes) -> None:
+        """Write a record; an event as text, a unit in hexadecimal."""
+        text = data.decode() if way is RecordDirection.EVENT else data.hex()
+        self._put(f"{way} {now.utime} {now.monotonic_ns} {text}\n")
 
     def close(self) -> None:
-        """Close the file, and tell what is not in it."""
+        """Close the file and log how many records were dropped."""
         with contextlib.suppress(OSError):
-            # what the disk did not take stands in the buffer still, and is refused again
+            # the rest of the buffer fails again on a full disk
             self.stream.close()
-        if self.lost:
-            log.warning("recording %s: %d records came after its end and are not in it", self.name, self.lost)
+        if self.dropped:
+            log.warning("recording %s: %d records after its end were dropped", self.name, self.dropped)
 
     def _put(self, line: str) -> None:
-        if self.full:
-            self.lost += 1
-        elif self.written + len(line) > self.limit:
-            self._end(f"it has its {self.limit / 1e6:g} MB, see --record-limit")
+        if self.is_full:
+            self.dropped += 1
+        elif self.bytes_written + len(line) > self.limit:
+            self._stop_recording(f"it has its {self.limit / 1e6:g} MB, see --record-limit")
         else:
             try:
                 self.stream.write(line)
                 # what was received is there after a crash too
                 self.stream.flush()
             except OSError as error:
-                self._end(error.strerror or str(error))
+                self._stop_recording(error.strerror or str(error))
             else:
-                self.written += len(line)
+                self.bytes_written += len(line)
 
-    def _end(self, why: str) -> None:
-        self.full, self.lost = True, 1
-        log.warning("recording %s ended: %s; the driver goes on", self.name, why)
+    def _stop_recording(self, why: str) -> None:
+        self.is_full, self.dropped = True, 1
+        log.warning("recording %s ended: %s; the driver continues", self.name, why)
 
 
 @dataclass(slots=True)
@@ -163,28 +164,28 @@ class RawReader:
 
     def __iter__(self) -> Iterator[RawRecord]:
         while line := self.stream.readline(MAX_LINE):
-            record = _record(line)
+            record = _parse_record(line)
             if record is None:
                 self.damaged += 1
             else:
                 yield record
 
 
-def _record(line: str) -> RawRecord | None:
+def _parse_record(line: str) -> RawRecord | None:
     way, _, rest = line.partition(" ")
     parts = rest.split(" ", 2)
     if not line.endswith("\n") or len(parts) != 3:
         return None
     try:
         direction = RecordDirection(way)
-        data = parts[2].encode().strip() if direction is RecordDirection.WORD else bytes.fromhex(parts[2])
-        return RawRecord(direction, Now(int(parts[1]), int(parts[0])), data)
+        data = parts[2].encode().strip() if direction is RecordDirection.EVENT else bytes.fromhex(parts[2])
+        return RawRecord(direction, HostTime(int(parts[1]), int(parts[0])), data)
     except ValueError:
         return None
 
 
 @contextlib.contextmanager
-def recording(path: Path, limit: int) -> Iterator[RawWriter]:
+def open_for_writing(path: Path, limit: int) -> Iterator[RawWriter]:
     """Make the file of a recording of at most `limit` bytes and close it again; one without records is taken away.
 
     A recording that is there stays: beside gps.raw the next is gps.1.raw. Raises RecordingError for another file of
@@ -218,7 +219,7 @@ def recording(path: Path, limit: int) -> Iterator[RawWriter]:
 
 
 def _is_recording(file: Path) -> bool:
-    """Return whether a file begins as a recording does, as far as it goes: one that a full disk cut short does too."""
+    """Return whether a file begins like a recording; also one that a full disk has truncated."""
     with open_regular(file) as stream:
         return MAGIC.encode().startswith(stream.read(len(MAGIC)))
 
@@ -243,3 +244,103 @@ def open_for_reading(path: Path) -> RawReader:
     except RecordingError:
         stream.close()
         raise
+
+
+class RecordingLink(LinkWrapper[U]):
+    """A line whose traffic is recorded."""
+
+    def __init__(self, link: Link[U], codec: UnitCodec[U], writer: RawWriter, time: TimeSource):
+        super().__init__(link)
+        self._codec, self._writer, self._time_source = codec, writer, time
+        self._is_open = False
+
+    def open(self, baud: int | None = None) -> None:
+        """Open the line. Raises LinkError."""
+        self._link.open(baud)
+        self._is_open = True
+        self._record_event(f"open {self.description} {self.baud}")
+
+    def close(self) -> None:
+        """Close the line."""
+        self._link.close()
+        # one that cannot be opened is closed each time that it was tried
+        if self._is_open:
+            self._record_event("close")
+        self._is_open = False
+
+    def poll(self, timeout: float) -> Sequence[U]:
+        """Return received units. Raises LinkError."""
+        units = self._link.poll(timeout)
+        for unit in units:
+            self._writer.record(RecordDirection.RECEIVED, self._time_source.now(), self._codec.pack(unit))
+        return units
+
+    def send(self, unit: U) -> None:
+        """Send a unit. Raises LinkError."""
+        self._link.send(unit)
+        self._writer.record(RecordDirection.SENT, self._time_source.now(), self._codec.pack(unit))
+
+    def _record_event(self, text: str) -> None:
+        self._writer.record(RecordDirection.EVENT, self._time_source.now(), text.encode())
+
+
+class ReplayLink(Generic[U]):
+    """A link that replays the received units of a recording with their original timing.
+
+    Sent units are discarded. The end raises EndOfRecordingError with the number of damaged lines.
+    """
+
+    baud = 0
+
+    def __init__(self, reader: RawReader, unpack: Callable[[bytes], U], time: TimeSource):
+        self.description = reader.name
+        self._reader = reader
+        self._records = (record for record in reader if record.direction is RecordDirection.RECEIVED)
+        self._unpack, self._time_source = unpack, time
+        self._replayed = self._unreadable = 0
+        self._next: RawRecord | None = None
+        self._replay_offset_ns: int | None = None
+
+    def open(self, baud: int | None = None) -> None:
+        """Begin, or go on."""
+
+    def close(self) -> None:
+        """Stop."""
+
+    def poll(self, timeout: float) -> Sequence[U]:
+        """Return what is due, waiting `timeout` seconds at most.
+
+        Raises PlayedOutError at the end, RecordingError at the end of one of which nothing could be played.
+        """
+        if self._next is None:
+            self._next = next(self._records, None)
+            if self._next is None:
+                raise self._make_end_error()
+        now_ns = self._time_source.now().monotonic_ns
+        if self._replay_offset_ns is None:
+            self._replay_offset_ns = now_ns - self._next.time.monotonic_ns
+        wait = (self._next.time.monotonic_ns + self._replay_offset_ns - now_ns) * 1e-9
+        if wait > 0:
+            self._time_source.sleep(min(wait, max(0.0, timeout)))
+            if wait > timeout:
+                return ()
+        record, self._next = self._next, None
+        try:
+            unit = self._unpack(record.data)
+        except ValueError:
+            # written by a form of another version, or damaged
+            self._unreadable += 1
+            return ()
+        self._replayed += 1
+        return (unit,)
+
+    def send(self, unit: U) -> None:
+        """Send nothing."""
+
+    def _make_end_error(self) -> EndOfRecordingError | RecordingError:
+        damaged = self._reader.damaged + self._unreadable
+        if not self._replayed:
+            why = f"all that was received is damaged, {damaged} lines" if damaged else "nothing was received in it"
+            return RecordingError(f"{self.description}: nothing of it can be played: {why}")
+        left_out = f"; {damaged} damaged lines of it were left out" if damaged else ""
+        return EndOfRecordingError(self.description, f"the recording has ended{left_out}")

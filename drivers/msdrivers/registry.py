@@ -1,6 +1,6 @@
-"""The kinds of devices there are: what each wants to know, on which lines it speaks, and what is made of it.
+"""Registry of the kinds of devices: settings, lines, drivers, emulators.
 
-A kind's own modules are imported when they are needed, so that the driver of one device does not pay for the others.
+A kind's modules are imported on demand, so that a driver does not load those of other devices.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from modelserver.errors import ConfigError, Location, Problem, Severity, Suggested, shown, suggestions
+from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_name
+from modelserver.files.regular import read_regular
 from modelserver.messages import GpsSample, ImuSample, JointsSample, Sample, VehicleStatusSample, WheelsSample
-from modelserver.regular_files import read_regular
-from msdrivers.faults import FAULTS, InjectedFault
+from msdrivers.endpoint import Endpoint
+from msdrivers.fault_injection import FAULT_AMOUNTS, InjectedFault
 from msdrivers.line_settings import CanSettings, LineSettings, ModbusSettings, SerialSettings, TcpSettings
-from msdrivers.station import Station
 
 if TYPE_CHECKING:
     from msdrivers.protocol.can.database import CanDatabase
@@ -27,196 +27,203 @@ CHANNELS: Mapping[type[Sample], str] = {
     JointsSample: "JOINTS",
     VehicleStatusSample: "VEHICLE_STATUS",
 }
-"""The customary channel of what a device says."""
+"""Default channel of each type of sample."""
 
 
 class DeviceModules(NamedTuple):
-    """What a kind's modules hold.
+    """Contents of a kind's modules.
 
-    settings: the dataclass of its settings; a field `source` takes the driver's name, a field `bauds` the rates to try;
-        a field `joint` names a constraint of the geometry, a field `wheels` has the wheels by their names.
-    station: makes the driver from them and the folder that paths in them start from; raises ConfigError.
+    settings: dataclass of the device's settings. Its field `source` is the driver's name, `bauds` the rates to try,
+    `joint` a constraint of the geometry, `wheels` the wheels by name.
+    make_driver: makes the driver from the settings and the folder of relative paths; raises ConfigError.
     """
 
     settings: type
-    station: Callable[[Any, Path], Station[Any]]
+    make_driver: Callable[[Any, Path], Endpoint[Any]]
 
 
-class Emulation(NamedTuple):
-    """What drives a device in software: its driver's settings, their folder, samples in the order of their stamps.
+class EmulatorInputs(NamedTuple):
+    """Inputs of an emulator: the driver's settings, their folder, samples in the order of their stamps.
 
-    faults: what is to go wrong, of the kinds that `DeviceKind.faults` names. memory: where a device that
-    `DeviceKind.remembers` keeps what it was told to keep; None: nowhere.
+    faults: of the kinds in `DeviceKind.faults`. memory_file: non-volatile memory of a device with
+    `DeviceKind.has_memory`; None: not persisted.
     """
 
     settings: Any
     folder: Path
     samples: Iterable[Any]
     faults: tuple[InjectedFault, ...] = ()
-    memory: Path | None = None
+    memory_file: Path | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceKind:
     """A kind of device.
 
-    sample: what it says in the main, and what its emulator is driven by. lines: what it may hang on, the usual one
-    first. load, emulate: import its modules. baud: what its maker sets. presets: settings that the kind itself gives.
-    commands: the channel whose messages it takes, empty for none. faults: what can go wrong with its emulator, and what
-    the amount of each is. follows: its emulator is where the samples say, and not where it was commanded to go.
-    remembers: its emulator can keep its memory in a file. hard_iron: it has a procedure by which it finds the vehicle's
-    own magnetic field.
+    sample: type of its main sample, which also drives its emulator. lines: types of line, the usual one first.
+    load, make_emulator: import its modules. baud: factory setting. presets: settings that the kind implies.
+    command_channel: channel of the commands that it accepts, empty for none. faults: kinds of faults of its emulator
+    and the meaning of their amounts. follows_samples: the emulator's state comes from samples, not from commands.
+    has_memory: the emulator can persist its memory in a file. has_hard_iron: it has a hard-iron calibration.
     """
 
     name: str
-    about: str
+    description: str
     sample: type[Sample]
     lines: tuple[type[LineSettings], ...]
     load: Callable[[], DeviceModules]
-    emulate: Callable[[Emulation], Station[Any]]
+    make_emulator: Callable[[EmulatorInputs], Endpoint[Any]]
     baud: int = 0
     presets: Mapping[str, Any] = field(default_factory=dict)
-    commands: str = ""
-    faults: Mapping[str, str] = field(default_factory=lambda: FAULTS)
-    follows: bool = True
-    remembers: bool = False
-    hard_iron: bool = False
+    command_channel: str = ""
+    faults: Mapping[str, str] = field(default_factory=lambda: FAULT_AMOUNTS)
+    follows_samples: bool = True
+    has_memory: bool = False
+    has_hard_iron: bool = False
 
 
-def _gps() -> DeviceModules:
+def _load_gps() -> DeviceModules:
     from msdrivers.devices.gps import GpsDriver, GpsSettings
 
     return DeviceModules(GpsSettings, lambda settings, _: GpsDriver(settings))
 
 
-def _gps_unit(wanted: Emulation) -> Station[Any]:
+def _make_gps_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
     from msdrivers.emulate.gps import GpsEmulator, GpsUnit
-    from msdrivers.faulty import FaultyStation
+    from msdrivers.fault_injection import FaultInjector
 
     unit = GpsUnit()
     if wanted.settings.protocol == "nmea":
         period = 1.0 / wanted.settings.rate_hz
         saved = tuple(f"log com1 {sentence} ontime {period:g}" for sentence in ("gpgga", "gprmc", "gpgst"))
-        unit = GpsUnit(saved=saved, answers=False)
+        unit = GpsUnit(saved=saved, is_answering=False)
     # one series for the receiver before and after a restart
     samples = iter(wanted.samples)
-    return FaultyStation(lambda: GpsEmulator(samples, unit), wanted.faults)
+    return FaultInjector(lambda: GpsEmulator(samples, unit), wanted.faults)
 
 
-def _gx1() -> DeviceModules:
+def _load_gx1() -> DeviceModules:
     from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
 
     return DeviceModules(Gx1Settings, lambda settings, _: Gx1Driver(settings))
 
 
-def _gx1_unit(wanted: Emulation) -> Station[Any]:
+def _make_gx1_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
     from msdrivers.emulate.gx1 import Gx1Emulator
     from msdrivers.emulate.gx1_unit import Gx1Unit
-    from msdrivers.emulate.gx1_unit import UnitFault as UnitFault
-    from msdrivers.gx1_memory import read_eeprom, write_eeprom
+    from msdrivers.gx1_eeprom_file import read_eeprom, write_eeprom
 
-    unit = Gx1Unit(faults=tuple(UnitFault(*each) for each in wanted.faults))
-    if wanted.memory is None:
+    unit = Gx1Unit(faults=wanted.faults)
+    if wanted.memory_file is None:
         return Gx1Emulator(wanted.samples, unit=unit)
-    memory = wanted.memory
+    memory = wanted.memory_file
     return Gx1Emulator(wanted.samples, read_eeprom(memory), unit, lambda eeprom: write_eeprom(memory, eeprom))
 
 
-def _wheels() -> DeviceModules:
+def _load_wheels() -> DeviceModules:
     from msdrivers.devices.wheels import WheelsDriver, WheelsSettings
 
-    return DeviceModules(WheelsSettings, lambda settings, folder: WheelsDriver(settings, _dbc(settings, folder)))
+    return DeviceModules(WheelsSettings, lambda settings, folder: WheelsDriver(settings, _load_dbc(settings, folder)))
 
 
-def _wheels_unit(wanted: Emulation) -> Station[Any]:
-    from msdrivers.emulate.can_line import CanFault
+def _make_wheels_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
     from msdrivers.emulate.wheels import WheelsEmulator
 
-    faults = [CanFault(*each) for each in wanted.faults]  # type: ignore[arg-type]
-    database = _dbc(wanted.settings, wanted.folder)
-    return WheelsEmulator(wanted.settings.wheels, database, wanted.samples, faults)
+    database = _load_dbc(wanted.settings, wanted.folder)
+    return WheelsEmulator(wanted.settings.wheels, database, wanted.samples, wanted.faults)
 
 
-def _vehicle() -> DeviceModules:
+def _load_vehicle() -> DeviceModules:
     from msdrivers.devices.vehicle import VehicleDriver
     from msdrivers.devices.vehicle_settings import VehicleSettings
 
-    return DeviceModules(VehicleSettings, lambda settings, folder: VehicleDriver(settings, _dbc(settings, folder)))
+    return DeviceModules(VehicleSettings, lambda settings, folder: VehicleDriver(settings, _load_dbc(settings, folder)))
 
 
-def _vehicle_unit(wanted: Emulation) -> Station[Any]:
-    from msdrivers.emulate.can_line import CanFault
+def _make_vehicle_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
     from msdrivers.emulate.vehicle import VehicleEmulator
 
-    faults = [CanFault(*each) for each in wanted.faults]  # type: ignore[arg-type]
-    settings, database = wanted.settings, _dbc(wanted.settings, wanted.folder)
-    return VehicleEmulator(database, settings.status, settings.command, samples=wanted.samples, faults=faults)
+    settings, database = wanted.settings, _load_dbc(wanted.settings, wanted.folder)
+    return VehicleEmulator(database, settings.status, settings.command, samples=wanted.samples, faults=wanted.faults)
 
 
-def _axis() -> DeviceModules:
+def _load_axis() -> DeviceModules:
     from msdrivers.devices.axis import AxisDriver
     from msdrivers.devices.axis_settings import AxisSettings
 
     return DeviceModules(AxisSettings, lambda settings, _: AxisDriver(settings))
 
 
-def _axis_unit(wanted: Emulation) -> Station[Any]:
-    from msdrivers.emulate.axis import AxisEmulator, AxisFault
+def _make_axis_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
+    from msdrivers.emulate.axis import AxisEmulator
 
-    faults = [AxisFault(*each) for each in wanted.faults]  # type: ignore[arg-type]
-    return AxisEmulator(wanted.settings.registers, faults=faults)
+    return AxisEmulator(wanted.settings.registers, faults=wanted.faults)
 
 
-def _dbc(settings: Any, folder: Path) -> CanDatabase:
-    """Return what the DBC file of a driver's settings says. Raises ConfigError."""
-    from msdrivers.protocol.can.database import MAX_TEXT, parse_dbc
+def _load_dbc(settings: Any, folder: Path) -> CanDatabase:
+    """Load the DBC file of a driver's settings. Raises ConfigError."""
+    from msdrivers.protocol.can.database import MAX_DBC_CHARS, parse_dbc
 
     path = Path(settings.dbc)
     file = folder / path.expanduser()
     try:
         # some tools write the degree sign in Latin-1
-        text = read_regular(file, MAX_TEXT).decode("latin-1")
+        text = read_regular(file, MAX_DBC_CHARS).decode("latin-1")
     except (OSError, ValueError) as error:
         # the name nearest to that of a file which is there is its own
         there = [each.name for each in file.parent.glob("*")] if isinstance(error, FileNotFoundError) else []
-        near = Suggested.of(settings.dbc, *(str(path.with_name(name)) for name in suggestions(path.name, there)))
+        near = Suggestion.of(settings.dbc, *(str(path.with_name(name)) for name in suggest_name(path.name, there)))
         fix = f"write {near[0]}" if near else "the path of a DBC file, relative to the vehicle file"
-        said = f"the DBC file {shown(str(file), 200)} cannot be read: {getattr(error, 'strerror', None) or error}"
+        message = f"the DBC file {quote(str(file), 200)} cannot be read: {getattr(error, 'strerror', None) or error}"
         place = Location(element=f"drivers.{settings.source}.dbc")
-        raise ConfigError([Problem(Severity.ERROR, said, place, fix, near)]) from None
+        raise ConfigError([Problem(Severity.ERROR, message, place, fix, near)]) from None
     return parse_dbc(text, str(file))
 
 
-_CAN_FAULTS = {**FAULTS, "jump": "counts by which counters jump", "bus_off": "seconds for which the bus is left"}
+_CAN_FAULTS = {**FAULT_AMOUNTS, "jump": "counts by which counters jump", "bus_off": "seconds for which the bus is left"}
 
-_BYTES: tuple[type[LineSettings], ...] = (SerialSettings, TcpSettings)
+_BYTE_LINES: tuple[type[LineSettings], ...] = (SerialSettings, TcpSettings)
 
-_ALL = (
+_KINDS = (
     DeviceKind(
-        "novatel", "NovAtel OEM4 and heirs", GpsSample, _BYTES, _gps, _gps_unit, 9600, presets={"protocol": "novatel"}
+        "novatel",
+        "NovAtel OEM4 and heirs",
+        GpsSample,
+        _BYTE_LINES,
+        _load_gps,
+        _make_gps_emulator,
+        9600,
+        presets={"protocol": "novatel"},
     ),
     DeviceKind(
-        "nmea", "receiver that speaks NMEA 0183", GpsSample, _BYTES, _gps, _gps_unit, 4800, presets={"protocol": "nmea"}
+        "nmea",
+        "receiver that speaks NMEA 0183",
+        GpsSample,
+        _BYTE_LINES,
+        _load_gps,
+        _make_gps_emulator,
+        4800,
+        presets={"protocol": "nmea"},
     ),
     DeviceKind(
         "gx1",
         "MicroStrain 3DM-GX1 inertial unit",
         ImuSample,
-        _BYTES,
-        _gx1,
-        _gx1_unit,
+        _BYTE_LINES,
+        _load_gx1,
+        _make_gx1_emulator,
         38400,
-        faults={**FAULTS, "restart": "has none", "jump": "ticks by which its time jumps"},
-        remembers=True,
-        hard_iron=True,
+        faults={**FAULT_AMOUNTS, "restart": "has none", "jump": "ticks by which its time jumps"},
+        has_memory=True,
+        has_hard_iron=True,
     ),
     DeviceKind(
         "wheels",
         "wheels on a CAN bus, by a DBC file",
         WheelsSample,
         (CanSettings,),
-        _wheels,
-        _wheels_unit,
+        _load_wheels,
+        _make_wheels_emulator,
         faults=_CAN_FAULTS,
     ),
     DeviceKind(
@@ -224,9 +231,9 @@ _ALL = (
         "vehicle controller on a CAN bus, by a DBC file",
         VehicleStatusSample,
         (CanSettings,),
-        _vehicle,
-        _vehicle_unit,
-        commands="VEHICLE_COMMAND",
+        _load_vehicle,
+        _make_vehicle_emulator,
+        command_channel="VEHICLE_COMMAND",
         faults=_CAN_FAULTS,
     ),
     DeviceKind(
@@ -234,12 +241,16 @@ _ALL = (
         "nodding axis behind Modbus/TCP",
         JointsSample,
         (ModbusSettings,),
-        _axis,
-        _axis_unit,
-        follows=False,
-        faults={**FAULTS, "jump": "degrees by which its angle jumps", "exception": "the code that a request gets"},
+        _load_axis,
+        _make_axis_emulator,
+        follows_samples=False,
+        faults={
+            **FAULT_AMOUNTS,
+            "jump": "degrees by which its angle jumps",
+            "exception": "the code that a request gets",
+        },
     ),
 )
 
-KINDS: Mapping[str, DeviceKind] = {kind.name: kind for kind in _ALL}
+KINDS: Mapping[str, DeviceKind] = {kind.name: kind for kind in _KINDS}
 """Kinds of devices by the name that a vehicle file gives as `device`."""

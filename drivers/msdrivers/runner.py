@@ -1,4 +1,11 @@
-"""The runner: carries between a station and a line, keeps the line open, stamps what was measured, and reports."""
+"""The runner: connects an endpoint to a link, reconnects, stamps samples, and reports health.
+
+One thread, one pass at a time (`run_once`): open the line when the backoff allows, else poll it until the next
+deadline of the endpoint or of the health report, pass on received units, fire the timer, check for silence.
+
+Reconnect: the wait doubles from `min_backoff` to `max_backoff` with 20 % jitter and is reset once the line was open for
+5 s. Errors of the endpoint are counted and logged and the driver continues; errors of the link close the line.
+"""
 
 from __future__ import annotations
 
@@ -11,29 +18,93 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from modelserver.messages import DriverHealth, DriverPhase, Sample, VehicleCommand
-from msdrivers.device_clock import DeviceClock
-from msdrivers.links import Link, LinkError, PlayedOutError
-from msdrivers.links.guarded import GuardedLink
-from msdrivers.raw_log import Time
-from msdrivers.reporting import Reporter
-from msdrivers.retries import Retries
-from msdrivers.stamping import Stamper
-from msdrivers.station import CommandableStation, Measured, Now, Output, Quiet, Reopen, Send, Station, StationStatus
+from msdrivers.device_clock import DeviceClock, Stamper
+from msdrivers.endpoint import (
+    CommandableEndpoint,
+    Endpoint,
+    EndpointStatus,
+    HasMaxSilence,
+    HostTime,
+    MeasuredSample,
+    Output,
+    Reopen,
+    Send,
+)
+from msdrivers.health import HealthReporter
+from msdrivers.links import EndOfRecordingError, Link, LinkError
+from msdrivers.links.guard import GuardedLink
+from msdrivers.raw_log import TimeSource
+
+STABLE_NS = 5_000_000_000
+"""A line that was open for this long is stable; one that is lost earlier counts as a failed attempt."""
+
+MIN_FAILURES_REPORTED = 3
+"""Consecutive failed attempts from which on the status text mentions them."""
+
+
+class ReconnectBackoff:
+    """Exponential backoff with jitter for opening a line. Waits in seconds, instants in monotonic nanoseconds."""
+
+    def __init__(self, min_wait: float, max_wait: float, rng: random.Random):
+        self._min_wait, self._max_wait, self._rng = min_wait, max_wait, rng
+        self._wait = min_wait
+        self._opened_ns: int | None = None
+        self._failures = 0
+        self._failing_since_ns = 0
+
+    def on_open(self, at_ns: int) -> None:
+        """Record that the line was opened."""
+        self._opened_ns = at_ns
+        if not self._failures:
+            self._failing_since_ns = at_ns
+
+    def is_stable(self, at_ns: int) -> bool:
+        """Return whether the line is stable; if so, reset the backoff."""
+        if self._opened_ns is None or at_ns - self._opened_ns < STABLE_NS:
+            return False
+        self._wait, self._failures = self._min_wait, 0
+        return True
+
+    def on_lost(self, at_ns: int, *, is_orderly: bool = False) -> float:
+        """Return how long to wait before the next attempt; 0 only for an orderly close of a stable line.
+
+        A lost line always waits: a program that competes for it must not cause a busy loop.
+        """
+        was_stable = self.is_stable(at_ns)
+        if self._opened_ns is not None and not was_stable:
+            self._failures += 1
+        self._opened_ns = None
+        if is_orderly and was_stable:
+            return 0.0
+        wait, self._wait = self._wait, min(self._wait * 2.0, self._max_wait)
+        return wait * self._rng.uniform(0.8, 1.2)
+
+    def on_rate_change(self) -> None:
+        """Record that the line was closed to change the baud rate: neither failure nor success."""
+        self._opened_ns = None
+
+    def describe_failures(self, at_ns: int) -> str:
+        """Return a status suffix for repeated failures; empty if there are few."""
+        if self._failures < MIN_FAILURES_REPORTED:
+            return ""
+        seconds = (at_ns - self._failing_since_ns) * 1e-9
+        return f"; opened and closed {self._failures} times in {seconds:.0f} s: does another program use it?"
+
 
 log = logging.getLogger(__name__)
 
 U = TypeVar("U")
 
 MAX_COUNTERS = 200
-"""Of a station that go out in a report; a report takes a few more."""
+"""Largest number of the endpoint's counters in a health report; the runner's own come on top."""
 
 
-class SystemTime:
+class SystemTimeSource:
     """The host's clocks."""
 
-    def now(self) -> Now:
+    def now(self) -> HostTime:
         """Return the instant."""
-        return Now(time.monotonic_ns(), time.time_ns() // 1000)
+        return HostTime(time.monotonic_ns(), time.time_ns() // 1000)
 
     def sleep(self, seconds: float) -> None:
         """Wait."""
@@ -42,241 +113,234 @@ class SystemTime:
 
 @dataclass(frozen=True, slots=True)
 class RunnerSettings:
-    """How a driver is run. Times in seconds.
+    """Settings of a runner. Times in seconds.
 
-    source, device: its name in the vehicle file and the kind of its device.
-    first_wait, last_wait: before the line is tried again, growing. silence: after so long without a unit the device is
-        called silent, and after `reopen` the line is opened anew; a station that is `Quiet` may be quiet for longer.
-        report: between reports. look: so often it is looked whether to end, and for commands.
+    source, device: the driver's name in the vehicle file and its kind of device. min_backoff, max_backoff: wait before
+    the line is opened again. silence: without data for this long the device is SILENT, and after `reopen_timeout` the
+    line is reopened; both grow with the endpoint's `max_silence`. report_period: between health reports. poll_timeout:
+    longest wait for data, and so the latency of `stop` and of commands.
     """
 
     source: str
     device: str
-    first_wait: float = 0.2
-    last_wait: float = 0.5
+    min_backoff: float = 0.2
+    max_backoff: float = 0.5
     silence: float = 3.0
-    reopen: float = 10.0
-    report: float = 1.0
-    look: float = 0.2
+    reopen_timeout: float = 10.0
+    report_period: float = 1.0
+    poll_timeout: float = 0.2
 
 
 class Runner(Generic[U]):
-    """Runs one station on one line. `publish` takes the stamped samples, `report` how the driver is."""
+    """Runs one endpoint on one link; `publish` gets the stamped samples, `publish_health` the health reports."""
 
     def __init__(
         self,
-        station: Station[U],
+        endpoint: Endpoint[U],
         link: Link[U],
         settings: RunnerSettings,
-        clock: Time,
+        time_source: TimeSource,
         publish: Callable[[Sample], object] = lambda sample: None,
-        report: Callable[[DriverHealth], object] = lambda health: None,
+        publish_health: Callable[[DriverHealth], object] = lambda health: None,
         rng: random.Random | None = None,
     ):
         self.counts: Counter[str] = Counter()
-        """Errors of the runner's own, by kind."""
+        """Errors and dropped commands, by kind."""
         self.reconnects = 0
-        self._station, self._settings, self._clock = station, settings, clock
-        self._link = GuardedLink(link, self._failed)
-        self._publish, self._report = publish, report
-        self._retries = Retries(settings.first_wait, settings.last_wait, rng or random.Random())
-        quiet = station.quiet if isinstance(station, Quiet) else 0.0
-        # a line that is quiet twice as long as the device may be is opened anew
-        self._silence, self._patience = max(settings.silence, quiet), max(settings.reopen, 2.0 * quiet)
+        self._endpoint, self._settings, self._time_source = endpoint, settings, time_source
+        self._link = GuardedLink(link, self._count_error)
+        self._publish, self._publish_health = publish, publish_health
+        self._backoff = ReconnectBackoff(settings.min_backoff, settings.max_backoff, rng or random.Random())
+        max_silence = endpoint.max_silence if isinstance(endpoint, HasMaxSilence) else 0.0
+        self._silence = max(settings.silence, max_silence)
+        self._reopen_timeout = max(settings.reopen_timeout, 2.0 * max_silence)
         self._stamper = Stamper(DeviceClock())
-        self._stopping, self._last_word = False, "ended"
+        self._is_stopping, self._close_reason = False, "ended"
         self._is_open = self._was_open = False
         self._baud: int | None = None
-        now = clock.now()
-        self._open_ns = self._heard_ns = now.monotonic_ns
-        self._reporter = Reporter(settings.source, self._silence, settings.report, now, self._send_report)
+        now = time_source.now()
+        self._open_ns = self._received_ns = now.monotonic_ns
+        self._reporter = HealthReporter(settings.source, self._silence, settings.report_period, now, self._send_report)
 
     @property
     def samples(self) -> int:
-        """How many samples have gone out."""
+        """Number of published samples."""
         return self._reporter.samples
 
     @property
     def state(self) -> tuple[DriverPhase, str]:
-        """The phase that the driver is in, and what there is to say of it for a person."""
+        """Phase and status text."""
         return self._reporter.state
 
-    def run(self, attend: Callable[[], object] = lambda: None) -> None:
-        """Run until `stop` is called or a recording has ended, then leave the device as the station will have it.
-
-        `attend` is called before each pass.
-        """
+    def run(self, before_pass: Callable[[], object] = lambda: None) -> None:
+        """Run until `stop` is called or a recording ends, then close in order; `before_pass` runs before each pass."""
         try:
-            while not self._stopping:
-                attend()
-                self.turn()
+            while not self._is_stopping:
+                before_pass()
+                self.run_once()
         finally:
             self._finish()
 
     def stop(self) -> None:
-        """Make `run` return. May be called from a signal handler."""
-        self._stopping = self._reporter.is_ending = True
+        """Make `run` return; safe in a signal handler."""
+        self._is_stopping = self._reporter.is_ending = True
 
-    def command(self, command: VehicleCommand) -> None:
-        """Hand a command to a station that takes them; without an open line it goes nowhere and is counted."""
-        self._commanded(lambda station, now: station.command(command, now))
+    def send_command(self, command: VehicleCommand) -> None:
+        """Pass a command to the endpoint; it is dropped and counted if the line is closed or takes no commands."""
+        self._dispatch_command(lambda endpoint, now: endpoint.on_command(command, now))
 
-    def refuse(self, reason: str, text: str) -> None:
-        """Let the station count and tell what came as a command and cannot be one."""
-        self._commanded(lambda station, now: station.refuse(reason, text, now))
+    def reject_command(self, reason: str, text: str) -> None:
+        """Let the endpoint count and report a malformed command."""
+        self._dispatch_command(lambda endpoint, now: endpoint.reject_command(reason, text, now))
 
-    def _commanded(self, ask: Callable[[CommandableStation[U], Now], Sequence[Output[U]]]) -> None:
-        station = self._station
-        if not self._is_open or not isinstance(station, CommandableStation):
-            self.counts["commands_lost"] += 1
+    def _dispatch_command(self, call: Callable[[CommandableEndpoint[U], HostTime], Sequence[Output[U]]]) -> None:
+        endpoint = self._endpoint
+        if not self._is_open or not isinstance(endpoint, CommandableEndpoint):
+            self.counts["commands_dropped"] += 1
             return
-        now = self._clock.now()
+        now = self._time_source.now()
         try:
-            self._do(self._asked("command", lambda: ask(station, now)))
+            self._execute(self._call_endpoint("on_command", lambda: call(endpoint, now)))
         except LinkError as error:
-            self._lost(error)
+            self._on_link_error(error)
 
-    def turn(self) -> None:
-        """Make one pass: open the line, or take what it brings; wake the station when it is due; report."""
+    def run_once(self) -> None:
+        """Make one pass: open the line or process its input, fire the endpoint's timer, report health."""
         if not self._is_open:
             self._open_when_due()
         else:
             try:
-                self._carry()
-            except PlayedOutError as error:
-                self._last_word = error.why
+                self._transfer()
+            except EndOfRecordingError as error:
+                self._close_reason = error.reason
                 self._link.close()
                 self._is_open = self._reporter.is_silent = False
                 self.stop()
             except LinkError as error:
-                self._lost(error)
-        self._reporter.woken(self._clock.now())
-
-    # --- the line ---------------------------------------------------------------------------------------------
+                self._on_link_error(error)
+        self._reporter.on_timer(self._time_source.now())
 
     def _open_when_due(self) -> None:
-        now = self._clock.now()
-        left = (self._open_ns - now.monotonic_ns) * 1e-9
-        if left > 0:
-            self._clock.sleep(min(left, self._settings.look))
+        now = self._time_source.now()
+        wait = (self._open_ns - now.monotonic_ns) * 1e-9
+        if wait > 0:
+            self._time_source.sleep(min(wait, self._settings.poll_timeout))
             return
         try:
             self._link.open(self._baud)
         except LinkError as error:
-            self._lost(error)
+            self._on_link_error(error)
             return
         self.reconnects += self._was_open
         self._is_open = self._was_open = True
-        now = self._clock.now()
-        self._heard_ns = now.monotonic_ns
-        self._retries.opened(now.monotonic_ns)
-        self._tell(DriverPhase.WAITING, f"{self._link.description} is open")
+        now = self._time_source.now()
+        self._received_ns = now.monotonic_ns
+        self._backoff.on_open(now.monotonic_ns)
+        self._set_status(DriverPhase.WAITING, f"{self._link.description} is open")
         try:
-            self._do(self._asked("opened", lambda: self._station.opened(now)))
+            self._execute(self._call_endpoint("on_open", lambda: self._endpoint.on_open(now)))
         except LinkError as error:
-            self._lost(error)
+            self._on_link_error(error)
 
-    def _lost(self, error: LinkError) -> None:
-        self._close(str(error), lambda at_ns: self._retries.lost(at_ns))
+    def _on_link_error(self, error: LinkError) -> None:
+        self._close(str(error), lambda at_ns: self._backoff.on_lost(at_ns))
 
-    def _reopen(self, wish: Reopen) -> None:
-        changes = wish.baud is not None and wish.baud != self._link.baud
-        self._baud = wish.baud or self._baud
+    def _reopen(self, request: Reopen) -> None:
+        changes_baud = request.baud is not None and request.baud != self._link.baud
+        self._baud = request.baud or self._baud
 
         def wait(at_ns: int) -> float:
-            if not changes:
-                return self._retries.lost(at_ns, in_order=True)
-            self._retries.changed()
+            if not changes_baud:
+                return self._backoff.on_lost(at_ns, is_orderly=True)
+            self._backoff.on_rate_change()
             return 0.0
 
-        self._close(f"opening anew: {wish.why}", wait)
+        self._close(f"reopening: {request.reason}", wait)
 
-    def _close(self, why: str, wait: Callable[[int], float]) -> None:
-        """Close the line, tell `why`, and open it again after `wait`, which takes the present instant."""
+    def _close(self, reason: str, wait: Callable[[int], float]) -> None:
+        """Close the line and schedule its reopening after `wait(now)` seconds."""
         self._link.close()
         self._is_open = self._reporter.is_silent = False
-        at_ns = self._clock.now().monotonic_ns
+        at_ns = self._time_source.now().monotonic_ns
         self._open_ns = at_ns + round(wait(at_ns) * 1e9)
-        self._reporter.tell(DriverPhase.CLOSED, why, self._clock.now(), note=self._retries.note(at_ns))
-        self._reporter.steady(False)
+        self._reporter.set_status(
+            DriverPhase.CLOSED, reason, self._time_source.now(), suffix=self._backoff.describe_failures(at_ns)
+        )
+        self._reporter.set_stable(False)
 
-    # --- the station ------------------------------------------------------------------------------------------
-
-    def _carry(self) -> None:
-        due = self._station.due()
-        now = self._clock.now()
-        next_ns = min(self._reporter.due_ns, due) if due is not None else self._reporter.due_ns
-        units = self._link.poll(min(max(0.0, (next_ns - now.monotonic_ns) * 1e-9), self._settings.look))
-        now = self._clock.now()
+    def _transfer(self) -> None:
+        due = self._endpoint.get_deadline()
+        now = self._time_source.now()
+        next_ns = min(self._reporter.next_report_ns, due) if due is not None else self._reporter.next_report_ns
+        units = self._link.poll(min(max(0.0, (next_ns - now.monotonic_ns) * 1e-9), self._settings.poll_timeout))
+        now = self._time_source.now()
         if units:
-            self._heard_ns, self._reporter.is_silent = now.monotonic_ns, False
+            self._received_ns, self._reporter.is_silent = now.monotonic_ns, False
         for unit in units:
-            self._do(self._asked("received", lambda unit=unit: self._station.received(unit, now)))  # type: ignore[misc]
+            self._execute(self._call_endpoint("on_receive", lambda unit=unit: self._endpoint.on_receive(unit, now)))  # type: ignore[misc]
             if not self._is_open:
                 return
-        due = self._station.due()
+        due = self._endpoint.get_deadline()
         if due is not None and now.monotonic_ns >= due:
-            self._do(self._asked("woken", lambda: self._station.woken(now)))
-        self._watch(now)
+            self._execute(self._call_endpoint("on_timer", lambda: self._endpoint.on_timer(now)))
+        self._check_silence(now)
 
-    def _asked(self, what: str, ask: Callable[[], Sequence[Output[U]]]) -> Sequence[Output[U]]:
-        """Ask the station; an error of its own is counted and told, and the driver goes on."""
+    def _call_endpoint(self, what: str, call: Callable[[], Sequence[Output[U]]]) -> Sequence[Output[U]]:
+        """Call the endpoint; an exception is counted and logged, and the driver continues."""
         try:
-            return ask()
+            return call()
         except Exception:
-            self._failed(what)
+            self._count_error(what)
             return ()
 
-    def _failed(self, what: str) -> None:
+    def _count_error(self, what: str) -> None:
         self.counts[f"errors.{what}"] += 1
         count = self.counts[f"errors.{what}"]
-        # the first, the tenth, the hundredth: a flood must not fill the log
+        # log the 1st, 10th, 100th: a flood must not fill the log
         if str(count).strip("0") == "1":
-            log.exception("%s: an error of the driver's own, number %d in %s", self._settings.source, count, what)
+            log.exception("%s: internal error number %d in %s", self._settings.source, count, what)
 
-    def _do(self, outputs: Sequence[Output[U]]) -> None:
+    def _execute(self, outputs: Sequence[Output[U]]) -> None:
         for output in outputs:
             if isinstance(output, Send):
                 self._link.send(output.unit)
-            elif isinstance(output, Measured):
-                self._measured(output)
-            elif isinstance(output, StationStatus):
-                self._tell(DriverPhase[output.phase.name], output.text, output.is_trouble)
+            elif isinstance(output, MeasuredSample):
+                self._publish_sample(output)
+            elif isinstance(output, EndpointStatus):
+                self._set_status(DriverPhase[output.phase.name], output.text, output.is_warning)
             else:
                 self._reopen(output)
                 return
 
-    def _measured(self, measured: Measured) -> None:
-        now = self._clock.now()
+    def _publish_sample(self, measured: MeasuredSample) -> None:
+        now = self._time_source.now()
         try:
             self._publish(self._stamper.stamp(measured, now))
         except Exception:
-            self._failed("publish")
+            self._count_error("publish")
             return
-        self._reporter.measured(now)
+        self._reporter.count_sample(now)
 
-    def _watch(self, now: Now) -> None:
-        self._reporter.steady(self._retries.is_steady(now.monotonic_ns))
-        quiet = (now.monotonic_ns - self._heard_ns) * 1e-9
+    def _check_silence(self, now: HostTime) -> None:
+        self._reporter.set_stable(self._backoff.is_stable(now.monotonic_ns))
+        quiet = (now.monotonic_ns - self._received_ns) * 1e-9
         if quiet >= self._silence and not self._reporter.is_silent:
             self._reporter.is_silent = True
-            self._reporter.announce(now)
-        if quiet >= self._patience:
-            self._reopen(Reopen(f"nothing heard for {quiet:.0f} s"))
+            self._reporter.report_change(now)
+        if quiet >= self._reopen_timeout:
+            self._reopen(Reopen(f"nothing received for {quiet:.0f} s"))
 
-    # --- telling ----------------------------------------------------------------------------------------------
+    def _set_status(self, phase: DriverPhase, text: str, is_warning: bool = False) -> None:
+        self._reporter.set_status(phase, text, self._time_source.now(), is_warning=is_warning)
 
-    def _tell(self, phase: DriverPhase, text: str, is_trouble: bool = False) -> None:
-        self._reporter.tell(phase, text, self._clock.now(), is_trouble=is_trouble)
-
-    def _send_report(self, now: Now) -> None:
+    def _send_report(self, now: HostTime) -> None:
         try:
-            self._report(self.health(now))
+            self._publish_health(self.make_health(now))
         except Exception:
-            self._failed("report")
+            self._count_error("report")
 
-    def health(self, now: Now) -> DriverHealth:
-        """Return how the driver is."""
+    def make_health(self, now: HostTime) -> DriverHealth:
+        """Return the driver's health report."""
         phase, text = self._reporter.state
         clock = self._stamper.clock
         return DriverHealth(
@@ -290,21 +354,21 @@ class Runner(Generic[U]):
             reconnects=self.reconnects,
             samples=self.samples,
             rate_hz=self._reporter.rate_hz,
-            age=self._reporter.age(now),
+            age=self._reporter.sample_age(now),
             clock_offset=self._stamper.offset,
             clock_drift=clock.drift,
             clock_sigma=self._stamper.sigma,
             clock_restarts=clock.restarts,
-            counters=(*sorted(self._station.counts.items())[:MAX_COUNTERS], *sorted(self.counts.items())),
+            counters=(*sorted(self._endpoint.counts.items())[:MAX_COUNTERS], *sorted(self.counts.items())),
         )
 
     def _finish(self) -> None:
         if self._is_open:
-            now = self._clock.now()
+            now = self._time_source.now()
             try:
-                self._do(self._asked("leaving", lambda: self._station.leaving(now)))
+                self._execute(self._call_endpoint("on_close", lambda: self._endpoint.on_close(now)))
             except LinkError as error:
-                log.warning("%s: the device could not be left as it was found: %s", self._settings.source, error)
+                log.warning("%s: the device's state could not be restored: %s", self._settings.source, error)
             self._link.close()
             self._is_open = self._reporter.is_silent = False
-        self._tell(DriverPhase.CLOSED, self._last_word)
+        self._set_status(DriverPhase.CLOSED, self._close_reason)

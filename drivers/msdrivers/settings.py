@@ -1,52 +1,315 @@
-"""The `drivers` section of a vehicle file: read into the settings of the kind of device that each driver names.
+"""Read and validate the `drivers` section of a vehicle file.
 
     drivers:
       gps: {device: novatel, port: /dev/ttyUSB0, baud: 38400}
 
-`device` is the kind; which further keys there are follows from the kind's lines and its settings, both dataclasses:
-names, types and limits are written there and nowhere else.
+`device` is the kind. The other keys follow from the dataclasses of the kind's lines and settings, which alone define
+names, types and limits. `SectionReader` validates a section with pydantic and collects every problem with its line and
+fix: an invalid value is removed and the rest validated again, until only valid values are left.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias, get_args, get_type_hints
 
-from modelserver.errors import ConfigError, Location, Problem, Severity
-from msdrivers.line_settings import LineSettings, TcpSettings
+from pydantic import ValidationError
+
+from modelserver.config.reader import find_renamed_key, get_adapter
+from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_key, suggest_name
+from msdrivers.line_settings import LineSettings, TcpSettings, get_line_key
 from msdrivers.registry import KINDS, DeviceKind
-from msdrivers.section_reader import SectionReader, keys_of
-from msdrivers.settings_words import Words
 
-SOURCE = "source"
+_LIST_ERRORS = ("tuple_type", "list_type")
+_SECTION_ERRORS = ("dataclass_type", "dict_type")
+_CHOICE_ERRORS = ("literal_error", "enum")
+_EXPECTED = {
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "bool_type": "true or false",
+    "string_type": "text",
+    **dict.fromkeys(_LIST_ERRORS, "a list"),
+    **dict.fromkeys(_SECTION_ERRORS, "a section"),
+}
+
+
+class ProblemText(NamedTuple):
+    """Message of a problem, its fix, and the nearest known names."""
+
+    message: str
+    fix: str = ""
+    nearest: tuple[str, ...] = ()
+
+
+def describe_error(detail: Any, keys: Sequence[str]) -> ProblemText:
+    """Describe one of pydantic's errors; `keys` are those of the section that is expected there."""
+    kind, got = detail["type"], detail.get("input")
+    *path, last = detail["loc"]
+    name = f"{path[-1]}, number {last + 1} in it," if isinstance(last, int) else str(last)
+    actual = f", got {format_value(got)}" if isinstance(got, str | int | float) else ""
+    if kind in _CHOICE_ERRORS:
+        expected = detail["ctx"]["expected"]
+        near = suggest_name(str(got), re.findall(r"'([^']*)'", expected))
+        return ProblemText(f"{name} is {expected}{actual}", f"write {near[0]}" if near else "", near)
+    if kind not in _EXPECTED:
+        message = str(detail["msg"])
+        return ProblemText(f"{name}: {message[:1].lower()}{message[1:]}{actual}")
+    return ProblemText(f"{name} is {_EXPECTED[kind]}{actual}", _suggest_fix(kind, got, keys))
+
+
+def _suggest_fix(kind: str, got: Any, keys: Sequence[str]) -> str:
+    value = got if isinstance(got, str) else format_value(got) if isinstance(got, int | float) else "..."
+    if kind in _LIST_ERRORS:
+        return f"write [{value}]"
+    if kind in _SECTION_ERRORS:
+        return f"write {{{keys[0] if keys else 'NAME'}: {value}}}"
+    if kind == "string_type":
+        return f'write "{value}"'
+    if kind in ("float_type", "int_type") and isinstance(got, str) and _NUMBER.fullmatch(got):
+        return f"write {got} without quotes"
+    return ""
+
+
+_NUMBER = re.compile(r"-?\d+(\.\d*)?")
+
+
+def format_value(value: str | float) -> str:
+    """Format a value as in a vehicle file."""
+    if isinstance(value, str):
+        return quote(value)
+    return str(value).lower() if isinstance(value, bool) else f"{value}"
+
+
+KeyPath: TypeAlias = tuple[str | int, ...]
+"""Path of a value in a section."""
+
+
+def list_keys(*kinds: type) -> list[str]:
+    """Return the names of the fields of dataclasses."""
+    return list(dict.fromkeys(each.name for kind in kinds for each in dataclasses.fields(kind)))
+
+
+def _list_known_keys(kind: Any, path: tuple[str | int, ...]) -> list[str]:
+    """Return the keys known at a place below settings of `kind`: in a section, a mapping or a list of sections."""
+    for step in path:
+        if dataclasses.is_dataclass(kind):
+            kind = get_type_hints(kind).get(str(step))
+        else:
+            # a mapping or a list: what it holds is its last argument, or the first of tuple[X, ...]
+            kind = next((each for each in reversed(get_args(kind)) if each is not Ellipsis), None)
+        if type(None) in get_args(kind):
+            kind = next(each for each in get_args(kind) if each is not type(None))
+    return list_keys(kind) if dataclasses.is_dataclass(kind) and isinstance(kind, type) else []
+
+
+class SectionReader:
+    """Reads one driver's section and collects its problems."""
+
+    def __init__(self, name: str, section: Mapping[str, Any], locate: Callable[..., Location]):
+        """`locate` returns the location of a key path in the vehicle file."""
+        self.name, self.section, self._locate = name, section, locate
+        self.problems: list[Problem] = []
+        self._has_line = True
+
+    def read_kind(self, kinds: Mapping[str, DeviceKind]) -> DeviceKind:
+        """Return the kind of device that the section names. Raises ConfigError."""
+        given = self.section.get("device")
+        known = f"kinds: {', '.join(kinds)}"
+        if given is None:
+            words = ProblemText("device is missing", f"add a line: device: ... ({known})")
+            raise ConfigError([self._make_problem(words, "device")])
+        if not isinstance(given, str) or given not in kinds:
+            near = suggest_name(str(given), kinds)
+            fix = f"write {near[0]}" if near else known
+            raise ConfigError(
+                [self._make_problem(ProblemText(f"unknown device {quote(str(given))}", fix, near), "device")]
+            )
+        return kinds[given]
+
+    def read_line_type(self, kind: DeviceKind, more: list[str]) -> type[LineSettings]:
+        """Return the type of line that the section names by its first key.
+
+        `more`: the keys beside those of the line.
+        """
+        firsts = {get_line_key(each): each for each in kind.lines}
+        if not any(key in self.section for key in firsts):
+            known = [*list_keys(*kind.lines), *more]
+            for key in [each for each in self.section if each not in known]:
+                if not firsts.keys().isdisjoint(self._suggest_key(key, known)):
+                    self._report_misspelled(key, known)
+        given = [key for key in firsts if key in self.section]
+        if len(given) == 1:
+            return firsts[given[0]]
+        wanted = " or ".join(firsts)
+        if given:
+            self.report(given[-1], ProblemText(f"both {' and '.join(given)} are given", f"keep one of {wanted}"))
+        elif not any(key in self.section for key in _list_other_lines(kind)):
+            fix = f"add a line: {next(iter(firsts))}: ..."
+            self.problems.append(self._make_problem(ProblemText(f"no line is named: {wanted} is missing", fix)))
+        self._has_line = False
+        return next(iter(firsts.values()))
+
+    def report_unknown_keys(self, kind: DeviceKind, line: type[LineSettings], more: list[str]) -> None:
+        """Report keys that a driver of this kind on this line does not have."""
+        known = [*list_keys(*((line,) if self._has_line else kind.lines)), *more]
+        firsts = [get_line_key(each) for each in kind.lines]
+        on = f"device {kind.name} is on {' or '.join(firsts)}"
+        others = _list_other_lines(kind)
+        for key in [each for each in self.section if each not in known]:
+            if key in others:
+                what = f"{on}, not on {others[key]}"
+                fix = "take it out" if self._has_line else f"write {firsts[0]}: ... in its place"
+                self.report(key, ProblemText(what, fix))
+            elif key in list_keys(*get_args(LineSettings)):
+                owner = next(get_line_key(each) for each in get_args(LineSettings) if key in list_keys(each))
+                there = f"and {on}" if owner not in firsts else f"and the line here is {get_line_key(line)}"
+                self.report(key, ProblemText(f"{key} goes with {owner}, {there}", "take it out"))
+            else:
+                self._report_misspelled(key, known)
+
+    def _suggest_key(self, key: str, known: list[str]) -> Suggestion:
+        """Return the key that one of the section misspells; one that is given already is not what was meant."""
+        return self._suggest_at((key,), [each for each in known if each not in self.section])
+
+    def _suggest_at(self, path: KeyPath, known: list[str]) -> Suggestion:
+        """Return the key that an unknown one at a path had become, or misspells."""
+        renamed = find_renamed_key(".".join(map(str, ("drivers", self.name, *path))))
+        return Suggestion.of(str(path[-1]), renamed) if renamed in known else suggest_key(str(path[-1]), known)
+
+    def _report_misspelled(self, key: str, known: list[str]) -> None:
+        """Report an unknown key; its value is that of the key that is meant, which is not missing then."""
+        near = self._suggest_key(key, known)
+        fix = f"write {near[0]}" if near else f"known here: {', '.join(dict.fromkeys(known))}"
+        self.report(key, ProblemText(f"unknown key {quote(key)}", fix, near))
+        if near:
+            self.section = {near[0] if name == key else name: value for name, value in self.section.items()}
+
+    def report(self, key: str, words: ProblemText) -> None:
+        """Report a problem of a key."""
+        self.problems.append(self._make_problem(words, key))
+
+    def read_values(self, kind: type, given: Mapping[str, Any] | None = None) -> Any:
+        """Return the instance of `kind` that the section makes, None where something is wrong with it.
+
+        What is `given` goes before the section; what `kind` does not have is left out. A section's own rules are looked
+        at once all in it can be read, and end at the first: so what is wrong is left out, and the rest read again.
+        """
+        merged = json.loads(json.dumps({**self.section, **(given or {})}, default=str))
+        values = {key: value for key, value in merged.items() if key in list_keys(kind)}
+        gone: set[KeyPath] = set()
+        while True:
+            try:
+                # by way of JSON: strict there means that "4" is no number, while a list still makes a tuple
+                found: Any = get_adapter(kind).validate_json(json.dumps(values), strict=True)
+                return None if gone else found
+            except ValidationError as error:
+                wrong = [self._explain_error(kind, detail) for detail in error.errors()]
+            # a key that is misspelled is not missing
+            meant = {each for path, words in wrong for each in _suggested_paths(path, words)}
+            for path, words in wrong:
+                # what misses a part that was left out is no mistake
+                if words is not None and path not in meant and not any(each[: len(path)] == path for each in gone):
+                    self.problems.append(self._make_problem(words, *path))
+            # try to remove each, also after one failed
+            dropped = [_drop_at_path(values, path, gone) for path, _ in wrong]
+            if not all(dropped):
+                return None
+
+    def _explain_error(self, kind: type, detail: Any) -> tuple[KeyPath, ProblemText | None]:
+        """Return the key path of a pydantic error and its text; None if it is reported otherwise."""
+        path = tuple(detail["loc"])
+        last = str(path[-1]) if path else ""
+        if detail["type"] == "missing":
+            words = ProblemText(f"{last} is missing", f"add a line: {last}: ...")
+            return path, words if self._has_line or last not in list_keys(*get_args(LineSettings)) else None
+        if detail["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+            known = _list_known_keys(kind, path[:-1])
+            around = _get_at_path(self.section, path[:-1])
+            given = around if isinstance(around, dict) else {}
+            near = self._suggest_at(path, [each for each in known if each not in given])
+            return path, ProblemText(
+                f"unknown key {quote(last)}", f"write {near[0]}" if near else f"known here: {', '.join(known)}", near
+            )
+        if detail["type"] != "value_error":
+            return path, describe_error(detail, _list_known_keys(kind, path))
+        # found by the section as a whole; the message begins with the key that it is about
+        message = str(detail["msg"]).removeprefix("Value error, ")
+        key = message.partition(" ")[0].rstrip(":")
+        path = (*path, key) if key in _list_known_keys(kind, path) else path
+        return path, ProblemText(message[:1].lower() + message[1:])
+
+    def _make_problem(self, words: ProblemText, *path: str | int) -> Problem:
+        source = self._locate("drivers", self.name, *path)
+        return Problem(Severity.ERROR, words.message, source, words.fix, words.nearest)
+
+
+def _list_other_lines(kind: DeviceKind) -> dict[str, str]:
+    """Return the first keys of the lines that a kind is not on, and what they are lines to."""
+    own = {get_line_key(each) for each in kind.lines}
+    every = {get_line_key(each): each.description for each in get_args(LineSettings)}
+    return {key: about for key, about in every.items() if key not in own}
+
+
+def _suggested_paths(path: KeyPath, words: ProblemText | None) -> tuple[KeyPath, ...]:
+    """Return the path of the key that is meant by one that is misspelled; none where that is not what is wrong."""
+    if words is None or not isinstance(words.nearest, Suggestion) or path[-1:] != (words.nearest.replaced,):
+        return ()
+    return tuple((*path[:-1], each) for each in words.nearest)
+
+
+def _get_at_path(values: Any, path: KeyPath) -> Any:
+    for step in path:
+        values = values.get(step) if isinstance(values, dict) else None
+    return values
+
+
+def _drop_at_path(values: Any, path: KeyPath, gone: set[KeyPath]) -> bool:
+    """Remove the value at a path, or the nearest one around it (a whole list); return whether there was one."""
+    path = path[: next((n for n, step in enumerate(path) if isinstance(step, int)), len(path))]
+    while path:
+        around = _get_at_path(values, path[:-1])
+        if isinstance(around, dict) and path[-1] in around:
+            del around[path[-1]]
+            gone.add(path)
+            return True
+        gone.add(path)
+        path = path[:-1]
+    return False
+
+
+SOURCE_FIELD = "source"
 """The field of a kind's settings that takes the driver's name."""
 
-BAUDS = "bauds"
+BAUDS_FIELD = "bauds"
 """The field of a kind's settings that has the rates to try; `baud` in the section gives it one."""
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Where in which file a section stands; `lines` has the line of each key by its path."""
+class SourceMap:
+    """File and lines of the keys by path."""
 
     file: str = ""
     lines: Mapping[tuple[str | int, ...], int] = field(default_factory=dict)
 
-    def source(self, *path: str | int) -> Location:
+    def locate(self, *path: str | int) -> Location:
         """Return the place of a key, or of the nearest section around it."""
         line = next((self.lines[path[:n]] for n in range(len(path), 0, -1) if path[:n] in self.lines), 0)
         return Location(self.file, line, ".".join(map(str, path)))
 
-    def located(self, name: str, problems: Iterable[Problem]) -> tuple[Problem, ...]:
+    def locate_problems(self, name: str, problems: Iterable[Problem]) -> tuple[Problem, ...]:
         """Return problems of the driver `name` with the lines of the keys that they are about.
 
         Those of another file, e.g. of the syntax of a DBC, stay as they are. Names in a path may have dots.
         """
         lines = {".".join(map(str, path)): line for path, line in self.lines.items()}
 
-        def there(problem: Problem) -> Problem:
+        def locate_problem(problem: Problem) -> Problem:
             key = problem.element
             if not key.startswith("drivers."):
                 if problem.file:
@@ -57,7 +320,7 @@ class Place:
             line = next((lines[each] for each in around if each in lines), 0)
             return dataclasses.replace(problem, source=Location(self.file, line, key))
 
-        return tuple(map(there, problems))
+        return tuple(map(locate_problem, problems))
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,74 +333,76 @@ class DriverSettings:
     name: str
     kind: DeviceKind
     line: LineSettings
-    station: Any
+    device_settings: Any
     channel: str = ""
-    place: Place = field(default=Place(), compare=False, repr=False)
+    source_map: SourceMap = field(default=SourceMap(), compare=False, repr=False)
 
 
 def read_drivers(
-    sections: Mapping[str, Mapping[str, Any]], place: Place | None = None, kinds: Mapping[str, DeviceKind] = KINDS
+    sections: Mapping[str, Mapping[str, Any]],
+    source_map: SourceMap | None = None,
+    kinds: Mapping[str, DeviceKind] = KINDS,
 ) -> tuple[dict[str, DriverSettings], tuple[Problem, ...]]:
     """Return the settings of every driver of which nothing is wrong, by its name; and every problem of the others."""
-    place = place or Place()
-    problems = [empty_section(name, place) for name in empty_sections(sections, place)]
+    source_map = source_map or SourceMap()
+    problems = [make_empty_section_problem(name, source_map) for name in find_empty_sections(sections, source_map)]
     found = {}
     for name, section in sections.items():
         try:
-            found[name] = read_driver(name, section, place, kinds)
+            found[name] = read_driver(name, section, source_map, kinds)
         except ConfigError as error:
             problems += error.problems
     return found, tuple(problems)
 
 
-def empty_sections(sections: Mapping[str, object], place: Place) -> list[str]:
-    """Return the names of drivers that stand in the file with nothing after them, which counts as left out."""
+def find_empty_sections(sections: Mapping[str, object], place: SourceMap) -> list[str]:
+    """Return the names of drivers whose section is empty, which the parser leaves out."""
     named = [path[1] for path in place.lines if len(path) == 2 and path[0] == "drivers"]
     return [str(name) for name in named if name not in sections]
 
 
-def empty_section(name: str, place: Place) -> Problem:
+def make_empty_section_problem(name: str, place: SourceMap) -> Problem:
     """Return the problem of a driver that has a name and nothing else."""
     message, fix = f"drivers.{name} is empty: device is missing", "add a line: device: ..., or take the name out"
-    return Problem(Severity.ERROR, message, place.source("drivers", name), fix)
+    return Problem(Severity.ERROR, message, place.locate("drivers", name), fix)
 
 
 def read_driver(
-    name: str, section: Mapping[str, Any], place: Place | None = None, kinds: Mapping[str, DeviceKind] = KINDS
+    name: str, section: Mapping[str, Any], source_map: SourceMap | None = None, kinds: Mapping[str, DeviceKind] = KINDS
 ) -> DriverSettings:
     """Return the settings of one driver. Raises ConfigError with every problem of its section."""
-    place = place or Place()
-    reader = SectionReader(name, section, place.source)
-    kind = reader.kind(kinds)
+    source_map = source_map or SourceMap()
+    reader = SectionReader(name, section, source_map.locate)
+    kind = reader.read_kind(kinds)
     settings = kind.load().settings
-    station_keys = [key for key in keys_of(settings) if key != SOURCE and key not in kind.presets]
-    more = [*keys_of(_Common), *station_keys]
-    line = reader.line(kind, more)
-    reader.refuse_unknown(kind, line, more)
-    line_values = reader.values(line)
-    given: dict[str, Any] = {SOURCE: name, **kind.presets}
+    station_keys = [key for key in list_keys(settings) if key != SOURCE_FIELD and key not in kind.presets]
+    more = [*list_keys(_CommonKeys), *station_keys]
+    line = reader.read_line_type(kind, more)
+    reader.report_unknown_keys(kind, line, more)
+    line_values = reader.read_values(line)
+    given: dict[str, Any] = {SOURCE_FIELD: name, **kind.presets}
     baud = getattr(line_values, "baud", 0)
     if "bauds" in section and "baud" in section:
-        reader.refuse("baud", Words("both baud and bauds are given", "keep one of baud or bauds"))
-    elif baud and BAUDS in station_keys:
-        given[BAUDS] = [baud]
-    if line is TcpSettings and BAUDS in station_keys:
-        # the device server has the rate, and cannot be told another
-        given[BAUDS] = []
-    values = reader.values(settings, given)
-    common = reader.values(_Common)
+        reader.report("baud", ProblemText("both baud and bauds are given", "keep one of baud or bauds"))
+    elif baud and BAUDS_FIELD in station_keys:
+        given[BAUDS_FIELD] = [baud]
+    if line is TcpSettings and BAUDS_FIELD in station_keys:
+        # the device server owns the rate; it cannot be changed from here
+        given[BAUDS_FIELD] = []
+    values = reader.read_values(settings, given)
+    common = reader.read_values(_CommonKeys)
     if reader.problems:
         raise ConfigError(reader.problems)
-    return DriverSettings(name, kind, line_values, values, common.channel, place)
+    return DriverSettings(name, kind, line_values, values, common.channel, source_map)
 
 
 @dataclass(frozen=True, slots=True)
-class _Common:
+class _CommonKeys:
     """Keys that every driver has: its kind, and the channel, where it is not that of the sensors section."""
 
     device: str = ""
     channel: str = ""
 
 
-COMMON = tuple(keys_of(_Common))
+COMMON_KEYS = tuple(list_keys(_CommonKeys))
 """Keys that every driver has."""

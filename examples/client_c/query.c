@@ -1,4 +1,4 @@
-/* Where is one frame in another? A client written from the .lcm files alone. */
+/* Query the pose of one frame in another: a client written from the .lcm files alone. */
 #include <inttypes.h>
 #include <lcm/lcm.h>
 #include <math.h>
@@ -10,7 +10,7 @@
 #include "mslcm_get_transformation_request_t.h"
 
 #define REQUEST_CHANNEL "PLATFORM_GET_TRANSFORMATION"
-/* Starts with the server's reply prefix, and is the same at every start: programs on the bus remember each name. */
+/* Starts with the server's reply prefix, and is the same at every start: programs on the bus store each channel name. */
 #define REPLY_CHANNEL "REPLY_EXAMPLE_C"
 #define TRIES 3
 #define TRY_MS 500
@@ -38,7 +38,7 @@ static int64_t now_ms(void)
     return now.tv_sec * 1000LL + now.tv_nsec / 1000000;
 }
 
-/* Sends the request until its reply comes; NULL when none came. */
+/* Sends the request until its reply arrives; NULL after the last try. */
 static mslcm_get_transformation_reply_t *ask(lcm_t *bus, const mslcm_get_transformation_request_t *request)
 {
     struct waiting waiting = {request->header.request_id, NULL};
@@ -62,7 +62,7 @@ static void show(const mslcm_pose_transform_t *pose)
     /* fixed-axis roll, pitch, yaw */
     double level = hypot(h[0][0], h[1][0]);
     double pitch = atan2(-h[2][0], level), roll = 0.0, yaw;
-    if (level < 1e-9) { /* straight up or down: only the difference of roll and yaw is known */
+    if (level < 1e-9) { /* gimbal lock: only the difference of roll and yaw is known */
         yaw = atan2(-h[0][1], h[1][1]);
     } else {
         roll = atan2(h[2][1], h[2][2]);

@@ -12,10 +12,10 @@ import mslcm.reply_header_t;
 import mslcm.request_header_t;
 import mslcm.time_query_t;
 
-/** Where is one frame in another? A client written from the .lcm files alone. */
+/** Query the pose of one frame in another: a client written from the .lcm files alone. */
 public final class Query {
     private static final String REQUEST_CHANNEL = "PLATFORM_GET_TRANSFORMATION";
-    // Starts with the server's reply prefix, and is the same at every start: programs on the bus remember each name.
+    // Starts with the server's reply prefix, and is the same at every start: programs on the bus store each channel name.
     private static final String REPLY_CHANNEL = "REPLY_EXAMPLE_JAVA";
     private static final int TRIES = 3;
     private static final long TRY_MS = 500;
@@ -23,7 +23,7 @@ public final class Query {
     private Query() {
     }
 
-    /** Sends the request until its reply comes; null when none came. */
+    /** Sends the request until its reply arrives; null after the last try. */
     private static get_transformation_reply_t ask(LCM bus, get_transformation_request_t request)
             throws InterruptedException {
         LinkedBlockingQueue<get_transformation_reply_t> replies = new LinkedBlockingQueue<>();
@@ -34,7 +34,7 @@ public final class Query {
                     replies.add(reply);
                 }
             } catch (IOException error) {
-                // another type: somebody else speaks on our channel
+                // another type: another program publishes on our channel
             }
         });
         for (int attempt = 0; attempt < TRIES; attempt++) {
@@ -52,7 +52,7 @@ public final class Query {
         // fixed-axis roll, pitch, yaw
         double level = Math.hypot(h[0][0], h[1][0]);
         double pitch = Math.atan2(-h[2][0], level);
-        // straight up or down only the difference of roll and yaw is known
+        // gimbal lock: only the difference of roll and yaw is known
         boolean upright = level < 1e-9;
         double roll = upright ? 0.0 : Math.atan2(h[2][1], h[2][2]);
         double yaw = upright ? Math.atan2(-h[0][1], h[1][1]) : Math.atan2(h[1][0], h[0][0]);

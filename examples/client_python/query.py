@@ -1,4 +1,4 @@
-"""Where is one frame in another? A client written from the .lcm files alone: it needs lcm and the generated types."""
+"""Query the pose of one frame in another: a client written from the .lcm files alone, with lcm and generated types."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ import lcm
 from mslcm import get_transformation_reply_t, get_transformation_request_t, pose_transform_t
 
 REQUEST_CHANNEL = "PLATFORM_GET_TRANSFORMATION"
-# Starts with the server's reply prefix, and is the same at every start: programs on the bus remember each name.
+# Starts with the server's reply prefix, and is the same at every start: programs on the bus store each channel name.
 REPLY_CHANNEL = "REPLY_EXAMPLE_PYTHON"
 TRIES = 3
-TRY_SECONDS = 0.5
+TRY_TIMEOUT_S = 0.5
 
 
 def ask(bus: lcm.LCM, request: get_transformation_request_t) -> get_transformation_reply_t | None:
-    """Send the request until its reply comes; None when none came."""
+    """Send the request until its reply arrives; None after the last try."""
     replies: list[get_transformation_reply_t] = []
 
-    def take(channel: str, data: bytes) -> None:
+    def on_reply(channel: str, data: bytes) -> None:
         try:
             reply = get_transformation_reply_t.decode(data)
         except ValueError:
-            return  # another type: somebody else speaks on our channel
+            return  # another type: another program publishes on our channel
         if reply.header.request_id == request.header.request_id:
             replies.append(reply)
 
-    # LCM takes the name for a regular expression
-    subscription = bus.subscribe(re.escape(REPLY_CHANNEL), take)
+    # LCM treats the name as a regular expression
+    subscription = bus.subscribe(re.escape(REPLY_CHANNEL), on_reply)
     try:
         for _ in range(TRIES):
             bus.publish(REQUEST_CHANNEL, request.encode())
-            deadline = time.monotonic() + TRY_SECONDS
+            deadline = time.monotonic() + TRY_TIMEOUT_S
             while not replies and (left := deadline - time.monotonic()) > 0:
                 bus.handle_timeout(int(left * 1000) + 1)
             if replies:
@@ -46,11 +46,11 @@ def ask(bus: lcm.LCM, request: get_transformation_request_t) -> get_transformati
     return None
 
 
-def rpy(h: list[list[float]]) -> tuple[float, float, float]:
+def to_rpy(h: list[list[float]]) -> tuple[float, float, float]:
     """Fixed-axis roll, pitch, yaw of a homogeneous transform, radians."""
     level = math.hypot(h[0][0], h[1][0])
     pitch = math.atan2(-h[2][0], level)
-    if level < 1e-9:  # straight up or down: only the difference of roll and yaw is known
+    if level < 1e-9:  # gimbal lock: only the difference of roll and yaw is known
         return 0.0, pitch, math.atan2(-h[0][1], h[1][1])
     return math.atan2(h[2][1], h[2][2]), pitch, math.atan2(h[1][0], h[0][0])
 
@@ -60,7 +60,7 @@ def show(pose: pose_transform_t) -> None:
     h = pose.h_transform
     print(f"{pose.frame_of_interest} in {pose.frame_of_reference}")
     print("position_m {:.6f} {:.6f} {:.6f}".format(*(h[row][3] for row in range(3))))
-    print("rpy_deg {:.6f} {:.6f} {:.6f}".format(*map(math.degrees, rpy(h))))
+    print("rpy_deg {:.6f} {:.6f} {:.6f}".format(*map(math.degrees, to_rpy(h))))
     print("utime", pose.utime)
     print("valid", "yes" if pose.pose_valid else f"no, reasons 0x{pose.invalid_reasons:x}")
 
@@ -80,7 +80,7 @@ def main(arguments: list[str]) -> int:
         return 1
     reply = ask(bus, request)
     if reply is None:
-        print(f"query: no reply after {TRIES} tries of {TRY_SECONDS} s: is the server running?", file=sys.stderr)
+        print(f"query: no reply after {TRIES} tries of {TRY_TIMEOUT_S} s: is the server running?", file=sys.stderr)
         return 1
     if reply.header.status != reply.header.OK:
         near = f". Nearest: {', '.join(reply.header.nearest)}" if reply.header.nearest else ""

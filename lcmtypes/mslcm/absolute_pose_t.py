@@ -11,8 +11,9 @@ import mslcm
 
 class absolute_pose_t(object):
     """
-    Where a frame of the vehicle is in a frame of the world, as told by a source that is no satellite receiver: a
-    motion-capture system, a localizer on a map, a survey.
+    Pose of a frame of the vehicle in a world frame, from a source other than a GNSS receiver: a motion-capture system, a
+    map-based localizer, a survey.
+    @value AbsolutePoseSample
     """
 
     __slots__ = ["header", "frame_of_interest", "frame_of_reference", "position", "orientation", "covariance"]
@@ -24,7 +25,7 @@ class absolute_pose_t(object):
     def __init__(self):
         self.header = mslcm.sensor_header_t()
         """
-        When and by whom; header.utime is the instant the pose holds for.
+        Time and source; header.utime is the instant the pose holds for.
         LCM Type: mslcm.sensor_header_t
         """
 
@@ -32,32 +33,37 @@ class absolute_pose_t(object):
         """
         The frame of the vehicle whose pose this is: full name, Body:Frame; 200 characters at most on each side of the
         colon.
+        @check frame_name
         LCM Type: string
         """
 
         self.frame_of_reference = ""
         """
         The frame it is expressed in: World:UTM or World:ENU.
+        @check frame_name
         LCM Type: string
         """
 
         self.position = [ 0.0 for dim0 in range(3) ]
         """
-        Position of the frame of interest in the frame of reference, along its axes, metres; nan = not told.
+        Position of the frame of interest in the frame of reference, along its axes, meters; nan = not known.
+        @optional @check position
         LCM Type: double[3]
         """
 
         self.orientation = [ 0.0 for dim0 in range(4) ]
         """
-        Unit quaternion of the frame of interest in the frame of reference, scalar first (w x y z); nan = not told.
+        Unit quaternion of the frame of interest in the frame of reference, scalar first (w x y z); nan = not known.
+        @optional @check unit_quaternion
         LCM Type: double[4]
         """
 
         self.covariance = [ 0.0 for dim0 in range(36) ]
         """
         Covariance, row-major: x, y, z (m), about x, about y, about z (rad), along the axes of the frame of reference,
-        rotation applied on the left (fixed axes). The first number nan: not told. Rows and columns of a position or an
-        orientation that is not told are ignored: write 0.
+        rotation applied on the left (fixed axes). The first number nan: not known. Rows and columns of a position or an
+        orientation that is not known are ignored: write 0.
+        @optional @check finite
         LCM Type: double[36]
         """
 

@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class acknowledgement_t(object):
-    """ Reply to a request that asks for nothing but that something be done. """
+    """
+    Reply to a command.
+    @value Acknowledgement tuple
+    """
 
     __slots__ = ["header"]
 
@@ -21,7 +24,7 @@ class acknowledgement_t(object):
     def __init__(self):
         self.header = mslcm.reply_header_t()
         """
-        How the request ended.
+        Status of the request.
         LCM Type: mslcm.reply_header_t
         """
 

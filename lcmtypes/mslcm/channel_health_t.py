@@ -8,7 +8,11 @@ from io import BytesIO
 import struct
 
 class channel_health_t(object):
-    """ Traffic of one source that the daemon hears, or of a sensor of the vehicle file that it never heard. """
+    """
+    Traffic of one source, or of a sensor of the vehicle file from which no sample was received yet.
+    @value ChannelHealth
+    @part
+    """
 
     __slots__ = ["channel", "count", "rate_hz", "age", "delay_max", "silent", "measured", "used"]
 
@@ -19,14 +23,14 @@ class channel_health_t(object):
     def __init__(self):
         self.channel = ""
         """
-        `sensor:NAME` or `command:NAME` with the source's own name for itself (header.source); for a sensor of the vehicle
-        file that was never heard, the name of its channel with the vehicle's prefix.
+        `sensor:NAME` or `command:NAME` with the name in header.source; for a sensor of the vehicle file without samples,
+        the name of its channel with the vehicle's prefix.
         LCM Type: string
         """
 
         self.count = 0
         """
-        Messages taken since the start; 0 = never heard.
+        Messages received since the start.
         LCM Type: int64_t
         """
 
@@ -45,26 +49,30 @@ class channel_health_t(object):
         self.delay_max = 0.0
         """
         Greatest time over the last report's interval from when the host received a sample (header.host_utime) until the
-        daemon handled it, seconds: driver, bus and queue together; nan = no sample, or none that tells when it was received.
+        daemon handled it, seconds: driver, bus and queue together; nan = no sample, or host_utime is not known.
+        @default nan
         LCM Type: double
         """
 
         self.silent = False
         """
-        Whether it has been silent for longer than five of its usual intervals and than a second, or was never heard.
+        Whether no sample was received for five of its usual intervals and at least a second, or none at all.
+        @default False
         LCM Type: boolean
         """
 
         self.measured = 0
         """
         Measurements of its samples that localization decided on since the start; a sample may hold several, and wheels
-        are looked at every localization.filter.wheel_period. 0 for an inertial unit, which propagates.
+        are evaluated every localization.filter.wheel_period. 0 for an IMU, which propagates the state.
+        @default 0
         LCM Type: int64_t
         """
 
         self.used = 0
         """
         How many of these were used.
+        @default 0
         LCM Type: int64_t
         """
 

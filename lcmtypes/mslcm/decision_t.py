@@ -8,7 +8,11 @@ from io import BytesIO
 import struct
 
 class decision_t(object):
-    """ What became of one measurement in localization: used or not, and why. Part of decisions_t. """
+    """
+    Innovation test of one measurement in localization, and its outcome. Part of decisions_t.
+    @value Decision tuple
+    @part
+    """
 
     __slots__ = ["utime", "source", "seq", "kind", "verdict", "reason", "num", "residual", "innovation_covariance", "noise", "statistic", "limit"]
 
@@ -17,24 +21,26 @@ class decision_t(object):
     __dimensions__ = [None, None, None, None, None, None, None, ["num"], ["num", "num"], ["num", "num"], None, None]
 
     USED = 0
-    """ It went into the state. """
+    """ The state was updated with it. """
     REJECTED = 1
-    """ It contradicts what is known or is not good enough; reason says which. """
+    """ It failed the gate or a quality check, which reason names. """
     MONITORED = 2
-    """ It was compared and not used on purpose. """
-    TOOK_UP = 3
-    """ The state was set from it. """
+    """ It was compared and intentionally not used. """
+    RESET = 3
+    """ It initialized or reset the state. """
 
     def __init__(self):
         self.utime = 0
         """
         The instant of measurement, microseconds since the Unix epoch (UTC).
+        @check utime
         LCM Type: int64_t
         """
 
         self.source = ""
         """
         Name of the source that the measurement came from, as in its samples' header; 64 characters at most.
+        @check name
         LCM Type: string
         """
 
@@ -47,57 +53,65 @@ class decision_t(object):
         self.kind = ""
         """
         What was measured, one word: gps_position, wheel_speed, ...; 64 characters at most.
+        @check name
         LCM Type: string
         """
 
         self.verdict = 0
         """
-        What became of it: USED, REJECTED, MONITORED or TOOK_UP.
+        Outcome: USED, REJECTED, MONITORED or RESET.
+        @enum Verdict
         LCM Type: int8_t
         """
 
         self.reason = ""
         """
-        Why, one word; empty where there is nothing to say; 64 characters at most.
+        Reason, one word; may be empty; 64 characters at most.
+        @default "" @check name
         LCM Type: string
         """
 
         self.num = 0
         """
-        How many numbers were compared, 0 to 64: the degrees of freedom; 0 = refused before it could be compared.
+        Degrees of freedom, 0 to 64: the size of the residual; 0 = rejected before the comparison.
+        @max 64 @property dof
         LCM Type: int32_t
         """
 
         self.residual = []
         """
-        Measured minus expected, each number in the unit of the measurement.
+        Innovation: measured minus predicted, in the unit of the measurement.
+        @default ()
         LCM Type: double[num]
         """
 
         self.innovation_covariance = []
         """
-        Covariance of the residual as it was expected, noise included, in the squared units of the measurement. The first
-        number nan: not told.
+        Predicted covariance S of the residual, noise included, in the squared units of the measurement. The first number
+        nan: not known.
+        @default () @empty_nan
         LCM Type: double[num][num]
         """
 
         self.noise = []
         """
-        Covariance of the noise that was assumed of the measurement, in the squared units of the measurement. The first
-        number nan: not told.
+        Covariance R of the measurement noise, in the squared units of the measurement. The first number nan: not known.
+        @default () @empty_nan
         LCM Type: double[num][num]
         """
 
         self.statistic = 0.0
         """
-        Residual squared against its covariance, residual' S^-1 residual, no unit: chi-square distributed with num degrees
-        of freedom if all is well; nan = not told.
+        Normalized innovation squared (NIS), residual' S^-1 residual, no unit: chi-square distributed with num degrees of
+        freedom if the model is right; nan = not known.
+        @default nan
         LCM Type: double
         """
 
         self.limit = 0.0
         """
-        What statistic was held against, no unit: it was rejected above; nan = it was not.
+        Chi-square gate: a greater statistic is rejected, no unit; nan = not gated.
+        @default nan
         LCM Type: double
         """
 

@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class decisions_t(object):
-    """ What became of measurements, each said once, when nothing can change it any more. """
+    """
+    Decisions about measurements, each published once, when it is final.
+    @value PublishDecisions
+    """
 
     __slots__ = ["utime", "count", "decisions"]
 
@@ -21,13 +24,15 @@ class decisions_t(object):
     def __init__(self):
         self.utime = 0
         """
-        When it was said, microseconds since the Unix epoch (UTC).
+        Time of publication, microseconds since the Unix epoch (UTC).
+        @check utime
         LCM Type: int64_t
         """
 
         self.count = 0
         """
         Number of decisions, 0 to 1,024.
+        @max 1024
         LCM Type: int32_t
         """
 

@@ -8,7 +8,10 @@ from io import BytesIO
 import struct
 
 class driver_health_t(object):
-    """ How a driver is, once a second and whenever its phase changes. Counts are since the start of the driver. """
+    """
+    Health report of a driver, once a second and at every change of its phase. Counts are since the start of the driver.
+    @value DriverHealth
+    """
 
     __slots__ = ["utime", "source", "device", "phase", "text", "link", "baud", "reconnects", "samples", "rate_hz", "age", "clock_offset", "clock_drift", "clock_sigma", "clock_restarts", "num_counters", "counter_names", "counter_values"]
 
@@ -19,108 +22,124 @@ class driver_health_t(object):
     CLOSED = 0
     """ The line is not open: not yet, or the device was unplugged. """
     WAITING = 1
-    """ The line is open and nothing was heard. """
+    """ The line is open and nothing was received. """
     CONFIGURING = 2
     """ The device answers and is being set up. """
     STREAMING = 3
-    """ Samples come. """
+    """ Samples arrive. """
     SILENT = 4
-    """ The device has stopped to speak, or speaks what cannot be used. """
+    """ The device stopped sending, or sends what cannot be used. """
 
     def __init__(self):
         self.utime = 0
         """
         When the report was made, microseconds since the Unix epoch (UTC, host's clock).
+        @check utime
         LCM Type: int64_t
         """
 
         self.source = ""
         """
         Name of the driver in the vehicle file, which is also the source in the headers of its samples, e.g. gps.
+        @check name
         LCM Type: string
         """
 
         self.device = ""
         """
-        Kind of the device, e.g. novatel.
+        Type of the device, e.g. novatel.
+        @check name
         LCM Type: string
         """
 
         self.phase = 0
         """
         CLOSED, WAITING, CONFIGURING, STREAMING or SILENT.
+        @enum DriverPhase
         LCM Type: int8_t
         """
 
         self.text = ""
         """
-        What there is to say of it, for people: why the line is closed, what is being set up.
+        Details for people: why the line is closed, what is being configured.
+        @default ""
         LCM Type: string
         """
 
         self.link = ""
         """
         The line, for people, e.g. /dev/ttyUSB0 or tcp 10.0.0.5:3001.
+        @default ""
         LCM Type: string
         """
 
         self.baud = 0
         """
         Symbols a second on the line; 0 where that makes no sense.
+        @default 0
         LCM Type: int32_t
         """
 
         self.reconnects = 0
         """
-        How often the line was opened anew after the first time.
+        How often the line was reopened.
+        @default 0
         LCM Type: int64_t
         """
 
         self.samples = 0
         """
         Samples published.
+        @default 0
         LCM Type: int64_t
         """
 
         self.rate_hz = 0.0
         """
         Samples a second over the last report's interval, Hz.
+        @default 0.0
         LCM Type: double
         """
 
         self.age = 0.0
         """
         Time since the last sample, seconds; nan = none yet.
+        @default nan
         LCM Type: double
         """
 
         self.clock_offset = 0.0
         """
-        Host minus device time at the last sample, seconds; nan = the device has no time, or none came yet.
+        Host minus device time at the last sample, seconds; nan = the device has no clock, or sent no time yet.
+        @default nan
         LCM Type: double
         """
 
         self.clock_drift = 0.0
         """
         By what fraction the host's clock runs faster than the device's; nan as above.
+        @default nan
         LCM Type: double
         """
 
         self.clock_sigma = 0.0
         """
         Standard deviation of the last sample's utime, seconds; nan = no sample yet.
+        @default nan
         LCM Type: double
         """
 
         self.clock_restarts = 0
         """
-        How often a step of the device's or the host's clock was seen.
+        Detected steps of the device's or the host's clock.
+        @default 0
         LCM Type: int64_t
         """
 
         self.num_counters = 0
         """
         Number of counters.
+        @rows counters @max 256 @default ()
         LCM Type: int32_t
         """
 

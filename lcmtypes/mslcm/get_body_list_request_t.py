@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class get_body_list_request_t(object):
-    """ Platform.getBodyList: the names of all bodies. Answered by name_list_reply_t. """
+    """
+    Platform.getBodyList: the names of all bodies. Answered by name_list_reply_t.
+    @value GetBodyList tuple
+    """
 
     __slots__ = ["header"]
 
@@ -21,7 +24,7 @@ class get_body_list_request_t(object):
     def __init__(self):
         self.header = mslcm.request_header_t()
         """
-        Which request, and where the answer goes.
+        Id of the request, and the channel of the reply.
         LCM Type: mslcm.request_header_t
         """
 

@@ -10,7 +10,11 @@ import struct
 import mslcm
 
 class get_explanation_reply_t(object):
-    """ Reply to get_explanation_request_t. """
+    """
+    Reply to get_explanation_request_t.
+    @value ExplanationReply
+    @codec motion value
+    """
 
     __slots__ = ["header", "transform", "num_edges", "edges"]
 
@@ -21,7 +25,7 @@ class get_explanation_reply_t(object):
     def __init__(self):
         self.header = mslcm.reply_header_t()
         """
-        How the request ended.
+        Status of the request.
         LCM Type: mslcm.reply_header_t
         """
 
@@ -39,7 +43,7 @@ class get_explanation_reply_t(object):
 
         self.edges = []
         """
-        The way from the frame of reference to the frame of interest.
+        The path from the frame of reference to the frame of interest.
         LCM Type: mslcm.path_edge_t[num_edges]
         """
 

@@ -10,7 +10,11 @@ import struct
 import mslcm
 
 class get_explanation_request_t(object):
-    """ Platform.getExplanation: a transformation, and each edge that it rests on. Answered by get_explanation_reply_t. """
+    """
+    Platform.getExplanation: a transformation, and each edge of its path. Answered by get_explanation_reply_t.
+    @value GetExplanation tuple
+    @order header frame_of_interest frame_of_reference time
+    """
 
     __slots__ = ["header", "time", "frame_of_interest", "frame_of_reference"]
 
@@ -21,25 +25,28 @@ class get_explanation_request_t(object):
     def __init__(self):
         self.header = mslcm.request_header_t()
         """
-        Which request, and where the answer goes.
+        Id of the request, and the channel of the reply.
         LCM Type: mslcm.request_header_t
         """
 
         self.time = mslcm.time_query_t()
         """
-        What time is meant.
+        Time of the query.
+        @default TimeQuery()
         LCM Type: mslcm.time_query_t
         """
 
         self.frame_of_interest = ""
         """
         The frame whose pose is asked for: full name, as in get_transformation_request_t.
+        @check frame_name
         LCM Type: string
         """
 
         self.frame_of_reference = ""
         """
         The frame it is to be expressed in: full name.
+        @check frame_name
         LCM Type: string
         """
 

@@ -13,6 +13,7 @@ class get_h_transform_request_t(object):
     """
     Pose.getHTransform and Pose.getHTransformInv: the vehicle's base frame in World:UTM, or World:UTM in the base frame.
     Answered by get_transformation_reply_t.
+    @value GetHTransform tuple
     """
 
     __slots__ = ["header", "inverse", "time"]
@@ -24,19 +25,21 @@ class get_h_transform_request_t(object):
     def __init__(self):
         self.header = mslcm.request_header_t()
         """
-        Which request, and where the answer goes.
+        Id of the request, and the channel of the reply.
         LCM Type: mslcm.request_header_t
         """
 
         self.inverse = False
         """
         false: the base frame in World:UTM. true: World:UTM in the base frame.
+        @default False
         LCM Type: boolean
         """
 
         self.time = mslcm.time_query_t()
         """
-        What time is meant.
+        Time of the query.
+        @default TimeQuery()
         LCM Type: mslcm.time_query_t
         """
 

@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class get_history_reply_t(object):
-    """ Reply to get_history_request_t. """
+    """
+    Reply to get_history_request_t.
+    @value HistoryReply tuple
+    """
 
     __slots__ = ["header", "num_poses", "poses"]
 
@@ -21,7 +24,7 @@ class get_history_reply_t(object):
     def __init__(self):
         self.header = mslcm.reply_header_t()
         """
-        How the request ended.
+        Status of the request.
         LCM Type: mslcm.reply_header_t
         """
 
@@ -33,7 +36,8 @@ class get_history_reply_t(object):
 
         self.poses = []
         """
-        At start, start + 1/rate, ... up to end; times that are not held are left out.
+        At start, start + 1/rate, ... up to end; times outside the history are left out.
+        @as answers @default ()
         LCM Type: mslcm.pose_vector_t[num_poses]
         """
 

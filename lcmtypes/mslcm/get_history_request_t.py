@@ -13,6 +13,7 @@ class get_history_request_t(object):
     """
     Pose.getHistory: the vehicle's base frame in World:UTM between two times at an even rate.
     Answered by get_history_reply_t.
+    @value GetHistory tuple
     """
 
     __slots__ = ["header", "start_utime", "end_utime", "rate_hz"]
@@ -24,25 +25,27 @@ class get_history_request_t(object):
     def __init__(self):
         self.header = mslcm.request_header_t()
         """
-        Which request, and where the answer goes.
+        Id of the request, and the channel of the reply.
         LCM Type: mslcm.request_header_t
         """
 
         self.start_utime = 0
         """
         First time, microseconds since the Unix epoch (UTC).
+        @check utime
         LCM Type: int64_t
         """
 
         self.end_utime = 0
         """
         Last time, microseconds since the Unix epoch (UTC), not before start_utime.
+        @check utime
         LCM Type: int64_t
         """
 
         self.rate_hz = 0.0
         """
-        Poses a second, Hz, positive. More than 1,000 poses in one request are refused.
+        Poses a second, Hz, positive. More than 1,000 poses in one request are rejected.
         LCM Type: double
         """
 

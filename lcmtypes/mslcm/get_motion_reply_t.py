@@ -10,9 +10,13 @@ import struct
 import mslcm
 
 class get_motion_reply_t(object):
-    """ Reply to get_motion_request_t. """
+    """
+    Reply to get_motion_request_t.
+    @value MotionReply
+    @codec motion value
+    """
 
-    __slots__ = ["header", "transform", "expressed_in", "velocity", "rate", "acceleration", "turn_acceleration", "covariance"]
+    __slots__ = ["header", "transform", "expressed_in", "velocity", "angular_velocity", "acceleration", "angular_acceleration", "covariance"]
 
     __typenames__ = ["mslcm.reply_header_t", "mslcm.pose_transform_t", "string", "double", "double", "double", "double", "double"]
 
@@ -21,13 +25,13 @@ class get_motion_reply_t(object):
     def __init__(self):
         self.header = mslcm.reply_header_t()
         """
-        How the request ended.
+        Status of the request.
         LCM Type: mslcm.reply_header_t
         """
 
         self.transform = mslcm.pose_transform_t()
         """
-        Where the frame of interest is, in the frame of reference. Meaningful only when header.status is OK, as all below.
+        Pose of the frame of interest in the frame of reference. Meaningful only when header.status is OK, as all below.
         LCM Type: mslcm.pose_transform_t
         """
 
@@ -43,7 +47,7 @@ class get_motion_reply_t(object):
         LCM Type: double[3]
         """
 
-        self.rate = [ 0.0 for dim0 in range(3) ]
+        self.angular_velocity = [ 0.0 for dim0 in range(3) ]
         """
         Angular velocity, rad/s.
         LCM Type: double[3]
@@ -55,7 +59,7 @@ class get_motion_reply_t(object):
         LCM Type: double[3]
         """
 
-        self.turn_acceleration = [ 0.0 for dim0 in range(3) ]
+        self.angular_acceleration = [ 0.0 for dim0 in range(3) ]
         """
         Angular acceleration, rad/s2.
         LCM Type: double[3]
@@ -84,9 +88,9 @@ class get_motion_reply_t(object):
         buf.write(__expressed_in_encoded)
         buf.write(b"\0")
         buf.write(struct.pack('>3d', *self.velocity[:3]))
-        buf.write(struct.pack('>3d', *self.rate[:3]))
+        buf.write(struct.pack('>3d', *self.angular_velocity[:3]))
         buf.write(struct.pack('>3d', *self.acceleration[:3]))
-        buf.write(struct.pack('>3d', *self.turn_acceleration[:3]))
+        buf.write(struct.pack('>3d', *self.angular_acceleration[:3]))
         buf.write(struct.pack('>36d', *self.covariance[:36]))
 
     @staticmethod
@@ -107,9 +111,9 @@ class get_motion_reply_t(object):
         __expressed_in_len = struct.unpack('>I', buf.read(4))[0]
         self.expressed_in = buf.read(__expressed_in_len)[:-1].decode('utf-8', 'replace')
         self.velocity = struct.unpack('>3d', buf.read(24))
-        self.rate = struct.unpack('>3d', buf.read(24))
+        self.angular_velocity = struct.unpack('>3d', buf.read(24))
         self.acceleration = struct.unpack('>3d', buf.read(24))
-        self.turn_acceleration = struct.unpack('>3d', buf.read(24))
+        self.angular_acceleration = struct.unpack('>3d', buf.read(24))
         self.covariance = struct.unpack('>36d', buf.read(288))
         return self
 
@@ -117,7 +121,7 @@ class get_motion_reply_t(object):
     def _get_hash_recursive(parents):
         if get_motion_reply_t in parents: return 0
         newparents = parents + [get_motion_reply_t]
-        tmphash = (0x772719d98dd164c3+ mslcm.reply_header_t._get_hash_recursive(newparents)+ mslcm.pose_transform_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0xed36430f04a151ca+ mslcm.reply_header_t._get_hash_recursive(newparents)+ mslcm.pose_transform_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class get_motion_request_t(object):
-    """ Platform.getMotion: how one frame moves in another. Answered by get_motion_reply_t. """
+    """
+    Platform.getMotion: how one frame moves in another. Answered by get_motion_reply_t.
+    @value GetMotion tuple
+    """
 
     __slots__ = ["header", "frame_of_interest", "frame_of_reference", "expressed_in", "time"]
 
@@ -21,31 +24,35 @@ class get_motion_request_t(object):
     def __init__(self):
         self.header = mslcm.request_header_t()
         """
-        Which request, and where the answer goes.
+        Id of the request, and the channel of the reply.
         LCM Type: mslcm.request_header_t
         """
 
         self.frame_of_interest = ""
         """
         The frame whose motion is asked for: full name, as in get_transformation_request_t.
+        @check frame_name
         LCM Type: string
         """
 
         self.frame_of_reference = ""
         """
-        The frame that the motion is relative to, as seen by one who rides on it.
+        The frame that the motion is relative to, as an observer fixed to it measures it.
+        @check frame_name
         LCM Type: string
         """
 
         self.expressed_in = ""
         """
         The frame along whose axes the vectors are to be; empty: frame_of_reference.
+        @default "" @check frame_name
         LCM Type: string
         """
 
         self.time = mslcm.time_query_t()
         """
-        What time is meant.
+        Time of the query.
+        @default TimeQuery()
         LCM Type: mslcm.time_query_t
         """
 

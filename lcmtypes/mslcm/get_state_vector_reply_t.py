@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class get_state_vector_reply_t(object):
-    """ Reply to get_state_vector_request_t. """
+    """
+    Reply to get_state_vector_request_t.
+    @value StateVectorReply tuple
+    """
 
     __slots__ = ["header", "pose"]
 
@@ -21,13 +24,14 @@ class get_state_vector_reply_t(object):
     def __init__(self):
         self.header = mslcm.reply_header_t()
         """
-        How the request ended.
+        Status of the request.
         LCM Type: mslcm.reply_header_t
         """
 
         self.pose = mslcm.pose_vector_t()
         """
         The base frame in World:UTM. Meaningful only when header.status is OK.
+        @if_ok answer
         LCM Type: mslcm.pose_vector_t
         """
 

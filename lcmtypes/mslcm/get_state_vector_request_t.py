@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class get_state_vector_request_t(object):
-    """ Pose.getStateVector: the vehicle's base frame in World:UTM as a 7-vector. Answered by get_state_vector_reply_t. """
+    """
+    Pose.getStateVector: the vehicle's base frame in World:UTM as a 7-vector. Answered by get_state_vector_reply_t.
+    @value GetStateVector tuple
+    """
 
     __slots__ = ["header", "time"]
 
@@ -21,13 +24,14 @@ class get_state_vector_request_t(object):
     def __init__(self):
         self.header = mslcm.request_header_t()
         """
-        Which request, and where the answer goes.
+        Id of the request, and the channel of the reply.
         LCM Type: mslcm.request_header_t
         """
 
         self.time = mslcm.time_query_t()
         """
-        What time is meant.
+        Time of the query.
+        @default TimeQuery()
         LCM Type: mslcm.time_query_t
         """
 

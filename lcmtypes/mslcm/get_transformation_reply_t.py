@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class get_transformation_reply_t(object):
-    """ Reply to get_transformation_request_t and get_h_transform_request_t. """
+    """
+    Reply to get_transformation_request_t and get_h_transform_request_t.
+    @value TransformReply tuple
+    """
 
     __slots__ = ["header", "transform"]
 
@@ -21,13 +24,14 @@ class get_transformation_reply_t(object):
     def __init__(self):
         self.header = mslcm.reply_header_t()
         """
-        How the request ended.
+        Status of the request.
         LCM Type: mslcm.reply_header_t
         """
 
         self.transform = mslcm.pose_transform_t()
         """
         The pose asked for. Meaningful only when header.status is OK.
+        @if_ok answer
         LCM Type: mslcm.pose_transform_t
         """
 

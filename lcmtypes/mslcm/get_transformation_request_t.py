@@ -13,6 +13,7 @@ class get_transformation_request_t(object):
     """
     Platform.getTransformation: the pose of frame_of_interest in frame_of_reference.
     Answered by get_transformation_reply_t.
+    @value GetTransformation tuple
     """
 
     __slots__ = ["header", "frame_of_interest", "frame_of_reference", "time"]
@@ -24,7 +25,7 @@ class get_transformation_request_t(object):
     def __init__(self):
         self.header = mslcm.request_header_t()
         """
-        Which request, and where the answer goes.
+        Id of the request, and the channel of the reply.
         LCM Type: mslcm.request_header_t
         """
 
@@ -43,7 +44,8 @@ class get_transformation_request_t(object):
 
         self.time = mslcm.time_query_t()
         """
-        What time is meant.
+        Time of the query.
+        @default TimeQuery()
         LCM Type: mslcm.time_query_t
         """
 

@@ -13,6 +13,8 @@ class get_transformations_reply_t(object):
     """
     A part of the reply to get_transformations_request_t. Parts may be lost or come in any order; together they hold
     every instant of every pair.
+    @value PoseBatchReply
+    @codec batch value
     """
 
     __slots__ = ["header", "part", "num_parts", "pair", "first", "initial_utm", "utm_zone", "utm_north", "origin_id", "num_instants", "vectors", "status", "invalid_reasons", "quality_flags", "pose_epochs", "num_covariances", "covariances"]
@@ -24,7 +26,7 @@ class get_transformations_reply_t(object):
     def __init__(self):
         self.header = mslcm.reply_header_t()
         """
-        How the request ended. Unless its status is OK there is one part, and nothing in it.
+        Status of the request. Unless its status is OK there is one part, and nothing in it.
         LCM Type: mslcm.reply_header_t
         """
 
@@ -84,7 +86,7 @@ class get_transformations_reply_t(object):
 
         self.vectors = []
         """
-        Poses as px py pz qs qx qy qz: metres, unit quaternion, scalar first. nan unless status is OK.
+        Poses as px py pz qs qx qy qz: meters, unit quaternion, scalar first. nan unless status is OK.
         LCM Type: double[num_instants][7]
         """
 

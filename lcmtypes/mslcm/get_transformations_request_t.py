@@ -11,8 +11,9 @@ import mslcm
 
 class get_transformations_request_t(object):
     """
-    Platform.getTransformations: poses of several pairs of frames at many instants, worked out together.
+    Platform.getTransformations: poses of several pairs of frames at many instants, as one batch.
     Answered by get_transformations_reply_t, in parts.
+    @value GetTransformations tuple
     """
 
     __slots__ = ["header", "num_pairs", "frames_of_interest", "frames_of_reference", "num_instants", "at", "fixed_frame", "reference_at", "with_covariance"]
@@ -24,45 +25,51 @@ class get_transformations_request_t(object):
     def __init__(self):
         self.header = mslcm.request_header_t()
         """
-        Which request, and where the answers go.
+        Id of the request, and the channel of the replies.
         LCM Type: mslcm.request_header_t
         """
 
         self.num_pairs = 0
         """
         Number of pairs, 1 to 64.
+        @rows pairs @limit 64 @least 1
         LCM Type: int32_t
         """
 
         self.frames_of_interest = []
         """
         The frames whose poses are asked for: full names, as in get_transformation_request_t.
+        @check frame_name
         LCM Type: string[num_pairs]
         """
 
         self.frames_of_reference = []
         """
         The frames they are to be expressed in.
+        @check frame_name
         LCM Type: string[num_pairs]
         """
 
         self.num_instants = 0
         """
-        Number of instants; times num_pairs it is 2,000 at most, more is refused.
+        Number of instants; times num_pairs it is 2,000 at most, more is rejected.
+        @max 100_000
         LCM Type: int32_t
         """
 
         self.at = []
         """
         The instants, microseconds since the Unix epoch (UTC). Poses are exact or between two held values.
+        @check_all instants
         LCM Type: int64_t[num_instants]
         """
 
         self.fixed_frame = ""
         """
-        A frame that is taken to stand still: then the poses are those of the frames of interest at the instants in the
+        A frame that is assumed to be fixed: then the poses are those of the frames of interest at the instants in the
         frames of reference at reference_at. Odom:Origin for short times, a world frame otherwise. Empty: both at the
         same instant.
+        @default "" @check frame_name
         LCM Type: string
         """
 
@@ -70,12 +77,14 @@ class get_transformations_request_t(object):
         """
         The instant of the frames of reference, microseconds since the Unix epoch (UTC); 0 = the latest. Not read where
         fixed_frame is empty.
+        @default 0 @check utime
         LCM Type: int64_t
         """
 
         self.with_covariance = False
         """
         Whether covariances are wanted: they make the reply five times as long.
+        @default True
         LCM Type: boolean
         """
 

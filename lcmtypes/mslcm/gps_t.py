@@ -11,8 +11,10 @@ import mslcm
 
 class gps_t(object):
     """
-    One fix of a satellite receiver. What the receiver did not say is nan.
-    The position is that of the antenna's phase centre.
+    One fix of a GNSS receiver. What the receiver does not report is nan.
+    The position is that of the antenna's phase center.
+    @value GpsSample
+    @order header fix_type latitude_deg longitude_deg height_ellipsoidal height_msl undulation satellites hdop vdop pdop position_covariance velocity velocity_covariance velocity_latency speed speed_sigma course course_sigma baseline_yaw baseline_yaw_sigma
     """
 
     __slots__ = ["header", "fix_type", "satellites", "hdop", "vdop", "pdop", "latitude_deg", "longitude_deg", "height_ellipsoidal", "height_msl", "undulation", "position_covariance", "velocity", "velocity_covariance", "velocity_latency", "speed", "speed_sigma", "course", "course_sigma", "baseline_yaw", "baseline_yaw_sigma"]
@@ -39,37 +41,42 @@ class gps_t(object):
     def __init__(self):
         self.header = mslcm.sensor_header_t()
         """
-        When and by whom; header.utime is the instant the position holds for.
+        Time and source; header.utime is the instant the position holds for.
         LCM Type: mslcm.sensor_header_t
         """
 
         self.fix_type = 0
         """
         What the fix rests on: one of FIX_NONE to FIX_DEAD_RECKONING.
+        @enum FixType FIX_
         LCM Type: int8_t
         """
 
         self.satellites = 0
         """
-        Satellites used in the solution; -1 = not said.
+        Satellites used in the solution; -1 = not known.
+        @default -1
         LCM Type: int16_t
         """
 
         self.hdop = 0.0
         """
         Horizontal dilution of precision, no unit.
+        @default nan
         LCM Type: double
         """
 
         self.vdop = 0.0
         """
         Vertical dilution of precision, no unit.
+        @default nan
         LCM Type: double
         """
 
         self.pdop = 0.0
         """
         Position dilution of precision, no unit.
+        @default nan
         LCM Type: double
         """
 
@@ -87,37 +94,43 @@ class gps_t(object):
 
         self.height_ellipsoidal = 0.0
         """
-        Height above the WGS 84 ellipsoid, metres, up positive.
+        Height above the WGS 84 ellipsoid, meters, up positive.
+        @default nan
         LCM Type: double
         """
 
         self.height_msl = 0.0
         """
-        Height above mean sea level, metres, up positive.
+        Height above mean sea level, meters, up positive.
+        @default nan
         LCM Type: double
         """
 
         self.undulation = 0.0
         """
-        Geoid's height above the ellipsoid, metres, up positive: height_ellipsoidal = height_msl + undulation.
+        Geoid's height above the ellipsoid, meters, up positive: height_ellipsoidal = height_msl + undulation.
+        @default nan
         LCM Type: double
         """
 
         self.position_covariance = [ 0.0 for dim0 in range(9) ]
         """
         Covariance of the position, row-major, along true east, true north, up, m2.
+        @optional
         LCM Type: double[9]
         """
 
         self.velocity = [ 0.0 for dim0 in range(3) ]
         """
         Velocity of the antenna over ground along true east, true north, up, m/s.
+        @optional
         LCM Type: double[3]
         """
 
         self.velocity_covariance = [ 0.0 for dim0 in range(9) ]
         """
         Covariance of the velocity, row-major, along true east, true north, up, (m/s)2.
+        @optional
         LCM Type: double[9]
         """
 
@@ -125,30 +138,35 @@ class gps_t(object):
         """
         Seconds, not negative: velocity, speed and course hold for header.utime minus this. Some receivers report
         a velocity of the recent past.
+        @default nan
         LCM Type: double
         """
 
         self.speed = 0.0
         """
         Horizontal speed over ground, m/s, never negative.
+        @default nan
         LCM Type: double
         """
 
         self.speed_sigma = 0.0
         """
         Standard deviation of speed, m/s.
+        @default nan
         LCM Type: double
         """
 
         self.course = 0.0
         """
         Direction of motion over ground, radians, counter-clockwise from true east (not a compass course), -pi to pi.
+        @default nan
         LCM Type: double
         """
 
         self.course_sigma = 0.0
         """
         Standard deviation of course, radians.
+        @default nan
         LCM Type: double
         """
 
@@ -156,12 +174,14 @@ class gps_t(object):
         """
         Direction of the antenna baseline of a dual-antenna receiver, from the antenna whose position is given to the
         other one, radians, counter-clockwise from true east (not a compass heading), -pi to pi.
+        @default nan
         LCM Type: double
         """
 
         self.baseline_yaw_sigma = 0.0
         """
         Standard deviation of baseline_yaw, radians.
+        @default nan
         LCM Type: double
         """
 

@@ -11,16 +11,17 @@ import mslcm
 
 class health_t(object):
     """
-    How the daemon is, once a second and when something changes that people who watch should know at once: the state, why
-    the pose may not be used, the geometry, a notice, a sensor that falls silent or returns; then at most ten times a
-    second. Counts are since the start. Rates and the lateness of ticks are of the last whole period, not of a change.
+    Health report of the service, once a second and at once when the state, the invalid reasons, the geometry, a warning
+    or the silence of a sensor changes; at most ten times a second. Counts are since the start. Rates and tick latencies
+    are of the last whole period, also in a report of a change.
+    @value Health
     """
 
-    __slots__ = ["utime", "uptime", "version", "vehicle", "model_revision", "host", "pid", "state", "invalid_reasons", "invalid_text", "pose_epoch", "origin_id", "poses_published", "requests_answered", "requests_parked", "requests_queued", "ticks_missed", "handler_errors", "tick_lateness_p50", "tick_lateness_p90", "tick_lateness_p99", "tick_lateness_max", "memory", "cpu_share", "mode", "phase", "standing", "horizontal_bound", "heading_bound", "seconds_to_limit", "fix_age", "num_channels", "channels", "num_rejected", "rejected", "num_notices", "notice_subjects", "notice_texts"]
+    __slots__ = ["utime", "uptime", "version", "vehicle", "model_revision", "state", "invalid_reasons", "pose_epoch", "origin_id", "poses_published", "requests_answered", "requests_waiting", "ticks_missed", "handler_errors", "tick_latency_p50", "tick_latency_p90", "tick_latency_p99", "tick_latency_max", "invalid_text", "host", "pid", "requests_queued", "memory", "cpu_share", "localization", "num_channels", "channels", "num_rejected", "rejected", "num_warnings", "warning_subjects", "warning_texts"]
 
-    __typenames__ = ["int64_t", "double", "string", "string", "string", "string", "int32_t", "int8_t", "int32_t", "string", "int32_t", "int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "int64_t", "int64_t", "double", "double", "double", "double", "int64_t", "double", "int8_t", "int8_t", "boolean", "double", "double", "double", "double", "int32_t", "mslcm.channel_health_t", "int32_t", "mslcm.rejected_count_t", "int32_t", "string", "string"]
+    __typenames__ = ["int64_t", "double", "string", "string", "string", "int8_t", "int32_t", "int32_t", "int64_t", "int64_t", "int64_t", "int32_t", "int64_t", "int64_t", "double", "double", "double", "double", "string", "string", "int32_t", "int32_t", "int64_t", "double", "mslcm.localization_health_t", "int32_t", "mslcm.channel_health_t", "int32_t", "mslcm.rejected_count_t", "int32_t", "string", "string"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_channels"], None, ["num_rejected"], None, ["num_notices"], ["num_notices"]]
+    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_channels"], None, ["num_rejected"], None, ["num_warnings"], ["num_warnings"]]
 
     STARTING = 0
     """ No valid pose was published yet. """
@@ -60,18 +61,6 @@ class health_t(object):
         LCM Type: string
         """
 
-        self.host = ""
-        """
-        The machine that the daemon runs on, as it calls itself; empty = not known.
-        LCM Type: string
-        """
-
-        self.pid = 0
-        """
-        The daemon's process number there; 0 = not known. With host it tells two daemons on one bus apart.
-        LCM Type: int32_t
-        """
-
         self.state = 0
         """
         STARTING, RUNNING or DEGRADED.
@@ -81,13 +70,8 @@ class health_t(object):
         self.invalid_reasons = 0
         """
         Why the last pose may not be used, bit by bit as in pose_transform_t; 0 = it may.
+        @flags Invalid
         LCM Type: int32_t
-        """
-
-        self.invalid_text = ""
-        """
-        The same in words, for people who watch; empty when it may be used.
-        LCM Type: string
         """
 
         self.pose_epoch = 0
@@ -114,21 +98,15 @@ class health_t(object):
         LCM Type: int64_t
         """
 
-        self.requests_parked = 0
+        self.requests_waiting = 0
         """
-        Requests that wait for data right now.
-        LCM Type: int32_t
-        """
-
-        self.requests_queued = 0
-        """
-        Requests that wait for the daemon to look at them right now.
+        Requests that wait for data.
         LCM Type: int32_t
         """
 
         self.ticks_missed = 0
         """
-        Ticks of the timer that were skipped because the loop came too late.
+        Timer ticks skipped because the loop was late.
         LCM Type: int64_t
         """
 
@@ -138,124 +116,126 @@ class health_t(object):
         LCM Type: int64_t
         """
 
-        self.tick_lateness_p50 = 0.0
+        self.tick_latency_p50 = 0.0
         """
-        Median lateness of the ticks since the last report, seconds; 0 = no tick.
+        Median latency of the ticks since the last report, seconds; 0 = no tick.
+        @default 0.0
         LCM Type: double
         """
 
-        self.tick_lateness_p90 = 0.0
+        self.tick_latency_p90 = 0.0
         """
-        Lateness that nine of ten ticks since the last report stayed within, seconds; 0 = no tick.
+        90th percentile of the tick latency since the last report, seconds; 0 = no tick.
+        @default 0.0
         LCM Type: double
         """
 
-        self.tick_lateness_p99 = 0.0
+        self.tick_latency_p99 = 0.0
         """
-        Lateness that 99 of 100 ticks since the last report stayed within, seconds; 0 = no tick.
+        99th percentile of the tick latency since the last report, seconds; 0 = no tick.
+        @default 0.0
         LCM Type: double
         """
 
-        self.tick_lateness_max = 0.0
+        self.tick_latency_max = 0.0
         """
-        Greatest lateness of a tick since the last report, seconds; 0 = no tick.
+        Maximum tick latency since the last report, seconds; 0 = no tick.
+        @default 0.0
         LCM Type: double
+        """
+
+        self.invalid_text = ""
+        """
+        The same in words, for people; empty when it may be used.
+        @default ""
+        LCM Type: string
+        """
+
+        self.host = ""
+        """
+        Host name of the machine; empty = not known.
+        @default ""
+        LCM Type: string
+        """
+
+        self.pid = 0
+        """
+        Process id; 0 = not known. Host and pid distinguish two services on one bus.
+        @default 0
+        LCM Type: int32_t
+        """
+
+        self.requests_queued = 0
+        """
+        Requests in the queue.
+        @default 0
+        LCM Type: int32_t
         """
 
         self.memory = 0
         """
-        Memory that the daemon holds (resident), bytes; 0 = not known.
+        Resident memory of the service, bytes; 0 = not known.
+        @default 0
         LCM Type: int64_t
         """
 
         self.cpu_share = 0.0
         """
-        Share of one processor's time that the daemon took over the last report's interval; nan = not known.
+        Share of one processor's time over the last report's interval; nan = not known.
+        @default nan
         LCM Type: double
         """
 
-        self.mode = 0
+        self.localization = mslcm.localization_health_t()
         """
-        Which sources localization uses: one of the constants of localization_mode_t, FULL to DEAD_RECKONING; -1 = none.
-        LCM Type: int8_t
-        """
-
-        self.phase = 0
-        """
-        How far the filter has come: as in navigation_state_t, LEVELLING to ALIGNED; -1 = no filter is at work (raw mode).
-        LCM Type: int8_t
-        """
-
-        self.standing = False
-        """
-        Whether the vehicle is taken to stand.
-        LCM Type: boolean
-        """
-
-        self.horizontal_bound = 0.0
-        """
-        The horizontal position error is taken to be within this, as in pose_transform_t, metres; nan = not known.
-        LCM Type: double
-        """
-
-        self.heading_bound = 0.0
-        """
-        The heading error is taken to be within this either way, as in pose_transform_t, radians; nan = not known.
-        LCM Type: double
-        """
-
-        self.seconds_to_limit = 0.0
-        """
-        Seconds until a configured limit is passed if nothing more arrives; nan = not known, or passed already.
-        LCM Type: double
-        """
-
-        self.fix_age = 0.0
-        """
-        Time since the last GPS fix that was used, seconds; nan = none yet.
-        LCM Type: double
+        The localization in short.
+        @default LocalizationHealth()
+        LCM Type: mslcm.localization_health_t
         """
 
         self.num_channels = 0
         """
-        Number of sources of samples and wishes, and of sensors that are yet to be heard.
+        Number of sources of samples and commands, and of configured sensors without samples yet.
         LCM Type: int32_t
         """
 
         self.channels = []
         """
         Traffic of each.
+        @default ()
         LCM Type: mslcm.channel_health_t[num_channels]
         """
 
         self.num_rejected = 0
         """
-        Number of kinds of rejected input.
+        Number of pairs of channel and reason of rejected input.
         LCM Type: int32_t
         """
 
         self.rejected = []
         """
-        What was rejected, by channel and reason.
+        Rejected input, by channel and reason.
+        @default ()
         LCM Type: mslcm.rejected_count_t[num_rejected]
         """
 
-        self.num_notices = 0
+        self.num_warnings = 0
         """
-        Number of notices.
+        Number of warnings.
+        @rows warnings @default ()
         LCM Type: int32_t
         """
 
-        self.notice_subjects = []
+        self.warning_subjects = []
         """
-        What each notice is about, e.g. journal; once each.
-        LCM Type: string[num_notices]
+        Subject of each warning, e.g. journal; unique.
+        LCM Type: string[num_warnings]
         """
 
-        self.notice_texts = []
+        self.warning_texts = []
         """
-        What people who watch should know of it, until it is over.
-        LCM Type: string[num_notices]
+        Text of each warning, until it is cleared.
+        LCM Type: string[num_warnings]
         """
 
 
@@ -279,16 +259,19 @@ class health_t(object):
         buf.write(struct.pack('>I', len(__model_revision_encoded)+1))
         buf.write(__model_revision_encoded)
         buf.write(b"\0")
-        __host_encoded = self.host.encode('utf-8')
-        buf.write(struct.pack('>I', len(__host_encoded)+1))
-        buf.write(__host_encoded)
-        buf.write(b"\0")
-        buf.write(struct.pack(">ibi", self.pid, self.state, self.invalid_reasons))
+        buf.write(struct.pack(">biiqqqiqqdddd", self.state, self.invalid_reasons, self.pose_epoch, self.origin_id, self.poses_published, self.requests_answered, self.requests_waiting, self.ticks_missed, self.handler_errors, self.tick_latency_p50, self.tick_latency_p90, self.tick_latency_p99, self.tick_latency_max))
         __invalid_text_encoded = self.invalid_text.encode('utf-8')
         buf.write(struct.pack('>I', len(__invalid_text_encoded)+1))
         buf.write(__invalid_text_encoded)
         buf.write(b"\0")
-        buf.write(struct.pack(">iqqqiiqqddddqdbbbddddi", self.pose_epoch, self.origin_id, self.poses_published, self.requests_answered, self.requests_parked, self.requests_queued, self.ticks_missed, self.handler_errors, self.tick_lateness_p50, self.tick_lateness_p90, self.tick_lateness_p99, self.tick_lateness_max, self.memory, self.cpu_share, self.mode, self.phase, self.standing, self.horizontal_bound, self.heading_bound, self.seconds_to_limit, self.fix_age, self.num_channels))
+        __host_encoded = self.host.encode('utf-8')
+        buf.write(struct.pack('>I', len(__host_encoded)+1))
+        buf.write(__host_encoded)
+        buf.write(b"\0")
+        buf.write(struct.pack(">iiqd", self.pid, self.requests_queued, self.memory, self.cpu_share))
+        assert self.localization._get_packed_fingerprint() == mslcm.localization_health_t._get_packed_fingerprint()
+        self.localization._encode_one(buf)
+        buf.write(struct.pack(">i", self.num_channels))
         for i0 in range(self.num_channels):
             assert self.channels[i0]._get_packed_fingerprint() == mslcm.channel_health_t._get_packed_fingerprint()
             self.channels[i0]._encode_one(buf)
@@ -296,16 +279,16 @@ class health_t(object):
         for i0 in range(self.num_rejected):
             assert self.rejected[i0]._get_packed_fingerprint() == mslcm.rejected_count_t._get_packed_fingerprint()
             self.rejected[i0]._encode_one(buf)
-        buf.write(struct.pack(">i", self.num_notices))
-        for i0 in range(self.num_notices):
-            __notice_subjects_encoded = self.notice_subjects[i0].encode('utf-8')
-            buf.write(struct.pack('>I', len(__notice_subjects_encoded)+1))
-            buf.write(__notice_subjects_encoded)
+        buf.write(struct.pack(">i", self.num_warnings))
+        for i0 in range(self.num_warnings):
+            __warning_subjects_encoded = self.warning_subjects[i0].encode('utf-8')
+            buf.write(struct.pack('>I', len(__warning_subjects_encoded)+1))
+            buf.write(__warning_subjects_encoded)
             buf.write(b"\0")
-        for i0 in range(self.num_notices):
-            __notice_texts_encoded = self.notice_texts[i0].encode('utf-8')
-            buf.write(struct.pack('>I', len(__notice_texts_encoded)+1))
-            buf.write(__notice_texts_encoded)
+        for i0 in range(self.num_warnings):
+            __warning_texts_encoded = self.warning_texts[i0].encode('utf-8')
+            buf.write(struct.pack('>I', len(__warning_texts_encoded)+1))
+            buf.write(__warning_texts_encoded)
             buf.write(b"\0")
 
     @staticmethod
@@ -328,14 +311,14 @@ class health_t(object):
         self.vehicle = buf.read(__vehicle_len)[:-1].decode('utf-8', 'replace')
         __model_revision_len = struct.unpack('>I', buf.read(4))[0]
         self.model_revision = buf.read(__model_revision_len)[:-1].decode('utf-8', 'replace')
-        __host_len = struct.unpack('>I', buf.read(4))[0]
-        self.host = buf.read(__host_len)[:-1].decode('utf-8', 'replace')
-        self.pid, self.state, self.invalid_reasons = struct.unpack(">ibi", buf.read(9))
+        self.state, self.invalid_reasons, self.pose_epoch, self.origin_id, self.poses_published, self.requests_answered, self.requests_waiting, self.ticks_missed, self.handler_errors, self.tick_latency_p50, self.tick_latency_p90, self.tick_latency_p99, self.tick_latency_max = struct.unpack(">biiqqqiqqdddd", buf.read(85))
         __invalid_text_len = struct.unpack('>I', buf.read(4))[0]
         self.invalid_text = buf.read(__invalid_text_len)[:-1].decode('utf-8', 'replace')
-        self.pose_epoch, self.origin_id, self.poses_published, self.requests_answered, self.requests_parked, self.requests_queued, self.ticks_missed, self.handler_errors, self.tick_lateness_p50, self.tick_lateness_p90, self.tick_lateness_p99, self.tick_lateness_max, self.memory, self.cpu_share, self.mode, self.phase = struct.unpack(">iqqqiiqqddddqdbb", buf.read(102))
-        self.standing = bool(struct.unpack('b', buf.read(1))[0])
-        self.horizontal_bound, self.heading_bound, self.seconds_to_limit, self.fix_age, self.num_channels = struct.unpack(">ddddi", buf.read(36))
+        __host_len = struct.unpack('>I', buf.read(4))[0]
+        self.host = buf.read(__host_len)[:-1].decode('utf-8', 'replace')
+        self.pid, self.requests_queued, self.memory, self.cpu_share = struct.unpack(">iiqd", buf.read(24))
+        self.localization = mslcm.localization_health_t._decode_one(buf)
+        self.num_channels = struct.unpack(">i", buf.read(4))[0]
         self.channels = []
         for i0 in range(self.num_channels):
             self.channels.append(mslcm.channel_health_t._decode_one(buf))
@@ -343,22 +326,22 @@ class health_t(object):
         self.rejected = []
         for i0 in range(self.num_rejected):
             self.rejected.append(mslcm.rejected_count_t._decode_one(buf))
-        self.num_notices = struct.unpack(">i", buf.read(4))[0]
-        self.notice_subjects = []
-        for i0 in range(self.num_notices):
-            __notice_subjects_len = struct.unpack('>I', buf.read(4))[0]
-            self.notice_subjects.append(buf.read(__notice_subjects_len)[:-1].decode('utf-8', 'replace'))
-        self.notice_texts = []
-        for i0 in range(self.num_notices):
-            __notice_texts_len = struct.unpack('>I', buf.read(4))[0]
-            self.notice_texts.append(buf.read(__notice_texts_len)[:-1].decode('utf-8', 'replace'))
+        self.num_warnings = struct.unpack(">i", buf.read(4))[0]
+        self.warning_subjects = []
+        for i0 in range(self.num_warnings):
+            __warning_subjects_len = struct.unpack('>I', buf.read(4))[0]
+            self.warning_subjects.append(buf.read(__warning_subjects_len)[:-1].decode('utf-8', 'replace'))
+        self.warning_texts = []
+        for i0 in range(self.num_warnings):
+            __warning_texts_len = struct.unpack('>I', buf.read(4))[0]
+            self.warning_texts.append(buf.read(__warning_texts_len)[:-1].decode('utf-8', 'replace'))
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if health_t in parents: return 0
         newparents = parents + [health_t]
-        tmphash = (0x2f359b4dd9cbbc0b+ mslcm.channel_health_t._get_hash_recursive(newparents)+ mslcm.rejected_count_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0xed405a70b97f078d+ mslcm.localization_health_t._get_hash_recursive(newparents)+ mslcm.channel_health_t._get_hash_recursive(newparents)+ mslcm.rejected_count_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -10,7 +10,11 @@ import struct
 import mslcm
 
 class imu_t(object):
-    """ One sample of an inertial unit, along the axes of its own sensor frame. What the unit did not say is nan. """
+    """
+    One sample of an IMU, along the axes of its own sensor frame. What the unit does not measure is nan.
+    @value ImuSample
+    @order header angular_velocity specific_force magnetic_field orientation orientation_reference yaw_source angular_velocity_covariance specific_force_covariance orientation_covariance temperature_celsius
+    """
 
     __slots__ = ["header", "angular_velocity", "angular_velocity_covariance", "specific_force", "specific_force_covariance", "magnetic_field", "orientation_reference", "yaw_source", "orientation", "orientation_covariance", "temperature_celsius"]
 
@@ -21,9 +25,9 @@ class imu_t(object):
     REFERENCE_NONE = 0
     """ The unit gives no orientation. """
     REFERENCE_ENU = 1
-    """ Reference axes x east, y north, z up; magnetic or true as yaw_source says. """
+    """ Reference axes x east, y north, z up; magnetic or true according to yaw_source. """
     REFERENCE_NED = 2
-    """ Reference axes x north, y east, z down; magnetic or true as yaw_source says. """
+    """ Reference axes x north, y east, z down; magnetic or true according to yaw_source. """
     YAW_NONE = 0
     """ The zero of the yaw is arbitrary and drifts (vertical gyro). """
     YAW_MAGNETIC = 1
@@ -34,67 +38,77 @@ class imu_t(object):
     def __init__(self):
         self.header = mslcm.sensor_header_t()
         """
-        When and by whom.
+        Time and source.
         LCM Type: mslcm.sensor_header_t
         """
 
         self.angular_velocity = [ 0.0 for dim0 in range(3) ]
         """
         Angular velocity of the sensor with respect to inertial space, along the sensor's axes, rad/s, right-hand rule.
+        @optional
         LCM Type: double[3]
         """
 
         self.angular_velocity_covariance = [ 0.0 for dim0 in range(9) ]
         """
         Covariance of the angular velocity, row-major, along the sensor's axes, (rad/s)2.
+        @optional
         LCM Type: double[9]
         """
 
         self.specific_force = [ 0.0 for dim0 in range(3) ]
         """
         Specific force along the sensor's axes, m/s2: at rest it points up, against gravity, with 9.81.
+        @optional
         LCM Type: double[3]
         """
 
         self.specific_force_covariance = [ 0.0 for dim0 in range(9) ]
         """
         Covariance of the specific force, row-major, along the sensor's axes, (m/s2)2.
+        @optional
         LCM Type: double[9]
         """
 
         self.magnetic_field = [ 0.0 for dim0 in range(3) ]
         """
         Magnetic field along the sensor's axes, tesla.
+        @optional
         LCM Type: double[3]
         """
 
         self.orientation_reference = 0
         """
         What the unit's own orientation is measured against: one of REFERENCE_NONE, REFERENCE_ENU, REFERENCE_NED.
+        @enum OrientationReference REFERENCE_ @default NONE
         LCM Type: int8_t
         """
 
         self.yaw_source = 0
         """
         Where the unit's yaw comes from: one of YAW_NONE, YAW_MAGNETIC, YAW_TRUE.
+        @enum YawSource YAW_ @default NONE
         LCM Type: int8_t
         """
 
         self.orientation = [ 0.0 for dim0 in range(4) ]
         """
         The unit's own orientation: unit quaternion of its sensor frame in its reference, scalar first (w x y z).
+        @optional
         LCM Type: double[4]
         """
 
         self.orientation_covariance = [ 0.0 for dim0 in range(9) ]
         """
         Covariance of the orientation about the (fixed) axes of its reference, row-major, rad2.
+        @optional
         LCM Type: double[9]
         """
 
         self.temperature_celsius = 0.0
         """
         Temperature of the unit, degrees Celsius.
+        @default nan
         LCM Type: double
         """
 

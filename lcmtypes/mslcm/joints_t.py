@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class joints_t(object):
-    """ Positions of joints (constraints that move). Arrays have one entry for each joint; what was not measured is nan. """
+    """
+    Positions of joints (constraints that move). Arrays have one entry for each joint; what was not measured is nan.
+    @value JointsSample
+    """
 
     __slots__ = ["header", "num_joints", "names", "position", "position_sigma", "rate", "rate_sigma"]
 
@@ -21,43 +24,48 @@ class joints_t(object):
     def __init__(self):
         self.header = mslcm.sensor_header_t()
         """
-        When and by whom.
+        Time and source.
         LCM Type: mslcm.sensor_header_t
         """
 
         self.num_joints = 0
         """
         Number of joints, 0 to 1,024.
+        @rows joints JointSample @max 1024
         LCM Type: int32_t
         """
 
         self.names = []
         """
         Names of the constraints in the geometry file.
+        @as name
         LCM Type: string[num_joints]
         """
 
         self.position = []
         """
-        Position: radians for a turning joint, metres for a sliding one, along the joint's positive sense.
+        Position: radians for a turning joint, meters for a sliding one, along the joint's positive sense.
         LCM Type: double[num_joints]
         """
 
         self.position_sigma = []
         """
-        Standard deviation of position, radians or metres.
+        Standard deviation of position, radians or meters.
+        @default nan
         LCM Type: double[num_joints]
         """
 
         self.rate = []
         """
         Rate of the position, rad/s or m/s, along the joint's positive sense.
+        @default nan
         LCM Type: double[num_joints]
         """
 
         self.rate_sigma = []
         """
         Standard deviation of rate, rad/s or m/s.
+        @default nan
         LCM Type: double[num_joints]
         """
 

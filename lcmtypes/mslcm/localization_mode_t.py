@@ -11,8 +11,9 @@ import mslcm
 
 class localization_mode_t(object):
     """
-    A wish that localization uses other sources from now on. Heard on the channel that the vehicle file names
-    (localization.mode_channel); without one nobody is heard.
+    Command to localize with other sources from now on, on the channel localization.mode_channel of the vehicle file;
+    without that key the service does not subscribe to it.
+    @value SwitchMode
     """
 
     __slots__ = ["header", "mode"]
@@ -22,28 +23,29 @@ class localization_mode_t(object):
     __dimensions__ = [None, None]
 
     FULL = 0
-    """ All sources that are there. """
+    """ All sources. """
     RAW = 1
-    """ GPS and inertial unit straight, no filter. """
+    """ GPS and IMU directly, without a filter. """
     NO_IMU = 2
-    """ All but the inertial unit. """
+    """ All but the IMU. """
     NO_WHEELS = 3
     """ All but the wheels. """
     NO_GPS = 4
-    """ All but the satellite receiver; other sources that know of the world count. """
+    """ All but the GNSS receiver; other absolute sources are used. """
     DEAD_RECKONING = 5
-    """ Inertial unit and wheels alone, nothing that knows of the world. """
+    """ IMU and wheels only, no absolute source. """
 
     def __init__(self):
         self.header = mslcm.sensor_header_t()
         """
-        When and by whom; header.utime is the instant from which it counts.
+        Time and source; header.utime is the instant from which it counts.
         LCM Type: mslcm.sensor_header_t
         """
 
         self.mode = 0
         """
         One of FULL to DEAD_RECKONING.
+        @enum Mode
         LCM Type: int8_t
         """
 

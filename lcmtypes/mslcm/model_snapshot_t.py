@@ -9,9 +9,11 @@ import struct
 
 class model_snapshot_t(object):
     """
-    A part of the vehicle's geometry as the service has it, so that who comes late, and a log, know it too. All parts of
-    one revision put together are a zlib stream of UTF-8 JSON: vehicle, base_frame, rolling_frame, history_s,
-    joints_channel, joints_latency_us, revision, and geometry, the text of the YAML form.
+    A part of the geometry in use, for late subscribers and for logs. The concatenated parts of one revision are a zlib
+    stream of UTF-8 JSON: vehicle, base_frame, rolling_frame, history_s, joints_channel, joints_latency_us, revision, and
+    geometry, the text of the YAML form.
+    @value SnapshotPart
+    @verify
     """
 
     __slots__ = ["utime", "model_revision", "part", "num_parts", "size", "data"]
@@ -24,12 +26,14 @@ class model_snapshot_t(object):
         self.utime = 0
         """
         When it was sent, microseconds since the Unix epoch (UTC).
+        @check utime
         LCM Type: int64_t
         """
 
         self.model_revision = ""
         """
         Content hash of the geometry; the same in all parts of it, and in every pose and reply that rests on it.
+        @check name
         LCM Type: string
         """
 
@@ -42,6 +46,7 @@ class model_snapshot_t(object):
         self.num_parts = 0
         """
         Number of parts, 1 to 100,000.
+        @as parts
         LCM Type: int32_t
         """
 

@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class name_list_reply_t(object):
-    """ Reply to get_body_list_request_t and get_body_frame_list_request_t. """
+    """
+    Reply to get_body_list_request_t and get_body_frame_list_request_t.
+    @value NameListReply tuple
+    """
 
     __slots__ = ["header", "num_names", "names", "descriptions"]
 
@@ -21,7 +24,7 @@ class name_list_reply_t(object):
     def __init__(self):
         self.header = mslcm.reply_header_t()
         """
-        How the request ended.
+        Status of the request.
         LCM Type: mslcm.reply_header_t
         """
 
@@ -34,12 +37,14 @@ class name_list_reply_t(object):
         self.names = []
         """
         Names of bodies, or of the frames of one body without the body's name; in the order of the geometry file.
+        @default ()
         LCM Type: string[num_names]
         """
 
         self.descriptions = []
         """
         Their descriptions, empty where the file gives none.
+        @default ()
         LCM Type: string[num_names]
         """
 

@@ -8,20 +8,24 @@ from io import BytesIO
 import struct
 
 class navigation_state_t(object):
-    """ The whole state of the localization filter: more than a pose, for those who want to look inside. """
+    """
+    State of the localization filter, for diagnostics.
+    @value NavigationState
+    @codec navigation value
+    """
 
-    __slots__ = ["utime", "mode", "phase", "standing", "invalid_reasons", "pose_epoch", "latitude_deg", "longitude_deg", "height", "position", "orientation", "linear_velocity", "angular_velocity", "twist_covariance", "n", "names", "values", "num_covariance", "covariance"]
+    __slots__ = ["utime", "mode", "phase", "stationary", "invalid_reasons", "pose_epoch", "latitude_deg", "longitude_deg", "height", "position", "orientation", "linear_velocity", "angular_velocity", "twist_covariance", "n", "names", "values", "num_covariance", "covariance"]
 
     __typenames__ = ["int64_t", "int8_t", "int8_t", "boolean", "int32_t", "int32_t", "double", "double", "double", "double", "double", "double", "double", "double", "int32_t", "string", "double", "int32_t", "double"]
 
     __dimensions__ = [None, None, None, None, None, None, None, None, None, [3], [4], [3], [3], [36], None, ["n"], ["n"], None, ["num_covariance"]]
 
-    LEVELLING = 0
-    """ Which way is up, and the gyros' biases, are being found. """
+    LEVELING = 0
+    """ Coarse alignment: roll and pitch from gravity, and the gyro biases. """
     UNALIGNED = 1
-    """ Level and moving in Odom; heading in the world not known yet. """
+    """ Dead reckoning in Odom; heading alignment is not done yet. """
     ALIGNED = 2
-    """ Known in the world. """
+    """ Heading and position in the world are known. """
 
     def __init__(self):
         self.utime = 0
@@ -33,18 +37,20 @@ class navigation_state_t(object):
         self.mode = 0
         """
         Which sources are used: one of the constants of localization_mode_t, FULL to DEAD_RECKONING.
+        @enum Mode
         LCM Type: int8_t
         """
 
         self.phase = 0
         """
-        How far the filter has come: LEVELLING, UNALIGNED or ALIGNED.
+        Phase of the alignment: LEVELING, UNALIGNED or ALIGNED.
+        @enum Phase
         LCM Type: int8_t
         """
 
-        self.standing = False
+        self.stationary = False
         """
-        Whether the vehicle is taken to stand.
+        Whether the vehicle is detected as stationary.
         LCM Type: boolean
         """
 
@@ -74,13 +80,13 @@ class navigation_state_t(object):
 
         self.height = 0.0
         """
-        Height of the tangent plane's origin above the WGS 84 ellipsoid, metres, up positive; nan = not known.
+        Height of the tangent plane's origin above the WGS 84 ellipsoid, meters, up positive; nan = not known.
         LCM Type: double
         """
 
         self.position = [ 0.0 for dim0 in range(3) ]
         """
-        Position of the rolling frame in the tangent plane (true east, true north, up at its origin), metres.
+        Position of the rolling frame in the tangent plane (true east, true north, up at its origin), meters.
         LCM Type: double[3]
         """
 
@@ -148,7 +154,7 @@ class navigation_state_t(object):
         return buf.getvalue()
 
     def _encode_one(self, buf):
-        buf.write(struct.pack(">qbbbiiddd", self.utime, self.mode, self.phase, self.standing, self.invalid_reasons, self.pose_epoch, self.latitude_deg, self.longitude_deg, self.height))
+        buf.write(struct.pack(">qbbbiiddd", self.utime, self.mode, self.phase, self.stationary, self.invalid_reasons, self.pose_epoch, self.latitude_deg, self.longitude_deg, self.height))
         buf.write(struct.pack('>3d', *self.position[:3]))
         buf.write(struct.pack('>4d', *self.orientation[:4]))
         buf.write(struct.pack('>3d', *self.linear_velocity[:3]))
@@ -178,7 +184,7 @@ class navigation_state_t(object):
     def _decode_one(buf):
         self = navigation_state_t()
         self.utime, self.mode, self.phase = struct.unpack(">qbb", buf.read(10))
-        self.standing = bool(struct.unpack('b', buf.read(1))[0])
+        self.stationary = bool(struct.unpack('b', buf.read(1))[0])
         self.invalid_reasons, self.pose_epoch, self.latitude_deg, self.longitude_deg, self.height = struct.unpack(">iiddd", buf.read(32))
         self.position = struct.unpack('>3d', buf.read(24))
         self.orientation = struct.unpack('>4d', buf.read(32))
@@ -198,7 +204,7 @@ class navigation_state_t(object):
     @staticmethod
     def _get_hash_recursive(parents):
         if navigation_state_t in parents: return 0
-        tmphash = (0xb027a32ec3dcbaa0) & 0xffffffffffffffff
+        tmphash = (0x6c611ac9a328d90c) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

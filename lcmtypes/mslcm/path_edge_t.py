@@ -8,9 +8,9 @@ from io import BytesIO
 import struct
 
 class path_edge_t(object):
-    """ One edge of the way from a frame of reference to a frame of interest. """
+    """ One edge of the path from a frame of reference to a frame of interest. """
 
-    __slots__ = ["kind", "name", "from_end", "to_end", "forward", "vector", "how", "stamp", "age", "source", "num_coordinates", "coordinates", "position_share", "rotation_share", "doubt"]
+    __slots__ = ["kind", "name", "from_end", "to_end", "forward", "vector", "provenance", "stamp", "age", "source", "num_coordinates", "coordinates", "position_share", "rotation_share", "warning"]
 
     __typenames__ = ["int8_t", "string", "string", "string", "boolean", "double", "int8_t", "int64_t", "double", "string", "int32_t", "double", "double", "double", "string"]
 
@@ -21,7 +21,7 @@ class path_edge_t(object):
     CONSTRAINT = 1
     """ From the from frame of a constraint to its to frame; of one that moves, the place where it is mounted. """
     JOINT = 2
-    """ How far a joint has moved. """
+    """ Displacement of a joint. """
     VEHICLE = 3
     """ From a world frame to the vehicle. """
     FIXED = 0
@@ -33,9 +33,9 @@ class path_edge_t(object):
     HELD = 3
     """ The last measurement before. """
     PREDICTED = 4
-    """ Carried on past the last measurement. """
-    AT_REST = 5
-    """ Never heard: where it rests. """
+    """ Predicted past the last measurement. """
+    DEFAULT = 5
+    """ No sample was received: the default of the joint. """
 
     def __init__(self):
         self.kind = 0
@@ -64,19 +64,19 @@ class path_edge_t(object):
 
         self.forward = False
         """
-        Whether the way passes it from from_end to to_end; else the pose here is the inverse of the file's.
+        Whether the path traverses it from from_end to to_end; else the pose here is the inverse of the file's.
         LCM Type: boolean
         """
 
         self.vector = [ 0.0 for dim0 in range(7) ]
         """
-        Pose of the end passed last in that passed first: px py pz (m), qs qx qy qz.
+        Pose of the end traversed last in that traversed first: px py pz (m), qs qx qy qz.
         LCM Type: double[7]
         """
 
-        self.how = 0
+        self.provenance = 0
         """
-        How it was come by: FIXED to AT_REST.
+        Provenance of its value: FIXED to DEFAULT.
         LCM Type: int8_t
         """
 
@@ -94,7 +94,7 @@ class path_edge_t(object):
 
         self.source = ""
         """
-        Who told: the source in the header of a joint's newest sample, or localization; empty = nobody.
+        Source: header.source of a joint's newest sample, or localization; empty = none.
         LCM Type: string
         """
 
@@ -106,7 +106,7 @@ class path_edge_t(object):
 
         self.coordinates = []
         """
-        Where the joint stands: radians or metres.
+        Position of the joint: radians or meters.
         LCM Type: double[num_coordinates]
         """
 
@@ -122,9 +122,9 @@ class path_edge_t(object):
         LCM Type: double
         """
 
-        self.doubt = ""
+        self.warning = ""
         """
-        What speaks against it in words, e.g. that a joint was silent or stands beyond its limits; empty = nothing.
+        Warning in words, e.g. that a joint was silent or is beyond its limits; empty = none.
         LCM Type: string
         """
 
@@ -151,7 +151,7 @@ class path_edge_t(object):
         buf.write(b"\0")
         buf.write(struct.pack(">b", self.forward))
         buf.write(struct.pack('>7d', *self.vector[:7]))
-        buf.write(struct.pack(">bqd", self.how, self.stamp, self.age))
+        buf.write(struct.pack(">bqd", self.provenance, self.stamp, self.age))
         __source_encoded = self.source.encode('utf-8')
         buf.write(struct.pack('>I', len(__source_encoded)+1))
         buf.write(__source_encoded)
@@ -159,9 +159,9 @@ class path_edge_t(object):
         buf.write(struct.pack(">i", self.num_coordinates))
         buf.write(struct.pack('>%dd' % self.num_coordinates, *self.coordinates[:self.num_coordinates]))
         buf.write(struct.pack(">dd", self.position_share, self.rotation_share))
-        __doubt_encoded = self.doubt.encode('utf-8')
-        buf.write(struct.pack('>I', len(__doubt_encoded)+1))
-        buf.write(__doubt_encoded)
+        __warning_encoded = self.warning.encode('utf-8')
+        buf.write(struct.pack('>I', len(__warning_encoded)+1))
+        buf.write(__warning_encoded)
         buf.write(b"\0")
 
     @staticmethod
@@ -186,20 +186,20 @@ class path_edge_t(object):
         self.to_end = buf.read(__to_end_len)[:-1].decode('utf-8', 'replace')
         self.forward = bool(struct.unpack('b', buf.read(1))[0])
         self.vector = struct.unpack('>7d', buf.read(56))
-        self.how, self.stamp, self.age = struct.unpack(">bqd", buf.read(17))
+        self.provenance, self.stamp, self.age = struct.unpack(">bqd", buf.read(17))
         __source_len = struct.unpack('>I', buf.read(4))[0]
         self.source = buf.read(__source_len)[:-1].decode('utf-8', 'replace')
         self.num_coordinates = struct.unpack(">i", buf.read(4))[0]
         self.coordinates = struct.unpack('>%dd' % self.num_coordinates, buf.read(self.num_coordinates * 8))
         self.position_share, self.rotation_share = struct.unpack(">dd", buf.read(16))
-        __doubt_len = struct.unpack('>I', buf.read(4))[0]
-        self.doubt = buf.read(__doubt_len)[:-1].decode('utf-8', 'replace')
+        __warning_len = struct.unpack('>I', buf.read(4))[0]
+        self.warning = buf.read(__warning_len)[:-1].decode('utf-8', 'replace')
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if path_edge_t in parents: return 0
-        tmphash = (0xb8ad9eaa70e537ab) & 0xffffffffffffffff
+        tmphash = (0x9d99647421fdfed9) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -9,11 +9,13 @@ import struct
 
 class pose_transform_t(object):
     """
-    Pose of one frame in another, how sure it is, and whether it may be used.
+    Pose of one frame in another, its covariance, and whether it may be used.
     Mirrors the PoseTransformIDL of DRDC TR 2005-240: time, HTransform, initialUTM, poseValidFlag.
+    @value PoseAnswer
+    @codec poses value
     """
 
-    __slots__ = ["utime", "frame_of_interest", "frame_of_reference", "h_transform", "covariance", "initial_utm", "utm_zone", "utm_north", "origin_id", "pose_epoch", "pose_valid", "invalid_reasons", "quality_flags", "horizontal_bound", "heading_bound", "seconds_to_limit", "model_revision"]
+    __slots__ = ["utime", "frame_of_interest", "frame_of_reference", "h_transform", "covariance", "initial_utm", "utm_zone", "utm_north", "origin_id", "pose_epoch", "pose_valid", "invalid_reasons", "quality_flags", "horizontal_protection_level", "heading_protection_level", "seconds_to_limit", "model_revision"]
 
     __typenames__ = ["int64_t", "string", "string", "double", "double", "double", "int8_t", "boolean", "int64_t", "int32_t", "boolean", "int32_t", "int32_t", "double", "double", "double", "string"]
 
@@ -28,27 +30,27 @@ class pose_transform_t(object):
     NOT_MOVED_YET = 8
     """ Heading is not known before the vehicle moves. """
     STATIONARY_HEADING = 16
-    """ Heading has drifted too long at rest. """
+    """ The vehicle was stationary for too long: heading has drifted. """
     STALE_GPS = 32
     """ The last usable fix is too old. """
     STALE_IMU = 64
     """ The last inertial sample is too old. """
     GPS_REJECTED = 128
-    """ Fixes arrive but the gates refuse them. """
-    BOUND_EXCEEDED = 256
-    """ A bound passes the configured limit. """
+    """ Fixes arrive but are rejected by the gates. """
+    PROTECTION_LEVEL_EXCEEDED = 256
+    """ A protection level exceeds the configured limit (alert limit). """
     CLOCK_STEPPED = 512
-    """ The clock stepped; time is being taken up anew. """
+    """ The clock stepped; localization restarts at the new time. """
     TILTED = 1024
-    """ Gravity says that the vehicle lies on its side or its back: it has fallen, or the inertial unit's mount is wrong. """
+    """ Gravity indicates a vehicle on its side or back: it has rolled over, or the mount of the IMU is wrong. """
     STALE_JOINT = 2048
-    """ A joint on the way was silent for more than a second around that time. """
+    """ A joint on the path was silent for more than a second around that time. """
     JOINT_UNKNOWN = 4096
-    """ A joint on the way was never heard, and the geometry states no default for it. """
+    """ No sample of a joint on the path was received, and the geometry has no default for it. """
     HEADING_FROM_GYRO = 1
-    """ Heading is carried by the gyro: the vehicle stands or crawls. """
+    """ Heading is propagated by the gyro alone: the vehicle is stationary or crawls. """
     PREDICTED = 2
-    """ Later than the last sample: carried on by the motion model. """
+    """ Later than the last sample: predicted by the motion model. """
     INTERPOLATED = 4
     """ Between two samples. """
     HELD = 8
@@ -56,13 +58,13 @@ class pose_transform_t(object):
     CORRELATION_UNKNOWN = 16
     """ The covariance is an upper bound. """
     REVERSING = 32
-    """ The vehicle is taken to drive backwards. """
+    """ The vehicle is assumed to drive backwards. """
     OUT_OF_LIMITS = 64
-    """ A joint on the way stands beyond its limits. """
-    AT_REST = 128
-    """ A joint on the way was never heard; it is taken to stand at its default. """
+    """ A joint on the path is beyond its limits. """
+    JOINT_DEFAULT = 128
+    """ No sample of a joint on the path was received; its default is assumed. """
     LOOP = 256
-    """ There is another way round through a loop of constraints; this is the shortest. """
+    """ The loop of constraints has another path; this is the shortest. """
 
     def __init__(self):
         self.utime = 0
@@ -86,7 +88,7 @@ class pose_transform_t(object):
 
         self.h_transform = [ [ 0.0 for dim1 in range(4) ] for dim0 in range(4) ]
         """
-        Homogeneous transform, row by row, translation in metres:
+        Homogeneous transform, row by row, translation in meters:
         maps points of the frame of interest to the frame of reference.
         LCM Type: double[4][4]
         """
@@ -100,7 +102,7 @@ class pose_transform_t(object):
 
         self.initial_utm = [ 0.0 for dim0 in range(3) ]
         """
-        Origin of World:UTM: grid easting, grid northing, height above the ellipsoid, metres.
+        Origin of World:UTM: grid easting, grid northing, height above the ellipsoid, meters.
         nan where no world frame is involved or the origin is not known yet.
         LCM Type: double[3]
         """
@@ -144,19 +146,19 @@ class pose_transform_t(object):
 
         self.quality_flags = 0
         """
-        What a user should know although the pose may be used, bit by bit: HEADING_FROM_GYRO to LOOP.
+        Properties of a usable pose, bit by bit: HEADING_FROM_GYRO to LOOP.
         LCM Type: int32_t
         """
 
-        self.horizontal_bound = 0.0
+        self.horizontal_protection_level = 0.0
         """
-        The horizontal position error is taken to be within this, at the configured risk, metres. nan = not known.
+        Horizontal protection level: bound of the position error at the configured risk, meters. nan = not known.
         LCM Type: double
         """
 
-        self.heading_bound = 0.0
+        self.heading_protection_level = 0.0
         """
-        The heading error is taken to be within this either way, at the configured risk, radians. nan = not known.
+        Heading protection level: bound of the heading error at the configured risk, radians. nan = not known.
         LCM Type: double
         """
 
@@ -168,7 +170,7 @@ class pose_transform_t(object):
 
         self.model_revision = ""
         """
-        Content hash of the geometry that the answer rests on.
+        Content hash of the geometry used.
         LCM Type: string
         """
 
@@ -193,7 +195,7 @@ class pose_transform_t(object):
             buf.write(struct.pack('>4d', *self.h_transform[i0][:4]))
         buf.write(struct.pack('>36d', *self.covariance[:36]))
         buf.write(struct.pack('>3d', *self.initial_utm[:3]))
-        buf.write(struct.pack(">bbqibiiddd", self.utm_zone, self.utm_north, self.origin_id, self.pose_epoch, self.pose_valid, self.invalid_reasons, self.quality_flags, self.horizontal_bound, self.heading_bound, self.seconds_to_limit))
+        buf.write(struct.pack(">bbqibiiddd", self.utm_zone, self.utm_north, self.origin_id, self.pose_epoch, self.pose_valid, self.invalid_reasons, self.quality_flags, self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit))
         __model_revision_encoded = self.model_revision.encode('utf-8')
         buf.write(struct.pack('>I', len(__model_revision_encoded)+1))
         buf.write(__model_revision_encoded)
@@ -226,7 +228,7 @@ class pose_transform_t(object):
         self.utm_north = bool(struct.unpack('b', buf.read(1))[0])
         self.origin_id, self.pose_epoch = struct.unpack(">qi", buf.read(12))
         self.pose_valid = bool(struct.unpack('b', buf.read(1))[0])
-        self.invalid_reasons, self.quality_flags, self.horizontal_bound, self.heading_bound, self.seconds_to_limit = struct.unpack(">iiddd", buf.read(32))
+        self.invalid_reasons, self.quality_flags, self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit = struct.unpack(">iiddd", buf.read(32))
         __model_revision_len = struct.unpack('>I', buf.read(4))[0]
         self.model_revision = buf.read(__model_revision_len)[:-1].decode('utf-8', 'replace')
         return self
@@ -234,7 +236,7 @@ class pose_transform_t(object):
     @staticmethod
     def _get_hash_recursive(parents):
         if pose_transform_t in parents: return 0
-        tmphash = (0x5d4bbe8ce7ad3da0) & 0xffffffffffffffff
+        tmphash = (0x44b33ce418ba8c90) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

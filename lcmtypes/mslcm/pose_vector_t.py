@@ -11,9 +11,11 @@ class pose_vector_t(object):
     """
     Pose of one frame in another as the 7-vector of the PoseVectorIDL of DRDC TR 2005-240.
     Everything beside the vector is as in pose_transform_t, constants included.
+    @value PoseAnswer
+    @codec poses value
     """
 
-    __slots__ = ["utime", "frame_of_interest", "frame_of_reference", "vec", "covariance", "initial_utm", "utm_zone", "utm_north", "origin_id", "pose_epoch", "pose_valid", "invalid_reasons", "quality_flags", "horizontal_bound", "heading_bound", "seconds_to_limit", "model_revision"]
+    __slots__ = ["utime", "frame_of_interest", "frame_of_reference", "vec", "covariance", "initial_utm", "utm_zone", "utm_north", "origin_id", "pose_epoch", "pose_valid", "invalid_reasons", "quality_flags", "horizontal_protection_level", "heading_protection_level", "seconds_to_limit", "model_revision"]
 
     __typenames__ = ["int64_t", "string", "string", "double", "double", "double", "int8_t", "boolean", "int64_t", "int32_t", "boolean", "int32_t", "int32_t", "double", "double", "double", "string"]
 
@@ -40,7 +42,7 @@ class pose_vector_t(object):
 
         self.vec = [ 0.0 for dim0 in range(7) ]
         """
-        px py pz (metres) and the unit quaternion qs qx qy qz (scalar first, qs >= 0) of the frame of interest in the
+        px py pz (meters) and the unit quaternion qs qx qy qz (scalar first, qs >= 0) of the frame of interest in the
         frame of reference.
         LCM Type: double[7]
         """
@@ -54,7 +56,7 @@ class pose_vector_t(object):
 
         self.initial_utm = [ 0.0 for dim0 in range(3) ]
         """
-        Origin of World:UTM: grid easting, grid northing, height above the ellipsoid, metres.
+        Origin of World:UTM: grid easting, grid northing, height above the ellipsoid, meters.
         nan where no world frame is involved or the origin is not known yet.
         LCM Type: double[3]
         """
@@ -98,19 +100,19 @@ class pose_vector_t(object):
 
         self.quality_flags = 0
         """
-        What a user should know although the pose may be used, bit by bit as in pose_transform_t.
+        Properties of a usable pose, bit by bit as in pose_transform_t.
         LCM Type: int32_t
         """
 
-        self.horizontal_bound = 0.0
+        self.horizontal_protection_level = 0.0
         """
-        The horizontal position error is taken to be within this, at the configured risk, metres. nan = not known.
+        Horizontal protection level: bound of the position error at the configured risk, meters. nan = not known.
         LCM Type: double
         """
 
-        self.heading_bound = 0.0
+        self.heading_protection_level = 0.0
         """
-        The heading error is taken to be within this either way, at the configured risk, radians. nan = not known.
+        Heading protection level: bound of the heading error at the configured risk, radians. nan = not known.
         LCM Type: double
         """
 
@@ -122,7 +124,7 @@ class pose_vector_t(object):
 
         self.model_revision = ""
         """
-        Content hash of the geometry that the answer rests on.
+        Content hash of the geometry used.
         LCM Type: string
         """
 
@@ -146,7 +148,7 @@ class pose_vector_t(object):
         buf.write(struct.pack('>7d', *self.vec[:7]))
         buf.write(struct.pack('>36d', *self.covariance[:36]))
         buf.write(struct.pack('>3d', *self.initial_utm[:3]))
-        buf.write(struct.pack(">bbqibiiddd", self.utm_zone, self.utm_north, self.origin_id, self.pose_epoch, self.pose_valid, self.invalid_reasons, self.quality_flags, self.horizontal_bound, self.heading_bound, self.seconds_to_limit))
+        buf.write(struct.pack(">bbqibiiddd", self.utm_zone, self.utm_north, self.origin_id, self.pose_epoch, self.pose_valid, self.invalid_reasons, self.quality_flags, self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit))
         __model_revision_encoded = self.model_revision.encode('utf-8')
         buf.write(struct.pack('>I', len(__model_revision_encoded)+1))
         buf.write(__model_revision_encoded)
@@ -177,7 +179,7 @@ class pose_vector_t(object):
         self.utm_north = bool(struct.unpack('b', buf.read(1))[0])
         self.origin_id, self.pose_epoch = struct.unpack(">qi", buf.read(12))
         self.pose_valid = bool(struct.unpack('b', buf.read(1))[0])
-        self.invalid_reasons, self.quality_flags, self.horizontal_bound, self.heading_bound, self.seconds_to_limit = struct.unpack(">iiddd", buf.read(32))
+        self.invalid_reasons, self.quality_flags, self.horizontal_protection_level, self.heading_protection_level, self.seconds_to_limit = struct.unpack(">iiddd", buf.read(32))
         __model_revision_len = struct.unpack('>I', buf.read(4))[0]
         self.model_revision = buf.read(__model_revision_len)[:-1].decode('utf-8', 'replace')
         return self
@@ -185,7 +187,7 @@ class pose_vector_t(object):
     @staticmethod
     def _get_hash_recursive(parents):
         if pose_vector_t in parents: return 0
-        tmphash = (0x6fd93037c7f15edf) & 0xffffffffffffffff
+        tmphash = (0x9b37ffa50366e8f4) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class range_t(object):
-    """ The distance from a frame of the vehicle to a beacon whose place is known, as a radio ranging tag tells. """
+    """
+    Distance from a frame of the vehicle to a beacon at a known position, e.g. of a radio ranging tag.
+    @value RangeSample
+    """
 
     __slots__ = ["header", "frame", "beacon", "beacon_position", "frame_of_reference", "distance", "sigma"]
 
@@ -21,43 +24,49 @@ class range_t(object):
     def __init__(self):
         self.header = mslcm.sensor_header_t()
         """
-        When and by whom; header.utime is the instant the distance holds for.
+        Time and source; header.utime is the instant the distance holds for.
         LCM Type: mslcm.sensor_header_t
         """
 
         self.frame = ""
         """
         The frame of the vehicle that measures: full name, Body:Frame; 200 characters at most on each side of the colon.
+        @check frame_name
         LCM Type: string
         """
 
         self.beacon = ""
         """
         Name of the beacon, for people; 64 characters at most.
+        @check name
         LCM Type: string
         """
 
         self.beacon_position = [ 0.0 for dim0 in range(3) ]
         """
-        Position of the beacon in the frame of reference, along its axes, metres.
+        Position of the beacon in the frame of reference, along its axes, meters.
+        @check position
         LCM Type: double[3]
         """
 
         self.frame_of_reference = ""
         """
         The frame that beacon_position is expressed in: World:UTM or World:ENU.
+        @check frame_name
         LCM Type: string
         """
 
         self.distance = 0.0
         """
-        Distance from the frame's origin to the beacon, metres, never negative.
+        Distance from the frame's origin to the beacon, meters, never negative.
+        @check distance
         LCM Type: double
         """
 
         self.sigma = 0.0
         """
-        Standard deviation of the distance, metres; nan = not told.
+        Standard deviation of the distance, meters; nan = not known.
+        @default nan
         LCM Type: double
         """
 

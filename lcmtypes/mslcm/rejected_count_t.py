@@ -8,7 +8,11 @@ from io import BytesIO
 import struct
 
 class rejected_count_t(object):
-    """ How much input of one channel was rejected for one reason since the start. """
+    """
+    Number of inputs of one channel that were rejected for one reason.
+    @value RejectedCount tuple
+    @part
+    """
 
     __slots__ = ["channel", "reason", "count"]
 
@@ -19,19 +23,21 @@ class rejected_count_t(object):
     def __init__(self):
         self.channel = ""
         """
-        Channel, or `sensor:NAME` for samples that were read but not used.
+        Channel, or `sensor:NAME` for samples that were decoded but not used.
         LCM Type: string
         """
 
         self.reason = ""
         """
-        One word: fingerprint, truncated, malformed, reply_channel, load, stale, duplicate, order, future, ...
+        One word: fingerprint, truncated, malformed, reply_channel, overload, stale, duplicate, out_of_sequence, future,
+        too_old, ...
         LCM Type: string
         """
 
         self.count = 0
         """
         How many, since the start.
+        @as occurrences
         LCM Type: int64_t
         """
 

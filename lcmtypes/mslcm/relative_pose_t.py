@@ -10,7 +10,12 @@ import struct
 import mslcm
 
 class relative_pose_t(object):
-    """ How a frame of the vehicle has moved between two instants, as visual odometry or scan matching tells. """
+    """
+    Motion of a frame of the vehicle between two instants, e.g. by visual odometry or scan matching.
+    @value RelativePoseSample
+    @verify
+    @order header frame since_utime position orientation covariance
+    """
 
     __slots__ = ["header", "since_utime", "frame", "position", "orientation", "covariance"]
 
@@ -21,7 +26,7 @@ class relative_pose_t(object):
     def __init__(self):
         self.header = mslcm.sensor_header_t()
         """
-        When and by whom; header.utime is the later of the two instants.
+        Time and source; header.utime is the later of the two instants.
         LCM Type: mslcm.sensor_header_t
         """
 
@@ -34,25 +39,29 @@ class relative_pose_t(object):
         self.frame = ""
         """
         The frame of the vehicle: full name, Body:Frame; 200 characters at most on each side of the colon.
+        @check frame_name
         LCM Type: string
         """
 
         self.position = [ 0.0 for dim0 in range(3) ]
         """
-        Position of the frame at the later instant in the frame at the earlier one, along its axes then, metres.
+        Position of the frame at the later instant in the frame at the earlier one, along its axes then, meters.
+        @check position
         LCM Type: double[3]
         """
 
         self.orientation = [ 0.0 for dim0 in range(4) ]
         """
         Unit quaternion of the frame at the later instant in the frame at the earlier one, scalar first (w x y z).
+        @check unit_quaternion
         LCM Type: double[4]
         """
 
         self.covariance = [ 0.0 for dim0 in range(36) ]
         """
         Covariance, row-major: x, y, z (m), about x, about y, about z (rad), along the axes of the frame at the earlier
-        instant, rotation applied on the left (fixed axes). The first number nan: not told.
+        instant, rotation applied on the left (fixed axes). The first number nan: not known.
+        @optional @check finite
         LCM Type: double[36]
         """
 

@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class reload_model_reply_t(object):
-    """ Reply to reload_model_request_t. """
+    """
+    Reply to reload_model_request_t.
+    @value ReloadReply tuple
+    """
 
     __slots__ = ["header", "new_revision", "num_changes", "changes"]
 
@@ -21,13 +24,14 @@ class reload_model_reply_t(object):
     def __init__(self):
         self.header = mslcm.reply_header_t()
         """
-        How the request ended. REJECTED: the file is wrong, or does not suit the vehicle; the old geometry stays.
+        Status of the request. REJECTED: the file is invalid, or does not fit the vehicle; the old geometry stays.
         LCM Type: mslcm.reply_header_t
         """
 
         self.new_revision = ""
         """
         Content hash of the geometry in the file; empty unless header.status is OK.
+        @as revision @default ""
         LCM Type: string
         """
 
@@ -40,6 +44,7 @@ class reload_model_reply_t(object):
         self.changes = []
         """
         What changes, one in a line, in words.
+        @default ()
         LCM Type: string[num_changes]
         """
 

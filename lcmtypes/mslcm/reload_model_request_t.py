@@ -11,8 +11,9 @@ import mslcm
 
 class reload_model_request_t(object):
     """
-    Has the service read its geometry file anew, and use it if it is sound; else nothing changes.
-    Refused unless the vehicle file allows it (commands.reload). Answered by reload_model_reply_t.
+    Reload the geometry file, and use it if it is valid; else nothing changes.
+    Denied unless the vehicle file allows it (commands.reload). Answered by reload_model_reply_t.
+    @value ReloadModel tuple
     """
 
     __slots__ = ["header", "dry_run"]
@@ -24,13 +25,14 @@ class reload_model_request_t(object):
     def __init__(self):
         self.header = mslcm.request_header_t()
         """
-        Which request, and where the answer goes.
+        Id of the request, and the channel of the reply.
         LCM Type: mslcm.request_header_t
         """
 
         self.dry_run = False
         """
-        Whether only to say what would change.
+        Whether only to report what would change.
+        @default False
         LCM Type: boolean
         """
 

@@ -8,7 +8,12 @@ from io import BytesIO
 import struct
 
 class reply_header_t(object):
-    """ How a request ended. First member of every reply. """
+    """
+    How a request ended. First member of every reply.
+    @value ReplyHeader tuple
+    @codec queries
+    @part
+    """
 
     __slots__ = ["request_id", "utime", "status", "message", "num_nearest", "nearest", "model_revision"]
 
@@ -25,23 +30,23 @@ class reply_header_t(object):
     NOT_CONNECTED = 3
     """ Both frames exist but no chain of constraints joins them. """
     NO_POSE = 4
-    """ A world frame was asked for before the vehicle's pose is known; ask again later. """
+    """ A world frame was requested before the vehicle's pose is known; retry later. """
     TOO_OLD = 5
-    """ The time asked for lies before what is held. """
+    """ The requested time is before the history. """
     TOO_NEW = 6
-    """ The time asked for lies after what is held, and the policy forbids to predict. """
+    """ The requested time is after the history, and the policy does not allow prediction. """
     MALFORMED = 7
-    """ The request makes no sense: an unknown policy, a negative wait, a range that ends before it starts. """
-    REFUSED_LOAD = 8
-    """ The server is loaded and did not take the request; ask again later. """
+    """ The request is invalid: an unknown policy, a negative wait, a range that ends before it starts. """
+    OVERLOADED = 8
+    """ The server is overloaded and dropped the request; retry later. """
     LIMIT = 9
-    """ The request asks for more than the server gives at once. """
+    """ The request exceeds a limit of the server. """
     INTERNAL = 10
-    """ The server failed on its side; its log holds the cause. """
+    """ Internal error of the server; see its log. """
     FORBIDDEN = 11
     """ The vehicle file does not allow it. """
     REJECTED = 12
-    """ What was given was looked at and not taken; nothing has changed. """
+    """ The given data were checked and rejected; nothing has changed. """
 
     def __init__(self):
         self.request_id = 0
@@ -58,13 +63,15 @@ class reply_header_t(object):
 
         self.status = 0
         """
-        How the request ended: OK to REJECTED. Take a number you do not know for INTERNAL.
+        Status: OK to REJECTED. Treat an unknown number as INTERNAL.
+        @enum Status @default OK
         LCM Type: int16_t
         """
 
         self.message = ""
         """
         What went wrong and what to do, for a person; empty when status is OK.
+        @default ""
         LCM Type: string
         """
 
@@ -76,13 +83,15 @@ class reply_header_t(object):
 
         self.nearest = []
         """
-        Known names close to one that is not known, best first.
+        Suggestions: names similar to an unknown one, best first.
+        @default ()
         LCM Type: string[num_nearest]
         """
 
         self.model_revision = ""
         """
-        Content hash of the geometry that the answer rests on.
+        Content hash of the geometry used.
+        @default ""
         LCM Type: string
         """
 

@@ -8,7 +8,11 @@ from io import BytesIO
 import struct
 
 class request_header_t(object):
-    """ Which request, and where the answer goes. First member of every request. """
+    """
+    Id of the request, and the channel of the reply. First member of every request.
+    @value RequestHeader tuple
+    @part
+    """
 
     __slots__ = ["request_id", "reply_channel"]
 

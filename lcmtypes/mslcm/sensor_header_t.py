@@ -8,7 +8,12 @@ from io import BytesIO
 import struct
 
 class sensor_header_t(object):
-    """ When and by whom a sample was taken. First member of every sensor message. """
+    """
+    Time and source of a sample. First member of every sensor message.
+    @value SensorHeader
+    @part
+    @order utime source seq host_utime device_utime utime_sigma
+    """
 
     __slots__ = ["utime", "utime_sigma", "host_utime", "device_utime", "seq", "source"]
 
@@ -20,36 +25,42 @@ class sensor_header_t(object):
         self.utime = 0
         """
         Instant of measurement, microseconds since the Unix epoch (UTC, host's clock), positive.
+        @check sample_utime
         LCM Type: int64_t
         """
 
         self.utime_sigma = 0.0
         """
         Standard deviation of utime, seconds; nan = not known.
+        @default nan
         LCM Type: double
         """
 
         self.host_utime = 0
         """
         When the host received the sample, microseconds since the Unix epoch (UTC, host's clock); 0 = not known.
+        @default 0 @check utime
         LCM Type: int64_t
         """
 
         self.device_utime = 0
         """
         The device's own time of the sample, microseconds in the device's own epoch; 0 = the device has none.
+        @default 0
         LCM Type: int64_t
         """
 
         self.seq = 0
         """
         Counts the samples of this source, from 0; a gap means lost samples.
+        @default 0
         LCM Type: int64_t
         """
 
         self.source = ""
         """
         Name of the source as the vehicle file knows it, e.g. gps; 64 characters at most.
+        @default "" @check name
         LCM Type: string
         """
 

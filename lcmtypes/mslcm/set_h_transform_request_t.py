@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class set_h_transform_request_t(object):
-    """ Pose.setHTransform: as set_state_vector_request_t, with a homogeneous transform. """
+    """
+    Pose.setHTransform: as set_state_vector_request_t, with a homogeneous transform.
+    @value SetHTransform tuple
+    """
 
     __slots__ = ["header", "pose"]
 
@@ -21,7 +24,7 @@ class set_h_transform_request_t(object):
     def __init__(self):
         self.header = mslcm.request_header_t()
         """
-        Which request, and where the answer goes.
+        Id of the request, and the channel of the reply.
         LCM Type: mslcm.request_header_t
         """
 

@@ -11,8 +11,9 @@ import mslcm
 
 class set_state_vector_request_t(object):
     """
-    Pose.setStateVector: tells localization where the vehicle is. Refused unless the vehicle file allows it
+    Pose.setStateVector: sets the pose of the vehicle. Denied unless the vehicle file allows it
     (commands.set_pose). Answered by acknowledgement_t.
+    @value SetStateVector tuple
     """
 
     __slots__ = ["header", "pose"]
@@ -24,14 +25,14 @@ class set_state_vector_request_t(object):
     def __init__(self):
         self.header = mslcm.request_header_t()
         """
-        Which request, and where the answer goes.
+        Id of the request, and the channel of the reply.
         LCM Type: mslcm.request_header_t
         """
 
         self.pose = mslcm.pose_vector_t()
         """
-        The base frame's pose in World:UTM; utime 0 is now. Its covariance says how sure that is: without one,
-        1 m and 5 degrees. The origin must be that of the service, or nan.
+        The base frame's pose in World:UTM; utime 0 is now. Without a covariance, sigmas of 1 m and 5 degrees are
+        assumed. The origin must be that of the service, or nan.
         LCM Type: mslcm.pose_vector_t
         """
 

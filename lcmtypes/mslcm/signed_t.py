@@ -9,8 +9,9 @@ import struct
 
 class signed_t(object):
     """
-    A message that changes something, with the proof that its sender knows the vehicle's key. docs/wire.md says over
-    which bytes mac is worked out, with an example. Answered as the message in it would be.
+    A command with a message authentication code of the vehicle's key. docs/wire.md specifies the bytes that mac is
+    computed over, with an example. Answered as the message in it would be.
+    @value Envelope tuple
     """
 
     __slots__ = ["key_name", "sender", "utime", "counter", "channel", "size", "payload", "mac"]
@@ -23,36 +24,41 @@ class signed_t(object):
         self.key_name = ""
         """
         Which of the vehicle's keys, as the key file names it; 64 characters at most.
+        @check name
         LCM Type: string
         """
 
         self.sender = ""
         """
-        Who signs: a name for each program on each computer, the same at every start; 64 characters at most.
+        Name of the sender: one for each program on each computer, the same at every start; 64 characters at most.
+        @check name
         LCM Type: string
         """
 
         self.utime = 0
         """
         When it was signed, microseconds since the Unix epoch (UTC).
+        @check utime
         LCM Type: int64_t
         """
 
         self.counter = 0
         """
-        Tells messages of one sender and one utime apart: utime and counter together rise with each.
+        Distinguishes messages of one sender and one utime: (utime, counter) increases with each message.
         LCM Type: int64_t
         """
 
         self.channel = ""
         """
         The channel that the message would go out on by itself, without the vehicle's prefix.
+        @check name
         LCM Type: string
         """
 
         self.size = 0
         """
         Number of bytes of the message; 4096 at most.
+        @limit 4096
         LCM Type: int32_t
         """
 
@@ -65,6 +71,7 @@ class signed_t(object):
         self.mac = b""
         """
         HMAC-SHA256.
+        @default bytes(32)
         LCM Type: byte[32]
         """
 

@@ -8,7 +8,11 @@ from io import BytesIO
 import struct
 
 class time_query_t(object):
-    """ What time a request means. """
+    """
+    Time of a request.
+    @value TimeQuery tuple
+    @part
+    """
 
     __slots__ = ["at", "policy", "wait_ms"]
 
@@ -17,30 +21,33 @@ class time_query_t(object):
     __dimensions__ = [None, None, None]
 
     INTERPOLATED = 0
-    """ Exact or between two held values, else an error. """
+    """ Exact, or interpolated between two values of the history; else an error. """
     LATEST = 1
-    """ As at = 0, whatever `at` says. """
+    """ As at = 0, whatever `at` is. """
     HELD = 2
     """ The last value at or before `at`. """
     PREDICTED = 3
-    """ As INTERPOLATED, and carried on by the motion model past the last sample. """
+    """ As INTERPOLATED, and predicted by the motion model past the last sample. """
 
     def __init__(self):
         self.at = 0
         """
         Microseconds since the Unix epoch (UTC); 0 = the latest time for which everything asked for is known.
+        @default 0 @check utime
         LCM Type: int64_t
         """
 
         self.policy = 0
         """
         Which answer is accepted when `at` is given: INTERPOLATED, LATEST, HELD or PREDICTED.
+        @enum Policy @default INTERPOLATED
         LCM Type: int8_t
         """
 
         self.wait_ms = 0
         """
         How long the server may wait for data that cover `at`, milliseconds, not negative; 0 = answer at once.
+        @default 0 @check not_negative
         LCM Type: int32_t
         """
 

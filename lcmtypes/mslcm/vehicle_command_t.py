@@ -8,7 +8,10 @@ from io import BytesIO
 import struct
 
 class vehicle_command_t(object):
-    """ A wish to the vehicle controller. The controller stops the vehicle when no command comes before the last expires. """
+    """
+    Command to the vehicle controller. The controller stops the vehicle when the last command expires (dead-man timeout).
+    @value VehicleCommand
+    """
 
     __slots__ = ["utime", "valid_for", "seq", "source", "forward_speed", "steering_angle"]
 
@@ -20,12 +23,14 @@ class vehicle_command_t(object):
         self.utime = 0
         """
         When the command was given, microseconds since the Unix epoch (UTC).
+        @check sample_utime
         LCM Type: int64_t
         """
 
         self.valid_for = 0.0
         """
         The command counts until utime plus this, seconds, positive.
+        @check positive
         LCM Type: double
         """
 
@@ -37,19 +42,22 @@ class vehicle_command_t(object):
 
         self.source = ""
         """
-        Name of who commands.
+        Name of the commanding program.
+        @check name
         LCM Type: string
         """
 
         self.forward_speed = 0.0
         """
         Speed of the vehicle's base frame along its x axis (forward), m/s, forward positive.
+        @check number
         LCM Type: double
         """
 
         self.steering_angle = 0.0
         """
         Steering angle of the equivalent front wheel, radians, to the left positive.
+        @check number
         LCM Type: double
         """
 

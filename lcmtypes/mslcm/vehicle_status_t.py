@@ -10,16 +10,19 @@ import struct
 import mslcm
 
 class vehicle_status_t(object):
-    """ What the vehicle controller says of itself. """
+    """
+    Status of the vehicle controller.
+    @value VehicleStatusSample
+    """
 
-    __slots__ = ["header", "mode", "forward_speed", "steering_angle", "supply_voltage", "engine_speed", "fault_bits", "commands_refused"]
+    __slots__ = ["header", "mode", "forward_speed", "steering_angle", "supply_voltage", "engine_speed", "fault_bits", "commands_rejected"]
 
     __typenames__ = ["mslcm.sensor_header_t", "int8_t", "double", "double", "double", "double", "int32_t", "int64_t"]
 
     __dimensions__ = [None, None, None, None, None, None, None, None]
 
     MODE_UNKNOWN = 0
-    """ The controller does not say. """
+    """ Not known. """
     MODE_MANUAL = 1
     """ A person drives. """
     MODE_AUTONOMOUS = 2
@@ -27,54 +30,61 @@ class vehicle_status_t(object):
     MODE_EMERGENCY_STOP = 3
     """ Nobody drives, and the vehicle must not move. """
     MODE_FAULT = 4
-    """ The controller has a fault and takes no commands. """
+    """ The controller has a fault and accepts no commands. """
 
     def __init__(self):
         self.header = mslcm.sensor_header_t()
         """
-        When and by whom.
+        Time and source.
         LCM Type: mslcm.sensor_header_t
         """
 
         self.mode = 0
         """
         Who drives: one of MODE_UNKNOWN to MODE_FAULT.
+        @enum VehicleMode MODE_ @default UNKNOWN
         LCM Type: int8_t
         """
 
         self.forward_speed = 0.0
         """
-        Forward speed as the controller measures it, m/s, forward positive; nan = not said.
+        Forward speed as the controller measures it, m/s, forward positive; nan = not known.
+        @default nan
         LCM Type: double
         """
 
         self.steering_angle = 0.0
         """
-        Steering angle of the equivalent front wheel, radians, to the left positive; nan = not said.
+        Steering angle of the equivalent front wheel, radians, to the left positive; nan = not known.
+        @default nan
         LCM Type: double
         """
 
         self.supply_voltage = 0.0
         """
-        Battery or supply, volts; nan = not said.
+        Battery or supply, volts; nan = not known.
+        @default nan
         LCM Type: double
         """
 
         self.engine_speed = 0.0
         """
-        Engine or motor speed, rad/s; nan = not said.
+        Engine or motor speed, rad/s; nan = not known.
+        @default nan
         LCM Type: double
         """
 
         self.fault_bits = 0
         """
-        The controller's own fault words, bit by bit as its manual says.
+        The controller's own fault words, bit by bit as in its manual.
+        @default 0
         LCM Type: int32_t
         """
 
-        self.commands_refused = 0
+        self.commands_rejected = 0
         """
-        Commands refused since the controller started: out of limits, too old, or from a stranger.
+        Commands rejected since the controller started: out of limits, too old, or from an unknown source.
+        @default 0 @check not_negative
         LCM Type: int64_t
         """
 
@@ -88,7 +98,7 @@ class vehicle_status_t(object):
     def _encode_one(self, buf):
         assert self.header._get_packed_fingerprint() == mslcm.sensor_header_t._get_packed_fingerprint()
         self.header._encode_one(buf)
-        buf.write(struct.pack(">bddddiq", self.mode, self.forward_speed, self.steering_angle, self.supply_voltage, self.engine_speed, self.fault_bits, self.commands_refused))
+        buf.write(struct.pack(">bddddiq", self.mode, self.forward_speed, self.steering_angle, self.supply_voltage, self.engine_speed, self.fault_bits, self.commands_rejected))
 
     @staticmethod
     def decode(data: bytes):
@@ -104,14 +114,14 @@ class vehicle_status_t(object):
     def _decode_one(buf):
         self = vehicle_status_t()
         self.header = mslcm.sensor_header_t._decode_one(buf)
-        self.mode, self.forward_speed, self.steering_angle, self.supply_voltage, self.engine_speed, self.fault_bits, self.commands_refused = struct.unpack(">bddddiq", buf.read(45))
+        self.mode, self.forward_speed, self.steering_angle, self.supply_voltage, self.engine_speed, self.fault_bits, self.commands_rejected = struct.unpack(">bddddiq", buf.read(45))
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if vehicle_status_t in parents: return 0
         newparents = parents + [vehicle_status_t]
-        tmphash = (0x4313fe4f3186d2d7+ mslcm.sensor_header_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0xf1116ca5d09f6f4a+ mslcm.sensor_header_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

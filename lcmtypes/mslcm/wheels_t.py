@@ -10,7 +10,10 @@ import struct
 import mslcm
 
 class wheels_t(object):
-    """ Travel and speed of each wheel. Arrays have one entry for each wheel; what was not measured is nan. """
+    """
+    Travel and speed of each wheel. Arrays have one entry for each wheel; what was not measured is nan.
+    @value WheelsSample
+    """
 
     __slots__ = ["header", "num_wheels", "names", "travel", "travel_sigma", "speed", "speed_sigma", "direction", "steering"]
 
@@ -27,55 +30,62 @@ class wheels_t(object):
     UNKNOWN = 2
     """ The encoder does not measure it; travel and speed have a sign all the same. """
     UNSIGNED = 3
-    """ Nothing measures it: travel counts up and speed is a magnitude, whichever way the wheel turns. """
+    """ Nothing measures it: travel counts up and speed is a magnitude, in both directions. """
 
     def __init__(self):
         self.header = mslcm.sensor_header_t()
         """
-        When and by whom.
+        Time and source.
         LCM Type: mslcm.sensor_header_t
         """
 
         self.num_wheels = 0
         """
         Number of wheels, 0 to 1,024.
+        @rows wheels WheelSample @max 1024
         LCM Type: int32_t
         """
 
         self.names = []
         """
         Names of the wheels, as the vehicle file knows them, e.g. front_left.
+        @as name
         LCM Type: string[num_wheels]
         """
 
         self.travel = []
         """
-        Way rolled since the source started, metres along the ground, forward positive; going back subtracts (UNSIGNED:
-        adds).
+        Distance travelled since the source started, meters along the ground, forward positive; reversing subtracts
+        (UNSIGNED: adds).
+        @default nan
         LCM Type: double[num_wheels]
         """
 
         self.travel_sigma = []
         """
-        Standard deviation of travel, metres.
+        Standard deviation of travel, meters.
+        @default nan
         LCM Type: double[num_wheels]
         """
 
         self.speed = []
         """
         Speed of the wheel's contact point over ground without slip, m/s, forward positive.
+        @default nan
         LCM Type: double[num_wheels]
         """
 
         self.speed_sigma = []
         """
         Standard deviation of speed, m/s.
+        @default nan
         LCM Type: double[num_wheels]
         """
 
         self.direction = []
         """
         Direction of rotation as the encoder measures it: one of BACKWARD, STOPPED, FORWARD, UNKNOWN, UNSIGNED.
+        @enum Direction @default UNKNOWN
         LCM Type: int8_t[num_wheels]
         """
 
@@ -83,6 +93,7 @@ class wheels_t(object):
         """
         Steering angle of the wheel about the vehicle's up axis, radians, to the left positive; 0 = not steered,
         nan = steered, and not measured by the wheel.
+        @default 0.0
         LCM Type: double[num_wheels]
         """
 

@@ -1,4 +1,4 @@
-"""What can be asked of a vehicle, whoever answers: the running service, or a mirror of it."""
+"""The queries that `Platform` (asks the server) and `PlatformMirror` (answers from a local replica) share."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.messages import Explanation, ManyPoses, MotionAnswer, Policy, PoseAnswer
-from modelserver.spatial.transformation import Transformation
+from modelserver.messages import Explanation, MotionAnswer, Policy, PoseAnswer, PoseBatch
+from modelserver.transforms.transformation import Transformation
 
 
 class PlatformClient(Protocol):
-    """What `Platform` and `PlatformMirror` have in common: the questions. Say this where either will do.
+    """Annotate a parameter with this where `Platform` or `PlatformMirror` will do.
 
-    Times are microseconds since the Unix epoch, 0 for the latest. All raise NoServerError where the service is not
-    heard, and the QueryError that says why there is no answer.
+    Times are microseconds since the Unix epoch, 0 for the latest. All methods raise NoServerError if the server does
+    not answer, and a QueryError with the reason if there is no answer.
     """
 
     def get_transformation(
@@ -40,7 +40,7 @@ class PlatformClient(Protocol):
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> PoseAnswer:
-        """Return what `get_transformation` does, with the origin, the bounds and the flags beside it."""
+        """Return the transformation with its origin, protection levels and quality flags."""
         ...
 
     def get_body_list(self) -> list[str]:
@@ -60,11 +60,11 @@ class PlatformClient(Protocol):
     def get_h_transform(
         self, *, inverse: bool = False, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
     ) -> Transformation:
-        """Return the vehicle's pose in World:UTM, or with `inverse` the world's in the vehicle."""
+        """Return the vehicle's pose in World:UTM, with `inverse` the pose of World:UTM in the vehicle."""
         ...
 
     def get_history(self, start_utime: int, end_utime: int, rate_hz: float) -> list[Transformation]:
-        """Return the vehicle's poses in World:UTM at an even rate; times not held are left out."""
+        """Return the vehicle's poses in World:UTM at a fixed rate; times outside the history are left out."""
         ...
 
     def get_transformations(
@@ -75,8 +75,8 @@ class PlatformClient(Protocol):
         fixed_frame: str = "",
         reference_at: int = 0,
         covariance: bool = True,
-    ) -> list[ManyPoses]:
-        """Return for each pair, of frame of interest and frame of reference, its poses at all the instants `at`."""
+    ) -> list[PoseBatch]:
+        """Return for each pair (frame of interest, frame of reference) its poses at all times `at`."""
         ...
 
     def get_motion(
@@ -89,7 +89,7 @@ class PlatformClient(Protocol):
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> MotionAnswer:
-        """Return how `frame_of_interest` moves in `frame_of_reference`."""
+        """Return velocity and acceleration of `frame_of_interest` in `frame_of_reference`."""
         ...
 
     def explain(
@@ -101,7 +101,7 @@ class PlatformClient(Protocol):
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> Explanation:
-        """Return what `get_pose` does, and each edge it rests on."""
+        """Return the pose with the provenance and variance share of each edge on its path."""
         ...
 
     def close(self) -> None:
@@ -113,6 +113,5 @@ if TYPE_CHECKING:
     from modelserver.client.mirror import PlatformMirror
     from modelserver.client.remote import Platform
 
-    def _both(remote: Platform, mirror: PlatformMirror) -> tuple[PlatformClient, PlatformClient]:
-        """Have the type checker see that each is one."""
+    def _check_protocol(remote: Platform, mirror: PlatformMirror) -> tuple[PlatformClient, PlatformClient]:
         return remote, mirror

@@ -1,9 +1,8 @@
-"""Questions answered from what is known here, instead of by the service. No socket, no clock."""
+"""Queries answered from a local replica instead of by the server. No socket, no clock."""
 
 from __future__ import annotations
 
 import math
-import reprlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Final
@@ -11,42 +10,49 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.client.knowledge import NEVER, Known
-from modelserver.client.parts import stacked
+from modelserver.client.batch_reply import check_batch, concatenate
+from modelserver.client.mirror_state import NEVER, MirrorState
 from modelserver.errors import MalformedRequestError, NoPoseError, OutOfDateError, WireError
 from modelserver.geometry import names
 from modelserver.geometry.model import CACHE_SIZE
-from modelserver.messages import MOST_INSTANTS, Explanation, ManyPoses, MotionAnswer, Policy, PoseAnswer, TimeQuery
-from modelserver.platform import WORLD_FRAMES, PlatformView
-from modelserver.platform.explained import explained
-from modelserver.platform.many import many
-from modelserver.platform.moving import motion
-from modelserver.spatial.transformation import Transformation
-from modelserver.wire.fields import MAX_UTIME, time_query
-from modelserver.wire.many import MAX_PAIRS
+from modelserver.messages import (
+    MAX_REQUEST_INSTANTS,
+    Explanation,
+    MotionAnswer,
+    Policy,
+    PoseAnswer,
+    PoseBatch,
+    TimeQuery,
+)
+from modelserver.query import WORLD_FRAMES, PlatformView
+from modelserver.query.batch import lookup_batch
+from modelserver.query.explanation import explain
+from modelserver.query.motion import compute_motion
+from modelserver.transforms.transformation import Transformation
+from modelserver.wire.fields import MAX_UTIME, check_not_negative, check_utime, read_enum
 
 MAX_WAIT_MS: Final = (1 << 31) - 1
-"""What the wire's field holds: a question that `Platform` cannot put is refused here too."""
+"""Range of the wire's field, so that a query that `Platform` cannot send is rejected here too."""
 
 
 class LocalPlatform(ABC):
-    """The questions of `Platform`, answered from a `Known`. Who derives says what is known, and how to wait for more.
+    """The queries of `Platform`, answered from a `MirrorState`, which subclasses provide.
 
-    `limit`: seconds after which knowledge is too old to answer from.
+    `limit`: largest age of the state, seconds. `where`: place of the state for messages.
     """
 
     limit: float = math.inf
     where: str = "here"
 
     @abstractmethod
-    def known(self) -> tuple[Known, int]:
-        """Return what is known, and the instant it is, on the clock of reception."""
+    def read_state(self) -> tuple[MirrorState, int]:
+        """Return the state and the time now, microseconds of the receive clock."""
 
-    def wait_for(self, enough: Callable[[], bool], seconds: float) -> bool:
-        """Wait for so long at most until more is known and that is enough; return whether it is."""
-        return enough()
+    def wait_for(self, is_enough: Callable[[], bool], seconds: float) -> bool:
+        """Wait up to `seconds` for a new state with `is_enough`; return whether there is one."""
+        return is_enough()
 
-    # --- the questions
+    # --- queries
 
     def get_transformation(
         self,
@@ -59,9 +65,9 @@ class LocalPlatform(ABC):
     ) -> Transformation:
         """Return the pose of `frame_of_interest` in `frame_of_reference`; see `Platform.get_transformation`.
 
-        Raises OutOfDateError where too little is known, or too long since; the QueryErrors as `Platform` does.
+        Raises OutOfDateError where the state is incomplete or too old, and the QueryErrors of `Platform`.
         """
-        return self._pose(frame_of_interest, frame_of_reference, at, policy, wait_ms).transformation
+        return self._compute_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms).transformation
 
     def get_pose(
         self,
@@ -72,26 +78,26 @@ class LocalPlatform(ABC):
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> PoseAnswer:
-        """Return what `get_transformation` does, with the origin, the bounds and the flags beside it."""
-        return self._pose(frame_of_interest, frame_of_reference, at, policy, wait_ms)
+        """Return the transformation with its origin, protection levels and quality flags."""
+        return self._compute_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms)
 
-    def _pose(self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int) -> PoseAnswer:
-        time = _time(at, policy, wait_ms)
-        known, view, now = self._ready(time, interest, reference)
+    def _compute_pose(self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int) -> PoseAnswer:
+        time = _make_time_query(at, policy, wait_ms)
+        state, view, now = self._wait_until_ready(time, interest, reference)
         answer = view.transformation(interest, reference, time, now)
-        if _stands_still(view, interest, reference) and len(known.still) < CACHE_SIZE:
-            # kept with the geometry that it is of: when that goes, it goes too
-            known.answers[interest, reference] = answer
-            known.still[interest, reference] = answer.transformation
+        if _is_static(view, interest, reference) and len(state.static_transforms) < CACHE_SIZE:
+            # cached in the state of this geometry, so that a new geometry drops it
+            state.static_answers[interest, reference] = answer
+            state.static_transforms[interest, reference] = answer.transformation
         return answer
 
     def get_body_list(self) -> list[str]:
         """Return the names of the bodies, root first. Raises OutOfDateError."""
-        return self._geometry().model.get_body_list()
+        return self._get_view().model.get_body_list()
 
     def get_body_frame_list(self, body: str) -> list[str]:
         """Return the names of a body's frames. Raises OutOfDateError, UnknownBodyError."""
-        return self._geometry().model.get_body_frame_list(body)
+        return self._get_view().model.get_body_frame_list(body)
 
     def get_state_vector(
         self, *, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
@@ -102,23 +108,23 @@ class LocalPlatform(ABC):
     def get_h_transform(
         self, *, inverse: bool = False, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
     ) -> Transformation:
-        """Return the vehicle's pose in World:UTM, or with `inverse` the world's in the vehicle.
+        """Return the vehicle's pose in World:UTM, with `inverse` the pose of World:UTM in the vehicle.
 
         Raises as `get_transformation`.
         """
-        time = _time(at, policy, wait_ms)
-        _, view, now = self._ready(time, names.WORLD_UTM, "")
+        time = _make_time_query(at, policy, wait_ms)
+        _, view, now = self._wait_until_ready(time, names.WORLD_UTM, "")
         ends = (view.base_frame, names.WORLD_UTM)
         interest, reference = reversed(ends) if inverse else ends
         return view.transformation(interest, reference, time, now).transformation
 
     def get_history(self, start_utime: int, end_utime: int, rate_hz: float) -> list[Transformation]:
-        """Return the vehicle's poses in World:UTM at an even rate; times not held are left out.
+        """Return the vehicle's poses in World:UTM at a fixed rate; times outside the history are left out.
 
         Raises OutOfDateError, NoPoseError, LimitError (more than 1,000 poses), MalformedRequestError.
         """
         _check_utimes(start_utime, end_utime)
-        view = self._held(names.WORLD_UTM)[0]
+        view = self._get_history_view(names.WORLD_UTM)[0]
         return [answer.transformation for answer in view.vehicle_history(start_utime, end_utime, rate_hz)]
 
     def get_transformations(
@@ -129,30 +135,27 @@ class LocalPlatform(ABC):
         fixed_frame: str = "",
         reference_at: int = 0,
         covariance: bool = True,
-    ) -> list[ManyPoses]:
-        """Return for each pair its poses at all the instants `at`; see `Platform.get_transformations`.
+    ) -> list[PoseBatch]:
+        """Return for each pair its poses at all times `at`; see `Platform.get_transformations`.
 
-        Raises OutOfDateError, the QueryErrors as `Platform` does; MalformedRequestError for too many pairs.
+        Raises OutOfDateError and the QueryErrors of `Platform`; MalformedRequestError for too many pairs.
         """
-        utimes = _instants(at)
-        wanted = tuple((interest, reference) for interest, reference in pairs)
-        if not 1 <= len(wanted) <= MAX_PAIRS:
-            raise MalformedRequestError(f"1 to {MAX_PAIRS} pairs go in one question, got {len(wanted)}")
+        wanted, utimes = check_batch(pairs, at)
         _check_utimes(reference_at, *((int(utimes.min()), int(utimes.max())) if len(utimes) else ()))
         ends = [frame for pair in wanted for frame in pair]
         if fixed_frame and not reference_at:
-            _, view, now = self._ready(TimeQuery(), fixed_frame, *ends)
+            _, view, now = self._wait_until_ready(TimeQuery(), fixed_frame, *ends)
         else:
-            view, now = self._held(fixed_frame, *ends)
-        starts = range(0, max(len(utimes), 1), MOST_INSTANTS)
+            view, now = self._get_history_view(fixed_frame, *ends)
+        starts = range(0, max(len(utimes), 1), MAX_REQUEST_INSTANTS)
         return [
-            stacked(
+            concatenate(
                 [
-                    many(
+                    lookup_batch(
                         view,
                         interest,
                         reference,
-                        utimes[start : start + MOST_INSTANTS],
+                        utimes[start : start + MAX_REQUEST_INSTANTS],
                         reference_at,
                         fixed_frame,
                         covariance,
@@ -174,14 +177,14 @@ class LocalPlatform(ABC):
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> MotionAnswer:
-        """Return how `frame_of_interest` moves in `frame_of_reference`; see `Platform.get_motion`.
+        """Return velocity and acceleration of `frame_of_interest` in `frame_of_reference`; see `Platform.get_motion`.
 
-        The vehicle's own velocity comes from its last poses in Odom, so it is less sure than the service's, and no
-        acceleration is known. Raises as `get_transformation`.
+        The vehicle's velocity is estimated from its poses in Odom: its sigma is larger than the server's, and its
+        acceleration is unknown (nan). Raises as `get_transformation`.
         """
-        time = _time(at, policy, wait_ms)
-        _, view, now = self._ready(time, frame_of_interest, frame_of_reference)
-        return motion(view, frame_of_interest, frame_of_reference, expressed_in, time, now)
+        time = _make_time_query(at, policy, wait_ms)
+        _, view, now = self._wait_until_ready(time, frame_of_interest, frame_of_reference)
+        return compute_motion(view, frame_of_interest, frame_of_reference, expressed_in, time, now)
 
     def explain(
         self,
@@ -192,120 +195,111 @@ class LocalPlatform(ABC):
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> Explanation:
-        """Return what `get_pose` does, and each edge it rests on. Raises as `get_transformation`."""
-        time = _time(at, policy, wait_ms)
-        _, view, now = self._ready(time, frame_of_interest, frame_of_reference)
-        return explained(view, frame_of_interest, frame_of_reference, time, now)
+        """Return the pose with the provenance of each edge on its path. Raises as `get_transformation`."""
+        time = _make_time_query(at, policy, wait_ms)
+        _, view, now = self._wait_until_ready(time, frame_of_interest, frame_of_reference)
+        return explain(view, frame_of_interest, frame_of_reference, time, now)
 
-    # --- whether enough is known
+    # --- state
 
-    def is_fresh(self, known: Known, now: int) -> bool:
-        """Return whether the geometry may be answered from."""
-        return known.view is not None and not known.other_revision and known.ages(now).geometry <= self.limit
+    def is_fresh(self, state: MirrorState, now: int) -> bool:
+        """Return whether the geometry is complete, in force and not too old."""
+        return state.view is not None and not state.other_revision and state.get_ages(now).geometry <= self.limit
 
-    def _geometry(self) -> PlatformView:
-        return self._held()[0]
+    def _get_view(self) -> PlatformView:
+        return self._get_history_view()[0]
 
-    def _held(self, *ends: str) -> tuple[PlatformView, int]:
-        """Return what answers questions about times that are held, and the service's time. Raises as `_ready`."""
-        _, view, now = self._ready(TimeQuery(1), *ends)
+    def _get_history_view(self, *ends: str) -> tuple[PlatformView, int]:
+        """Return the view for queries of times in the history, and the server's time. Raises as `_wait_until_ready`."""
+        _, view, now = self._wait_until_ready(TimeQuery(1), *ends)
         return view, now
 
-    def _ready(self, time: TimeQuery, *ends: str) -> tuple[Known, PlatformView, int]:
-        """Return what is known, what answers a question, and the service's time; waits for more where it may.
+    def _wait_until_ready(self, time: TimeQuery, *ends: str) -> tuple[MirrorState, PlatformView, int]:
+        """Return the state, its view and the server's time, after waiting up to the query's wait_ms for new data.
 
-        Raises OutOfDateError that says what is missing, since when, and what to do; NoPoseError.
+        Raises OutOfDateError with what is missing, since when, and what to do; NoPoseError.
         """
-        known, now = self.known()
-        error = self._missing(known, now, time, ends)
-        if time.wait_ms and (error is not None or _awaits(known, time, ends)):
+        state, now = self.read_state()
+        error = self._find_missing(state, now, time, ends)
+        if time.wait_ms and (error is not None or _needs_newer_data(state, time, ends)):
 
-            def enough() -> bool:
-                known, now = self.known()
-                return self._missing(known, now, time, ends) is None and not _awaits(known, time, ends)
+            def is_ready() -> bool:
+                state, now = self.read_state()
+                return self._find_missing(state, now, time, ends) is None and not _needs_newer_data(state, time, ends)
 
-            self.wait_for(enough, time.wait_ms * 1e-3)
-            known, now = self.known()
-            error = self._missing(known, now, time, ends)
-        if error is not None or known.view is None:
-            raise error or self._nothing(known, now)
-        return known, known.view, known.service_time(now)
+            self.wait_for(is_ready, time.wait_ms * 1e-3)
+            state, now = self.read_state()
+            error = self._find_missing(state, now, time, ends)
+        if error is not None or state.view is None:
+            raise error or self._make_no_geometry_error(state, now)
+        return state, state.view, state.get_service_time(now)
 
-    def _missing(self, known: Known, now: int, time: TimeQuery, ends: Sequence[str]) -> Exception | None:
-        if known.view is None:
-            return self._nothing(known, now)
-        ages = known.ages(now)
-        revision = known.view.model.revision
-        if known.other_revision:
+    def _find_missing(self, state: MirrorState, now: int, time: TimeQuery, ends: Sequence[str]) -> Exception | None:
+        if state.view is None:
+            return self._make_no_geometry_error(state, now)
+        ages = state.get_ages(now)
+        revision = state.view.model.revision
+        if state.other_revision:
             return OutOfDateError(
-                f"the service's poses rest on a geometry of revision {known.other_revision}, and the one known "
-                f"{self.where} is {revision}: the new one's MODEL_SNAPSHOT is not whole yet. It is sent "
-                "anew every few seconds (publish.snapshot_s); ask again, or give wait_ms"
+                f"the server's poses have geometry revision {state.other_revision}, the geometry {self.where} has "
+                f"revision {revision}: no complete MODEL_SNAPSHOT of the new one was received yet. It is published "
+                "every few seconds (publish.snapshot_s); retry, or give wait_ms"
             )
         if ages.geometry > self.limit:
             return OutOfDateError(
                 f"the geometry {self.where} (revision {revision}) was confirmed {ages.geometry:.1f} s ago, and the "
-                f"limit is {self.limit:g} s: neither MODEL_SNAPSHOT nor POSE has come since. Is the daemon running? "
-                "Where it has no POSE and sends snapshots more seldom (publish.snapshot_s), give a larger limit"
+                f"limit is {self.limit:g} s: no MODEL_SNAPSHOT and no POSE came since. Is the daemon running? "
+                "If it has no POSE and publishes snapshots less often (publish.snapshot_s), give a larger limit"
             )
         if not any(end in WORLD_FRAMES for end in ends):
             return None
-        if known.pose_heard == NEVER:
+        if state.pose_received == NEVER:
             return NoPoseError(
-                f"no POSE with its POSE_ODOM has been heard {self.where}, so there is no pose in the world: the "
-                "vehicle file names no sensor to localize by, none has spoken yet, the service has only been listened "
-                "to for a moment (give wait_ms), or one of the two channels does not come through"
+                f"no POSE with its POSE_ODOM was received {self.where}, so there is no pose in the world: no "
+                "localization sensor is configured, none has published yet, this client started a moment ago (give "
+                "wait_ms), or one of the two channels does not arrive"
             )
         latest = not time.at or time.policy in (Policy.LATEST, Policy.PREDICTED)
         if latest and ages.pose > self.limit:
             return OutOfDateError(
                 f"the last POSE {self.where} is {ages.pose:.1f} s old, and the limit is {self.limit:g} s. Is the "
-                "daemon running, and do its sensors speak? With publish.mode event, POSE comes with their samples. "
-                "Times that are held are still answered: give at="
+                "daemon running, and do its sensors publish? With publish.mode event, POSE follows their samples. "
+                "Times in the history are still answered: give at="
             )
         return None
 
-    def _nothing(self, known: Known, now: int) -> OutOfDateError:
-        heard = "" if known.pose_heard == NEVER else f" (a POSE came {known.ages(now).pose:.1f} s ago)"
+    def _make_no_geometry_error(self, state: MirrorState, now: int) -> OutOfDateError:
+        last = "" if state.pose_received == NEVER else f" (last POSE {state.get_ages(now).pose:.1f} s ago)"
         return OutOfDateError(
-            f"no whole MODEL_SNAPSHOT has been heard {self.where} yet{heard}, so the geometry is not known. The "
-            "service sends it at its start and every few seconds (publish.snapshot_s): wait for it with wait(), or "
-            "give wait_ms. Is the daemon running, on this bus ($LCM_DEFAULT_URL) and with this channel prefix?"
+            f"no complete MODEL_SNAPSHOT was received {self.where} yet{last}, so the geometry is unknown. The server "
+            "publishes it at its start and every few seconds (publish.snapshot_s): wait for it with wait(), or give "
+            "wait_ms. Is the daemon running, on this bus ($LCM_DEFAULT_URL) and with this channel prefix?"
         )
 
 
-def _awaits(known: Known, time: TimeQuery, ends: Sequence[str]) -> bool:
-    return known.view is None or known.view.awaits(time, *(ends[0], ends[1] or known.view.base_frame))
+def _needs_newer_data(state: MirrorState, time: TimeQuery, ends: Sequence[str]) -> bool:
+    return state.view is None or state.view.is_awaiting_data(time, *(ends[0], ends[1] or state.view.base_frame))
 
 
-def _stands_still(view: PlatformView, interest: str, reference: str) -> bool:
-    """Whether the relation of two frames is the same at any time: no world, and no joint that moves between them."""
+def _is_static(view: PlatformView, interest: str, reference: str) -> bool:
+    """Return whether two frames are rigidly connected: neither is a world frame, and no joint moves between them."""
     if interest in WORLD_FRAMES or reference in WORLD_FRAMES:
         return False
-    return not view.model.route(interest, reference).legs
+    return not view.model.get_kinematic_path(interest, reference).joints
 
 
-def _time(at: int, policy: Policy, wait_ms: int) -> TimeQuery:
-    """Return what time a question means. Raises MalformedRequestError for one that the service would not take."""
+def _make_time_query(at: int, policy: Policy, wait_ms: int) -> TimeQuery:
+    """Return the time query. Raises MalformedRequestError for one that the server would reject."""
     try:
         if isinstance(at, float):
-            raise MalformedRequestError(f"at is whole microseconds since 1970, got {at!r}: write int(...) around it")
+            raise MalformedRequestError(f"at must be integer microseconds since 1970, got {at!r}; write int(...)")
         if wait_ms > MAX_WAIT_MS:
             raise MalformedRequestError(f"wait_ms {wait_ms} is above {MAX_WAIT_MS}")
-        return time_query(at, policy, wait_ms)
+        return TimeQuery(
+            check_utime(at, "at"), read_enum(Policy, policy, "policy"), check_not_negative(wait_ms, "wait_ms")
+        )
     except (WireError, TypeError) as error:
         raise MalformedRequestError(str(error)) from None
-
-
-def _instants(at: Sequence[int] | npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    try:
-        given = np.asarray(at)
-        utimes = given.astype(np.int64)
-        if given.ndim == 1 and (utimes == given).all():
-            return utimes
-    except (TypeError, ValueError, OverflowError):
-        pass
-    raise MalformedRequestError(f"instants are a row of whole microseconds since 1970, got {reprlib.repr(at)}")
 
 
 def _check_utimes(*utimes: int) -> None:

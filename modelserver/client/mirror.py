@@ -1,4 +1,4 @@
-"""PlatformMirror: the client that keeps a copy. It listens to the service and answers by itself."""
+"""PlatformMirror: the client with a local replica of the vehicle. It answers queries without the server."""
 
 from __future__ import annotations
 
@@ -12,41 +12,47 @@ from typing import Final, Self
 
 import lcm
 
-from modelserver.client.knowledge import Ages, Knowledge, Known
 from modelserver.client.local import LocalPlatform
+from modelserver.client.mirror_state import Ages, MirrorReceiver, MirrorState
 from modelserver.errors import OutOfDateError
 from modelserver.messages import Policy, PoseAnswer
-from modelserver.spatial.transformation import Transformation
-from modelserver.wire.channels import literal
-from modelserver.wire.provider import open_lcm, resolve_url, take_message
+from modelserver.transforms.transformation import Transformation
+from modelserver.wire.channels import to_subscription_pattern
+from modelserver.wire.provider import handle_message, open_lcm, resolve_url
 
 log = logging.getLogger(__name__)
 
 POLL_S: Final = 0.1
-"""The longest that the listening thread waits on the bus: so late may it notice that knowledge has grown old."""
+"""Longest wait of the listener thread on the bus, and so the delay with which an expired replica is noticed."""
 
-AT_ONCE: Final = 200
-"""Messages taken before what they tell is shown: a flood must not keep it back."""
+MAX_BATCH: Final = 200
+"""Messages processed before the state is published: a flood must not delay it."""
 
-UNREAD: Final = 10_000
-"""Messages of a channel kept until they are looked at: all the parts of a large geometry come at once."""
+QUEUE_CAPACITY: Final = 10_000
+"""Queued messages of a channel: all parts of a large geometry arrive at once."""
 
-CLOSING_S: Final = 2.0
+JOIN_TIMEOUT_S: Final = 2.0
 
 
 class PlatformMirror(LocalPlatform):
-    """Answers what `Platform` does, without asking: it keeps geometry, joints and poses in step with the service.
+    """Answer the queries of `Platform` from a replica of geometry, joints and poses that follows the server.
 
         with modelserver.PlatformMirror() as mirror:
             mirror.wait(10.0)
             mirror.get_transformation("Digiclops:ImagePlane", "World:UTM")
 
-    A thread of its own listens, on an LCM instance of its own; any number of threads may ask, none waits for another.
-    `url` is the LCM provider, by default $LCM_DEFAULT_URL, else loopback. What is older than `limit` seconds is not
-    answered from: OutOfDateError says how old it is. `age` says it at any time.
+    A thread of its own subscribes, on an LCM instance of its own; any number of threads may query without waiting for
+    each other. Poses of the vehicle are those of POSE: in timer mode the server predicts them to the time of sending,
+    and flags them so.
 
-    What is told of the vehicle is what POSE said: in the service's timer mode that is predicted to the instant of
-    sending, and flagged so. `clock` gives microseconds on a clock that never steps; another is for tests.
+    Parameters
+    ----------
+    url
+        LCM provider, default $LCM_DEFAULT_URL, else loopback.
+    limit
+        Largest age of the replica, seconds. Beyond it queries raise OutOfDateError; `age` is the age now.
+    clock
+        Returns microseconds of a monotonic clock; for tests.
     """
 
     def __init__(
@@ -58,23 +64,23 @@ class PlatformMirror(LocalPlatform):
         clock: Callable[[], int] = lambda: time.monotonic_ns() // 1000,
     ):
         if not limit > 0:
-            raise ValueError(f"limit is above 0 s, got {limit}")
+            raise ValueError(f"limit must be above 0 s, got {limit}")
         self.url = resolve_url(url)
         self.limit = limit
         self.where = f"at {self.url}" + (f" with prefix {channel_prefix!r}" if channel_prefix else "")
         self._clock = clock
-        self._knowledge = Knowledge(channel_prefix)
-        self._known = self._knowledge.known
-        # what does not move: replaced by nothing when it may not be answered from any more
-        self._still: dict[tuple[str, str], Transformation] = {}
-        self._answers: dict[tuple[str, str], PoseAnswer] = {}
+        self._receiver = MirrorReceiver(channel_prefix)
+        self._state = self._receiver.state
+        # caches of the state, emptied when it is out of date
+        self._static_transforms: dict[tuple[str, str], Transformation] = {}
+        self._static_answers: dict[tuple[str, str], PoseAnswer] = {}
         self._changed = threading.Condition()
-        self._end = threading.Event()
+        self._stop = threading.Event()
         bus = open_lcm(self.url)
         self._thread = threading.Thread(
-            # it does not hold this object: one that is forgotten, not closed, ends the thread all the same
+            # a weak reference, so that a mirror that is deleted without close() also ends its thread
             target=_listen,
-            args=(weakref.ref(self), bus, self._end),
+            args=(weakref.ref(self), bus, self._stop),
             name="PlatformMirror",
             daemon=True,
         )
@@ -89,16 +95,15 @@ class PlatformMirror(LocalPlatform):
         self.close()
 
     def close(self) -> None:
-        """Leave the bus. Further questions raise ValueError."""
-        self._end.set()
+        """Leave the bus. Further queries raise ValueError."""
+        self._stop.set()
         if threading.current_thread() is not self._thread:
-            self._thread.join(CLOSING_S)
-        self._still, self._answers = {}, {}
+            self._thread.join(JOIN_TIMEOUT_S)
+        self._static_transforms, self._static_answers = {}, {}
         with self._changed:
             self._changed.notify_all()
 
-    # No `*` before `at`, though it is meant to be named as in `Platform`: defaults of what can only be named are looked
-    # up by name at every call, which makes a lookup a fifth dearer.
+    # Without `*` before `at`, unlike `Platform`: keyword-only defaults cost a cached lookup 20 % of its time.
     def get_transformation(
         self,
         frame_of_interest: str,
@@ -109,12 +114,12 @@ class PlatformMirror(LocalPlatform):
     ) -> Transformation:
         """Return the pose of `frame_of_interest` in `frame_of_reference`; see `Platform.get_transformation`.
 
-        Raises OutOfDateError where too little is known, or too long since; the QueryErrors as `Platform` does.
+        Raises OutOfDateError where the replica is incomplete or too old, and the QueryErrors of `Platform`.
         """
         try:
-            return self._still[frame_of_interest, frame_of_reference]
+            return self._static_transforms[frame_of_interest, frame_of_reference]
         except KeyError:
-            return self._pose(frame_of_interest, frame_of_reference, at, policy, wait_ms).transformation
+            return self._compute_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms).transformation
 
     def get_pose(
         self,
@@ -125,92 +130,93 @@ class PlatformMirror(LocalPlatform):
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> PoseAnswer:
-        """Return what `get_transformation` does, with the origin, the bounds and the flags beside it."""
+        """Return the transformation with its origin, protection levels and quality flags."""
         try:
-            return self._answers[frame_of_interest, frame_of_reference]
+            return self._static_answers[frame_of_interest, frame_of_reference]
         except KeyError:
-            return self._pose(frame_of_interest, frame_of_reference, at, policy, wait_ms)
+            return self._compute_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms)
 
     @property
     def age(self) -> Ages:
-        """Seconds since the geometry was confirmed, a pose came, a joint was told of; infinite for never."""
-        known, now = self._known, self._clock()
-        return known.ages(now)
+        """Seconds since the geometry was confirmed, and a pose and a joint were received; infinite for never."""
+        known, now = self._state, self._clock()
+        return known.get_ages(now)
 
     @property
     def rejected(self) -> dict[tuple[str, str], int]:
-        """Messages that could not be used: how often, by channel and reason."""
-        return dict(self._knowledge.rejected)
+        """Number of rejected messages by channel and reason."""
+        return dict(self._receiver.rejected)
 
     def wait(self, timeout: float = 10.0, *, pose: bool = True) -> Self:
-        """Wait until the geometry is known, and with `pose` where the vehicle is; return this mirror.
+        """Wait for the geometry, and with `pose` for a pose; return self. Raises OutOfDateError."""
 
-        Raises OutOfDateError that says what is missing after `timeout` seconds.
-        """
+        def is_ready() -> bool:
+            known, now = self.read_state()
+            return self.is_fresh(known, now) and (not pose or known.get_ages(now).pose <= self.limit)
 
-        def enough() -> bool:
-            known, now = self.known()
-            return self.is_fresh(known, now) and (not pose or known.ages(now).pose <= self.limit)
-
-        if not self.wait_for(enough, timeout):
-            self._geometry()
+        if not self.wait_for(is_ready, timeout):
+            self._get_view()
             raise OutOfDateError(
-                f"the geometry is known, and no POSE with its POSE_ODOM has come {self.where} within {timeout:g} s. Do "
-                "the sensors speak? Where the vehicle file names none, wait with pose=False"
+                f"no POSE with its POSE_ODOM was received {self.where} within {timeout:g} s, only the geometry. Do the "
+                "sensors publish? For a vehicle file without sensors call wait(pose=False)"
             )
         return self
 
-    # --- what is known
+    # --- state
 
-    def known(self) -> tuple[Known, int]:
-        """Return what is known, and the instant it is. Raises ValueError when closed."""
-        if self._end.is_set():
+    def read_state(self) -> tuple[MirrorState, int]:
+        """Return the replica and the time of its clock. Raises ValueError when closed."""
+        if self._stop.is_set():
             raise ValueError("this PlatformMirror is closed")
-        return self._known, self._clock()
+        return self._state, self._clock()
 
     def wait_for(self, enough: Callable[[], bool], seconds: float) -> bool:
-        """Wait for so long at most until more is known and that is enough; return whether it is."""
+        """Wait up to `seconds` for a new state with `is_enough`; return whether there is one."""
         with self._changed:
             return self._changed.wait_for(enough, seconds)
 
-    def take(self, messages: list[tuple[str, bytes]]) -> None:
-        """Take what has come, and look at the clock; the listening thread does that all the time."""
-        now, knowledge = self._clock(), self._knowledge
+    def process_messages(self, messages: list[tuple[str, bytes]]) -> None:
+        """Process received messages and check the age of the state; called by the listener thread."""
+        now, knowledge = self._clock(), self._receiver
         for channel, data in messages:
             knowledge.feed(channel, data, now)
-        known, before = knowledge.known, self._known
-        self._known = known
-        self._still, self._answers = (known.still, known.answers) if self.is_fresh(known, now) else ({}, {})
+        known, before = knowledge.state, self._state
+        self._state = known
+        self._static_transforms, self._static_answers = (
+            (known.static_transforms, known.static_answers) if self.is_fresh(known, now) else ({}, {})
+        )
         if known is not before:
             with self._changed:
                 self._changed.notify_all()
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The channels that it listens to."""
-        return self._knowledge.channels
+        """The subscribed channels."""
+        return self._receiver.channels
 
 
-def _listen(whose: weakref.ref[PlatformMirror], bus: lcm.LCM, end: threading.Event) -> None:
-    """Take messages from a bus to a mirror until it is closed or forgotten."""
-    fresh: list[tuple[str, bytes]] = []
-    heard: set[str] = set()
-    while not end.is_set():
-        mirror = whose()
+def _listen(mirror_ref: weakref.ref[PlatformMirror], bus: lcm.LCM, stop: threading.Event) -> None:
+    """Pass messages from a bus to a mirror until it is closed or deleted."""
+    received: list[tuple[str, bytes]] = []
+    subscribed: set[str] = set()
+    while not stop.is_set():
+        mirror = mirror_ref()
         if mirror is None:
             return
         try:
-            mirror.take(fresh)
+            mirror.process_messages(received)
         except Exception:
-            # one message that breaks this must not end the listening: knowledge that is not renewed grows old
-            log.exception("an error of the mirror's own")
-        fresh.clear()
+            # one message must not end the thread; a state that is not updated expires
+            log.exception("internal error in PlatformMirror")
+        received.clear()
         for channel in mirror.channels:
-            if channel not in heard:
-                heard.add(channel)
-                subscription = bus.subscribe(literal(channel), lambda channel, data: fresh.append((channel, data)))
-                subscription.set_queue_capacity(UNREAD)
+            if channel not in subscribed:
+                subscribed.add(channel)
+                subscription = bus.subscribe(
+                    to_subscription_pattern(channel), lambda channel, data: received.append((channel, data))
+                )
+                subscription.set_queue_capacity(QUEUE_CAPACITY)
         del mirror
-        take_message(bus, int(POLL_S * 1000))
-        while len(fresh) < AT_ONCE and take_message(bus):
+        handle_message(bus, int(POLL_S * 1000))
+        while len(received) < MAX_BATCH and handle_message(bus):
             pass

@@ -1,11 +1,15 @@
-"""Platform: the client. Its methods look local; each asks the daemon and waits for the reply."""
+"""Platform: the client that sends each query as a request and waits for the reply of the server.
+
+Exchange: publish the request, wait `timeout` seconds for a reply with its id, retry `retries` times. Queries change
+nothing, so a retry is safe; commands are sent once and wait the whole time. A batch reply is complete when all its
+parts are (`batch_reply`).
+"""
 
 from __future__ import annotations
 
 import os
 import random
 import re
-import reprlib
 import secrets
 import struct
 import sys
@@ -20,13 +24,13 @@ import numpy as np
 import numpy.typing as npt
 
 from modelserver.client import commands
-from modelserver.client.parts import Parts, stacked
-from modelserver.client.signing import Signer, signer
-from modelserver.errors import MalformedRequestError, NoServerError, Status, WireError, error_for_status
+from modelserver.client.batch_reply import BatchReplyAssembler, check_batch, concatenate
+from modelserver.client.commands import Signer, load_signer
+from modelserver.errors import MalformedRequestError, NoServerError, Status, WireError, make_status_error
 from modelserver.messages import (
     CHANNEL_OF,
     MAX_CHANNEL_LENGTH,
-    MOST_INSTANTS,
+    MAX_REQUEST_INSTANTS,
     Acknowledgement,
     Explanation,
     ExplanationReply,
@@ -40,13 +44,13 @@ from modelserver.messages import (
     GetTransformation,
     GetTransformations,
     HistoryReply,
-    ManyPoses,
-    ManyReply,
     MotionAnswer,
     MotionReply,
     NameListReply,
     Policy,
     PoseAnswer,
+    PoseBatch,
+    PoseBatchReply,
     ReloadModel,
     ReloadReply,
     ReplyHeader,
@@ -55,12 +59,11 @@ from modelserver.messages import (
     TimeQuery,
     TransformReply,
 )
-from modelserver.spatial.transformation import Transformation
-from modelserver.wire.channels import REPLY_PREFIX, literal
+from modelserver.transforms.transformation import Transformation
+from modelserver.wire.channels import REPLY_PREFIX, to_subscription_pattern
 from modelserver.wire.codec import decode, encode
-from modelserver.wire.many import MAX_PAIRS
-from modelserver.wire.provider import open_lcm, resolve_url, take_message
-from modelserver.wire.queries import read_answer, write_question
+from modelserver.wire.provider import handle_message, open_lcm, resolve_url
+from modelserver.wire.queries import pack_get_transformation, read_answer
 
 R = TypeVar(
     "R",
@@ -68,50 +71,63 @@ R = TypeVar(
     NameListReply,
     StateVectorReply,
     HistoryReply,
-    ManyReply,
+    PoseBatchReply,
     MotionReply,
     ExplanationReply,
     ReloadReply,
     Acknowledgement,
 )
 
+A = TypeVar("A")
+
 _REPLY_TYPES = {
     TransformReply: "get_transformation_reply_t",
     NameListReply: "name_list_reply_t",
     StateVectorReply: "get_state_vector_reply_t",
     HistoryReply: "get_history_reply_t",
-    ManyReply: "get_transformations_reply_t",
+    PoseBatchReply: "get_transformations_reply_t",
     MotionReply: "get_motion_reply_t",
     ExplanationReply: "get_explanation_reply_t",
     **commands.REPLY_TYPES,
 }
 
-UNREAD_REPLIES: Final = 64
-"""Replies kept until they are looked at; further ones are lost."""
+REPLY_QUEUE_CAPACITY: Final = 64
+"""Queued replies; further ones are lost."""
 
 IDLE_S: Final = 0.01
-"""After so long without a question the replies to others of this program's name are thrown away first."""
+"""After this time without a request, queued replies (to programs of the same name) are discarded first."""
 
-LONGEST_WAIT_S: Final = 60.0
-_LONGEST_WAIT_MS: Final = 60_000
-"""LCM counts milliseconds in an int: a longer wait is made of several."""
+MAX_WAIT_S: Final = 60.0
+_MAX_WAIT_MS: Final = 60_000
+"""LCM's timeout is an int of milliseconds: a longer wait is split."""
 
-_ID: Final = slice(8, 16)
-"""Where every request and every reply carries the request's id: first, behind the fingerprint."""
+_REQUEST_ID: Final = slice(8, 16)
+"""Bytes of the request's id in every request and reply: the first field after the fingerprint."""
 
 
 class Platform:
-    """Asks the running service.
+    """Query the running server.
 
         with modelserver.Platform() as platform:
             platform.get_transformation("Digiclops:ImagePlane", "World:UTM")
 
-    It has an LCM instance of its own, so it may be used inside another instance's handler, and by several
-    threads (one asks at a time). `url` is the LCM provider, by default $LCM_DEFAULT_URL, else loopback.
-    `timeout` is how long one try waits for its reply, seconds; `retries` how many more tries follow.
-    `name` names this program on the bus; its reply channel is made of it. `key_file` holds the vehicle's key, by
-    default $MODELSERVER_KEY_FILE names it: only what is signed with it may change the service. It is read when it is
-    first needed.
+    It has an LCM instance of its own, so it may be used inside another instance's handler, and by several threads (one
+    request at a time).
+
+    Parameters
+    ----------
+    url
+        LCM provider, default $LCM_DEFAULT_URL, else loopback.
+    channel_prefix, reply_prefix
+        Prefix of the vehicle's channels and of reply channels.
+    timeout
+        Wait for a reply before the next try, seconds.
+    retries
+        Number of further tries.
+    name
+        Name of this program on the bus, from which its reply channel is made; default: the script's name.
+    key_file
+        The vehicle's key, default $MODELSERVER_KEY_FILE: commands must be signed with it. Read when first needed.
     """
 
     def __init__(
@@ -126,29 +142,31 @@ class Platform:
         key_file: str | os.PathLike[str] = "",
     ):
         if not timeout > 0:
-            raise ValueError(f"timeout is above 0 s, got {timeout}")
+            raise ValueError(f"timeout must be above 0 s, got {timeout}")
         if retries < 0:
-            raise ValueError(f"retries is 0 or more, got {retries}")
+            raise ValueError(f"retries must be 0 or more, got {retries}")
         self.url = resolve_url(url)
         self.timeout = timeout
         self.retries = retries
         self._key_file, self._prefix = os.fspath(key_file), channel_prefix
         self._signer: Signer | None = None
         self._channels = {kind: f"{channel_prefix}{channel}" for kind, channel in CHANNEL_OF.items()}
-        # stable for a program, not random: every process on the bus keeps each channel name it ever saw
+        # the same at each start, not random: every process on the bus stores each channel name it ever received
         self._name = name or os.path.basename(sys.argv[0] or "python")
-        self.reply_channel = _reply_channel(reply_prefix, self._name)
+        self.reply_channel = _make_reply_channel(reply_prefix, self._name)
         # ids need to differ between programs, not to be unguessable
         self._ids = random.Random(secrets.randbits(128))
         self._lock = threading.Lock()
-        self._fresh: list[bytes] = []
+        self._received: list[bytes] = []
         self._lcm: lcm.LCM | None = open_lcm(self.url)
-        self._last_asked = 0.0
-        fresh = self._fresh
-        # the handler does not hold this object: one that is forgotten, not closed, leaves the bus all the same
-        subscription = self._lcm.subscribe(literal(self.reply_channel), lambda _, data: fresh.append(data))
-        # between two questions only what others of this program's name are told can come: that is not gathered
-        subscription.set_queue_capacity(UNREAD_REPLIES)
+        self._last_request = 0.0
+        received = self._received
+        # the handler holds no reference to self, so that an object that is deleted without close() leaves the bus
+        subscription = self._lcm.subscribe(
+            to_subscription_pattern(self.reply_channel), lambda _, data: received.append(data)
+        )
+        # between two requests only replies to programs of the same name arrive
+        subscription.set_queue_capacity(REPLY_QUEUE_CAPACITY)
 
     def __enter__(self) -> Self:
         return self
@@ -159,7 +177,7 @@ class Platform:
         self.close()
 
     def close(self) -> None:
-        """Leave the bus. Further questions raise ValueError."""
+        """Leave the bus. Further queries raise ValueError."""
         with self._lock:
             self._lcm = None
 
@@ -174,9 +192,23 @@ class Platform:
     ) -> Transformation:
         """Return the pose of `frame_of_interest` in `frame_of_reference`.
 
-        `at` is a time in microseconds since the Unix epoch, 0 for the latest common one; `policy` says what is
-        accepted for an answer there; `wait_ms` how long the server may wait for data that cover it.
-        Raises NoServerError, or the QueryError that the server meant.
+        Parameters
+        ----------
+        frame_of_interest, frame_of_reference
+            Body:Frame.
+        at
+            Time in microseconds since the Unix epoch, 0 for the latest common one.
+        policy
+            What is accepted at that time: interpolated, latest, held (the last value before it) or predicted data.
+        wait_ms
+            How long the server may wait for data that cover it.
+
+        Raises
+        ------
+        NoServerError
+            No reply was received.
+        QueryError
+            The reason in the reply.
         """
         return self.get_pose(
             frame_of_interest, frame_of_reference, at=at, policy=policy, wait_ms=wait_ms
@@ -191,48 +223,48 @@ class Platform:
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> PoseAnswer:
-        """Return what `get_transformation` does, with the origin, the bounds and the flags beside it."""
-        # by hand, not through `_ask`: this is what is asked all the time, and often what was asked before
+        """Return the transformation with its origin, protection levels and quality flags."""
+        # packed without `_request`: the hot path
         names = (self.reply_channel, frame_of_interest, frame_of_reference)
         try:
-            request = write_question(self._ids.getrandbits(63), *names, at, policy, wait_ms)
-        except _UNWRITABLE as error:
-            raise _unwritable(error, at) from error
+            request = pack_get_transformation(self._ids.getrandbits(63), *names, at, policy, wait_ms)
+        except _ENCODE_ERRORS as error:
+            raise _to_malformed_request(error, at) from error
         reply = self._exchange(self._channels[GetTransformation], request, self.timeout + wait_ms * 1e-3)
-        return opened_pose(reply, frame_of_interest, frame_of_reference)
+        return decode_pose_reply(reply, frame_of_interest, frame_of_reference)
 
     def get_body_list(self) -> list[str]:
         """Return the names of the bodies, root first. Raises NoServerError."""
-        return list(self._ask(GetBodyList(self._header()), NameListReply).names)
+        return list(self._request(GetBodyList(self._header()), NameListReply).names)
 
     def get_body_frame_list(self, body: str) -> list[str]:
         """Return the names of a body's frames. Raises NoServerError, UnknownBodyError."""
-        return list(self._ask(GetBodyFrameList(self._header(), body), NameListReply).names)
+        return list(self._request(GetBodyFrameList(self._header(), body), NameListReply).names)
 
     def get_state_vector(
         self, *, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
     ) -> Transformation:
         """Return the vehicle's pose in World:UTM, through its 7-vector. Raises as `get_transformation`."""
         request = GetStateVector(self._header(), TimeQuery(at, policy, wait_ms))
-        return _found(self._ask(request, StateVectorReply, wait_ms).answer).transformation
+        return _require_answer(self._request(request, StateVectorReply, wait_ms).answer).transformation
 
     def get_h_transform(
         self, *, inverse: bool = False, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
     ) -> Transformation:
-        """Return the vehicle's pose in World:UTM, or with `inverse` the world's in the vehicle.
+        """Return the vehicle's pose in World:UTM, with `inverse` the pose of World:UTM in the vehicle.
 
         Raises as `get_transformation`.
         """
         request = GetHTransform(self._header(), inverse, TimeQuery(at, policy, wait_ms))
-        return _found(self._ask(request, TransformReply, wait_ms).answer).transformation
+        return _require_answer(self._request(request, TransformReply, wait_ms).answer).transformation
 
     def get_history(self, start_utime: int, end_utime: int, rate_hz: float) -> list[Transformation]:
-        """Return the vehicle's poses in World:UTM at an even rate; times not held are left out.
+        """Return the vehicle's poses in World:UTM at a fixed rate; times outside the history are left out.
 
         Raises NoServerError, NoPoseError, LimitError (more than 1,000 poses), MalformedRequestError.
         """
         request = GetHistory(self._header(), start_utime, end_utime, rate_hz)
-        return [answer.transformation for answer in self._ask(request, HistoryReply).answers]
+        return [answer.transformation for answer in self._request(request, HistoryReply).answers]
 
     def get_transformations(
         self,
@@ -242,38 +274,51 @@ class Platform:
         fixed_frame: str = "",
         reference_at: int = 0,
         covariance: bool = True,
-    ) -> list[ManyPoses]:
-        """Return for each pair, of frame of interest and frame of reference, its poses at all the instants `at`.
+    ) -> list[PoseBatch]:
+        """Return for each pair (frame of interest, frame of reference) its poses at all times `at`.
 
-        With `fixed_frame` they are those at the instants in the frame of reference at `reference_at` (0: the latest),
-        through a frame that is taken to stand still: Odom:Origin for short times. `at` are times in microseconds since
-        the Unix epoch. What is not held at an instant has a status there that says so, and nan for a pose.
-        Raises NoServerError, or the QueryError that the server meant; MalformedRequestError for too many pairs, for
-        instants that are none, and for so many through a fixed frame that one question does not hold them, at a
-        reference time of 0: it would be another one in each.
+        A time without data has a status with the reason, and a pose of nan.
+
+        Parameters
+        ----------
+        pairs
+            Frames of interest and reference.
+        at
+            (n,) times, microseconds since the Unix epoch.
+        fixed_frame
+            If given, the frame of reference is taken at `reference_at` instead of at each time, through this frame,
+            which is assumed stationary between the times: Odom:Origin for short ones (tf2's "advanced" lookup).
+        reference_at
+            Time of the frame of reference with `fixed_frame`, 0 for the latest.
+        covariance
+            Whether to compute covariances.
+
+        Raises
+        ------
+        NoServerError, QueryError
+            As `get_transformation`; MalformedRequestError also for too many pairs, non-integer times, and with
+            `fixed_frame` and a `reference_at` of 0 for more times than one request holds.
         """
-        utimes = _instants(at)
-        wanted = tuple((interest, reference) for interest, reference in pairs)
-        if not 1 <= len(wanted) <= MAX_PAIRS:
-            raise MalformedRequestError(f"1 to {MAX_PAIRS} pairs go in one question, got {len(wanted)}")
-        # the server takes so many at once; a longer question is asked in several
-        most = MOST_INSTANTS // len(wanted)
+        wanted, utimes = check_batch(pairs, at)
+        most = MAX_REQUEST_INSTANTS // len(wanted)
         if fixed_frame and not reference_at and len(utimes) > most:
             raise MalformedRequestError(
-                f"{len(utimes)} instants of {len(wanted)} pairs take several questions of {most}, and the latest time "
-                "is another one in each: give reference_at, or ask for fewer"
+                f"{len(utimes)} times of {len(wanted)} pairs need several requests of {most}, whose latest times "
+                "differ; give reference_at, or fewer times"
             )
-        chunks = []
+        batches = []
         for start in range(0, max(len(utimes), 1), most):
-            some = tuple(utimes[start : start + most].tolist())
-            parts = Parts(lambda data: _opened(data, ManyReply))
-            self._ask(
-                GetTransformations(self._header(), wanted, some, fixed_frame, reference_at, covariance),
-                ManyReply,
-                whole=parts.add,
+            chunk = utimes[start : start + most]
+            parts = BatchReplyAssembler(lambda data: _decode_reply(data, PoseBatchReply))
+            self._request(
+                GetTransformations(
+                    self._header(), wanted, tuple(chunk.tolist()), fixed_frame, reference_at, covariance
+                ),
+                PoseBatchReply,
+                is_complete=parts.add,
             )
-            chunks.append(parts.joined(wanted, utimes[start : start + most]))
-        return [stacked([chunk[number] for chunk in chunks]) for number in range(len(wanted))]
+            batches.append(parts.join(wanted, chunk))
+        return [concatenate([batch[number] for batch in batches]) for number in range(len(wanted))]
 
     def get_motion(
         self,
@@ -285,16 +330,13 @@ class Platform:
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> MotionAnswer:
-        """Return how `frame_of_interest` moves in `frame_of_reference`: velocity, turn rate, and how they change.
+        """Return velocity and acceleration, linear and angular, of `frame_of_interest` in `frame_of_reference`.
 
         Vectors are along the axes of `expressed_in`, by default the frame of reference. Raises as `get_transformation`.
         """
         time = TimeQuery(at, policy, wait_ms)
         request = GetMotion(self._header(), frame_of_interest, frame_of_reference, expressed_in, time)
-        answer = self._ask(request, MotionReply, wait_ms).answer
-        if answer is None:
-            raise WireError("malformed", "the server said OK but sent no motion")
-        return answer
+        return _require_answer(self._request(request, MotionReply, wait_ms).answer)
 
     def explain(
         self,
@@ -305,161 +347,139 @@ class Platform:
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> Explanation:
-        """Return what `get_pose` does, and each edge it rests on: how it was come by, its share of the variance.
+        """Return the pose with the provenance and variance share of each edge on its path.
 
         Raises as `get_transformation`.
         """
         time = TimeQuery(at, policy, wait_ms)
         request = GetExplanation(self._header(), frame_of_interest, frame_of_reference, time)
-        answer = self._ask(request, ExplanationReply, wait_ms).answer
-        if answer is None:
-            raise WireError("malformed", "the server said OK but sent no explanation")
-        return answer
+        return _require_answer(self._request(request, ExplanationReply, wait_ms).answer)
 
     def reload_model(self, *, dry_run: bool = False) -> ReloadReply:
-        """Have the service read its geometry file anew; return the file's revision and what changes, a line each.
+        """Reload the server's geometry file; return its revision and the changes, one per line.
 
-        With `dry_run` nothing is changed. Raises NoServerError, ForbiddenError where the vehicle file does not allow
-        it or the signature does not do, KeyFileError, RejectedError where the file is wrong or does not suit the
-        vehicle: the geometry in force stays.
+        With `dry_run` nothing is changed. Raises NoServerError; ForbiddenError if the vehicle file or the signature
+        does not permit it; KeyFileError; RejectedError if the file is wrong or does not fit the vehicle: the geometry
+        in force stays.
         """
-        return self._ask(ReloadModel(self._header(), dry_run), ReloadReply)
+        return self._request(ReloadModel(self._header(), dry_run), ReloadReply)
 
     def set_state_vector(self, pose: Transformation) -> Acknowledgement:
         """Set the pose of the vehicle, the base frame in World:UTM, through a 7-vector.
 
-        `pose` is as `get_state_vector` returns it: of the base frame, at its `utime` (0: now), from the origin that its
-        `origin_id` names (0: the service's own), as sure as its covariance says (None: 1 m and 5 degrees). It is
-        fused like a measurement of source "operator"; LOCALIZATION_DECISIONS carries the decision on it, at the
-        `header.utime` of the returned reply where `utime` is 0. Sent once: where NoServerError is raised it may have
-        been accepted all the same. Raises ForbiddenError, KeyFileError, RejectedError.
+        `pose` is as `get_state_vector` returns it: of the base frame, at its `utime` (0: now), from the origin of its
+        `origin_id` (0: the server's), with its covariance (None: 1 m and 5 degrees). It is fused like a measurement of
+        source "operator"; LOCALIZATION_DECISIONS carries the decision on it, at the `header.utime` of the returned
+        reply where `utime` is 0. Sent once: after NoServerError it may still have been accepted. Raises ForbiddenError,
+        KeyFileError, RejectedError.
         """
-        return self._ask(commands.pose_to_set(self._header(), pose, as_vector=True), Acknowledgement)
+        return self._request(commands.make_set_pose_request(self._header(), pose, as_vector=True), Acknowledgement)
 
     def set_h_transform(self, pose: Transformation) -> Acknowledgement:
-        """Do what `set_state_vector` does, through a homogeneous transform."""
-        return self._ask(commands.pose_to_set(self._header(), pose, as_vector=False), Acknowledgement)
+        """Set the pose as `set_state_vector`, through a homogeneous transform."""
+        return self._request(commands.make_set_pose_request(self._header(), pose, as_vector=False), Acknowledgement)
 
     def _header(self) -> RequestHeader:
         return RequestHeader(self._ids.getrandbits(63), self.reply_channel)
 
-    def _ask(
-        self, request: Any, reply_kind: type[R], wait_ms: int = 0, whole: Callable[[bytes], bool] | None = None
+    def _request(
+        self, request: Any, reply_kind: type[R], wait_ms: int = 0, is_complete: Callable[[bytes], bool] | None = None
     ) -> R:
-        """Return the reply to a request; of one in parts, the last that came: `whole` is shown each.
-
-        Raises NoServerError, the QueryError that the server meant, WireError.
-        """
+        """Return the reply to a request, for a batch its last part. Raises NoServerError, QueryError, WireError."""
         try:
             data = encode(request)
-        except _UNWRITABLE as error:
-            raise _unwritable(error, getattr(getattr(request, "time", None), "at", 0)) from error
+        except _ENCODE_ERRORS as error:
+            raise _to_malformed_request(error, getattr(getattr(request, "time", None), "at", 0)) from error
         channel = self._channels[type(request)]
-        patience, tries = self.timeout + wait_ms * 1e-3, 1 + self.retries
-        wanted = data[_ID]
+        timeout, tries = self.timeout + wait_ms * 1e-3, 1 + self.retries
+        request_id = data[_REQUEST_ID]
         if isinstance(request, commands.COMMANDS):
-            patience, tries = patience * tries, 1
-            self._signer = self._signer or signer(self._key_file, self._prefix, self._name)
-            # without a key it goes out as it is: the service says that it must be signed, and how
+            timeout, tries = timeout * tries, 1
+            self._signer = self._signer or load_signer(self._key_file, self._prefix, self._name)
+            # without a key it is sent unsigned: the server's reply explains how to sign
             if self._signer is not None:
-                channel, data = self._signer.channel, self._signer.sealed(CHANNEL_OF[type(request)], data)
-        return _opened(self._exchange(channel, data, patience, whole, tries, wanted), reply_kind)
+                channel, data = self._signer.channel, self._signer.seal(CHANNEL_OF[type(request)], data)
+        return _decode_reply(self._exchange(channel, data, timeout, is_complete, tries, request_id), reply_kind)
 
     def _exchange(
         self,
         channel: str,
         request: bytes,
-        patience: float,
-        whole: Callable[[bytes], bool] | None = None,
+        timeout: float,
+        is_complete: Callable[[bytes], bool] | None = None,
         tries: int = 0,
-        wanted: bytes = b"",
+        request_id: bytes = b"",
     ) -> bytes:
-        """Send a request until its reply comes, or `whole` says so of its parts; `tries` times, 0: as `retries` says.
-
-        `wanted` is the id of the reply, by default the one that the request begins with.
-        Asking twice does no harm: questions change nothing.
-        """
+        """Send a request up to `tries` times (0: 1 + retries) until a reply with its id is complete; return that."""
         tries = tries or 1 + self.retries
-        wanted = wanted or request[_ID]
-        fresh = self._fresh
+        request_id = request_id or request[_REQUEST_ID]
+        received = self._received
         with self._lock:
             bus = self._lcm
             if bus is None:
                 raise ValueError("this Platform is closed")
             for tried in range(tries):
                 begin = time.monotonic()
-                if tried or begin > self._last_asked + IDLE_S:
+                if tried or begin > self._last_request + IDLE_S:
                     _discard_unread(bus)
-                self._last_asked = begin
-                fresh.clear()
+                self._last_request = begin
+                received.clear()
                 bus.publish(channel, request)
-                left = patience
+                left = timeout
                 while left > 0:
-                    take_message(bus, int(left * 1000) + 1 if left < LONGEST_WAIT_S else _LONGEST_WAIT_MS)
-                    for reply in fresh:
-                        if reply[_ID] == wanted and (whole is None or whole(reply)):
+                    handle_message(bus, int(left * 1000) + 1 if left < MAX_WAIT_S else _MAX_WAIT_MS)
+                    for reply in received:
+                        if reply[_REQUEST_ID] == request_id and (is_complete is None or is_complete(reply)):
                             return reply
-                    fresh.clear()
-                    left = begin + patience - time.monotonic()
+                    received.clear()
+                    left = begin + timeout - time.monotonic()
         raise NoServerError(
             f"no reply on {self.reply_channel} to a request on {channel} at {self.url} after "
-            f"{tries} {'try' if tries == 1 else 'tries'} of {patience:g} s. Is the daemon running "
+            f"{tries} {'try' if tries == 1 else 'tries'} of {timeout:g} s. Is the daemon running "
             "(modelserver run -c vehicle.yaml), on this bus ($LCM_DEFAULT_URL) and with this channel prefix?"
         )
 
 
-_UNWRITABLE: Final = (struct.error, TypeError, AttributeError, UnicodeEncodeError)
-"""What writing a question raises for a value that no message can hold."""
+_ENCODE_ERRORS: Final = (struct.error, TypeError, AttributeError, UnicodeEncodeError)
+"""Errors of encoding a value that the message cannot hold."""
 
 
-def _unwritable(error: Exception, at: object) -> MalformedRequestError:
+def _to_malformed_request(error: Exception, at: object) -> MalformedRequestError:
     if isinstance(at, float):
-        return MalformedRequestError(f"at is whole microseconds since 1970, got {at!r}: write int(...) around it")
-    return MalformedRequestError(f"this question cannot be put into a message: {error}")
+        return MalformedRequestError(f"at must be integer microseconds since 1970, got {at!r}; write int(...)")
+    return MalformedRequestError(f"the request cannot be encoded: {error}")
 
 
-def _opened(data: bytes, kind: type[R]) -> R:
-    """Return the reply in its bytes. Raises the QueryError that the server meant, WireError."""
+def _decode_reply(data: bytes, kind: type[R]) -> R:
+    """Decode a reply. Raises the QueryError in it, WireError."""
     reply: R = decode(_REPLY_TYPES[kind], data)
     header: ReplyHeader = reply.header
     if header.status is not Status.OK:
-        raise error_for_status(header.status, header.message, header.nearest)
+        raise make_status_error(header.status, header.message, header.nearest)
     return reply
 
 
-def opened_pose(data: bytes, frame_of_interest: str, frame_of_reference: str) -> PoseAnswer:
-    """Return the answer in the reply to a GetTransformation. Raises as `Platform.get_pose`."""
+def decode_pose_reply(data: bytes, frame_of_interest: str, frame_of_reference: str) -> PoseAnswer:
+    """Decode the reply to a GetTransformation. Raises as `Platform.get_pose`."""
     try:
         answer = read_answer(data, frame_of_interest, frame_of_reference)
     except struct.error:
-        # cut short: `decode` says so
-        answer = None
-    return answer or _found(_opened(data, TransformReply).answer)
+        answer = None  # truncated: `decode` raises the error
+    return answer or _require_answer(_decode_reply(data, TransformReply).answer)
 
 
-def _instants(at: Sequence[int] | npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    try:
-        given = np.asarray(at)
-        utimes = given.astype(np.int64)
-        if given.ndim == 1 and (utimes == given).all():
-            return utimes
-    except (TypeError, ValueError, OverflowError):
-        pass
-    raise MalformedRequestError(f"instants are a row of whole microseconds since 1970, got {reprlib.repr(at)}")
-
-
-def _found(answer: PoseAnswer | None) -> PoseAnswer:
+def _require_answer(answer: A | None) -> A:
     if answer is None:
-        raise WireError("malformed", "the server said OK but sent no pose")
+        raise WireError("malformed", "the reply has status OK and no answer")
     return answer
 
 
 def _discard_unread(bus: lcm.LCM) -> None:
-    for _ in range(UNREAD_REPLIES):
-        if not take_message(bus):
+    for _ in range(REPLY_QUEUE_CAPACITY):
+        if not handle_message(bus):
             return
 
 
-def _reply_channel(prefix: str, program: str) -> str:
+def _make_reply_channel(prefix: str, program: str) -> str:
     plain = re.sub(r"[^A-Za-z0-9]+", "_", program).strip("_").upper() or "CLIENT"
     return f"{prefix}{plain}"[:MAX_CHANNEL_LENGTH]

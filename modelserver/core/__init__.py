@@ -1,21 +1,33 @@
-"""The core: a deterministic state machine, `step(state, event, now) -> (state, outputs)`. Pure.
+"""The core of the server: a deterministic state machine, `step(state, event, now) -> (state, outputs)`. Pure.
 
-Live and replay run this same function: the same events at the same instants give the same outputs. Time enters
-only with events. Nothing that comes from the bus can raise out of `step`; what cannot be used is counted by
-channel and reason, and the counts go out with the health report.
+Live operation and replay run this function: the same events at the same instants give the same outputs, bit for bit.
+Time enters only with an event, as an `Instant` of both host clocks. `_HANDLERS` dispatches by event type:
+
+- samples (`samples`) update the localizer and the joints, and may publish a pose;
+- ticks (`ticks`) do what is due by the clock: poses, health report, snapshot, state to persist, waiting requests;
+- requests (`requests`, `answers`) are answered at once, in steps by the server loop, or wait until their data arrive;
+- signed commands (`commands`) change the geometry, the pose or the mode.
+
+A message from the bus never raises out of `step`. What cannot be used is counted by channel and reason, and the health
+report publishes the counts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Any, Final, get_args
 
-from modelserver.core.commands import OPERATOR, SET_COVARIANCE, commanded, model_loaded, unsigned
+from modelserver.core.commands import OPERATOR, SET_COVARIANCE, ModelLoaded, apply_model, deny_unsigned, execute_command
 from modelserver.core.host_clock import Instant
-from modelserver.core.keeping import START, kept, start_told
-from modelserver.core.reload import ModelLoaded
-from modelserver.core.requests import denied, fail, refuse, requested, turn_back
-from modelserver.core.samples import AHEAD_LIMIT_S, FUTURE_LIMIT_S, mode_wished, sample_taken
+from modelserver.core.persistence import START, get_state_to_persist, report_start
+from modelserver.core.requests import (
+    handle_denied,
+    handle_request,
+    reply_internal_error,
+    reply_malformed,
+    reply_overloaded,
+)
+from modelserver.core.samples import COMMAND_FUTURE_LIMIT_S, SAMPLE_FUTURE_LIMIT_S, process_sample, switch_mode
 from modelserver.core.state import (
     DEGRADED,
     MAX_COUNTERS,
@@ -26,89 +38,57 @@ from modelserver.core.state import (
     CoreState,
     ExpectedSensor,
     Outputs,
-    Parked,
     SourceTraffic,
-    Step,
-    check_bolted,
-    noticed,
-    rejected,
+    StepResult,
+    WaitingRequest,
+    check_rigid,
+    handle_rejected,
+    handle_warning,
     start,
 )
-from modelserver.core.ticks import LATENESS_KEPT, ticked
+from modelserver.core.ticks import MAX_TICK_LATENCIES, handle_tick
 from modelserver.messages import (
-    AbsolutePoseSample,
     Denied,
     Event,
-    GetBodyFrameList,
-    GetBodyList,
-    GetExplanation,
-    GetHistory,
-    GetHTransform,
-    GetMotion,
-    GetStateVector,
-    GetTransformation,
-    GetTransformations,
-    GpsSample,
-    ImuSample,
-    JointsSample,
-    Noticed,
-    RangeSample,
+    HealthWarning,
     Rejected,
-    RelativePoseSample,
     ReloadModel,
+    Request,
+    Sample,
     SetHTransform,
     SetStateVector,
     SignedCommand,
     SwitchMode,
     Tick,
-    VehicleStatusSample,
-    WheelsSample,
 )
 
 
 def step(state: CoreState, event: Event | ModelLoaded, now: Instant) -> tuple[CoreState, AllOutputs]:
-    """Return the state after an event, and what is to be sent."""
+    """Return the state after an event, and the outputs to send."""
     return _HANDLERS[type(event)](state, event, now)
 
 
 _HANDLERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], tuple[CoreState, AllOutputs]]]] = {
-    GpsSample: sample_taken,
-    ImuSample: sample_taken,
-    WheelsSample: sample_taken,
-    VehicleStatusSample: sample_taken,
-    JointsSample: sample_taken,
-    AbsolutePoseSample: sample_taken,
-    RelativePoseSample: sample_taken,
-    RangeSample: sample_taken,
-    SwitchMode: mode_wished,
-    Tick: ticked,
-    Rejected: rejected,
-    Noticed: noticed,
-    Denied: denied,
-    GetTransformation: requested,
-    GetBodyList: requested,
-    GetBodyFrameList: requested,
-    GetStateVector: requested,
-    GetHTransform: requested,
-    GetHistory: requested,
-    GetTransformations: requested,
-    GetMotion: requested,
-    GetExplanation: requested,
-    SignedCommand: commanded,
-    ModelLoaded: model_loaded,
-    ReloadModel: unsigned,
-    SetStateVector: unsigned,
-    SetHTransform: unsigned,
+    **dict.fromkeys(get_args(Sample), process_sample),
+    **dict.fromkeys(get_args(Request), handle_request),
+    **dict.fromkeys((ReloadModel, SetStateVector, SetHTransform), deny_unsigned),
+    SignedCommand: execute_command,
+    SwitchMode: switch_mode,
+    ModelLoaded: apply_model,
+    Tick: handle_tick,
+    Rejected: handle_rejected,
+    HealthWarning: handle_warning,
+    Denied: handle_denied,
 }
 
 __all__ = [
-    "AHEAD_LIMIT_S",
+    "COMMAND_FUTURE_LIMIT_S",
     "DEGRADED",
-    "FUTURE_LIMIT_S",
-    "LATENESS_KEPT",
     "MAX_COUNTERS",
+    "MAX_TICK_LATENCIES",
     "OPERATOR",
     "RUNNING",
+    "SAMPLE_FUTURE_LIMIT_S",
     "SET_COVARIANCE",
     "START",
     "STARTING",
@@ -118,15 +98,15 @@ __all__ = [
     "ExpectedSensor",
     "Instant",
     "Outputs",
-    "Parked",
     "SourceTraffic",
-    "Step",
-    "check_bolted",
-    "fail",
-    "kept",
-    "refuse",
+    "StepResult",
+    "WaitingRequest",
+    "check_rigid",
+    "get_state_to_persist",
+    "reply_internal_error",
+    "reply_malformed",
+    "reply_overloaded",
+    "report_start",
     "start",
-    "start_told",
     "step",
-    "turn_back",
 ]

@@ -1,7 +1,8 @@
-"""Answers: the reply to each kind of request, from what the platform knows. Pure.
+"""Compute the reply to each type of request from a `PlatformView`. Pure.
 
-A deferred answer is one that may take milliseconds: it is a value bound to the view at which the request was accepted,
-and its work is done in steps. The view is immutable, so when the steps are done makes no difference to the answer.
+An answer that may take milliseconds is deferred: `DeferredAnswer` binds the request to the view at which it was
+accepted, and the server loop computes it in steps. The view is immutable, so the answer does not depend on when the
+steps run.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from modelserver.errors import LimitError, QueryError, Status
 from modelserver.geometry import names
 from modelserver.messages import (
-    MOST_INSTANTS,
+    MAX_REQUEST_INSTANTS,
     Acknowledgement,
     ExplanationReply,
     GetBodyFrameList,
@@ -27,10 +28,10 @@ from modelserver.messages import (
     GetTransformation,
     GetTransformations,
     HistoryReply,
-    ManyPoses,
-    ManyReply,
     MotionReply,
     NameListReply,
+    PoseBatch,
+    PoseBatchReply,
     ReloadModel,
     ReloadReply,
     Reply,
@@ -42,64 +43,66 @@ from modelserver.messages import (
     StateVectorReply,
     TransformReply,
 )
-from modelserver.platform import HISTORY_LIMIT, PlatformView
-from modelserver.platform.explained import explained
-from modelserver.platform.many import many_in_steps
-from modelserver.platform.moving import motion
-from modelserver.platform.steps import Steps, complete
+from modelserver.query import HISTORY_LIMIT, PlatformView
+from modelserver.query.batch import lookup_batch_in_steps
+from modelserver.query.explanation import explain
+from modelserver.query.motion import compute_motion
+from modelserver.query.steps import Steps, complete
 
 
 class DeferredAnswer(NamedTuple):
-    """The answer to a request that takes long, to be worked out and sent to its reply channel by the server loop."""
+    """A long answer that the server loop computes in steps and sends to the reply channel."""
 
     view: PlatformView
     request: Request
     utime: int
 
     def work(self) -> Steps[list[Reply]]:
-        """Return, in steps, the messages of the reply. A question without an answer gives one that says why."""
+        """Compute the messages of the reply in steps; on a QueryError it is one error reply."""
         view, request, utime = self
         header = ReplyHeader(request.header.request_id, utime, model_revision=view.model.revision)
         try:
             replies: list[Reply] = yield from _DEFERRED_ANSWERS[type(request)](view, request, header)
         except QueryError as error:
-            return [failure(view, type(request), request.header, error.status, str(error), utime, error.nearest)]
+            return [
+                make_error_reply(view, type(request), request.header, error.status, str(error), utime, error.nearest)
+            ]
         return replies
 
 
 def effort_of(request: Request) -> float:
-    """Return the work of a request in units of a usual one (about 0.1 ms), from the request alone."""
+    """Return the computing effort of a request in units of a typical one (about 0.1 ms), from the request alone."""
     if isinstance(request, GetTransformations):
         return len(request.pairs) * (PAIR_EFFORT + INSTANT_EFFORT * len(request.at))
     if isinstance(request, GetHistory):
         poses = (request.end_utime - request.start_utime) * 1e-6 * request.rate_hz
-        # more than the limit, or not a number: the reply is an error
+        # more than the limit, or non-finite: the reply is an error
         return 1.0 + POSE_EFFORT * poses if 0.0 < poses <= HISTORY_LIMIT else 1.0
     return EXPLANATION_EFFORT if isinstance(request, GetExplanation) else 1.0
 
 
 def is_deferred(request: Request) -> bool:
-    """Return whether the answer to a request may take long, so that it is worked out in steps."""
+    """Return whether the answer to a request may take long, so that it is computed in steps."""
     return type(request) in _DEFERRED_ANSWERS and effort_of(request) > DEFERRED_EFFORT
 
 
-def answers(view: PlatformView, request: Request, utime: int) -> list[Reply]:
-    """Return the messages of the reply to a request at `utime`, one for most kinds."""
+def compute_replies(view: PlatformView, request: Request, utime: int) -> list[Reply]:
+    """Compute the messages of the reply to a request at `utime`; most types have one."""
     if type(request) in _DEFERRED_ANSWERS:
         return complete(DeferredAnswer(view, request, utime).work())
-    return [answer(view, request, utime)]
+    return [compute_reply(view, request, utime)]
 
 
-def answer(view: PlatformView, request: Request, utime: int) -> Reply:
-    """Return the one message of the reply to a request at `utime`. Without an answer it is one that says why."""
+def compute_reply(view: PlatformView, request: Request, utime: int) -> Reply:
+    """Compute the single message of the reply to a request at `utime`; on a QueryError it is an error reply."""
     header = ReplyHeader(request.header.request_id, utime, model_revision=view.model.revision)
     try:
         return _ANSWERS[type(request)](view, request, header)
     except QueryError as error:
-        return failure(view, type(request), request.header, error.status, str(error), utime, error.nearest)
+        return make_error_reply(view, type(request), request.header, error.status, str(error), utime, error.nearest)
 
 
-def failure(
+def make_error_reply(
     view: PlatformView,
     kind: type[Request],
     header: RequestHeader,
@@ -108,8 +111,8 @@ def failure(
     utime: int,
     nearest: tuple[str, ...] = (),
 ) -> Reply:
-    """Return the reply to a request of a kind that says why there is no answer."""
-    return _REPLY_KINDS[kind](ReplyHeader(header.request_id, utime, status, message, nearest, view.model.revision))
+    """Return an error reply of the type that belongs to a type of request."""
+    return _REPLY_TYPES[kind](ReplyHeader(header.request_id, utime, status, message, nearest, view.model.revision))
 
 
 def _get_transformation(view: PlatformView, request: GetTransformation, header: ReplyHeader) -> Reply:
@@ -144,15 +147,15 @@ def _get_body_frame_list(view: PlatformView, request: GetBodyFrameList, header: 
 
 def _get_transformations(view: PlatformView, request: GetTransformations, header: ReplyHeader) -> Steps[list[Reply]]:
     wanted = len(request.pairs) * len(request.at)
-    if wanted > MOST_INSTANTS:
+    if wanted > MAX_REQUEST_INSTANTS:
         raise LimitError(
-            f"{len(request.at)} instants of {len(request.pairs)} pairs are {wanted} poses; at most {MOST_INSTANTS} go "
-            "in one question. Ask in parts."
+            f"{len(request.pairs)} pairs at {len(request.at)} instants are {wanted} poses; a request may have at most "
+            f"{MAX_REQUEST_INSTANTS}; split it into several requests"
         )
     utimes = np.array(request.at, dtype=np.int64)
-    parts: list[tuple[int, int, ManyPoses]] = []
+    parts: list[tuple[int, int, PoseBatch]] = []
     for number, (interest, reference) in enumerate(request.pairs):
-        poses = yield from many_in_steps(
+        poses = yield from lookup_batch_in_steps(
             view,
             interest,
             reference,
@@ -164,35 +167,36 @@ def _get_transformations(view: PlatformView, request: GetTransformations, header
         )
         most = POSES_IN_PART if poses.covariances is None else COVARIANCES_IN_PART
         starts = range(0, max(len(utimes), 1), most)
-        parts += [(number, first, poses.part(first, first + most)) for first in starts]
+        parts += [(number, first, poses.slice_instants(first, first + most)) for first in starts]
         yield
     return [
-        ManyReply(header, part, len(parts), number, first, poses) for part, (number, first, poses) in enumerate(parts)
+        PoseBatchReply(header, part, len(parts), number, first, poses)
+        for part, (number, first, poses) in enumerate(parts)
     ]
 
 
 def _get_motion(view: PlatformView, request: GetMotion, header: ReplyHeader) -> Reply:
     _, interest, reference, expressed_in, time = request
-    return MotionReply(header, motion(view, interest, reference, expressed_in, time, header.utime))
+    return MotionReply(header, compute_motion(view, interest, reference, expressed_in, time, header.utime))
 
 
 def _get_explanation(view: PlatformView, request: GetExplanation, header: ReplyHeader) -> Reply:
     _, interest, reference, time = request
-    return ExplanationReply(header, explained(view, interest, reference, time, header.utime))
+    return ExplanationReply(header, explain(view, interest, reference, time, header.utime))
 
 
 POSES_IN_PART: Final = 600
 COVARIANCES_IN_PART: Final = 120
-"""Instants in a part of a reply: some 45 kB, which LCM sends as one datagram."""
+"""Instants in one message of a reply without and with covariances: some 45 kB, which LCM sends as one datagram."""
 
 PAIR_EFFORT: Final = 10.0
 INSTANT_EFFORT: Final = 0.06
 POSE_EFFORT: Final = 0.33
 EXPLANATION_EFFORT: Final = 4.0
-"""Work of a pair and of each instant of it in many transformations, of a pose in a history, and of an explanation."""
+"""Effort of a pair of a batch and of each of its instants, of a pose of a history, and of an explanation."""
 
 DEFERRED_EFFORT: Final = 11.0
-"""Work beyond which an answer is worked out in steps: about a millisecond."""
+"""Effort beyond which an answer is deferred: about a millisecond."""
 
 _ANSWERS: Final[Mapping[type, Callable[[PlatformView, Any, ReplyHeader], Reply]]] = {
     GetTransformation: _get_transformation,
@@ -209,14 +213,14 @@ _DEFERRED_ANSWERS: Final[Mapping[type, Callable[[PlatformView, Any, ReplyHeader]
     GetTransformations: _get_transformations,
 }
 
-_REPLY_KINDS: Final[Mapping[type, Callable[[ReplyHeader], Reply]]] = {
+_REPLY_TYPES: Final[Mapping[type, Callable[[ReplyHeader], Reply]]] = {
     GetTransformation: TransformReply,
     GetBodyList: NameListReply,
     GetBodyFrameList: NameListReply,
     GetStateVector: StateVectorReply,
     GetHTransform: TransformReply,
     GetHistory: HistoryReply,
-    GetTransformations: ManyReply,
+    GetTransformations: PoseBatchReply,
     GetMotion: MotionReply,
     GetExplanation: ExplanationReply,
     ReloadModel: ReloadReply,

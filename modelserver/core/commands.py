@@ -1,22 +1,27 @@
-"""Requests that change what the service knows: the geometry read anew, a pose that is set. Only signed ones count."""
+"""Commands: reload the geometry, set the pose, switch the mode. Executed only if signed. Pure.
+
+A reload has two steps, since the core does no input or output: `_request_reload` outputs `LoadModel`, the server loop
+reads the file, and the result comes back as the event `ModelLoaded` (`apply_model`). A pose that is set becomes an
+absolute-pose sample of the source `OPERATOR`, and passes the gates of localization as any other measurement.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from modelserver.core.host_clock import Instant
-from modelserver.core.reload import ModelLoaded
-from modelserver.core.requests import turned_down
-from modelserver.core.samples import FUTURE_LIMIT_S, localized, mode_wished
-from modelserver.core.state import CoreState, Step, counted
+from modelserver.core.requests import reply_error
+from modelserver.core.samples import COMMAND_FUTURE_LIMIT_S, switch_mode, update_localizer
+from modelserver.core.state import CoreState, StepResult, count_rejection
 from modelserver.errors import Status
+from modelserver.estimation.interface import Localizer, LocalizerEvent
 from modelserver.geometry import names
-from modelserver.geometry.difference import changes
-from modelserver.localization.interface import Note
+from modelserver.geometry.difference import describe_changes
+from modelserver.geometry.model import Model
 from modelserver.messages import (
     CHANNEL_OF,
     AbsolutePoseSample,
@@ -40,61 +45,68 @@ from modelserver.messages import (
     SwitchMode,
     Verdict,
 )
-from modelserver.spatial.covariance import fault
+from modelserver.messages.requests import is_answerable
+from modelserver.transforms.covariance import find_problem
+
+
+@dataclass(frozen=True, slots=True)
+class ModelLoaded:
+    """Event: the geometry was read. It has a model and the localizer for it, or the reason `why` not.
+
+    `request` is the client's request, None for a reload by signal.
+    """
+
+    request: ReloadModel | None
+    model: Model | None = None
+    localizer: Localizer | None = None
+    why: str = ""
+
 
 SET_COVARIANCE: Final = tuple(np.diag([1.0] * 3 + [math.radians(5.0) ** 2] * 3).ravel().tolist())
-"""Of a pose that is set without one: 1 m and 5 degrees."""
+"""Default covariance of a pose that is set: 1 m and 5 degrees."""
 
 OPERATOR: Final = "operator"
-"""The source under which a pose that was set is known to localization and its ledger."""
+"""Source of the sample that a set pose becomes."""
 
-
-UNSIGNED: Final = (
-    "it is not signed: whoever asks needs the vehicle's key (Platform(key_file=...), --key FILE or "
+UNSIGNED_MESSAGE: Final = (
+    "the command is not signed; sign it with the vehicle's key (Platform(key_file=...), --key FILE or "
     "$MODELSERVER_KEY_FILE; docs/wire.md for other languages)"
 )
-"""What is said to who asks without a signature for what would be done with one."""
 
 
-def unsigned(state: CoreState, request: ReloadModel | SetStateVector | SetHTransform, now: Instant) -> Step:
-    """Turn down what changes the service and comes without a signature."""
-    if not request.header.is_answerable(state.settings.reply_prefix):
-        return counted(state, CHANNEL_OF[type(request)], "reply_channel"), ()
+def deny_unsigned(state: CoreState, request: ReloadModel | SetStateVector | SetHTransform, now: Instant) -> StepResult:
+    """Deny a command without signature."""
+    if not is_answerable(request.header, state.settings.reply_prefix):
+        return count_rejection(state, CHANNEL_OF[type(request)], "reply_channel"), ()
     reload = isinstance(request, ReloadModel)
     if not (state.settings.may_reload if reload else state.settings.may_set_pose):
-        return _forbidden(state, request, "commands.reload" if reload else "commands.set_pose", now)
-    state = counted(state, CHANNEL_OF[type(request)], "unsigned")
-    return state, turned_down(state, type(request), request.header, Status.FORBIDDEN, UNSIGNED, now)
+        return _deny(state, request, "commands.reload" if reload else "commands.set_pose", now)
+    state = count_rejection(state, CHANNEL_OF[type(request)], "unsigned")
+    return state, reply_error(state, type(request), request.header, Status.FORBIDDEN, UNSIGNED_MESSAGE, now)
 
 
-def commanded(state: CoreState, command: SignedCommand, now: Instant) -> Step:
-    """Do what a sender who has proved to know the key asks for, where the vehicle file allows it."""
-    order = command.order
-    if isinstance(order, SwitchMode):
-        return mode_wished(state, order, now)
-    if isinstance(order, ReloadModel):
-        return _reload_wished(state, order, now)
-    return _pose_set(state, order, now)
+def execute_command(state: CoreState, signed: SignedCommand, now: Instant) -> StepResult:
+    """Execute a command whose signature is verified, where the vehicle file permits it."""
+    command = signed.command
+    if isinstance(command, SwitchMode):
+        return switch_mode(state, command, now)
+    reload = isinstance(command, ReloadModel)
+    if not is_answerable(command.header, state.settings.reply_prefix):
+        return count_rejection(state, CHANNEL_OF[type(command)], "reply_channel"), ()
+    if not (state.settings.may_reload if reload else state.settings.may_set_pose):
+        return _deny(state, command, "commands.reload" if reload else "commands.set_pose", now)
+    return (state, (LoadModel(command),)) if isinstance(command, ReloadModel) else _set_pose(state, command, now)
 
 
-def _reload_wished(state: CoreState, request: ReloadModel, now: Instant) -> Step:
-    """Have the geometry read anew, where clients may ask for that."""
-    if not request.header.is_answerable(state.settings.reply_prefix):
-        return counted(state, CHANNEL_OF[ReloadModel], "reply_channel"), ()
-    if not state.settings.may_reload:
-        return _forbidden(state, request, "commands.reload", now)
-    return state, (LoadModel(request),)
-
-
-def model_loaded(state: CoreState, loaded: ModelLoaded, now: Instant) -> Step:
-    """Take the new geometry as a whole, or leave the old one as it is."""
+def apply_model(state: CoreState, loaded: ModelLoaded, now: Instant) -> StepResult:
+    """Replace the geometry as a whole, or keep the old one if the new one could not be loaded."""
     request, model = loaded.request, loaded.model
     if model is None:
-        state = counted(state, CHANNEL_OF[ReloadModel], "rejected")
+        state = count_rejection(state, CHANNEL_OF[ReloadModel], "rejected")
         if request is None:
             return state, ()
-        return state, turned_down(state, ReloadModel, request.header, Status.REJECTED, loaded.why, now)
-    said = changes(state.model, model)
+        return state, reply_error(state, ReloadModel, request.header, Status.REJECTED, loaded.why, now)
+    changes = describe_changes(state.model, model)
     outputs: list[Output] = []
     if request is None or not request.dry_run:
         view = replace(state.view, model=model, localizer=loaded.localizer, joints=state.view.joints.for_model(model))
@@ -104,82 +116,83 @@ def model_loaded(state: CoreState, loaded: ModelLoaded, now: Instant) -> Step:
     if request is not None:
         state = state._replace(requests_answered=state.requests_answered + 1)
         header = ReplyHeader(request.header.request_id, now.utime, model_revision=state.model.revision)
-        outputs.append(SendReply(request.header.reply_channel, ReloadReply(header, model.revision, said)))
+        outputs.append(SendReply(request.header.reply_channel, ReloadReply(header, model.revision, changes)))
     return state, tuple(outputs)
 
 
-def _pose_set(state: CoreState, request: SetStateVector | SetHTransform, now: Instant) -> Step:
-    """Tell localization where the vehicle is, where clients may do that."""
-    if not request.header.is_answerable(state.settings.reply_prefix):
-        return counted(state, CHANNEL_OF[type(request)], "reply_channel"), ()
-    if not state.settings.may_set_pose:
-        return _forbidden(state, request, "commands.set_pose", now)
-    wish, view = request.pose.transformation, state.view
+def _set_pose(state: CoreState, request: SetStateVector | SetHTransform, now: Instant) -> StepResult:
+    """Fuse a pose that a client sets."""
+    given, view = request.pose.transformation, state.view
     state = state._replace(requests_answered=state.requests_answered + 1)
     origin = None if view.localizer is None else view.localizer.estimate(now.utime).origin
     why = ""
     if view.localizer is None:
-        why = "the vehicle file names no sensor to localize by"
-    elif (wish.frame_of_interest, wish.frame_of_reference) != (view.base_frame, names.WORLD_UTM):
-        why = f"the pose of {view.base_frame} in {names.WORLD_UTM} is set, not that of another frame"
+        why = "no localization sensor is configured (section 'sensors' of the vehicle file)"
+    elif (given.frame_of_interest, given.frame_of_reference) != (view.base_frame, names.WORLD_UTM):
+        why = (
+            f"the pose is of {given.frame_of_interest} in {given.frame_of_reference}; expected the pose of "
+            f"{view.base_frame} in {names.WORLD_UTM}"
+        )
     elif origin is None:
-        why = "the origin is not known yet; give one in the vehicle file, or wait for fixes"
-    elif wish.covariance is not None and (wrong := fault(wish.covariance)):
-        why = f"its covariance is none: {wrong}"
-    elif _is_elsewhere(request.pose, origin):
-        why = "the pose is told from another origin than the service's; ask for the vehicle's pose to see that one"
-    elif wish.utime > now.utime + FUTURE_LIMIT_S * 1e6:
-        ahead = (wish.utime - now.utime) * 1e-6
-        why = f"the pose is stamped {ahead:.3f} s after the service's clock; stamp it with 0 for now"
+        why = "the origin is not known yet; configure one in the vehicle file, or wait for GPS fixes"
+    elif given.covariance is not None and (problem := find_problem(given.covariance)):
+        why = f"invalid covariance: {problem}"
+    elif _has_other_origin(request.pose, origin):
+        why = "the pose has another origin than the server; ask for the vehicle's pose to get that origin"
+    elif given.utime > now.utime + COMMAND_FUTURE_LIMIT_S * 1e6:
+        ahead = (given.utime - now.utime) * 1e-6
+        why = f"the pose is stamped {ahead:.3f} s ahead of the server's clock; stamp it with 0 for now"
     if why or view.localizer is None:
-        return state, turned_down(state, type(request), request.header, Status.REJECTED, why, now)
-    covariance = SET_COVARIANCE if wish.covariance is None else tuple(wish.covariance.ravel().tolist())
+        return state, reply_error(state, type(request), request.header, Status.REJECTED, why, now)
+    covariance = SET_COVARIANCE if given.covariance is None else tuple(given.covariance.ravel().tolist())
     sample = AbsolutePoseSample(
-        SensorHeader(wish.utime or now.utime, OPERATOR, state.requests_answered),
-        wish.frame_of_interest,
-        wish.frame_of_reference,
-        wish.pose.xyz,
-        wish.pose.wxyz,
+        SensorHeader(given.utime or now.utime, OPERATOR, state.requests_answered),
+        given.frame_of_interest,
+        given.frame_of_reference,
+        given.pose.xyz,
+        given.pose.wxyz,
         covariance,
     )
-    # pure, so it may be asked twice: the counts do not say which sample a refusal is of
-    taken, notes = view.localizer.take(sample)
-    refused = [why for each in notes if (why := _refusal(each, sample))]
-    state, outputs = localized(state, view.localizer, sample, now)
+    # the localizer is pure, so it may process the sample twice: the counts do not identify the rejected sample
+    localizer, events = view.localizer.process(sample)
+    reasons = [reason for event in events if (reason := _get_rejection_reason(event, sample))]
+    state, outputs = update_localizer(state, view.localizer, sample, now)
     header = ReplyHeader(request.header.request_id, now.utime, model_revision=state.model.revision)
-    if refused:
-        text = f"localization did not take it: {', '.join(refused)}"
-        if not _STAMPED_BADLY.isdisjoint(refused):
-            text += "; its instant lies before what can still be weighed, stamp it with 0 for now"
+    if reasons:
+        text = f"localization rejected the pose: {', '.join(reasons)}"
+        if not _STAMP_REASONS.isdisjoint(reasons):
+            text += "; its time is older than what can still be fused, stamp it with 0 for now"
         header = header._replace(status=Status.REJECTED, message=text)
-    elif taken is view.localizer:
-        text = "localization takes no poses from outside in the mode in force (raw mode knows GPS and IMU only)"
+    elif localizer is view.localizer:
+        text = "the active mode fuses no external poses (raw mode uses GPS and IMU only)"
         header = header._replace(status=Status.REJECTED, message=text)
     return state, (*outputs, SendReply(request.header.reply_channel, Acknowledgement(header)))
 
 
-_STAMPED_BADLY: Final = frozenset({"late", "order", "duplicate"})
+_STAMP_REASONS: Final = frozenset({"too_old", "out_of_sequence", "duplicate"})
 
 
-def _refusal(note: Note, sample: AbsolutePoseSample) -> str:
-    """Return why a note says that the sample was not taken, else nothing; what is told late is of an earlier one."""
-    if isinstance(note, Rejected):
-        return note.reason
-    if isinstance(note, Decision) and note.verdict is Verdict.REJECTED:
-        of_it = (note.source, note.seq) == (sample.header.source, sample.header.seq)
-        return (note.reason or "rejected") if of_it else ""
+def _get_rejection_reason(event: LocalizerEvent, sample: AbsolutePoseSample) -> str:
+    """Return why a sample was rejected, else an empty text; a decision may also be on an earlier sample."""
+    if isinstance(event, Rejected):
+        return event.reason
+    if isinstance(event, Decision) and event.verdict is Verdict.REJECTED:
+        is_own = (event.source, event.seq) == (sample.header.source, sample.header.seq)
+        return (event.reason or "rejected") if is_own else ""
     return ""
 
 
-def _is_elsewhere(pose: PoseAnswer, origin: Origin) -> bool:
-    """Return whether a pose says that it is told from another origin; one that says nothing means the service's."""
+def _has_other_origin(pose: PoseAnswer, origin: Origin) -> bool:
+    """Return whether a pose names another origin; without a name it means the server's."""
     named = pose.transformation.origin_id
     return (pose.origin is not None and pose.origin != origin) or (named != 0 and named != origin.origin_id)
 
 
-def _forbidden(state: CoreState, request: Request, key: str, now: Instant) -> Step:
-    state = counted(state, CHANNEL_OF[type(request)], "forbidden")
+def _deny(state: CoreState, request: Request, key: str, now: Instant) -> StepResult:
+    state = count_rejection(state, CHANNEL_OF[type(request)], "forbidden")
     section, _, name = key.partition(".")
-    allowing = f"{section}: {{{name}: true}}"
-    why = f"the vehicle file does not allow it; write {allowing} and a key_file beside it, whose key clients sign with"
-    return state, turned_down(state, type(request), request.header, Status.FORBIDDEN, why, now)
+    why = (
+        f"the vehicle file does not permit it; write {section}: {{{name}: true}} and beside it a key_file, whose key "
+        "clients sign with"
+    )
+    return state, reply_error(state, type(request), request.header, Status.FORBIDDEN, why, now)

@@ -1,12 +1,20 @@
-"""Questions: answered at once, parked until the data come, or turned down with the reason."""
+"""Requests: answered at once, deferred, kept waiting until their data arrive, or rejected with the reason. Pure."""
 
 from __future__ import annotations
 
 from typing import Final
 
-from modelserver.core.answers import DeferredAnswer, answers, failure, is_deferred
+from modelserver.core.answers import DeferredAnswer, compute_replies, is_deferred, make_error_reply
 from modelserver.core.host_clock import Instant
-from modelserver.core.state import AllOutputs, CoreState, Outputs, Parked, Step, TimedRequest, counted
+from modelserver.core.state import (
+    AllOutputs,
+    CoreState,
+    Outputs,
+    StepResult,
+    TimedRequest,
+    WaitingRequest,
+    count_rejection,
+)
 from modelserver.errors import Status
 from modelserver.geometry import names
 from modelserver.messages import (
@@ -22,91 +30,92 @@ from modelserver.messages import (
     RequestHeader,
     SendReply,
 )
+from modelserver.messages.requests import is_answerable
 
 _TIMED: Final = (GetTransformation, GetStateVector, GetHTransform, GetMotion, GetExplanation)
-"""Requests that ask about a time, and may wait for it."""
+"""Requests that name a time, and may wait for its data."""
 
 
-def requested(state: CoreState, request: Request, now: Instant) -> tuple[CoreState, AllOutputs]:
-    """Answer a question, have it answered in steps, or park it until the data come that it is ready to wait for."""
-    if not request.header.is_answerable(state.settings.reply_prefix):
-        return counted(state, CHANNEL_OF[type(request)], "reply_channel"), ()
+def handle_request(state: CoreState, request: Request, now: Instant) -> tuple[CoreState, AllOutputs]:
+    """Answer a request, defer a long answer, or let the request wait until the data it asks for arrive."""
+    if not is_answerable(request.header, state.settings.reply_prefix):
+        return count_rejection(state, CHANNEL_OF[type(request)], "reply_channel"), ()
     if isinstance(request, _TIMED) and request.time.wait_ms and _must_wait(state, request):
-        if len(state.parked) < state.settings.parked_requests:
+        if len(state.waiting) < state.settings.waiting_requests:
             wait_ms = min(request.time.wait_ms, state.settings.wait_ms)
-            parked = Parked(request, now.monotonic_ns + wait_ms * 1_000_000)
-            return state._replace(parked=(*state.parked, parked)), ()
-        state = counted(state, CHANNEL_OF[type(request)], "load")
-        why = f"{len(state.parked)} requests wait already, as many as may (limits.parked_requests); ask without wait_ms"
-        return state, turned_down(state, type(request), request.header, Status.REFUSED_LOAD, why, now)
-    # what `_replace` does, at a third of its cost: this is done for every request
+            waiting = WaitingRequest(request, now.monotonic_ns + wait_ms * 1_000_000)
+            return state._replace(waiting=(*state.waiting, waiting)), ()
+        state = count_rejection(state, CHANNEL_OF[type(request)], "overload")
+        why = f"{len(state.waiting)} requests wait already, the limit (limits.waiting_requests); ask without wait_ms"
+        return state, reply_error(state, type(request), request.header, Status.OVERLOADED, why, now)
+    # a third of the cost of `_replace`, for every request
     after = CoreState._make((*state[:-1], state.requests_answered + 1))
     if is_deferred(request):
         return after, (DeferredAnswer(state.view, request, now.utime),)
-    return after, _replies(state, request, now)
+    return after, _make_replies(state, request, now)
 
 
 def _must_wait(state: CoreState, request: TimedRequest) -> bool:
-    """Whether a request asked for a time that is yet to come, and gave time to wait for it."""
+    """Return whether the data that a request asks for are yet to come, and it may wait for them."""
     if not request.time.wait_ms:
         return False
     ends = (names.WORLD_UTM, state.view.base_frame)
     if isinstance(request, (GetTransformation, GetMotion, GetExplanation)):
         ends = (request.frame_of_interest, request.frame_of_reference)
-    return state.view.awaits(request.time, *ends)
+    return state.view.is_awaiting_data(request.time, *ends)
 
 
-def answer_parked(state: CoreState, now: Instant) -> tuple[CoreState, list[Output]]:
-    """Answer the parked requests whose data have come or whose time is up."""
-    still: list[Parked] = []
+def answer_waiting(state: CoreState, now: Instant) -> tuple[CoreState, list[Output]]:
+    """Answer the waiting requests whose data have arrived or whose deadline has passed."""
+    remaining: list[WaitingRequest] = []
     replies: list[Output] = []
-    for parked in state.parked:
-        if now.monotonic_ns < parked.until_ns and _must_wait(state, parked.request):
-            still.append(parked)
+    for request in state.waiting:
+        if now.monotonic_ns < request.deadline_ns and _must_wait(state, request.request):
+            remaining.append(request)
         else:
-            replies += _replies(state, parked.request, now)
+            replies += _make_replies(state, request.request, now)
     if replies:
-        state = state._replace(parked=tuple(still), requests_answered=state.requests_answered + len(replies))
+        state = state._replace(waiting=tuple(remaining), requests_answered=state.requests_answered + len(replies))
     return state, replies
 
 
-def _replies(state: CoreState, request: Request, now: Instant) -> tuple[SendReply, ...]:
+def _make_replies(state: CoreState, request: Request, now: Instant) -> tuple[SendReply, ...]:
     channel = request.header.reply_channel
-    return tuple([SendReply(channel, reply) for reply in answers(state.view, request, now.utime)])
+    return tuple([SendReply(channel, reply) for reply in compute_replies(state.view, request, now.utime)])
 
 
-def refuse(state: CoreState, request: Request, now: Instant) -> Outputs:
-    """Return the refusal of a request that the server has no time for."""
-    message = "the server is loaded and did not take the request; ask again later"
-    return turned_down(state, type(request), request.header, Status.REFUSED_LOAD, message, now)
+def reply_overloaded(state: CoreState, request: Request, now: Instant) -> Outputs:
+    """Reply to a request that is dropped because of overload."""
+    message = "the server is overloaded and dropped the request; try again later"
+    return reply_error(state, type(request), request.header, Status.OVERLOADED, message, now)
 
 
-def fail(state: CoreState, request: Request, now: Instant) -> Outputs:
-    """Return the reply to a request that an error of the server's own kept from being answered."""
-    message = "the server failed on its side; its log says why"
-    return turned_down(state, type(request), request.header, Status.INTERNAL, message, now)
+def reply_internal_error(state: CoreState, request: Request, now: Instant) -> Outputs:
+    """Reply to a request whose handling raised an exception in the server."""
+    message = "internal error of the server; its log has the traceback"
+    return reply_error(state, type(request), request.header, Status.INTERNAL, message, now)
 
 
-def denied(state: CoreState, command: Denied, now: Instant) -> Step:
-    """Count a signed command that is not obeyed, and say why to who has proved to know the key."""
-    state = counted(state, command.channel, command.reason)
-    if command.kind is None or command.header is None:
+def handle_denied(state: CoreState, command: Denied, now: Instant) -> StepResult:
+    """Count a denied command, and reply with the reason to a sender whose signature is verified."""
+    state = count_rejection(state, command.channel, command.reason)
+    if command.request_type is None or command.header is None:
         return state, ()
-    if command.malformed:
-        return state, turn_back(state, command.kind, command.header, command.why, now)
-    why = f"the command is not obeyed: {command.why}"
-    return state, turned_down(state, command.kind, command.header, Status.FORBIDDEN, why, now)
+    if command.is_malformed:
+        return state, reply_malformed(state, command.request_type, command.header, command.message, now)
+    why = f"the command is denied: {command.message}"
+    return state, reply_error(state, command.request_type, command.header, Status.FORBIDDEN, why, now)
 
 
-def turn_back(state: CoreState, kind: type[Request], header: RequestHeader, why: str, now: Instant) -> Outputs:
-    """Return the reply to a request that makes no sense beyond its header."""
-    return turned_down(state, kind, header, Status.MALFORMED, why, now)
+def reply_malformed(state: CoreState, kind: type[Request], header: RequestHeader, why: str, now: Instant) -> Outputs:
+    """Reply to a request of which only the header can be decoded."""
+    return reply_error(state, kind, header, Status.MALFORMED, why, now)
 
 
-def turned_down(
+def reply_error(
     state: CoreState, kind: type[Request], header: RequestHeader, status: Status, message: str, now: Instant
 ) -> Outputs:
-    """Return the reply that says why a request is not answered; nothing where it may not be spoken to."""
-    if not header.is_answerable(state.settings.reply_prefix):
+    """Reply with an error and its reason; without output if the reply channel is not permitted."""
+    if not is_answerable(header, state.settings.reply_prefix):
         return ()
-    return (SendReply(header.reply_channel, failure(state.view, kind, header, status, message, now.utime)),)
+    return (SendReply(header.reply_channel, make_error_reply(state.view, kind, header, status, message, now.utime)),)

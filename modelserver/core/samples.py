@@ -1,4 +1,4 @@
-"""What follows from what sensors say: for the joints, for localization, and for what is broadcast."""
+"""Sensor samples: update the joints and the localizer, publish poses and decisions. Pure."""
 
 from __future__ import annotations
 
@@ -7,18 +7,28 @@ from dataclasses import replace
 from typing import Final
 
 from modelserver.core.host_clock import Instant
-from modelserver.core.keeping import KEPT, start_told
-from modelserver.core.requests import answer_parked
-from modelserver.core.state import DEGRADED, RUNNING, STARTING, CoreState, Step, counted, decided, heard, traffic_noted
+from modelserver.core.persistence import WARM_START, report_start
+from modelserver.core.requests import answer_waiting
+from modelserver.core.state import (
+    DEGRADED,
+    RUNNING,
+    STARTING,
+    CoreState,
+    StepResult,
+    count_decision,
+    count_message,
+    count_rejection,
+    mark_received,
+)
+from modelserver.estimation.interface import Localizer
 from modelserver.geometry import names
-from modelserver.localization.interface import Localizer
 from modelserver.messages import (
     VALID,
     Decision,
     Invalid,
     JointsSample,
-    OriginLatched,
     Output,
+    PersistOrigin,
     PublishDecisions,
     PublishPose,
     Rejected,
@@ -26,129 +36,126 @@ from modelserver.messages import (
     SwitchMode,
     Verdict,
 )
-from modelserver.platform import PlatformView
+from modelserver.query import PlatformView
 
-FUTURE_LIMIT_S: Final = 1.0
-"""A wish stamped this far ahead of the host's clock is refused: one of the two clocks is wrong."""
+COMMAND_FUTURE_LIMIT_S: Final = 1.0
+"""A command stamped this far ahead of the host's clock is rejected: one of the two clocks is wrong."""
 
-AHEAD_LIMIT_S: Final = 0.25
-"""The same for a sample, which nobody can have taken before it is: clocks that are kept together differ by less, and a
-fix that is taken for one of a quarter of a second later is off by what the vehicle drives in that."""
+SAMPLE_FUTURE_LIMIT_S: Final = 0.25
+"""The same for a sample: synchronized clocks differ by less, and a fix that is fused a quarter of a second late is off
+by what the vehicle travels in that time."""
 
 
-def sample_taken(state: CoreState, sample: Sample, now: Instant) -> Step:
-    """Take a sensor's sample."""
+def process_sample(state: CoreState, sample: Sample, now: Instant) -> StepResult:
+    """Process a sample of a sensor."""
     source = f"sensor:{sample.header.source}"
-    state = traffic_noted(state, source, sample.header.host_utime, now)
-    if state.unheard:
-        state = heard(state, sample)
+    state = count_message(state, source, sample.header.host_utime, now)
+    if state.missing_sensors:
+        state = mark_received(state, sample)
     state = check_host_clock(state, now)
-    if sample.header.utime > now.utime + AHEAD_LIMIT_S * 1e6:
-        # it speaks for its own source alone: anyone can stamp as it likes
-        return counted(state, source, "future"), ()
+    if sample.header.utime > now.utime + SAMPLE_FUTURE_LIMIT_S * 1e6:
+        # rejected for its own source alone: any publisher can stamp as it likes
+        return count_rejection(state, source, "future"), ()
     if isinstance(sample, JointsSample):
-        return joints_told(state, sample, now)
+        return process_joints(state, sample, now)
     if state.localizer is None:
         return state, ()
-    return localized(state, state.localizer, sample, now)
+    return update_localizer(state, state.localizer, sample, now)
 
 
 def check_host_clock(state: CoreState, now: Instant) -> CoreState:
-    """Return the state after a look at the host's clocks.
+    """Detect a backward step of the time of day, which invalidates the pose until a sample of the new time is used.
 
-    Where the time of day was set back, the pose that is held is of another time than what is asked for now: it is
-    invalid until localization has used a sample of the new time.
+    The last pose is then of a later time than what clients ask for now.
     """
-    set_back = state.host_clock.is_set_back(now)
-    state = state._replace(host_clock=state.host_clock.next(now, set_back))
+    set_back = state.host_clock.has_stepped_back(now)
+    state = state._replace(host_clock=state.host_clock.update(now, set_back))
     if set_back and state.localizer is not None:
-        state = state._replace(view=replace(state.view, doubt=Invalid.CLOCK_STEPPED))
+        state = state._replace(view=replace(state.view, invalid=Invalid.CLOCK_STEPPED))
     return state
 
 
-def joints_told(state: CoreState, sample: JointsSample, now: Instant) -> Step:
-    """Return what follows from positions of joints."""
-    joints, refused = state.view.joints.taken(sample, now.utime)
-    for why, count in Counter(refused).items():
-        state = counted(state, f"sensor:{sample.header.source}", why, count)
+def process_joints(state: CoreState, sample: JointsSample, now: Instant) -> StepResult:
+    """Process positions of joints."""
+    joints, rejected = state.view.joints.update(sample, now.utime)
+    for reason, count in Counter(rejected).items():
+        state = count_rejection(state, f"sensor:{sample.header.source}", reason, count)
     if joints is state.view.joints:
         return state, ()
     state = state._replace(view=replace(state.view, joints=joints))
-    if not state.parked:
+    if not state.waiting:
         return state, ()
-    state, replies = answer_parked(state, now)
+    state, replies = answer_waiting(state, now)
     return state, tuple(replies)
 
 
-def mode_wished(state: CoreState, wish: SwitchMode, now: Instant) -> Step:
-    """Take a wish for other sources."""
-    source = f"command:{wish.header.source}"
-    state = traffic_noted(state, source, wish.header.host_utime, now)
-    if wish.header.utime > now.utime + FUTURE_LIMIT_S * 1e6:
-        # unlike a sensor's this says nothing of the host's clock: it may be the operator's that is wrong
-        return counted(state, source, "future"), ()
+def switch_mode(state: CoreState, command: SwitchMode, now: Instant) -> StepResult:
+    """Switch the localization mode."""
+    source = f"command:{command.header.source}"
+    state = count_message(state, source, command.header.host_utime, now)
+    if command.header.utime > now.utime + COMMAND_FUTURE_LIMIT_S * 1e6:
+        return count_rejection(state, source, "future"), ()
     if state.localizer is None:
         return state, ()
-    return localized(state, state.localizer, wish, now)
+    return update_localizer(state, state.localizer, command, now)
 
 
-def localized(state: CoreState, before: Localizer, sample: Sample | SwitchMode, now: Instant) -> Step:
-    """Return what follows from a sample, or from a wish, for the localization."""
-    localizer, notes = before.take(sample)
+def update_localizer(state: CoreState, before: Localizer, sample: Sample | SwitchMode, now: Instant) -> StepResult:
+    """Update the localizer with a sample or a mode command, and publish what follows from it."""
+    localizer, events = before.process(sample)
     outputs: list[Output] = []
     decisions: list[Decision] = []
-    refused = False
-    for note in notes:
-        if isinstance(note, Rejected):
-            state = counted(state, note.channel, note.reason)
-            refused = True
-        elif isinstance(note, OriginLatched):
-            outputs.append(note)
+    is_rejected = False
+    for event in events:
+        if isinstance(event, Rejected):
+            state = count_rejection(state, event.channel, event.reason)
+            is_rejected = True
+        elif isinstance(event, PersistOrigin):
+            outputs.append(event)
         else:
-            decisions.append(note)
-            state = decided(state, note)
-            if note.kind == KEPT:
-                state, said = start_told(state, note, now)
-                outputs.extend(said)
-            if note.verdict is Verdict.REJECTED:
-                state = counted(state, f"sensor:{note.source}", note.reason or "rejected")
-                # what is said late is of an earlier sample
-                refused |= (note.source, note.seq) == (sample.header.source, sample.header.seq)
+            decisions.append(event)
+            state = count_decision(state, event)
+            if event.kind == WARM_START:
+                state, reports = report_start(state, event, now)
+                outputs.extend(reports)
+            if event.verdict is Verdict.REJECTED:
+                state = count_rejection(state, f"sensor:{event.source}", event.reason or "rejected")
+                # a delayed decision is on an earlier sample
+                is_rejected |= (event.source, event.seq) == (sample.header.source, sample.header.seq)
     if decisions and state.settings.publish_decisions:
         outputs.append(PublishDecisions(now.utime, tuple(decisions)))
     if localizer is before:
         return state, tuple(outputs)
-    # before the first sample that can be used there is no time that an estimate could hold for
     utime = localizer.utime
-    known = utime > 0
+    has_estimate = utime > 0
     history = state.history
-    if known and not history.holds_enough(utime):
-        history = history.extended(localizer.deferred(utime))
+    if has_estimate and not history.is_too_soon(utime):
+        history = history.append(localizer.defer_estimate(utime))
     view = state.view
-    doubt = view.doubt
-    if doubt and known and not refused and utime <= now.utime + AHEAD_LIMIT_S * 1e6:
-        # what is held is of the time that the host has now
-        doubt = VALID
-    view = PlatformView(view.model, view.base_frame, localizer, history, view.rolling_frame, doubt, view.joints)
+    invalid = view.invalid
+    if invalid and has_estimate and not is_rejected and utime <= now.utime + SAMPLE_FUTURE_LIMIT_S * 1e6:
+        # the estimate is of the host's new time of day
+        invalid = VALID
+    view = PlatformView(view.model, view.base_frame, localizer, history, view.rolling_frame, invalid, view.joints)
     state = state._replace(view=view)
-    if known:
-        # a part may be refused of a sample that moves time on all the same
-        if state.settings.publish == "event" and (not refused or utime != before.utime):
-            state, pose = published(state, utime)
+    if has_estimate:
+        # a sample that is rejected in part may still advance the time
+        if state.settings.publish == "event" and (not is_rejected or utime != before.utime):
+            state, pose = publish_pose(state, utime)
             outputs.append(pose)
-        if state.parked:
-            state, replies = answer_parked(state, now)
+        if state.waiting:
+            state, replies = answer_waiting(state, now)
             outputs.extend(replies)
     return state, tuple(outputs)
 
 
-def published(state: CoreState, utime: int) -> tuple[CoreState, PublishPose]:
-    """Return the poses to broadcast for an instant."""
+def publish_pose(state: CoreState, utime: int) -> tuple[CoreState, PublishPose]:
+    """Make the poses to publish for an instant."""
     assert state.localizer is not None
     estimate = state.localizer.estimate(utime)
     view = state.view
-    world = view.broadcast(estimate, names.WORLD_UTM)
-    run_state = RUNNING if world.transformation.valid else DEGRADED
+    world = view.get_published_pose(estimate, names.WORLD_UTM)
+    run_state = RUNNING if world.transformation.is_valid else DEGRADED
     if run_state == DEGRADED and state.run_state == STARTING:
         run_state = STARTING
     state = state._replace(
@@ -156,4 +163,4 @@ def published(state: CoreState, utime: int) -> tuple[CoreState, PublishPose]:
         run_state=run_state,
         pose_invalid=world.transformation.invalid_reasons,
     )
-    return state, PublishPose(world, view.broadcast(estimate, names.ODOM))
+    return state, PublishPose(world, view.get_published_pose(estimate, names.ODOM))

@@ -1,4 +1,4 @@
-"""What the core knows: one value, whose successor is made for every event."""
+"""State of the core: one immutable value, replaced with every event."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 from modelserver.core.answers import DeferredAnswer
 from modelserver.core.host_clock import HostClock, Instant
 from modelserver.errors import NotConnectedError
+from modelserver.estimation.interface import Localizer
 from modelserver.geometry.model import Model
 from modelserver.history import History
-from modelserver.joints.joints import Joints
-from modelserver.localization.interface import Localizer
+from modelserver.joints.history import JointHistory
 from modelserver.messages import (
     NAN,
     Decision,
@@ -23,47 +23,48 @@ from modelserver.messages import (
     GetMotion,
     GetStateVector,
     GetTransformation,
-    Noticed,
+    HealthWarning,
     Output,
     Rejected,
     Sample,
     Verdict,
 )
-from modelserver.platform import PlatformView
+from modelserver.query import PlatformView
 
 MAX_COUNTERS: Final = 256
-"""Distinct causes of rejection that are told apart; further ones are counted together."""
+"""Distinct causes of rejection with a counter of their own; further ones share one."""
 
 STARTING, RUNNING, DEGRADED = 0, 1, 2
 
 SILENT_INTERVALS: Final = 5.0
-SILENT_LEAST_S: Final = 1.0
+MIN_SILENCE_S: Final = 1.0
 """A source is silent after so many of its usual intervals, and so many seconds at least."""
 
 INTERVAL_GAIN: Final = 0.1
-"""By how much each interval counts for the usual one."""
+"""Weight of a new interval in the moving average of a source's intervals."""
 
-UNCOUNTED: Final = frozenset(("inertial", "steering", "imu_tilt", "imu_yaw", "magnetometer"))
-"""Kinds of measurements that are not counted as used or dropped: not each one is decided on."""
+UNCOUNTED_KINDS: Final = frozenset(("inertial", "steering", "imu_tilt", "imu_yaw", "magnetometer"))
+"""Kinds of measurements without a decision for each one: not counted as used or dropped."""
 
 CHANGE_PERIOD_NS: Final = 100_000_000
-"""Nanoseconds between two looks for what a health report goes out for at once: changes to and fro cannot flood."""
-
+"""Nanoseconds between two evaluations of the health conditions: alternating conditions cannot flood the bus."""
 
 TimedRequest: TypeAlias = GetTransformation | GetStateVector | GetHTransform | GetMotion | GetExplanation
-"""A request that asks about a time, and may wait for it."""
+"""A request that names a time, and may wait for its data."""
 
 
 @dataclass(frozen=True, slots=True)
 class CoreSettings:
-    """What does not change while the core runs; see `modelserver.config` for the meanings.
+    """Constants of a run; see `modelserver.config.vehicle_file` for those not listed.
 
-    ticks_per_pose: in timer mode POSE goes out at the first of each so many ticks; missed ones are counted too.
-    ticks_per_state: the same for the filter's state; 0 = it does not go out.
-    publish_decisions: whether what became of measurements goes out.
-    keep_period_ns: how often that goes out which the next run of the service should know; 0 = never.
-    may_reload, may_set_pose: whether clients may have that done, where they sign.
-    sensors: those of the vehicle file, so that the health report can tell which were never heard.
+    Attributes
+    ----------
+    ticks_per_pose: ticks per POSE in timer mode, missed ones included.
+    ticks_per_state: ticks per LOCALIZATION_STATE; 0 = not published.
+    publish_decisions: whether the filter's decisions on measurements are published.
+    persist_period_ns: how often the state for a warm start is output; 0 = never.
+    may_reload, may_set_pose: commands that signed clients may send.
+    sensors: configured sensors, so that the health report can list those without any message.
     """
 
     base_frame: str
@@ -75,26 +76,26 @@ class CoreSettings:
     publish_decisions: bool = True
     health_period_ns: int = 1_000_000_000
     history_s: float = 60.0
-    parked_requests: int = 64
+    waiting_requests: int = 64
     wait_ms: int = 2000
     reply_prefix: str = "REPLY_"
     snapshot_period_ns: int = 5_000_000_000
     may_reload: bool = False
     may_set_pose: bool = False
-    keep_period_ns: int = 0
+    persist_period_ns: int = 0
     sensors: tuple[ExpectedSensor, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Parked:
-    """A request that waits for data, and is answered as best it can at `until_ns` (monotonic)."""
+class WaitingRequest:
+    """A request that waits for data, and is answered without them at `deadline_ns` (monotonic)."""
 
     request: TimedRequest
-    until_ns: int
+    deadline_ns: int
 
 
 class ExpectedSensor(NamedTuple):
-    """A sensor of the vehicle file: its channel, what its samples are, and, where that is told, its name for itself."""
+    """A configured sensor: its channel, the type of its samples, and its source name if that is configured."""
 
     channel: str
     kind: type[Sample]
@@ -103,70 +104,73 @@ class ExpectedSensor(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SourceTraffic:
-    """Messages of one source: how many, the last one's arrival, and how many there were at the last whole report.
+    """Statistics of the messages of one source.
 
-    `measured` counts the measurements of its samples that localization decided on, `used` those that it used, `dropped`
-    those dropped in a row since, and `reason` is the last one's.
-
-    `interval` is the usual time between two, seconds; 0 = not known yet. `delay` is the greatest from the host's
-    receipt to handling since the last whole report, seconds. `rate` and `told_delay` are what that report said.
+    Attributes
+    ----------
+    count, last_received_ns: messages, and arrival of the last one.
+    reported, rate, reported_delay: count, rate (Hz) and greatest delay (s) of the last full health report.
+    interval: moving average of the time between two messages, s; 0 = not known yet.
+    delay: greatest delay from the host's receipt to handling since the last full report, s.
+    measured, used: measurements with a decision of localization, and those that it used.
+    dropped, reason: measurements dropped in a row since the last used one, and the last reason.
     """
 
     count: int = 0
-    last_ns: int = 0
+    last_received_ns: int = 0
     reported: int = 0
     interval: float = 0.0
     delay: float = NAN
     rate: float = 0.0
-    told_delay: float = NAN
+    reported_delay: float = NAN
     measured: int = 0
     used: int = 0
     dropped: int = 0
     reason: str = ""
 
 
-class Signs(NamedTuple):
-    """What a report goes out for at once when it changes. `silent` names sources, `unheard` channels.
+class HealthConditions(NamedTuple):
+    """Conditions whose change is reported at once.
 
-    `unused` are sensors that cannot be used, each with a word why.
+    `silent` names sources, `missing` channels without any message, `unusable` sensors with the reason.
     """
 
     run_state: int = STARTING
     invalid: int = 0
     revision: str = ""
     silent: tuple[str, ...] = ()
-    unheard: tuple[str, ...] = ()
-    notices: Mapping[str, str] = MappingProxyType({})
-    unused: tuple[tuple[str, str], ...] = ()
+    missing: tuple[str, ...] = ()
+    warnings: Mapping[str, str] = MappingProxyType({})
+    unusable: tuple[tuple[str, str], ...] = ()
 
 
 class HealthInputs(NamedTuple):
-    """What the health report needs beside the rest.
+    """State of the health report.
 
-    `gauges`: the last that came, at `gauged_ns`; `cpu_share` what follows from the last two. `due_ns`: when signs are
-    looked at again; `said`: what they were at the last report.
+    `gauges` were read at `gauges_ns`; `cpu_share` follows from the last two readings. The conditions are evaluated next
+    at `due_ns`; `reported` are those of the last report.
     """
 
     gauges: Gauges = Gauges()
-    gauged_ns: int = 0
+    gauges_ns: int = 0
     cpu_share: float = NAN
     due_ns: int = 0
-    said: Signs = Signs()
+    reported: HealthConditions = HealthConditions()
 
 
 class CoreState(NamedTuple):
-    """All that the core knows. Make the first one with `start`.
+    """State of the core. `start` makes the first one.
 
-    A NamedTuple, not a dataclass like the rest: its successor is made for every event, at a third of the cost.
+    A NamedTuple, not a dataclass: it is replaced with every event, at a third of the cost.
     """
 
     settings: CoreSettings
     view: PlatformView
     started_ns: int
-    parked: tuple[Parked, ...] = ()
+    waiting: tuple[WaitingRequest, ...] = ()
     rejected: Mapping[tuple[str, str], int] = MappingProxyType({})
     traffic: Mapping[str, SourceTraffic] = MappingProxyType({})
-    lateness: tuple[float, ...] = ()
+    tick_latencies: tuple[float, ...] = ()
     health_due_ns: int = 0
     health_sent_ns: int = 0
     poses_published: int = 0
@@ -176,21 +180,21 @@ class CoreState(NamedTuple):
     run_state: int = STARTING
     host_clock: HostClock = HostClock()
     snapshot_due_ns: int = 0
-    notices: Mapping[str, str] = MappingProxyType({})
-    keep_due_ns: int = 0
-    unheard: tuple[ExpectedSensor, ...] = ()
+    warnings: Mapping[str, str] = MappingProxyType({})
+    persist_due_ns: int = 0
+    missing_sensors: tuple[ExpectedSensor, ...] = ()
     pose_invalid: int = 0
-    watch: HealthInputs = HealthInputs()
-    requests_answered: int = 0  # stays last: see `_request`
+    health_inputs: HealthInputs = HealthInputs()
+    requests_answered: int = 0  # last: see `handle_request`
 
     @property
     def model(self) -> Model:
-        """The geometry in force."""
+        """The current geometry."""
         return self.view.model
 
     @property
     def localizer(self) -> Localizer | None:
-        """What has been concluded from the samples so far; None for a vehicle without GPS and IMU."""
+        """The localizer; None for a vehicle without localization sensors."""
         return self.view.localizer
 
     @property
@@ -200,51 +204,52 @@ class CoreState(NamedTuple):
 
 
 Outputs: TypeAlias = tuple[Output, ...]
-Step: TypeAlias = tuple[CoreState, Outputs]
+StepResult: TypeAlias = tuple[CoreState, Outputs]
 
 AllOutputs: TypeAlias = tuple[Output | DeferredAnswer, ...]
-"""Outputs of an event, which may be a request whose answer takes long."""
+"""Outputs of an event, also of a request with a deferred answer."""
 
 
 def start(settings: CoreSettings, model: Model, localizer: Localizer | None, now: Instant) -> CoreState:
-    """Return the first state. Raises a QueryError where the model lacks the base frame or the rolling frame."""
-    history, joints = History(settings.history_s), Joints(model.joints.values(), settings.history_s)
+    """Make the first state. Raises QueryError if the model lacks the base frame or the rolling frame."""
+    history, joints = History(settings.history_s), JointHistory(model.joints.values(), settings.history_s)
     view = PlatformView(model, settings.base_frame, localizer, history, settings.rolling_frame, joints=joints)
-    check_bolted(model, view.base_frame, view.rolling_frame)
+    check_rigid(model, view.base_frame, view.rolling_frame)
     due = now.monotonic_ns
-    clock = HostClock.at(now)
+    clock = HostClock.from_instant(now)
     return CoreState(
-        settings, view, due, health_due_ns=due, snapshot_due_ns=due, unheard=settings.sensors, host_clock=clock
+        settings, view, due, health_due_ns=due, snapshot_due_ns=due, missing_sensors=settings.sensors, host_clock=clock
     )
 
 
-def check_bolted(model: Model, base_frame: str, rolling_frame: str) -> None:
-    """Raise a QueryError where the model lacks one of the two frames, or a joint moves one against the other."""
-    legs = model.route(base_frame, rolling_frame).legs
-    if legs:
+def check_rigid(model: Model, base_frame: str, rolling_frame: str) -> None:
+    """Raise a QueryError if the model lacks one of the two frames, or a joint moves one relative to the other."""
+    joints = model.get_kinematic_path(base_frame, rolling_frame).joints
+    if joints:
         raise NotConnectedError(
-            f"joint {legs[0].name} moves {base_frame} against {rolling_frame}: both are to be of the vehicle's own body"
+            f"joint {joints[0].name} moves {base_frame} relative to {rolling_frame}; choose frames that are rigidly "
+            "fixed to each other"
         )
 
 
-def rejected(state: CoreState, rejected: Rejected, now: Instant) -> Step:
-    """Count something that was not understood."""
-    return counted(state, rejected.channel, rejected.reason, rejected.count), ()
+def handle_rejected(state: CoreState, rejected: Rejected, now: Instant) -> StepResult:
+    """Count a rejected message."""
+    return count_rejection(state, rejected.channel, rejected.reason, rejected.count), ()
 
 
-def noticed(state: CoreState, notice: Noticed, now: Instant) -> Step:
-    """Take a notice up, or back; a health report tells of the change within `CHANGE_PERIOD_NS`."""
-    known = state.notices.get(notice.subject, "")
-    if known == notice.text or (not known and len(state.notices) >= MAX_COUNTERS):
+def handle_warning(state: CoreState, warning: HealthWarning, now: Instant) -> StepResult:
+    """Set or clear a warning; a health report follows within `CHANGE_PERIOD_NS`."""
+    known = state.warnings.get(warning.subject, "")
+    if known == warning.text or (not known and len(state.warnings) >= MAX_COUNTERS):
         return state, ()
-    notices = {subject: text for subject, text in state.notices.items() if subject != notice.subject}
-    if notice.text:
-        notices[notice.subject] = notice.text
-    return state._replace(notices=notices), ()
+    warnings = {subject: text for subject, text in state.warnings.items() if subject != warning.subject}
+    if warning.text:
+        warnings[warning.subject] = warning.text
+    return state._replace(warnings=warnings), ()
 
 
-def counted(state: CoreState, channel: str, reason: str, count: int = 1) -> CoreState:
-    """Return the state with one rejection more, or `count`, by channel and reason."""
+def count_rejection(state: CoreState, channel: str, reason: str, count: int = 1) -> CoreState:
+    """Count one rejection, or `count`, by channel and reason."""
     key = (channel, reason)
     if key not in state.rejected and len(state.rejected) >= MAX_COUNTERS:
         key = ("*", "other")
@@ -254,22 +259,21 @@ def counted(state: CoreState, channel: str, reason: str, count: int = 1) -> Core
     return state._replace(rejected=counts, handler_errors=errors)
 
 
-def traffic_noted(state: CoreState, source: str, host_utime: int, now: Instant) -> CoreState:
-    """Return the state with one message more of a source, which the host received at `host_utime` (0 = not told)."""
+def count_message(state: CoreState, source: str, host_utime: int, now: Instant) -> CoreState:
+    """Count a message of a source that the host received at `host_utime` (0 = unknown)."""
     known = state.traffic.get(source)
     if known is None and len(state.traffic) >= MAX_COUNTERS:
         return state
     known = known or SourceTraffic()
     interval, delay = known.interval, known.delay
     if known.count:
-        since = (now.monotonic_ns - known.last_ns) * 1e-9
-        # a pause counts for no more than what makes it silent, or its return would be long forgotten for
-        usual = min(since, silent_after(interval)) if interval else since
+        since = (now.monotonic_ns - known.last_received_ns) * 1e-9
+        # limited, so that a pause does not hide the next ones
+        usual = min(since, get_silence_limit(interval)) if interval else since
         interval += (usual - interval) * (INTERVAL_GAIN if known.count > 1 else 1.0)
     if host_utime:
-        took = (now.utime - host_utime) * 1e-6
-        # a nan fails the comparison
-        delay = delay if delay >= took else took
+        latest = (now.utime - host_utime) * 1e-6
+        delay = delay if delay >= latest else latest  # also if it is nan
     updated = SourceTraffic(
         known.count + 1,
         now.monotonic_ns,
@@ -277,7 +281,7 @@ def traffic_noted(state: CoreState, source: str, host_utime: int, now: Instant) 
         interval,
         delay,
         known.rate,
-        known.told_delay,
+        known.reported_delay,
         known.measured,
         known.used,
         known.dropped,
@@ -286,33 +290,32 @@ def traffic_noted(state: CoreState, source: str, host_utime: int, now: Instant) 
     return state._replace(traffic={**state.traffic, source: updated})
 
 
-def decided(state: CoreState, decision: Decision) -> CoreState:
-    """Return the state with a decision of localization counted for its source.
-
-    An inertial unit's measurements are not counted: of those that are used for propagation nothing is reported.
-    """
+def count_decision(state: CoreState, decision: Decision) -> CoreState:
+    """Count a decision of localization on a measurement for its source."""
     source = f"sensor:{decision.source}"
     known = state.traffic.get(source)
-    if known is None or decision.kind in UNCOUNTED:
+    if known is None or decision.kind in UNCOUNTED_KINDS:
         return state
-    dropped = decision.verdict is Verdict.REJECTED
+    is_rejected = decision.verdict is Verdict.REJECTED
     updated = replace(
         known,
         measured=known.measured + 1,
-        used=known.used + (decision.verdict in (Verdict.USED, Verdict.TOOK_UP)),
-        dropped=known.dropped + 1 if dropped else 0,
-        reason=decision.reason if dropped else "",
+        used=known.used + (decision.verdict in (Verdict.USED, Verdict.RESET)),
+        dropped=known.dropped + 1 if is_rejected else 0,
+        reason=decision.reason if is_rejected else "",
     )
     return state._replace(traffic={**state.traffic, source: updated})
 
 
-def silent_after(interval: float) -> float:
-    """Return after how many seconds a source with this usual interval is silent."""
-    return max(SILENT_LEAST_S, SILENT_INTERVALS * interval)
+def get_silence_limit(interval: float) -> float:
+    """Return after how many seconds a source with this mean interval counts as silent."""
+    return max(MIN_SILENCE_S, SILENT_INTERVALS * interval)
 
 
-def heard(state: CoreState, sample: Sample) -> CoreState:
-    """Return the state in which the sensors that a sample may be of are heard."""
+def mark_received(state: CoreState, sample: Sample) -> CoreState:
+    """Remove the sensors that a sample may be from from the missing ones."""
     kind, source = type(sample), sample.header.source
-    still = tuple([each for each in state.unheard if each.kind is not kind or each.source not in ("", source)])
-    return state if len(still) == len(state.unheard) else state._replace(unheard=still)
+    missing = tuple(
+        [each for each in state.missing_sensors if each.kind is not kind or each.source not in ("", source)]
+    )
+    return state if len(missing) == len(state.missing_sensors) else state._replace(missing_sensors=missing)

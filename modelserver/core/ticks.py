@@ -1,4 +1,4 @@
-"""What is due by the clock: poses, the filter's state, health, the snapshot, and those who have waited long enough."""
+"""Ticks: what is due by the clock: pose, filter state, waiting requests, health, snapshot, state to persist. Pure."""
 
 from __future__ import annotations
 
@@ -6,22 +6,23 @@ from typing import Final
 
 from modelserver.core import health
 from modelserver.core.host_clock import Instant
-from modelserver.core.keeping import keep_if_due
-from modelserver.core.requests import answer_parked
-from modelserver.core.samples import check_host_clock, published
-from modelserver.core.state import CoreState, Step
+from modelserver.core.persistence import persist_if_due
+from modelserver.core.requests import answer_waiting
+from modelserver.core.samples import check_host_clock, publish_pose
+from modelserver.core.state import CoreState, StepResult
 from modelserver.messages import Output, PublishNavigation, PublishSnapshot, Tick
 
-LATENESS_KEPT: Final = 512
+MAX_TICK_LATENCIES: Final = 512
+"""Tick latencies that are retained for the percentiles of a health report."""
 
 
-def ticked(state: CoreState, tick: Tick, now: Instant) -> Step:
+def handle_tick(state: CoreState, tick: Tick, now: Instant) -> StepResult:
     """Do what is due by the clock."""
     outputs: list[Output] = []
     settings, before = state.settings, state.ticks
     state = check_host_clock(state, now)
     state = state._replace(
-        lateness=(*state.lateness[-LATENESS_KEPT + 1 :], tick.late),
+        tick_latencies=(*state.tick_latencies[-MAX_TICK_LATENCIES + 1 :], tick.latency),
         ticks=state.ticks + 1 + tick.missed,
         ticks_missed=state.ticks_missed + tick.missed,
         requests_answered=state.requests_answered + tick.answered,
@@ -29,27 +30,26 @@ def ticked(state: CoreState, tick: Tick, now: Instant) -> Step:
     localizer = state.localizer
     if localizer is not None:
         if settings.publish == "timer" and _is_due(settings.ticks_per_pose, before, state.ticks):
-            state, pose = published(state, now.utime)
+            state, pose = publish_pose(state, now.utime)
             outputs.append(pose)
         if settings.ticks_per_state and _is_due(settings.ticks_per_state, before, state.ticks):
             navigation = localizer.navigation(now.utime)
             if navigation is not None:
                 outputs.append(PublishNavigation(navigation))
-    if state.parked:
-        state, replies = answer_parked(state, now)
+    if state.waiting:
+        state, replies = answer_waiting(state, now)
         outputs.extend(replies)
-    state, reports = health.told(state, tick.gauges, now)
+    state, reports = health.report_if_due(state, tick.gauges, now)
     outputs.extend(reports)
     if now.monotonic_ns >= state.snapshot_due_ns:
         state = state._replace(snapshot_due_ns=now.monotonic_ns + settings.snapshot_period_ns)
         outputs.append(PublishSnapshot(now.utime))
-    if settings.keep_period_ns:
-        state, keeping = keep_if_due(state, now)
-        outputs.extend(keeping)
+    if settings.persist_period_ns:
+        state, to_persist = persist_if_due(state, now)
+        outputs.extend(to_persist)
     return state, tuple(outputs)
 
 
 def _is_due(every: int, before: int, after: int) -> bool:
-    """Return whether, of ticks counted from 0, the next after `before` of them up to `after` hold one in `every`."""
-    # the first tick is one at which all is due
+    """Return whether ticks `before` to `after` (counted from 0, without the last) hold a multiple of `every`."""
     return (after - 1) // every > (before - 1) // every

@@ -1,1 +1,1 @@
-"""The earth: ellipsoid and UTM, gravity and rotation, magnetic field."""
+"""The earth: geodesy, gravity and rotation, magnetic field."""

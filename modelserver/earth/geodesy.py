@@ -1,11 +1,10 @@
-"""Geodesy on WGS 84: geodetic, earth-centred, UTM with a pinned zone, and local tangent planes. Pure.
+"""Geodesy on WGS 84: geodetic, earth-centered (ECEF), UTM with a pinned zone, and local tangent planes (ENU). Pure.
 
-Projections and the ellipsoid are PROJ's (pyproj); nothing of them is written out here. Latitudes and
-longitudes are degrees, north and east positive; lengths are metres; heights are above the ellipsoid, up.
-Only localization needs this module: importing it loads pyproj.
+Projections and ellipsoid are those of PROJ (pyproj). Latitudes and longitudes are degrees, north and east positive;
+lengths are meters; heights are above the ellipsoid, up. Importing this module loads pyproj.
 
-Sources: J. Snyder, "Map projections: a working manual", USGS 1395, 1987 (UTM zones, convergence); NGA.SIG.0012,
-2014, 7 (the zones of Norway and Svalbard, latitude limits of UTM).
+Sources: J. Snyder, "Map projections: a working manual", USGS 1395, 1987 (UTM zones, convergence); NGA.SIG.0012, 2014, 7
+(the zones of Norway and Svalbard, latitude limits of UTM).
 """
 
 from __future__ import annotations
@@ -21,27 +20,27 @@ from pyproj.enums import TransformDirection
 
 from modelserver.errors import ModelServerError
 from modelserver.messages import Origin
-from modelserver.spatial import so3
-from modelserver.spatial.pose import Pose
-from modelserver.spatial.so3 import Quaternion, Vector3
+from modelserver.transforms import so3
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Quaternion, Vector3
 
 SOUTHERN_LIMIT = -80.0
 NORTHERN_LIMIT = 84.0
-"""UTM serves the latitudes between; the polar caps have a projection of their own (UPS)."""
+"""UTM covers the latitudes between; the polar caps have a projection of their own (UPS)."""
 
-ZONE_REACH = 20.0
+MAX_ZONE_OFFSET = 20.0
 """Degrees of longitude from the zone's central meridian within which a pinned zone is used."""
 
 _INVERSE = TransformDirection.INVERSE
 
 
 class GeodesyError(ModelServerError, ValueError):
-    """A place that the asked-for coordinates cannot express: not finite, polar, or far outside the zone."""
+    """A place that the coordinates cannot express: not finite, polar, or far outside the zone."""
 
 
 @lru_cache(maxsize=1)
 def _cart() -> Transformer:
-    """Geodetic (longitude, latitude, height) to earth-centred; made when first used: it costs 0.2 ms."""
+    """Return the transformer from (longitude, latitude, height) to ECEF, cached: creating it costs 0.2 ms."""
     return Transformer.from_pipeline(
         "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84"
     )
@@ -54,7 +53,7 @@ def _utm(zone: int, north: bool) -> Proj:
 
 @lru_cache(maxsize=128)
 def _cart_to_utm(zone: int, north: bool) -> Transformer:
-    """Earth-centred to (easting, northing, height) in one call, which a pose costs every time."""
+    """Return the transformer from ECEF to (easting, northing, height), in one call for each pose."""
     south = "" if north else " +south"
     return Transformer.from_pipeline(
         f"+proj=pipeline +step +inv +proj=cart +ellps=WGS84 +step +proj=utm +zone={zone}{south} +ellps=WGS84"
@@ -64,10 +63,10 @@ def _cart_to_utm(zone: int, north: bool) -> Transformer:
 def utm_zone(latitude_deg: float, longitude_deg: float) -> tuple[int, bool]:
     """Return the UTM zone of a place and whether it is of the northern hemisphere.
 
-    South-west Norway is in zone 32 and Svalbard in 31, 33, 35 and 37, as mapping there uses them.
-    Raises GeodesyError outside 80 S to 84 N, or where a number is not finite.
+    South-west Norway is in zone 32 and Svalbard in 31, 33, 35 and 37. Raises GeodesyError outside 80 S to 84 N, or
+    where a number is not finite.
     """
-    _check(latitude_deg, longitude_deg)
+    _check_place(latitude_deg, longitude_deg)
     if not SOUTHERN_LIMIT <= latitude_deg <= NORTHERN_LIMIT:
         raise GeodesyError(
             f"latitude {latitude_deg:.6f} deg is beyond UTM, which ends at 80 S and 84 N: "
@@ -83,23 +82,23 @@ def utm_zone(latitude_deg: float, longitude_deg: float) -> tuple[int, bool]:
 
 
 def ecef_from_geodetic(latitude_deg: float, longitude_deg: float, height: float) -> Vector3:
-    """Return earth-centred, earth-fixed x, y, z. Raises GeodesyError where a number is not finite."""
-    _check(latitude_deg, longitude_deg, height)
+    """Return ECEF x, y, z. Raises GeodesyError where a number is not finite."""
+    _check_place(latitude_deg, longitude_deg, height)
     x, y, z = _cart().transform(longitude_deg, latitude_deg, height)
     return (x, y, z)
 
 
 def geodetic_from_ecef(ecef: Vector3) -> Vector3:
-    """Return latitude, longitude in degrees and height of an earth-centred point."""
+    """Return latitude, longitude in degrees and height of an ECEF point."""
     longitude, latitude, height = _cart().transform(*ecef, direction=_INVERSE)
     return (latitude, longitude, height)
 
 
 @dataclass(frozen=True, slots=True)
 class LocalFrame:
-    """A tangent plane: x true east, y true north, z up along the ellipsoid's normal at one place.
+    """A tangent plane (ENU): x true east, y true north, z up along the ellipsoid's normal.
 
-    `ecef` is its origin and `rotation` the quaternion R_EL that turns its axes to earth-centred ones.
+    `ecef` is its origin and `rotation` the quaternion R_EL from its axes to ECEF.
     """
 
     ecef: Vector3
@@ -112,18 +111,18 @@ class LocalFrame:
         return cls(ecef, _tangent_rotation(latitude_deg, longitude_deg))
 
     def to_ecef(self, point: Vector3) -> Vector3:
-        """Return a point of this frame (east, north, up) in earth-centred coordinates."""
+        """Return a point of this frame (east, north, up) in ECEF."""
         x, y, z = so3.rotate(self.rotation, point)
         a, b, c = self.ecef
         return (a + x, b + y, c + z)
 
     def from_ecef(self, ecef: Vector3) -> Vector3:
-        """Return an earth-centred point as east, north, up in this frame."""
+        """Return an ECEF point as east, north, up in this frame."""
         a, b, c = self.ecef
         return so3.rotate(so3.conjugate(self.rotation), (ecef[0] - a, ecef[1] - b, ecef[2] - c))
 
     def rotation_of(self, other: LocalFrame) -> Quaternion:
-        """Return the quaternion that turns the axes of `other` to those of this frame."""
+        """Return the rotation from the axes of `other` to those of this frame."""
         return so3.multiply(so3.conjugate(self.rotation), other.rotation)
 
 
@@ -132,20 +131,20 @@ def _tangent_rotation(latitude_deg: float, longitude_deg: float) -> Quaternion:
     a = math.radians(longitude_deg + 90.0) / 2.0
     b = math.radians(90.0 - latitude_deg) / 2.0
     ca, sa, cb, sb = math.cos(a), math.sin(a), math.cos(b), math.sin(b)
-    return so3.normalized((ca * cb, ca * sb, sa * sb, sa * cb))
+    return so3.normalize((ca * cb, ca * sb, sa * sb, sa * cb))
 
 
 def make_origin(easting: float, northing: float, height: float, zone: int, north: bool) -> Origin:
     """Return the origin of World:UTM at grid coordinates; its `origin_id` is a hash of the five numbers.
 
-    Raises GeodesyError for a zone outside 1 to 60, or numbers that name no place in reach of the zone.
+    Raises GeodesyError for a zone outside 1 to 60, or coordinates far outside the zone.
     """
     if not 1 <= zone <= 60:
         raise GeodesyError(f"a UTM zone is 1 to 60, got {zone}")
     if not (math.isfinite(height) and 0.0 <= northing <= 1e7 and -1.5e6 <= easting <= 2.5e6):
         raise GeodesyError(
             f"no origin in zone {zone}: easting {easting}, northing {northing}, height {height} m; "
-            "give grid metres, northing counted from the equator or in the south from 10,000,000 m"
+            "give grid meters, northing counted from the equator or in the south from 10,000,000 m"
         )
     # + 0.0 turns a negative zero into zero, so that equal numbers have equal ids
     numbers = struct.pack(">dddB?", easting + 0.0, northing + 0.0, height + 0.0, zone, north)
@@ -154,7 +153,7 @@ def make_origin(easting: float, northing: float, height: float, zone: int, north
 
 
 def origin_at(latitude_deg: float, longitude_deg: float, height: float) -> Origin:
-    """Return an origin at a place, in the zone of that place, rounded to 0.1 mm so that it is short to write.
+    """Return an origin at a place, in the zone of that place, rounded to 0.1 mm.
 
     Raises GeodesyError beyond UTM's latitudes, or where a number is not finite.
     """
@@ -166,9 +165,9 @@ def origin_at(latitude_deg: float, longitude_deg: float, height: float) -> Origi
 class Geodesy:
     """World coordinates around one origin: its pinned UTM zone and its tangent plane (World:ENU).
 
-    The zone stays that of the origin where the vehicle crosses into the next: PROJ's series hold far beyond
-    a zone's border. Immutable; two of one origin are equal. Scalar calls cost microseconds.
-    Raises GeodesyError for an origin that is no place.
+    The zone stays that of the origin where the vehicle crosses into the next: PROJ's series hold far beyond a zone's
+    border. Immutable; two of one origin are equal. Scalar calls cost microseconds. Raises GeodesyError for an invalid
+    origin.
     """
 
     __slots__ = ("origin", "tangent")
@@ -177,34 +176,34 @@ class Geodesy:
     tangent: LocalFrame
 
     def __init__(self, origin: Origin):
-        """Take the origin; `tangent` is the plane at it."""
+        """Create the geodesy of an origin; `tangent` is the plane at it."""
         checked = make_origin(
             origin.easting, origin.northing, origin.height, origin.zone, origin.north
-        )  # the caller's origin_id is kept: it may have been persisted by another version
+        )  # the caller's origin_id stays: it may have been persisted by another version
         longitude, latitude = _utm(origin.zone, origin.north)(checked.easting, checked.northing, inverse=True)
         object.__setattr__(self, "origin", origin)
         object.__setattr__(self, "tangent", LocalFrame.at(latitude, longitude, origin.height))
 
     def utm_from_geodetic(self, latitude_deg: float, longitude_deg: float, height: float) -> Vector3:
         """Return grid easting, grid northing and height, absolute, in the pinned zone."""
-        self._check_reach(latitude_deg, longitude_deg)
+        self._check_zone_offset(latitude_deg, longitude_deg)
         easting, northing = _utm(self.origin.zone, self.origin.north)(longitude_deg, latitude_deg)
         return (easting, northing, height)
 
     def geodetic_from_utm(self, easting: float, northing: float, height: float) -> Vector3:
         """Return latitude, longitude and height of absolute grid coordinates in the pinned zone.
 
-        Raises GeodesyError where the numbers name no place.
+        Raises GeodesyError for coordinates far outside the zone.
         """
         longitude, latitude = _utm(self.origin.zone, self.origin.north)(easting, northing, inverse=True)
-        _check(latitude, longitude, height)
+        _check_place(latitude, longitude, height)
         return (latitude, longitude, height)
 
     def utm_from_ecef(self, ecef: Vector3) -> Vector3:
-        """Return absolute grid easting, grid northing and height of an earth-centred point, in one step."""
+        """Return absolute grid easting, grid northing and height of an ECEF point, in one step."""
         easting, northing, height = _cart_to_utm(self.origin.zone, self.origin.north).transform(*ecef)
         if not math.isfinite(easting + northing + height):
-            raise GeodesyError(f"earth-centred point {ecef} is out of reach of UTM zone {self.origin.zone}")
+            raise GeodesyError(f"earth-centered point {ecef} is outside UTM zone {self.origin.zone}")
         return (easting, northing, height)
 
     def enu_from_geodetic(self, latitude_deg: float, longitude_deg: float, height: float) -> Vector3:
@@ -216,17 +215,17 @@ class Geodesy:
         return geodetic_from_ecef(self.tangent.to_ecef(enu))
 
     def convergence(self, latitude_deg: float, longitude_deg: float) -> float:
-        """Return the grid convergence at a place, radians: what turns yaw from true east to yaw from grid east.
+        """Return the grid convergence at a place, radians: yaw from grid east minus yaw from true east.
 
         Positive where grid north lies clockwise of true north: east of the central meridian in the north.
         """
-        self._check_reach(latitude_deg, longitude_deg)
+        self._check_zone_offset(latitude_deg, longitude_deg)
         factors = _utm(self.origin.zone, self.origin.north).get_factors(longitude_deg, latitude_deg)
         return math.radians(factors.meridian_convergence)
 
     def scale(self, latitude_deg: float, longitude_deg: float) -> float:
-        """Return grid length over length on the ellipsoid at a place: 0.9996 on the central meridian."""
-        self._check_reach(latitude_deg, longitude_deg)
+        """Return the grid scale factor at a place: 0.9996 on the central meridian."""
+        self._check_zone_offset(latitude_deg, longitude_deg)
         return float(
             _utm(self.origin.zone, self.origin.north).get_factors(longitude_deg, latitude_deg).meridional_scale
         )
@@ -234,44 +233,44 @@ class Geodesy:
     def pose_in_utm(self, X_enu: Pose) -> Pose:
         """Return the pose in World:UTM of a pose in World:ENU.
 
-        Position is projected; orientation is brought to the tangent plane at the pose's own place and turned
-        by the convergence there, so that yaw counts from grid east and tilt from the vertical of that place.
+        The position is projected. The orientation is rotated to the tangent plane at the pose's own place, and by the
+        convergence there: yaw counts from grid east, and tilt from the local vertical.
         """
         ecef = self.tangent.to_ecef(X_enu.xyz)
         latitude, longitude, height = geodetic_from_ecef(ecef)
         local = LocalFrame(ecef, _tangent_rotation(latitude, longitude))
         q_local = so3.multiply(local.rotation_of(self.tangent), X_enu.wxyz)
         return Pose(
-            self.relative(self.utm_from_geodetic(latitude, longitude, height)),
-            so3.multiply(about_up(self.convergence(latitude, longitude)), q_local),
+            self.to_relative_utm(self.utm_from_geodetic(latitude, longitude, height)),
+            so3.multiply(rotation_about_up(self.convergence(latitude, longitude)), q_local),
         )
 
     def pose_in_enu(self, X_utm: Pose) -> Pose:
-        """Return the pose in World:ENU of a pose in World:UTM: what `pose_in_utm` does, backwards.
+        """Return the pose in World:ENU of a pose in World:UTM, the inverse of `pose_in_utm`.
 
-        Raises GeodesyError for one out of reach of the zone.
+        Raises GeodesyError outside the zone.
         """
         east, north, height = self.origin.initial_utm
         x, y, z = X_utm.xyz
         place = self.geodetic_from_utm(east + x, north + y, height + z)
         local = LocalFrame.at(*place)
-        q_local = so3.multiply(about_up(-self.convergence(*place[:2])), X_utm.wxyz)
+        q_local = so3.multiply(rotation_about_up(-self.convergence(*place[:2])), X_utm.wxyz)
         return Pose(self.tangent.from_ecef(local.ecef), so3.multiply(self.tangent.rotation_of(local), q_local))
 
-    def relative(self, utm: Vector3) -> Vector3:
-        """Return absolute grid coordinates as metres from the origin: a position in World:UTM."""
+    def to_relative_utm(self, utm: Vector3) -> Vector3:
+        """Return absolute grid coordinates as meters from the origin: a position in World:UTM."""
         east, north, height = self.origin.initial_utm
         return (utm[0] - east, utm[1] - north, utm[2] - height)
 
-    def _check_reach(self, latitude_deg: float, longitude_deg: float) -> None:
-        _check(latitude_deg, longitude_deg)
+    def _check_zone_offset(self, latitude_deg: float, longitude_deg: float) -> None:
+        _check_place(latitude_deg, longitude_deg)
         if not SOUTHERN_LIMIT <= latitude_deg <= NORTHERN_LIMIT:
             raise GeodesyError(f"latitude {latitude_deg:.6f} deg is beyond UTM, which ends at 80 S and 84 N")
         away = math.remainder(longitude_deg - (6.0 * self.origin.zone - 183.0), 360.0)
-        if abs(away) > ZONE_REACH:
+        if abs(away) > MAX_ZONE_OFFSET:
             raise GeodesyError(
                 f"longitude {longitude_deg:.6f} deg lies {abs(away):.1f} deg from the middle of the pinned UTM "
-                f"zone {self.origin.zone}, which reaches {ZONE_REACH:g} deg: set the origin anew"
+                f"zone {self.origin.zone}, which reaches {MAX_ZONE_OFFSET:g} deg: set a new origin"
             )
 
     def __eq__(self, other: object) -> bool:
@@ -290,12 +289,12 @@ class Geodesy:
         return f"Geodesy({self.origin!r})"
 
 
-def about_up(angle: float) -> Quaternion:
+def rotation_about_up(angle: float) -> Quaternion:
     """Return the rotation by `angle` radians about z, counter-clockwise seen from above."""
     return (math.cos(angle / 2.0), 0.0, 0.0, math.sin(angle / 2.0))
 
 
-def _check(latitude_deg: float, longitude_deg: float, height: float = 0.0) -> None:
+def _check_place(latitude_deg: float, longitude_deg: float, height: float = 0.0) -> None:
     if not (
         math.isfinite(latitude_deg + longitude_deg + height)
         and -90.0 <= latitude_deg <= 90.0

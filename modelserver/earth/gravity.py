@@ -1,14 +1,14 @@
-"""What a resting inertial unit feels of the earth: gravity and rotation.
+"""Gravity and earth rate, as an inertial unit at rest measures them.
 
 Source: NGA.STND.0036, WGS 84, 2014: rotation rate (table 3.1), normal gravity on the ellipsoid (eq. 4-1) and its
-fall with height (eq. 4-3).
+decrease with height (eq. 4-3).
 """
 
 from __future__ import annotations
 
 import math
 
-from modelserver.spatial.so3 import Vector3
+from modelserver.transforms.so3 import Vector3
 
 ROTATION_RATE = 7.292115e-5
 """Of the earth, rad/s."""
@@ -22,14 +22,14 @@ _M = 3.449786506841e-3
 
 
 def gravity(latitude_deg: float, height: float) -> float:
-    """Return normal gravity, m/s2, at a latitude and a height above the ellipsoid in metres."""
+    """Return normal gravity, m/s2, at a latitude and a height above the ellipsoid in meters."""
     s2 = math.sin(math.radians(latitude_deg)) ** 2
     surface = _GAMMA_EQUATOR * (1.0 + _K * s2) / math.sqrt(1.0 - _E2 * s2)
     h = height / _A
     return surface * (1.0 - 2.0 * (1.0 + _F + _M - 2.0 * _F * s2) * h + 3.0 * h * h)
 
 
-def rotation(latitude_deg: float) -> Vector3:
-    """Return the earth's rotation, rad/s, along east, north, up at a latitude."""
+def earth_rate(latitude_deg: float) -> Vector3:
+    """Return the earth's rotation rate, rad/s, along east, north, up at a latitude."""
     angle = math.radians(latitude_deg)
     return (0.0, ROTATION_RATE * math.cos(angle), ROTATION_RATE * math.sin(angle))

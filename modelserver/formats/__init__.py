@@ -1,9 +1,9 @@
-"""Geometry files: reading, checking and writing the forms that a model may stand in.
+"""Geometry files: read, check and write the formats of a model.
 
     model = load_model("config/raptor/geometry.xml")
-    text, losses = save_model(model, "yaml")
+    text, unsupported = save_model(model, "yaml")
 
-Importing this loads neither lxml nor yaml; each is imported when a file of its kind is met.
+Importing this package loads neither lxml nor yaml; each is imported for the first file of its format.
 """
 
 from __future__ import annotations
@@ -13,18 +13,17 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from modelserver.errors import GeometryError, Problem
-from modelserver.formats import content, registry
-from modelserver.formats.registry import FORMS, form_of_path
-from modelserver.formats.saved import Saved
+from modelserver.formats.registry import FORMATS, format_of_path, parse_content, read_content, save_model
+from modelserver.formats.writing import SavedModel
 from modelserver.geometry.model import Model
 
 __all__ = [
-    "FORMS",
-    "Examined",
-    "Saved",
+    "FORMATS",
+    "FileExamination",
+    "SavedModel",
     "check_file",
     "examine_file",
-    "form_of_path",
+    "format_of_path",
     "load_model",
     "parse_model",
     "save_model",
@@ -38,17 +37,30 @@ def load_model(
     variables: Mapping[str, str] | None = None,
     strict: bool = False,
 ) -> Model:
-    """Return the model in a geometry file; its `problems` hold the warnings and notes.
+    """Load the model in a geometry file.
 
-    The form is told by the content: YAML; Miro XML, with bodies and constraints or with a tree of frames; URDF; or
+    The format is detected from the content: YAML; Miro XML with bodies and constraints, or with a tree of frames; URDF;
     libbot2's coordinate frames.
-    `variables` fill `$NAME` in a frame tree, before the environment does. With `repair`, what is badly formed
-    and what is not traceable to the first body is dropped and reported instead of refused. With `strict`, a frame has
-    one constraint at most, as in 2005.
 
-    Raises GeometryError, with every problem, where the file is wrong; OSError where it cannot be opened.
+    Parameters
+    ----------
+    repair : drop what is badly formed and what is not connected to the first body, with a warning, instead of rejecting
+        the file
+    variables : values of `$NAME` in a frame tree, before those of the environment
+    strict : allow one constraint per frame at most, as the 2005 report does
+
+    Returns
+    -------
+    The model; its `problems` are the warnings and notes.
+
+    Raises
+    ------
+    GeometryError
+        The file is wrong; with every problem.
+    OSError
+        The file cannot be opened.
     """
-    return parse_model(content.read(path), os.fspath(path), repair=repair, variables=variables, strict=strict)
+    return parse_model(read_content(path), os.fspath(path), repair=repair, variables=variables, strict=strict)
 
 
 def parse_model(
@@ -59,8 +71,8 @@ def parse_model(
     variables: Mapping[str, str] | None = None,
     strict: bool = False,
 ) -> Model:
-    """Return the model that the bytes of a geometry file hold; as `load_model`, with `file` named in problems."""
-    return registry.read(text, file, variables, strict).build(repair)
+    """Return the model in the bytes of a geometry file, as `load_model`; problems name `file`."""
+    return parse_content(text, file, variables, strict).build(repair)
 
 
 def check_file(
@@ -70,48 +82,39 @@ def check_file(
     repair: bool = False,
     strict: bool = False,
 ) -> tuple[Model | None, tuple[Problem, ...]]:
-    """Return the model in a file, None where there is an error, and every problem in the order of the file.
+    """Return the model in a file, None if there is an error, and every problem in the order of the file.
 
-    Raises OSError where the file cannot be opened.
+    Raises OSError if the file cannot be opened.
     """
     try:
-        text = content.read(path)
+        text = read_content(path)
     except GeometryError as error:
         return None, error.problems
-    return registry.read(text, os.fspath(path), variables, strict).check(repair)
+    return parse_content(text, os.fspath(path), variables, strict).check(repair)
 
 
-class Examined(NamedTuple):
-    """What is found in a geometry file.
-
-    model: None where there is an error. problems: in the order of the file. stated: the bodies of a file with errors
-    too, without constraints, so that what others say of its frames can be checked; None where none can be read.
-    constraints: the names of all constraints; None where no body can be read.
-    """
+class FileExamination(NamedTuple):
+    """The content of a geometry file, as far as it can be read."""
 
     model: Model | None = None
+    """None if there is an error."""
     problems: tuple[Problem, ...] = ()
-    stated: Model | None = None
+    """In the order of the file."""
+    partial_model: Model | None = None
+    """The bodies, without constraints if there is an error, to check references to frames; None without any body."""
     constraints: tuple[str, ...] | None = None
+    """Names of all constraints; None if no body can be read."""
 
 
 def examine_file(
     path: str | os.PathLike[str], variables: Mapping[str, str] | None = None, *, strict: bool = False
-) -> Examined:
-    """Return what is in a geometry file, as far as it can be read. Raises OSError where it cannot be opened."""
+) -> FileExamination:
+    """Read as much of a geometry file as is valid. Raises OSError if it cannot be opened."""
     try:
-        text = content.read(path)
+        text = read_content(path)
     except GeometryError as error:
-        return Examined(problems=error.problems)
-    builder = registry.read(text, os.fspath(path), variables, strict)
+        return FileExamination(problems=error.problems)
+    builder = parse_content(text, os.fspath(path), variables, strict)
     model, problems = builder.check()
-    stated = model or builder.stated()
-    return Examined(model, problems, stated, None if stated is None else builder.constraint_names)
-
-
-def save_model(model: Model, form: str) -> Saved:
-    """Return the text of `model` in a form (`FORMS`), and what that form cannot hold.
-
-    Raises ValueError for a form that is not known.
-    """
-    return registry.save(model, form)
+    partial = model or builder.build_bodies()
+    return FileExamination(model, problems, partial, None if partial is None else builder.constraint_names)

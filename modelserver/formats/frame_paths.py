@@ -1,9 +1,9 @@
 """Paths in a frame tree: which frame a `Parent` of Miro's frame store names.
 
-A path is names between slashes, from a frame down to one that it carries: `PanTiltUnit/Pan`. `...` stands for any
-number of levels, `A/.../B`; `.` for none; `..` takes the name before it back. A path that begins with a slash begins at
-a root; any other may begin anywhere, so `Pan` is `.../Pan`, and a root goes before a frame further down. NASA's frame
-store has the same rules, but there a parent must stand before its children; here the order of the file is free.
+A path is names between slashes, from a frame down to its descendant: `PanTiltUnit/Pan`. `...` matches any number of
+levels, `A/.../B`; `.` none; `..` removes the name before it. A path that begins with a slash begins at a root; any
+other begins anywhere, so `Pan` is `.../Pan`, and a root has priority over deeper frames. NASA's frame store has the
+same rules, but requires a parent before its children; here the order of the file is free.
 """
 
 from __future__ import annotations
@@ -13,56 +13,56 @@ from dataclasses import dataclass
 
 ANY = "..."
 
-GREATEST_STEPS = 2_000_000
-"""Levels that are walked for all paths of a file: only a file made to take time needs more."""
+MAX_STEPS = 2_000_000
+"""Levels visited for all paths of a file: only a hostile file needs more."""
 
 
 @dataclass(frozen=True, slots=True)
 class FramePath:
-    """A path: its names from above to below, and whether it begins at a root."""
+    """A path: its names from the top down, and whether it begins at a root."""
 
     parts: tuple[str, ...]
     is_absolute: bool
 
     @property
     def name(self) -> str:
-        """The frame that the path names, without the way to it."""
+        """Name of the frame, without its ancestors."""
         return self.parts[-1] if self.parts else ""
 
     @property
     def is_plain(self) -> bool:
-        """Whether it is a name alone, which any frame of that name fits."""
+        """Whether it is a single name, which matches any frame of that name."""
         return len(self.parts) == 1 and not self.is_absolute
 
     def matches(self, names: Sequence[str]) -> bool:
-        """Return whether the frame with these names, from the root down to its own, is one that the path names."""
+        """Return whether the path matches a frame, given the names from its root down to its own."""
         if ANY not in self.parts:
             above = len(names) - len(self.parts)
             return above >= 0 and (not self.is_absolute or above == 0) and tuple(names[above:]) == self.parts
         parts = self.parts if self.is_absolute else (ANY, *self.parts)
-        # as a star in a file name: on a mismatch the last wildcard takes a level more
+        # glob matching: on a mismatch, backtrack to the last wildcard, which takes one more level
         at = part = 0
-        again: tuple[int, int] | None = None
+        backtrack: tuple[int, int] | None = None
         while at < len(names):
             if part < len(parts) and parts[part] == ANY:
                 part += 1
-                again = (part, at)
+                backtrack = (part, at)
             elif part < len(parts) and parts[part] == names[at]:
                 part, at = part + 1, at + 1
-            elif again is not None:
-                again = (again[0], again[1] + 1)
-                part, at = again
+            elif backtrack is not None:
+                backtrack = (backtrack[0], backtrack[1] + 1)
+                part, at = backtrack
             else:
                 return False
         return all(each == ANY for each in parts[part:])
 
 
 ROOT = FramePath((), False)
-"""The path of a frame that has no parent."""
+"""The path of a frame without a parent."""
 
 
 def parse_path(text: str) -> FramePath:
-    """Return the path that a `Parent` states; without parts for a root (empty, or a slash alone)."""
+    """Parse a `Parent`; the path of a root (empty, or a single slash) has no parts."""
     parts: list[str] = []
     for part in (each.strip() for each in text.split("/")):
         if part == ".." and parts and parts[-1] != ANY:
@@ -73,9 +73,9 @@ def parse_path(text: str) -> FramePath:
 
 
 class Ancestry:
-    """The names above frames, walked along `parents` (key of a frame to key of its parent, "" for a root).
+    """The names of the ancestors of frames, by `parents`: the key of each frame's parent, "" for a root.
 
-    A frame that is not in `parents` is not placed yet.
+    The parent of a frame that is not in `parents` is not known yet.
     """
 
     def __init__(self, names: Mapping[str, str], parents: Mapping[str, str]):
@@ -85,16 +85,16 @@ class Ancestry:
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether more levels were walked than a file may take."""
-        return self.steps > GREATEST_STEPS
+        """Whether more than `MAX_STEPS` levels were visited."""
+        return self.steps > MAX_STEPS
 
     def match(self, path: FramePath, names: Sequence[str]) -> bool:
-        """Return whether a path names the frame with these names; False once the file is exhausted."""
+        """Return whether a path matches the frame with these names; False when exhausted."""
         self.steps += len(names) * (len(path.parts) if ANY in path.parts else 1)
         return not self.is_exhausted and path.matches(names)
 
     def of(self, key: str) -> list[str] | None:
-        """Return the names from the root down to a frame; None where one is not placed yet, or they form a cycle."""
+        """Return the names from the root down to a frame; None if a parent is not known yet, or for a cycle."""
         found: list[str] = []
         seen: set[str] = set()
         while key:

@@ -1,4 +1,7 @@
-"""Which form a file is in: told by what it holds, for names of files lie."""
+"""Detect the format of a geometry file by its content, and call the reader or writer of the format.
+
+yaml and lxml are imported by the reader that needs them, so that a file of one format does not pay for the other.
+"""
 
 from __future__ import annotations
 
@@ -8,79 +11,98 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import PurePath
 
-from modelserver.errors import Location, shown
-from modelserver.file_kinds import FileKind, conversion_command, file_kind, geometry_named
-from modelserver.formats import bot_param
-from modelserver.formats.saved import Saved
+from modelserver.errors import GeometryError, Location, Problem, Severity, quote
+from modelserver.files.kinds import FileKind, detect_file_kind, find_geometry_path, format_conversion_command
+from modelserver.files.regular import FileTooLargeError, NotRegularFileError, read_regular
+from modelserver.formats.writing import SavedModel
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
 
-FORMS = ("yaml", "miro", "miro-frames", "urdf")
-"""Forms that `save` writes: YAML, Miro body and constraint XML, Miro frame-tree XML, URDF."""
+FORMATS = ("yaml", "miro", "miro-frames", "urdf")
+"""Formats that `save_model` writes: YAML, Miro body and constraint XML, Miro frame-tree XML, URDF."""
 
-_ENDINGS = {".yaml": "yaml", ".yml": "yaml", ".xml": "miro", ".urdf": "urdf"}
+MAX_BYTES = 32 * 1024 * 1024
+"""Larger files are rejected unread: 10,000 frames take 3 MiB in the most verbose format."""
 
-_XML_ENDINGS = (".xml", ".urdf")
+_FORMAT_BY_SUFFIX = {".yaml": "yaml", ".yml": "yaml", ".xml": "miro", ".urdf": "urdf"}
 
-_ELSEWHERE = {
-    "sdf": "this looks like SDF, which is not read",
+_XML_SUFFIXES = (".xml", ".urdf")
+
+_OTHER_XML = {
+    "sdf": "this looks like SDF, which is not supported",
     "config_group": "this is Miro's compile-time parameter file; the run-time file holds the geometry",
 }
 
-
-_INSTEAD = {
+_EXAMPLE_HINT = "docs/geometry-files.md has an example to begin with"
+_FIXES = {
+    FileKind.EMPTY: _EXAMPLE_HINT,
+    FileKind.COMMENTS: _EXAMPLE_HINT,
     FileKind.VEHICLE: "a vehicle file goes with -c; here give the geometry file that it names",
     FileKind.LOG: "give a geometry file; modelserver query --log and modelserver replay take logs",
-    FileKind.COMMENTS: "see docs/geometry-files.md for an example to begin with",
     FileKind.MIRO_PROCESS: "convert it to a vehicle file, which names the geometry file: {command}",
 }
-"""What to give instead of a file that is no geometry file."""
+"""Fix for a file that is not a geometry file."""
 
 
-def form_of_path(path: str | os.PathLike[str]) -> str:
-    """Return the form to write to a file of that name. Raises ValueError for an ending that names none."""
-    ending = PurePath(path).suffix.lower()
-    if ending not in _ENDINGS:
-        raise ValueError(
-            f"{shown(ending)} names no form; endings are {', '.join(_ENDINGS)}"
-            if ending
-            else f"a file name without an ending names no form; endings are {', '.join(_ENDINGS)}"
-        )
-    return _ENDINGS[ending]
+def format_of_path(path: str | os.PathLike[str]) -> str:
+    """Return the format to write to a file of this name. Raises ValueError for an unknown suffix."""
+    suffix = PurePath(path).suffix.lower()
+    if suffix not in _FORMAT_BY_SUFFIX:
+        what = quote(suffix) if suffix else "a file name without a suffix"
+        raise ValueError(f"{what} names no format; suffixes are {', '.join(_FORMAT_BY_SUFFIX)}")
+    return _FORMAT_BY_SUFFIX[suffix]
 
 
-def read(
+def read_content(path: str | os.PathLike[str]) -> bytes:
+    """Read the bytes of a geometry file.
+
+    Raises GeometryError for a directory, a FIFO, a device or a file that is too large, OSError if it cannot be opened.
+    """
+    try:
+        return read_regular(path, MAX_BYTES)
+    except NotRegularFileError as error:
+        message = f"this is {error.kind}, not a geometry file"
+        fix = "name the file inside it" if error.is_directory else "save the geometry to a file, and give that"
+    except FileTooLargeError as error:
+        message, fix = str(error.strerror), "name a geometry file; point clouds and meshes do not belong in one"
+    raise GeometryError([Problem(Severity.ERROR, message, Location(os.fspath(path)), fix)])
+
+
+def parse_content(
     content: bytes, file: str = "", variables: Mapping[str, str] | None = None, strict: bool = False
 ) -> ModelBuilder:
-    """Return a builder with what `content` holds and every problem met; never raises for what is in it.
+    """Return a builder with the parts of the model in `content` and every problem; never raises for the content.
 
-    `file` is named in problems; the builder is `strict`, or not.
+    Problems name `file`. See `modelserver.formats.load_model` for the other parameters.
     """
     builder = ModelBuilder(strict=strict)
     text = content.removeprefix(b"\xef\xbb\xbf").lstrip()
-    if not text:
-        builder.error("the file is empty", Location(file), "see docs/geometry-files.md for an example to begin with")
-    elif (kind := file_kind(text)) in _INSTEAD:
-        named = geometry_named(text) if kind is FileKind.VEHICLE else ""
-        what = kind.value if kind.is_nothing else f"{kind.value}, not a geometry file"
-        fix = _INSTEAD[kind].replace("{command}", conversion_command(file or "FILE.xml"))
-        builder.error(what, Location(file), fix + (f", {shown(named, 100)}" if named else ""))
-    else:
-        with _collector_paused():
-            if text.startswith(b"<") or PurePath(file).suffix.lower() in _XML_ENDINGS:
-                _read_xml(content, builder, file, variables or {})
-            elif bot_param.is_likely(text):
-                _read_bot_frames(content, builder, file)
-            else:
-                _read_yaml(content, builder, file)
+    kind = detect_file_kind(text)
+    if kind in _FIXES:
+        named = find_geometry_path(text) if kind is FileKind.VEHICLE else ""
+        what = kind.value if kind.is_empty else f"{kind.value}, not a geometry file"
+        fix = _FIXES[kind].replace("{command}", format_conversion_command(file or "FILE.xml"))
+        builder.add_error(what, Location(file), fix + (f", {quote(named, 100)}" if named else ""))
+        return builder
+    from modelserver.formats import bot_frames
+
+    with _pause_garbage_collector():
+        if text.startswith(b"<") or PurePath(file).suffix.lower() in _XML_SUFFIXES:
+            _read_xml(content, builder, file, variables or {})
+        elif bot_frames.is_bot_param(text):
+            bot_frames.load(content, builder, file)
+        else:
+            from modelserver.formats import yaml_loader
+
+            yaml_loader.load(content, builder, file)
     return builder
 
 
 @contextmanager
-def _collector_paused() -> Iterator[None]:
-    """Keep the garbage collector from walking the growing tree again and again: it doubles the time of a parse.
+def _pause_garbage_collector() -> Iterator[None]:
+    """Disable the garbage collector while a tree grows: walking it again and again doubles the time of a parse.
 
-    All that a parse makes stays alive until its end, so there is nothing to find; sizes are bounded.
+    All objects of a parse live until its end, so there is nothing to collect; sizes are bounded.
     """
     was_on = gc.isenabled()
     gc.disable()
@@ -91,46 +113,33 @@ def _collector_paused() -> Iterator[None]:
             gc.enable()
 
 
-def _read_yaml(content: bytes, builder: ModelBuilder, file: str) -> None:
-    # yaml and lxml are imported where they are needed: a file of one kind must not pay for the other
-    from modelserver.formats import yaml_form
-
-    yaml_form.load(content, builder, file)
-
-
-def _read_bot_frames(content: bytes, builder: ModelBuilder, file: str) -> None:
-    from modelserver.formats import bot_frames_text
-
-    bot_frames_text.load(content, builder, file)
-
-
 def _read_xml(content: bytes, builder: ModelBuilder, file: str, variables: Mapping[str, str]) -> None:
-    from modelserver.formats import frame_tree_xml, miro_xml, urdf_xml, xml_document
-    from modelserver.formats.spelling import label
+    from modelserver.formats import frame_tree_loader, miro_loader, urdf_loader, xml_document
+    from modelserver.formats.reading import label
 
     root = xml_document.parse(content, builder, file)
     if root is None:
         return
-    name = xml_document.tag(root)
-    first = Location(file, xml_document.line(root), f"<{label(name)}>")
+    name = xml_document.get_tag(root)
+    first = Location(file, xml_document.get_line(root), f"<{label(name)}>")
     if name == "robot":
-        urdf_xml.load(root, builder, file)
+        urdf_loader.load(root, builder, file)
         return
-    if name in _ELSEWHERE:
-        builder.error(_ELSEWHERE[name], first, "give a file in one of Miro's forms, URDF or YAML")
+    if name in _OTHER_XML:
+        builder.add_error(_OTHER_XML[name], first, "give a file in one of Miro's formats, URDF or YAML")
         return
     if next(root.iter("{*}config_group"), None) is not None:
-        builder.error(_ELSEWHERE["config_group"], first, "give the file with BodyName and ConstraintName in it")
+        builder.add_error(_OTHER_XML["config_group"], first, "give the file with BodyName and ConstraintName in it")
         return
     before = len(builder.problems)
-    if next(frame_tree_xml.instances(root), None) is not None:
-        frame_tree_xml.load(root, builder, file, variables)
-        if not miro_xml.has_bodies(root):
+    if next(frame_tree_loader.find_instances(root), None) is not None:
+        frame_tree_loader.load(root, builder, file, variables)
+        if not miro_loader.has_bodies(root):
             return
-        # one configuration may hold both; nothing is passed over in silence
-    miro_xml.load(root, builder, file)
+        # one configuration may hold both
+    miro_loader.load(root, builder, file)
     if builder.is_empty and not any(problem.severity == "error" for problem in builder.problems[before:]):
-        builder.error(
+        builder.add_error(
             "there is no geometry in this file: no parameter BodyName, no instance of type FrameRpyParameters"
             + ("" if name == "config" else f", and the outermost element is {label(name)}, not config"),
             first,
@@ -138,22 +147,25 @@ def _read_xml(content: bytes, builder: ModelBuilder, file: str, variables: Mappi
         )
 
 
-def save(model: Model, form: str) -> Saved:
-    """Return the text of `model` in one of `FORMS`, and what that form cannot hold. Raises ValueError."""
-    if form == "yaml":
-        from modelserver.formats import yaml_text
+def save_model(model: Model, file_format: str) -> SavedModel:
+    """Return the text of `model` in one of `FORMATS`, and the features that the format does not support.
 
-        return yaml_text.save(model)
-    if form == "miro":
-        from modelserver.formats import miro_text
+    Raises ValueError for an unknown format.
+    """
+    if file_format == "yaml":
+        from modelserver.formats import yaml_writer
 
-        return miro_text.save(model)
-    if form == "miro-frames":
-        from modelserver.formats import frame_tree_text
+        return yaml_writer.save(model)
+    if file_format == "miro":
+        from modelserver.formats import miro_writer
 
-        return frame_tree_text.save(model)
-    if form == "urdf":
-        from modelserver.formats import urdf_text
+        return miro_writer.save(model)
+    if file_format == "miro-frames":
+        from modelserver.formats import frame_tree_writer
 
-        return urdf_text.save(model)
-    raise ValueError(f"{shown(form)} is no form; forms are {', '.join(FORMS)}")
+        return frame_tree_writer.save(model)
+    if file_format == "urdf":
+        from modelserver.formats import urdf_writer
+
+        return urdf_writer.save(model)
+    raise ValueError(f"{quote(file_format)} is not a format; formats are {', '.join(FORMATS)}")

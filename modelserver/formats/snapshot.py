@@ -1,4 +1,4 @@
-"""The geometry as it goes over the bus: all that a mirror needs to answer by itself. Bytes to values and back."""
+"""Encode the geometry as a message, with all that a mirror needs to answer queries by itself (model_snapshot_t)."""
 
 from __future__ import annotations
 
@@ -7,19 +7,17 @@ import zlib
 from dataclasses import dataclass
 
 from modelserver.errors import GeometryError, WireError
-from modelserver.formats import parse_model, yaml_text
+from modelserver.formats import parse_model
+from modelserver.formats.yaml_writer import save
 from modelserver.geometry.model import Model
 
 MAX_BYTES = 64 << 20
-"""Of the text that a snapshot may unpack to: more is an attack, not a vehicle."""
+"""Greatest size of a decompressed snapshot."""
 
 
 @dataclass(frozen=True, slots=True)
 class ModelSnapshot:
-    """A vehicle's geometry, and what else a mirror of the service has to know. See model_snapshot_t.
-
-    `joints_latency_us`: microseconds by which the stamps on that channel are later than the measurement.
-    """
+    """The geometry of a vehicle, and the settings that a mirror of the service needs."""
 
     vehicle: str
     model: Model
@@ -28,10 +26,11 @@ class ModelSnapshot:
     history_s: float
     joints_channel: str
     joints_latency_us: int = 0
+    """Microseconds by which the stamps on `joints_channel` are later than the measurement."""
 
 
-def written(snapshot: ModelSnapshot) -> bytes:
-    """Return the bytes of a snapshot: a zlib stream of JSON."""
+def encode_snapshot(snapshot: ModelSnapshot) -> bytes:
+    """Encode a snapshot as a zlib stream of JSON."""
     content = {
         "vehicle": snapshot.vehicle,
         "base_frame": snapshot.base_frame,
@@ -40,18 +39,18 @@ def written(snapshot: ModelSnapshot) -> bytes:
         "joints_channel": snapshot.joints_channel,
         "joints_latency_us": snapshot.joints_latency_us,
         "revision": snapshot.model.revision,
-        "geometry": yaml_text.save(snapshot.model, exact=True).text,
+        "geometry": save(snapshot.model, exact=True).text,
     }
     return zlib.compress(json.dumps(content, ensure_ascii=False).encode(), 9)
 
 
-def read(data: bytes) -> ModelSnapshot:
-    """Return the snapshot in its bytes. Raises WireError where they are none, or the geometry is not what it says."""
+def decode_snapshot(data: bytes) -> ModelSnapshot:
+    """Decode a snapshot. Raises WireError for other bytes, or a geometry of another revision."""
     unpacker = zlib.decompressobj()
     try:
         text = unpacker.decompress(data, MAX_BYTES)
         if unpacker.unconsumed_tail:
-            raise WireError("malformed", f"a snapshot unpacks to more than {MAX_BYTES} bytes")
+            raise WireError("malformed", f"a snapshot decompresses to more than {MAX_BYTES} bytes")
         content = json.loads(text)
         model = parse_model(content["geometry"].encode(), "the service's snapshot")
         snapshot = ModelSnapshot(
@@ -65,7 +64,7 @@ def read(data: bytes) -> ModelSnapshot:
         )
         revision = str(content["revision"])
     except (zlib.error, ValueError, KeyError, TypeError, AttributeError, RecursionError, GeometryError) as error:
-        raise WireError("malformed", f"no snapshot of a geometry: {error}") from None
+        raise WireError("malformed", f"not a snapshot of a geometry: {error}") from None
     if model.revision != revision:
-        raise WireError("malformed", f"the snapshot says revision {revision}, and what it holds is {model.revision}")
+        raise WireError("malformed", f"the snapshot states revision {revision}, but its geometry has {model.revision}")
     return snapshot

@@ -1,7 +1,8 @@
-"""Joints as the YAML form writes them: `joint: floating`, or a mapping with type, axis, limits and so on.
+"""Read joints of the YAML format: `joint: floating`, or a mapping with type, axis, limits and so on.
 
-A key that ends in `_deg` is in degrees, without it in metres and radians, as `rpy_deg` and `rpy` are. A joint with one
-coordinate has plain values; one with several has a mapping by coordinate, `limits: {x: [-1, 1], turn_deg: [-90, 90]}`.
+A key that ends in `_deg` is in degrees, one without it in meters and radians, as `rpy_deg` and `rpy` are. A joint with
+one coordinate has plain values; one with several has a mapping by coordinate: `limits: {x: [-1, 1], turn_deg: [-90,
+90]}`.
 """
 
 from __future__ import annotations
@@ -9,51 +10,50 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from modelserver.errors import shown, suggestions
-from modelserver.formats import numbers
-from modelserver.formats.yaml_nodes import NodeKind, YamlNode
-from modelserver.formats.yaml_reader import NodeReader
-from modelserver.geometry.joint import AXIAL, FIXED, SUFFIXES, Joint, JointType, Mimic
-from modelserver.spatial.so3 import Vector3
+from modelserver.errors import quote, suggest_name
+from modelserver.formats.reading import MAX_POSITION
+from modelserver.formats.yaml_nodes import NodeKind, NodeReader, YamlNode
+from modelserver.geometry.joint import FIXED, SUFFIXES, TYPES_WITH_AXIS, Joint, JointType, Mimic
+from modelserver.transforms.so3 import Vector3
 
 _QUANTITIES = ("limits", "rate_limit", "default", "sigma")
 _KEYS = ("type", "axis", *(f"{key}{unit}" for key in _QUANTITIES for unit in ("", "_deg")), "mimic")
-_TYPES = tuple(str(each) for each in JointType)
+_JOINT_TYPES = tuple(str(each) for each in JointType)
 _INFINITE = {".inf": math.inf, "+.inf": math.inf, "-.inf": -math.inf}
 
 _Values = tuple[float, ...]
 _Read = Callable[[YamlNode, str, bool], _Values | None]
-"""Reads what stands at a key, given the key and whether it is in degrees; None where it is wrong, which is reported."""
+"""Reads the value of a key, given the key and whether it is in degrees; None, with an error, if it is wrong."""
 
 
 def read_joint(reader: NodeReader, node: YamlNode, place: str) -> Joint | None:
-    """Return the joint that a constraint states, None where it is wrong, which is reported."""
+    """Read the joint of a constraint; None, with an error, if it is wrong."""
     if node.kind is not NodeKind.MAPPING:
-        kind = _type(reader, node, place, "joint")
+        kind = _read_type(reader, node, place, "joint")
         fields: dict[str, YamlNode] = {}
     else:
         place = f"{place}, joint"
-        fields = reader.fields(node, place, _KEYS)
+        fields = reader.read_fields(node, place, _KEYS)
         if "type" not in fields:
-            reader.error("type is missing", node, place, f"add type: with one of {', '.join(_TYPES)}")
+            reader.error("type is missing", node, place, f"add type: with one of {', '.join(_JOINT_TYPES)}")
             return None
-        kind = _type(reader, fields["type"], place, "type")
-    return None if kind is None else _Joint(reader, node, place, kind, fields).read()
+        kind = _read_type(reader, fields["type"], place, "type")
+    return None if kind is None else _YamlJointReader(reader, node, place, kind, fields).read()
 
 
-def _type(reader: NodeReader, node: YamlNode, place: str, key: str) -> JointType | None:
-    text = reader.text(node, place, key)
+def _read_type(reader: NodeReader, node: YamlNode, place: str, key: str) -> JointType | None:
+    text = reader.read_text(node, place, key)
     if node.kind is not NodeKind.SCALAR:
         return None
-    if text in _TYPES:
+    if text in _JOINT_TYPES:
         return JointType(text)
-    near = suggestions(text, _TYPES)
-    fix = f"write {key}: {near[0]}" if near else f"joints are {', '.join(_TYPES)}"
-    reader.error(f"there is no joint {shown(text)}", node, place, fix, near)
+    near = suggest_name(text, _JOINT_TYPES)
+    fix = f"write {key}: {near[0]}" if near else f"joints are {', '.join(_JOINT_TYPES)}"
+    reader.error(f"there is no joint {quote(text)}", node, place, fix, near)
     return None
 
 
-class _Joint:
+class _YamlJointReader:
     def __init__(self, reader: NodeReader, node: YamlNode, place: str, kind: JointType, fields: dict[str, YamlNode]):
         self.reader = reader
         self.node = node
@@ -61,27 +61,27 @@ class _Joint:
         self.kind = kind
         self.fields = fields
         self.names = [suffix.removeprefix(".") for suffix in SUFFIXES[kind]]
-        self.is_angle = dict(zip(self.names, Joint(kind).is_angle, strict=True))
-        self.wrong = False
+        self.is_angle = dict(zip(self.names, Joint(kind).angle_flags, strict=True))
+        self.has_errors = False
 
     def read(self) -> Joint | None:
         if self.kind is JointType.FIXED:
             for key, node in self.fields.items():
                 if key != "type":
                     self.error(f"{key}: a fixed joint does not move", node, f"remove {key}, or write another type")
-            return None if self.wrong else FIXED
-        axis = self.axis()
-        limits = self.quantity("limits", self.limits, (-math.inf, math.inf))
-        rates = self.quantity("rate_limit", self.not_negative, (math.inf,))
-        defaults = self.quantity("default", self.default, (0.0,))
-        sigmas = self.quantity("sigma", self.not_negative, None)
-        mimic = self.mimic()
+            return None if self.has_errors else FIXED
+        axis = self.read_axis()
+        limits = self.read_quantity("limits", self.read_limits, (-math.inf, math.inf))
+        rates = self.read_quantity("rate_limit", self.read_non_negative, (math.inf,))
+        defaults = self.read_quantity("default", self.read_default, (0.0,))
+        sigmas = self.read_quantity("sigma", self.read_non_negative, None)
+        mimic = self.read_mimic()
         for name, (value,) in defaults.items():
             low, high = limits.get(name, (-math.inf, math.inf))
             if not low - 1e-9 <= value <= high + 1e-9:
                 of = f" of {name}" if name else ""
-                self.error(f"the default{of} is out of the limits", self.given("default"), "put it within them")
-        if self.wrong:
+                self.error(f"the default{of} is out of the limits", self.find_node("default"), "put it within them")
+        if self.has_errors:
             return None
         try:
             return Joint(
@@ -99,17 +99,17 @@ class _Joint:
             return None
 
     def error(self, message: str, node: YamlNode, fix: str) -> None:
-        self.wrong = True
+        self.has_errors = True
         self.reader.error(message, node, self.place, fix)
 
-    def given(self, key: str) -> YamlNode:
-        """Return the node of a quantity that is there, in whichever unit."""
+    def find_node(self, key: str) -> YamlNode:
+        """Return the node of a quantity, in either unit; that of the joint if it is absent."""
         return self.fields.get(key) or self.fields.get(f"{key}_deg") or self.node
 
-    def axis(self) -> Vector3:
+    def read_axis(self) -> Vector3:
         up = (0.0, 0.0, 1.0)
         node = self.fields.get("axis")
-        if self.kind not in AXIAL:
+        if self.kind not in TYPES_WITH_AXIS:
             if node is not None:
                 self.error(f"a {self.kind} joint has no axis", node, "remove axis")
             return up
@@ -119,20 +119,20 @@ class _Joint:
                 fix = f"write joint: {{type: {self.kind}, axis: [0, 1, 0]}} with the direction that it {verb}"
                 self.error(f"a {self.kind} joint needs an axis", self.node, fix)
             return up
-        values = self.reader.numbers(node, 3, self.place, "axis", "")
+        values = self.reader.read_numbers(node, 3, self.place, "axis", "")
         if values is None:
-            self.wrong = True
+            self.has_errors = True
             return up
         length = math.hypot(*values)
         if not 1e-9 < length < math.inf:
-            self.error("the axis has no direction", node, "write axis: [0, 1, 0], say; its length does not matter")
+            self.error("the axis has no direction", node, "write e.g. axis: [0, 1, 0]; its length does not matter")
             return up
         return (values[0], values[1], values[2])
 
-    def quantity(self, key: str, read: _Read, left_out: _Values | None) -> dict[str, _Values]:
-        """Return what is stated under a key for each coordinate, nothing where it is not stated.
+    def read_quantity(self, key: str, read: _Read, omitted: _Values | None) -> dict[str, _Values]:
+        """Read the value of a key for each coordinate; empty if the key is absent.
 
-        A coordinate that a mapping leaves out has `left_out`; None where it may leave out none.
+        A coordinate that a mapping omits has the value `omitted`; None if it must have all.
         """
         plain, degrees = self.fields.get(key), self.fields.get(f"{key}_deg")
         if plain is None and degrees is None:
@@ -141,29 +141,31 @@ class _Joint:
             self.error(f"{key} and {key}_deg are both given", degrees, "keep one of the two")
             return {}
         if len(self.names) == 1:
-            return self.single(key, plain, degrees, read)
+            return self.read_single(key, plain, degrees, read)
         if degrees is not None:
             first = next(name for name, angle in self.is_angle.items() if angle)
             fix = f"write {key}: {{{first}_deg: ...}}, by coordinate"
             self.error(f"{key}_deg: a {self.kind} joint has several coordinates", degrees, fix)
             return {}
         assert plain is not None
-        return self.several(key, plain, read, left_out)
+        return self.read_by_coordinate(key, plain, read, omitted)
 
-    def single(self, key: str, plain: YamlNode | None, degrees: YamlNode | None, read: _Read) -> dict[str, _Values]:
+    def read_single(
+        self, key: str, plain: YamlNode | None, degrees: YamlNode | None, read: _Read
+    ) -> dict[str, _Values]:
         if degrees is not None and not self.is_angle[""]:
-            self.error(f"{key}_deg: a {self.kind} joint moves in metres", degrees, f"write {key}: in metres")
+            self.error(f"{key}_deg: a {self.kind} joint moves in meters", degrees, f"write {key}: in meters")
             return {}
         value = None
         if degrees is not None:
             value = read(degrees, f"{key}_deg", True)
         elif plain is not None:
             value = read(plain, key, False)
-        self.wrong |= value is None
+        self.has_errors |= value is None
         return {} if value is None else {"": value}
 
-    def several(self, key: str, node: YamlNode, read: _Read, left_out: _Values | None) -> dict[str, _Values]:
-        keys = self.coordinate_keys()
+    def read_by_coordinate(self, key: str, node: YamlNode, read: _Read, omitted: _Values | None) -> dict[str, _Values]:
+        keys = self.list_coordinate_keys()
         if node.kind is not NodeKind.MAPPING:
             example = ", ".join(f"{each}: ..." for each in list(keys)[: len(self.names)])
             self.error(
@@ -173,50 +175,50 @@ class _Joint:
             )
             return {}
         before = len(self.reader.builder.problems)
-        fields = self.reader.fields(node, f"{self.place}, {key}", tuple(keys))
-        self.wrong |= len(self.reader.builder.problems) > before
+        fields = self.reader.read_fields(node, f"{self.place}, {key}", tuple(keys))
+        self.has_errors |= len(self.reader.builder.problems) > before
         found: dict[str, _Values] = {}
         for each, inside in fields.items():
             name, is_degrees = keys[each]
             if is_degrees and not self.is_angle[name]:
-                self.error(f"{key}: {each} is a length, not an angle", inside, f"write {name}: in metres")
+                self.error(f"{key}: {each} is a length, not an angle", inside, f"write {name}: in meters")
             elif name in found:
                 self.error(f"{name} and {name}_deg are both given", inside, "keep one of the two")
             value = read(inside, each, is_degrees)
-            self.wrong |= value is None
-            found[name] = value or left_out or ()
+            self.has_errors |= value is None
+            found[name] = value or omitted or ()
         missing = [name for name in self.names if name not in found]
-        if missing and left_out is None:
+        if missing and omitted is None:
             self.error(f"{key} does not state {', '.join(missing)}", node, "state it of each coordinate; 0 is exact")
-        return {name: found.get(name, left_out or ()) for name in self.names}
+        return {name: found.get(name, omitted or ()) for name in self.names}
 
-    def coordinate_keys(self) -> dict[str, tuple[str, bool]]:
-        """Return each key that a mapping by coordinate may have, with the coordinate, and whether it is in degrees.
+    def list_coordinate_keys(self) -> dict[str, tuple[str, bool]]:
+        """Return the keys of a mapping by coordinate, each with the coordinate and whether it is in degrees.
 
-        What a person would write comes first. Lengths in degrees are in it for an error of their own.
+        The usual keys come first. Lengths in degrees are included for an error of their own.
         """
         keys = {f"{name}_deg" if angle else name: (name, angle) for name, angle in self.is_angle.items()}
         keys |= {name: (name, False) for name in self.names}
         return keys | {f"{name}_deg": (name, True) for name in self.names}
 
-    def name_of(self, node: YamlNode, key: str) -> str:
-        """Return the name of the joint that this one follows, empty with an error where there is none."""
-        name = self.reader.text(node, self.place, key)
+    def read_joint_name(self, node: YamlNode, key: str) -> str:
+        """Return the name of the joint that this one follows; empty, with an error, if there is none."""
+        name = self.reader.read_text(node, self.place, key)
         if node.kind is NodeKind.SCALAR and not name:
             self.error(f"{key} names no joint", node, f"write {key}: NAME, of another constraint")
-        self.wrong |= not name
+        self.has_errors |= not name
         return name
 
-    def limits(self, node: YamlNode, key: str, is_degrees: bool) -> _Values | None:
+    def read_limits(self, node: YamlNode, key: str, is_degrees: bool) -> _Values | None:
         fix = f"write {key}: [lower, upper]; .inf is none"
         if node.kind is not NodeKind.LIST or len(node.items) != 2:
             self.error(f"{key} is a list of 2 numbers, lower and upper", node, fix)
             return None
         pair = []
         for item in node.items:
-            value = _INFINITE.get(item.text.lower()) if item.plain else None
+            value = _INFINITE.get(item.text.lower()) if item.is_plain else None
             if value is None:
-                value = self.number(item, key, fix)
+                value = self.read_number(item, key, fix)
             if value is None:
                 return None
             pair.append(value)
@@ -226,8 +228,8 @@ class _Joint:
             return None
         return (math.radians(low), math.radians(high)) if is_degrees else (low, high)
 
-    def not_negative(self, node: YamlNode, key: str, is_degrees: bool) -> _Values | None:
-        value = self.number(node, key, f"write {key}: number")
+    def read_non_negative(self, node: YamlNode, key: str, is_degrees: bool) -> _Values | None:
+        value = self.read_number(node, key, f"write {key}: number")
         if value is None:
             return None
         if value < 0.0:
@@ -235,20 +237,20 @@ class _Joint:
             return None
         return (math.radians(value) if is_degrees else value,)
 
-    def default(self, node: YamlNode, key: str, is_degrees: bool) -> _Values | None:
-        value = self.number(node, key, f"write {key}: number")
+    def read_default(self, node: YamlNode, key: str, is_degrees: bool) -> _Values | None:
+        value = self.read_number(node, key, f"write {key}: number")
         return None if value is None else (math.radians(value) if is_degrees else value,)
 
-    def number(self, node: YamlNode, key: str, fix: str) -> float | None:
-        """Return one number that can be computed with."""
-        value = self.reader.number(node, self.place, key, fix)
-        if value is not None and abs(value) > numbers.GREATEST_LENGTH:
-            self.error(f"{key}: {value:g} is out of reach; the limit is {numbers.GREATEST_LENGTH:g}", node, fix)
+    def read_number(self, node: YamlNode, key: str, fix: str) -> float | None:
+        """Read one number that is not too large."""
+        value = self.reader.read_number(node, self.place, key, fix)
+        if value is not None and abs(value) > MAX_POSITION:
+            self.error(f"{key}: {value:g} is out of reach; the limit is {MAX_POSITION:g}", node, fix)
             return None
-        self.wrong |= value is None
+        self.has_errors |= value is None
         return value
 
-    def mimic(self) -> Mimic | None:
+    def read_mimic(self) -> Mimic | None:
         node = self.fields.get("mimic")
         if node is None:
             return None
@@ -257,16 +259,16 @@ class _Joint:
             self.error(f"a {self.kind} joint has several coordinates and cannot follow another", node, fix)
             return None
         if node.kind is not NodeKind.MAPPING:
-            name = self.name_of(node, "mimic")
+            name = self.read_joint_name(node, "mimic")
             return Mimic(name) if name else None
         place = f"{self.place}, mimic"
         before = len(self.reader.builder.problems)
-        fields = self.reader.fields(node, place, ("joint", "multiplier", "offset", "offset_deg"))
-        self.wrong |= len(self.reader.builder.problems) > before
-        name = self.name_of(fields["joint"], "joint") if "joint" in fields else ""
+        fields = self.reader.read_fields(node, place, ("joint", "multiplier", "offset", "offset_deg"))
+        self.has_errors |= len(self.reader.builder.problems) > before
+        name = self.read_joint_name(fields["joint"], "joint") if "joint" in fields else ""
         if "joint" not in fields:
-            self.error("mimic does not say which joint it follows", node, "write mimic: {joint: NAME}")
-        numbers_ = {key: self.number(fields[key], key, f"write {key}: number") for key in fields if key != "joint"}
+            self.error("mimic does not name the joint that it follows", node, "write mimic: {joint: NAME}")
+        numbers_ = {key: self.read_number(fields[key], key, f"write {key}: number") for key in fields if key != "joint"}
         multiplier, offset = numbers_.get("multiplier", 1.0), numbers_.get("offset", 0.0)
         if "offset_deg" in fields:
             degrees = numbers_["offset_deg"]
@@ -274,8 +276,8 @@ class _Joint:
             if "offset" in fields:
                 self.error("offset and offset_deg are both given", fields["offset_deg"], "keep one of the two")
             elif not self.is_angle[""]:
-                fix = "write offset: in metres"
-                self.error(f"offset_deg: a {self.kind} joint moves in metres", fields["offset_deg"], fix)
+                fix = "write offset: in meters"
+                self.error(f"offset_deg: a {self.kind} joint moves in meters", fields["offset_deg"], fix)
         if not name or multiplier is None or offset is None:
             return None
         return Mimic(name, multiplier, offset)

@@ -1,9 +1,11 @@
-"""YAML text as a tree of nodes that know their lines.
+"""YAML text as a tree of nodes with their lines, and typed reading of the nodes.
 
-PyYAML's composer calls itself for each level, in C, so that a few kilobytes of brackets end the process; its
-events do not. The tree is built from them with a bounded depth, a bounded size counted with aliases written out
-(so an alias bomb is refused where it is laid), and without tags: what a scalar means is decided by the key it
-stands at, so a frame may be called `on`, `12` or `null`.
+PyYAML's composer is recursive in C, so a few kilobytes of brackets would end the process; its events are not. The tree
+is built from them with bounded depth and bounded size. The size counts the nodes of each alias again, so an alias bomb
+is rejected at the alias that exceeds it. Tags are rejected: the key decides what a scalar means, so a frame may be
+named `on`, `12` or `null`.
+
+Each method of `NodeReader` returns a value, or None with a problem at the line of the node.
 """
 
 from __future__ import annotations
@@ -15,20 +17,21 @@ from typing import Any
 
 import yaml
 
-from modelserver.errors import Location
+from modelserver.errors import Location, quote
+from modelserver.formats.reading import parse_number, suggest_known_key
 from modelserver.geometry.builder import ModelBuilder
 
-GREATEST_DEPTH = 20
-"""No form of geometry nests deeper than 8."""
+MAX_DEPTH = 20
+"""No geometry file is nested deeper than 8."""
 
-GREATEST_SIZE = 4_000_000
-"""Nodes with aliases written out; 10,000 frames have about 130,000."""
+MAX_NODES = 4_000_000
+"""Nodes, aliases expanded; 10,000 frames have about 130,000."""
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class NodeKind(Enum):
-    """What a node is."""
+    """Type of a node; the value is the text of messages."""
 
     SCALAR = "a single value"
     LIST = "a list"
@@ -36,71 +39,71 @@ class NodeKind(Enum):
 
 
 class YamlNode:
-    """A value with its line. `text` is a scalar's, `items` a list's, `pairs` a mapping's, in order.
+    """A value with its line: `text` of a scalar, `items` of a list, `pairs` of a mapping, in order.
 
-    `plain` is true for a scalar without quotes; `size` counts the nodes in it, aliases written out.
+    `is_plain` is true for a scalar without quotes; `size` counts its nodes, aliases expanded.
     """
 
-    __slots__ = ("items", "kind", "line", "pairs", "plain", "size", "text")
+    __slots__ = ("is_plain", "items", "kind", "line", "pairs", "size", "text")
 
-    def __init__(self, kind: NodeKind, line: int, text: str = "", plain: bool = False):
+    def __init__(self, kind: NodeKind, line: int, text: str = "", is_plain: bool = False):
         self.kind = kind
         self.line = line
         self.text = text
-        self.plain = plain
+        self.is_plain = is_plain
         self.size = 1
-        # most nodes are scalars: empty lists of their own would double what the garbage collector walks
+        # most nodes are scalars: an empty list for each would double the work of the garbage collector
         self.items: list[YamlNode] = [] if kind is NodeKind.LIST else _NO_ITEMS
         self.pairs: list[tuple[YamlNode, YamlNode]] = [] if kind is NodeKind.MAPPING else _NO_PAIRS
 
     @property
-    def is_nothing(self) -> bool:
-        """Whether it is an empty value, `~` or `null` without quotes."""
-        return self.kind is NodeKind.SCALAR and self.plain and self.text in ("", "~", "null", "Null", "NULL")
+    def is_null(self) -> bool:
+        """Whether the value is empty, `~` or `null` without quotes."""
+        return self.kind is NodeKind.SCALAR and self.is_plain and self.text in ("", "~", "null", "Null", "NULL")
 
 
 _NO_ITEMS: list[YamlNode] = []
 _NO_PAIRS: list[tuple[YamlNode, YamlNode]] = []
 
 
-class _RefusedError(Exception):
+class _RejectedYamlError(Exception):
     def __init__(self, message: str, line: int, fix: str):
         super().__init__(message)
         self.line = line
         self.fix = fix
 
 
-def parse(content: bytes, builder: ModelBuilder, file: str) -> YamlNode | None:
-    """Return the one document in `content`, or None with the problem added to `builder`."""
+def parse_yaml(content: bytes, builder: ModelBuilder, file: str) -> YamlNode | None:
+    """Parse the one document in `content`; None, with an error in `builder`, if it is not YAML."""
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
-        builder.error(
+        builder.add_error(
             f"the file is not UTF-8 text: byte {content[error.start]:#04x} in this line",
             Location(file, line),
-            "save it as UTF-8; if it is no text at all, it is not a geometry file",
+            "save it as UTF-8; a binary file is not a geometry file",
         )
         return None
     try:
-        return _Builder().build(text)
-    except _RefusedError as error:
-        builder.error(str(error), Location(file, error.line), error.fix)
+        return _NodeBuilder().build(text)
+    except _RejectedYamlError as error:
+        builder.add_error(str(error), Location(file, error.line), error.fix)
     except yaml.MarkedYAMLError as error:
         _report_syntax(error, text, builder, file)
     except yaml.reader.ReaderError as error:
         place = error.position if isinstance(error.position, int) else 0
-        builder.error(
-            f"the file holds a character that YAML forbids: {_character(error.character)}",
+        builder.add_error(
+            f"the file holds a character that YAML forbids: {_format_character(error.character)}",
             Location(file, text.count("\n", 0, place) + 1),
-            "remove it; if the file is no text at all, it is not a geometry file",
+            "remove it; a binary file is not a geometry file",
         )
     except yaml.YAMLError as error:
-        builder.error(f"the YAML cannot be read: {error}", Location(file), "write it as in docs/geometry-files.md")
+        builder.add_error(f"the YAML cannot be read: {error}", Location(file), "write it as in docs/geometry-files.md")
     return None
 
 
-def _character(value: object) -> str:
+def _format_character(value: object) -> str:
     code = ord(value) if isinstance(value, str) and len(value) == 1 else value
     return f"#x{code:04x}" if isinstance(code, int) else repr(value)
 
@@ -111,21 +114,21 @@ def _report_syntax(error: yaml.MarkedYAMLError, text: str, builder: ModelBuilder
     lines = text.split("\n")
     indent = re.match(r"[ ]*(\t)?", lines[number - 1]) if 0 < number <= len(lines) else None
     if indent is not None and indent[1]:
-        builder.error(
+        builder.add_error(
             "the line is indented with a tab, which YAML forbids",
             Location(file, number),
             "write spaces instead of tabs",
         )
         return
     context = f" {error.context}" if error.context else ""
-    builder.error(
+    builder.add_error(
         f"the YAML is not well-formed: {error.problem or 'unreadable'}{context}",
         Location(file, number),
         "look at this line and the one before: a missing colon, bracket or quote, or a wrong indentation",
     )
 
 
-class _Builder:
+class _NodeBuilder:
     def __init__(self) -> None:
         self.anchors: dict[str, YamlNode] = {}
         self.total = 0
@@ -133,28 +136,28 @@ class _Builder:
     def build(self, text: str) -> YamlNode:
         root: YamlNode | None = None
         open_nodes: list[tuple[YamlNode, str | None, YamlNode | None]] = []
-        """Containers not yet closed: node, its anchor, and for a mapping the key that waits for its value."""
+        """Open containers: node, its anchor, and for a mapping the key whose value is next."""
         events: Iterator[Any] = yaml.parse(text, Loader=_LOADER)
         for event in events:
             kind = type(event)
             if kind is yaml.ScalarEvent:
                 line = event.start_mark.line + 1
                 if event.tag is not None:
-                    self.untagged(event.tag, line)
+                    self.reject_tag(event.tag, line)
                 node = YamlNode(NodeKind.SCALAR, line, event.value, not event.style)
-                self.count(1, line)
+                self.add_size(1, line)
                 if event.anchor:
                     self.anchors[event.anchor] = node
             elif kind is yaml.MappingStartEvent or kind is yaml.SequenceStartEvent:
                 line = event.start_mark.line + 1
-                self.untagged(event.tag, line)
-                if len(open_nodes) >= GREATEST_DEPTH:
-                    raise _RefusedError(
-                        f"the file nests deeper than {GREATEST_DEPTH} levels",
+                self.reject_tag(event.tag, line)
+                if len(open_nodes) >= MAX_DEPTH:
+                    raise _RejectedYamlError(
+                        f"the file nests deeper than {MAX_DEPTH} levels",
                         line,
-                        "no form of geometry needs that; look for brackets that are not closed",
+                        "no geometry needs that; look for brackets that are not closed",
                     )
-                self.count(1, line)
+                self.add_size(1, line)
                 container = YamlNode(NodeKind.MAPPING if kind is yaml.MappingStartEvent else NodeKind.LIST, line)
                 open_nodes.append((container, event.anchor, None))
                 continue
@@ -163,9 +166,9 @@ class _Builder:
                 if anchor:
                     self.anchors[anchor] = node
             elif kind is yaml.AliasEvent:
-                node = self.alias(event.anchor, event.start_mark.line + 1)
+                node = self.resolve_alias(event.anchor, event.start_mark.line + 1)
             elif kind is yaml.DocumentStartEvent and root is not None:
-                raise _RefusedError(
+                raise _RejectedYamlError(
                     "a second document begins here", event.start_mark.line + 1, "keep one model in a file; remove ---"
                 )
             else:
@@ -182,29 +185,160 @@ class _Builder:
             else:
                 parent.pairs.append((key, node))
                 open_nodes[-1] = (parent, anchor, None)
-        return root or YamlNode(NodeKind.SCALAR, 1, "", plain=True)
+        return root or YamlNode(NodeKind.SCALAR, 1, "", is_plain=True)
 
-    def count(self, size: int, line: int) -> None:
+    def add_size(self, size: int, line: int) -> None:
         self.total += size
-        if self.total > GREATEST_SIZE:
-            raise _RefusedError(
-                f"the file, with its aliases written out, holds more than {GREATEST_SIZE} values",
+        if self.total > MAX_NODES:
+            raise _RejectedYamlError(
+                f"the file, with its aliases expanded, holds more than {MAX_NODES} values",
                 line,
                 "split it, or use a template instead of aliases within aliases",
             )
 
-    def alias(self, anchor: str, line: int) -> YamlNode:
+    def resolve_alias(self, anchor: str, line: int) -> YamlNode:
         node = self.anchors.get(anchor)
         if node is None:
-            raise _RefusedError(
-                f"alias *{anchor} has no anchor &{anchor} before it that is complete",
+            raise _RejectedYamlError(
+                f"alias *{anchor} has no complete anchor &{anchor} before it",
                 line,
                 "write the anchor first; a value cannot hold itself",
             )
-        self.count(node.size, line)
+        self.add_size(node.size, line)
         return node
 
     @staticmethod
-    def untagged(tag: str | None, line: int) -> None:
+    def reject_tag(tag: str | None, line: int) -> None:
         if tag not in (None, "!"):
-            raise _RefusedError(f"the tag {tag} has no meaning here", line, "remove it")
+            raise _RejectedYamlError(f"the tag {tag} has no meaning here", line, "remove it")
+
+
+class NodeReader:
+    """Reads nodes of one file into plain values; `place` names the element for problems, e.g. `body Raptor`."""
+
+    def __init__(self, builder: ModelBuilder, file: str):
+        self.builder = builder
+        self.file = file
+
+    def locate(self, node: YamlNode, place: str) -> Location:
+        """Return the place of a node."""
+        return Location(self.file, node.line, place)
+
+    def error(self, message: str, node: YamlNode, place: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
+        """Report an error at a node."""
+        self.builder.add_error(message, Location(self.file, node.line, place), fix, nearest)
+
+    def read_fields(self, node: YamlNode, place: str, known: tuple[str, ...]) -> dict[str, YamlNode]:
+        """Return the values of a mapping by key, without null values; unknown and duplicate keys are errors.
+
+        The value of a misspelled key is returned under the key that is meant: it is examined, and not missing.
+        """
+        found: dict[str, YamlNode] = {}
+        first: dict[str, int] = {}
+        pairs = self.read_pairs(node, place)
+        given = {name for name, _, _ in pairs}
+        for name, key, value in pairs:
+            if name not in known:
+                # a key that is present already is not what was meant
+                near = suggest_known_key(name, tuple(each for each in known if each not in given))
+                self.error(
+                    f"unknown key {quote(name)}",
+                    key,
+                    place,
+                    f"write {near[0]}" if near else f"keys here are {', '.join(known)}",
+                    near,
+                )
+                if near and not value.is_null:
+                    found.setdefault(near[0], value)
+            elif name in first:
+                self.error(f"{name} is given twice (first on line {first[name]})", key, place, "remove one of the two")
+            else:
+                first[name] = key.line
+                if not value.is_null:
+                    found[name] = value
+        return found
+
+    def read_pairs(self, node: YamlNode, place: str) -> list[tuple[str, YamlNode, YamlNode]]:
+        """Return key text, key and value of each pair of a mapping, in order."""
+        if node.is_null:
+            return []
+        if node.kind is not NodeKind.MAPPING:
+            what = node.kind.value
+            self.error(f"expected a mapping (key: value), got {what}", node, place, "write key: value, one per line")
+            return []
+        pairs = []
+        for key, value in node.pairs:
+            if key.kind is not NodeKind.SCALAR:
+                self.error(f"a key is a name, got {key.kind.value}", key, place, "write name: value")
+            elif key.text == "<<" and key.is_plain:
+                self.error("merge keys (<<) are not supported", key, place, "use templates; see docs/geometry-files.md")
+            else:
+                pairs.append((key.text.strip(), key, value))
+        return pairs
+
+    def read_text(self, node: YamlNode | None, place: str, key: str) -> str:
+        """Return the trimmed text of a scalar, empty if it is absent or wrong."""
+        if node is None:
+            return ""
+        if node.kind is not NodeKind.SCALAR:
+            self.error(
+                f"{key} is a text, got {node.kind.value}", node, place, f"write {key}: some text, in quotes if need be"
+            )
+            return ""
+        return node.text.strip()
+
+    def read_numbers(self, node: YamlNode, count: int, place: str, key: str, unit: str) -> list[float] | None:
+        """Read a list of `count` numbers."""
+        fix = f"write {key}: [{', '.join(['number'] * count)}]" + (f", in {unit}" if unit else "")
+        if node.kind is not NodeKind.LIST:
+            got = quote(node.text, 40) if node.kind is NodeKind.SCALAR else node.kind.value
+            self.error(f"{key} is a list of {count} numbers, got {got}", node, place, fix)
+            return None
+        values = []
+        wrong = False
+        for item in node.items:
+            value = self.read_number(item, place, key, fix)
+            if value is None:
+                wrong = True
+            else:
+                values.append(value)
+        if wrong:
+            return None
+        if len(values) != count:
+            plural = "" if len(values) == 1 else "s"
+            self.error(f"{key} has {len(values)} number{plural}, not {count}", node, place, fix)
+            return None
+        return values
+
+    def read_number(self, node: YamlNode, place: str, key: str, fix: str) -> float | None:
+        """Read one number."""
+        if node.kind is not NodeKind.SCALAR:
+            self.error(f"{key}: expected a number, got {node.kind.value}", node, place, fix)
+            return None
+        try:
+            if not node.is_plain:
+                raise ValueError(f"{quote(node.text, 40)} is a text in quotes, not a number")
+            return parse_number(node.text)
+        except ValueError as error:
+            self.error(f"{key}: {error}", node, place, fix)
+            return None
+
+    def read_rows(
+        self, node: YamlNode, shapes: tuple[int, ...], width: int, place: str, key: str
+    ) -> list[list[float]] | None:
+        """Read rows of `width` numbers; their count is one of `shapes`."""
+        wanted = " or ".join(str(shape) for shape in shapes)
+        fix = f"write {key}: [[...], ...] with {wanted} rows of {width} numbers"
+        if node.kind is not NodeKind.LIST:
+            self.error(f"{key} is a list of rows, got {node.kind.value}", node, place, fix)
+            return None
+        if len(node.items) not in shapes:
+            self.error(f"{key} has {len(node.items)} rows, not {wanted}", node, place, fix)
+            return None
+        rows = [
+            self.read_numbers(item, width, place, f"{key} row {number}", "")
+            for number, item in enumerate(node.items, 1)
+        ]
+        if any(row is None for row in rows):
+            return None
+        return [row for row in rows if row is not None]

@@ -1,4 +1,4 @@
-"""The rules of joints among each other: coordinates with names of their own, and who may follow whom."""
+"""Rules between joints: unique coordinate names, valid mimic chains, plausible positions."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ import math
 from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
-from modelserver.errors import Location, shown, suggestions
-from modelserver.geometry.drives import at_rest, drives, followed
+from modelserver.errors import Location, quote, suggest_name
 from modelserver.geometry.joint import Joint, coordinate_names
+from modelserver.geometry.mimic import apply_mimic_defaults, find_mimic_chain, resolve_mimics
+from modelserver.geometry.names import MAX_LISTED, format_first_location, format_names
 from modelserver.geometry.parts import Constraint
-from modelserver.geometry.wording import LISTED, few, first_at
 
-Placed = tuple[Constraint, Location]
-"""A constraint and where it came from."""
-
-
-REACH = 1e9
-"""Metres or radians; what rests beyond would lose the millimetres of everything else."""
+LocatedConstraint = tuple[Constraint, Location]
+"""A constraint and its source location."""
 
 
-MOST_TURNED = 2.0 * math.tau
-"""Radians; an angle beyond two turns is rather one in degrees."""
+MAX_POSITION = 1e9
+"""Meters or radians; a default position beyond would cost the precision of millimeters."""
+
+
+MAX_ANGLE = 2.0 * math.tau
+"""Radians; an angle beyond two turns is probably one in degrees."""
 
 
 class JointProblem(NamedTuple):
-    """What is wrong with a joint, where, and what to do."""
+    """A problem of a joint: message, location and fix."""
 
     message: str
     source: Location
@@ -34,134 +34,138 @@ class JointProblem(NamedTuple):
 
 
 class JointRules:
-    """Looks at the joints of constraints that are well formed otherwise.
+    """Checks the joints of constraints that are well formed otherwise.
 
-    `known` are the names of all constraints of the file: what follows one that was refused is not refused again.
-    `unclear` are those whose joint could not be read.
-    `kept` are those left when the faulty are dropped, with each that follows another settled where its leader's rest
-    takes it. With `repair` what followed one that was dropped is dropped as well, and reported.
+    `known` are the names of all constraints of the file: a follower of a rejected joint is not reported again.
+    `unclear` are those whose joint could not be read. `constraints` are those left when the invalid ones are dropped,
+    with the defaults of mimic joints applied. With `repair` the followers of a dropped joint are dropped as well, and
+    reported.
     """
 
     def __init__(
-        self, placed: Sequence[Placed], known: Iterable[str], unclear: Collection[str] = (), repair: bool = False
+        self,
+        placed: Sequence[LocatedConstraint],
+        known: Iterable[str],
+        unclear: Collection[str] = (),
+        repair: bool = False,
     ):
-        self.faults: list[JointProblem] = []
+        self.problems: list[JointProblem] = []
         self.warnings: list[JointProblem] = []
         self._known = set(known)
         self._unclear = unclear
         self._repair = repair
-        kept = self._with_names_of_their_own(placed)
-        while refused := self._refused(kept):
-            kept = [each for each in kept if each[0].name not in refused]
-        self.kept = self._settled(kept)
+        valid = self._drop_duplicate_coordinates(placed)
+        while rejected := self._find_invalid_mimics(valid):
+            valid = [each for each in valid if each[0].name not in rejected]
+        self.constraints = self._apply_defaults(valid)
 
-    def _with_names_of_their_own(self, placed: Sequence[Placed]) -> list[Placed]:
-        kept: list[Placed] = []
-        taken: dict[str, Placed] = {}
+    def _drop_duplicate_coordinates(self, placed: Sequence[LocatedConstraint]) -> list[LocatedConstraint]:
+        valid: list[LocatedConstraint] = []
+        taken: dict[str, LocatedConstraint] = {}
         for constraint, source in placed:
             mine = coordinate_names(constraint.name, constraint.joint)
             clash = next((name for name in mine if name in taken), None)
             if clash is not None:
                 other, place = taken[clash]
-                self.faults.append(
+                self.problems.append(
                     JointProblem(
-                        f"constraint {shown(constraint.name)}: a coordinate of its joint is called {shown(clash)}, as "
-                        f"is one of constraint {other.name}{first_at(place)}",
+                        f"constraint {quote(constraint.name)}: a coordinate of its joint is called {quote(clash)}, as "
+                        f"is one of constraint {other.name}{format_first_location(place)}",
                         source,
                         "rename one of the two constraints",
                     )
                 )
                 continue
             taken.update((name, (constraint, source)) for name in mine)
-            kept.append((constraint, source))
-        return kept
+            valid.append((constraint, source))
+        return valid
 
-    def _refused(self, placed: Sequence[Placed]) -> set[str]:
-        """Return the joints that cannot follow as they should, and report each; a circle is reported once."""
-        joints = {constraint.name: constraint for constraint, _ in placed if constraint.joint.moves}
+    def _find_invalid_mimics(self, placed: Sequence[LocatedConstraint]) -> set[str]:
+        """Return the joints with invalid mimic chains, and report each; a cycle is reported once."""
+        joints = {constraint.name: constraint for constraint, _ in placed if constraint.joint.is_movable}
         present = {constraint.name for constraint, _ in placed if constraint.name not in self._unclear}
-        refused: set[str] = set()
-        sound: set[str] = set()
+        rejected: set[str] = set()
+        valid_names: set[str] = set()
         sources = {constraint.name: source for constraint, source in placed}
         for constraint, source in placed:
             mimic = constraint.joint.mimic
-            if mimic is None or constraint.name in refused or constraint.name in sound:
+            if mimic is None or constraint.name in rejected or constraint.name in valid_names:
                 continue
-            label = f"constraint {shown(constraint.name)}"
+            label = f"constraint {quote(constraint.name)}"
             leader = joints.get(mimic.joint)
             if mimic.joint == constraint.name:
-                self._refuse(f"{label}: its joint follows itself", source, "name another joint, or remove mimic")
-            elif mimic.joint in refused:
-                self._refuse_follower(constraint, source)
-            elif mimic.joint in sound:
-                sound.add(constraint.name)
+                self._report(f"{label}: its joint follows itself", source, "name another joint, or remove mimic")
+            elif mimic.joint in rejected:
+                self._report_follower(constraint, source)
+            elif mimic.joint in valid_names:
+                valid_names.add(constraint.name)
                 continue
             elif leader is not None and leader.joint.count != 1:
-                self._refuse(
+                self._report(
                     f"{label}: its joint follows {leader.name}, a {leader.joint.type} one with "
                     f"{leader.joint.count} coordinates",
                     source,
                     "follow a joint with one coordinate, revolute or prismatic",
                 )
             elif leader is not None:
-                way = followed(constraint, joints)
-                last = joints.get(way[-1])
-                if way[-1] != constraint.name:
+                chain = find_mimic_chain(constraint, joints)
+                last = joints.get(chain[-1])
+                if chain[-1] != constraint.name:
                     if last is not None and last.joint.mimic is None and last.joint.count == 1:
-                        sound.update(way)
+                        valid_names.update(chain)
                         continue
-                    # the fault is farther on, and reported there: in a circle, or at the last that follows
-                    tail = way[: way.index(way[-1])]
+                    # the problem is farther along the chain, and reported there
+                    tail = chain[: chain.index(chain[-1])]
                     for name in tail if last is not None and last.joint.mimic is not None else tail[:-1]:
-                        if name not in refused:
-                            self._refuse_follower(joints[name], sources[name])
-                            refused.add(name)
+                        if name not in rejected:
+                            self._report_follower(joints[name], sources[name])
+                            rejected.add(name)
                     continue
-                round_ = " follows ".join(way[:LISTED]) + (" follows ..." if len(way) > LISTED else "")
-                self._refuse(
-                    f"{label}: joints follow each other in a circle: {round_}",
+                cycle = " follows ".join(chain[:MAX_LISTED]) + (" follows ..." if len(chain) > MAX_LISTED else "")
+                self._report(
+                    f"{label}: joints follow each other in a cycle: {cycle}",
                     source,
                     "remove the mimic of one of them",
                 )
-                refused.update(way)
+                rejected.update(chain)
             elif mimic.joint in present:
                 fix = "follow a joint that moves, or remove mimic"
-                self._refuse(f"{label}: its joint follows {mimic.joint}, which does not move", source, fix)
+                self._report(f"{label}: its joint follows {mimic.joint}, which does not move", source, fix)
             elif mimic.joint in self._known:
-                self._refuse_follower(constraint, source)
+                self._report_follower(constraint, source)
             else:
-                near = suggestions(mimic.joint, joints)
-                self._refuse(
-                    f"{label}: its joint follows {shown(mimic.joint)}, and there is no constraint of that name",
+                near = suggest_name(mimic.joint, joints)
+                self._report(
+                    f"{label}: its joint follows {quote(mimic.joint)}, and there is no constraint of that name",
                     source,
-                    f"write {near[0]}" if near else f"joints here are: {few(list(joints))}",
+                    f"write {near[0]}" if near else f"joints here are: {format_names(list(joints))}",
                     near,
                 )
-            refused.add(constraint.name)
-        return refused
+            rejected.add(constraint.name)
+        return rejected
 
-    def _refuse_follower(self, constraint: Constraint, source: Location) -> None:
-        """Report one that follows what is dropped; where nothing is, that was complaint enough."""
+    def _report_follower(self, constraint: Constraint, source: Location) -> None:
+        """Report a follower of a dropped joint; without `repair` nothing is dropped, and the first report is enough."""
         if self._repair and constraint.joint.mimic is not None:
-            message = f"constraint {shown(constraint.name)}: its joint follows {constraint.joint.mimic.joint}"
-            self._refuse(f"{message}, which was removed", source, "mend that one")
+            message = f"constraint {quote(constraint.name)}: its joint follows {constraint.joint.mimic.joint}"
+            self._report(f"{message}, which was removed", source, "fix that one")
 
-    def _refuse(self, message: str, source: Location, fix: str, nearest: tuple[str, ...] = ()) -> None:
-        self.faults.append(JointProblem(message, source, fix, nearest))
+    def _report(self, message: str, source: Location, fix: str, nearest: tuple[str, ...] = ()) -> None:
+        self.problems.append(JointProblem(message, source, fix, nearest))
 
-    def _settled(self, placed: Sequence[Placed]) -> tuple[Placed, ...]:
-        placed = self._within_reach(placed)
-        self._warn_of_degrees(placed)
-        settled = at_rest(constraint for constraint, _ in placed)
-        for (stated, source), each in zip(placed, settled, strict=True):
+    def _apply_defaults(self, placed: Sequence[LocatedConstraint]) -> tuple[LocatedConstraint, ...]:
+        placed = self._drop_out_of_range(placed)
+        self._check_degrees(placed)
+        applied = apply_mimic_defaults(constraint for constraint, _ in placed)
+        for (stated, source), each in zip(placed, applied, strict=True):
             joint, mimic = each.joint, each.joint.mimic
             if mimic is None:
                 continue
-            label = f"constraint {shown(each.name)}"
+            label = f"constraint {quote(each.name)}"
             if stated.joint.default not in ((), joint.default):
                 self.warnings.append(
                     JointProblem(
-                        f"{label}: the default of its joint counts for nothing, for it follows {mimic.joint}",
+                        f"{label}: the default of its joint is not used, because it follows {mimic.joint}",
                         source,
                         f"remove it, or state the default of {mimic.joint}",
                     )
@@ -169,36 +173,37 @@ class JointRules:
             if stated.joint.sigma:
                 self.warnings.append(
                     JointProblem(
-                        f"{label}: the sigma of its joint counts for nothing, for it follows {mimic.joint}",
+                        f"{label}: the sigma of its joint is not used, because it follows {mimic.joint}",
                         source,
-                        f"remove it, or state the sigma of {mimic.joint}: a follower errs with its leader",
+                        f"remove it, or state the sigma of {mimic.joint}: their errors are common",
                     )
                 )
-            if joint.out_of_limits(joint.default):
+            if joint.is_out_of_limits(joint.default):
                 self.warnings.append(
                     JointProblem(
-                        f"{label}: where {mimic.joint} rests, its joint is at {_measure(joint)}, out of its limits",
+                        f"{label}: at the default of {mimic.joint}, its joint is at "
+                        f"{_format_default(joint)}, out of its limits",
                         source,
-                        "mend the multiplier or offset of mimic, the limits, or the default of the joint it follows",
+                        "fix the multiplier or offset of mimic, the limits, or the default of the joint it follows",
                     )
                 )
-        return tuple((each, source) for (_, source), each in zip(placed, settled, strict=True))
+        return tuple((each, source) for (_, source), each in zip(placed, applied, strict=True))
 
-    def _warn_of_degrees(self, placed: Sequence[Placed]) -> None:
-        """Say where angles are so large that they look like degrees written as radians."""
+    def _check_degrees(self, placed: Sequence[LocatedConstraint]) -> None:
+        """Warn of angles so large that they look like degrees written as radians."""
         for constraint, source in placed:
             joint = constraint.joint
             for key in ("lower", "upper", "default"):
                 turns = [
                     value
-                    for value, angle in zip(getattr(joint, key), joint.is_angle, strict=False)
-                    if angle and MOST_TURNED < abs(value) < math.inf
+                    for value, angle in zip(getattr(joint, key), joint.angle_flags, strict=False)
+                    if angle and MAX_ANGLE < abs(value) < math.inf
                 ]
                 if turns:
                     what = "default" if key == "default" else f"{key} limit"
                     self.warnings.append(
                         JointProblem(
-                            f"constraint {shown(constraint.name)}: the {what} of its joint is {turns[0]:.6g} rad, "
+                            f"constraint {quote(constraint.name)}: the {what} of its joint is {turns[0]:.6g} rad, "
                             f"{abs(turns[0]) / math.tau:.3g} turns",
                             source,
                             "where that is degrees, name them so (limits_deg, default_deg); a winch may turn that far",
@@ -206,27 +211,27 @@ class JointRules:
                     )
                     break
 
-    def _within_reach(self, placed: Sequence[Placed]) -> list[Placed]:
-        """Return those whose positions at rest are numbers; what follows one that is none is none either."""
-        joints = {constraint.name: constraint for constraint, _ in placed if constraint.joint.moves}
-        placed_by = drives(joints.values())
-        kept = []
+    def _drop_out_of_range(self, placed: Sequence[LocatedConstraint]) -> list[LocatedConstraint]:
+        """Return those whose default positions are in range; report the others."""
+        joints = {constraint.name: constraint for constraint, _ in placed if constraint.joint.is_movable}
+        drives = resolve_mimics(joints.values())
+        valid = []
         for constraint, source in placed:
             if constraint.joint.mimic is not None:
-                drive = placed_by[constraint.name]
-                (rest,) = joints[drive.leader].joint.rest
-                if not abs(drive.multiplier * rest + drive.offset) <= REACH:
-                    self._refuse(
-                        f"constraint {shown(constraint.name)}: following {constraint.joint.mimic.joint} takes its "
-                        "joint out of all reach",
+                drive = drives[constraint.name]
+                (leader_default,) = joints[drive.leader].joint.default_position
+                if not abs(drive.multiplier * leader_default + drive.offset) <= MAX_POSITION:
+                    self._report(
+                        f"constraint {quote(constraint.name)}: following {constraint.joint.mimic.joint} puts its "
+                        f"joint beyond {MAX_POSITION:g}",
                         source,
-                        "mend the multipliers and offsets on the way",
+                        "fix the multipliers and offsets of the mimic chain",
                     )
                     continue
-            kept.append((constraint, source))
-        return kept
+            valid.append((constraint, source))
+        return valid
 
 
-def _measure(joint: Joint) -> str:
+def _format_default(joint: Joint) -> str:
     (value,) = joint.default
-    return f"{math.degrees(value):.4g} deg" if joint.is_angle[0] else f"{value:.4g} m"
+    return f"{math.degrees(value):.4g} deg" if joint.angle_flags[0] else f"{value:.4g} m"

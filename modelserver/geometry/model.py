@@ -1,4 +1,4 @@
-"""Model: bodies and constraints as one immutable graph that answers where a frame is in another."""
+"""Model: bodies and constraints as an immutable graph that answers where a frame is in another."""
 
 from __future__ import annotations
 
@@ -16,32 +16,30 @@ from modelserver.errors import (
     Problem,
     UnknownBodyError,
     UnknownFrameError,
-    nearest_names,
-    shown,
+    find_nearest_names,
+    quote,
 )
-from modelserver.geometry import adjacency, names
-from modelserver.geometry.adjacency import Neighbor
-from modelserver.geometry.drives import drives
-from modelserver.geometry.edges import Edge, edges_along
-from modelserver.geometry.frame_tree import FrameNode, FrameTree
+from modelserver.geometry import names
+from modelserver.geometry import topology as adjacency
 from modelserver.geometry.joint import Coordinates, Joint
+from modelserver.geometry.kinematic_path import FrameNode, FrameTree, KinematicPath
+from modelserver.geometry.mimic import resolve_mimics
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
-from modelserver.geometry.route import Route
-from modelserver.geometry.topology import Crossing, Topology
-from modelserver.spatial import chain
-from modelserver.spatial.pose import Pose
-from modelserver.spatial.transformation import Transformation
+from modelserver.geometry.topology import Crossing, Edge, Neighbor, Topology, list_edges
+from modelserver.transforms import chain
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.transformation import Transformation
 
 CACHE_SIZE = 16384
-"""Static answers kept for programs that ask in their own process, about 1 kB each. When full the oldest goes."""
+"""Transformations cached, about 1 kB each; the oldest is dropped when full."""
 
 
-ROUTES_KEPT = 1024
-"""Routes kept for the same: one that was never asked for is assembled of the frame tree in some 10 us."""
+PATH_CACHE_SIZE = 1024
+"""Kinematic paths cached; building one from the frame tree takes some 10 us."""
 
 
 class Search(StrEnum):
-    """How a path is looked for: the shortest one, or the report's own search (4.6.2)."""
+    """How a path is searched: the shortest one, or the report's own search (4.6.2)."""
 
     BREADTH_FIRST = "breadth_first"
     DEPTH_FIRST = "depth_first"
@@ -50,19 +48,19 @@ class Search(StrEnum):
 class Model:
     """The geometry of a vehicle. Build one with `ModelBuilder` or `modelserver.load_model`.
 
-    `bodies`, `constraints`, `problems` are tuples in the order of the file; the first body is the root.
-    `joints` are the constraints that move, by name; `drives` says for each of them which coordinates place it.
-    `revision` is a hash of everything in the model that can change an answer or a list. Immutable.
-    Raises ValueError for two bodies or two constraints of one name, which `ModelBuilder` reports with their places.
+    `bodies`, `constraints`, `problems` are tuples in the order of the file; the first body is the root. `joints` are
+    the constraints with movable joints, by name; `drives` gives for each of them the coordinates that determine its
+    position. `revision` is a hash of everything that can change an answer or a list. Immutable. Raises ValueError for
+    two bodies or two constraints of one name, which `ModelBuilder` reports with their locations.
     """
 
     __slots__ = (
-        "_answers",
+        "_assemblies_with_loops",
         "_bodies",
         "_in_loops",
-        "_looped",
-        "_routes",
+        "_paths",
         "_topology",
+        "_transformations",
         "_tree",
         "bodies",
         "constraints",
@@ -92,27 +90,22 @@ class Model:
         _check_unique("constraint", [each.name for each in constraints])
         self._bodies = {body.name: body for body in bodies}
         self._topology = Topology(bodies, constraints)
-        # An OrderedDict drops its oldest in constant time; a dict walks over all that was dropped before.
-        self._answers: OrderedDict[tuple[str, str], Transformation] = OrderedDict()
-        self._routes: OrderedDict[tuple[str, str], Route] = OrderedDict()
-        self.joints = {each.name: each for each in constraints if each.joint.moves}
-        self.drives = drives(self.joints.values())
+        # An OrderedDict drops its oldest in constant time; a dict passes over all entries dropped before.
+        self._transformations: OrderedDict[tuple[str, str], Transformation] = OrderedDict()
+        self._paths: OrderedDict[tuple[str, str], KinematicPath] = OrderedDict()
+        self.joints = {each.name: each for each in constraints if each.joint.is_movable}
+        self.drives = resolve_mimics(self.joints.values())
         self._tree = FrameTree(self._bodies, self._topology, lambda name: self.drives[name].leader)
-        closures = self._topology.loop_closures()
+        closures = self._topology.find_loop_closures()
         assembly_of = {body: number for number, bodies in enumerate(self.assemblies) for body in bodies}
-        self._looped = frozenset(assembly_of[closing.bodies[0]] for closing in closures)
-        # going round by each closing constraint passes every constraint that there is another way around
+        self._assemblies_with_loops = frozenset(assembly_of[closing.bodies[0]] for closing in closures)
+        # the loops of all closing constraints contain every constraint that is in any loop
         self._in_loops = frozenset(each.constraint.name for closing in closures for each in closing.path)
 
     @property
     def root(self) -> Body:
         """The first body in the file."""
         return self.bodies[0]
-
-    @property
-    def has_loops(self) -> bool:
-        """Whether somewhere two ways lead from one body to another."""
-        return bool(self._in_loops)
 
     @property
     def assemblies(self) -> tuple[tuple[str, ...], ...]:
@@ -123,7 +116,7 @@ class Model:
         """Return the body of that name. Raises UnknownBodyError with the nearest names."""
         found = self._bodies.get(name)
         if found is None:
-            raise UnknownBodyError(f"the model has no body {shown(name)}", nearest_names(name, self._bodies))
+            raise UnknownBodyError(f"the model has no body {quote(name)}", find_nearest_names(name, self._bodies))
         return found
 
     def frame(self, name: str) -> BodyFrame:
@@ -132,18 +125,18 @@ class Model:
         return body.frame(frame.name)
 
     def constraints_of(self, frame: str | BodyFrame) -> tuple[Constraint, ...]:
-        """Return the constraints at a frame, in the order of the file; see `neighbors` for what it raises."""
+        """Return the constraints at a frame, in the order of the file. Raises as `neighbors`."""
         return tuple([each.constraint for each in self.neighbors(frame)])
 
     def neighbors(self, frame: str | BodyFrame) -> tuple[Neighbor, ...]:
-        """Return the frames at the other ends of a frame's constraints, with the sense in which each is crossed.
+        """Return the frames at the other ends of a frame's constraints, with the crossing to each.
 
         `frame` is a full name, `Body:Frame`, or a frame of this model. Raises UnknownBodyError or UnknownFrameError
         with the nearest names.
         """
         name = adjacency.full_name(frame)
         self.frame(name)
-        return tuple([Neighbor(self.frame(each.leaves), each) for each in self._topology.crossings(name)])
+        return tuple([Neighbor(self.frame(each.far_frame), each) for each in self._topology.crossings(name)])
 
     def next(self, frame: str | BodyFrame, constraint: str = "") -> Neighbor:
         """Cross a frame's constraint to the partner frame (the report's nextBodyFrame).
@@ -154,7 +147,7 @@ class Model:
         return adjacency.select_one(adjacency.full_name(frame), self.neighbors(frame), constraint)
 
     def verify(self, frame: str | BodyFrame) -> tuple[Problem, ...]:
-        """Return what is wrong at a frame, nothing where all is well (the report's verifyConstraint).
+        """Return the problems of a frame, none where it is valid (the report's verifyConstraint).
 
         A frame value that differs from the model's is an error, an orphaned body a warning, several constraints a note:
         a strict model allows one. Raises as `neighbors`.
@@ -168,9 +161,9 @@ class Model:
     def is_static(self, frame_of_interest: str, frame_of_reference: str) -> bool:
         """Return whether no joint lies between two frames: the report's pose type, static or dynamic.
 
-        Raises as `route`.
+        Raises as `get_kinematic_path`.
         """
-        return not self.route(frame_of_interest, frame_of_reference).legs
+        return not self.get_kinematic_path(frame_of_interest, frame_of_reference).joints
 
     def get_body_list(self) -> list[str]:
         """Return the names of the bodies, root first."""
@@ -183,50 +176,50 @@ class Model:
     def get_transformation(self, frame_of_interest: str, frame_of_reference: str) -> Transformation:
         """Return the pose of `frame_of_interest` in `frame_of_reference` by the shortest path (eq. 11-13).
 
-        Joints that move stand where they rest; `modelserver.platform` knows where they are. Both are full names,
+        Movable joints are at their default positions; `modelserver.query` knows the actual ones. Both are full names,
         `Body:Frame`. Raises UnknownBodyError, UnknownFrameError or NotConnectedError.
         """
         try:
-            return self._answers[frame_of_interest, frame_of_reference]
+            return self._transformations[frame_of_interest, frame_of_reference]
         except KeyError:
-            return self._answer(frame_of_interest, frame_of_reference)
+            return self._compute(frame_of_interest, frame_of_reference)
 
-    def route(self, frame_of_interest: str, frame_of_reference: str) -> Route:
-        """Return the shortest way from the frame of reference to the frame of interest, kept for the next time.
+    def get_kinematic_path(self, frame_of_interest: str, frame_of_reference: str) -> KinematicPath:
+        """Return the shortest kinematic path from the frame of reference to the frame of interest, cached.
 
         Raises UnknownBodyError, UnknownFrameError or NotConnectedError.
         """
-        found = self._routes.get((frame_of_interest, frame_of_reference))
+        found = self._paths.get((frame_of_interest, frame_of_reference))
         if found is None:
-            interest, reference = self._ends(frame_of_interest, frame_of_reference)
-            if interest.assembly in self._looped:
+            interest, reference = self._get_end_nodes(frame_of_interest, frame_of_reference)
+            if interest.assembly in self._assemblies_with_loops:
                 path = self.find_path(frame_of_interest, frame_of_reference)
                 in_loop = any(crossing.constraint.name in self._in_loops for crossing in path)
-                found = Route(self.edges(path, frame_of_interest, frame_of_reference), in_loop)
+                found = KinematicPath(self.get_edges(path, frame_of_interest, frame_of_reference), in_loop)
             else:
-                found = self._tree.route(interest, reference)
-            if len(self._routes) >= ROUTES_KEPT:
-                self._routes.popitem(last=False)
-            self._routes[frame_of_interest, frame_of_reference] = found
+                found = self._tree.build_path(interest, reference)
+            if len(self._paths) >= PATH_CACHE_SIZE:
+                self._paths.popitem(last=False)
+            self._paths[frame_of_interest, frame_of_reference] = found
         return found
 
     def rigid_transformation(self, frame_of_interest: str, frame_of_reference: str) -> Transformation | None:
-        """Return what `get_transformation` does, or None where a joint is between the two or a loop around them.
+        """Return `get_transformation`, or None where a joint is between the two or a loop around them.
 
         Raises UnknownBodyError, UnknownFrameError or NotConnectedError.
         """
-        interest, reference = self._ends(frame_of_interest, frame_of_reference)
-        if interest.group is not reference.group or interest.assembly in self._looped:
+        interest, reference = self._get_end_nodes(frame_of_interest, frame_of_reference)
+        if interest.group is not reference.group or interest.assembly in self._assemblies_with_loops:
             return None
-        known = self._answers.get((frame_of_interest, frame_of_reference))
-        return known or self._rigid(frame_of_interest, frame_of_reference, interest, reference)
+        known = self._transformations.get((frame_of_interest, frame_of_reference))
+        return known or self._compute_rigid(frame_of_interest, frame_of_reference, interest, reference)
 
-    def edges(self, path: Iterable[Crossing], frame_of_interest: str, frame_of_reference: str) -> list[Edge]:
-        """Return the edges of a path of `find_path`: frames of bodies, constraints, and joints that move.
+    def get_edges(self, path: Iterable[Crossing], frame_of_interest: str, frame_of_reference: str) -> list[Edge]:
+        """Return the edges of a path of `find_path`: frames of bodies, constraints, and movable joints.
 
-        A frame that stands at its body's origin by definition is no edge.
+        A frame at its body's origin by definition is no edge.
         """
-        edges = edges_along(path, self.frame, frame_of_interest, frame_of_reference)
+        edges = list_edges(path, self.frame, frame_of_interest, frame_of_reference)
         return [
             each._replace(leader=self.drives[each.name].leader)
             if each.joint is not None and each.joint.mimic is not None
@@ -244,31 +237,31 @@ class Model:
         body, frame = self._split(frame_of_reference)
         target, _ = self._split(frame_of_interest)
         if search is Search.BREADTH_FIRST:
-            path = self._topology.breadth_first(body.name, target.name)
+            path = self._topology.find_shortest_path(body.name, target.name)
         else:
-            path = self._topology.depth_first(body.name, frame.name, frame_of_interest)
+            path = self._topology.find_path_depth_first(body.name, frame.name, frame_of_interest)
         if path is None:
             raise self._not_connected(target.name, body.name)
         return path
 
-    def along(self, path: Iterable[Crossing], frame_of_interest: str, frame_of_reference: str) -> Transformation:
-        """Return the transformation that a path of `find_path` builds, edge by edge (eq. 12 and 13).
+    def compose_path(self, path: Iterable[Crossing], frame_of_interest: str, frame_of_reference: str) -> Transformation:
+        """Return the transformation along a path of `find_path`, edge by edge (eq. 12 and 13).
 
-        Joints stand where they rest. Its covariance is that of the edges' sigmas, None where an edge states none.
+        Joints are at their default positions. The covariance is that of the edges' sigmas, None where one is missing.
         """
-        route = Route(self.edges(path, frame_of_interest, frame_of_reference))
-        rest = route.rest
-        links = route.links(rest, [self._stated_sigma(leg.name) for leg in route.legs])
+        folded = KinematicPath(self.get_edges(path, frame_of_interest, frame_of_reference))
+        positions = folded.default_positions
+        links = folded.build_links(positions, [self._get_joint_sigma(joint.name) for joint in folded.joints])
         return Transformation(
             frame_of_interest,
             frame_of_reference,
-            route.pose(rest),
+            folded.compute_pose(positions),
             chain.covariance(links),
             model_revision=self.revision,
         )
 
-    def _stated_sigma(self, name: str) -> Coordinates:
-        """Return what the file states of how sure a joint's position is, nan where it does not; see `Route.links`."""
+    def _get_joint_sigma(self, name: str) -> Coordinates:
+        """Return the stated sigma of a joint's position, nan where there is none; see `KinematicPath.build_links`."""
         drive = self.drives[name]
         leader = self.joints[drive.leader].joint
         return tuple([drive.multiplier * value for value in leader.sigma or (math.nan,) * leader.count])
@@ -277,26 +270,26 @@ class Model:
         try:
             body_name, frame_name = names.split(name)
         except ValueError:
-            everything = (names.joined(body.name, frame.name) for body in self.bodies for frame in body)
+            everything = (names.join(body.name, frame.name) for body in self.bodies for frame in body)
             raise UnknownFrameError(
-                f"{shown(name)} is not a frame: frames are named Body:Frame", nearest_names(name, everything)
+                f"{quote(name)} is not a frame: frames are named Body:Frame", find_nearest_names(name, everything)
             ) from None
         found = self._bodies.get(body_name)
         if found is None:
-            near = nearest_names(body_name, self._bodies)
+            near = find_nearest_names(body_name, self._bodies)
             raise UnknownBodyError(
-                f"the model has no body {shown(body_name)}",
-                (names.joined(body, frame_name) if self._bodies[body].has_frame(frame_name) else body for body in near),
+                f"the model has no body {quote(body_name)}",
+                (names.join(body, frame_name) if self._bodies[body].has_frame(frame_name) else body for body in near),
             )
         return found, found.frame(frame_name)
 
-    def _ends(self, frame_of_interest: str, frame_of_reference: str) -> tuple[FrameNode, FrameNode]:
-        """Return the nodes of two frames of one assembly. Raises as `route`."""
+    def _get_end_nodes(self, frame_of_interest: str, frame_of_reference: str) -> tuple[FrameNode, FrameNode]:
+        """Return the nodes of two frames of one assembly. Raises as `get_kinematic_path`."""
         nodes = self._tree.nodes
         try:
             reference, interest = nodes[frame_of_reference], nodes[frame_of_interest]
         except KeyError:
-            # says what is wrong with the first of them, which is not there
+            # raises for the unknown one
             self._split(frame_of_reference)
             self._split(frame_of_interest)
             raise
@@ -304,24 +297,24 @@ class Model:
             raise self._not_connected(interest.body, reference.body)
         return interest, reference
 
-    def _answer(self, frame_of_interest: str, frame_of_reference: str) -> Transformation:
-        """Work out a pair that was not asked for before, and keep it."""
-        interest, reference = self._ends(frame_of_interest, frame_of_reference)
-        if interest.group is reference.group and interest.assembly not in self._looped:
-            return self._rigid(frame_of_interest, frame_of_reference, interest, reference)
-        route = self.route(frame_of_interest, frame_of_reference)
-        covariance = partial(self._covariance_at_rest, route)
-        return self._kept(frame_of_interest, frame_of_reference, route.pose(route.rest), covariance)
+    def _compute(self, frame_of_interest: str, frame_of_reference: str) -> Transformation:
+        """Compute and cache the transformation of a pair of frames."""
+        interest, reference = self._get_end_nodes(frame_of_interest, frame_of_reference)
+        if interest.group is reference.group and interest.assembly not in self._assemblies_with_loops:
+            return self._compute_rigid(frame_of_interest, frame_of_reference, interest, reference)
+        path = self.get_kinematic_path(frame_of_interest, frame_of_reference)
+        covariance = partial(self._default_covariance, path)
+        return self._cache(frame_of_interest, frame_of_reference, path.compute_pose(path.default_positions), covariance)
 
-    def _rigid(
+    def _compute_rigid(
         self, frame_of_interest: str, frame_of_reference: str, interest: FrameNode, reference: FrameNode
     ) -> Transformation:
-        # a frame in itself is so exactly
+        # exact for a frame in itself
         pose = Pose.identity() if interest is reference else reference.X_NG @ interest.X_GN
         covariance = partial(FrameTree.rigid_covariance, interest, reference)
-        return self._kept(frame_of_interest, frame_of_reference, pose, covariance)
+        return self._cache(frame_of_interest, frame_of_reference, pose, covariance)
 
-    def _kept(
+    def _cache(
         self,
         frame_of_interest: str,
         frame_of_reference: str,
@@ -329,13 +322,15 @@ class Model:
         covariance: Callable[[], tuple[float, ...] | None],
     ) -> Transformation:
         answer = Transformation(frame_of_interest, frame_of_reference, pose, covariance, model_revision=self.revision)
-        if len(self._answers) >= CACHE_SIZE:
-            self._answers.popitem(last=False)
-        self._answers[frame_of_interest, frame_of_reference] = answer
+        if len(self._transformations) >= CACHE_SIZE:
+            self._transformations.popitem(last=False)
+        self._transformations[frame_of_interest, frame_of_reference] = answer
         return answer
 
-    def _covariance_at_rest(self, route: Route) -> tuple[float, ...] | None:
-        return route.covariance(route.rest, [self._stated_sigma(leg.name) for leg in route.legs])
+    def _default_covariance(self, path: KinematicPath) -> tuple[float, ...] | None:
+        return path.compute_covariance(
+            path.default_positions, [self._get_joint_sigma(joint.name) for joint in path.joints]
+        )
 
     def _not_connected(self, body_I: str, body_R: str) -> NotConnectedError:
         def assembly(body: str) -> str:
@@ -370,11 +365,11 @@ def _check_unique(what: str, given: list[str]) -> None:
     """Raise ValueError for a name that is given twice (report 4.2, 4.4)."""
     if len(set(given)) < len(given):
         twice = next(name for name in given if given.count(name) > 1)
-        raise ValueError(f"the {what} name {shown(twice)} is given twice; names are unique in a model")
+        raise ValueError(f"the {what} name {quote(twice)} is given twice; names are unique in a model")
 
 
 def _revision(bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> str:
-    """Return 16 hex digits of a SHA-256 over what answers and lists hold; floats enter exactly (repr round-trips)."""
+    """Return 16 hex digits of a SHA-256 over all that answers and lists contain; floats enter exactly."""
 
     def sigma(value: Sigma | None) -> object:
         return None if value is None else (value.position, value.rotation)
@@ -383,7 +378,7 @@ def _revision(bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> 
         return None if value is None else (value.xyz, value.wxyz)
 
     def joint(value: Joint) -> object:
-        if not value.moves:
+        if not value.is_movable:
             return value.type
         numbers = (value.axis, value.lower, value.upper, value.rate_limit, value.default, value.sigma)
         return (value.type, numbers, None if value.mimic is None else astuple(value.mimic))

@@ -1,21 +1,23 @@
-"""Names of bodies and frames: `Body:Frame`."""
+"""Names of bodies and frames, `Body:Frame`, and their text in messages."""
 
 from __future__ import annotations
 
-from modelserver.errors import shown
+from collections.abc import Sequence
+
+from modelserver.errors import Location, quote
 
 WORLD_UTM = "World:UTM"
 WORLD_ENU = "World:ENU"
 ODOM = "Odom:Origin"
 
 MAX_LENGTH = 200
-"""Of a name of a body, frame or constraint; it stands in messages, lists and replies."""
+"""Of a name of a body, frame or constraint."""
 
 RESERVED_BODIES = ("World", "Odom")
-"""Bodies that the service itself provides; a file may not define them."""
+"""Bodies that the server itself provides; a file may not define them."""
 
 
-def joined(body: str, frame: str) -> str:
+def join(body: str, frame: str) -> str:
     """Return the full name of a frame."""
     return f"{body}:{frame}"
 
@@ -24,12 +26,12 @@ def split(name: str) -> tuple[str, str]:
     """Return body and frame of a full name. Raises ValueError where it is not of the form `Body:Frame`."""
     body, colon, frame = name.partition(":")
     if not colon or not body or not frame or ":" in frame:
-        raise ValueError(f"{shown(name)} is not of the form Body:Frame")
+        raise ValueError(f"{quote(name)} is not of the form Body:Frame")
     return body, frame
 
 
-def fault(name: str) -> str:
-    """Return what is wrong with a name of a body, frame or constraint; empty where nothing is."""
+def find_problem(name: str) -> str:
+    """Return why a name of a body, frame or constraint is not allowed, "" if it is."""
     if not name:
         return "the name is empty"
     if ":" in name:
@@ -41,3 +43,17 @@ def fault(name: str) -> str:
     if not name.isprintable():
         return "a name has only printable characters"
     return ""
+
+
+MAX_LISTED = 12
+"""Names that a message lists at most."""
+
+
+def format_first_location(place: Location) -> str:
+    """Return the location of the first of two definitions, for a message about the second."""
+    return f" (first at {place})" if str(place) else ""
+
+
+def format_names(several: Sequence[str]) -> str:
+    """Return the first `MAX_LISTED` of several names, with their number."""
+    return ", ".join(several[:MAX_LISTED]) + (f", ... ({len(several)} in all)" if len(several) > MAX_LISTED else "")

@@ -6,21 +6,21 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
-from modelserver.errors import UnknownFrameError, nearest_names, shown, suggestion
+from modelserver.errors import UnknownFrameError, find_nearest_names, find_suggestion, quote
 from modelserver.geometry import inertia as spatial_inertia
 from modelserver.geometry import names
 from modelserver.geometry.joint import FIXED, Joint
 from modelserver.geometry.shape import Shape
-from modelserver.spatial import covariance
-from modelserver.spatial.pose import Pose
-from modelserver.spatial.so3 import Array, Vector3
+from modelserver.transforms import covariance
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Array, Vector3
 
 
 @dataclass(frozen=True, slots=True)
 class Sigma:
-    """Standard deviations of a survey or a mount, along the axes of the parent frame.
+    """Standard deviations of a surveyed pose, along the axes of the parent frame.
 
-    `position` in metres, `rotation` in radians. Raises ValueError for a negative or non-finite one.
+    `position` in meters, `rotation` in radians. Raises ValueError for a negative or non-finite one.
     """
 
     position: Vector3 = (0.0, 0.0, 0.0)
@@ -38,7 +38,7 @@ class Sigma:
 
     @property
     def is_zero(self) -> bool:
-        """Whether it states that there is no error at all."""
+        """Whether the pose is stated as exact."""
         return not any(self.position) and not any(self.rotation)
 
     @property
@@ -49,10 +49,10 @@ class Sigma:
 
 @dataclass(frozen=True, slots=True)
 class BodyFrame:
-    """A frame of interest on a body: `pose` is its place in body coordinates (the report's A_ij).
+    """A frame on a body: `pose` is its pose in body coordinates (the report's A_ij).
 
-    The body's own coordinates are its origin; a frame named Origin usually stands there. `body` is the name of the
-    body that the frame is on, set by `Body`, and no part of the frame's value: the same frame on two bodies is equal.
+    The body's own coordinates are its origin; a frame named Origin is usually there. `body` is the name of the body
+    that the frame is on, set by `Body`; it is not compared: the same frame on two bodies is equal.
     """
 
     name: str
@@ -63,20 +63,18 @@ class BodyFrame:
 
     @property
     def full_name(self) -> str:
-        """The name by which a model knows the frame, `Body:Frame`; the plain name while it is on no body."""
-        return names.joined(self.body, self.name) if self.body else self.name
+        """The name `Body:Frame`; the plain name while it is on no body."""
+        return names.join(self.body, self.name) if self.body else self.name
 
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """A rigid assembly: named frames around one origin.
+    """A rigid body: named frames around one origin.
 
-    `pose` is the optional transform of the whole body that a 2005 file may carry; it is kept and written
-    back, and takes no part in relations between frames. `inertia` is the 6x6 spatial inertia in body
-    coordinates, rows of 6 (the report's InertiaMatrix), or None; `modelserver.geometry.inertia` says how it is made.
-    `visuals` and `collisions` are what it looks like and what it occupies, kept for others. Copying a body is
-    `renamed`: values are shared, and each frame knows the copy as its body. Raises ValueError for two frames of one
-    name, or an inertia that is not 6x6 and finite.
+    `pose` is the optional transform of the whole body that a 2005 file may have; it is stored and written back, and not
+    used in relations between frames. `inertia` is the 6x6 spatial inertia in body coordinates, rows of 6 (the report's
+    InertiaMatrix), or None; see `modelserver.geometry.inertia`. `visuals` and `collisions` are its shapes, for viewers.
+    `with_name` copies a body. Raises ValueError for two frames of one name, or an inertia that is not 6x6 and finite.
     """
 
     name: str
@@ -107,22 +105,22 @@ class Body:
     @property
     def mass(self) -> float | None:
         """The mass in kilograms; None where no inertia is stated, or one that is not a rigid body's."""
-        found = None if self.inertia is None else spatial_inertia.rigid(self.inertia)
+        found = None if self.inertia is None else spatial_inertia.from_spatial_inertia(self.inertia)
         return None if found is None else found.mass
 
     @property
-    def centre_of_mass(self) -> Vector3 | None:
-        """The centre of mass in body coordinates, metres; None as for `mass`."""
-        found = None if self.inertia is None else spatial_inertia.rigid(self.inertia)
-        return None if found is None else found.centre
+    def center_of_mass(self) -> Vector3 | None:
+        """The center of mass in body coordinates, meters; None as for `mass`."""
+        found = None if self.inertia is None else spatial_inertia.from_spatial_inertia(self.inertia)
+        return None if found is None else found.center
 
     def frame(self, name: str) -> BodyFrame:
         """Return the frame of that name. Raises UnknownFrameError with the nearest names."""
         found = self._by_name.get(name)
         if found is None:
             raise UnknownFrameError(
-                f"body {self.name} has no frame {shown(name)}",
-                (names.joined(self.name, near) for near in nearest_names(name, self._by_name)),
+                f"body {self.name} has no frame {quote(name)}",
+                (names.join(self.name, near) for near in find_nearest_names(name, self._by_name)),
             )
         return found
 
@@ -133,16 +131,16 @@ class Body:
         return frame.body == self.name and self._by_name.get(frame.name) == frame
 
     def with_frame(self, frame: BodyFrame) -> Body:
-        """Return this body with one frame more. Raises ValueError for a name that is taken."""
+        """Return this body with a further frame. Raises ValueError for a name that exists."""
         return replace(self, frames=(*self.frames, frame))
 
     def without_frame(self, name: str) -> Body:
         """Return this body without the frame of that name. Raises UnknownFrameError."""
-        gone = self.frame(name)
-        return replace(self, frames=tuple(frame for frame in self.frames if frame is not gone))
+        removed = self.frame(name)
+        return replace(self, frames=tuple(frame for frame in self.frames if frame is not removed))
 
-    def renamed(self, name: str) -> Body:
-        """Return a copy under another name, with all its frames: a second camera, say."""
+    def with_name(self, name: str) -> Body:
+        """Return a copy under another name, with all its frames, e.g. a second camera."""
         return replace(self, name=name)
 
     def __iter__(self) -> Iterator[BodyFrame]:
@@ -151,10 +149,10 @@ class Body:
 
 @dataclass(frozen=True, slots=True)
 class Constraint:
-    """A joint between two frames: `pose` is the place of frame `to` in frame `from_` (the report's T_k).
+    """A fixed connection or joint between two frames: `pose` is that of frame `to` in frame `from_` (the report's T_k).
 
-    `from_` and `to` are full names, `Body:Frame`. Crossing it from `to` to `from_` takes the inverse. Where the joint
-    moves, `pose` is the place of `to` with all its coordinates 0, and `sigma` says how sure that is.
+    `from_` and `to` are full names, `Body:Frame`. Crossing it from `to` to `from_` takes the inverse. For a movable
+    joint, `pose` is that of `to` with all coordinates 0, and `sigma` its uncertainty.
     """
 
     name: str
@@ -167,13 +165,13 @@ class Constraint:
 
     @property
     def is_static(self) -> bool:
-        """Whether the two frames keep their place to each other; the report's pose type, static or dynamic."""
-        return not self.joint.moves
+        """Whether the two frames are fixed to each other; the report's pose type, static or dynamic."""
+        return not self.joint.is_movable
 
     @property
-    def at_rest(self) -> Pose:
-        """The place of `to` in `from_` while nobody tells where a joint that moves stands; else `pose`."""
-        return self.pose @ self.joint.motion(self.joint.rest) if self.joint.moves else self.pose
+    def default_pose(self) -> Pose:
+        """The pose of `to` in `from_` with a movable joint at its default position; else `pose`."""
+        return self.pose @ self.joint.compute_pose(self.joint.default_position) if self.joint.is_movable else self.pose
 
     def other_end(self, frame: str) -> str:
         """Return the full name of the frame at the other end. Raises ValueError for a frame not in it."""
@@ -184,20 +182,20 @@ class Constraint:
         raise ValueError(f"constraint {self.name} does not join {frame}")
 
 
-def meant_frame(name: str, bodies: Mapping[str, Body]) -> str:
-    """Return the frame that a misspelled full name means; empty where that is not clear.
+def suggest_frame(name: str, bodies: Mapping[str, Body]) -> str:
+    """Return the frame that a misspelled full name probably means; "" where that is not clear.
 
-    One of its two names is misspelled at most: with both wrong, neither says what the other means.
+    At most one of its two names may be misspelled.
     """
     try:
         body, frame = names.split(name)
     except ValueError:
-        return suggestion(name, (names.joined(each.name, frame.name) for each in bodies.values() for frame in each))
+        return find_suggestion(name, (names.join(each.name, frame.name) for each in bodies.values() for frame in each))
     if body in bodies:
         if any(each.has_frame(frame) for each in bodies.values()):
-            # a name that other bodies have is no misspelling
+            # a name that other bodies have is not misspelled
             return ""
-        near = suggestion(frame, (each.name for each in bodies[body]))
-        return names.joined(body, near) if near else ""
-    near = suggestion(body, (each for each in bodies if bodies[each].has_frame(frame)))
-    return names.joined(near, frame) if near else ""
+        near = find_suggestion(frame, (each.name for each in bodies[body]))
+        return names.join(body, near) if near else ""
+    near = find_suggestion(body, (each for each in bodies if bodies[each].has_frame(frame)))
+    return names.join(near, frame) if near else ""

@@ -1,29 +1,28 @@
-"""Covariance of a path: how the uncertainty of surveys and joints adds up at its far end.
+"""Covariance of a kinematic path: the sum of the uncertainties of surveys and joints at its far end.
 
-Theory of operation. A path consists of rigid segments with a joint between each and the next. A perturbation (dp,
-dtheta) of an edge X_FT, along the axes of F, is a small motion of everything behind it: at the far end N of the path
+A path consists of rigid segments with a joint between each and the next. A perturbation (dp, dtheta) of an edge X_FT,
+along the axes of F, is a small motion of everything behind it; at the far end N of the path
 
     v = R_F dp + (R_F dtheta) x (p_N - p_T),   w = R_F dtheta
 
-with R_F the orientation of F and p_T the position of T in the base frame of the segment. Each fixed edge keeps p_T,
-P = R_F diag(sigma_p^2) R_F' and W = R_F diag(sigma_r^2) R_F' in the base: `EdgeCovariance`. With r = p_N - p_T, its
-share is
+with R_F the orientation of F and p_T the position of T in the base frame of the segment. Each fixed edge stores p_T,
+P = R_F diag(sigma_p^2) R_F' and W = R_F diag(sigma_r^2) R_F' in the base: `EdgeCovariance`. With the lever arm
+r = p_N - p_T, its share is
 
     cov(v) = P + [r]x W [r]x',   cov(v, w) = -[r]x W,   cov(w) = W
 
-These are summed over the edges of a segment, along the axes of the frame of reference. Every edge has its own lever, so
-nothing of a common ancestor is subtracted and no long lever to a distant base cancels after it was squared. The result
-is that of `spatial.chain.covariance`, which carries every edge by itself from frame to frame.
+These are summed over the edges of a segment, along the axes of the frame of reference. Every edge has its own lever
+arm, so nothing is subtracted, and no precision is lost where the base is far away. The result is that of
+`transforms.chain.covariance`, which transports the covariance of every edge from frame to frame.
 
-Most surveys state one variance for all axes. Such a P or W is the same along any axes; only r has to be turned. With W
-a number, cov(v, w) = -W [r]x is a vector, and the sum over such edges is 10 numbers (`Isotropic`) instead of 21.
+Most surveys state one variance for all axes. Such a P or W is the same along any axes; only r has to be rotated. With a
+scalar W, cov(v, w) = -W [r]x is a vector, and the sum over such edges is 10 numbers (`Isotropic`) instead of 21.
 
-A joint's motion is written in the segment that contains its F frame, the frame that the motion starts from. Motions are
-turned to the axes of the reference, where those of one source (one joint follows another) are added, signs and all,
-before they are squared.
+A joint's Jacobian is expressed in the segment that contains its F frame. The twists of one source (mimic joints share
+it) are added, with their signs, along the axes of the reference before they are squared.
 
-All of it is plain floats. A service sleeps between two requests and runs with cold caches, where a call of numpy on 6x6
-costs 5 to 8 us, and a hundred multiplications in Python 2 us (measured).
+All of it is plain floats: after a server wakes with cold caches, a numpy call on 6x6 costs 5 to 8 us, and a hundred
+multiplications in Python 2 us (measured).
 """
 
 from __future__ import annotations
@@ -34,24 +33,24 @@ from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from modelserver.geometry.edges import Edge
 from modelserver.geometry.joint import Coordinates, Joint
 from modelserver.geometry.parts import Sigma
-from modelserver.spatial import so3
-from modelserver.spatial.pose import Pose
-from modelserver.spatial.so3 import Array, Quaternion, Vector3
+from modelserver.geometry.topology import Edge
+from modelserver.transforms import so3
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Array, Quaternion, Vector3
 
-Place: TypeAlias = tuple[Vector3, Quaternion]
+PlainPose: TypeAlias = tuple[Vector3, Quaternion]
 """Position and orientation of a frame, as plain floats."""
 
 Variance: TypeAlias = float | tuple[float, ...]
-"""Covariance (3, 3): one variance where it is the same along all axes, else its upper triangle (6)."""
+"""Covariance (3, 3): a scalar where it is the same along all axes, else its upper triangle (6)."""
 
 EdgeCovariance: TypeAlias = tuple[Vector3, Variance, Variance]
 """p_T (3), P and W of a fixed edge in the base of its segment."""
 
 Isotropic: TypeAlias = tuple[float, ...]
-"""Sum over edges whose rotation variance W is the same about all axes: 10 numbers.
+"""Sum over edges whose rotation variance W is a scalar: 10 numbers.
 
 They are the upper triangle of cov(v), s = sum of W r with cov(v, w) = -[s]x, and w = sum of W with cov(w) = w I.
 """
@@ -60,8 +59,8 @@ Twists: TypeAlias = list[tuple[Vector3, Vector3]]
 """Small motions (v, w)."""
 
 
-class JointMotion(NamedTuple):
-    """How a joint moves the segment behind it; `X_BF` is the pose of its F frame in the base of its segment.
+class JointJacobian(NamedTuple):
+    """The Jacobian of a joint at the base of its segment; `X_BF` is the pose of its F frame in the base.
 
     `twists` are those of a joint with one coordinate, the same at every position.
     """
@@ -71,33 +70,33 @@ class JointMotion(NamedTuple):
     twists: Twists
 
     @classmethod
-    def at(cls, joint: Joint, X_BF: Pose) -> JointMotion:
-        """Return the motion of a joint at a pose."""
+    def at(cls, joint: Joint, X_BF: Pose) -> JointJacobian:
+        """Return the Jacobian of a joint at a pose."""
         found = cls(joint, X_BF, [])
-        return found._replace(twists=found.at_position((0.0,) * joint.count))
+        return found._replace(twists=found.compute_twists((0.0,) * joint.count))
 
-    def at_position(self, position: Coordinates) -> Twists:
-        """Return for each coordinate the motion that a unit of it makes, at the base's origin and along its axes."""
+    def compute_twists(self, position: Coordinates) -> Twists:
+        """Return for each coordinate the twist at unit rate, at the base's origin and along its axes."""
         J = self.joint.jacobian(position)
         x, y, z = self.X_BF.xyz
-        mx, my, mz = so3.rotate(self.X_BF.wxyz, self.joint.motion(position).xyz)
+        mx, my, mz = so3.rotate(self.X_BF.wxyz, self.joint.compute_pose(position).xyz)
         twists = []
         for column in J.T.tolist():
             v = so3.rotate(self.X_BF.wxyz, (column[0], column[1], column[2]))
             w = so3.rotate(self.X_BF.wxyz, (column[3], column[4], column[5]))
-            # the Jacobian is that of the place where the joint has moved to
+            # the Jacobian is that of the displaced origin
             a, b, c = so3.cross((x + mx, y + my, z + mz), w)
             twists.append(((v[0] + a, v[1] + b, v[2] + c), w))
         return twists
 
 
 class JointCrossing(NamedTuple):
-    """A joint on a path: its motion, in the base of segment number `segment`; `sign` -1.0 where passed from T to F.
+    """A joint on a path: its Jacobian in the base of segment number `segment`, and the sense of the crossing.
 
-    `source` names where its error comes from: joints of one source err together.
+    `sign` is -1.0 where it is passed from T to F. Joints of one `source` have common errors.
     """
 
-    motion: JointMotion
+    jacobian: JointJacobian
     segment: int
     sign: float
     source: str
@@ -106,11 +105,11 @@ class JointCrossing(NamedTuple):
 class PathCovariance:
     """Covariance of the far end of a path, for any position of its joints; see the module.
 
-    `segments` holds the fixed edges of each rigid segment, `crossings` the joints between them. `is_stated` is false
+    `segments` holds the fixed edges of each rigid segment, `crossings` the joints between them. `is_complete` is false
     where an edge states no sigma, and counts as exact here.
     """
 
-    __slots__ = ("_joints", "_segments", "is_stated")
+    __slots__ = ("_joints", "_segments", "is_complete")
 
     def __init__(
         self,
@@ -118,15 +117,15 @@ class PathCovariance:
         crossings: Sequence[JointCrossing] = (),
         is_stated: bool = True,
     ):
-        self.is_stated = is_stated
+        self.is_complete = is_stated
         self._segments = segments
-        # the joints of each segment with their numbers on the path
+        # the joints of each segment, with their numbers on the path
         self._joints: list[list[tuple[int, JointCrossing]]] = [[] for _ in segments]
         for number, each in enumerate(crossings):
             self._joints[each.segment].append((number, each))
 
     @classmethod
-    def along(cls, edges: Sequence[Edge]) -> PathCovariance:
+    def from_edges(cls, edges: Sequence[Edge]) -> PathCovariance:
         """Return that of a path given by its edges; each segment's base is its first frame."""
         segments: list[list[EdgeCovariance]] = [[]]
         crossings: list[JointCrossing] = []
@@ -135,8 +134,8 @@ class PathCovariance:
         for edge in edges:
             if edge.joint is not None:
                 number = len(crossings)
-                # the frame that the motion starts from is the last of this segment, or the first of the next
-                motion = JointMotion.at(edge.joint, pose if edge.forward else Pose.identity())
+                # F is the last frame of this segment, or the first of the next
+                motion = JointJacobian.at(edge.joint, pose if edge.forward else Pose.identity())
                 at, sign = (number, 1.0) if edge.forward else (number + 1, -1.0)
                 crossings.append(JointCrossing(motion, at, sign, edge.leader or edge.name))
                 segments.append([])
@@ -146,17 +145,20 @@ class PathCovariance:
             if edge.sigma is not None:
                 X_F, X_T = (pose, behind) if edge.forward else (behind, pose)
                 segments[-1].append(edge_covariance(X_F.wxyz, X_T.xyz, edge.sigma))
-            is_stated &= not edge.is_unstated
+            is_stated &= not edge.is_sigma_missing
             pose = behind
         return cls(segments, crossings, is_stated)
 
-    def at(
-        self, bases: Sequence[Place], far: Vector3, positions: Sequence[Coordinates], sigmas: Sequence[Coordinates]
+    def compute(
+        self, bases: Sequence[PlainPose], far: Vector3, positions: Sequence[Coordinates], sigmas: Sequence[Coordinates]
     ) -> tuple[float, ...]:
         """Return the covariance of the far end along the axes of the frame of reference: 36 numbers, row by row.
 
-        Parameters: `bases` are the places of the segments' bases in the frame of reference, `far` the position of the
-        far end there; `positions` and `sigmas` those of the joints' coordinates, nan counts as exact.
+        Parameters
+        ----------
+        bases : poses of the segments' bases in the frame of reference
+        far : position of the far end there, meters
+        positions, sigmas : of the joints' coordinates; a sigma of nan counts as exact
         """
         isotropic = _NONE
         others: tuple[float, ...] | None = None
@@ -169,8 +171,8 @@ class PathCovariance:
                 if rest is not None:
                     others = rest if others is None else tuple(map(add, others, rest))
             for index, crossing in joints:
-                motion, sign, source = crossing.motion, crossing.sign, crossing.source
-                units = motion.twists if motion.joint.count == 1 else motion.at_position(positions[index])
+                motion, sign, source = crossing.jacobian, crossing.sign, crossing.source
+                units = motion.twists if motion.joint.count == 1 else motion.compute_twists(positions[index])
                 for coordinate, (v, w) in enumerate(units):
                     s = sigmas[index][coordinate] * sign
                     if s != s:
@@ -181,7 +183,7 @@ class PathCovariance:
                     twist: tuple[float, ...] = (s * (vx + a), s * (vy + b), s * (vz + c), s * wx, s * wy, s * wz)
                     known = twists.get((source, coordinate))
                     twists[source, coordinate] = twist if known is None else tuple(map(add, known, twist))
-        numbers = upper(isotropic)
+        numbers = to_upper_triangle(isotropic)
         if others is not None:
             numbers = tuple(map(add, numbers, others))
         for twist in twists.values():
@@ -190,7 +192,7 @@ class PathCovariance:
 
 
 def edge_covariance(q_F: Quaternion, p_T: Vector3, sigma: Sigma) -> EdgeCovariance:
-    """Return what a fixed edge keeps: orientation of F and position of T are those in the base of its segment."""
+    """Return the stored covariance of a fixed edge, from the pose of its frames in the base of its segment."""
     R = np.array(so3.matrix_rows(q_F))
     return p_T, _variance(sigma.position, R), _variance(sigma.rotation, R)
 
@@ -206,17 +208,17 @@ def _variance(sigma: Vector3, R: Array) -> Variance:
 def covariance_at(edges: Sequence[EdgeCovariance], lever: Vector3, q: Quaternion) -> tuple[float, ...]:
     """Return the covariance that the edges make at a point: 36 numbers; parameters as in `add_edges`."""
     isotropic, others = add_edges(_NONE, edges, lever, q)
-    numbers = upper(isotropic)
+    numbers = to_upper_triangle(isotropic)
     return expand(numbers if others is None else tuple(map(add, numbers, others)))
 
 
 def add_edges(
     isotropic: Isotropic, edges: Sequence[EdgeCovariance], lever: Vector3, q: Quaternion
 ) -> tuple[Isotropic, tuple[float, ...] | None]:
-    """Return the sum with the shares of a segment's edges added, and the sum of those with a matrix W by itself.
+    """Return the sum plus the shares of a segment's edges, and the sum of those with a matrix W.
 
-    `lever` leads from the base to the far end along the axes of the reference, `q` turns to them from the base's. The
-    second is None where there is no such edge, else 21 numbers: see `sum_others`.
+    `lever` leads from the base to the far end along the axes of the reference, `q` rotates from the base's axes to
+    them. The second is None where there is no such edge, else 21 numbers: see `sum_anisotropic`.
     """
     (a, b, c), (d, e, f), (g, h, i) = R = so3.matrix_rows(q)
     lx, ly, lz = lever
@@ -250,10 +252,10 @@ def add_edges(
             vyy += P + xx + zz
             vzz += P + xx + yy
     isotropic = (vxx, vxy, vxz, vyy, vyz, vzz, sx, sy, sz, w)
-    return isotropic, sum_others(others, lever, R) if others else None
+    return isotropic, sum_anisotropic(others, lever, R) if others else None
 
 
-def sum_others(
+def sum_anisotropic(
     edges: Sequence[EdgeCovariance], lever: Vector3, R: tuple[Vector3, Vector3, Vector3]
 ) -> tuple[float, ...]:
     """Return the sum of the shares of edges whose W is a matrix: 21 numbers; parameters as in `add_edges`.
@@ -298,7 +300,7 @@ def sum_others(
 
 
 def rotate_symmetric(numbers: tuple[float, ...], R: tuple[Vector3, Vector3, Vector3]) -> tuple[float, ...]:
-    """Return R M R', of a symmetric M (3, 3): upper triangles (6)."""
+    """Return R M R' of a symmetric M (3, 3), as upper triangles (6)."""
     (a, b, c), (d, e, f), (g, h, i) = R
     xx, xy, xz, yy, yz, zz = numbers
     # R M
@@ -313,8 +315,8 @@ def rotate_symmetric(numbers: tuple[float, ...], R: tuple[Vector3, Vector3, Vect
     # fmt: on
 
 
-def upper(numbers: Isotropic) -> tuple[float, ...]:
-    """Return the 21 numbers of `sum_others` of a sum."""
+def to_upper_triangle(numbers: Isotropic) -> tuple[float, ...]:
+    """Return an isotropic sum as the 21 numbers of `sum_anisotropic`."""
     vxx, vxy, vxz, vyy, vyz, vzz, sx, sy, sz, w = numbers
     # fmt: off
     return (
@@ -328,7 +330,7 @@ def upper(numbers: Isotropic) -> tuple[float, ...]:
 
 
 def add_square(numbers: tuple[float, ...], twist: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the 21 numbers with those of the small motion (v, w) that one standard deviation makes added."""
+    """Return the 21 numbers plus those of the outer product of the twist (v, w) at one standard deviation."""
     a, b, c, d, e, f = twist
     vxx, vxy, vxz, vyy, vyz, vzz, cxx, cxy, cxz, cyx, cyy, cyz, czx, czy, czz, wxx, wxy, wxz, wyy, wyz, wzz = numbers
     # fmt: off
@@ -343,7 +345,7 @@ def add_square(numbers: tuple[float, ...], twist: tuple[float, ...]) -> tuple[fl
 
 
 def expand(numbers: tuple[float, ...]) -> tuple[float, ...]:
-    """Return all 36 numbers of the covariance whose 21 `sum_others` gives."""
+    """Return all 36 numbers of the covariance given by the 21 of `sum_anisotropic`."""
     vxx, vxy, vxz, vyy, vyz, vzz, cxx, cxy, cxz, cyx, cyy, cyz, czx, czy, czz, wxx, wxy, wxz, wyy, wyz, wzz = numbers
     # fmt: off
     return (

@@ -1,18 +1,41 @@
-"""Topology: which frames lead to which, and the two searches of the report (4.6.1, 4.6.2)."""
+"""The graph of frames and constraints: adjacency, searches, loop closures, and the edges of a path.
+
+A `Crossing` is a constraint passed in one sense. Paths are found breadth-first (the shortest) or depth-first as in the
+report (4.6.1, 4.6.2). In the report a BodyFrame holds a pointer to its constraint; here frames are values, and the
+model finds the constraints at a frame (report 4.3, 4.4). `list_edges` turns a path into its edges: frames of bodies,
+constraints, and movable joints.
+"""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple
 
-from modelserver.errors import LimitError
+import numpy as np
+
+from modelserver.errors import (
+    LimitError,
+    Location,
+    MalformedRequestError,
+    NotConnectedError,
+    Problem,
+    Severity,
+    UnknownFrameError,
+    find_nearest_names,
+    quote,
+)
 from modelserver.geometry import names
-from modelserver.geometry.parts import Body, Constraint
-from modelserver.spatial.pose import Pose
+from modelserver.geometry.joint import Joint
+from modelserver.geometry.names import format_names
+from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Array
 
 DEPTH_FIRST_VISITS = 1_000_000
-"""A depth-first search gives up after so many frames: on densely looped models it grows exponentially."""
+"""Limit of a depth-first search, in frames: its cost grows exponentially with the loops of a model."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,51 +46,49 @@ class Crossing:
     forward: bool
 
     @property
-    def enters(self) -> str:
-        """The frame the path leaves a body by."""
+    def near_frame(self) -> str:
+        """The frame by which the path leaves a body."""
         return self.constraint.from_ if self.forward else self.constraint.to
 
     @property
-    def leaves(self) -> str:
-        """The frame the path comes into the next body by."""
+    def far_frame(self) -> str:
+        """The frame by which the path enters the next body."""
         return self.constraint.to if self.forward else self.constraint.from_
 
     @property
     def pose(self) -> Pose:
-        """The pose of the far frame in the near one, with a joint that moves where it rests."""
-        X_FT = self.constraint.at_rest
+        """The pose of the far frame in the near one, with a movable joint at its default position."""
+        X_FT = self.constraint.default_pose
         return X_FT if self.forward else X_FT.inverse()
 
 
 @dataclass(frozen=True, slots=True)
 class LoopClosure:
-    """A constraint that joins two bodies which are joined already: going round comes back with `error`.
+    """A constraint that joins two bodies which are joined already.
 
-    `bodies` are those of the loop, `path` the constraints crossed going round; `error` is metres and radians, with
-    joints that move where they rest.
+    `bodies` are those of the loop, `path` the constraints crossed around it.
     """
 
     constraint: str
     bodies: tuple[str, ...]
     path: tuple[Crossing, ...]
-    error: tuple[float, float]
 
 
 class Topology:
-    """The graph of bodies and constraints. Names in it are known to be good; see `ModelBuilder`."""
+    """The graph of bodies and constraints, all names valid (see `ModelBuilder`)."""
 
-    __slots__ = ("_at", "_bodies", "_exits", "assemblies")
+    __slots__ = ("_bodies", "_by_body", "_by_frame", "assemblies")
 
     def __init__(self, bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]):
         self._bodies = {body.name: body for body in bodies}
-        self._at: dict[str, list[Crossing]] = {}
+        self._by_frame: dict[str, list[Crossing]] = {}
         for constraint in constraints:
-            self._at.setdefault(constraint.from_, []).append(Crossing(constraint, forward=True))
-            self._at.setdefault(constraint.to, []).append(Crossing(constraint, forward=False))
-        self._exits: dict[str, list[Crossing]] = {body.name: [] for body in bodies}
+            self._by_frame.setdefault(constraint.from_, []).append(Crossing(constraint, forward=True))
+            self._by_frame.setdefault(constraint.to, []).append(Crossing(constraint, forward=False))
+        self._by_body: dict[str, list[Crossing]] = {body.name: [] for body in bodies}
         for body in bodies:
             for frame in body:
-                self._exits[body.name] += self._at.get(names.joined(body.name, frame.name), ())
+                self._by_body[body.name] += self._by_frame.get(names.join(body.name, frame.name), ())
         self.assemblies = self._find_assemblies()
         """Groups of bodies that constraints join, each in breadth-first order; the root's comes first."""
 
@@ -76,19 +97,22 @@ class Topology:
         assemblies = []
         for start in self._bodies:
             if start not in seen:
-                assembly = (start, *(names.split(crossing.leaves)[0] for _, crossing in self.spread(start)))
+                assembly = (
+                    start,
+                    *(names.split(crossing.far_frame)[0] for _, crossing in self.traverse_breadth_first(start)),
+                )
                 seen.update(assembly)
                 assemblies.append(assembly)
         return tuple(assemblies)
 
-    def spread(self, start: str) -> Iterator[tuple[str, Crossing]]:
-        """Walk breadth first from body `start`; yield each newly met body's predecessor and the crossing to it."""
+    def traverse_breadth_first(self, start: str) -> Iterator[tuple[str, Crossing]]:
+        """Traverse the bodies breadth-first from `start`; yield the predecessor of each body and the crossing to it."""
         seen = {start}
         queue = deque([start])
         while queue:
             body = queue.popleft()
-            for crossing in self._exits[body]:
-                entered = names.split(crossing.leaves)[0]
+            for crossing in self._by_body[body]:
+                entered = names.split(crossing.far_frame)[0]
                 if entered not in seen:
                     seen.add(entered)
                     queue.append(entered)
@@ -96,84 +120,72 @@ class Topology:
 
     def crossings(self, frame: str) -> tuple[Crossing, ...]:
         """Return the constraints at a frame, given by its full name, each in the sense that leads away from it."""
-        return tuple(self._at.get(frame, ()))
+        return tuple(self._by_frame.get(frame, ()))
 
-    def loop_closures(self) -> tuple[LoopClosure, ...]:
-        """Return the constraints that are left over when each body is reached by a shortest path."""
+    def find_loop_closures(self) -> tuple[LoopClosure, ...]:
+        """Return the constraints that are not in the breadth-first spanning tree."""
         closures = []
         for assembly in self.assemblies:
             start = assembly[0]
             reached: dict[str, tuple[str, Crossing]] = {}
-            place = {start: Pose.identity()}
             used = set()
-            for body, crossing in self.spread(start):
-                entered = names.split(crossing.leaves)[0]
+            for body, crossing in self.traverse_breadth_first(start):
+                entered = names.split(crossing.far_frame)[0]
                 reached[entered] = (body, crossing)
-                place[entered] = place[body] @ self.step(crossing)
                 used.add(crossing.constraint.name)
             for body in assembly:
-                for crossing in self._exits[body]:
+                for crossing in self._by_body[body]:
                     name = crossing.constraint.name
                     if name in used:
                         continue
                     used.add(name)
-                    entered = names.split(crossing.leaves)[0]
-                    error = (place[body] @ self.step(crossing)).distance(place[entered])
-                    back = self._way_back(reached, entered, body)
-                    closures.append(LoopClosure(name, _loop(reached, body, entered), (crossing, *back), error))
+                    entered = names.split(crossing.far_frame)[0]
+                    back = self._tree_path(reached, entered, body)
+                    closures.append(LoopClosure(name, _find_loop_bodies(reached, body, entered), (crossing, *back)))
         return tuple(closures)
 
     @staticmethod
-    def _way_back(reached: dict[str, tuple[str, Crossing]], start: str, target: str) -> tuple[Crossing, ...]:
-        """Return the crossings from one body to another along the tree that says how each was reached."""
+    def _tree_path(reached: dict[str, tuple[str, Crossing]], start: str, target: str) -> tuple[Crossing, ...]:
+        """Return the crossings from one body to another along a spanning tree."""
 
-        def up(body: str) -> list[Crossing]:
+        def climb(body: str) -> list[Crossing]:
             line = []
             while body in reached:
                 body, crossing = reached[body]
                 line.append(crossing)
             return line
 
-        rising, falling = up(start), up(target)
+        rising, falling = climb(start), climb(target)
         while rising and falling and rising[-1] is falling[-1]:
             rising.pop()
             falling.pop()
         return (*[Crossing(each.constraint, not each.forward) for each in rising], *reversed(falling))
 
-    def step(self, crossing: Crossing) -> Pose:
-        """Return the pose of the entered body's origin in the left body's origin."""
-        body, frame = names.split(crossing.enters)
-        next_body, next_frame = names.split(crossing.leaves)
-        out = self._bodies[body].frame(frame).pose
-        back = self._bodies[next_body].frame(next_frame).pose.inverse()
-        return out @ crossing.pose @ back
-
-    def breadth_first(self, body: str, target: str) -> tuple[Crossing, ...] | None:
+    def find_shortest_path(self, body: str, target: str) -> tuple[Crossing, ...] | None:
         """Return the crossings of a shortest path from one body to another, None where there is none."""
         if body == target:
             return ()
-        came_by: dict[str, tuple[str, Crossing]] = {}
-        for previous, crossing in self.spread(body):
-            entered = names.split(crossing.leaves)[0]
-            came_by[entered] = (previous, crossing)
+        predecessors: dict[str, tuple[str, Crossing]] = {}
+        for previous, crossing in self.traverse_breadth_first(body):
+            entered = names.split(crossing.far_frame)[0]
+            predecessors[entered] = (previous, crossing)
             if entered == target:
-                return _unwind(came_by, body, target)
+                return _backtrack(predecessors, body, target)
         return None
 
-    def depth_first(self, body: str, frame: str, target: str) -> tuple[Crossing, ...] | None:
+    def find_path_depth_first(self, body: str, frame: str, target: str) -> tuple[Crossing, ...] | None:
         """Return the path that the report's search finds (4.6.2), None where there is none.
 
-        Starting at `body:frame`, each frame of the body is compared with `target` (a full name); one that
-        does not match and is constrained goes on the path stack, its constraint is crossed and the attached
-        frame examined, then those of its body; a frame that is on the stack already closes a cycle and its
-        branch is left. Order is that of the file, so the path need not be the shortest. Raises LimitError
-        after a million frames.
+        From `body:frame`, each frame of the body is compared with `target` (a full name). A constrained frame that does
+        not match is pushed on the path stack, its constraint is crossed, and the frames of the next body are examined.
+        A frame that is on the stack closes a cycle, and its branch is left. Order is that of the file, so the path need
+        not be the shortest. Raises LimitError after `DEPTH_FIRST_VISITS` frames.
         """
-        if names.joined(body, frame) == target:
+        if names.join(body, frame) == target:
             return ()
         path: list[Crossing] = []
         on_path: set[str] = set()
-        stack = [self._ways_on(body)]
+        stack = [self._iterate_crossings(body)]
         visits = 0
         while stack:
             visits += 1
@@ -182,43 +194,43 @@ class Topology:
                     f"the depth-first search gave up after {DEPTH_FIRST_VISITS} frames: the model has too many "
                     "loops for it; use the breadth-first search"
                 )
-            way = next(stack[-1], None)
-            if way is None:
+            step = next(stack[-1], None)
+            if step is None:
                 stack.pop()
                 if path:
-                    on_path.discard(path.pop().enters)
+                    on_path.discard(path.pop().near_frame)
                 continue
-            name, crossing = way
+            name, crossing = step
             if name == target:
                 return tuple(path)
-            if crossing is None or name in on_path or crossing.leaves in on_path:
+            if crossing is None or name in on_path or crossing.far_frame in on_path:
                 continue
             path.append(crossing)
-            if crossing.leaves == target:
+            if crossing.far_frame == target:
                 return tuple(path)
             on_path.add(name)
-            stack.append(self._ways_on(names.split(crossing.leaves)[0]))
+            stack.append(self._iterate_crossings(names.split(crossing.far_frame)[0]))
         return None
 
-    def _ways_on(self, body: str) -> Iterator[tuple[str, Crossing | None]]:
-        """Yield a body's frames in order, by their full names, each with None first and then with its constraints."""
+    def _iterate_crossings(self, body: str) -> Iterator[tuple[str, Crossing | None]]:
+        """Yield a body's frames in order by full name, each with None first and then with its crossings."""
         for frame in self._bodies[body].frames:
-            name = names.joined(body, frame.name)
+            name = names.join(body, frame.name)
             yield name, None
-            for crossing in self._at.get(name, ()):
+            for crossing in self._by_frame.get(name, ()):
                 yield name, crossing
 
 
-def _unwind(came_by: dict[str, tuple[str, Crossing]], start: str, target: str) -> tuple[Crossing, ...]:
+def _backtrack(predecessors: dict[str, tuple[str, Crossing]], start: str, target: str) -> tuple[Crossing, ...]:
     path = []
     while target != start:
-        target, crossing = came_by[target]
+        target, crossing = predecessors[target]
         path.append(crossing)
     return tuple(reversed(path))
 
 
-def _loop(reached: dict[str, tuple[str, Crossing]], a: str, b: str) -> tuple[str, ...]:
-    """Return the bodies of the loop that joining `a` and `b` closes, given how each was reached."""
+def _find_loop_bodies(reached: dict[str, tuple[str, Crossing]], a: str, b: str) -> tuple[str, ...]:
+    """Return the bodies of the loop that joining `a` and `b` closes, given the spanning tree."""
 
     def ancestors(body: str) -> list[str]:
         line = [body]
@@ -231,3 +243,173 @@ def _loop(reached: dict[str, tuple[str, Crossing]], a: str, b: str) -> tuple[str
     above_b = set(line_b)
     shared = next(body for body in line_a if body in above_b)
     return (*line_a[: line_a.index(shared) + 1], *reversed(line_b[: line_b.index(shared)]))
+
+
+class Neighbor(NamedTuple):
+    """The frame at the other end of a constraint, and the crossing that leads to it."""
+
+    frame: BodyFrame
+    crossing: Crossing
+
+    @property
+    def constraint(self) -> Constraint:
+        """The constraint that joins the two frames."""
+        return self.crossing.constraint
+
+    @property
+    def pose(self) -> Pose:
+        """The neighbor's pose in the frame that it was reached from; a movable joint at its default position."""
+        return self.crossing.pose
+
+
+def select_one(frame: str, found: Sequence[Neighbor], constraint: str) -> Neighbor:
+    """Return the neighbor across the constraint of that name, or the only one where `constraint` is empty.
+
+    Raises NotConnectedError where there is none, MalformedRequestError where there are several and none is named.
+    """
+    known = [each.constraint.name for each in found]
+    if constraint:
+        for each in found:
+            if each.constraint.name == constraint:
+                return each
+        there = f"it has {format_names(known)}" if known else "it has none"
+        raise NotConnectedError(
+            f"frame {frame} has no constraint {quote(constraint)}; {there}", find_nearest_names(constraint, known)
+        )
+    if not found:
+        raise NotConnectedError(f"frame {frame} has no constraint, so no frame is next to it")
+    if len(found) > 1:
+        raise MalformedRequestError(
+            f"frame {frame} has {len(found)} constraints, {format_names(known)}; name the one to cross"
+        )
+    return found[0]
+
+
+def full_name(frame: str | BodyFrame) -> str:
+    """Return the full name of a frame given by name or value. Raises UnknownFrameError for a value on no body."""
+    if isinstance(frame, str):
+        return frame
+    if not frame.body:
+        raise UnknownFrameError(f"frame {quote(frame.name)} is on no body; add it to one, or give its name Body:Frame")
+    return frame.full_name
+
+
+def find_problems(
+    name: str, found: Sequence[Neighbor], is_other: bool, is_orphan: bool, root: str
+) -> tuple[Problem, ...]:
+    """Return the problems of a frame: differs from the model's, body is an orphan, several constraints."""
+    problems = []
+    source = Location(element=f"frame {name}")
+    if is_other:
+        problems.append(
+            Problem(
+                Severity.ERROR,
+                "the model's frame of this name differs from this one",
+                source,
+                "take the frame from this model, or build a model with this frame in it",
+            )
+        )
+    if is_orphan:
+        body = name.partition(":")[0]
+        problems.append(
+            Problem(
+                Severity.WARNING,
+                f"body {body} is an orphan: no constraints lead to the root body {root}",
+                source,
+                f"add a constraint that joins it to {root} or to what is mounted there",
+            )
+        )
+    if len(found) > 1:
+        problems.append(
+            Problem(
+                Severity.NOTE,
+                f"the frame has {len(found)} constraints, {format_names([each.constraint.name for each in found])}; "
+                "a strict model allows one",
+                source,
+                "give each constraint a frame of its own, if the file has to load with strict",
+            )
+        )
+    return tuple(problems)
+
+
+class EdgeKind(StrEnum):
+    """The kind of an edge of a path."""
+
+    FRAME = "frame"
+    """From a body's origin to one of its frames."""
+    CONSTRAINT = "constraint"
+    """From the `from` frame of a constraint to its `to` frame, with a movable joint at 0."""
+    JOINT = "joint"
+    """The displacement of a joint."""
+    VEHICLE = "vehicle"
+    """From a world frame to the vehicle."""
+
+
+class Edge(NamedTuple):
+    """One edge of a path: passed from its near to its far end where `forward`.
+
+    `pose` is that of the far in the near end; for a movable joint it is the identity, and `joint` gives the
+    displacement. `sigma` is that of a survey, None where none is stated. `leader` is the joint that a mimic joint
+    follows, else "".
+    """
+
+    kind: EdgeKind
+    name: str
+    forward: bool
+    pose: Pose
+    sigma: Sigma | None = None
+    joint: Joint | None = None
+    leader: str = ""
+
+    @property
+    def is_sigma_missing(self) -> bool:
+        """Whether a fixed edge states no sigma; an identity pose is exact by definition."""
+        return self.sigma is None and self.pose != _IDENTITY
+
+    @property
+    def survey_factor(self) -> Array | None:
+        """The factor (6, n) of a fixed edge's covariance; None where its sigma is missing."""
+        if self.sigma is not None:
+            return np.diag((*self.sigma.position, *self.sigma.rotation))
+        return None if self.is_sigma_missing else _EXACT
+
+
+def list_edges(
+    path: Iterable[Crossing],
+    frame: Callable[[str], BodyFrame],
+    frame_of_interest: str,
+    frame_of_reference: str,
+) -> list[Edge]:
+    """Return the edges of a path from one frame to another: frames of bodies, constraints, and movable joints.
+
+    `frame` returns a frame by its full name. A frame at its body's origin by definition is no edge.
+    """
+    edges: list[Edge] = []
+    inside, name = frame(frame_of_reference), frame_of_reference
+
+    def add_frame_edges(leaving: BodyFrame, leaving_name: str) -> None:
+        if leaving is not inside:
+            for each, full, forward in ((inside, name, False), (leaving, leaving_name, True)):
+                if each.pose != _IDENTITY or each.sigma is not None:
+                    edges.append(Edge(EdgeKind.FRAME, full, forward, each.pose, each.sigma))
+
+    for crossing in path:
+        add_frame_edges(frame(crossing.near_frame), crossing.near_frame)
+        edges += list_crossing_edges(crossing)
+        inside, name = frame(crossing.far_frame), crossing.far_frame
+    add_frame_edges(frame(frame_of_interest), frame_of_interest)
+    return edges
+
+
+def list_crossing_edges(crossing: Crossing, leader: str = "") -> list[Edge]:
+    """Return the edge of a constraint, and that of its movable joint, which follows the joint `leader`, if any."""
+    each, forward = crossing.constraint, crossing.forward
+    edges = [Edge(EdgeKind.CONSTRAINT, each.name, forward, each.pose, each.sigma)]
+    if each.joint.is_movable:
+        joint = Edge(EdgeKind.JOINT, each.name, forward, _IDENTITY, joint=each.joint, leader=leader)
+        edges.insert(1 if forward else 0, joint)
+    return edges
+
+
+_IDENTITY = Pose.identity()
+_EXACT = np.zeros((6, 1))

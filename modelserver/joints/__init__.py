@@ -1,1 +1,1 @@
-"""Joint states over time: the readings of each coordinate, and where it is between them."""
+"""Joint states over time: the readings of each coordinate, interpolated, held or predicted."""

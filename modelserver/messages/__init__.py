@@ -1,76 +1,42 @@
-"""The values that the core speaks: what comes in, what is asked, what goes out. Pure, immutable.
+"""Values of the messages: samples, requests, replies, reports; inputs and outputs of the core.
 
-Units, frames and signs are those of the wire types of the same names in `lcmtypes/`, where each field is
-described; the codec in `modelserver.wire` is the only place that knows both. What a device did not say is
-nan for a number and None for a vector or a matrix.
-
-Requests and replies are NamedTuples where the rest are dataclasses: they are made with every query, and a
-NamedTuple is made at a third of the cost.
+Units, frames and signs are those of the wire types in `lcmtypes/`, which declare most of them. A number that is not
+known is nan, a vector or matrix None. What is exchanged with every query is a NamedTuple, which costs a third of a
+dataclass; the rest are frozen dataclasses. This module and `generated` are written by `make types`.
 """
 
-from modelserver.messages.decisions import Decision, Verdict
-from modelserver.messages.driver_health import DriverHealth, DriverPhase
+from modelserver.messages.answers import EdgeReport, Explanation, MotionAnswer, PoseAnswer, PoseBatch
 from modelserver.messages.estimates import Estimate, MotionCovariance, Origin, VehicleMotion
 from modelserver.messages.events import (
     Denied,
     Event,
-    KeepState,
+    Gauges,
+    HealthWarning,
     LoadModel,
-    Noticed,
-    OriginLatched,
     Output,
-    PublishDecisions,
+    PersistOrigin,
+    PersistState,
     PublishHealth,
     PublishNavigation,
     PublishPose,
     PublishSnapshot,
     Rejected,
+    ReportStart,
     SendReply,
     SignedCommand,
-    SnapshotPart,
-    StartTold,
-    SwitchMode,
     Tick,
 )
-from modelserver.messages.flags import (
-    NAN,
-    NO_FLAGS,
-    SILENCE,
-    VALID,
-    Direction,
-    FixType,
-    Invalid,
-    OrientationReference,
-    Policy,
-    Quality,
-    VehicleMode,
-    YawSource,
-)
-from modelserver.messages.health import ChannelHealth, Gauges, Health, LocalizationHealth
-from modelserver.messages.kept import Kept, KeptPose, Recalled
-from modelserver.messages.navigation import LocalizerSummary, Mode, NavigationState, Phase, SensorFinding
-from modelserver.messages.replies import (
+from modelserver.messages.flags import NAN, NO_FLAGS, STALE_SENSORS, VALID, Invalid, Quality
+from modelserver.messages.generated import (
+    AbsolutePoseSample,
     Acknowledgement,
-    EdgeReport,
-    Explanation,
-    ExplanationReply,
-    HistoryReply,
-    ManyPoses,
-    ManyReply,
-    MotionAnswer,
-    MotionReply,
-    NameListReply,
-    PoseAnswer,
-    ReloadReply,
-    Reply,
-    ReplyHeader,
-    StateVectorReply,
-    TransformReply,
-)
-from modelserver.messages.requests import (
-    CHANNEL_OF,
-    MAX_CHANNEL_LENGTH,
-    MOST_INSTANTS,
+    ChannelHealth,
+    Decision,
+    Direction,
+    DriverHealth,
+    DriverPhase,
+    Envelope,
+    FixType,
     GetBodyFrameList,
     GetBodyList,
     GetExplanation,
@@ -80,40 +46,55 @@ from modelserver.messages.requests import (
     GetStateVector,
     GetTransformation,
     GetTransformations,
-    ReloadModel,
-    Request,
-    RequestHeader,
-    SetHTransform,
-    SetStateVector,
-    TimeQuery,
-)
-from modelserver.messages.samples import (
-    AbsolutePoseSample,
     GpsSample,
+    Health,
+    HistoryReply,
     ImuSample,
     JointSample,
     JointsSample,
-    Matrix3,
+    LocalizationHealth,
+    Mode,
+    NameListReply,
+    OrientationReference,
+    Phase,
+    Policy,
+    PublishDecisions,
     RangeSample,
+    RejectedCount,
     RelativePoseSample,
-    Sample,
+    ReloadModel,
+    ReloadReply,
+    ReplyHeader,
+    RequestHeader,
     SensorHeader,
+    SetHTransform,
+    SetStateVector,
+    SnapshotPart,
+    StateVectorReply,
+    SwitchMode,
+    TimeQuery,
+    TransformReply,
+    VehicleCommand,
+    VehicleMode,
     VehicleStatusSample,
+    Verdict,
     WheelSample,
     WheelsSample,
+    YawSource,
 )
-from modelserver.messages.signed import MAC_BYTES, MAX_PAYLOAD, Envelope
-from modelserver.messages.vehicle import VehicleCommand
+from modelserver.messages.navigation import LocalizerSummary, NavigationState, SensorFinding
+from modelserver.messages.persistence import PersistedPose, PersistedState, RestoredState
+from modelserver.messages.replies import ExplanationReply, MotionReply, PoseBatchReply, Reply
+from modelserver.messages.requests import CHANNEL_OF, MAX_CHANNEL_LENGTH, MAX_REQUEST_INSTANTS, Request, is_answerable
+from modelserver.messages.samples import Sample
 
 __all__ = [
     "CHANNEL_OF",
-    "MAC_BYTES",
     "MAX_CHANNEL_LENGTH",
-    "MAX_PAYLOAD",
-    "MOST_INSTANTS",
+    "MAX_REQUEST_INSTANTS",
     "NAN",
     "NO_FLAGS",
-    "SILENCE",
+    "STALE_SENSORS",
     "VALID",
     "AbsolutePoseSample",
     "Acknowledgement",
@@ -142,34 +123,33 @@ __all__ = [
     "GetTransformations",
     "GpsSample",
     "Health",
+    "HealthWarning",
     "HistoryReply",
     "ImuSample",
     "Invalid",
     "JointSample",
     "JointsSample",
-    "KeepState",
-    "Kept",
-    "KeptPose",
     "LoadModel",
     "LocalizationHealth",
     "LocalizerSummary",
-    "ManyPoses",
-    "ManyReply",
-    "Matrix3",
     "Mode",
     "MotionAnswer",
     "MotionCovariance",
     "MotionReply",
     "NameListReply",
     "NavigationState",
-    "Noticed",
     "OrientationReference",
     "Origin",
-    "OriginLatched",
     "Output",
+    "PersistOrigin",
+    "PersistState",
+    "PersistedPose",
+    "PersistedState",
     "Phase",
     "Policy",
     "PoseAnswer",
+    "PoseBatch",
+    "PoseBatchReply",
     "PublishDecisions",
     "PublishHealth",
     "PublishNavigation",
@@ -177,15 +157,17 @@ __all__ = [
     "PublishSnapshot",
     "Quality",
     "RangeSample",
-    "Recalled",
     "Rejected",
+    "RejectedCount",
     "RelativePoseSample",
     "ReloadModel",
     "ReloadReply",
     "Reply",
     "ReplyHeader",
+    "ReportStart",
     "Request",
     "RequestHeader",
+    "RestoredState",
     "Sample",
     "SendReply",
     "SensorFinding",
@@ -194,7 +176,6 @@ __all__ = [
     "SetStateVector",
     "SignedCommand",
     "SnapshotPart",
-    "StartTold",
     "StateVectorReply",
     "SwitchMode",
     "Tick",
@@ -208,4 +189,5 @@ __all__ = [
     "WheelSample",
     "WheelsSample",
     "YawSource",
+    "is_answerable",
 ]

@@ -1,4 +1,4 @@
-"""What localization says."""
+"""Results of localization."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 from modelserver.messages.flags import NAN, NO_FLAGS, VALID, Invalid, Quality
-from modelserver.spatial.pose import Pose
-from modelserver.spatial.so3 import Vector3
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Vector3
 
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """The origin of World:UTM: grid coordinates in a pinned zone, ellipsoidal height, metres.
+    """Origin of World:UTM: grid coordinates in a pinned zone, ellipsoidal height, meters.
 
-    `origin_id` names it; it changes with any of the numbers.
+    `origin_id` identifies it and changes with any of the numbers.
     """
 
     easting: float
@@ -26,45 +26,44 @@ class Origin:
 
     @property
     def initial_utm(self) -> Vector3:
-        """Grid easting, grid northing, height above the ellipsoid, metres."""
+        """Grid easting, grid northing, height above the ellipsoid, meters."""
         return (self.easting, self.northing, self.height)
 
 
 class MotionCovariance(Protocol):
-    """Works out the covariance of a motion when it is called: 36 numbers of velocity and rate, row-major.
+    """Computes the covariance of velocity and angular velocity (36 numbers, row-major) when called.
 
-    What a journal keeps of it are its fields, so it is a declared value, not a function.
+    A value with fields, not a function, so that the journal can store it.
     """
 
     def __call__(self) -> tuple[float, ...]:
-        """Return the numbers: the same each time."""
+        """Return the 36 numbers."""
         ...
 
 
 class VehicleMotion(NamedTuple):
-    """How the vehicle moves relative to the ground, along the axes of the frame that an estimate is of.
+    """Motion of the vehicle relative to the ground, along the axes of the estimated frame.
 
-    `velocity` (m/s) is that of its origin, `rate` (rad/s) its angular velocity. `acceleration` (m/s2) is that of the
-    point `felt_at` (m, from the frame's origin), where the inertial unit is; nan where nobody felt any. `covariance`
-    works out the 36 numbers of velocity and rate when it is called; None: not known.
+    `velocity` (m/s) is that of the frame's origin, `angular_velocity` in rad/s. `acceleration` (m/s2) is that of the
+    IMU at `imu_position` (m, from the frame's origin), nan = not known. `covariance` is None where it is not known.
     """
 
     velocity: Vector3
-    rate: Vector3
+    angular_velocity: Vector3
     acceleration: Vector3 = (NAN, NAN, NAN)
-    felt_at: Vector3 = (0.0, 0.0, 0.0)
+    imu_position: Vector3 = (0.0, 0.0, 0.0)
     covariance: MotionCovariance | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """The base frame at one instant.
+    """Estimate of the base frame at one instant.
 
-    `odom` is its pose in Odom:Origin, `enu` in the tangent plane at the origin, `utm` in World:UTM; the last
-    two are None before the origin is known. `covariance` is 36 numbers, row-major, of the world pose along
-    east, north, up (of `utm` and `enu` alike: the convergence between their axes is below the noise that a
-    covariance states). `odom_covariance` has grown since Odom began: as a random walk does where `odom_walks`, so that
-    variances add up; else in proportion to time, so that sigmas do. `motion` is None where it is not known.
+    `odom` is its pose in Odom:Origin, `enu` in the tangent plane at the origin, `utm` in World:UTM; the last two are
+    None before the origin is known. `covariance` (36 numbers, row-major) is that of the world pose along east, north,
+    up, for `utm` and `enu` alike: the meridian convergence between their axes is negligible in it. `odom_covariance`
+    grows from the start of Odom: as a random walk (variances add) if `is_odom_random_walk`, else in proportion to time
+    (sigmas add). `motion` is None where it is not known.
     """
 
     utime: int
@@ -77,8 +76,8 @@ class Estimate:
     quality: Quality = NO_FLAGS
     pose_epoch: int = 0
     origin: Origin | None = None
-    horizontal_bound: float = NAN
-    heading_bound: float = NAN
+    horizontal_protection_level: float = NAN
+    heading_protection_level: float = NAN
     seconds_to_limit: float = NAN
     motion: VehicleMotion | None = field(default=None, repr=False)
-    odom_walks: bool = False
+    is_odom_random_walk: bool = False

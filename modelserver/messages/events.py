@@ -1,29 +1,52 @@
-"""What the core is told, and what it says."""
+"""Inputs (`Event`) and outputs (`Output`) of the core."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
-from modelserver.messages.decisions import Decision
+from modelserver.messages.answers import PoseAnswer
 from modelserver.messages.estimates import Origin
-from modelserver.messages.health import Gauges, Health
-from modelserver.messages.kept import Kept
-from modelserver.messages.navigation import Mode, NavigationState
-from modelserver.messages.replies import PoseAnswer, Reply
-from modelserver.messages.requests import ReloadModel, Request, RequestHeader, SetHTransform, SetStateVector
-from modelserver.messages.samples import Sample, SensorHeader
+from modelserver.messages.flags import NAN
+from modelserver.messages.generated import (
+    Health,
+    PublishDecisions,
+    ReloadModel,
+    RequestHeader,
+    SetHTransform,
+    SetStateVector,
+    SwitchMode,
+)
+from modelserver.messages.navigation import NavigationState
+from modelserver.messages.persistence import PersistedState
+from modelserver.messages.replies import Reply
+from modelserver.messages.requests import Request
+from modelserver.messages.samples import Sample
+
+
+class Gauges(NamedTuple):
+    """Measured values of the process and its loop, which enter the core with a tick.
+
+    `host` and `pid` identify the process. `queued`: requests in the queue. `memory`: resident bytes, 0 = not known.
+    `cpu_s`: processor time since the start of the process, seconds, nan = not known.
+    """
+
+    host: str = ""
+    pid: int = 0
+    queued: int = 0
+    memory: int = 0
+    cpu_s: float = NAN
 
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """The clock has reached a due time, `late` seconds after it; `missed` due times before it were skipped.
+    """Timer tick, `latency` seconds after its deadline; `missed` deadlines before it were skipped.
 
-    `answered`: requests that were answered from what is remembered, without the core, since the last tick. `gauges`
-    comes with ticks at which a health report is due.
+    `answered` counts the requests that were answered from the reply cache, without the core, since the last tick.
+    `gauges` comes with ticks at which a health report is due.
     """
 
-    late: float = 0.0
+    latency: float = 0.0
     missed: int = 0
     answered: int = 0
     gauges: Gauges | None = None
@@ -31,7 +54,7 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Rejected:
-    """Something that came in and was not understood or not taken, `count` times: counted by channel and reason."""
+    """Input that was rejected `count` times; counted by channel and reason."""
 
     channel: str
     reason: str
@@ -39,10 +62,10 @@ class Rejected:
 
 
 @dataclass(frozen=True, slots=True)
-class Noticed:
-    """Something about the service itself that people who watch should know until it is over; see health_t.
+class HealthWarning:
+    """Warning about the service itself in the health report (health_t), until it is cleared.
 
-    `subject` names what it is about, e.g. journal; an empty `text` takes the notice back.
+    `subject` identifies the warning, e.g. journal; an empty `text` clears it.
     """
 
     subject: str
@@ -50,38 +73,30 @@ class Noticed:
 
 
 @dataclass(frozen=True, slots=True)
-class SwitchMode:
-    """The operator's wish that localization uses other sources from `header.utime` on; see localization_mode_t."""
-
-    header: SensorHeader
-    mode: Mode
-
-
-@dataclass(frozen=True, slots=True)
 class SignedCommand:
-    """What changes the service, from a sender who has proved to know the vehicle's key."""
+    """A command whose signature was verified with the vehicle's key."""
 
-    order: ReloadModel | SetStateVector | SetHTransform | SwitchMode
+    command: ReloadModel | SetStateVector | SetHTransform | SwitchMode
     sender: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Denied:
-    """A signed command that is not obeyed: counted under `channel` by `reason`.
+    """A denied command; counted under `channel` by `reason`.
 
-    Where its signature is right and it wants a reply, `kind` and `header` say which, and `why` is told, as of something
-    `malformed` or else forbidden; who does not know the key is told nothing.
+    With a valid signature the sender gets a reply of `request_type` to `header` with `message` and the status MALFORMED
+    (`is_malformed`) or FORBIDDEN. Without one it gets no reply: the two fields are None.
     """
 
     channel: str
     reason: str
-    why: str = ""
-    kind: type[Request] | None = None
+    message: str = ""
+    request_type: type[Request] | None = None
     header: RequestHeader | None = None
-    malformed: bool = False
+    is_malformed: bool = False
 
 
-Event: TypeAlias = Sample | SwitchMode | Request | SignedCommand | Denied | Tick | Rejected | Noticed
+Event: TypeAlias = Sample | SwitchMode | Request | SignedCommand | Denied | Tick | Rejected | HealthWarning
 
 
 class SendReply(NamedTuple):
@@ -93,7 +108,7 @@ class SendReply(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class PublishPose:
-    """Broadcast the vehicle's pose in the world, and in Odom."""
+    """Publish the vehicle's pose in World:UTM and in Odom:Origin."""
 
     world: PoseAnswer
     odom: PoseAnswer
@@ -101,68 +116,49 @@ class PublishPose:
 
 @dataclass(frozen=True, slots=True)
 class PublishHealth:
-    """Broadcast how the daemon is."""
+    """Publish the health report."""
 
     health: Health
 
 
 @dataclass(frozen=True, slots=True)
-class OriginLatched:
-    """The origin was set: keep it across restarts."""
+class PersistOrigin:
+    """Persist the origin of World:UTM, which was just set."""
 
     origin: Origin
 
 
 @dataclass(frozen=True, slots=True)
-class PublishDecisions:
-    """Broadcast what became of measurements; each is said once, when nothing can change it any more."""
-
-    utime: int
-    decisions: tuple[Decision, ...]
-
-
-@dataclass(frozen=True, slots=True)
 class PublishNavigation:
-    """Broadcast the filter's whole state."""
+    """Publish the filter's state."""
 
     state: NavigationState
 
 
 @dataclass(frozen=True, slots=True)
 class LoadModel:
-    """Read the geometry anew and tell the core what came of it; `request` is None where the machine's owner asks."""
+    """Reload the geometry file; `request` is None for a reload by signal."""
 
     request: ReloadModel | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class PublishSnapshot:
-    """Broadcast the geometry that is in force."""
+    """Publish the geometry in use."""
 
     utime: int
 
 
 @dataclass(frozen=True, slots=True)
-class SnapshotPart:
-    """A part of the geometry on the bus; see model_snapshot_t."""
+class PersistState:
+    """Persist the state for the next run of the service, in place of the one before."""
 
-    utime: int
-    model_revision: str
-    part: int
-    parts: int
-    data: bytes
+    state: PersistedState
 
 
 @dataclass(frozen=True, slots=True)
-class KeepState:
-    """Keep this for the next run of the service, in place of what was kept before."""
-
-    kept: Kept
-
-
-@dataclass(frozen=True, slots=True)
-class StartTold:
-    """How the start goes, for the log: warm, or cold and why."""
+class ReportStart:
+    """Log the kind of start: warm, or cold and why."""
 
     text: str
 
@@ -171,11 +167,11 @@ Output: TypeAlias = (
     SendReply
     | PublishPose
     | PublishHealth
-    | OriginLatched
+    | PersistOrigin
     | PublishDecisions
     | PublishNavigation
     | LoadModel
     | PublishSnapshot
-    | KeepState
-    | StartTold
+    | PersistState
+    | ReportStart
 )

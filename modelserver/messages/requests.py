@@ -1,149 +1,47 @@
-"""What is asked, and on which channel."""
+"""Requests, their channels and limits. The requests themselves are generated from the .lcm files."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, TypeAlias
 
-from modelserver.messages.flags import Policy
-from modelserver.messages.replies import PoseAnswer
-
-
-class RequestHeader(NamedTuple):
-    """Which request, and where the answer goes."""
-
-    request_id: int
-    reply_channel: str
-
-    def is_answerable(self, prefix: str) -> bool:
-        """Return whether a server may speak on the reply channel: within its prefix, plain, not too long."""
-        # the length first: what is looked up is kept
-        return len(self.reply_channel) <= MAX_CHANNEL_LENGTH and _is_answerable(self.reply_channel, prefix)
-
+from modelserver.messages.generated import (
+    GetBodyFrameList,
+    GetBodyList,
+    GetExplanation,
+    GetHistory,
+    GetHTransform,
+    GetMotion,
+    GetStateVector,
+    GetTransformation,
+    GetTransformations,
+    ReloadModel,
+    RequestHeader,
+    SetHTransform,
+    SetStateVector,
+)
 
 MAX_CHANNEL_LENGTH = 63
-"""LCM refuses longer names."""
+"""LCM rejects longer names."""
+
+MAX_REQUEST_INSTANTS: Final = 2_000
+"""In one GetTransformations, all pairs together: they take the server about a hundredth of a second."""
 
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_]+")
 
 
+def is_answerable(header: RequestHeader, prefix: str) -> bool:
+    """Return whether a server may reply on the request's reply channel: within its prefix, plain, not too long."""
+    channel = header.reply_channel
+    # the length first: what is looked up is cached
+    return len(channel) <= MAX_CHANNEL_LENGTH and _is_plain(channel, prefix)
+
+
 @lru_cache(maxsize=1024)
-def _is_answerable(channel: str, prefix: str) -> bool:
+def _is_plain(channel: str, prefix: str) -> bool:
     return len(channel) > len(prefix) and channel.startswith(prefix) and _PLAIN_NAME.fullmatch(channel) is not None
-
-
-class TimeQuery(NamedTuple):
-    """What time a request means; `at` 0 is the latest common time. See time_query_t."""
-
-    at: int = 0
-    policy: Policy = Policy.INTERPOLATED
-    wait_ms: int = 0
-
-
-class GetTransformation(NamedTuple):
-    """Where is `frame_of_interest` in `frame_of_reference`?"""
-
-    header: RequestHeader
-    frame_of_interest: str
-    frame_of_reference: str
-    time: TimeQuery = TimeQuery()
-
-
-class GetBodyList(NamedTuple):
-    """Which bodies are there?"""
-
-    header: RequestHeader
-
-
-class GetBodyFrameList(NamedTuple):
-    """Which frames has a body?"""
-
-    header: RequestHeader
-    body: str
-
-
-class GetStateVector(NamedTuple):
-    """Where is the vehicle in the world, as a 7-vector?"""
-
-    header: RequestHeader
-    time: TimeQuery = TimeQuery()
-
-
-class GetHTransform(NamedTuple):
-    """Where is the vehicle in the world, or with `inverse` the world in the vehicle?"""
-
-    header: RequestHeader
-    inverse: bool = False
-    time: TimeQuery = TimeQuery()
-
-
-class GetHistory(NamedTuple):
-    """Where was the vehicle in the world between two times?"""
-
-    header: RequestHeader
-    start_utime: int
-    end_utime: int
-    rate_hz: float
-
-
-MOST_INSTANTS: Final = 2_000
-"""In one GetTransformations, all pairs together: they take the server about a hundredth of a second."""
-
-
-class GetTransformations(NamedTuple):
-    """Where are frames in others at many instants? `pairs` are of frame of interest and frame of reference.
-
-    With `fixed_frame`, at the instants in the frames of reference at `reference_at`; see get_transformations_request_t.
-    """
-
-    header: RequestHeader
-    pairs: tuple[tuple[str, str], ...]
-    at: tuple[int, ...]
-    fixed_frame: str = ""
-    reference_at: int = 0
-    with_covariance: bool = True
-
-
-class GetMotion(NamedTuple):
-    """How does `frame_of_interest` move in `frame_of_reference`, along the axes of `expressed_in`?"""
-
-    header: RequestHeader
-    frame_of_interest: str
-    frame_of_reference: str
-    expressed_in: str = ""
-    time: TimeQuery = TimeQuery()
-
-
-class GetExplanation(NamedTuple):
-    """Where is `frame_of_interest` in `frame_of_reference`, and what does that rest on?"""
-
-    header: RequestHeader
-    frame_of_interest: str
-    frame_of_reference: str
-    time: TimeQuery = TimeQuery()
-
-
-class ReloadModel(NamedTuple):
-    """Read the geometry anew; with `dry_run` only say what would change."""
-
-    header: RequestHeader
-    dry_run: bool = False
-
-
-class SetStateVector(NamedTuple):
-    """The vehicle is there: its base frame's pose in World:UTM; see set_state_vector_request_t."""
-
-    header: RequestHeader
-    pose: PoseAnswer
-
-
-class SetHTransform(NamedTuple):
-    """As SetStateVector; see set_h_transform_request_t."""
-
-    header: RequestHeader
-    pose: PoseAnswer
 
 
 Request: TypeAlias = (
@@ -175,4 +73,4 @@ CHANNEL_OF: Final[Mapping[type, str]] = {
     SetStateVector: "POSE_SET_STATE_VECTOR",
     SetHTransform: "POSE_SET_H_TRANSFORM",
 }
-"""The channel that each kind of request comes in on, without the vehicle's prefix."""
+"""The channel of each request type, without the vehicle's prefix."""

@@ -1,38 +1,33 @@
-"""A simulated vehicle with truth and sensors: deterministic from a seed, no clock, no device. Pure.
+"""Simulated vehicle with truth and sensors: deterministic from a seed, without clock or device. Pure.
 
 trajectory = Trajectory(figure_eight(speed=2.0, radius=8.0))
 simulation = Simulation(model, "Raptor:CG", trajectory, origin_at(50.27, -111.1, 700.0),
-                        gps_frame="GPSAntenna:PhaseCentre", imu_frame="Microstrain:Sensor", seed=7)
+                        gps_frame="GPSAntenna:PhaseCenter", imu_frame="Microstrain:Sensor", seed=7)
 for sample in simulation.events(30.0):      # in order of arrival
     ...
-simulation.truth(sample.header.utime).enu   # where the base frame really was
+simulation.truth(sample.header.utime).enu   # true pose of the base frame
 
-More on request: ground that rises (`Terrain`), side slip (`SideSlip`), errors of every sensor, further sources;
-`faults` has what goes wrong on the way from a sensor to the server.
+Options: uneven ground (`Terrain`), side slip (`SideSlip`), errors of every sensor (`GpsModel`, `ImuModel`, ...), aiding
+sensors; `faults` has transport faults between sensor and server.
 """
 
 from modelserver.simulation.aiding import AbsolutePoseModel, RangeModel, RelativePoseModel
-from modelserver.simulation.encoder import EncoderModel
-from modelserver.simulation.figures import (
+from modelserver.simulation.gps import GpsModel
+from modelserver.simulation.ground_motion import GroundMotion, SideSlip, Terrain, Wave, make_motion
+from modelserver.simulation.imu import ImuModel, MagnetometerModel, TriadModel
+from modelserver.simulation.maneuvers import (
     city,
     figure_eight,
     reverse_eight,
-    stand,
+    stationary,
     stop_and_go,
     straight,
     there_and_back,
 )
-from modelserver.simulation.gps import GpsModel
-from modelserver.simulation.imu import ImuModel
-from modelserver.simulation.magnetometer import MagnetometerModel
-from modelserver.simulation.ride import Ride, ride
 from modelserver.simulation.scenario import Event, Simulation, Truth
-from modelserver.simulation.side_slip import SideSlip
-from modelserver.simulation.stamps import Timing
-from modelserver.simulation.terrain import Terrain, Wave
+from modelserver.simulation.timing import Timing
 from modelserver.simulation.trajectory import DrivePhase, MotionModel, Trajectory, TrajectoryMotion
-from modelserver.simulation.triad import TriadModel
-from modelserver.simulation.wheels import StatusModel, WheelsModel
+from modelserver.simulation.wheels import EncoderModel, StatusModel, WheelsModel
 
 __all__ = [
     "AbsolutePoseModel",
@@ -40,12 +35,12 @@ __all__ = [
     "EncoderModel",
     "Event",
     "GpsModel",
+    "GroundMotion",
     "ImuModel",
     "MagnetometerModel",
     "MotionModel",
     "RangeModel",
     "RelativePoseModel",
-    "Ride",
     "SideSlip",
     "Simulation",
     "StatusModel",
@@ -59,9 +54,9 @@ __all__ = [
     "WheelsModel",
     "city",
     "figure_eight",
+    "make_motion",
     "reverse_eight",
-    "ride",
-    "stand",
+    "stationary",
     "stop_and_go",
     "straight",
     "there_and_back",

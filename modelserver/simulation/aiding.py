@@ -1,4 +1,4 @@
-"""Sources beside GPS, inertial unit and wheels: poses from elsewhere, visual odometry, ranges to beacons."""
+"""Simulation of aiding sensors: absolute poses (map matching), visual odometry, ranges to beacons."""
 
 from __future__ import annotations
 
@@ -8,49 +8,56 @@ from dataclasses import dataclass, replace
 
 from modelserver.earth.geodesy import Geodesy
 from modelserver.messages import AbsolutePoseSample, RangeSample, RelativePoseSample
-from modelserver.simulation import rigid
+from modelserver.simulation import kinematics
 from modelserver.simulation.noise import NoiseSource
-from modelserver.simulation.stamps import Intervals, Timing, headers, within
+from modelserver.simulation.timing import Intervals, Timing, generate_headers, is_within
 from modelserver.simulation.trajectory import MotionModel
-from modelserver.spatial import so3
-from modelserver.spatial.pose import Pose
-from modelserver.spatial.so3 import Vector3
+from modelserver.transforms import so3
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Vector3
 
 ENU = "World:ENU"
 UTM = "World:UTM"
 
 _TIMING = Timing(5.0, latency=0.05, jitter=0.005)
-_LEAST = 1e-4
-"""No source claims a smaller standard deviation, metres or radians."""
+_MIN_SIGMA = 1e-4
+"""Smallest standard deviation that a source states, meters or radians."""
 
 
 @dataclass(frozen=True, slots=True)
 class AbsolutePoseModel:
-    """A source of poses in a world frame, as matching with a map. Metres, radians, seconds.
+    """A source of poses in a world frame, such as map matching. Meters, radians, seconds.
 
-    position_sigma, orientation_sigma: of each axis in each sample. frame_of_reference: World:ENU or World:UTM.
-    tells_position, tells_orientation: what is not told is None. outages: as everywhere.
+    Attributes
+    ----------
+    position_sigma, orientation_sigma : noise of each axis and sample
+    frame_of_reference : World:ENU or World:UTM
+    has_position, has_orientation : whether they are reported; otherwise None
+    outages : (begin, end) in seconds since the start without samples
     """
 
     timing: Timing = _TIMING
     position_sigma: float = 0.05
     orientation_sigma: float = 0.01
     frame_of_reference: str = ENU
-    tells_position: bool = True
-    tells_orientation: bool = True
+    has_position: bool = True
+    has_orientation: bool = True
     outages: Intervals = ()
 
     def __post_init__(self) -> None:
         if self.frame_of_reference not in (ENU, UTM):
-            raise ValueError(f"poses are in {ENU} or {UTM}, got {self.frame_of_reference!r}")
+            raise ValueError(f"frame_of_reference must be {ENU} or {UTM}; got {self.frame_of_reference!r}")
 
 
 @dataclass(frozen=True, slots=True)
 class RelativePoseModel:
-    """Visual odometry: each sample tells the way since the last. Metres, radians.
+    """Visual odometry: each sample is the pose relative to the last instant. Meters, radians.
 
-    position_sigma, orientation_sigma: of each axis in each sample. scale_sigma: of its error of scale, drawn once.
-    outages: samples that are lost; the next tells the way since its own predecessor all the same.
+    Attributes
+    ----------
+    position_sigma, orientation_sigma : noise of each axis and sample
+    scale_sigma : standard deviation of the scale error, drawn once
+    outages : lost samples; the next one is still relative to its own predecessor
     """
 
     timing: Timing = _TIMING
@@ -62,20 +69,24 @@ class RelativePoseModel:
 
 @dataclass(frozen=True, slots=True)
 class RangeModel:
-    """Distances to beacons, all at each instant. Metres.
+    """Distances to beacons, all at each instant. Meters.
 
-    sigma: of each distance; bias_sigma: of each beacon's constant error, drawn once. reach: beacons farther away are
-    not heard. outages: as everywhere.
+    Attributes
+    ----------
+    sigma : noise of each distance
+    bias_sigma : standard deviation of each beacon's constant error, drawn once
+    max_range : beacons farther away give no sample
+    outages : (begin, end) in seconds since the start without samples
     """
 
     timing: Timing = _TIMING
     sigma: float = 0.1
     bias_sigma: float = 0.0
-    reach: float = math.inf
+    max_range: float = math.inf
     outages: Intervals = ()
 
 
-def absolute_poses(
+def simulate_absolute_poses(
     model: AbsolutePoseModel,
     drive: MotionModel,
     frame: str,
@@ -85,51 +96,51 @@ def absolute_poses(
     seed: int,
     source: str,
 ) -> Iterator[AbsolutePoseSample]:
-    """Yield the samples, for ever. `X_VF` is the pose of `frame` in the vehicle's moving frame."""
-    noise = NoiseSource(seed, f"absolute/{source}").draw_ahead()
+    """Yield samples without end. `X_VF` is the pose of `frame` in the vehicle's moving frame."""
+    noise = NoiseSource(seed, f"absolute/{source}").prefetch()
     covariance = _covariance(model.position_sigma, model.orientation_sigma)
     arrival = NoiseSource(seed, f"absolute/{source}/arrival")
-    for header in headers(model.timing, start_utime, start_utime - 1_000_000, source, arrival):
+    for header in generate_headers(model.timing, start_utime, start_utime - 1_000_000, source, arrival):
         shift, turn = noise.vector(model.position_sigma), noise.vector(model.orientation_sigma)
         t = (header.utime - start_utime) * 1e-6
-        if within(model.outages, t):
+        if is_within(model.outages, t):
             continue
-        true = rigid.pose(drive.at(t), X_VF)
+        true = kinematics.pose(drive.at(t), X_VF)
         if model.frame_of_reference == UTM:
             true = geodesy.pose_in_utm(true)
-        said = _disturbed(true, shift, turn)
+        measured = _add_error(true, shift, turn)
         yield AbsolutePoseSample(
             header,
             frame,
             model.frame_of_reference,
-            position=said.xyz if model.tells_position else None,
-            orientation=said.wxyz if model.tells_orientation else None,
+            position=measured.xyz if model.has_position else None,
+            orientation=measured.wxyz if model.has_orientation else None,
             covariance=covariance,
         )
 
 
-def relative_poses(
+def simulate_relative_poses(
     model: RelativePoseModel, drive: MotionModel, frame: str, X_VF: Pose, start_utime: int, seed: int, source: str
 ) -> Iterator[RelativePoseSample]:
-    """Yield the samples, for ever; the first at the second instant. `X_VF` is as in `absolute_poses`."""
-    noise = NoiseSource(seed, f"relative/{source}").draw_ahead()
+    """Yield samples without end, the first at the second instant. `X_VF` as in `simulate_absolute_poses`."""
+    noise = NoiseSource(seed, f"relative/{source}").prefetch()
     scale = 1.0 + noise.normal(model.scale_sigma)
     covariance = _covariance(model.position_sigma, model.orientation_sigma)
     arrival = NoiseSource(seed, f"relative/{source}/arrival")
     since: int | None = None
     before = Pose()
-    for header in headers(model.timing, start_utime, start_utime - 1_000_000, source, arrival):
+    for header in generate_headers(model.timing, start_utime, start_utime - 1_000_000, source, arrival):
         shift, turn = noise.vector(model.position_sigma), noise.vector(model.orientation_sigma)
         t = (header.utime - start_utime) * 1e-6
-        here = rigid.pose(drive.at(t), X_VF)
-        if since is not None and not within(model.outages, t):
-            x, y, z = (way := before.inverse() @ here).xyz
-            said = _disturbed(Pose((x * scale, y * scale, z * scale), way.wxyz), shift, turn)
-            yield RelativePoseSample(header, frame, since, said.xyz, said.wxyz, covariance)
+        here = kinematics.pose(drive.at(t), X_VF)
+        if since is not None and not is_within(model.outages, t):
+            x, y, z = (step := before.inverse() @ here).xyz
+            measured = _add_error(Pose((x * scale, y * scale, z * scale), step.wxyz), shift, turn)
+            yield RelativePoseSample(header, frame, since, measured.xyz, measured.wxyz, covariance)
         before, since = here, header.utime
 
 
-def ranges(
+def simulate_ranges(
     model: RangeModel,
     drive: MotionModel,
     frame: str,
@@ -139,37 +150,37 @@ def ranges(
     seed: int,
     source: str,
 ) -> Iterator[RangeSample]:
-    """Yield the samples, for ever. `beacons` are places in World:ENU, metres, by name.
+    """Yield samples without end. `beacons` are positions in World:ENU, meters, by name; `seq` counts samples.
 
-    `lever` is the place of `frame` in the vehicle's moving frame. `seq` counts samples.
+    `lever` is the position of `frame` in the vehicle's moving frame.
     """
-    noise = NoiseSource(seed, f"range/{source}").draw_ahead()
+    noise = NoiseSource(seed, f"range/{source}").prefetch()
     biases = {name: noise.normal(model.bias_sigma) for name in beacons}
-    sigma = max(math.hypot(model.sigma, model.bias_sigma), _LEAST)
+    sigma = max(math.hypot(model.sigma, model.bias_sigma), _MIN_SIGMA)
     arrival = NoiseSource(seed, f"range/{source}/arrival")
     X_VF = Pose(lever)
     seq = 0
-    for header in headers(model.timing, start_utime, start_utime - 1_000_000, source, arrival):
+    for header in generate_headers(model.timing, start_utime, start_utime - 1_000_000, source, arrival):
         errors = {name: bias + noise.normal(model.sigma) for name, bias in biases.items()}
         t = (header.utime - start_utime) * 1e-6
-        if within(model.outages, t):
+        if is_within(model.outages, t):
             continue
-        here = rigid.pose(drive.at(t), X_VF).xyz
+        here = kinematics.pose(drive.at(t), X_VF).xyz
         for name, place in beacons.items():
             distance = math.dist(here, place)
-            if distance <= model.reach:
-                said = max(distance + errors[name], 0.0)
-                yield RangeSample(replace(header, seq=seq), frame, name, place, ENU, said, sigma)
+            if distance <= model.max_range:
+                measured = max(distance + errors[name], 0.0)
+                yield RangeSample(replace(header, seq=seq), frame, name, place, ENU, measured, sigma)
                 seq += 1
 
 
-def _disturbed(X: Pose, shift: Vector3, turn: Vector3) -> Pose:
+def _add_error(X: Pose, shift: Vector3, turn: Vector3) -> Pose:
     """Return the pose with an error along the axes of its frame of reference."""
     (x, y, z), (dx, dy, dz) = X.xyz, shift
     return Pose((x + dx, y + dy, z + dz), so3.multiply(so3.exponential(turn), X.wxyz))
 
 
 def _covariance(position_sigma: float, orientation_sigma: float) -> tuple[float, ...]:
-    """Return the 36 numbers, row-major, of alike axes."""
-    sigmas = (max(position_sigma, _LEAST),) * 3 + (max(orientation_sigma, _LEAST),) * 3
+    """Return the row-major covariance (6, 6) of isotropic position and orientation errors."""
+    sigmas = (max(position_sigma, _MIN_SIGMA),) * 3 + (max(orientation_sigma, _MIN_SIGMA),) * 3
     return tuple(sigmas[i] ** 2 if i == j else 0.0 for i in range(6) for j in range(6))

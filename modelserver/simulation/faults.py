@@ -1,7 +1,7 @@
-"""What goes wrong between a sensor and the server: pure transforms of a stream of samples in order of arrival.
+"""Faults between sensor and server: pure transforms of a stream of samples in order of arrival.
 
-Each takes samples and yields samples, so that they nest: `drop(late(run.events(60.0), 3, "gps", 0.5), 4, 0.1)`.
-`source` picks the samples whose header names it; None picks all. The same seed gives the same faults.
+Each takes samples and yields samples, so that they nest: `drop(delay(run.events(60.0), 3, "gps", 0.5), 4, 0.1)`.
+`source` selects the samples by the source of their header; None selects all. The same seed gives the same faults.
 """
 
 from __future__ import annotations
@@ -23,57 +23,57 @@ def drop(events: Iterable[Event], seed: int, share: float, source: str | None = 
     """Yield the samples without a random `share` of them."""
     chance = NoiseSource(seed, f"drop/{source}")
     for event in events:
-        if not (_is(event, source) and chance.chance(share)):
+        if not (_is_from(event, source) and chance.bernoulli(share)):
             yield event
 
 
 def cut(events: Iterable[Event], begin_utime: int, end_utime: int, source: str | None = None) -> Iterator[Event]:
-    """Yield the samples without those that arrive from `begin_utime` to before `end_utime`."""
+    """Yield the samples without those that arrive in [begin_utime, end_utime)."""
     for event in events:
-        if not (_is(event, source) and begin_utime <= event.header.host_utime < end_utime):
+        if not (_is_from(event, source) and begin_utime <= event.header.host_utime < end_utime):
             yield event
 
 
-def late(
+def delay(
     events: Iterable[Event],
     seed: int,
     source: str | None,
-    most: float,
+    max_delay: float,
     share: float = 1.0,
     *,
-    least: float = 0.0,
+    min_delay: float = 0.0,
     in_order: bool = False,
 ) -> Iterator[Event]:
-    """Yield a random `share` of the samples later by `least` to `most` seconds, evenly spread.
+    """Yield the samples, a random `share` of them delayed by `min_delay` to `max_delay` seconds, uniformly distributed.
 
-    Their host_utime moves, their utime stays, and the stream is in order of arrival again. With `in_order` the
-    source's own samples stay behind each other, else they overtake each other.
+    Their host_utime moves, their utime stays, and the stream stays in order of arrival. With `in_order` the samples of
+    a source keep their order, else they may overtake each other.
     """
-    if not 0.0 <= least <= most < math.inf:
-        raise ValueError(f"a delay is finite and not negative, got {least} to {most} s")
+    if not 0.0 <= min_delay <= max_delay < math.inf:
+        raise ValueError(f"delays must be finite and not negative; got {min_delay} to {max_delay} s")
     chance = NoiseSource(seed, f"late/{source}")
     waiting: list[tuple[int, int, Event]] = []
     last: dict[str, int] = {}
     for number, event in enumerate(events):
         arrival = event.header.host_utime
-        # nothing that is still to come arrives before this one did
+        # no later event can arrive before this one
         while waiting and waiting[0][0] <= arrival:
             yield heapq.heappop(waiting)[2]
         at = arrival
-        if _is(event, source):
-            if chance.chance(share):
-                at += round(chance.uniform(least, most) * 1e6)
+        if _is_from(event, source):
+            if chance.bernoulli(share):
+                at += round(chance.uniform(min_delay, max_delay) * 1e6)
             if in_order:
                 at = last[event.header.source] = max(at, last.get(event.header.source, at))
-        heapq.heappush(waiting, (at, number, event if at == arrival else _with(event, host_utime=at)))
+        heapq.heappush(waiting, (at, number, event if at == arrival else _replace_header(event, host_utime=at)))
     while waiting:
         yield heapq.heappop(waiting)[2]
 
 
 def duplicate(
-    events: Iterable[Event], seed: int, share: float, source: str | None = None, delay: float = 0.0
+    events: Iterable[Event], seed: int, share: float, source: str | None = None, max_delay: float = 0.0
 ) -> Iterator[Event]:
-    """Yield a random `share` of the samples twice, the second one up to `delay` seconds later."""
+    """Yield a random `share` of the samples twice, the second one up to `max_delay` seconds later."""
     chance = NoiseSource(seed, f"duplicate/{source}")
     waiting: list[tuple[int, int, Event]] = []
     for number, event in enumerate(events):
@@ -81,64 +81,65 @@ def duplicate(
         while waiting and waiting[0][0] <= arrival:
             yield heapq.heappop(waiting)[2]
         yield event
-        if _is(event, source) and chance.chance(share):
-            at = arrival + round(chance.uniform(0.0, delay) * 1e6)
-            heapq.heappush(waiting, (at, number, _with(event, host_utime=at)))
+        if _is_from(event, source) and chance.bernoulli(share):
+            at = arrival + round(chance.uniform(0.0, max_delay) * 1e6)
+            heapq.heappush(waiting, (at, number, _replace_header(event, host_utime=at)))
     while waiting:
         yield heapq.heappop(waiting)[2]
 
 
-def not_a_number(events: Iterable[Event], seed: int, share: float, source: str | None = None) -> Iterator[Event]:
-    """Yield the samples, one number in a random `share` of them nan: any of the sample's own, in vectors too."""
+def inject_nan(events: Iterable[Event], seed: int, share: float, source: str | None = None) -> Iterator[Event]:
+    """Yield the samples, one number in a random `share` of them nan, also within vectors; not in headers."""
     chance = NoiseSource(seed, f"nan/{source}")
     for event in events:
-        yield _holed(event, chance) if _is(event, source) and chance.chance(share) else event
+        yield _set_random_nan(event, chance) if _is_from(event, source) and chance.bernoulli(share) else event
 
 
-def step_back(events: Iterable[Event], from_utime: int, seconds: float, source: str | None = None) -> Iterator[Event]:
+def step_clock_back(
+    events: Iterable[Event], from_utime: int, seconds: float, source: str | None = None
+) -> Iterator[Event]:
     """Yield the samples with the time stepping back by `seconds` at `from_utime` (forward where negative).
 
-    Without `source` the computer's clock steps: utime and host_utime of all that arrives from then on; what was
-    measured before and arrives after keeps its utime. With `source` that source's stamps step alone: its utime.
-    The order stays that of arrival.
+    Without `source` the host's clock steps: utime and host_utime of all that arrives from then on; samples measured
+    before keep their utime. With `source` only that source's stamps (utime) step. The order stays that of arrival.
     """
     back = round(seconds * 1e6)
 
-    def stepped(utime: int) -> int:
+    def step_utime(utime: int) -> int:
         return utime - back if utime >= from_utime else utime
 
     for event in events:
-        if not _is(event, source):
+        if not _is_from(event, source):
             yield event
             continue
         header = event.header
-        host = stepped(header.host_utime) if source is None else header.host_utime
-        moved: Event = _with(event, utime=stepped(header.utime), host_utime=host)
-        if isinstance(moved, RelativePoseSample):
-            moved = replace(moved, since_utime=stepped(moved.since_utime))
-        yield moved
+        host = step_utime(header.host_utime) if source is None else header.host_utime
+        changed: Event = _replace_header(event, utime=step_utime(header.utime), host_utime=host)
+        if isinstance(changed, RelativePoseSample):
+            changed = replace(changed, since_utime=step_utime(changed.since_utime))
+        yield changed
 
 
-def _is(event: Event, source: str | None) -> bool:
+def _is_from(event: Event, source: str | None) -> bool:
     return source is None or event.header.source == source
 
 
-def _with(event: _E, **changes: int) -> _E:
+def _replace_header(event: _E, **changes: int) -> _E:
     """Return the sample with other fields in its header."""
     header: SensorHeader = replace(event.header, **changes)  # type: ignore[arg-type]
     return replace(event, header=header)
 
 
-def _holed(event: Event, chance: NoiseSource) -> Event:
-    numbers = [path for each in fields(event) if each.name != "header" for path in _numbers(event, each.name)]
+def _set_random_nan(event: Event, chance: NoiseSource) -> Event:
+    numbers = [path for each in fields(event) if each.name != "header" for path in _float_paths(event, each.name)]
     if not numbers:
         return event
-    name, *inside = numbers[chance.index(len(numbers))]
-    return replace(event, **{name: _put(getattr(event, name), tuple(inside))})
+    name, *inside = numbers[chance.integer(len(numbers))]
+    return replace(event, **{name: _set_nan(getattr(event, name), tuple(inside))})
 
 
-def _numbers(value: Any, *path: Any) -> Iterator[tuple[Any, ...]]:
-    """Yield the paths, of names and places, to the floats in a field that are numbers."""
+def _float_paths(value: Any, *path: Any) -> Iterator[tuple[Any, ...]]:
+    """Yield the paths (field names and indices) to the floats in a field that are not nan."""
     found = value
     for step in path:
         found = getattr(found, step) if isinstance(step, str) else found[step]
@@ -147,17 +148,17 @@ def _numbers(value: Any, *path: Any) -> Iterator[tuple[Any, ...]]:
             yield path
     elif isinstance(found, tuple):
         for place in range(len(found)):
-            yield from _numbers(value, *path, place)
+            yield from _float_paths(value, *path, place)
     elif hasattr(found, "__dataclass_fields__"):
         for each in fields(found):
-            yield from _numbers(value, *path, each.name)
+            yield from _float_paths(value, *path, each.name)
 
 
-def _put(value: Any, path: tuple[Any, ...]) -> Any:
+def _set_nan(value: Any, path: tuple[Any, ...]) -> Any:
     """Return the value with nan at a path."""
     if not path:
         return math.nan
     step, *rest = path
     if isinstance(step, str):
-        return replace(value, **{step: _put(getattr(value, step), tuple(rest))})
-    return (*value[:step], _put(value[step], tuple(rest)), *value[step + 1 :])
+        return replace(value, **{step: _set_nan(getattr(value, step), tuple(rest))})
+    return (*value[:step], _set_nan(value[step], tuple(rest)), *value[step + 1 :])

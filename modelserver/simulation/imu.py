@@ -1,8 +1,19 @@
-"""An inertial unit: rates, specific force, its own orientation; magnetic field where it has a magnetometer.
+"""IMU simulation: angular rate, specific force, orientation and, where there is one, a magnetometer.
 
-As the report's 3DM-GX1 in vertical-gyro mode unless told otherwise: its tilt is held by gravity; its yaw starts
-anywhere and is nothing but the integral of its own gyros, so that it drifts with their bias and with the earth's
-rotation. With a yaw source it is that of magnetic or true north, with an error.
+Measurement of the gyros and accelerometers, along the sensor axes (`_SimulatedImu`):
+
+    y = quantize(M x + b + b_walk(t) + b_instability(t) + vibration + n)
+
+x is the true angular rate (with the Earth's, if `earth_rotation`) or the specific force f = a + 2 w_e x v - g (Groves
+(2013) 5.4), M scale errors and misalignment drawn once, b a constant bias, b_walk a random walk, b_instability a
+first-order Gauss-Markov process, n white noise of density N: sigma = N sqrt(rate). Terms as in Allan-variance data
+sheets (IEEE Std 952-1997, annex C).
+Orientation: tilt is true up to an error drawn once plus noise. Without a yaw source, yaw starts anywhere and integrates
+the measured rate about up, so it drifts with the gyro bias and the Earth's rotation (vertical gyro, as 3DM-GX1). With
+one it is relative to magnetic or true north.
+Magnetometer: y = soft_iron (field + disturbance) + hard_iron + n.
+Limits: gravity is normal gravity at the origin along the up of its tangent plane; 100 m away the true vertical differs
+by 16 microradians.
 """
 
 from __future__ import annotations
@@ -12,47 +23,170 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from modelserver.earth import gravity as earth
-from modelserver.earth.geodesy import Geodesy, about_up
+from modelserver.earth.geodesy import Geodesy, rotation_about_up
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
-from modelserver.simulation import rigid
-from modelserver.simulation.magnetometer import MagnetometerModel, SimulatedMagnetometer
-from modelserver.simulation.noise import NoiseSource, diagonal, quantised
-from modelserver.simulation.stamps import Intervals, Timing, headers, within
+from modelserver.simulation import kinematics
+from modelserver.simulation.noise import GaussMarkov, NoiseSource, diagonal_covariance, quantize
+from modelserver.simulation.timing import Intervals, Timing, generate_headers, is_within
 from modelserver.simulation.trajectory import MotionModel
-from modelserver.simulation.triad import Triad, TriadModel
-from modelserver.spatial import so3
-from modelserver.spatial.pose import Pose
-from modelserver.spatial.so3 import Quaternion, Vector3
+from modelserver.transforms import so3
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Quaternion, Vector3
+
+Rows = tuple[Vector3, Vector3, Vector3]
+
+FIELD: Vector3 = (0.0, 18e-6, -50e-6)
+"""Geomagnetic field along east, north, up, tesla: typical of mid northern latitudes, without declination."""
+
+_IDENTITY: Rows = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+@dataclass(frozen=True, slots=True)
+class MagnetometerModel:
+    """Errors of a magnetometer. Tesla.
+
+    Attributes
+    ----------
+    field : geomagnetic field along east, north, up
+    hard_iron : offset from the vehicle, along the sensor axes
+    soft_iron : rows of the matrix (3, 3) that the vehicle applies to the ambient field, sensor axes
+    noise : standard deviation of each axis and sample
+    disturbances : (begin, end, field) in seconds since the start: field along east, north, up of external iron
+    """
+
+    field: Vector3 = FIELD
+    hard_iron: Vector3 = (0.0, 0.0, 0.0)
+    soft_iron: Rows = _IDENTITY
+    noise: float = 0.0
+    disturbances: tuple[tuple[float, float, Vector3], ...] = ()
+
+
+class SimulatedMagnetometer:
+    """One simulated magnetometer."""
+
+    __slots__ = ("_model", "_noise")
+
+    def __init__(self, model: MagnetometerModel, noise: NoiseSource):
+        self._model = model
+        self._noise = noise.prefetch()
+
+    def ambient_field(self, t: float) -> Vector3:
+        """Return the field around the vehicle along east, north, up at `t` seconds."""
+        e, n, u = self._model.field
+        for begin, end, (de, dn, du) in self._model.disturbances:
+            if begin <= t < end:
+                e, n, u = e + de, n + dn, u + du
+        return (e, n, u)
+
+    def measure(self, t: float, q_SE: Quaternion) -> Vector3:
+        """Return the sample along the sensor axes; `q_SE` rotates east, north, up to them."""
+        x, y, z = so3.rotate(q_SE, self.ambient_field(t))
+        a, b, c = self._model.soft_iron
+        hx, hy, hz = self._model.hard_iron
+        nx, ny, nz = self._noise.vector(self._model.noise)
+        return (
+            a[0] * x + a[1] * y + a[2] * z + hx + nx,
+            b[0] * x + b[1] * y + b[2] * z + hy + ny,
+            c[0] * x + c[1] * y + c[2] * z + hz + nz,
+        )
+
+
+_MOVING_SPEED = 0.05
+"""Speed in m/s above which the vehicle vibrates."""
+
+
+@dataclass(frozen=True, slots=True)
+class TriadModel:
+    """Errors of three gyros or accelerometers beyond white noise and constant bias, in rad/s or m/s2; 0 for none.
+
+    Attributes
+    ----------
+    scale_sigma : standard deviation of each axis's scale error, drawn once
+    misalignment_sigma : standard deviation of the misalignment between two axes, rad, drawn once
+    instability : standard deviation of the in-run bias, a Gauss-Markov process of `instability_time` seconds
+    walk : random walk of the bias, unit/sqrt(s)
+    vibration : standard deviation of each sample's vibration while the vehicle moves
+    """
+
+    scale_sigma: float = 0.0
+    misalignment_sigma: float = 0.0
+    instability: float = 0.0
+    instability_time: float = 300.0
+    walk: float = 0.0
+    vibration: float = 0.0
+
+
+class Triad:
+    """One simulated triad of gyros or accelerometers."""
+
+    __slots__ = ("_drift", "_instability", "_model", "_noise", "_period", "_rows", "_walk")
+
+    def __init__(self, model: TriadModel, rate_hz: float, noise: NoiseSource):
+        self._model = model
+        self._noise = noise.prefetch()
+        misalignment = [noise.vector(model.misalignment_sigma) for _ in range(3)]
+        scale = noise.vector(model.scale_sigma)
+        self._rows = [tuple(1.0 + scale[i] if i == j else misalignment[i][j] for j in range(3)) for i in range(3)]
+        self._instability = [GaussMarkov(model.instability, model.instability_time, noise) for _ in range(3)]
+        self._walk = (0.0, 0.0, 0.0)
+        self._drift = model.walk / math.sqrt(rate_hz)
+        self._period = 1.0 / rate_hz
+
+    def measure(self, true: Vector3, speed: float) -> Vector3:
+        """Return the measured vector for a true one at the vehicle's `speed`, m/s."""
+        x, y, z = true
+        a, b, c = self._rows
+        dx, dy, dz = self._walk
+        if self._drift:
+            wx, wy, wz = self._noise.vector(self._drift)
+            self._walk = dx, dy, dz = (dx + wx, dy + wy, dz + wz)
+        if self._model.instability:
+            one, two, three = self._instability
+            dt = self._period
+            dx, dy, dz = dx + one.step(dt), dy + two.step(dt), dz + three.step(dt)
+        if self._model.vibration and abs(speed) > _MOVING_SPEED:
+            wx, wy, wz = self._noise.vector(self._model.vibration)
+            dx, dy, dz = dx + wx, dy + wy, dz + wz
+        return (
+            a[0] * x + a[1] * y + a[2] * z + dx,
+            b[0] * x + b[1] * y + b[2] * z + dy,
+            c[0] * x + c[1] * y + c[2] * z + dz,
+        )
+
 
 _HALF = math.sqrt(0.5)
 _REFERENCE: dict[OrientationReference, Quaternion] = {
     OrientationReference.ENU: so3.IDENTITY,
-    # north, east, down of a vector of east, north, up: half a turn about the line between east and north
+    # rotates east, north, up to north, east, down: half a turn about the axis between east and north
     OrientationReference.NED: (0.0, _HALF, _HALF, 0.0),
 }
 
 
 _TIMING = Timing(100.0, latency=0.004, jitter=0.001)
 _PROMPT = Timing(100.0)
-_SOUND = TriadModel()
+_IDEAL = TriadModel()
 
 
 @dataclass(frozen=True, slots=True)
 class ImuModel:
-    """How good the unit is. SI units; the defaults are those of a MEMS unit of the report's day.
+    """Errors of an IMU, SI units; the defaults are those of the 3DM-GX1 (MEMS).
 
-    gyro_bias_sigma, accelerometer_bias_sigma: of the bias, drawn once for each axis. gyro_walk: how the gyro
-    biases wander, rad/s/sqrt(s). gyro_noise, accelerometer_noise: densities, rad/s/sqrt(Hz) and m/s2/sqrt(Hz).
-    gyro_step, accelerometer_step: quantisation, 0 for none. tilt_sigma: of the error of its tilt, drawn once;
-    tilt_noise: of what is new in each sample. yaw_offset: where its yaw starts, None for anywhere.
-    reference: against what it states its orientation; NONE for a unit that does not.
-    earth_rotation: whether its gyros feel the earth turn, and its accelerometers what follows from it.
-
-    gyro, accelerometer: errors beyond these. magnetometer: None for none. yaw_source: what its own yaw is against;
-    then its error is `yaw_offset` (None for 0) plus one drawn once with `yaw_sigma` plus `yaw_noise` new in each
-    sample, and what pulls at the magnetometer pulls at a magnetic yaw; without one magnetic north is true north.
-    frozen_from: seconds from which on it repeats its last values under new stamps, None for never.
-    outages: seconds since the start, from and to, in which no sample comes; `seq` runs on.
+    Attributes
+    ----------
+    gyro_bias_sigma, accelerometer_bias_sigma : standard deviation of each axis's bias, drawn once
+    gyro_walk : random walk of the gyro bias, rad/s/sqrt(s)
+    gyro_noise, accelerometer_noise : noise densities, rad/s/sqrt(Hz) and m/s2/sqrt(Hz)
+    gyro_step, accelerometer_step : quantization, 0 for none
+    tilt_sigma, tilt_noise : standard deviation of the tilt error drawn once, and of each sample's
+    yaw_offset : initial yaw, None for a random one
+    reference : frame that its orientation refers to; NONE for a unit without orientation
+    earth_rotation : include the Earth's rotation in the gyros and its Coriolis term in the accelerometers
+    gyro, accelerometer : further errors; `magnetometer` None for none
+    yaw_source : reference of its yaw. Then the yaw error is `yaw_offset` (None for 0) plus one drawn once with
+        `yaw_sigma` plus `yaw_noise` in each sample, and magnetic disturbances also act on a magnetic yaw. Without a
+        magnetometer magnetic north is true north
+    frozen_from : time from which the last values are repeated with new stamps, s; None for never
+    outages : (begin, end) in seconds since the start without samples; `seq` counts on
     """
 
     timing: Timing = _TIMING
@@ -68,8 +202,8 @@ class ImuModel:
     yaw_offset: float | None = None
     reference: OrientationReference = OrientationReference.NED
     earth_rotation: bool = True
-    gyro: TriadModel = _SOUND
-    accelerometer: TriadModel = _SOUND
+    gyro: TriadModel = _IDEAL
+    accelerometer: TriadModel = _IDEAL
     magnetometer: MagnetometerModel | None = None
     yaw_source: YawSource = YawSource.NONE
     yaw_sigma: float = 0.0
@@ -79,7 +213,7 @@ class ImuModel:
 
     @classmethod
     def noise_free(cls, timing: Timing = _PROMPT, yaw_offset: float = 0.0, earth_rotation: bool = True) -> ImuModel:
-        """Return a unit without error; its yaw still starts at `yaw_offset` and integrates what its gyros feel."""
+        """Return a unit without error; its yaw still starts at `yaw_offset` and integrates its gyros."""
         return cls(
             timing,
             gyro_bias_sigma=0.0,
@@ -94,18 +228,14 @@ class ImuModel:
         )
 
 
-def readings(
+def simulate_imu(
     model: ImuModel, drive: MotionModel, X_VS: Pose, geodesy: Geodesy, start_utime: int, seed: int, source: str
 ) -> Iterator[ImuSample]:
-    """Yield the samples, for ever. `X_VS` is the pose of the unit's own axes in the vehicle's moving frame.
-
-    Gravity is normal gravity at the origin, along the up of its tangent plane: a hundred metres away the vertical of
-    the place leans by 16 microradians from it, which no such unit can tell.
-    """
-    stamps = headers(
+    """Yield samples without end. `X_VS` is the pose of the sensor axes in the vehicle's moving frame."""
+    stamps = generate_headers(
         model.timing, start_utime, start_utime - 1_000_000, source, NoiseSource(seed, f"imu/{source}/arrival")
     )
-    unit = _Unit(model, drive, X_VS, geodesy, seed, source)
+    unit = _SimulatedImu(model, drive, X_VS, geodesy, seed, source)
     last: ImuSample | None = None
     for header in stamps:
         t = (header.utime - start_utime) * 1e-6
@@ -113,12 +243,12 @@ def readings(
             last = unit.sample(header, t)
         else:
             last = replace(last, header=header)
-        if not (model.outages and within(model.outages, t)):
+        if not (model.outages and is_within(model.outages, t)):
             yield last
 
 
-class _Unit:
-    """The unit at work: what is drawn once, and what drifts."""
+class _SimulatedImu:
+    """One simulated IMU: errors drawn once, and drifting ones."""
 
     def __init__(self, model: ImuModel, drive: MotionModel, X_VS: Pose, geodesy: Geodesy, seed: int, source: str):
         latitude, _, height = geodesy.geodetic_from_enu((0.0, 0.0, 0.0))
@@ -127,7 +257,7 @@ class _Unit:
         self.q_VS = X_VS.wxyz
         self.lever = X_VS.xyz
         self.up = earth.gravity(latitude, height)
-        self.turning = earth.rotation(latitude) if model.earth_rotation else (0.0, 0.0, 0.0)
+        self.earth_rate = earth.earth_rate(latitude) if model.earth_rotation else (0.0, 0.0, 0.0)
         noise = NoiseSource(seed, f"imu/{source}")
         rate = model.timing.rate_hz
         self.gyro_bias = noise.vector(model.gyro_bias_sigma)
@@ -136,25 +266,27 @@ class _Unit:
         self.yaw_error = noise.uniform(-math.pi, math.pi)
         if model.yaw_offset is not None:
             self.yaw_error = model.yaw_offset
-        self.noise = noise.draw_ahead()
+        self.noise = noise.prefetch()
         self.gyro_sigma = model.gyro_noise * math.sqrt(rate)
         self.accelerometer_sigma = model.accelerometer_noise * math.sqrt(rate)
         self.walk_sigma = model.gyro_walk / math.sqrt(rate)
         orientation_sigma = max(math.hypot(model.tilt_sigma, model.tilt_noise), 1e-4)
-        # a yaw that starts anywhere has the variance of a uniform one
+        # standard deviation of a uniform angle
         yaw_sigma = math.pi / math.sqrt(3.0)
         self.yaw_noise = NoiseSource(seed, f"imu/{source}/yaw")
         if model.yaw_source is not YawSource.NONE:
             self.yaw_error = (model.yaw_offset or 0.0) + self.yaw_noise.normal(model.yaw_sigma)
             yaw_sigma = max(math.hypot(model.yaw_sigma, model.yaw_noise), 1e-4)
-        self.gyro_covariance = _axes(max(math.hypot(self.gyro_sigma, model.gyro_bias_sigma), 1e-6))
-        self.force_covariance = _axes(max(math.hypot(self.accelerometer_sigma, model.accelerometer_bias_sigma), 1e-6))
-        self.orientation_covariance = diagonal(orientation_sigma, orientation_sigma, yaw_sigma)
-        # None costs nothing: most units are without
-        self.gyro = None if model.gyro == _SOUND else Triad(model.gyro, rate, NoiseSource(seed, f"imu/{source}/gyro"))
+        self.gyro_covariance = _isotropic(max(math.hypot(self.gyro_sigma, model.gyro_bias_sigma), 1e-6))
+        self.force_covariance = _isotropic(
+            max(math.hypot(self.accelerometer_sigma, model.accelerometer_bias_sigma), 1e-6)
+        )
+        self.orientation_covariance = diagonal_covariance(orientation_sigma, orientation_sigma, yaw_sigma)
+        # None for speed: most units have no such errors
+        self.gyro = None if model.gyro == _IDEAL else Triad(model.gyro, rate, NoiseSource(seed, f"imu/{source}/gyro"))
         self.accelerometer = (
             None
-            if model.accelerometer == _SOUND
+            if model.accelerometer == _IDEAL
             else Triad(model.accelerometer, rate, NoiseSource(seed, f"imu/{source}/accelerometer"))
         )
         self.magnetometer = (
@@ -164,37 +296,40 @@ class _Unit:
         )
 
     def sample(self, header: SensorHeader, t: float) -> ImuSample:
-        model, noise, lever, turning = self.model, self.noise, self.lever, self.turning
+        model, noise, lever, turning = self.model, self.noise, self.lever, self.earth_rate
         motion = self.drive.at(t)
-        q_ES = so3.multiply(rigid.orientation(motion), self.q_VS)
+        q_ES = so3.multiply(kinematics.orientation(motion), self.q_VS)
         q_SE = so3.conjugate(q_ES)
-        wander = noise.vector(self.walk_sigma)
+        step = noise.vector(self.walk_sigma)
         bias = self.gyro_bias
-        self.gyro_bias = bias = (bias[0] + wander[0], bias[1] + wander[1], bias[2] + wander[2])
-        turn = rigid.angular_rate(motion)
+        self.gyro_bias = bias = (bias[0] + step[0], bias[1] + step[1], bias[2] + step[2])
+        turn = kinematics.angular_rate(motion)
         rate = so3.rotate(q_SE, (turning[0] + turn[0], turning[1] + turn[1], turning[2] + turn[2]))
         force = so3.rotate(
-            q_SE, _force(rigid.acceleration(motion, lever), rigid.velocity(motion, lever), turning, self.up)
+            q_SE,
+            _specific_force(
+                kinematics.acceleration(motion, lever), kinematics.velocity(motion, lever), turning, self.up
+            ),
         )
         if self.gyro is not None:
-            rate = self.gyro.seen(rate, motion.speed)
+            rate = self.gyro.measure(rate, motion.speed)
         if self.accelerometer is not None:
-            force = self.accelerometer.seen(force, motion.speed)
-        rate = _measured(rate, bias, noise.vector(self.gyro_sigma), model.gyro_step)
-        force = _measured(
+            force = self.accelerometer.measure(force, motion.speed)
+        rate = _add_errors(rate, bias, noise.vector(self.gyro_sigma), model.gyro_step)
+        force = _add_errors(
             force, self.accelerometer_bias, noise.vector(self.accelerometer_sigma), model.accelerometer_step
         )
         orientation = None
         if model.reference is not OrientationReference.NONE:
             orientation = self._orientation(t, q_ES)
             if model.yaw_source is YawSource.NONE:
-                # its yaw runs on by what its gyros say, so by what they say too much
+                # yaw integrates the gyros, and so their error
                 self.yaw_error += (so3.rotate(q_ES, rate)[2] - turn[2]) / model.timing.rate_hz
         return ImuSample(
             header,
             angular_velocity=rate,
             specific_force=force,
-            magnetic_field=None if self.magnetometer is None else self.magnetometer.seen(t, q_SE),
+            magnetic_field=None if self.magnetometer is None else self.magnetometer.measure(t, q_SE),
             orientation=orientation,
             orientation_reference=model.reference,
             yaw_source=model.yaw_source,
@@ -211,17 +346,17 @@ class _Unit:
         if model.yaw_source is not YawSource.NONE:
             error += self.yaw_noise.normal(model.yaw_noise)
             if model.yaw_source is YawSource.MAGNETIC and self.magnetometer is not None:
-                east, north, _ = self.magnetometer.outside(t)
-                # clockwise from true north lies magnetic north: by so much larger is a yaw counted from it
+                east, north, _ = self.magnetometer.ambient_field(t)
+                # declination is clockwise from true north; yaw relative to magnetic north is larger by it
                 error += math.atan2(east, north)
-        q_stated = so3.multiply(so3.multiply(about_up(error), tilted), q_ES)
-        return so3.normalized(so3.multiply(_REFERENCE[model.reference], q_stated))
+        q_stated = so3.multiply(so3.multiply(rotation_about_up(error), tilted), q_ES)
+        return so3.normalize(so3.multiply(_REFERENCE[model.reference], q_stated))
 
 
-def _force(acceleration: Vector3, velocity: Vector3, turning: Vector3, gravity: float) -> Vector3:
-    """Return specific force along east, north, up: acceleration, Coriolis's share, and what holds against gravity.
+def _specific_force(acceleration: Vector3, velocity: Vector3, turning: Vector3, gravity: float) -> Vector3:
+    """Return specific force along east, north, up: acceleration, Coriolis term, reaction to gravity (Groves 5.4).
 
-    The centrifugal share of the earth's rotation is part of gravity. `turning` is the earth's rotation.
+    The centrifugal term is part of gravity.
     """
     _, n, u = turning
     vx, vy, vz = velocity
@@ -229,13 +364,13 @@ def _force(acceleration: Vector3, velocity: Vector3, turning: Vector3, gravity: 
     return (ax + 2.0 * (n * vz - u * vy), ay + 2.0 * u * vx, az - 2.0 * n * vx + gravity)
 
 
-def _measured(true: Vector3, bias: Vector3, noise: Vector3, step: float) -> Vector3:
+def _add_errors(true: Vector3, bias: Vector3, noise: Vector3, step: float) -> Vector3:
     return (
-        quantised(true[0] + bias[0] + noise[0], step),
-        quantised(true[1] + bias[1] + noise[1], step),
-        quantised(true[2] + bias[2] + noise[2], step),
+        quantize(true[0] + bias[0] + noise[0], step),
+        quantize(true[1] + bias[1] + noise[1], step),
+        quantize(true[2] + bias[2] + noise[2], step),
     )
 
 
-def _axes(sigma: float) -> tuple[float, float, float, float, float, float, float, float, float]:
-    return diagonal(sigma, sigma, sigma)
+def _isotropic(sigma: float) -> tuple[float, float, float, float, float, float, float, float, float]:
+    return diagonal_covariance(sigma, sigma, sigma)

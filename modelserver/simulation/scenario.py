@@ -1,4 +1,4 @@
-"""Simulation: a vehicle of a geometry model on a drive, what its sensors say, and where it really was."""
+"""Simulation of a vehicle of a geometry model on a drive: the samples of its sensors, and the truth."""
 
 from __future__ import annotations
 
@@ -18,20 +18,18 @@ from modelserver.messages import (
     VehicleStatusSample,
     WheelsSample,
 )
-from modelserver.simulation import aiding, gps, imu, rigid, wheels
+from modelserver.simulation import aiding, gps, imu, kinematics, wheels
 from modelserver.simulation.aiding import AbsolutePoseModel, RangeModel, RelativePoseModel
 from modelserver.simulation.gps import GpsModel
+from modelserver.simulation.ground_motion import SideSlip, Terrain, make_motion
 from modelserver.simulation.imu import ImuModel
-from modelserver.simulation.ride import ride
-from modelserver.simulation.side_slip import SideSlip
-from modelserver.simulation.terrain import Terrain
 from modelserver.simulation.trajectory import MotionModel, Trajectory
 from modelserver.simulation.wheels import StatusModel, WheelsModel
-from modelserver.spatial.pose import Pose
-from modelserver.spatial.so3 import Vector3, conjugate, rotate
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Vector3, conjugate, rotate
 
 START_UTIME = 1_750_000_000_000_000
-"""When a simulation starts unless told otherwise: a whole second in June 2025."""
+"""Default start of a simulation: a whole second in June 2025."""
 
 Event = (
     GpsSample | ImuSample | WheelsSample | VehicleStatusSample | AbsolutePoseSample | RelativePoseSample | RangeSample
@@ -40,12 +38,15 @@ Event = (
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """The base frame at one instant, without error.
+    """True motion of the base frame at one instant.
 
-    `enu` is its pose in World:ENU and `utm` in World:UTM, both relative to the origin. `latitude_deg`,
-    `longitude_deg`, `height` are the same place on the ellipsoid. `velocity` and `acceleration` are along east, north,
-    up of the origin; `twist` is the velocity and the angular velocity along the axes of the base frame.
-    `yaw` is the vehicle's, counter-clockwise from true east, not wrapped, and `yaw_rate` its derivative.
+    Attributes
+    ----------
+    enu, utm : pose in World:ENU and World:UTM, relative to the origin
+    latitude_deg, longitude_deg, height : the same position on the ellipsoid
+    velocity, acceleration : along east, north, up of the origin
+    twist : velocity and angular velocity along the axes of the base frame
+    yaw, yaw_rate : counter-clockwise from true east, not wrapped
     """
 
     utime: int
@@ -62,12 +63,12 @@ class Truth:
 
 
 class Simulation:
-    """One run. The same arguments give the same samples, however they are asked for.
+    """One run. The same arguments give the same samples, however they are requested.
 
-    The trajectory is driven by `rolling_frame`, the frame whose x axis points along the way: that which does not
-    slide sideways, on a vehicle that steers its front wheels the middle of the rear axle. Unless named it is the base
-    frame. It moves on the tangent plane of the origin, its z up; with `terrain` on ground that rises above that plane,
-    and with `side_slip` it points beside its way. Where the sensors sit comes from the model.
+    The trajectory is that of `rolling_frame`, whose x axis points along the path: the frame that does not slide
+    sideways (the middle of the rear axle of a vehicle with front-wheel steering), by default the base frame. It moves
+    on the tangent plane of the origin, on `terrain` above it, and with `side_slip` at an angle to its path. Sensor
+    poses are the model's.
     """
 
     def __init__(
@@ -98,78 +99,86 @@ class Simulation:
         beacons: Mapping[str, Vector3] | None = None,
         range_model: RangeModel | None = None,
     ):
-        """Take the vehicle, its drive and its sensors; a sensor without frame is not there.
+        """Set up vehicle, drive and sensors; a sensor without a frame is absent.
 
-        `second_gps_frame` is that of a second antenna. `pose_frame` is seen from outside, `odometry_frame` sees its
-        own way, `range_frame` hears the `beacons`, places in World:ENU by name.
+        Parameters
+        ----------
+        origin : origin of the world frames and of the drive's east and north
+        wheel_frames : frame of each wheel's contact point, by the wheel's name
+        status_model : of a vehicle controller; None for none
+        second_gps_frame : second antenna of the GPS receiver
+        pose_frame, odometry_frame, range_frame : frames of the aiding sensors
+        beacons : positions in World:ENU by name, meters
 
-        `status_model` is that of a vehicle controller; without it there is none.
-
-        `wheel_frames` has the frame of each wheel's contact point by the wheel's name. `origin` is that of the
-        world frames and of the drive's east and north. Raises UnknownBodyError, UnknownFrameError or
-        NotConnectedError for frames that the model does not have or join.
+        Raises UnknownBodyError, UnknownFrameError or NotConnectedError for frames that the model does not have or
+        connect.
         """
         rolling = rolling_frame or base_frame
 
-        def mounted(frame: str) -> Pose:
+        def pose_of(frame: str) -> Pose:
             return model.get_transformation(frame, rolling).pose
 
         self.trajectory = trajectory
-        self.drive: MotionModel = ride(trajectory, terrain, side_slip, seed)
+        self.drive: MotionModel = make_motion(trajectory, terrain, side_slip, seed)
         """The trajectory as it is driven: on its ground and with its side slip."""
         self.geodesy = Geodesy(origin)
         self.start_utime = start_utime
-        self._X_VB = mounted(base_frame)
+        self._X_VB = pose_of(base_frame)
         drive = self.drive
         sensors: list[Iterator[Event]] = []
         common = (self.geodesy, start_utime, seed)
         if imu_frame is not None:
-            sensors.append(imu.readings(imu_model or ImuModel(), drive, mounted(imu_frame), *common, "imu"))
+            sensors.append(imu.simulate_imu(imu_model or ImuModel(), drive, pose_of(imu_frame), *common, "imu"))
         if wheel_frames:
-            contacts = {name: mounted(frame).xyz for name, frame in wheel_frames.items()}
-            sensors.append(wheels.turns(wheels_model or WheelsModel(), drive, contacts, start_utime, seed, "wheels"))
+            contacts = {name: pose_of(frame).xyz for name, frame in wheel_frames.items()}
+            sensors.append(
+                wheels.simulate_wheels(wheels_model or WheelsModel(), drive, contacts, start_utime, seed, "wheels")
+            )
         if status_model is not None:
-            sensors.append(wheels.statuses(status_model, drive, start_utime, seed, "vehicle"))
+            sensors.append(wheels.simulate_status(status_model, drive, start_utime, seed, "vehicle"))
         if gps_frame is not None:
-            second = mounted(second_gps_frame).xyz if second_gps_frame is not None else None
-            sensors.append(gps.fixes(gps_model or GpsModel(), drive, mounted(gps_frame), *common, "gps", second))
+            second = pose_of(second_gps_frame).xyz if second_gps_frame is not None else None
+            sensors.append(
+                gps.simulate_fixes(gps_model or GpsModel(), drive, pose_of(gps_frame), *common, "gps", second)
+            )
         if pose_frame is not None:
             poses = pose_model or AbsolutePoseModel()
             sensors.append(
-                aiding.absolute_poses(poses, drive, pose_frame, mounted(pose_frame), *common, "absolute_pose")
+                aiding.simulate_absolute_poses(poses, drive, pose_frame, pose_of(pose_frame), *common, "absolute_pose")
             )
         if odometry_frame is not None:
-            X_VF, odometry = mounted(odometry_frame), odometry_model or RelativePoseModel()
+            X_VF, odometry = pose_of(odometry_frame), odometry_model or RelativePoseModel()
             sensors.append(
-                aiding.relative_poses(odometry, drive, odometry_frame, X_VF, start_utime, seed, "relative_pose")
+                aiding.simulate_relative_poses(
+                    odometry, drive, odometry_frame, X_VF, start_utime, seed, "relative_pose"
+                )
             )
         if range_frame is not None and beacons:
-            lever, radio = mounted(range_frame).xyz, range_model or RangeModel()
-            sensors.append(aiding.ranges(radio, drive, range_frame, lever, beacons, start_utime, seed, "range"))
+            lever, radio = pose_of(range_frame).xyz, range_model or RangeModel()
+            sensors.append(
+                aiding.simulate_ranges(radio, drive, range_frame, lever, beacons, start_utime, seed, "range")
+            )
         self._arrivals = heapq.merge(*sensors, key=lambda sample: sample.header.host_utime)
         self._next: Event | None = next(self._arrivals, None)
         self._until = start_utime
 
     def events(self, duration: float) -> Iterator[Event]:
-        """Return the samples that arrive in the next `duration` seconds, in the order of arrival (host_utime).
-
-        Each call goes on where the last one ended; what is left unread of one comes with the next.
-        """
+        """Return the samples that arrive in the next `duration` seconds, in order of arrival (host_utime)."""
         self._until += round(duration * 1e6)
-        return self._up_to(self._until)
+        return self._events_until(self._until)
 
-    def _up_to(self, until: int) -> Iterator[Event]:
+    def _events_until(self, until: int) -> Iterator[Event]:
         while self._next is not None and self._next.header.host_utime < until:
             sample = self._next
             self._next = next(self._arrivals, None)
             yield sample
 
     def truth(self, utime: int) -> Truth:
-        """Return where the base frame is at `utime`; before and after the drive it stands."""
+        """Return the true motion of the base frame at `utime`; before and after the drive it is stationary."""
         motion = self.drive.at((utime - self.start_utime) * 1e-6)
-        enu = rigid.pose(motion, self._X_VB)
+        enu = kinematics.pose(motion, self._X_VB)
         latitude, longitude, height = self.geodesy.geodetic_from_enu(enu.xyz)
-        velocity = rigid.velocity(motion, self._X_VB.xyz)
+        velocity = kinematics.velocity(motion, self._X_VB.xyz)
         to_base = conjugate(enu.wxyz)
         return Truth(
             utime,
@@ -179,8 +188,8 @@ class Simulation:
             longitude,
             height,
             velocity,
-            rigid.acceleration(motion, self._X_VB.xyz),
-            (rotate(to_base, velocity), rotate(to_base, rigid.angular_rate(motion))),
+            kinematics.acceleration(motion, self._X_VB.xyz),
+            (rotate(to_base, velocity), rotate(to_base, kinematics.angular_rate(motion))),
             motion.yaw,
             motion.yaw_rate,
         )

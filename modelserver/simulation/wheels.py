@@ -1,4 +1,13 @@
-"""Wheel encoders: way rolled, speed and direction of each wheel at its contact point; and the vehicle controller."""
+"""Wheel odometry simulation: travel, speed and direction of each wheel, and the vehicle controller's status.
+
+Kinematics: the speed of a contact point at (x, y, z) of the rolling frame is v_x - k w_z y + w_y z along the vehicle
+(k is `track_factor`, over 1 for skid steering), and for a steered wheel the speed along the wheel, which is steered for
+level ground without side slip. Travel is its integral: closed form on level ground without slip, else Gauss-Legendre
+with three nodes per sample.
+Encoder: travel is quantized to pulses, of which some may be missed; scale error per wheel; slip proportional to
+traction; bursts of wheel spin; stuck and swapped encoders (`EncoderModel`).
+Limits: side slip is not measured by a wheel; the wheels follow the slope of the ground without suspension.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +15,131 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from modelserver.messages import VehicleMode, VehicleStatusSample, WheelsSample
-from modelserver.simulation.encoder import Encoder, EncoderModel
-from modelserver.simulation.noise import NoiseSource
-from modelserver.simulation.stamps import Timing, headers
+from modelserver.messages import NAN, Direction, VehicleMode, VehicleStatusSample, WheelSample, WheelsSample
+from modelserver.simulation.noise import NoiseSource, quantize
+from modelserver.simulation.timing import Timing, generate_headers
 from modelserver.simulation.trajectory import MotionModel, Trajectory, TrajectoryMotion
-from modelserver.spatial.so3 import Vector3
+from modelserver.transforms.so3 import Vector3
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderModel:
+    """Faults of the wheels and encoders; by default none.
+
+    Attributes
+    ----------
+    burst_rate, burst_seconds, burst_excess : wheel spin of each wheel: starts per second, duration, share of excess
+        travel
+    missed : share of pulses that are not counted, for encoders with a `travel_step`
+    stuck : (wheel, time): from then on the encoder gives no pulses
+    swapped : wheels that count backward when they roll forward
+    speed_from_travel : compute speed from the pulses since the last sample
+    has_travel, has_speed : whether they are reported; otherwise nan
+    """
+
+    burst_rate: float = 0.0
+    burst_seconds: float = 1.0
+    burst_excess: float = 0.5
+    missed: float = 0.0
+    stuck: tuple[tuple[str, float], ...] = ()
+    swapped: frozenset[str] = frozenset()
+    speed_from_travel: bool = False
+    has_travel: bool = True
+    has_speed: bool = True
+
+
+class Encoder:
+    """One simulated encoder; each call of `sample` follows the last."""
+
+    def __init__(
+        self,
+        model: EncoderModel,
+        name: str,
+        *,
+        scale: float,
+        travel_step: float,
+        speed_sigma: float,
+        stationary_speed: float,
+        noise: NoiseSource,
+        faults: NoiseSource,
+    ):
+        """Set up the encoder of a wheel; the measures are those of `WheelsModel`.
+
+        `scale` is the measured per true travel. `noise` is shared by the wheels, `faults` is the wheel's own.
+        """
+        self._model = model
+        self._name = name
+        self._scale = scale
+        self._step = travel_step
+        self._noise_sigma = speed_sigma
+        self._stationary_speed = stationary_speed
+        self._noise = noise
+        self._faults = faults
+        self._stuck_from = min((t for wheel, t in model.stuck if wheel == name), default=math.inf)
+        self._sign = -1.0 if name in model.swapped else 1.0
+        self._travel_sigma = max(travel_step / math.sqrt(12.0), 1e-4) if model.has_travel else NAN
+        self._speed_sigma = max(speed_sigma, 1e-4) if model.has_speed else NAN
+        self._rotated = 0.0
+        self._counted = 0.0
+        self._pulses = 0
+        self._t = 0.0
+        self._burst = faults.exponential(1.0 / model.burst_rate) if model.burst_rate else math.inf
+
+    def sample(self, t: float, rolled: float, speed: float, excess: float, steering: float) -> WheelSample:
+        """Return the encoder's sample at `t` seconds.
+
+        `rolled` (m since the last sample) and `speed` are those over ground; wheel slip multiplies them by `excess`.
+        """
+        model = self._model
+        seen = self._scale * excess
+        if self._is_spinning(t):
+            seen *= 1.0 + model.burst_excess
+        error = self._noise.normal(self._noise_sigma) if abs(speed) > self._stationary_speed else 0.0
+        measured = speed * seen + error
+        stuck = t >= self._stuck_from
+        if stuck:
+            measured = speed = 0.0
+        else:
+            self._rotated += rolled * seen
+        travel = self._count() if model.missed and self._step else quantize(self._rotated, self._step)
+        if model.speed_from_travel:
+            measured = (travel - self._counted) / (t - self._t) if t > self._t else 0.0
+            speed = measured
+        self._counted, self._t = travel, t
+        sign = self._sign
+        return WheelSample(
+            self._name,
+            travel=sign * travel if model.has_travel else NAN,
+            travel_sigma=self._travel_sigma,
+            speed=sign * measured if model.has_speed else NAN,
+            speed_sigma=self._speed_sigma,
+            direction=_direction(sign * speed, self._stationary_speed),
+            steering=steering,
+        )
+
+    def _is_spinning(self, t: float) -> bool:
+        while t >= self._burst + self._model.burst_seconds:
+            self._burst += self._model.burst_seconds + self._faults.exponential(1.0 / self._model.burst_rate)
+        return t >= self._burst
+
+    def _count(self) -> float:
+        """Return the travel of the counted pulses, meters."""
+        pulses = round(self._rotated / self._step)
+        new = pulses - self._pulses
+        self._pulses = pulses
+        counted = abs(new) - self._faults.binomial(abs(new), self._model.missed)
+        return self._counted + math.copysign(counted, new) * self._step
+
+
+def _direction(speed: float, stationary_speed: float) -> Direction:
+    if abs(speed) <= stationary_speed:
+        return Direction.STOPPED
+    return Direction.FORWARD if speed > 0 else Direction.BACKWARD
+
 
 _GRAVITY = 9.81
 _NODES = ((0.5 - math.sqrt(0.15), 5.0 / 18.0), (0.5, 8.0 / 18.0), (0.5 + math.sqrt(0.15), 5.0 / 18.0))
-"""Gauss-Legendre on [0, 1]."""
+"""Gauss-Legendre nodes and weights on [0, 1]."""
 
 
 _TIMING = Timing(20.0, latency=0.01, jitter=0.002)
@@ -24,17 +148,19 @@ _PROMPT = Timing(20.0)
 
 @dataclass(frozen=True, slots=True)
 class WheelsModel:
-    """How good the encoders are, and which wheels steer. Metres, m/s.
+    """Errors of the wheel encoders, and the steering geometry. Meters, m/s.
 
-    scale_sigma: of each wheel's error of scale, drawn once (tyre pressure, load). speed_sigma: of the speed's
-    noise. travel_step: way from one pulse to the next, 0 for none. slip: share that a wheel turns too much when
-    the vehicle accelerates forward with 1 g, or turns with 1 g. standstill: below this speed an encoder sees no
-    turning. steered: names of wheels that turn into the direction in which their contact point moves; the others
-    roll straight ahead.
-
-    track_factor: over 1 for a vehicle that steers by the difference of its sides' speeds and skids: that difference
-    is yaw rate times track times this (1.5 to 2); steered wheels do not skid so. unstated_latency: seconds by which
-    a sample is older than its utime says. encoder: faults of the encoders.
+    Attributes
+    ----------
+    scale_sigma : standard deviation of each wheel's scale error, drawn once (tire pressure, load)
+    speed_sigma : noise of the speed
+    travel_step : travel per pulse, 0 for continuous
+    slip : share of excess rotation at a traction of 1 g
+    stationary_speed : speed below which an encoder measures none
+    steered : names of the wheels that steer into the direction of motion of their contact points
+    track_factor : effective over geometric track of a skid-steered vehicle (1.5 to 2)
+    unstated_latency : age of a sample at its utime, s
+    encoder : faults of the encoders
     """
 
     timing: Timing = _TIMING
@@ -42,7 +168,7 @@ class WheelsModel:
     speed_sigma: float = 0.02
     travel_step: float = 0.01
     slip: float = 0.0
-    standstill: float = 0.02
+    stationary_speed: float = 0.02
     steered: frozenset[str] = frozenset()
     track_factor: float = 1.0
     unstated_latency: float = 0.0
@@ -54,7 +180,7 @@ class WheelsModel:
         return cls(timing, scale_sigma=0.0, speed_sigma=0.0, travel_step=0.0, steered=steered)
 
 
-def turns(
+def simulate_wheels(
     model: WheelsModel,
     drive: MotionModel,
     contacts: Mapping[str, Vector3],
@@ -62,10 +188,7 @@ def turns(
     seed: int,
     source: str,
 ) -> Iterator[WheelsSample]:
-    """Yield the samples, for ever. `contacts` has each wheel's contact point in the vehicle's moving frame.
-
-    A wheel rolls by what its contact point moves along it: side slip it does not see, a slope it follows.
-    """
+    """Yield samples without end. `contacts` has each wheel's contact point in the vehicle's moving frame, meters."""
     noise = NoiseSource(seed, f"wheels/{source}")
     encoders = {
         name: Encoder(
@@ -74,21 +197,21 @@ def turns(
             scale=1.0 + noise.normal(model.scale_sigma),
             travel_step=model.travel_step,
             speed_sigma=model.speed_sigma,
-            standstill=model.standstill,
+            stationary_speed=model.stationary_speed,
             noise=noise,
             faults=NoiseSource(seed, f"wheels/{source}/{name}"),
         )
         for name in contacts
     }
-    noise.draw_ahead()
-    stamps = headers(
+    noise.prefetch()
+    stamps = generate_headers(
         model.timing, start_utime, start_utime - 1_000_000, source, NoiseSource(seed, f"wheels/{source}/arrival")
     )
-    rolling = _Rolling(model, drive, contacts)
+    rolling = _WheelOdometry(model, drive, contacts)
     for header in stamps:
         t = (header.utime - start_utime) * 1e-6 - model.unstated_latency
-        motion, ways = rolling.to(t)
-        excess = 1.0 + model.slip * _push(motion) / _GRAVITY
+        motion, distances = rolling.advance(t)
+        excess = 1.0 + model.slip * _traction(motion) / _GRAVITY
         wheels = []
         for name, contact in contacts.items():
             if name in model.steered:
@@ -98,32 +221,32 @@ def turns(
                 rates = _rates(motion)
                 speed = rates[0] - model.track_factor * contact[1] * rates[1] + contact[2] * rates[2]
                 steering = 0.0
-            wheels.append(encoders[name].sample(t, ways[name], speed, excess, steering))
+            wheels.append(encoders[name].sample(t, distances[name], speed, excess, steering))
         yield WheelsSample(header, tuple(wheels))
 
 
-class _Rolling:
-    """What each wheel rolls from one instant to the next, in metres."""
+class _WheelOdometry:
+    """Travel of each wheel between two calls, in meters."""
 
     def __init__(self, model: WheelsModel, drive: MotionModel, contacts: Mapping[str, Vector3]):
         self.model = model
         self.drive = drive
         self.contacts = contacts
-        # on level ground without side slip the way of wheels that do not steer has a closed form
-        self.closed = isinstance(drive, Trajectory)
-        self.steered_speed = _steered_speed if self.closed else _steered_speed_sliding
-        self.quadrature = bool(model.steered) or not self.closed
-        self.before = drive.at(0.0)
-        self.t_before = 0.0
+        # on level ground without side slip the travel of wheels that do not steer has a closed form
+        self.has_closed_form = isinstance(drive, Trajectory)
+        self.steered_speed = _steered_speed if self.has_closed_form else _steered_speed_sliding
+        self.quadrature = bool(model.steered) or not self.has_closed_form
+        self.previous = drive.at(0.0)
+        self.t_previous = 0.0
 
-    def to(self, t: float) -> tuple[TrajectoryMotion, dict[str, float]]:
-        """Return the motion at `t` seconds, and each wheel's way since the last call, the first since 0."""
-        model, drive, t_before, before = self.model, self.drive, self.t_before, self.before
+    def advance(self, t: float) -> tuple[TrajectoryMotion, dict[str, float]]:
+        """Return the motion at `t` seconds, and each wheel's travel since the last call, the first since 0."""
+        model, drive, t_previous, before = self.model, self.drive, self.t_previous, self.previous
         motion = drive.at(t)
-        elapsed = t - t_before
-        between = [(drive.at(t_before + u * elapsed), weight) for u, weight in _NODES] if self.quadrature else []
-        if self.closed:
-            along, turned, pitched = motion.way - before.way, motion.yaw - before.yaw, 0.0
+        elapsed = t - t_previous
+        between = [(drive.at(t_previous + u * elapsed), weight) for u, weight in _NODES] if self.quadrature else []
+        if self.has_closed_form:
+            along, turned, pitched = motion.distance - before.distance, motion.yaw - before.yaw, 0.0
         else:
             along = turned = pitched = 0.0
             for each, weight in between:
@@ -131,21 +254,21 @@ class _Rolling:
                 along += weight * elapsed * speed
                 turned += weight * elapsed * turn
                 pitched += weight * elapsed * pitch
-        ways = {}
+        distances = {}
         for name, contact in self.contacts.items():
             if name in model.steered:
-                ways[name] = elapsed * sum(weight * self.steered_speed(each, contact) for each, weight in between)
+                distances[name] = elapsed * sum(weight * self.steered_speed(each, contact) for each, weight in between)
             else:
-                ways[name] = along - model.track_factor * contact[1] * turned + contact[2] * pitched
-        self.before, self.t_before = motion, t
-        return motion, ways
+                distances[name] = along - model.track_factor * contact[1] * turned + contact[2] * pitched
+        self.previous, self.t_previous = motion, t
+        return motion, distances
 
 
 @dataclass(frozen=True, slots=True)
 class StatusModel:
-    """What the vehicle controller measures. `wheelbase`: meters from the rolling frame ahead to the steered axle.
+    """Measurements of the vehicle controller. `wheelbase`: meters from the rolling frame to the steered axle.
 
-    angle_sigma: standard deviation of the steering angle's noise, radians. angle_error: what it is off by, radians.
+    `angle_sigma` is the noise of the steering angle and `angle_error` its offset, radians.
     """
 
     wheelbase: float
@@ -154,12 +277,12 @@ class StatusModel:
     angle_error: float = 0.0
 
 
-def statuses(
+def simulate_status(
     model: StatusModel, drive: MotionModel, start_utime: int, seed: int, source: str
 ) -> Iterator[VehicleStatusSample]:
-    """Yield the controller's samples, for ever: forward speed, and the steering angle of the equivalent front wheel."""
+    """Yield the controller's samples without end: forward speed and steering angle of the equivalent front wheel."""
     noise = NoiseSource(seed, f"status/{source}")
-    stamps = headers(
+    stamps = generate_headers(
         model.timing, start_utime, start_utime - 1_000_000, source, NoiseSource(seed, f"status/{source}/arrival")
     )
     for header in stamps:
@@ -169,23 +292,20 @@ def statuses(
 
 
 def _rates(motion: TrajectoryMotion) -> Vector3:
-    """Return forward speed and the rates about the vehicle's z and y axes."""
+    """Return forward speed, yaw rate and pitch rate, along the vehicle's axes."""
     if motion.attitude is None:
         return (motion.speed, motion.yaw_rate, 0.0)
     return (motion.speed, motion.attitude.rate[2], motion.attitude.rate[1])
 
 
 def _steered_speed(motion: TrajectoryMotion, contact: Vector3) -> float:
-    """Return the speed of a contact point along the direction it moves in, negative when backing up."""
+    """Return the speed of a contact point along its direction of motion, negative in reverse."""
     k = motion.curvature
     return motion.speed * math.hypot(1.0 - k * contact[1], k * contact[0])
 
 
 def _steered_speed_sliding(motion: TrajectoryMotion, contact: Vector3) -> float:
-    """Return the speed of a contact point along its wheel, negative when backing up.
-
-    The wheel is steered as a vehicle on level ground without side slip would need it, so it moves aslant.
-    """
+    """Return the speed of a contact point along its wheel, negative in reverse, steered as without side slip."""
     k = motion.curvature
     x, y, z = contact
     wx, wy, wz = motion.attitude.rate if motion.attitude is not None else (0.0, 0.0, motion.yaw_rate)
@@ -193,7 +313,7 @@ def _steered_speed_sliding(motion: TrajectoryMotion, contact: Vector3) -> float:
     return (ahead * (1.0 - k * y) + left * k * x) / math.hypot(1.0 - k * y, k * x)
 
 
-def _push(motion: TrajectoryMotion) -> float:
-    """Return how hard the tyres push, m/s2: speeding up makes wheels turn too much, braking too little."""
+def _traction(motion: TrajectoryMotion) -> float:
+    """Return the acceleration at the tires, m/s2: positive makes wheels rotate too much, braking too little."""
     along = math.copysign(1.0, motion.speed) * motion.forward_acceleration
     return along + abs(motion.speed * motion.yaw_rate)

@@ -1,1 +1,1 @@
-"""The bus's side of the house: channel names, and the codec between wire types and the core's values."""
+"""The wire protocol: channels, codecs between bytes and message values, LCM logs and URLs."""

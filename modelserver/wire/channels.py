@@ -5,18 +5,22 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Final
 
 DEFAULT_URL = "udpm://239.255.76.67:7667?ttl=0"
-"""Loopback only: nothing leaves the machine unless a vehicle file or $LCM_DEFAULT_URL says so."""
+"""Loopback only: nothing leaves the machine unless a vehicle file or $LCM_DEFAULT_URL asks for it."""
 
 REPLY_PREFIX = "REPLY_"
 
+SIGNED: Final = "MODELSERVER_SIGNED"
+"""The channel of signed commands, without the vehicle's prefix."""
+
 PROBE_CHANNEL = "MODELSERVER_PROBE"
-"""Where a program tries out whether the bus delivers: random bytes, for itself alone."""
+"""Channel of the bus self-test: random bytes that a program sends to itself."""
 
 
 class ChannelUse(StrEnum):
-    """Who speaks on a channel."""
+    """Purpose of a channel, which determines its publisher."""
 
     SENSOR = "sensor"
     REQUEST = "request"
@@ -27,11 +31,11 @@ class ChannelUse(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A channel: its name without prefix, the type it carries, who speaks, how often, what for."""
+    """A channel: name without prefix, message type, purpose, rate, description."""
 
     name: str
     type_name: str
-    way: ChannelUse
+    use: ChannelUse
     rate: str
     about: str
 
@@ -49,17 +53,25 @@ CHANNELS = (
         "poses in the world by other means than GPS",
     ),
     Channel(
-        "RELATIVE_POSE", "relative_pose_t", ChannelUse.SENSOR, "as they come", "motion between two instants, as seen"
+        "RELATIVE_POSE",
+        "relative_pose_t",
+        ChannelUse.SENSOR,
+        "as they come",
+        "motion between two instants, e.g. by visual odometry",
     ),
-    Channel("RANGE", "range_t", ChannelUse.SENSOR, "as they come", "distances to beacons whose place is known"),
-    Channel("VEHICLE_STATUS", "vehicle_status_t", ChannelUse.SENSOR, "1-20 Hz", "what the vehicle controller says"),
+    Channel("RANGE", "range_t", ChannelUse.SENSOR, "as they come", "distances to beacons at known positions"),
+    Channel("VEHICLE_STATUS", "vehicle_status_t", ChannelUse.SENSOR, "1-20 Hz", "status of the vehicle controller"),
     Channel(
-        "VEHICLE_COMMAND", "vehicle_command_t", ChannelUse.COMMAND, "10 Hz and more", "wish to the vehicle controller"
+        "VEHICLE_COMMAND",
+        "vehicle_command_t",
+        ChannelUse.COMMAND,
+        "10 Hz and more",
+        "commands to the vehicle controller",
     ),
     Channel(
         "LOCALIZATION_MODE", "localization_mode_t", ChannelUse.COMMAND, "on demand", "which sources localization uses"
     ),
-    Channel("MODELSERVER_SIGNED", "signed_t", ChannelUse.COMMAND, "on demand", "what changes something, signed"),
+    Channel("MODELSERVER_SIGNED", "signed_t", ChannelUse.COMMAND, "on demand", "signed commands"),
     Channel("POSE", "pose_transform_t", ChannelUse.BROADCAST, "timer or event", "base frame in World:UTM"),
     Channel("POSE_VECTOR", "pose_vector_t", ChannelUse.BROADCAST, "with POSE", "the same as a 7-vector"),
     Channel(
@@ -70,11 +82,9 @@ CHANNELS = (
         "decisions_t",
         ChannelUse.BROADCAST,
         "on sensor events",
-        "which measurements were used, and why",
+        "innovation tests: which measurements were used, and why",
     ),
-    Channel(
-        "LOCALIZATION_STATE", "navigation_state_t", ChannelUse.BROADCAST, "timer, 5 Hz", "the filter's whole state"
-    ),
+    Channel("LOCALIZATION_STATE", "navigation_state_t", ChannelUse.BROADCAST, "timer, 5 Hz", "the filter's state"),
     Channel(
         "MODEL_SNAPSHOT", "model_snapshot_t", ChannelUse.BROADCAST, "at start, on change, every 5 s", "the geometry"
     ),
@@ -87,7 +97,7 @@ CHANNELS = (
         "driver_health_t",
         ChannelUse.REPORT,
         "1 Hz, on change",
-        "how each driver is: phase, rate, clock",
+        "health of each driver: phase, rate, clock",
     ),
     Channel(
         "PLATFORM_GET_TRANSFORMATION",
@@ -168,12 +178,12 @@ CHANNELS = (
 )
 
 BY_NAME = {channel.name: channel for channel in CHANNELS}
-REQUESTS = tuple(channel for channel in CHANNELS if channel.way is ChannelUse.REQUEST)
+REQUESTS = tuple(channel for channel in CHANNELS if channel.use is ChannelUse.REQUEST)
 
 
-def literal(channel: str) -> str:
-    """Return the regular expression that matches `channel` alone: LCM takes subscriptions for patterns.
+def to_subscription_pattern(channel: str) -> str:
+    """Return the regular expression that matches only `channel`: LCM interprets subscriptions as patterns.
 
-    LCM puts ^ and $ around it, and $ also matches before a line break at the end; \\z does not.
+    LCM adds ^ and $; $ also matches before a trailing line break, \\z does not.
     """
     return re.escape(channel) + r"\z"

@@ -1,9 +1,8 @@
-"""LCM event logs, read so that damage is told from the end.
+"""LCM event logs: a reader that distinguishes damage from the end of a log.
 
-lcm's own reader stops at the first damaged event as if the log ended there, and a length field that was
-overwritten makes it crash the process (lcm 1.5.3). `scan` is a pure function over the bytes: it yields the
-events, and in their order what lies between them that is none. `written` is its inverse for one event; whole logs are
-left to `lcm.EventLog`.
+lcm's own reader stops at the first damaged event as if the log ended there, and a corrupt length field crashes the
+process (lcm 1.5.3). `scan` is a pure function of the bytes: it yields events and the damaged regions between them, and
+resynchronizes at the next sync word. `encode_event` is its inverse for one event; `lcm.EventLog` writes whole logs.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ from types import TracebackType
 from typing import Self, TypeAlias
 
 from modelserver.errors import RecordingError
+from modelserver.files.regular import NotRegularFileError, open_regular
 from modelserver.messages import MAX_CHANNEL_LENGTH
-from modelserver.regular_files import NotRegularFileError, open_regular
 from modelserver.wire.fields import MAX_UTIME
 
 MAX_DATA = 256 << 20
-"""Messages beyond are taken for damage."""
+"""Longer messages are treated as damage."""
 
 _HEAD = struct.Struct(">Iqqii")  # sync word, event number, utime, lengths of channel and data
 _SYNC = struct.pack(">I", 0xEDA1DA01)
@@ -32,7 +31,7 @@ Buffer: TypeAlias = bytes | mmap.mmap
 
 @dataclass(frozen=True, slots=True)
 class LogEvent:
-    """One message of a log: when it arrived, on which channel, its bytes. `end` is where it ends in the file."""
+    """One message of a log: receive time, channel, bytes. `end` is its end offset in the file."""
 
     number: int
     utime: int
@@ -42,10 +41,10 @@ class LogEvent:
 
 
 @dataclass(frozen=True, slots=True)
-class Damage:
-    """Bytes of a log that are no event: where, how many, after how many good events.
+class LogDamage:
+    """Damaged bytes of a log: offset, length, number of good events before.
 
-    `tail` is set when nothing follows: what a logger leaves that was stopped in the middle of writing.
+    `tail`: nothing follows, as after a logger that was stopped while writing.
     """
 
     start: int
@@ -56,17 +55,17 @@ class Damage:
     def __str__(self) -> str:
         place = f"after event {self.after}, at byte {self.start}"
         if self.tail:
-            return f"the log breaks off {place}: the last {self.length} bytes are no whole event"
+            return f"the log is truncated {place}: the last {self.length} bytes are no complete event"
         return f"{self.length} bytes {place}, are no event and were skipped"
 
 
-def written(number: int, utime: int, channel: bytes, data: bytes) -> bytes:
-    """Return an event as it stands in a log; `channel` is ASCII, of 1 to MAX_CHANNEL_LENGTH characters."""
+def encode_event(number: int, utime: int, channel: bytes, data: bytes) -> bytes:
+    """Encode an event; `channel` is ASCII, of 1 to MAX_CHANNEL_LENGTH characters."""
     return _HEAD.pack(0xEDA1DA01, number, utime, len(channel), len(data)) + channel + data
 
 
-def scan(data: Buffer) -> Iterator[LogEvent | Damage]:
-    """Yield the events in the bytes of a log, and the stretches between them that are none."""
+def scan(data: Buffer) -> Iterator[LogEvent | LogDamage]:
+    """Yield the events in the bytes of a log, and the damaged regions between them."""
     size = len(data)
     at = bad = good = 0
     while at < size:
@@ -76,16 +75,16 @@ def scan(data: Buffer) -> Iterator[LogEvent | Damage]:
             at = size if found < 0 else found
             continue
         if at > bad:
-            yield Damage(bad, at - bad, good, tail=False)
+            yield LogDamage(bad, at - bad, good, tail=False)
         good += 1
         yield event
         at = bad = event.end
     if bad < size:
-        yield Damage(bad, size - bad, good, tail=True)
+        yield LogDamage(bad, size - bad, good, tail=True)
 
 
 def _event_at(data: Buffer, at: int, size: int) -> LogEvent | None:
-    """Return the event that starts at a place, None where there is no whole one."""
+    """Return the event that starts at an offset, None where there is no complete one."""
     if size - at < _HEAD.size or data[at : at + 4] != _SYNC:
         return None
     _, number, utime, channel_length, data_length = _HEAD.unpack(data[at : at + _HEAD.size])
@@ -96,7 +95,7 @@ def _event_at(data: Buffer, at: int, size: int) -> LogEvent | None:
     if end > size:
         return None
     if end < size and data[end : end + 4] != _SYNC and data.find(_SYNC, at + 4, end) >= 0:
-        return None  # the length was overwritten: it would swallow the events that follow
+        return None  # the length is corrupt: the event would contain the ones that follow
     try:
         channel = data[start : start + channel_length].decode("ascii")
     except UnicodeDecodeError:
@@ -105,14 +104,14 @@ def _event_at(data: Buffer, at: int, size: int) -> LogEvent | None:
 
 
 class LogFile:
-    """An event log on disk. A context manager; iterating yields its events, `damage` fills on the way.
+    """An event log on disk. A context manager; iterating yields its events and fills `damage`.
 
     Raises RecordingError for a file without a single event, OSError where it cannot be read.
     """
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
-        self.damage: list[Damage] = []
+        self.damage: list[LogDamage] = []
         self.size = 0
         self._data: Buffer = b""
 
@@ -148,6 +147,6 @@ class LogFile:
                 self.damage.append(each)
 
     @property
-    def torn(self) -> bool:
-        """Whether more than a broken-off tail was wrong, of what was read so far."""
+    def is_corrupt(self) -> bool:
+        """Whether damage other than a truncated tail was read so far."""
         return any(not each.tail for each in self.damage)

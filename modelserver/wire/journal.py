@@ -1,13 +1,13 @@
-"""The journal's bytes: LCM event logs that say in which order a service handled what, and what it said to that.
+"""Byte format of the journal: LCM event logs of the inputs and outputs of a service, in processing order.
 
-What came from the bus and what was said stands there as ordinary events, on its own channel and unchanged, so that any
-LCM tool reads it. Between them stand events of the journal's own on `CHANNEL`. A seal closes a batch: it says of each
-record before it what it was and at which instant it was handled, carries those records that never were on a bus
-(ticks, refusals, notices), and a checksum over the whole batch. A batch counts as a whole or not at all.
+Received and published messages are ordinary events on their own channels, unchanged, so that any LCM tool reads them.
+Sections of the journal's own are events on `CHANNEL`. A seal closes a batch of records: it holds the type and instant
+of each record before it, the records that never were on a bus (ticks, rejections, warnings), and a CRC over the whole
+batch. A batch is accepted as a whole or not at all; `read_segment` resynchronizes at the next section after damage.
 
     segment = head, files, state, (batch, seal) ..., end
 
-`written` and `read` are pure functions between records and bytes.
+`encode_*` and `read_segment` are pure functions between records and bytes. `server.journal.chain` links segments.
 """
 
 from __future__ import annotations
@@ -23,20 +23,19 @@ from enum import IntEnum
 from typing import Any, Final, NamedTuple, TypeAlias
 
 from modelserver.messages import MAX_CHANNEL_LENGTH
-from modelserver.wire.eventlog import Buffer, Damage, LogEvent, scan
-from modelserver.wire.eventlog import written as event_written
+from modelserver.wire.eventlog import Buffer, LogDamage, LogEvent, encode_event, scan
 from modelserver.wire.fields import MAX_UTIME
 
 CHANNEL: Final = "MODELSERVER_JOURNAL"
 
 MAGIC: Final = b"MSjrnl1\n"
-"""Stands where a message's fingerprint does."""
+"""In place of a message's fingerprint."""
 
 FORMAT: Final = 2
 
 
-class Part(IntEnum):
-    """What an event of the journal's own is."""
+class SectionType(IntEnum):
+    """Type of a section of the journal's own."""
 
     HEAD = 1
     FILE = 2
@@ -46,33 +45,33 @@ class Part(IntEnum):
 
 
 class RecordKind(IntEnum):
-    """What a record is.
+    """Type of a record.
 
-    SAID: a message that was published. SAMPLE: one that a sensor's channel brought, or a wish about the mode.
-    REQUEST: one that the core answered; REMEMBERED: answered without it, from memory; REFUSED: for want of time;
-    MALFORMED, FAILED: turned back. UNREAD: bytes that are no message of their channel. IGNORED: a sample that is not
-    used, as that of a second writer. EVENT: something of the service's own, encoded by the schema of the segment.
-    PORTION: the next messages of the deferred reply in progress were sent, as many as its four bytes say.
+    PUBLISHED: a published message. SAMPLE: a sensor sample or a mode command. REQUEST: answered by the core; CACHED:
+    answered from the reply cache; OVERLOAD: dropped for lack of time; MALFORMED, FAILED: answered with an error.
+    UNDECODABLE: bytes that are no message of their channel. DROPPED: a sample that is not used, as that of a
+    conflicting publisher. EVENT: an event of the service's own, encoded by the schema of the segment. DEFERRED_PART:
+    the next messages of the deferred reply were sent, as many as its four bytes state.
     """
 
-    SAID = 0
+    PUBLISHED = 0
     SAMPLE = 1
     REQUEST = 2
-    REMEMBERED = 3
-    REFUSED = 4
+    CACHED = 3
+    OVERLOAD = 4
     MALFORMED = 5
     FAILED = 6
-    UNREAD = 7
-    IGNORED = 8
+    UNDECODABLE = 7
+    DROPPED = 8
     EVENT = 9
-    PORTION = 10
+    DEFERRED_PART = 10
 
 
 class JournalRecord(NamedTuple):
-    """One thing that was handled or said, at an instant: the monotonic clock in ns, and utime.
+    """An input or a published message, at an instant: monotonic clock in ns, and utime.
 
-    What was said has no monotonic time of its own, and the utime of what it follows from. `at` is the place in the
-    segment, bytes.
+    A published message has no monotonic time of its own, and the utime of the input that it results from. `at` is the
+    byte offset in the segment.
     """
 
     kind: RecordKind
@@ -84,14 +83,14 @@ class JournalRecord(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Head:
-    """What a segment begins with: who wrote it, and how it follows from the one before."""
+class SegmentHead:
+    """Head of a segment: who wrote it, and its link to the previous segment."""
 
     facts: dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class File:
+class SegmentFile:
     """A file that the service was started with."""
 
     name: str
@@ -99,44 +98,44 @@ class File:
 
 
 @dataclass(frozen=True, slots=True)
-class State:
-    """What the service knew when the segment began, encoded with the description of its types."""
+class SegmentState:
+    """State of the service at the start of the segment, encoded with the description of its types."""
 
     data: bytes
 
 
 @dataclass(frozen=True, slots=True)
-class End:
-    """The end of a segment that was closed.
+class SegmentEnd:
+    """End of a closed segment.
 
-    `digest` is the SHA-256 of all bytes before it, and `intact` whether they still have it. `mac` proves, with the key,
-    who wrote that; empty for a journal without a key.
+    `digest` is the SHA-256 of all bytes before it, `is_intact` whether they match it. `mac` authenticates the writer,
+    empty for a journal without a key.
     """
 
-    intact: bool
+    is_intact: bool
     digest: bytes
     mac: bytes = b""
 
     @property
     def seal(self) -> bytes:
-        """What the next segment's head holds of this one."""
+        """Seal that the head of the next segment repeats."""
         return self.mac or self.digest
 
 
 @dataclass(frozen=True, slots=True)
-class Broken:
-    """Bytes of a segment that cannot be used: from where, how many, why. `tail`: nothing that can be used follows."""
+class CorruptRegion:
+    """Unusable bytes of a segment. `tail`: nothing usable follows."""
 
     start: int
     length: int
-    why: str
+    reason: str
     tail: bool = False
 
     def __str__(self) -> str:
-        return f"{self.length} bytes at byte {self.start}: {self.why}"
+        return f"{self.length} bytes at byte {self.start}: {self.reason}"
 
 
-Item: TypeAlias = Head | File | State | JournalRecord | End | Broken
+Item: TypeAlias = SegmentHead | SegmentFile | SegmentState | JournalRecord | SegmentEnd | CorruptRegion
 
 _OWN = struct.Struct(">8sBI")  # magic, part, checksum of what follows
 _DIGEST: Final = 32
@@ -146,68 +145,68 @@ _TIMES: Final = 20
 
 _SEAL = struct.Struct(">II")  # number of the batch, count of events before the seal
 _INLINE = struct.Struct(">BqqHI")  # kind, instant, lengths of channel and data
-_HEARD = struct.Struct(">Bq")
-_APART: Final = 0x80
-"""Added to the kind of a record that stands in the seal itself, with channel and data."""
+_RECEIVED = struct.Struct(">Bq")
+_INLINE_FLAG: Final = 0x80
+"""Flag of a record that is contained in the seal, with channel and data."""
 
 _NAME: Final = CHANNEL.encode()
 
 
-def _own(part: Part, utime: int, body: bytes, before: int = 0) -> bytes:
-    """Return an event of the journal's own; its checksum goes on from that of what it closes."""
-    return event_written(0, utime, _NAME, _OWN.pack(MAGIC, part, zlib.crc32(body, before)) + body)
+def _encode_section(part: SectionType, utime: int, body: bytes, before: int = 0) -> bytes:
+    """Encode a section; its CRC continues from `before`, the CRC of the batch that it closes."""
+    return encode_event(0, utime, _NAME, _OWN.pack(MAGIC, part, zlib.crc32(body, before)) + body)
 
 
-def head_written(facts: dict[str, Any], utime: int) -> bytes:
-    """Return the beginning of a segment."""
-    return _own(Part.HEAD, utime, json.dumps(facts).encode())
+def encode_head(facts: dict[str, Any], utime: int) -> bytes:
+    """Encode the head of a segment."""
+    return _encode_section(SectionType.HEAD, utime, json.dumps(facts).encode())
 
 
-def file_written(name: str, data: bytes, utime: int) -> bytes:
-    """Return a file that the service was started with."""
-    return _own(Part.FILE, utime, name.encode() + b"\0" + data)
+def encode_file(name: str, data: bytes, utime: int) -> bytes:
+    """Encode a file that the service was started with."""
+    return _encode_section(SectionType.FILE, utime, name.encode() + b"\0" + data)
 
 
-def state_written(data: bytes, utime: int) -> bytes:
-    """Return what the service knew."""
-    return _own(Part.STATE, utime, data)
+def encode_state(data: bytes, utime: int) -> bytes:
+    """Encode the state section."""
+    return _encode_section(SectionType.STATE, utime, data)
 
 
-def end_written(digest: bytes, utime: int, mac: bytes = b"") -> bytes:
-    """Return the end of a segment; `digest` is the SHA-256 of all bytes before, `mac` see `End`."""
-    return _own(Part.END, utime, digest + mac)
+def encode_end(digest: bytes, utime: int, mac: bytes = b"") -> bytes:
+    """Encode the end of a segment; see `SegmentEnd`."""
+    return _encode_section(SectionType.END, utime, digest + mac)
 
 
-def batch_written(number: int, records: Iterable[JournalRecord]) -> bytes:
-    """Return a batch with its seal. The channels of records are to be text, their times 63 bits."""
+def encode_batch(number: int, records: Iterable[JournalRecord]) -> bytes:
+    """Encode a batch with its seal. Channels must be encodable text, times 63 bits."""
     events: list[bytes] = []
     entries: list[bytes] = []
     utime = 0
     for kind, monotonic_ns, utime, channel, data, _ in records:
         if kind >= RecordKind.EVENT or not _is_plain(channel) or not 0 <= utime < MAX_UTIME:
             name = channel.encode()
-            entries.append(_INLINE.pack(kind | _APART, monotonic_ns, utime, len(name), len(data)) + name + data)
+            entries.append(_INLINE.pack(kind | _INLINE_FLAG, monotonic_ns, utime, len(name), len(data)) + name + data)
             continue
-        events.append(event_written(len(events), utime, channel.encode(), data))
-        entries.append(b"\0" if kind == RecordKind.SAID else _HEARD.pack(kind, monotonic_ns))
+        events.append(encode_event(len(events), utime, channel.encode(), data))
+        entries.append(b"\0" if kind == RecordKind.PUBLISHED else _RECEIVED.pack(kind, monotonic_ns))
     batch = b"".join(events)
     body = _SEAL.pack(number, len(events)) + b"".join(entries)
-    return batch + _own(Part.SEAL, min(max(utime, 0), MAX_UTIME - 1), body, zlib.crc32(batch))
+    return batch + _encode_section(SectionType.SEAL, min(max(utime, 0), MAX_UTIME - 1), body, zlib.crc32(batch))
 
 
 def _is_plain(channel: str) -> bool:
-    """Return whether a channel can stand in a log, and is not the journal's own."""
+    """Return whether a channel is valid in a log and is not the journal's own."""
     return 0 < len(channel) <= MAX_CHANNEL_LENGTH and channel.isascii() and channel != CHANNEL
 
 
-def read(data: Buffer) -> Iterator[Item]:
-    """Yield what a segment holds, in order; what cannot be used is told where it was found. Raises nothing."""
+def read_segment(data: Buffer) -> Iterator[Item]:
+    """Yield the contents of a segment in order, with `CorruptRegion` in place of unusable bytes. Raises nothing."""
     waiting: list[tuple[int, LogEvent]] = []
     start = at = 0
     expected = 0
     broken = ""
     for each in scan(data):
-        if isinstance(each, Damage):
+        if isinstance(each, LogDamage):
             broken = "no events"
             at = each.start + each.length
             continue
@@ -215,72 +214,74 @@ def read(data: Buffer) -> Iterator[Item]:
         if each.channel != CHANNEL:
             waiting.append((begin, each))
             continue
-        own = _own_read(each.data)
+        own = _decode_section_head(each.data)
         if own is None:
-            broken = "an event of the journal's own that is none"
+            broken = "a damaged section"
             continue
         part, check, body = own
-        sealed = part is Part.SEAL
+        sealed = part is SectionType.SEAL
         crc = zlib.crc32(body, zlib.crc32(data[start:begin])) if sealed else zlib.crc32(body)
         found: list[Item] | None = None
         if not broken and crc == check and (sealed or not waiting):
-            found = _batch(body, waiting, expected, begin) if sealed else _part(part, body, data, begin)
+            found = (
+                _decode_batch(body, waiting, expected, begin) if sealed else _decode_section(part, body, data, begin)
+            )
         if found is None:
-            why = broken or ("the checksum is wrong" if crc != check else "batches are missing, or do not belong here")
-            yield Broken(start, at - start, why)
+            why = broken or ("the checksum is wrong" if crc != check else "batches are missing or out of order")
+            yield CorruptRegion(start, at - start, why)
         else:
             yield from found
         if sealed and len(body) >= _SEAL.size:
             expected = _SEAL.unpack_from(body)[0] + 1
         waiting, start, broken = [], at, ""
     if start < len(data):
-        yield Broken(start, len(data) - start, "the segment breaks off: not sealed yet", tail=True)
+        yield CorruptRegion(start, len(data) - start, "the segment is truncated: not sealed yet", tail=True)
 
 
-def read_end(data: Buffer) -> End | None:
-    """Return the end of a segment without reading what is before; None where it is not closed. Checks no digest."""
+def read_end(data: Buffer) -> SegmentEnd | None:
+    """Return the end of a segment from its last bytes, without checking the digest; None where it is not closed."""
     for size in (2 * _DIGEST, _DIGEST):
         body = bytes(data[-size:])
-        event = _own(Part.END, 0, body)
+        event = _encode_section(SectionType.END, 0, body)
         tail = bytes(data[-len(event) :])
         # number and time of the event may be any
         if len(tail) == len(event) and tail[:4] == event[:4] and tail[_TIMES:] == event[_TIMES:]:
-            return End(True, body[:_DIGEST], body[_DIGEST:])
+            return SegmentEnd(True, body[:_DIGEST], body[_DIGEST:])
     return None
 
 
-def _own_read(data: bytes) -> tuple[Part, int, bytes] | None:
+def _decode_section_head(data: bytes) -> tuple[SectionType, int, bytes] | None:
     if len(data) < _OWN.size:
         return None
     magic, part, check = _OWN.unpack_from(data)
-    if magic != MAGIC or part not in _PARTS:
+    if magic != MAGIC or part not in _SECTION_TYPES:
         return None
-    return Part(part), check, data[_OWN.size :]
+    return SectionType(part), check, data[_OWN.size :]
 
 
-_PARTS: Final = frozenset(Part)
+_SECTION_TYPES: Final = frozenset(SectionType)
 
 
-def _part(part: Part, body: bytes, data: Buffer, begin: int) -> list[Item] | None:
-    if part is Part.END:
+def _decode_section(part: SectionType, body: bytes, data: Buffer, begin: int) -> list[Item] | None:
+    if part is SectionType.END:
         digest, mac = body[:_DIGEST], body[_DIGEST:]
         if len(digest) != _DIGEST or len(mac) not in (0, _DIGEST):
             return None
-        return [End(hmac.compare_digest(hashlib.sha256(data[:begin]).digest(), digest), digest, mac)]
-    if part is Part.STATE:
-        return [State(body)]
+        return [SegmentEnd(hmac.compare_digest(hashlib.sha256(data[:begin]).digest(), digest), digest, mac)]
+    if part is SectionType.STATE:
+        return [SegmentState(body)]
     try:
-        if part is Part.FILE:
+        if part is SectionType.FILE:
             name, _, content = body.partition(b"\0")
-            return [File(name.decode(), content)]
+            return [SegmentFile(name.decode(), content)]
         facts = json.loads(body)
     except (ValueError, RecursionError):
         return None
-    return [Head(facts)] if isinstance(facts, dict) else None
+    return [SegmentHead(facts)] if isinstance(facts, dict) else None
 
 
-def _batch(body: bytes, events: list[tuple[int, LogEvent]], expected: int, begin: int) -> list[Item] | None:
-    """Return the records of a batch; None where the seal does not fit them."""
+def _decode_batch(body: bytes, events: list[tuple[int, LogEvent]], expected: int, begin: int) -> list[Item] | None:
+    """Return the records of a batch; None where the seal does not match them."""
     found: list[Item] = []
     waiting = iter(events)
     try:
@@ -290,20 +291,20 @@ def _batch(body: bytes, events: list[tuple[int, LogEvent]], expected: int, begin
         at = _SEAL.size
         while at < len(body):
             kind = body[at]
-            if kind & _APART:
+            if kind & _INLINE_FLAG:
                 kind, monotonic_ns, utime, name, size = _INLINE.unpack_from(body, at)
                 at += _INLINE.size
                 channel, data = body[at : at + name].decode(), body[at + name : at + name + size]
                 at += name + size
-                found.append(JournalRecord(RecordKind(kind & ~_APART), monotonic_ns, utime, channel, data, begin))
+                found.append(JournalRecord(RecordKind(kind & ~_INLINE_FLAG), monotonic_ns, utime, channel, data, begin))
                 continue
             place, event = next(waiting)
             monotonic_ns = 0
-            if kind == RecordKind.SAID:
+            if kind == RecordKind.PUBLISHED:
                 at += 1
             else:
-                kind, monotonic_ns = _HEARD.unpack_from(body, at)
-                at += _HEARD.size
+                kind, monotonic_ns = _RECEIVED.unpack_from(body, at)
+                at += _RECEIVED.size
             found.append(JournalRecord(RecordKind(kind), monotonic_ns, event.utime, event.channel, event.data, place))
     except (struct.error, ValueError, StopIteration):
         return None

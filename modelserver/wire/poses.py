@@ -1,4 +1,4 @@
-"""Poses between Python and wire, packed by hand (see `packed`)."""
+"""Poses between Python and wire: pose_transform_t and pose_vector_t, whose values are transformations."""
 
 from __future__ import annotations
 
@@ -8,14 +8,11 @@ from typing import Any, Final
 
 from modelserver.errors import WireError
 from modelserver.messages import NO_FLAGS, Origin, PoseAnswer, Quality
-from modelserver.spatial import so3
-from modelserver.spatial.pose import Pose
-from modelserver.spatial.transformation import Transformation
+from modelserver.transforms import so3
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.transformation import Transformation
 from modelserver.wire import fields
-from modelserver.wire.fields import FAR, TOLERANCE
-from modelserver.wire.packed import check_end, read_text, text
-from mslcm.pose_transform_t import pose_transform_t
-from mslcm.pose_vector_t import pose_vector_t
+from modelserver.wire.fields import MAX_DISTANCE, ROTATION_TOLERANCE, pack_text, read_text
 
 _UTIME = struct.Struct(">q")
 _MATRIX = struct.Struct(">16d")
@@ -28,55 +25,30 @@ _TRANSFORM = struct.Struct(">16dd280x3dbbqibiiddd")
 _VECTOR = struct.Struct(">7dd280x3dbbqibiiddd")
 _NAN_COVARIANCE: Final = _NUMBERS.pack(*fields.NAN36)
 
-_TRANSFORM_FINGERPRINT: Final[bytes] = pose_transform_t._get_packed_fingerprint()
-_VECTOR_FINGERPRINT: Final[bytes] = pose_vector_t._get_packed_fingerprint()
-
-NO_TRANSFORM: Final[bytes] = pose_transform_t().encode()[8:]
-NO_VECTOR: Final[bytes] = pose_vector_t().encode()[8:]
+_POSE_HEAD: Final = bytes(8) + 2 * pack_text("")
+_POSE_END: Final = bytes(_NUMBERS.size + _REST.size) + pack_text("")
+NO_POSE_TRANSFORM: Final = _POSE_HEAD + bytes(_MATRIX.size) + _POSE_END
+NO_POSE_VECTOR: Final = _POSE_HEAD + bytes(_STATE_VECTOR.size) + _POSE_END
 """What stands in a reply that carries no pose."""
 
 
-def write_transform(answer: PoseAnswer) -> bytes:
-    """Return the bytes of a pose_transform_t."""
-    return _TRANSFORM_FINGERPRINT + transform_body(answer)
-
-
-def write_vector(answer: PoseAnswer) -> bytes:
-    """Return the bytes of a pose_vector_t."""
-    return _VECTOR_FINGERPRINT + vector_body(answer)
-
-
-def read_transform(data: bytes) -> PoseAnswer:
-    """Return the pose in the bytes of a pose_transform_t. Raises WireError, struct.error."""
-    answer, end = read_transform_body(data, 8)
-    check_end(data, end)
-    return answer
-
-
-def read_vector(data: bytes) -> PoseAnswer:
-    """Return the pose in the bytes of a pose_vector_t. Raises WireError, struct.error."""
-    answer, end = read_vector_body(data, 8)
-    check_end(data, end)
-    return answer
-
-
-def transform_body(answer: PoseAnswer) -> bytes:
+def pack_pose_transform(answer: PoseAnswer) -> bytes:
     """Return the bytes of a pose_transform_t without its fingerprint."""
     pose = answer.transformation.pose
     (a, b, c), (d, e, f), (g, h, i) = so3.matrix_rows(pose._q)
     x, y, z = pose._p
-    return _body(_MATRIX.pack(a, b, c, x, d, e, f, y, g, h, i, z, 0.0, 0.0, 0.0, 1.0), answer)
+    return _pack_pose(_MATRIX.pack(a, b, c, x, d, e, f, y, g, h, i, z, 0.0, 0.0, 0.0, 1.0), answer)
 
 
-def vector_body(answer: PoseAnswer) -> bytes:
+def pack_pose_vector(answer: PoseAnswer) -> bytes:
     """Return the bytes of a pose_vector_t without its fingerprint."""
     pose = answer.transformation.pose
-    return _body(_STATE_VECTOR.pack(*pose._p, *pose._q), answer)
+    return _pack_pose(_STATE_VECTOR.pack(*pose._p, *pose._q), answer)
 
 
-def read_transform_body(data: bytes, at: int) -> tuple[PoseAnswer, int]:
+def unpack_pose_transform(data: bytes, at: int) -> tuple[PoseAnswer, int]:
     """Return the pose that begins at `at`, and where it ends. Raises WireError, struct.error."""
-    utime, interest, reference, at = _head(data, at)
+    utime, interest, reference, at = _read_pose_head(data, at)
     return read_transform_numbers(data, at, utime, interest, reference)
 
 
@@ -88,57 +60,55 @@ def read_transform_numbers(data: bytes, at: int, utime: int, interest: str, refe
         raise WireError("malformed", f"the last row of a homogeneous transform is 0 0 0 1, got {last}")
     # rows of length 1 and at right angles, right-handed, and all of it finite: a nan fails every comparison
     if not (
-        abs(a * a + b * b + c * c - 1.0) <= TOLERANCE
-        and abs(d * d + e * e + f * f - 1.0) <= TOLERANCE
-        and abs(g * g + h * h + i * i - 1.0) <= TOLERANCE
-        and abs(a * d + b * e + c * f) <= TOLERANCE
-        and abs(a * g + b * h + c * i) <= TOLERANCE
-        and abs(d * g + e * h + f * i) <= TOLERANCE
+        abs(a * a + b * b + c * c - 1.0) <= ROTATION_TOLERANCE
+        and abs(d * d + e * e + f * f - 1.0) <= ROTATION_TOLERANCE
+        and abs(g * g + h * h + i * i - 1.0) <= ROTATION_TOLERANCE
+        and abs(a * d + b * e + c * f) <= ROTATION_TOLERANCE
+        and abs(a * g + b * h + c * i) <= ROTATION_TOLERANCE
+        and abs(d * g + e * h + f * i) <= ROTATION_TOLERANCE
         and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0.0
-        and abs(x) < FAR
-        and abs(y) < FAR
-        and abs(z) < FAR
+        and abs(x) < MAX_DISTANCE
+        and abs(y) < MAX_DISTANCE
+        and abs(z) < MAX_DISTANCE
     ):
         raise WireError("malformed", f"{((a, b, c), (d, e, f), (g, h, i))} with {(x, y, z)} is no rigid transform")
     pose = Pose._of((x, y, z), so3.from_rows(((a, b, c), (d, e, f), (g, h, i))))
-    return _answer(data, at + _MATRIX.size, utime, interest, reference, pose, rest)
+    return _make_answer(data, at + _MATRIX.size, utime, interest, reference, pose, rest)
 
 
-def read_vector_body(data: bytes, at: int) -> tuple[PoseAnswer, int]:
+def unpack_pose_vector(data: bytes, at: int) -> tuple[PoseAnswer, int]:
     """Return the pose that begins at `at`, and where it ends. Raises WireError, struct.error."""
-    utime, interest, reference, at = _head(data, at)
+    utime, interest, reference, at = _read_pose_head(data, at)
     x, y, z, *rest = _VECTOR.unpack_from(data, at)
     q, rest = rest[:4], rest[4:]
-    if not abs(sum(value * value for value in q) - 1.0) <= TOLERANCE:
+    if not abs(sum(value * value for value in q) - 1.0) <= ROTATION_TOLERANCE:
         raise WireError("malformed", f"{tuple(q)} is no unit quaternion")
     try:
         pose = Pose((x, y, z), q)
     except ValueError as error:
         raise WireError("malformed", str(error)) from None
-    return _answer(data, at + _STATE_VECTOR.size, utime, interest, reference, pose, rest)
+    return _make_answer(data, at + _STATE_VECTOR.size, utime, interest, reference, pose, rest)
 
 
-def check_no_transform(data: bytes, at: int) -> None:
-    """Check that what begins at `at` is a whole pose_transform_t, whatever it says. Raises WireError, struct.error."""
-    if data[at:] != NO_TRANSFORM:
-        check_end(data, _end(data, at, _MATRIX.size))
+def skip_pose_transform(data: bytes, at: int) -> int:
+    """Return where the pose_transform_t that begins at `at` ends, whatever is in it. Raises WireError, struct.error."""
+    return _find_pose_end(data, at, _MATRIX.size)
 
 
-def check_no_vector(data: bytes, at: int) -> None:
-    """Check that what begins at `at` is a whole pose_vector_t, whatever it says. Raises WireError, struct.error."""
-    if data[at:] != NO_VECTOR:
-        check_end(data, _end(data, at, _STATE_VECTOR.size))
+def skip_pose_vector(data: bytes, at: int) -> int:
+    """Return where the pose_vector_t that begins at `at` ends, whatever is in it. Raises WireError, struct.error."""
+    return _find_pose_end(data, at, _STATE_VECTOR.size)
 
 
-def _body(pose: bytes, answer: PoseAnswer) -> bytes:
-    transformation, origin, quality, horizontal_bound, heading_bound, seconds_to_limit = answer
+def _pack_pose(pose: bytes, answer: PoseAnswer) -> bytes:
+    transformation, origin, quality, horizontal_protection_level, heading_protection_level, seconds_to_limit = answer
     covariance = transformation.covariance_numbers
     invalid = transformation.invalid_reasons
     easting, northing, height = fields.NAN3 if origin is None else origin.initial_utm
     return b"%b%b%b%b%b%b%b" % (
         _UTIME.pack(transformation.utime),
-        text(transformation.frame_of_interest),
-        text(transformation.frame_of_reference),
+        pack_text(transformation.frame_of_interest),
+        pack_text(transformation.frame_of_reference),
         pose,
         _NAN_COVARIANCE if covariance is None else _NUMBERS.pack(*covariance),
         _REST.pack(
@@ -152,15 +122,15 @@ def _body(pose: bytes, answer: PoseAnswer) -> bytes:
             not invalid,
             invalid,
             quality,
-            horizontal_bound,
-            heading_bound,
+            horizontal_protection_level,
+            heading_protection_level,
             seconds_to_limit,
         ),
-        text(transformation.model_revision),
+        pack_text(transformation.model_revision),
     )
 
 
-def _head(data: bytes, at: int) -> tuple[int, str, str, int]:
+def _read_pose_head(data: bytes, at: int) -> tuple[int, str, str, int]:
     """Return time and names that a pose begins with, and where they end."""
     (utime,) = _UTIME.unpack_from(data, at)
     interest, at = read_text(data, at + 8)
@@ -168,14 +138,14 @@ def _head(data: bytes, at: int) -> tuple[int, str, str, int]:
     return utime, interest, reference, at
 
 
-def _end(data: bytes, at: int, size: int) -> int:
+def _find_pose_end(data: bytes, at: int, size: int) -> int:
     """Return where a pose ends whose numbers before the covariance are of that size. Raises WireError, struct.error."""
-    at = _head(data, at)[3] + size + _NUMBERS.size
+    at = _read_pose_head(data, at)[3] + size + _NUMBERS.size
     _REST.unpack_from(data, at)
     return read_text(data, at + _REST.size)[1]
 
 
-def _answer(
+def _make_answer(
     data: bytes, at: int, utime: int, interest: str, reference: str, pose: Pose, rest: list[Any]
 ) -> tuple[PoseAnswer, int]:
     """Return the answer of what both pose types have in common, whose covariance is at `at`, and where it ends.
@@ -184,11 +154,11 @@ def _answer(
     """
     first, easting, northing, height, zone, north, origin_id, epoch, _, invalid, quality, *bounds = rest
     revision, end = read_text(data, at + _NUMBERS.size + _REST.size)
-    covariance = None if first != first else partial(_covariance, data, at)
+    covariance = None if first != first else partial(_unpack_covariance, data, at)
     transformation = Transformation(interest, reference, pose, covariance, utime, invalid, epoch, origin_id, revision)
     origin = None if easting != easting else Origin(easting, northing, height, zone, bool(north), origin_id)
     return PoseAnswer(transformation, origin, Quality(quality) if quality else NO_FLAGS, *bounds), end
 
 
-def _covariance(data: bytes, at: int) -> tuple[float, ...]:
+def _unpack_covariance(data: bytes, at: int) -> tuple[float, ...]:
     return _NUMBERS.unpack_from(data, at)

@@ -1,4 +1,4 @@
-"""LCM: which provider, with which buffer, what to look at when joining fails, and how messages are taken."""
+"""LCM instances: URL, receive buffer, error hints, and handling of one message."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ import lcm
 
 from modelserver.errors import BusError
 from modelserver.wire.channels import DEFAULT_URL
-from modelserver.wire.multicast import group_of, route
-from modelserver.wire.urls import url_problem
+from modelserver.wire.urls import find_url_problem, group_of, make_route_command
 
 RECEIVE_BUFFER_BYTES = 4 * 1024 * 1024
-"""Kernel buffer asked for: the default loses an eighth of 20,000 messages a second (measured)."""
+"""Requested kernel buffer: the default loses an eighth of 20,000 messages a second (measured)."""
 
 
 def resolve_url(url: str = "") -> str:
-    """Return the provider to use: the one given, else $LCM_DEFAULT_URL, else loopback."""
+    """Return the URL to use: the given one, else $LCM_DEFAULT_URL, else loopback."""
     url = url or os.environ.get("LCM_DEFAULT_URL", "") or DEFAULT_URL
     if url.startswith("udpm://") and "recv_buf_size" not in url:
         url += f"{'&' if '?' in url else '?'}recv_buf_size={RECEIVE_BUFFER_BYTES}"
@@ -25,38 +24,37 @@ def resolve_url(url: str = "") -> str:
 
 
 def open_lcm(url: str) -> lcm.LCM:
-    """Return an LCM instance. Raises BusError that says what to look at."""
-    wrong = url_problem(url)
+    """Join the bus. Raises BusError with hints."""
+    wrong = find_url_problem(url)
     if wrong:
         raise BusError(f"cannot join the bus at {url}: {wrong}")
     try:
         return lcm.LCM(url)
     except (OSError, RuntimeError) as error:
-        other = _OTHERS.get(url.partition("://")[0])
+        other = _PROVIDER_HINTS.get(url.partition("://")[0])
         if other is not None:
             raise BusError(f"cannot join the bus at {url}: {error}. {other}") from None
         raise BusError(
             f"cannot join the bus at {url}: {error}. Is the address right (udpm://239.255.76.67:7667?ttl=0), and has "
             f"the machine a route for multicast? On one machine: sudo ip link set lo up multicast on && sudo "
-            f"{route(group_of(url))} (modelserver doctor says what is missing)"
+            f"{make_route_command(group_of(url))} (modelserver doctor checks it)"
         ) from None
 
 
-_OTHERS: Final = {
+_PROVIDER_HINTS: Final = {
     "file": "Is there a log of that name, that may be read? To play one onto the bus: modelserver replay LOG",
     "tcpq": f"Does LCM's TCP service run there (java lcm.lcm.TCPService)? Without one, write {DEFAULT_URL}",
 }
-"""What to look at where joining by another provider than multicast fails."""
+"""Hints for errors of providers other than multicast."""
 
 _INTERRUPTED: Final = ("lcm_handle_timeout() returned -1",)
 """What `LCM.handle_timeout` raises OSError with, without an errno, when a signal interrupted it."""
 
 
-def take_message(bus: lcm.LCM, milliseconds: int = 0) -> bool:
-    """Hand over the next message, waiting for it so long at most; return whether there was one.
+def handle_message(bus: lcm.LCM, milliseconds: int = 0) -> bool:
+    """Handle the next message, waiting at most `milliseconds`; return whether there was one.
 
-    A signal ends the waiting, as if nothing had come: no reload, end, resized window or profiler of the program that
-    gets one may make it fail.
+    A signal ends the wait without an error: reloads, stops, window resizes and profilers send signals.
     """
     try:
         return bool(bus.handle_timeout(milliseconds))

@@ -1,9 +1,9 @@
-"""Static replies as bytes: answers that do not depend on time, by the pair of frames.
+"""Cache of encoded static replies: answers that do not depend on time, by the pair of frames.
 
-Most questions are about how the vehicle is bolted together, and their answers hold until the model changes. The bytes
-of such a reply differ only in request id and stamp, and do not depend on the client. So the pair in the bytes of a
-request leads to the rest of the reply, without decoding, core and encoding. The cache is as large as the model's
-pairs of frames, within bounds, and drops the entry that was not used for longest.
+Most queries are about rigidly mounted frames, and their answers hold until the model changes. The bytes of such a reply
+differ only in request id and utime, and do not depend on the client. So the pair of names in the bytes of a request
+leads to the rest of the reply, without decoding, core or encoding. The capacity is the number of pairs of the model's
+frames, within a limit; the least recently used entry is evicted.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from mslcm.get_transformation_request_t import get_transformation_request_t
 CACHED_TYPE: Final = get_transformation_request_t.__name__
 """The only type of request whose replies are cached."""
 
-LARGEST_CACHE: Final = 16_384
+MAX_ENTRIES: Final = 16_384
 """Entries: all pairs of 128 frames, some 10 MB."""
 
-LONGEST_PAIR: Final = 512
-"""Bytes of both names; longer ones come from strangers and are not cached."""
+MAX_PAIR_BYTES: Final = 512
+"""Bytes of both names; longer ones are not cached."""
 
 _REQUEST: Final[bytes] = get_transformation_request_t._get_packed_fingerprint()
 _REPLY: Final[bytes] = get_transformation_reply_t._get_packed_fingerprint()
 _CHANNEL: Final = 20
-"""Where the reply channel begins in a request: behind fingerprint, id and the channel's length."""
+"""Offset of the reply channel in a request: behind fingerprint, id and the channel's length."""
 _TIME = struct.Struct(">qbi")
 _UTIME = struct.Struct(">q")
-_STAMPED: Final = 24
-"""Where a reply goes on behind fingerprint, id and stamp."""
+_AFTER_UTIME: Final = 24
+"""Offset in a reply behind fingerprint, request id and utime."""
 _LAST_POLICY: Final = max(Policy)
 
 
 class StaticReplyCache:
-    """The static replies of one model; see the module."""
+    """LRU cache of the static replies of one model."""
 
     def __init__(self) -> None:
         self._entries: dict[bytes, bytes] = {}
@@ -49,13 +49,13 @@ class StaticReplyCache:
         return len(self._entries)
 
     def reset(self, model: object, frames: int) -> None:
-        """Drop all entries and cache the replies of another model from now on, which has so many frames."""
+        """Clear the cache for another model with so many frames."""
         self._entries.clear()
         self._model = model
-        self._capacity = min(max(frames, 1) ** 2, LARGEST_CACHE)
+        self._capacity = min(max(frames, 1) ** 2, MAX_ENTRIES)
 
     def is_of(self, model: object) -> bool:
-        """Return whether the cache is of a model."""
+        """Return whether the cache is for this model."""
         return model is self._model
 
     def find(self, request: bytes, client: bytes, utime: int) -> bytes | None:
@@ -70,7 +70,7 @@ class StaticReplyCache:
         rest = entries.pop(pair, None)
         if rest is None:
             return None
-        # back in as the newest: the first entry is the one that was not used for longest
+        # re-inserted as the newest: the first entry is the least recently used one
         entries[pair] = rest
         at, policy, wait_ms = _TIME.unpack(request[-_TIME.size :])
         if not (0 <= at < MAX_UTIME and 0 <= policy <= _LAST_POLICY and wait_ms >= 0):
@@ -82,8 +82,8 @@ class StaticReplyCache:
         if not isinstance(reply, TransformReply) or reply.header.status is not Status.OK or reply.answer is None:
             return
         pair = request[_CHANNEL + len(client) : -_TIME.size]
-        if reply.answer.transformation.utime or len(pair) > LONGEST_PAIR:
+        if reply.answer.transformation.utime or len(pair) > MAX_PAIR_BYTES:
             return
         if len(self._entries) >= self._capacity:
             self._entries.pop(next(iter(self._entries), b""), None)
-        self._entries[pair] = encoded[_STAMPED:]
+        self._entries[pair] = encoded[_AFTER_UTIME:]

@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from typing import Final
 
-from modelserver.errors import WireError
 from modelserver.messages import SnapshotPart
-from modelserver.wire import fields
-from mslcm.model_snapshot_t import model_snapshot_t
 
 PART_BYTES: Final = 1200
 """Of payload: with its header a part fits an Ethernet frame, so that none is lost for a piece of it."""
 
-MAX_PARTS: Final = 100_000
 
-
-def in_parts(data: bytes, revision: str, utime: int) -> list[SnapshotPart]:
+def split_snapshot(data: bytes, revision: str, utime: int) -> list[SnapshotPart]:
     """Return the parts of a snapshot's bytes."""
     pieces = [data[start : start + PART_BYTES] for start in range(0, len(data), PART_BYTES)]
     return [SnapshotPart(utime, revision, number, len(pieces), piece) for number, piece in enumerate(pieces)]
@@ -39,29 +34,3 @@ class SnapshotAssembler:
         whole = b"".join(self._parts[number] for number in range(self._count))
         self._parts = {}
         return whole
-
-
-def read_snapshot(message: model_snapshot_t) -> SnapshotPart:
-    """Return the part in a message. Raises WireError."""
-    fields.checked_count(message.size, message.data, "size")
-    if not 0 <= message.part < message.num_parts <= MAX_PARTS:
-        raise WireError("malformed", f"part {message.part} of {message.num_parts} cannot be")
-    return SnapshotPart(
-        fields.checked_utime(message.utime),
-        fields.name(message.model_revision, "model_revision"),
-        message.part,
-        message.num_parts,
-        bytes(message.data),
-    )
-
-
-def write_snapshot(part: SnapshotPart) -> model_snapshot_t:
-    """Return the message of a part."""
-    message = model_snapshot_t()
-    message.utime = part.utime
-    message.model_revision = part.model_revision
-    message.part = part.part
-    message.num_parts = part.parts
-    message.size = len(part.data)
-    message.data = part.data
-    return message

@@ -1,7 +1,7 @@
-"""LCM URLs: what is wrong with one, told before liblcm refuses it, hangs on it or takes it for something else.
+"""Validation of LCM URLs, and the multicast group of a bus.
 
-What it takes was tried with liblcm 1.5: a udpm URL without a port opens and then waits for ever, ttl=300 is ttl 44, and
-ttl=abc is ttl 0. What it takes as it is meant is not refused here, strange as it may look.
+liblcm 1.5 accepts URLs that do not work: without a port udpm opens and waits forever, ttl=300 becomes 44, ttl=abc
+becomes 0. These are rejected here with a hint; whatever liblcm interprets as written is accepted.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ from __future__ import annotations
 import re
 import socket
 from typing import Final
+from urllib.parse import urlsplit
 
-from modelserver.errors import nearest_names, shown
+from modelserver.errors import find_nearest_names, quote
 
 SCHEMES: Final = ("udpm", "mpudpm", "tcpq", "file", "memq")
 """Providers that liblcm has."""
@@ -22,27 +23,27 @@ _MULTICAST: Final = ("udpm", "mpudpm")
 _NUMBER: Final = re.compile(r"\s*[+-]?(0[xX][0-9a-fA-F]+|\d+)")
 
 
-def url_problem(url: str) -> str:
-    """Return what is wrong with an LCM URL and what to write, empty where nothing is."""
+def find_url_problem(url: str) -> str:
+    """Return what is wrong with an LCM URL and what to write instead, empty for a valid one."""
     scheme, found, rest = url.partition("://")
     if not found:
         return f"it has no scheme; write it like {EXAMPLE}"
     if scheme not in SCHEMES:
-        near = nearest_names(scheme, SCHEMES, 1)
+        near = find_nearest_names(scheme, SCHEMES, 1)
         known = ", ".join(f"{each}://" for each in SCHEMES if each != "memq")
         offer = f"did you mean {near[0]}://? There are" if near else "there are"
-        return f"{shown(scheme, 40)} is no scheme of LCM's; {offer} {known}; for a start: {EXAMPLE}"
+        return f"{quote(scheme, 40)} is no scheme of LCM's; {offer} {known}; for a start: {EXAMPLE}"
     if scheme == "memq":
-        return f"memq:// reaches nobody, for each of its users has a bus of its own; write {EXAMPLE}"
+        return f"memq:// does not leave the process, so no other program receives it; write {EXAMPLE}"
     place, _, options = rest.partition("?")
     if scheme == "file":
         return "" if place else "it names no log; write file:///path/of/log"
     if scheme not in _MULTICAST:
         return ""
-    return (place and _place_problem(place, scheme)) or _ttl_problem(options)
+    return (place and _find_address_problem(place, scheme)) or _find_ttl_problem(options)
 
 
-def _place_problem(place: str, scheme: str) -> str:
+def _find_address_problem(place: str, scheme: str) -> str:
     group, colon, port = place.partition(":")
     example = f"{scheme}://239.255.76.67:7667?ttl=0"
     if not group:
@@ -51,30 +52,51 @@ def _place_problem(place: str, scheme: str) -> str:
         first = socket.inet_aton(group)[0]
     except (OSError, ValueError):
         return (
-            f"{shown(group, 40)} is no IPv4 address; write one between 224.0.0.0 and 239.255.255.255, such as {example}"
+            f"{quote(group, 40)} is no IPv4 address; write one between 224.0.0.0 and 239.255.255.255, such as {example}"
         )
     if not 224 <= first <= 239:
         return (
-            f"{shown(group, 40)} is no multicast address; write one between 224.0.0.0 and 239.255.255.255, the same on "
+            f"{quote(group, 40)} is no multicast address; write one between 224.0.0.0 and 239.255.255.255, the same on "
             f"all machines, such as {example}"
         )
     if not colon:
-        # mpudpm has a default, udpm waits on port 0 for ever
+        # mpudpm has a default, udpm waits on port 0 forever
         return "" if scheme == "mpudpm" else f"the port is missing; write {scheme}://{group}:7667"
     match = _NUMBER.match(port)
     number = int(match[0], 0 if match[1][:2] in ("0x", "0X") else 10) if match else -1
     lowest = 0 if scheme == "mpudpm" else 1
     if not lowest <= number <= 65535:
-        return f"the port is a number from {lowest} to 65535, got {shown(port, 40)}; such as {example}"
+        return f"the port is a number from {lowest} to 65535, got {quote(port, 40)}; such as {example}"
     return ""
 
 
-def _ttl_problem(options: str) -> str:
+def _find_ttl_problem(options: str) -> str:
     for each in options.split("&"):
         key, _, value = each.partition("=")
         if key == "ttl" and not (value.isascii() and value.isdigit() and len(value) <= 3 and int(value) <= 255):
             return (
-                f"ttl is a whole number from 0 to 255, got {shown(value, 40)}; 0 stays on this machine, 1 goes to the "
+                f"ttl is a whole number from 0 to 255, got {quote(value, 40)}; 0 stays on this machine, 1 goes to the "
                 "network's other machines"
             )
     return ""
+
+
+GROUP: Final = "239.255.76.67"
+"""Default multicast group of LCM."""
+
+
+def group_of(url: str) -> str:
+    """Return the multicast group of an LCM URL, LCM's default where it has none."""
+    try:
+        named = urlsplit(url).hostname or ""
+    except ValueError:
+        return GROUP
+    return named if re.fullmatch(r"2(2[4-9]|3[0-9])(\.[0-9]{1,3}){3}", named) else GROUP
+
+
+def make_route_command(group: str, device: str = "lo") -> str:
+    """Return the command, without sudo, that routes a multicast group through a network interface.
+
+    Only this group: the multicast traffic of other programs keeps its routes.
+    """
+    return f"ip route replace {group}/32 dev {device}"

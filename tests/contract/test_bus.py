@@ -1,4 +1,4 @@
-"""What the loop needs of a bus holds for the real one and for the fake one."""
+"""Contract of `Bus`, for LCM and for the fake bus."""
 
 from __future__ import annotations
 
@@ -10,41 +10,41 @@ import lcm
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support_lcm import PATIENCE_S, reserved_url
+from support_lcm import TIMEOUT_S, reserved_url
 
 from modelserver.errors import BusError
-from modelserver.service.bus import (
-    HEAD_BYTES,
-    LEAST_UNREAD,
-    MOST_UNREAD,
-    SENSOR_BYTES,
+from modelserver.server.bus import (
+    MAX_QUEUED,
+    MESSAGE_OVERHEAD_BYTES,
+    MIN_QUEUED,
+    SENSOR_QUEUE_BYTES,
     Bus,
     Inbox,
     LcmBus,
     QueueLimit,
 )
-from modelserver.service.clock import Clock, FakeClock, SystemClock
-from modelserver.service.fake_bus import FakeBus
+from modelserver.server.clock import Clock, FakeClock, SystemClock
+from modelserver.server.fake_bus import FakeBus
 from modelserver.wire.channels import CHANNELS
 
 ODD_CHANNELS = ["A.B", "A*", "A+", "(A)", "[A]", "A|B", "A-B", "^A$", "A{2}", "A?", "A\\B", "A/B", "#A", "A B", "."]
 
 
 class Rig:
-    """A bus with the clock that its waiting goes by."""
+    """A bus and the clock of its waits."""
 
     def __init__(self, bus: Bus, clock: Clock):
         self.bus = bus
         self.clock = clock
-        self.heard: list[tuple[str, bytes]] = []
+        self.received: list[tuple[str, bytes]] = []
 
-    def hear(self, channel: str, inbox: Inbox | None = None) -> None:
-        (inbox or self.bus.sensors).subscribe(channel, lambda name, data: self.heard.append((name, data)))
+    def subscribe(self, channel: str, inbox: Inbox | None = None) -> None:
+        (inbox or self.bus.sensors).subscribe(channel, lambda name, data: self.received.append((name, data)))
 
     def drain_until(self, done: Callable[[], bool], inbox: Inbox | None = None) -> bool:
-        """Drain while waiting on the bus, until `done` or patience ends."""
+        """Drain and wait until `done` or a timeout."""
         inbox = inbox or self.bus.sensors
-        end = time.monotonic() + PATIENCE_S
+        end = time.monotonic() + TIMEOUT_S
         while not done():
             if time.monotonic() > end:
                 return False
@@ -52,12 +52,12 @@ class Rig:
                 self.bus.wait(0.05)
         return True
 
-    def settled(self) -> list[tuple[str, bytes]]:
-        """All that was heard until a last message has come through."""
+    def receive_all(self) -> list[tuple[str, bytes]]:
+        """Return all received messages until a last one has arrived."""
         self.bus.publish("LAST", b"")
-        assert self.drain_until(lambda: ("LAST", b"") in self.heard)
-        self.heard.remove(("LAST", b""))
-        return self.heard
+        assert self.drain_until(lambda: ("LAST", b"") in self.received)
+        self.received.remove(("LAST", b""))
+        return self.received
 
 
 @pytest.fixture(params=["fake", "lcm"])
@@ -65,66 +65,66 @@ def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
     if request.param == "fake":
         clock = FakeClock()
         rig = Rig(FakeBus(clock), clock)
-        rig.hear("LAST")
+        rig.subscribe("LAST")
         yield rig
         return
     with reserved_url() as url:
         rig = Rig(LcmBus(url), SystemClock())
-        rig.hear("LAST")
+        rig.subscribe("LAST")
         yield rig
 
 
-def test_given_a_message_then_those_who_listen_hear_channel_and_bytes(rig: Rig) -> None:
-    rig.hear("A")
+def test_given_a_message_then_its_subscribers_receive_channel_and_bytes(rig: Rig) -> None:
+    rig.subscribe("A")
     rig.bus.publish("A", b"\x00\xffdata")
-    assert rig.settled() == [("A", b"\x00\xffdata")]
+    assert rig.receive_all() == [("A", b"\x00\xffdata")]
 
 
 def test_given_an_empty_and_a_large_message_then_both_come_whole(rig: Rig) -> None:
     large = bytes(range(256)) * 1000
-    rig.hear("A")
+    rig.subscribe("A")
     rig.bus.publish("A", b"")
     rig.bus.publish("A", large)
-    assert rig.settled() == [("A", b""), ("A", large)]
+    assert rig.receive_all() == [("A", b""), ("A", large)]
 
 
-def test_given_names_that_contain_a_channel_then_only_the_exact_one_is_heard(rig: Rig) -> None:
-    rig.hear("GPS")
+def test_given_names_that_contain_a_channel_then_only_the_exact_one_is_received(rig: Rig) -> None:
+    rig.subscribe("GPS")
     for name in ("GPS2", "XGPS", "GP", "gps", "GPS ", " GPS", "GPS\n", "\nGPS", "G.S", "GPS|A"):
         rig.bus.publish(name, b"wrong")
     rig.bus.publish("GPS", b"right")
-    assert rig.settled() == [("GPS", b"right")]
+    assert rig.receive_all() == [("GPS", b"right")]
 
 
 @pytest.mark.parametrize("channel", ODD_CHANNELS)
 def test_given_a_channel_of_characters_that_patterns_use_then_it_is_matched_literally(rig: Rig, channel: str) -> None:
-    rig.hear(channel)
+    rig.subscribe(channel)
     others = [name for name in ("A", "AB", "AA", "B", "A1B", "AxB", *ODD_CHANNELS) if name != channel]
     for name in others:
         rig.bus.publish(name, b"wrong")
     rig.bus.publish(channel, b"right")
-    assert rig.settled() == [(channel, b"right")]
+    assert rig.receive_all() == [(channel, b"right")]
 
 
-def test_given_many_messages_then_their_order_is_kept_across_channels(rig: Rig) -> None:
-    rig.hear("A")
-    rig.hear("B")
+def test_given_many_messages_then_their_order_is_preserved_across_channels(rig: Rig) -> None:
+    rig.subscribe("A")
+    rig.subscribe("B")
     sent = [("AB"[n % 3 == 0], str(n).encode()) for n in range(500)]
     for channel, data in sent:
         rig.bus.publish(channel, data)
-    assert rig.settled() == sent
+    assert rig.receive_all() == sent
 
 
-def test_given_a_limit_then_a_drain_hands_over_no_more_and_says_how_many(rig: Rig) -> None:
-    rig.hear("A")
+def test_given_a_limit_then_a_drain_handles_no_more_and_returns_how_many(rig: Rig) -> None:
+    rig.subscribe("A")
     for n in range(10):
         rig.bus.publish("A", bytes([n]))
     counts: list[int] = []
-    end = time.monotonic() + PATIENCE_S
+    end = time.monotonic() + TIMEOUT_S
     while sum(counts) < 10 and time.monotonic() < end:
-        before = len(rig.heard)
+        before = len(rig.received)
         counts.append(rig.bus.sensors.drain(3))
-        assert counts[-1] == len(rig.heard) - before <= 3
+        assert counts[-1] == len(rig.received) - before <= 3
         if not counts[-1]:
             rig.bus.wait(0.05)
     assert sum(counts) == 10
@@ -133,38 +133,38 @@ def test_given_a_limit_then_a_drain_hands_over_no_more_and_says_how_many(rig: Ri
 
 
 def test_given_nothing_sent_then_a_drain_returns_at_once(rig: Rig) -> None:
-    rig.hear("A")
-    begun = time.monotonic()
+    rig.subscribe("A")
+    begin = time.monotonic()
     assert rig.bus.sensors.drain(10) == 0
     assert rig.bus.requests.drain(10) == 0
-    assert time.monotonic() - begun < 5.0
+    assert time.monotonic() - begin < 5.0
 
 
 def test_given_handlers_then_they_run_within_drain_only(rig: Rig) -> None:
-    rig.hear("A")
+    rig.subscribe("A")
     rig.bus.publish("A", b"1")
     rig.bus.wait(0.2)
-    assert rig.heard == []
-    assert rig.drain_until(lambda: bool(rig.heard))
+    assert rig.received == []
+    assert rig.drain_until(lambda: bool(rig.received))
 
 
 def test_given_both_inboxes_then_each_has_its_own_queue(rig: Rig) -> None:
-    rig.hear("A", rig.bus.sensors)
-    rig.bus.requests.subscribe("A", lambda name, data: rig.heard.append(("request", data)))
+    rig.subscribe("A", rig.bus.sensors)
+    rig.bus.requests.subscribe("A", lambda name, data: rig.received.append(("request", data)))
     rig.bus.publish("A", b"1")
-    assert rig.drain_until(lambda: rig.heard == [("A", b"1")])
-    assert rig.drain_until(lambda: rig.heard == [("A", b"1"), ("request", b"1")], rig.bus.requests)
+    assert rig.drain_until(lambda: rig.received == [("A", b"1")])
+    assert rig.drain_until(lambda: rig.received == [("A", b"1"), ("request", b"1")], rig.bus.requests)
 
 
-def test_given_two_handlers_on_a_channel_then_both_hear_it(rig: Rig) -> None:
-    rig.hear("A")
-    rig.hear("A")
+def test_given_two_handlers_on_a_channel_then_both_receive_it(rig: Rig) -> None:
+    rig.subscribe("A")
+    rig.subscribe("A")
     rig.bus.publish("A", b"1")
-    assert rig.settled() == [("A", b"1"), ("A", b"1")]
+    assert rig.receive_all() == [("A", b"1"), ("A", b"1")]
 
 
-def test_given_a_handler_that_publishes_then_what_it_says_is_heard_too(rig: Rig) -> None:
-    rig.hear("ECHO")
+def test_given_a_handler_that_publishes_then_its_message_is_received_too(rig: Rig) -> None:
+    rig.subscribe("ECHO")
     echoed = []
 
     def echo(channel: str, data: bytes) -> None:
@@ -176,27 +176,27 @@ def test_given_a_handler_that_publishes_then_what_it_says_is_heard_too(rig: Rig)
     rig.bus.publish("A", b"1")
     assert rig.drain_until(lambda: len(echoed) == 1)
     assert rig.drain_until(lambda: len(echoed) == 2, rig.bus.requests)
-    assert rig.drain_until(lambda: len(rig.heard) == 2)
-    assert rig.heard == [("ECHO", b"1")] * 2
+    assert rig.drain_until(lambda: len(rig.received) == 2)
+    assert rig.received == [("ECHO", b"1")] * 2
 
 
 def test_given_a_handler_that_raises_then_the_messages_after_it_are_not_lost(rig: Rig) -> None:
     def failing(channel: str, data: bytes) -> None:
         if data == b"1":
             raise RuntimeError("on purpose")
-        rig.heard.append((channel, data))
+        rig.received.append((channel, data))
 
     rig.bus.sensors.subscribe("A", failing)
     for data in (b"0", b"1", b"2"):
         rig.bus.publish("A", data)
     with pytest.raises(RuntimeError, match="on purpose"):
-        rig.drain_until(lambda: len(rig.heard) == 2)
-    assert rig.drain_until(lambda: rig.heard == [("A", b"0"), ("A", b"2")])
+        rig.drain_until(lambda: len(rig.received) == 2)
+    assert rig.drain_until(lambda: rig.received == [("A", b"0"), ("A", b"2")])
 
 
 def test_given_nothing_arrives_then_wait_returns_at_its_deadline(rig: Rig) -> None:
     for seconds in (0.0, 0.0004, 0.009, 0.02, 0.0305):
-        # what is left of earlier messages may end one wait early
+        # a rest of earlier messages may end one wait early
         rig.bus.sensors.drain(100)
         rig.bus.requests.drain(100)
         before = rig.clock.monotonic_ns()
@@ -207,42 +207,42 @@ def test_given_nothing_arrives_then_wait_returns_at_its_deadline(rig: Rig) -> No
 
 @pytest.mark.parametrize("inbox", ["sensors", "requests"])
 def test_given_a_message_for_either_inbox_then_wait_returns_before_its_deadline(rig: Rig, inbox: str) -> None:
-    rig.hear("A", getattr(rig.bus, inbox))
+    rig.subscribe("A", getattr(rig.bus, inbox))
     rig.bus.publish("A", b"1")
     before = rig.clock.monotonic_ns()
-    rig.bus.wait(PATIENCE_S)
-    assert (rig.clock.monotonic_ns() - before) * 1e-9 < PATIENCE_S / 2
-    assert rig.drain_until(lambda: bool(rig.heard), getattr(rig.bus, inbox))
+    rig.bus.wait(TIMEOUT_S)
+    assert (rig.clock.monotonic_ns() - before) * 1e-9 < TIMEOUT_S / 2
+    assert rig.drain_until(lambda: bool(rig.received), getattr(rig.bus, inbox))
 
 
 def test_given_messages_that_were_left_then_wait_returns_at_once(rig: Rig) -> None:
-    rig.hear("A")
+    rig.subscribe("A")
     for n in range(3):
         rig.bus.publish("A", bytes([n]))
-    assert rig.drain_until(lambda: len(rig.heard) == 3)
+    assert rig.drain_until(lambda: len(rig.received) == 3)
     for n in range(3):
         rig.bus.publish("A", bytes([n]))
-    rig.bus.wait(PATIENCE_S)
-    end = time.monotonic() + PATIENCE_S
-    while len(rig.heard) < 4 and time.monotonic() < end:
+    rig.bus.wait(TIMEOUT_S)
+    end = time.monotonic() + TIMEOUT_S
+    while len(rig.received) < 4 and time.monotonic() < end:
         rig.bus.sensors.drain(1)
     before = rig.clock.monotonic_ns()
-    rig.bus.wait(PATIENCE_S)
-    assert (rig.clock.monotonic_ns() - before) * 1e-9 < PATIENCE_S / 2
-    assert rig.drain_until(lambda: len(rig.heard) == 6)
+    rig.bus.wait(TIMEOUT_S)
+    assert (rig.clock.monotonic_ns() - before) * 1e-9 < TIMEOUT_S / 2
+    assert rig.drain_until(lambda: len(rig.received) == 6)
 
 
 def test_given_the_names_of_this_service_then_they_are_plain_and_short_enough_for_lcm_with_the_longest_prefix() -> None:
     assert all(re.fullmatch("[A-Z_]+", channel.name) and len(channel.name) <= 63 - 24 for channel in CHANNELS)
 
 
-def test_given_a_bus_that_cannot_be_joined_then_the_error_says_what_to_look_at(
+def test_given_a_bus_that_cannot_be_joined_then_the_error_names_what_to_check(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def refused(url: str) -> None:
+    def reject(url: str) -> None:
         raise OSError("no way out")
 
-    monkeypatch.setattr("modelserver.wire.provider.lcm.LCM", refused)
+    monkeypatch.setattr("modelserver.wire.provider.lcm.LCM", reject)
     url = "udpm://239.1.2.3:7667?ttl=0"
     with pytest.raises(BusError, match=r"sudo ip route replace 239\.1\.2\.3/32 dev lo") as caught:
         LcmBus(url)
@@ -250,40 +250,40 @@ def test_given_a_bus_that_cannot_be_joined_then_the_error_says_what_to_look_at(
     assert "no way out" in str(caught.value)
 
 
-# --- bytes that wait ------------------------------------------------------------------------------------------
+# --- queue limits ---------------------------------------------------------------------------------------------
 
 
 @given(st.lists(st.tuples(st.integers(0, 1 << 24), st.integers(1, 300)), max_size=8), st.integers(0, 1 << 24))
 def test_given_messages_of_any_lengths_then_those_that_may_wait_fit_into_the_bytes_there_are(
     before: list[tuple[int, int]], length: int
 ) -> None:
-    limit = QueueLimit(SENSOR_BYTES)
+    limit = QueueLimit(SENSOR_QUEUE_BYTES)
     for each, count in before:
         for _ in range(count):
-            limit.changes(each)
+            limit.update(each)
     for _ in range(60):
-        limit.changes(length)
-    assert LEAST_UNREAD <= limit.capacity <= MOST_UNREAD
-    assert limit.capacity * length <= 2 * SENSOR_BYTES or limit.capacity <= 1.25 * LEAST_UNREAD
+        limit.update(length)
+    assert MIN_QUEUED <= limit.capacity <= MAX_QUEUED
+    assert limit.capacity * length <= 2 * SENSOR_QUEUE_BYTES or limit.capacity <= 1.25 * MIN_QUEUED
 
 
 def test_given_short_messages_again_then_as_many_may_wait_as_before_the_long_ones() -> None:
-    limit = QueueLimit(SENSOR_BYTES)
+    limit = QueueLimit(SENSOR_QUEUE_BYTES)
     for length in (160, 64_000, 160):
         for _ in range(1000):
-            limit.changes(length)
-    assert limit.capacity * (160 + HEAD_BYTES) >= 0.75 * SENSOR_BYTES
+            limit.update(length)
+    assert limit.capacity * (160 + MESSAGE_OVERHEAD_BYTES) >= 0.75 * SENSOR_QUEUE_BYTES
 
 
 @pytest.mark.parametrize("rig", ["lcm"], indirect=True)
-def test_given_long_messages_that_nobody_takes_then_few_of_them_are_held(rig: Rig) -> None:
+def test_given_long_messages_that_are_not_handled_then_few_of_them_are_queued(rig: Rig) -> None:
     bus = rig.bus
     assert isinstance(bus, LcmBus)
     taken: list[int] = []
     bus.sensors.subscribe("GPS", lambda channel, data: taken.append(len(data)))
     publisher = lcm.LCM(bus.url)
-    long, most = bytes(60_000), SENSOR_BYTES // 60_000
-    end = time.monotonic() + PATIENCE_S
+    long, most = bytes(60_000), SENSOR_QUEUE_BYTES // 60_000
+    end = time.monotonic() + TIMEOUT_S
     while len(taken) < 40 and time.monotonic() < end:
         publisher.publish("GPS", long)
         bus.wait(0.01)
@@ -291,7 +291,7 @@ def test_given_long_messages_that_nobody_takes_then_few_of_them_are_held(rig: Ri
     taken.clear()
     for _ in range(4 * most):
         publisher.publish("GPS", long)
-        # so that none is lost before it comes to LCM
+        # so that none is lost before LCM
         time.sleep(0.0005)
     while bus.sensors.drain(1000):
         pass

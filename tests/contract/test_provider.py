@@ -1,4 +1,4 @@
-"""What holds of liblcm itself and what we make of it."""
+"""Properties of liblcm and of the provider on it."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import pytest
 from support_lcm import reserved_url
 
 from modelserver.errors import BusError
-from modelserver.wire.provider import open_lcm, take_message
-from modelserver.wire.urls import url_problem
+from modelserver.wire.provider import handle_message, open_lcm
+from modelserver.wire.urls import find_url_problem
 
 WAIT_MS = 1000
 
 
 @contextmanager
 def alarms(period: float = 0.005) -> Iterator[list[int]]:
-    """Have this process interrupted again and again; yields the signals that came."""
+    """Interrupt this process repeatedly; yield the received signals."""
     came: list[int] = []
     before = signal.signal(signal.SIGALRM, lambda number, _: came.append(number))
     signal.setitimer(signal.ITIMER_REAL, period, period)
@@ -37,7 +37,7 @@ def bus() -> Iterator[lcm.LCM]:
 
 
 def wait_again_and_again(bus: lcm.LCM) -> None:
-    """Wait several times: a message by which LCM tests a new instance may come late and end the first waiting."""
+    """Wait several times: a self-test message of a new LCM instance may end the first wait."""
     for _ in range(5):
         bus.handle_timeout(WAIT_MS)
 
@@ -50,14 +50,14 @@ def test_given_a_signal_while_liblcm_waits_then_it_raises_without_an_errno(bus: 
 
 def test_given_a_signal_while_a_message_is_waited_for_then_nothing_has_come_and_nothing_raises(bus: lcm.LCM) -> None:
     with alarms() as came:
-        # the same message of LCM's own may come first
-        assert not all(take_message(bus, WAIT_MS) for _ in range(5))
+        # LCM's self-test message may come first
+        assert not all(handle_message(bus, WAIT_MS) for _ in range(5))
     assert came
-    heard: list[bytes] = []
-    bus.subscribe("A", lambda _, data: heard.append(data))
+    received: list[bytes] = []
+    bus.subscribe("A", lambda _, data: received.append(data))
     bus.publish("A", b"data")
-    assert take_message(bus, WAIT_MS)
-    assert heard == [b"data"]
+    assert handle_message(bus, WAIT_MS)
+    assert received == [b"data"]
 
 
 def test_given_a_handler_that_raises_then_its_error_comes_out(bus: lcm.LCM) -> None:
@@ -67,7 +67,7 @@ def test_given_a_handler_that_raises_then_its_error_comes_out(bus: lcm.LCM) -> N
     bus.subscribe("A", fail)
     bus.publish("A", b"disk")
     with pytest.raises(OSError, match="disk"):
-        take_message(bus, WAIT_MS)
+        handle_message(bus, WAIT_MS)
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_given_a_handler_that_raises_then_its_error_comes_out(bus: lcm.LCM) -> N
         "file://",
     ],
 )
-def test_given_a_url_that_liblcm_refuses_then_what_is_wrong_with_it_is_told_without_advice_on_routes(url: str) -> None:
+def test_given_a_url_that_liblcm_rejects_then_the_error_names_the_fault_without_advice_on_routes(url: str) -> None:
     with pytest.raises(RuntimeError):
         lcm.LCM(url)
     with pytest.raises(BusError, match="cannot join the bus at ") as raised:
@@ -102,25 +102,25 @@ def test_given_a_url_that_liblcm_refuses_then_what_is_wrong_with_it_is_told_with
     ("url", "words"),
     [("file:///none/of/that/name", "Is there a log of that name"), ("tcpq://127.0.0.1:1", "TCP service")],
 )
-def test_given_another_provider_that_fails_then_it_is_told_what_to_look_at_there(url: str, words: str) -> None:
-    assert not url_problem(url)
+def test_given_another_provider_that_fails_then_the_error_names_what_to_check(url: str, words: str) -> None:
+    assert not find_url_problem(url)
     with pytest.raises(BusError, match=words) as raised:
         open_lcm(url)
     assert "route" not in str(raised.value)
 
 
-def test_given_two_users_of_memq_then_neither_hears_the_other() -> None:
-    one, other, heard = lcm.LCM("memq://"), lcm.LCM("memq://"), []
-    other.subscribe("A", lambda _, data: heard.append(data))
+def test_given_two_users_of_memq_then_neither_receives_the_other() -> None:
+    one, other, received = lcm.LCM("memq://"), lcm.LCM("memq://"), []
+    other.subscribe("A", lambda _, data: received.append(data))
     one.publish("A", b"data")
-    assert not take_message(other)
-    assert not heard
-    assert "reaches nobody" in url_problem("memq://")
+    assert not handle_message(other)
+    assert not received
+    assert "does not leave the process" in find_url_problem("memq://")
 
 
 @pytest.mark.parametrize("ttl", ["0", "00", "0&recv_buf_size=100000", "0&other=1"])
-def test_given_a_url_that_liblcm_takes_as_it_is_meant_then_it_is_not_refused(ttl: str) -> None:
+def test_given_a_valid_url_then_it_is_not_rejected(ttl: str) -> None:
     with reserved_url() as url:
         other = url.replace("ttl=0", f"ttl={ttl}")
-        assert not url_problem(other)
+        assert not find_url_problem(other)
         assert open_lcm(other)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from modelserver.spatial import Pose, Transformation, covariance
+from modelserver.transforms import Pose, Transformation, covariance
 
 SAMPLES = 40_000
 SMALL = 1e-4
@@ -90,7 +90,7 @@ def test_laws_that_hold_exactly(where):
     # turning the axes is what an exact rotation on the left does
     turn = Pose((0, 0, 0), X_AB.wxyz)
     np.testing.assert_allclose(
-        covariance.rotated(turn.rotation, cov_BC), covariance.compose(turn, np.zeros((6, 6)), X_BC, cov_BC), **tight
+        covariance.rotate(turn.rotation, cov_BC), covariance.compose(turn, np.zeros((6, 6)), X_BC, cov_BC), **tight
     )
 
 
@@ -111,10 +111,10 @@ def test_transformations_carry_it_along():
     assert Transformation("c:c", "b:b", X_BC).inverse().covariance is None
 
 
-def test_given_matrices_that_are_no_covariance_then_it_is_said_why():
+def test_given_matrices_that_are_no_covariance_then_it_reports_why():
     good = np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.0])
-    assert covariance.fault(good) == ""
-    for row, column, value, said in (
+    assert covariance.find_problem(good) == ""
+    for row, column, value, message in (
         (0, 0, np.nan, "not finite"),
         (1, 2, np.inf, "not finite"),
         (0, 1, 0.5, "not symmetric"),
@@ -122,4 +122,4 @@ def test_given_matrices_that_are_no_covariance_then_it_is_said_why():
     ):
         bad = good.copy()
         bad[row, column] = value
-        assert said in covariance.fault(bad)
+        assert message in covariance.find_problem(bad)

@@ -1,4 +1,4 @@
-"""The encoding of states under hypothesis: any value comes back, and no bytes do more than raise RecordingError."""
+"""Encoding of states: any value survives, and any bytes raise RecordingError at most."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support_journal import OPEN, Kept
+from support_journal import OPEN, JournalRig
 
 from modelserver.errors import RecordingError
-from modelserver.service.encoding.schema import Schema
-from modelserver.service.journal import state as journal_state
+from modelserver.server.encoding.schema import Schema
+from modelserver.server.journal import state as journal_state
 
 MOST_MEMORY = 40
-"""Bytes of memory that one byte of a state may become: an object of its own, and its place in two lists."""
+"""Bytes of memory per byte of a state: an object, and its entries in two lists."""
 
 
 class Value(NamedTuple):
@@ -55,15 +55,15 @@ def test_given_any_value_then_it_is_read_back_to_the_same_bytes(value: Value) ->
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """A run of the filter as bytes."""
-    kept = Kept(Path(tmp_path_factory.mktemp("run")), OPEN)
-    kept.drive(0.4)
-    state = journal_state.detach(kept.loop.state)
-    return journal_state.encode_run(journal_state.RunState(kept.vehicle.config, state))
+    """Return an encoded run of the filter."""
+    rig = JournalRig(Path(tmp_path_factory.mktemp("run")), OPEN)
+    rig.drive(0.4)
+    state = journal_state.detach(rig.loop.state)
+    return journal_state.encode_run(journal_state.RunState(rig.vehicle.config, state))
 
 
 def read(data: bytes) -> None:
-    """Read what may be a run; only a RecordingError may come of it, and memory stays in proportion."""
+    """Decode bytes that may be a run; only RecordingError may be raised, and memory stays in proportion."""
     tracemalloc.start()
     try:
         journal_state.decode_run(data)
@@ -113,4 +113,4 @@ def test_given_any_bytes_then_nothing_but_a_recording_error_comes_of_them(data: 
     framed = struct.pack(">I", len(data)) + data
     for root in ("run", "event"):
         with contextlib.suppress(RecordingError):
-            journal_state.schema().decode(root, framed)
+            journal_state.get_schema().decode(root, framed)

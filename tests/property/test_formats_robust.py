@@ -1,4 +1,4 @@
-"""Whatever the bytes, a file is a model or a GeometryError that says where and what to do."""
+"""Whatever the bytes, a file is a model or a GeometryError that states place and fix."""
 
 import pytest
 from hypothesis import given, settings
@@ -77,7 +77,7 @@ PIECES = [
 
 
 @st.composite
-def mutated(draw):
+def mutate(draw):
     content = bytearray(draw(st.sampled_from(FILES)))
     for _ in range(draw(st.integers(1, 6))):
         at = draw(st.integers(0, len(content)))
@@ -86,7 +86,7 @@ def mutated(draw):
     return bytes(content)
 
 
-def assert_loads_or_says_why(content, file=""):
+def assert_loads_or_explains(content, file=""):
     for repair in (False, True):
         try:
             model = parse_model(content, file, repair=repair)
@@ -103,25 +103,25 @@ def assert_loads_or_says_why(content, file=""):
             assert 0 <= problem.line <= content.count(b"\n") + content.count(b"\r") + 2
 
 
-@given(mutated())
+@given(mutate())
 @settings(max_examples=400)
-def test_a_damaged_file_is_a_model_or_says_why_not(content):
-    assert_loads_or_says_why(content)
+def test_a_damaged_file_is_a_model_or_an_error(content):
+    assert_loads_or_explains(content)
 
 
 @given(st.binary(max_size=200), st.sampled_from(["", "a.xml", "a.yaml", "a.urdf"]))
-def test_any_bytes_are_a_model_or_say_why_not(content, file):
-    assert_loads_or_says_why(content, file)
+def test_any_bytes_are_a_model_or_an_error(content, file):
+    assert_loads_or_explains(content, file)
 
 
 @given(st.text(max_size=200), st.sampled_from(["", "bodies: ", "<config>", "<robot>", "coordinate_frames {"]))
-def test_any_text_is_a_model_or_says_why_not(text, before):
-    assert_loads_or_says_why((before + text).encode())
+def test_any_text_is_a_model_or_an_error(text, before):
+    assert_loads_or_explains((before + text).encode())
 
 
-@pytest.mark.parametrize("form", ["yaml", "miro", "miro-frames", "urdf"])
+@pytest.mark.parametrize("file_format", ["yaml", "miro", "miro-frames", "urdf"])
 @given(model=models(), part=st.floats(0, 1))
 @settings(max_examples=10)
-def test_a_file_cut_short_is_a_model_or_says_why_not(form, model, part):
-    content = save_model(model, form).text.encode()
-    assert_loads_or_says_why(content[: int(len(content) * part)])
+def test_a_file_cut_short_is_a_model_or_an_error(file_format, model, part):
+    content = save_model(model, file_format).text.encode()
+    assert_loads_or_explains(content[: int(len(content) * part)])

@@ -1,4 +1,4 @@
-"""Whatever a model is, each form gives it back, but for what the form says it cannot hold."""
+"""Every format reads back the model that it wrote, but for the features that it lists as unsupported."""
 
 from itertools import product
 
@@ -10,25 +10,25 @@ from support_formats import assert_same_transforms, models, read
 from support_spatial import rotations
 
 from modelserver.formats import save_model
-from modelserver.formats.frame_tree_text import instance_names
-from modelserver.formats.yaml_text import degrees_of
-from modelserver.spatial import Pose
+from modelserver.formats.frame_tree_writer import list_instance_names
+from modelserver.formats.yaml_writer import to_rpy_degrees
+from modelserver.transforms import Pose
 
 pytestmark = pytest.mark.slow
 
 
-def folded(text):
+def fold_spaces(text):
     return " ".join("".join(each if each.isprintable() else " " for each in text).split())
 
 
-def assert_same_poses(one, other, at_rest=False):
-    """The poses as stored, to 1e-12: what the file holds, not only what follows from it.
+def assert_same_poses(one, other, default=False):
+    """Compare the stored poses to 1e-12: the content of the file, not only what follows from it.
 
-    With `at_rest` the first one's joints stand where they rest, for the other has none.
+    With `default` the joints of the first are at their default position: the other has none.
     """
     pairs = [(a.pose, b.pose) for x, y in zip(one.bodies, other.bodies, strict=True) for a, b in zip(x, y, strict=True)]
     joined = zip(one.constraints, other.constraints, strict=True)
-    pairs += [(a.at_rest if at_rest else a.pose, b.pose) for a, b in joined]
+    pairs += [(a.default_pose if default else a.pose, b.pose) for a, b in joined]
     pairs += [(a.pose or Pose(), b.pose or Pose()) for a, b in zip(one.bodies, other.bodies, strict=True)]
     for a, b in pairs:
         np.testing.assert_allclose(a.matrix, b.matrix, rtol=0, atol=1e-12)
@@ -39,7 +39,7 @@ def assert_same_poses(one, other, at_rest=False):
 def test_yaml_gives_back_everything(model):
     saved = save_model(model, "yaml")
     again = read(saved.text)
-    assert saved.losses == ()
+    assert saved.unsupported == ()
     assert_same_poses(model, again)
     assert_same_transforms(model, again)
     assert (again.name, again.description) == (model.name, model.description)
@@ -61,18 +61,18 @@ def test_yaml_gives_back_everything(model):
 
 @given(models())
 @settings(max_examples=25)
-def test_miro_xml_gives_back_all_transforms_and_says_what_it_lost(model):
+def test_miro_xml_gives_back_all_transforms_and_lists_what_is_unsupported(model):
     saved = save_model(model, "miro")
     again = read(saved.text)
-    assert_same_poses(model, again, at_rest=True)
+    assert_same_poses(model, again, default=True)
     assert_same_transforms(model, again)
     assert not again.joints
     frames = [frame for body in model.bodies for frame in body]
-    lost = " ".join(saved.losses)
+    lost = " ".join(saved.unsupported)
     assert ("sigmas of" in lost) == any(each.sigma for each in (*frames, *model.constraints))
     assert ("motion of" in lost) == bool(model.joints)
     assert ("inertia" in lost) == any(body.inertia is not None for body in model.bodies)
-    assert [folded(body.description) for body in model.bodies] == [body.description for body in again.bodies]
+    assert [fold_spaces(body.description) for body in model.bodies] == [body.description for body in again.bodies]
     assert [frame.name for frame in frames] == [frame.name for body in again.bodies for frame in body]
 
 
@@ -80,12 +80,12 @@ def test_miro_xml_gives_back_all_transforms_and_says_what_it_lost(model):
 @settings(max_examples=25)
 def test_a_frame_tree_has_every_frame_at_its_place(model):
     saved = save_model(model, "miro-frames")
-    assert any("motion of" in loss for loss in saved.losses) == bool(model.joints)
+    assert any("motion of" in loss for loss in saved.unsupported) == bool(model.joints)
     again = read(saved.text)
     frames = {f"{body.name}:{frame.name}": frame.name for body in again.bodies for frame in body}
     by_instance = {frame: full for full, frame in frames.items() if frame != "Origin"}
     by_instance |= {body.name: f"{body.name}:Origin" for body in again.bodies}
-    place = {full: by_instance[name] for full, name in instance_names(model).items()}
+    place = {full: by_instance[name] for full, name in list_instance_names(model).items()}
     for a, b in product(place, repeat=2):
         wanted = model.get_transformation(a, b).pose
         # angles alone carry less near a pitch of 90 degrees than a quaternion does
@@ -95,7 +95,7 @@ def test_a_frame_tree_has_every_frame_at_its_place(model):
 @given(rotations)
 @settings(max_examples=300)
 def test_angles_in_degrees_are_written_only_where_they_read_back(wxyz):
-    degrees = degrees_of(wxyz)
+    degrees = to_rpy_degrees(wxyz)
     if degrees is not None:
         back = Pose.from_rpy((0, 0, 0), *np.radians(degrees).tolist())
         assert back.distance(Pose((0, 0, 0), wxyz))[1] <= 1e-12
@@ -104,4 +104,4 @@ def test_angles_in_degrees_are_written_only_where_they_read_back(wxyz):
 @given(st.tuples(*[st.integers(-89, 89).map(lambda tenth: tenth / 10)] * 3))
 def test_round_angles_are_written_round(angles):
     wxyz = Pose.from_rpy((0, 0, 0), *np.radians(angles).tolist()).wxyz
-    assert degrees_of(wxyz) == angles
+    assert to_rpy_degrees(wxyz) == angles

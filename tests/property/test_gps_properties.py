@@ -1,4 +1,4 @@
-"""Parsers of satellite receivers: cut anyhow they say the same, noise says nothing, what is written is read back."""
+"""Parsers of satellite receivers: independent of the chunks, silent on noise, inverse of the encoders."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from collections.abc import Sequence
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support_gps import drive, split
+from support_gps import drive, split_randomly
 
 from modelserver.messages import GpsSample
 from msdrivers.emulate import gps_logs
 from msdrivers.protocol.gps_stream import GpsMessage, GpsStream
 from msdrivers.protocol.nmea import NmeaEpoch
-from msdrivers.protocol.nmea.encode import angle
-from msdrivers.protocol.nmea.fields import angle as read_angle
+from msdrivers.protocol.nmea.encode import format_angle
+from msdrivers.protocol.nmea.fields import parse_angle
 from msdrivers.protocol.novatel import (
     LogHeader,
     NovatelLog,
@@ -27,33 +27,33 @@ from msdrivers.protocol.novatel import (
     UtmPosition,
     Velocity,
 )
-from msdrivers.protocol.novatel.crc import crc32
+from msdrivers.protocol.novatel.binary import crc32
 from msdrivers.protocol.novatel.encode import encode
 
-MOST_KEPT = 1024
+MAX_PENDING = 1024
 ALL = (*gps_logs.NMEA, *(f"{log}{letter}" for log in gps_logs.NOVATEL for letter in "ab"))
 
 
 def speech(samples: Sequence[GpsSample], names: Sequence[str] = ALL) -> bytes:
-    return b"".join(gps_logs.write(name, each, each.header.utime) for each in samples for name in names)
+    return b"".join(gps_logs.encode_sample(name, each, each.header.utime) for each in samples for name in names)
 
 
 GOOD = speech(list(drive(1.0, 2.0)))
 
 
 def everything(parts: Sequence[bytes]) -> tuple[str, dict[str, int]]:
-    """What is said, as text because nan differs from itself, and the counters."""
+    """Return the messages, as text because nan differs from itself, and the counters."""
     stream = GpsStream()
     messages: list[GpsMessage] = []
     for part in parts:
         messages += stream.feed(part)
-        assert stream.waiting <= MOST_KEPT
-    return repr(messages + stream.idle()), dict(stream.counts)
+        assert stream.pending_bytes <= MAX_PENDING
+    return repr(messages + stream.flush()), dict(stream.counts)
 
 
 @given(st.binary(max_size=3000), st.integers(0, 2**32))
-def test_given_any_bytes_when_split_anyhow_then_they_say_the_same(data: bytes, seed: int):
-    assert everything(split(data, seed)) == everything([data])
+def test_given_any_bytes_when_split_anyhow_then_the_messages_are_the_same(data: bytes, seed: int):
+    assert everything(split_randomly(data, seed)) == everything([data])
 
 
 @settings(max_examples=15)
@@ -61,7 +61,7 @@ def test_given_any_bytes_when_split_anyhow_then_they_say_the_same(data: bytes, s
     st.lists(st.sampled_from([b"#", b"%", b"$", b"<", b"[", b"*", b"\xaa\x44\x12", b"\xaa\x44\x13"]), max_size=12),
     st.integers(0, 2**32),
 )
-def test_given_good_messages_with_beginnings_between_when_split_anyhow_then_they_say_the_same(
+def test_given_good_messages_with_beginnings_between_when_split_anyhow_then_the_messages_are_the_same(
     beginnings: list[bytes], seed: int
 ):
     chance = random.Random(seed)
@@ -78,10 +78,10 @@ def test_given_noise_when_a_good_stream_follows_then_it_is_followed_within_one_m
     for _ in range(20):
         messages = stream.feed(chance.randbytes(10_000))
         assert not [each for each in messages if isinstance(each, (NovatelLog, NmeaEpoch))]
-        assert stream.waiting <= MOST_KEPT
+        assert stream.pending_bytes <= MAX_PENDING
     samples = list(drive(10.0, 4.0))
-    heard = [each for each in stream.feed(speech(samples, ["bestposb", "bestvelb"])) if isinstance(each, NovatelLog)]
-    assert len(heard) >= 2 * len(samples) - 1
+    logs = [each for each in stream.feed(speech(samples, ["bestposb", "bestvelb"])) if isinstance(each, NovatelLog)]
+    assert len(logs) >= 2 * len(samples) - 1
 
 
 angles = st.floats(-180.0, 180.0, allow_nan=False)
@@ -153,28 +153,28 @@ def test_given_a_log_when_written_and_read_then_it_is_the_same(named: tuple[str,
     (back,) = GpsStream().feed(encode(log))
     assert isinstance(back, NovatelLog)
     assert back.body is not None
-    assert back.header == log.header._replace(port="32" if header.binary else "COM1")
+    assert back.header == log.header._replace(port="32" if header.is_binary else "COM1")
     for field, got, expected in zip(body._fields, back.body, body, strict=True):
         if isinstance(expected, float):
             # ASCII is printed with four decimals at least, ages and latencies with three
-            assert got == pytest.approx(expected, rel=1e-6, abs=0.0 if header.binary else 6e-4), field
+            assert got == pytest.approx(expected, rel=1e-6, abs=0.0 if header.is_binary else 6e-4), field
         else:
             assert got == expected, field
 
 
 @given(st.floats(-179.9999999, 179.9999999))
 def test_given_an_angle_when_written_and_read_then_it_is_the_same(degrees: float):
-    assert read_angle(*angle(degrees, "EW", 3), "EW", 180.0) == pytest.approx(degrees, abs=1e-9)
+    assert parse_angle(*format_angle(degrees, "EW", 3), "EW", 180.0) == pytest.approx(degrees, abs=1e-9)
 
 
 @given(angles.filter(lambda x: abs(x) < 89.0), angles, st.integers(0, 40 * 365 * 86_400_000))
-def test_given_a_sample_when_said_in_nmea_and_read_then_it_is_the_same(latitude: float, longitude: float, ms: int):
+def test_given_a_sample_when_encoded_in_nmea_and_read_then_it_is_the_same(latitude: float, longitude: float, ms: int):
     utime = 400_000_000_000_000 + ms * 1000
     sample = next(iter(drive(1.0)))
     moved = GpsSample(sample.header, sample.fix_type, latitude, longitude, height_msl=12.5, speed=3.0, course=1.0)
-    data = b"".join(gps_logs.write(name, moved, utime) for name in ("gpgga", "gprmc", "gpzda"))
+    data = b"".join(gps_logs.encode_sample(name, moved, utime) for name in ("gpgga", "gprmc", "gpzda"))
     stream = GpsStream()
-    (epoch,) = [*stream.feed(data), *stream.idle()]
+    (epoch,) = [*stream.feed(data), *stream.flush()]
     assert isinstance(epoch, NmeaEpoch)
     assert epoch.utime == utime
     assert epoch.latitude == pytest.approx(latitude, abs=1e-9)
@@ -222,4 +222,4 @@ def test_given_a_text_log_with_any_fields_and_a_right_checksum_then_nothing_is_r
         assert 0 <= each.header.week <= 0xFFFF
     assert stream.counts.get("rejected.error", 0) == 0
     assert len(stream.feed(GOOD)) > 0
-    assert stream.waiting <= MOST_KEPT
+    assert stream.pending_bytes <= MAX_PENDING

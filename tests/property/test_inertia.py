@@ -8,20 +8,20 @@ from support_spatial import poses
 from support_urdf import inertias
 
 from modelserver.geometry import Body
-from modelserver.geometry.inertia import RigidInertia, rigid
-from modelserver.spatial import Pose, so3
+from modelserver.geometry.inertia import RigidInertia, from_spatial_inertia
+from modelserver.transforms import Pose, so3
 
 BOX = ((2.0, 0.0, 0.0), (0.0, 3.0, 0.0), (0.0, 0.0, 4.0))
 
 
 @given(inertias())
-def test_mass_centre_and_inertia_come_back_from_the_matrix(inertia):
-    found = rigid(inertia.matrix())
+def test_mass_center_and_inertia_come_back_from_the_matrix(inertia):
+    found = from_spatial_inertia(inertia.matrix())
     assert found.mass == inertia.mass
-    np.testing.assert_allclose(found.centre, inertia.centre, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(found.center, inertia.center, rtol=0, atol=1e-13)
     scale = np.abs(inertia.matrix()).max()
-    np.testing.assert_allclose(found.about_centre, inertia.about_centre, rtol=0, atol=1e-13 * scale)
-    assert inertia.fault() == ""
+    np.testing.assert_allclose(found.about_center, inertia.about_center, rtol=0, atol=1e-13 * scale)
+    assert inertia.find_problem() == ""
 
 
 @given(inertias())
@@ -33,35 +33,35 @@ def test_the_matrix_is_symmetric_and_positive_definite(inertia):
 
 @given(inertias())
 def test_inertia_at_the_origin_follows_the_parallel_axis_theorem(inertia):
-    c = np.array(inertia.centre)
-    by_steiner = np.asarray(inertia.about_centre) + inertia.mass * (c @ c * np.eye(3) - np.outer(c, c))
+    c = np.array(inertia.center)
+    by_steiner = np.asarray(inertia.about_center) + inertia.mass * (c @ c * np.eye(3) - np.outer(c, c))
     found = np.asarray(inertia.matrix())[3:, 3:]
     np.testing.assert_allclose(found, by_steiner, rtol=0, atol=1e-12 * np.abs(by_steiner).max())
 
 
 @given(inertias(), poses)
-def test_a_body_moved_has_its_centre_moved_and_its_axes_turned(inertia, pose):
+def test_a_body_moved_has_its_center_moved_and_its_axes_turned(inertia, pose):
     R = pose.rotation
     # how momentum is carried to another origin and other axes
     X = np.block([[R, np.zeros((3, 3))], [so3.skew(pose.xyz) @ R, R]])
     there = X @ np.asarray(inertia.matrix()) @ X.T
-    about = R @ np.asarray(inertia.about_centre) @ R.T
-    centre = tuple(pose.transform(inertia.centre).tolist())
-    wanted = RigidInertia(inertia.mass, centre, tuple(map(tuple, about.tolist()))).matrix()
+    about = R @ np.asarray(inertia.about_center) @ R.T
+    center = tuple(pose.transform(inertia.center).tolist())
+    wanted = RigidInertia(inertia.mass, center, tuple(map(tuple, about.tolist()))).matrix()
     np.testing.assert_allclose(there, wanted, rtol=0, atol=1e-10 * np.abs(there).max())
 
 
 @given(inertias(), st.tuples(*[st.floats(-5, 5)] * 6))
-def test_kinetic_energy_is_that_of_the_moving_centre_and_of_the_turn_about_it(inertia, twist):
+def test_kinetic_energy_is_that_of_the_moving_center_and_of_the_turn_about_it(inertia, twist):
     v, w = np.array(twist[:3]), np.array(twist[3:])
     energy = np.array(twist) @ np.asarray(inertia.matrix()) @ np.array(twist) / 2
-    v_centre = v + np.cross(w, inertia.centre)
-    wanted = inertia.mass * v_centre @ v_centre / 2 + w @ np.asarray(inertia.about_centre) @ w / 2
+    v_center = v + np.cross(w, inertia.center)
+    wanted = inertia.mass * v_center @ v_center / 2 + w @ np.asarray(inertia.about_center) @ w / 2
     assert energy == pytest.approx(wanted, rel=1e-9, abs=1e-9 * np.abs(inertia.matrix()).max())
 
 
 @pytest.mark.parametrize(
-    ("mass", "moments", "said"),
+    ("mass", "moments", "message"),
     [
         (0.0, BOX, "the mass is 0 kg"),
         (-1.0, BOX, "the mass is -1 kg"),
@@ -71,21 +71,21 @@ def test_kinetic_energy_is_that_of_the_moving_centre_and_of_the_turn_about_it(in
         (1.0, ((2, 0, 0), (0, 3, 0), (0, 0, 5)), ""),
     ],
 )
-def test_what_no_body_can_have_is_said(mass, moments, said):
-    fault = RigidInertia.turned(mass, Pose(), moments).fault()
-    assert said in fault
-    assert bool(said) == bool(fault)
+def test_what_no_body_can_have_is_reported(mass, moments, message):
+    problem = RigidInertia.from_moments(mass, Pose(), moments).find_problem()
+    assert message in problem
+    assert bool(message) == bool(problem)
 
 
-def test_a_body_tells_mass_and_centre_where_its_inertia_does():
+def test_a_body_has_mass_and_center_where_its_inertia_does():
     inertia = RigidInertia(2.0, (0.5, -1.0, 0.25), BOX).matrix()
     body = Body("b", inertia=inertia)
     assert body.mass == 2.0
-    assert body.centre_of_mass == (0.5, -1.0, 0.25)
+    assert body.center_of_mass == (0.5, -1.0, 0.25)
     assert inertia[0] == (2.0, 0.0, 0.0, 0.0, 0.5, 2.0)
     odd = [list(row) for row in inertia]
     odd[0][1] = 0.1
     nothing = ((0.0,) * 6,) * 6
     for matrix in (None, odd, nothing, tuple((1e200,) * 6 for _ in range(6))):
         assert Body("b", inertia=matrix).mass is None
-        assert Body("b", inertia=matrix).centre_of_mass is None
+        assert Body("b", inertia=matrix).center_of_mass is None

@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support_spatial import poses
 
-from modelserver.spatial import chain, so3
-from modelserver.spatial.chain import ChainLink
-from modelserver.spatial.kinematics import RigidMotion
-from modelserver.spatial.pose import Pose
+from modelserver.transforms import chain, so3
+from modelserver.transforms.chain import ChainLink
+from modelserver.transforms.kinematics import RigidMotion
+from modelserver.transforms.pose import Pose
 
 vectors = st.tuples(*[st.floats(-3, 3)] * 3)
 motions = st.builds(RigidMotion, poses, vectors, vectors, vectors, vectors)
@@ -20,27 +20,31 @@ H = 1e-4
 def at(motion: RigidMotion, t: float) -> Pose:
     """Return the pose after a short time, right up to the second order."""
     p, v, a = (np.array(each) for each in (motion.pose.xyz, motion.velocity, motion.acceleration))
-    w, b = np.array(motion.rate), np.array(motion.turn_acceleration)
+    w, b = np.array(motion.angular_velocity), np.array(motion.angular_acceleration)
     x, y, z = (w * t + b * t * t / 2).tolist()
     return Pose((p + v * t + a * t * t / 2).tolist(), so3.multiply(so3.exponential((x, y, z)), motion.pose.wxyz))
 
 
 def check(found: RigidMotion, before: Pose, here: Pose, after: Pose) -> None:
-    def turned(a: Pose, b: Pose) -> np.ndarray:
-        return np.array(so3.logarithm(so3.normalized(so3.multiply(b.wxyz, so3.conjugate(a.wxyz)))))
+    def rotation_between(a: Pose, b: Pose) -> np.ndarray:
+        return np.array(so3.logarithm(so3.normalize(so3.multiply(b.wxyz, so3.conjugate(a.wxyz)))))
 
     size = 1.0 + 10.0 * max(1.0, np.linalg.norm(here.position))
     assert found.pose.is_close(here, 1e-12, 1e-12)
     assert np.allclose(found.velocity, (after.position - before.position) / (2 * H), atol=1e-4 * size)
-    assert np.allclose(found.rate, turned(before, after) / (2 * H), atol=1e-4)
+    assert np.allclose(found.angular_velocity, rotation_between(before, after) / (2 * H), atol=1e-4)
     bent = (after.position - 2 * here.position + before.position) / H**2
     assert np.allclose(found.acceleration, bent, atol=1e-3 * size)
-    assert np.allclose(found.turn_acceleration, (turned(here, after) - turned(before, here)) / H**2, atol=1e-3 * size)
+    assert np.allclose(
+        found.angular_acceleration,
+        (rotation_between(here, after) - rotation_between(before, here)) / H**2,
+        atol=1e-3 * size,
+    )
 
 
 @given(motions, motions)
 def test_given_two_motions_then_their_chain_is_what_differencing_the_product_gives(one, other) -> None:
-    check(one.then(other), *(at(one, t) @ at(other, t) for t in (-H, 0.0, H)))
+    check(one.compose(other), *(at(one, t) @ at(other, t) for t in (-H, 0.0, H)))
 
 
 @given(motions)
@@ -50,7 +54,7 @@ def test_given_a_motion_then_its_inverse_is_what_differencing_the_inverse_gives(
 
 @given(motions)
 def test_given_a_motion_and_its_inverse_then_together_they_are_at_rest(motion) -> None:
-    for whole in (motion.then(motion.inverse()), motion.inverse().then(motion)):
+    for whole in (motion.compose(motion.inverse()), motion.inverse().compose(motion)):
         assert whole.pose.is_close(Pose.identity(), 1e-12, 1e-12)
         assert np.abs(whole[1:]).max() < 1e-11 * (1.0 + np.abs(motion[1:]).max()) ** 3 * (
             1.0 + np.abs(motion.pose.xyz).max()
@@ -59,7 +63,7 @@ def test_given_a_motion_and_its_inverse_then_together_they_are_at_rest(motion) -
 
 @given(motions, motions, motions)
 def test_given_three_motions_then_how_they_are_bracketed_does_not_matter(a, b, c) -> None:
-    left, right = a.then(b).then(c), a.then(b.then(c))
+    left, right = a.compose(b).compose(c), a.compose(b.compose(c))
     assert np.allclose(left[1:], right[1:], rtol=1e-9, atol=1e-8)
 
 
@@ -67,19 +71,19 @@ def test_given_three_motions_then_how_they_are_bracketed_does_not_matter(a, b, c
 def test_given_a_chain_then_each_links_jacobian_is_what_differencing_gives(some, which, column) -> None:
     which %= len(some)
 
-    def moved(size: float) -> Pose:
+    def move(size: float) -> Pose:
         links = []
         for number, (X, forward) in enumerate(some):
             off = np.zeros(6)
             off[column] = size if number == which else 0.0
             turn = so3.multiply(so3.exponential(tuple(off[3:].tolist())), X.wxyz)
             links.append(ChainLink(Pose((X.position + off[:3]).tolist(), turn), forward, None, (number,)))
-        return chain.product(links)
+        return chain.compose(links)
 
     step = 1e-5
-    ahead, behind = moved(step), moved(-step)
-    turned = so3.logarithm(so3.normalized(so3.multiply(ahead.wxyz, so3.conjugate(behind.wxyz))))
-    expected = np.concatenate((ahead.position - behind.position, turned)) / (2 * step)
+    ahead, behind = move(step), move(-step)
+    rotation_between = so3.logarithm(so3.normalize(so3.multiply(ahead.wxyz, so3.conjugate(behind.wxyz))))
+    expected = np.concatenate((ahead.position - behind.position, rotation_between)) / (2 * step)
     factor = np.zeros((6, 1))
     factor[column] = 1.0
     links = [

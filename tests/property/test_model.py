@@ -1,4 +1,4 @@
-"""Answers of random models against searches and products written another way."""
+"""Answers of random models against independent searches and products."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from support_geometry import (
 
 from modelserver.errors import NotConnectedError
 from modelserver.geometry import Search
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 TREES = [(seed, bodies, 0) for seed, bodies in enumerate((2, 3, 5, 8, 12))]
 LOOPED = [(100 + seed, bodies, extra) for seed, (bodies, extra) in enumerate([(2, 1), (3, 2), (4, 3), (6, 3), (8, 4)])]
@@ -29,8 +29,8 @@ def pairs(model, rng, count=60):
     return rng.sample(every, min(count, len(every)))
 
 
-def crossed(path):
-    return [(crossing.enters, crossing.leaves) for crossing in path]
+def cross(path):
+    return [(crossing.near_frame, crossing.far_frame) for crossing in path]
 
 
 @pytest.mark.parametrize(("seed", "bodies", "extra"), TREES + LOOPED)
@@ -40,7 +40,7 @@ def test_depth_first_takes_the_path_of_the_report(seed, bodies, extra):
     for interest, reference in pairs(model, rng, 150):
         expected = report_depth_first(model, reference, interest)
         found = model.find_path(interest, reference, Search.DEPTH_FIRST)
-        assert [crossing.enters for crossing in found] == expected, (interest, reference)
+        assert [crossing.near_frame for crossing in found] == expected, (interest, reference)
 
 
 @pytest.mark.parametrize(("seed", "bodies", "extra"), [*TREES, *LOOPED, (7, 30, 15)])
@@ -53,7 +53,7 @@ def test_breadth_first_is_shortest(seed, bodies, extra):
         path = model.find_path(interest, reference)
         assert len(path) == distances[number[reference.split(":")[0]], number[interest.split(":")[0]]]
         # and it is a path: each crossing starts in the body that the last one came into
-        stops = [reference, *[end for crossing in crossed(path) for end in crossing], interest]
+        stops = [reference, *[end for crossing in cross(path) for end in crossing], interest]
         for out, into in zip(stops[::2], stops[1::2], strict=True):
             assert out.split(":")[0] == into.split(":")[0]
 
@@ -66,13 +66,13 @@ def test_answers_are_the_products_along_the_shortest_path(seed, bodies, extra):
         answer = model.get_transformation(interest, reference)
         assert (answer.frame_of_interest, answer.frame_of_reference) == (interest, reference)
         assert answer.model_revision == model.revision
-        expected = product_along(model, crossed(model.find_path(interest, reference)), interest, reference)
+        expected = product_along(model, cross(model.find_path(interest, reference)), interest, reference)
         np.testing.assert_allclose(answer.matrix, expected, atol=1e-12)
         for search in Search:
             path = model.find_path(interest, reference, search)
-            walked = model.along(path, interest, reference)
+            walked = model.compose_path(path, interest, reference)
             np.testing.assert_allclose(
-                walked.matrix, product_along(model, crossed(path), interest, reference), atol=1e-12
+                walked.matrix, product_along(model, cross(path), interest, reference), atol=1e-12
             )
 
 
@@ -119,7 +119,7 @@ def test_covariance_along_a_path_agrees_with_monte_carlo(seed):
     A = {f"{body.name}:{frame.name}": frame for body in model.bodies for frame in body}
     count, noise = 15_000, np.random.default_rng(seed)
 
-    def sampled(part):
+    def sample(part):
         d = noise.normal(size=(count, 6)) * np.array(part.sigma.position + part.sigma.rotation)
         turned = Rotation.from_rotvec(d[:, 3:]) * Rotation.from_matrix(part.pose.rotation)
         return np.array(part.pose.xyz) + d[:, :3], turned
@@ -130,13 +130,13 @@ def test_covariance_along_a_path_agrees_with_monte_carlo(seed):
 
     steps, here = [], reference
     for crossing in model.find_path(interest, reference):
-        if crossing.enters != here:
-            steps += [inverse(sampled(A[here])), sampled(A[crossing.enters])]
-        drawn = sampled(crossing.constraint)
+        if crossing.near_frame != here:
+            steps += [inverse(sample(A[here])), sample(A[crossing.near_frame])]
+        drawn = sample(crossing.constraint)
         steps.append(drawn if crossing.forward else inverse(drawn))
-        here = crossing.leaves
+        here = crossing.far_frame
     if here != interest:
-        steps += [inverse(sampled(A[here])), sampled(A[interest])]
+        steps += [inverse(sample(A[here])), sample(A[interest])]
     p, R = np.zeros((count, 3)), Rotation.identity(count)
     for step_p, step_R in steps:
         p, R = p + R.apply(step_p), R * step_R
@@ -152,8 +152,8 @@ def test_covariance_is_none_where_a_part_states_none_and_zero_for_a_frame_in_its
     frame, source = builder.bodies[4].frames[0]
     builder.bodies[4].frames[0] = (type(frame)(frame.name, frame.pose), source)
     model = builder.build()
-    unsure = f"B4:{frame.name}"
+    without_sigma = f"B4:{frame.name}"
     other = next(name for name in all_frames(model) if name.startswith("B0:"))
-    last = {crossing.leaves for crossing in model.find_path(unsure, other)}
-    assert (model.get_transformation(unsure, other).covariance is None) == (unsure not in last)
-    np.testing.assert_array_equal(model.get_transformation(unsure, unsure).covariance, np.zeros((6, 6)))
+    last = {crossing.far_frame for crossing in model.find_path(without_sigma, other)}
+    assert (model.get_transformation(without_sigma, other).covariance is None) == (without_sigma not in last)
+    np.testing.assert_array_equal(model.get_transformation(without_sigma, without_sigma).covariance, np.zeros((6, 6)))

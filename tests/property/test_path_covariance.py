@@ -14,8 +14,8 @@ from support_formats import all_frames, models
 from support_joints import positions_of
 
 from modelserver.geometry import Joint, JointType, Mimic, ModelBuilder, Sigma
-from modelserver.geometry.route import Route
-from modelserver.spatial import Pose, chain
+from modelserver.geometry.kinematic_path import KinematicPath
+from modelserver.transforms import Pose, chain
 
 pytestmark = pytest.mark.slow
 
@@ -54,21 +54,21 @@ def assert_same(found, links):
 def test_given_any_model_and_positions_of_its_joints_then_the_covariance_is_that_of_the_chain(model, data):
     frames = all_frames(model)
     pair = data.draw(st.tuples(st.sampled_from(frames), st.sampled_from(frames)))
-    route = model.route(*pair)
-    positions = tuple(data.draw(positions_of(leg.joint)) for leg in route.legs)
+    route = model.get_kinematic_path(*pair)
+    positions = tuple(data.draw(positions_of(leg.joint)) for leg in route.joints)
     sigmas = [
         tuple(data.draw(st.sampled_from((0.0, 1e-3, 0.2, math.nan))) for _ in range(leg.joint.count))
-        for leg in route.legs
+        for leg in route.joints
     ]
-    links = route.links(positions, sigmas)
-    assert_same(route.covariance(positions, sigmas), links)
+    links = route.build_links(positions, sigmas)
+    assert_same(route.compute_covariance(positions, sigmas), links)
     # the same edges, without the tree
-    again = Route(route.edges, route.closes_loop)
-    assert again.pose(positions).is_close(route.pose(positions), 1e-10, 1e-10)
-    assert_same(again.covariance(positions, sigmas), links)
+    again = KinematicPath(route.edges, route.is_in_loop)
+    assert again.compute_pose(positions).is_close(route.compute_pose(positions), 1e-10, 1e-10)
+    assert_same(again.compute_covariance(positions, sigmas), links)
     rigid = model.rigid_transformation(*pair)
     if rigid is not None:
-        assert route.legs == ()
+        assert route.joints == ()
         assert_same(rigid.covariance_numbers, links)
 
 
@@ -85,9 +85,9 @@ def random_tree(rng, lever, moves):
 
     builder = ModelBuilder("tree")
     for body in range(10):
-        made = builder.body(f"B{body}").frame("Origin")
+        made = builder.add_body(f"B{body}").add_frame("Origin")
         for frame in range(3):
-            made.frame(f"F{frame}", pose(), sigma=sigma())
+            made.add_frame(f"F{frame}", pose(), sigma=sigma())
     for body in range(1, 10):
         ends = [f"B{rng.randrange(body)}:F{rng.randrange(3)}", f"B{body}:{rng.choice(('F0', 'F2', 'Origin'))}"]
         rng.shuffle(ends)
@@ -98,7 +98,7 @@ def random_tree(rng, lever, moves):
             joint = Joint(kind, [rng.gauss(0, 1) for _ in range(3)], mimic=mimic)
         elif moves and body == 1:
             joint = Joint(JointType.REVOLUTE, (0.0, 0.6, 0.8))
-        builder.constraint(f"C{body}", *ends, pose(), sigma=sigma(), joint=joint)
+        builder.add_constraint(f"C{body}", *ends, pose(), sigma=sigma(), joint=joint)
     return builder.build()
 
 
@@ -109,24 +109,24 @@ def test_given_trees_with_short_and_long_levers_then_pairs_have_the_covariance_o
     for _ in range(2):
         model = random_tree(rng, lever, moves)
         for pair in rng.sample(list(itertools.product(all_frames(model), repeat=2)), 100):
-            route = model.route(*pair)
-            positions = [tuple(rng.uniform(-1.5, 1.5) for _ in range(leg.joint.count)) for leg in route.legs]
-            sigmas = [tuple(rng.uniform(0, 0.1) for _ in range(leg.joint.count)) for leg in route.legs]
+            route = model.get_kinematic_path(*pair)
+            positions = [tuple(rng.uniform(-1.5, 1.5) for _ in range(leg.joint.count)) for leg in route.joints]
+            sigmas = [tuple(rng.uniform(0, 0.1) for _ in range(leg.joint.count)) for leg in route.joints]
             # of joints that follow the same one, the errors are one
             sigmas = [
                 tuple(model.drives[leg.name].multiplier * 0.02 for _ in each)
                 if model.drives[leg.name].leader == "C1"
                 else each
-                for leg, each in zip(route.legs, sigmas, strict=True)
+                for leg, each in zip(route.joints, sigmas, strict=True)
             ]
-            assert_same(route.covariance(positions, sigmas), route.links(positions, sigmas))
+            assert_same(route.compute_covariance(positions, sigmas), route.build_links(positions, sigmas))
 
 
 def test_given_a_short_lever_far_from_the_root_then_its_variance_is_not_lost_in_that_of_the_long_one():
     """What is folded at the root's origin and carried back would be off by the squared ratio of the levers, 1e-4."""
     builder = ModelBuilder("mast")
-    builder.body("Base").frame("Origin").frame("Far", Pose((1e3, 0, 0)), sigma=Sigma())
-    builder.body("Plate").frame("Origin").frame("Near", Pose((0, 1e-3, 0)), sigma=Sigma())
-    builder.constraint("Hinge", "Base:Far", "Plate:Origin", sigma=Sigma((0, 0, 0), (0, 0, 0.01)))
+    builder.add_body("Base").add_frame("Origin").add_frame("Far", Pose((1e3, 0, 0)), sigma=Sigma())
+    builder.add_body("Plate").add_frame("Origin").add_frame("Near", Pose((0, 1e-3, 0)), sigma=Sigma())
+    builder.add_constraint("Hinge", "Base:Far", "Plate:Origin", sigma=Sigma((0, 0, 0), (0, 0, 0.01)))
     covariance = builder.build().get_transformation("Plate:Near", "Base:Origin").covariance
     assert math.sqrt(covariance[0, 0]) == pytest.approx(1e-5, rel=1e-12)

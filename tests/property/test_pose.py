@@ -1,4 +1,4 @@
-"""Poses obey the group's laws and agree with products of 4x4 matrices."""
+"""Poses satisfy the group axioms and agree with products of 4x4 matrices."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support_spatial import angle_between, near_points, points, poses, rotations, scipy_of
 
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 
-def close(a, b, metres=1e-12, radians=1e-14):
-    return np.linalg.norm(a.position - b.position) < metres and angle_between(a.wxyz, b.wxyz) < radians
+def close(a, b, meters=1e-12, radians=1e-14):
+    return np.linalg.norm(a.position - b.position) < meters and angle_between(a.wxyz, b.wxyz) < radians
 
 
 def matrix(pose):
@@ -84,9 +84,9 @@ def test_a_quaternion_and_its_negative_are_one_pose(pose):
 @given(poses, poses, st.floats(0, 1))
 def test_interpolation_stays_between(a, b, fraction):
     between = a.interpolate(b, fraction)
-    metres, radians = a.distance(b)
-    assert a.distance(between) == pytest.approx((fraction * metres, fraction * radians), abs=1e-12)
-    assert between.distance(b) == pytest.approx(((1 - fraction) * metres, (1 - fraction) * radians), abs=1e-12)
+    meters, radians = a.distance(b)
+    assert a.distance(between) == pytest.approx((fraction * meters, fraction * radians), abs=1e-12)
+    assert between.distance(b) == pytest.approx(((1 - fraction) * meters, (1 - fraction) * radians), abs=1e-12)
     assert close(a.interpolate(b, 0.0), a)
     assert close(a.interpolate(b, 1.0), b)
 

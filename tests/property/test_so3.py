@@ -1,4 +1,4 @@
-"""Rotations obey the group's laws and agree with SciPy, near the identity and near half a turn too."""
+"""Rotations satisfy the group axioms and agree with SciPy, near the identity and near half a turn too."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support_spatial import TINY, angle_between, axes, near_points, rotations, scipy_of
 
-from modelserver.spatial import so3
+from modelserver.transforms import so3
 
 EXACT = 5e-15
 angles = st.one_of(st.floats(-math.pi, math.pi), st.sampled_from([*TINY, math.pi, -math.pi, math.pi - 1e-12]))
 
 
 def is_unit(q):
-    return abs(sum(value * value for value in q) - 1) <= so3.UNIT and q[0] >= 0
+    return abs(sum(value * value for value in q) - 1) <= so3.UNIT_TOLERANCE and q[0] >= 0
 
 
 @given(rotations, rotations, rotations)
@@ -55,7 +55,7 @@ def test_matrix_round_trip(q):
 @given(rotations)
 def test_normalizing_twice_changes_no_bit(q):
     assert is_unit(q)
-    assert so3.normalized(q) == q
+    assert so3.normalize(q) == q
 
 
 @given(
@@ -66,9 +66,9 @@ def test_any_length_but_zero_is_normalized_once_and_for_all(q, scale):
     scaled = tuple(value * scale for value in q)
     if not any(scaled):
         return
-    unit = so3.normalized(scaled)
+    unit = so3.normalize(scaled)
     assert is_unit(unit)
-    assert so3.normalized(unit) == unit
+    assert so3.normalize(unit) == unit
     # direction kept: every component stands to the largest as before
     i = max(range(4), key=lambda k: abs(scaled[k]))
     sign = math.copysign(1.0, unit[i]) * math.copysign(1.0, scaled[i])
@@ -88,7 +88,7 @@ def test_rpy_round_trip_keeps_the_rotation(q):
     assert abs(pitch) <= math.pi / 2
     assert abs(roll) <= math.pi
     assert abs(yaw) <= math.pi
-    # below 1e-12 rad from the lock roll is said to be 0, which turns the rotation by no more than that
+    # below 1e-12 rad from the lock roll is 0, which turns the rotation by no more than that
     assert angle_between(so3.from_rpy(roll, pitch, yaw), q) < 1e-11
 
 
@@ -135,10 +135,10 @@ def test_slerp_moves_at_constant_rate_from_end_to_end(a, b, fraction):
 
 
 @given(rotations, st.floats(-0.02, 0.02), st.floats(0.99, 1.01))
-def test_nearest_rotation_mends_a_rounded_matrix(q, shear, scale):
+def test_nearest_rotation_corrects_a_rounded_matrix(q, shear, scale):
     R = np.array(so3.matrix_rows(q))
     spoilt = R @ np.array([[scale, shear, 0], [shear, 1, 0], [0, 0, 1]])
-    mended, deviation = so3.nearest_rotation(spoilt)
+    corrected, deviation = so3.nearest_rotation(spoilt)
     # the factor on the right is symmetric and positive, so the polar decomposition gives back R itself
-    np.testing.assert_allclose(mended, R, atol=1e-13)
+    np.testing.assert_allclose(corrected, R, atol=1e-13)
     assert deviation == pytest.approx(np.abs(spoilt.T @ spoilt - np.eye(3)).max(), abs=1e-12)

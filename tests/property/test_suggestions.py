@@ -2,7 +2,7 @@
 
 Every name and word of the shipped and example files is misspelled in turn, in the ways that people misspell: a letter
 left out, doubled or exchanged with its neighbor, another case. Wrong advice is worse than none: a suggestion may be
-withheld, but one that is made must mend the file. A definition counts as right, so where it is the definition of a name
+withheld, but one that is made must fix the file. A definition counts as right, so where it is the definition of a name
 that is misspelled, the name must be the same everywhere after.
 """
 
@@ -16,12 +16,12 @@ from pathlib import Path
 import pytest
 from support_formats import YAML, miro, tree, tree_frame
 
-from modelserver.config import VehicleConfig
-from modelserver.config_reader import lines, read_partly
+from modelserver.config.reader import read_lines, read_partly
+from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.errors import ConfigError, Problem, Severity
 from modelserver.formats import parse_model
-from modelserver.formats.registry import read
-from msdrivers.settings import Place, read_drivers
+from modelserver.formats.registry import parse_content
+from msdrivers.settings import SourceMap, read_drivers
 
 pytestmark = pytest.mark.slow
 
@@ -60,7 +60,7 @@ def misspellings(word: str, number: int) -> Iterator[str]:
             yield wrong
 
 
-def broken(text: str) -> Iterator[tuple[str, str]]:
+def misspell(text: str) -> Iterator[tuple[str, str]]:
     """Yield a file with one word misspelled, many times, each with the file where that word is so everywhere."""
     places = [
         each for each in WORD.finditer(text) if "#" not in text[text.rfind("\n", 0, each.start()) + 1 : each.start()]
@@ -73,7 +73,7 @@ def broken(text: str) -> Iterator[tuple[str, str]]:
 
 def geometry(text: str, file: str = "file") -> tuple[object, tuple[Problem, ...]]:
     """Return what a geometry file means, and its problems."""
-    model, problems = read(text.encode(), file).check()
+    model, problems = parse_content(text.encode(), file).check()
     return None if model is None else model.revision, problems
 
 
@@ -85,7 +85,7 @@ def vehicle(text: str) -> tuple[object, tuple[Problem, ...]]:
         return None, error.problems
     if config is None:
         return None, problems
-    drivers, more = read_drivers(config.drivers, Place("file", lines(text.encode(), "file", VehicleConfig)))
+    drivers, more = read_drivers(config.drivers, SourceMap("file", read_lines(text.encode(), "file", VehicleConfig)))
     return (config, sorted(drivers)), (*problems, *more)
 
 
@@ -94,19 +94,19 @@ def apply_all(text: str, mean: Callable[[str], tuple[object, tuple[Problem, ...]
     whole, before = mean(text)
     assert whole is not None
     known = Counter((each.element, each.message) for each in before)
-    for wrong, renamed in broken(text):
+    for wrong, renamed in misspell(text):
         _, problems = mean(wrong)
         for problem in problems:
             if problem.edit is None or not problem.line or known[problem.element, problem.message]:
                 continue
             counts["made"] += 1
             try:
-                mended = problem.edit.apply(wrong)
+                fixed = problem.edit.apply(wrong)
             except ValueError:
                 counts["unclear"] += 1
                 continue
             counts["applied"] += 1
-            meaning, after = mean(mended)
+            meaning, after = mean(fixed)
             why = f"{problem}\n{[line for line in wrong.splitlines() if line not in text.splitlines()]}"
             # where the one definition of a name is misspelled, a reference is brought into line with it
             assert meaning == whole or meaning == mean(renamed)[0], why
@@ -116,7 +116,7 @@ def apply_all(text: str, mean: Callable[[str], tuple[object, tuple[Problem, ...]
 
 
 @pytest.mark.parametrize("path", GEOMETRIES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_each_suggestion_for_a_shipped_geometry_mends_it(path: Path) -> None:
+def test_each_suggestion_for_a_shipped_geometry_fixes_it(path: Path) -> None:
     counts: Counter[str] = Counter()
     apply_all(path.read_text(encoding="utf-8"), lambda text: geometry(text, path.name), counts)
     assert counts["applied"] >= 3, counts
@@ -124,7 +124,7 @@ def test_each_suggestion_for_a_shipped_geometry_mends_it(path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "text"), [("yaml", YAML), ("miro", miro()), ("tree", TREE)])
-def test_each_suggestion_for_a_small_geometry_mends_it(name: str, text: str) -> None:
+def test_each_suggestion_for_a_small_geometry_fixes_it(name: str, text: str) -> None:
     counts: Counter[str] = Counter()
     apply_all(text, geometry, counts)
     assert parse_model(text.encode())
@@ -132,7 +132,7 @@ def test_each_suggestion_for_a_small_geometry_mends_it(name: str, text: str) -> 
 
 
 @pytest.mark.parametrize("path", VEHICLES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_each_suggestion_for_a_shipped_vehicle_file_mends_it(path: Path) -> None:
+def test_each_suggestion_for_a_shipped_vehicle_file_fixes_it(path: Path) -> None:
     counts: Counter[str] = Counter()
     apply_all(path.read_text(encoding="utf-8"), vehicle, counts)
     assert counts["applied"] >= 10, counts

@@ -1,4 +1,4 @@
-"""Whatever a model is, URDF gives it back, but for what it says it cannot hold; and another loader reads it alike."""
+"""URDF reads back the model that it wrote, but for unsupported features; another loader reads the same."""
 
 import io
 from itertools import product
@@ -12,15 +12,15 @@ from support_formats import all_frames, read
 from support_urdf import URDF, jointed_models, joints, pose_at, positions
 
 from modelserver.formats import save_model
-from modelserver.formats.urdf_text import link_names
+from modelserver.formats.urdf_writer import list_link_names
 from modelserver.geometry import ModelBuilder
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 pytestmark = pytest.mark.slow
 
 
 def assert_same_places(model, again, place, values):
-    """Compare every pair of frames with the joints at `values`; `place` says which frame stands for which."""
+    """Compare every pair of frames with the joints at `values`; `place` maps the frames of one to the other."""
     root = next(iter(place))
     # one route for each frame here, and one for each pair only in the model that is tested: routes are what takes time
     X_R = {frame: pose_at(model, frame, root, values) for frame in place}
@@ -51,10 +51,10 @@ def test_a_model_written_as_urdf_has_every_frame_at_its_place_wherever_the_joint
     model = data.draw(jointed_models())
     saved = save_model(model, "urdf")
     again = read(saved.text)
-    place = {full: f"{link}:Origin" for full, link in link_names(model).items()}
+    place = {full: f"{link}:Origin" for full, link in list_link_names(model).items()}
     assert_same_places(model, again, place, data.draw(positions(model)))
     assert set(again.joints) == set(model.joints)
-    assert not [loss for loss in saved.losses if "frames but as links" not in loss]
+    assert not [loss for loss in saved.unsupported if "frames but as links" not in loss]
 
 
 @given(st.data())
@@ -63,7 +63,7 @@ def test_a_model_that_came_from_urdf_comes_back_from_it_whole(data):
     model = read(save_model(data.draw(jointed_models()), "urdf").text)
     saved = save_model(model, "urdf")
     again = read(saved.text)
-    assert saved.losses == ()
+    assert saved.unsupported == ()
     assert again.get_body_list() == model.get_body_list()
     assert all_frames(again) == all_frames(model)
     assert_same_joints(model, again)
@@ -108,16 +108,16 @@ def robots(draw):
     count = draw(st.integers(2, 6))
     leaders: list[str] = []
     for number in range(count):
-        body = builder.body(f"link{number}").frame("Origin")
+        body = builder.add_body(f"link{number}").add_frame("Origin")
         for each in range(number + 1, count):
-            body.frame(f"joint{each}")
+            body.add_frame(f"joint{each}")
         if number:
             joint = draw(joints(forward=False, leaders=leaders))
             parent = draw(st.integers(0, number - 1))
             pose = Pose.from_rpy(*draw(st.tuples(st.tuples(*[plain(5)] * 3), *[plain(3)] * 3)))
             name = f"joint{number}"
-            builder.constraint(name, f"link{parent}:{name}", f"link{number}:Origin", pose, joint=joint)
-            if joint.moves and joint.mimic is None:
+            builder.add_constraint(name, f"link{parent}:{name}", f"link{number}:Origin", pose, joint=joint)
+            if joint.is_movable and joint.mimic is None:
                 leaders.append(name)
     return builder.build()
 

@@ -23,13 +23,12 @@ from modelserver.messages import VehicleCommand, VehicleStatusSample, WheelsSamp
 from msdrivers.devices.vehicle import VehicleDriver
 from msdrivers.devices.wheels import WheelsDriver
 from msdrivers.emulate.axis import AxisEmulator, AxisUnit
-from msdrivers.protocol.can.counts import Odometer
+from msdrivers.endpoint import MeasuredSample, Send
 from msdrivers.protocol.can.database import parse_dbc
 from msdrivers.protocol.can.frame import CanFrame
+from msdrivers.protocol.can.odometer import Odometer
 from msdrivers.protocol.can.vehicle import bind_command
-from msdrivers.protocol.modbus.numbers import RegisterMap
-from msdrivers.protocol.modbus.registers import ReadRegisters, Registers
-from msdrivers.station import Measured, Send
+from msdrivers.protocol.modbus.registers import ReadRegisters, RegisterMap, Registers
 
 DATABASE = raptor_dbc()
 COMMAND = bind_command(RAPTOR_COMMAND, DATABASE, "command")
@@ -57,18 +56,20 @@ def test_given_any_whole_number_when_written_to_registers_then_it_is_read_again(
     mapped: RegisterMap, data: st.DataObject
 ) -> None:
     number = data.draw(st.integers(mapped.lowest, mapped.highest))
-    words = mapped.words(number)
+    words = mapped.to_words(number)
     assert len(words) == mapped.registers
     assert all(0 <= word <= 0xFFFF for word in words)
-    assert mapped.number(words) == number
-    assert mapped.degrees(mapped.of_degrees(mapped.degrees(words))) == pytest.approx(mapped.degrees(words), abs=1e-6)
+    assert mapped.to_number(words) == number
+    assert mapped.to_degrees(mapped.from_degrees(mapped.to_degrees(words))) == pytest.approx(
+        mapped.to_degrees(words), abs=1e-6
+    )
 
 
 @given(maps)
 def test_given_a_number_beyond_then_it_is_not_written(mapped: RegisterMap) -> None:
     for number in (mapped.lowest - 1, mapped.highest + 1):
         with pytest.raises(ValueError, match="is not within"):
-            mapped.words(number)
+            mapped.to_words(number)
 
 
 @given(
@@ -78,24 +79,24 @@ def test_given_any_counts_that_a_wheel_can_do_then_the_travel_is_their_sum(
     bits: int, first: int, shares: list[float], reverse: bool
 ) -> None:
     wrap = 1 << bits
-    metres = -0.01 if reverse else 0.01
+    meters = -0.01 if reverse else 0.01
     fastest = (wrap // 2 - 2) * 0.01 * 10.0
-    odometer = Odometer(wrap, metres, max_speed=fastest, delay=0.0)
+    odometer = Odometer(wrap, meters, max_speed=fastest, delay=0.0)
     count, way = first % wrap, 0
-    odometer, travel, reason = odometer.taken(count, 0)
+    odometer, travel, reason = odometer.update(count, 0)
     assert (travel, reason) == (0.0, "")
     for n, share in enumerate(shares, 1):
         step = math.trunc(share * (wrap // 2 - 2))
         count, way = (count + step) % wrap, way + step
         # half of the counters are signed
-        odometer, travel, reason = odometer.taken(count - wrap if count >= wrap // 2 and n % 2 else count, n * 10**8)
+        odometer, travel, reason = odometer.update(count - wrap if count >= wrap // 2 and n % 2 else count, n * 10**8)
         assert reason == ""
-        assert travel == pytest.approx(way * metres)
+        assert travel == pytest.approx(way * meters)
 
 
 @given(st.floats(-20.0, 20.0), st.floats(-60.0 * DEG, 60.0 * DEG), st.integers(0, 1 << 40), st.booleans())
 def test_given_any_command_then_the_controller_reads_it(speed: float, angle: float, number: int, is_stop: bool) -> None:
-    raw = DATABASE.decode(COMMAND.frame(speed, angle, number, is_stop=is_stop))
+    raw = DATABASE.decode(COMMAND.make_frame(speed, angle, number, is_stop=is_stop))
     assert raw["ForwardSpeed"] * 0.001 == pytest.approx(speed, abs=0.00051)
     assert raw["SteeringAngle"] * 0.01 * DEG == pytest.approx(angle, abs=0.0051 * DEG)
     assert raw["Alive"] == number % 256
@@ -107,19 +108,19 @@ def test_given_any_frames_then_the_drivers_publish_only_what_can_be(arrivals: li
     wheels, vehicle = WheelsDriver(wheels_settings(), DATABASE), VehicleDriver(vehicle_settings(), DATABASE)
     t = 0.0
     for driver in (wheels, vehicle):
-        driver.opened(at(t))
+        driver.on_open(at(t))
     for frame, wait in arrivals:
         t += wait
-        outputs = [*wheels.received(frame, at(t)), *vehicle.received(frame, at(t)), *wheels.woken(at(t))]
-        for output in [*outputs, *vehicle.woken(at(t))]:
+        outputs = [*wheels.on_receive(frame, at(t)), *vehicle.on_receive(frame, at(t)), *wheels.on_timer(at(t))]
+        for output in [*outputs, *vehicle.on_timer(at(t))]:
             assert not isinstance(output, Send)
-            if isinstance(output, Measured) and isinstance(output.sample, WheelsSample):
+            if isinstance(output, MeasuredSample) and isinstance(output.sample, WheelsSample):
                 assert all(not abs(wheel.speed) > 8.0 for wheel in output.sample.wheels)
-            elif isinstance(output, Measured):
+            elif isinstance(output, MeasuredSample):
                 assert isinstance(output.sample, VehicleStatusSample)
                 assert not abs(output.sample.forward_speed) > 20.0
         for driver in (wheels, vehicle):
-            due = driver.due()
+            due = driver.get_deadline()
             assert due is None or due >= at(0.0).monotonic_ns
 
 
@@ -135,21 +136,21 @@ def test_given_any_frames_then_the_drivers_publish_only_what_can_be(arrivals: li
     )
 )
 def test_given_any_commands_then_what_is_sent_is_within_the_limits_and_ends(
-    wishes: list[tuple[float, float, float, float]],
+    commands: list[tuple[float, float, float, float]],
 ) -> None:
     driver = VehicleDriver(vehicle_settings(), DATABASE)
-    driver.opened(at(0.0))
+    driver.on_open(at(0.0))
     t, sent = 0.0, []
-    for seq, (speed, angle, valid_for, wait) in enumerate(wishes):
+    for seq, (speed, angle, valid_for, wait) in enumerate(commands):
         t += wait
         command = VehicleCommand(at(t).utime, valid_for, seq, "any", speed, angle)
-        sent += [output.unit for output in driver.command(command, at(t)) if isinstance(output, Send)]
+        sent += [output.unit for output in driver.on_command(command, at(t)) if isinstance(output, Send)]
     for frame in sent:
         raw = DATABASE.decode(frame)
         assert -1000 <= raw["ForwardSpeed"] <= 3000
         assert abs(raw["SteeringAngle"]) <= 2865
-    # after the dead-man's time whatever is said is stop
-    last = [output.unit for output in driver.woken(at(t + 0.5)) if isinstance(output, Send)]
+    # after the dead-man's time whatever is text_out is stop
+    last = [output.unit for output in driver.on_timer(at(t + 0.5)) if isinstance(output, Send)]
     assert all(DATABASE.decode(frame)["Enable"] == 0 for frame in last)
     assert bool(last) == bool(sent)
 
@@ -163,16 +164,16 @@ def test_given_copies_of_commands_in_any_order_then_none_counts_after_a_newer_on
     copies: list[tuple[int, str, float, bool]],
 ) -> None:
     driver = VehicleDriver(vehicle_settings(max_validity=60.0), DATABASE)
-    driver.opened(at(10.0))
+    driver.on_open(at(10.0))
     t, taken = 10.0, []
     for seq, source, wait, is_opened in copies:
         t += wait
         if is_opened:
-            driver.opened(at(t))
-        driver.woken(at(t))
+            driver.on_open(at(t))
+        driver.on_timer(at(t))
         command = VehicleCommand(at(float(seq)).utime, 60.0, seq, source, 1.0, 0.0)
         before = driver.counts["commands"]
-        driver.command(command, at(t))
+        driver.on_command(command, at(t))
         taken += [command] if driver.counts["commands"] > before else []
     assert [each.utime for each in taken] == sorted(each.utime for each in taken)
     assert len({(each.source, each.seq) for each in taken}) == len(taken)
@@ -190,15 +191,15 @@ def test_given_any_limits_then_the_emulated_axis_turns_at_its_rate_and_stays_bet
 ) -> None:
     unit = AxisUnit(lower, lower + span, rate, start)
     axis = AxisEmulator(AXIS_REGISTERS, unit)
-    axis.opened(at(0.0))
+    axis.on_open(at(0.0))
     t, before = 0.0, start
     inside = lower <= start <= lower + span
     for wait in waits:
         t += wait
-        (output,) = axis.received(ReadRegisters(0, 4), at(t))
+        (output,) = axis.on_receive(ReadRegisters(0, 4), at(t))
         assert isinstance(output, Send)
         assert isinstance(output.unit, Registers)
-        angle = AXIS_REGISTERS.angle.degrees(output.unit.values[:2])
+        angle = AXIS_REGISTERS.angle.to_degrees(output.unit.values[:2])
         assert angle == pytest.approx(axis.degrees, abs=0.037)
         # it measures at most 2 ms before it is asked
         assert abs(axis.degrees - before) <= rate * (wait + 0.002) + 1e-6
@@ -209,15 +210,15 @@ def test_given_any_limits_then_the_emulated_axis_turns_at_its_rate_and_stays_bet
 
 @settings(max_examples=25, deadline=None)
 @given(st.data())
-def test_given_a_dbc_file_with_characters_changed_then_it_is_read_or_told(data: st.DataObject) -> None:
+def test_given_a_dbc_file_with_characters_changed_then_it_is_read_or_reported(data: st.DataObject) -> None:
     text = DBC.read_text(encoding="utf-8")[:1200]
     for _ in range(data.draw(st.integers(1, 3))):
         place = data.draw(st.integers(0, len(text)))
         text = text[:place] + data.draw(st.text(max_size=5)) + text[place + data.draw(st.integers(0, 5)) :]
-    said = ""
+    text_out = ""
     try:
-        said = repr(parse_dbc(text, "damaged.dbc"))
+        text_out = repr(parse_dbc(text, "damaged.dbc"))
     except ConfigError as error:
-        said = str(error)
-    assert said.count("damaged.dbc") >= 1
-    assert len(said) < 2000
+        text_out = str(error)
+    assert text_out.count("damaged.dbc") >= 1
+    assert len(text_out) < 2000

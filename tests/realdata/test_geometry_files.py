@@ -49,13 +49,13 @@ def test_nasas_files_load_with_true_findings_only(miro, name):
 
 
 @pytest.mark.parametrize("name", NASA)
-def test_a_rover_without_a_name_keeps_its_variable_and_says_how_to_name_it(miro, name):
+def test_a_rover_without_a_name_keeps_its_variable_and_reports_how_to_name_it(miro, name):
     model = load_model(miro / name)
     assert model.root.name == "$MRN"
     assert "--set MRN=NAME" in findings(model)[0].fix
 
 
-def test_numbers_of_a_rover_are_kept_verbatim(miro):
+def test_numbers_of_a_rover_are_retained_verbatim(miro):
     model = load_model(miro / "K11Frames.xml")
     wheel = model.get_transformation("RightFrontSteerFrame:RightFrontWheelMount", "$MRN:Origin")
     assert wheel.position == pytest.approx([0.406, 0.389, -0.352 + 0.207], abs=1e-15)

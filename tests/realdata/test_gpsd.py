@@ -1,8 +1,8 @@
-"""Receiver logs of many makers, beside what gpsd made of them: the same times, places, speeds, courses, fix status.
+"""Receiver logs of many makers compared with gpsd's reports: times, positions, speeds, courses, fix status.
 
 gpsd prints a report after each sentence and carries values from one to the next; the last report of an instant holds
-what its sentences said. What is compared is what the receiver said: a speed that gpsd worked out of two positions is
-not, nor a third dimension that it carries over from an earlier instant or sets against the receiver's own GSA.
+the values of its sentences. Only values of the receiver are compared: not a speed that gpsd computed from two
+positions, nor a third dimension that it carries over from an earlier instant or sets against the receiver's own GSA.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support_gps import split
+from support_gps import split_randomly
 
 from modelserver.messages import FixType
 from msdrivers.protocol.gps_stream import GpsStream
@@ -31,19 +31,19 @@ Report = Mapping[str, Any]
 EXCEPTIONS = {
     "rst39": "gpsd takes 2014 for a date that has rolled over: its time is 1024 weeks later than the receiver's",
     "tcp-torture": "gpsd takes 2007 for a date that has rolled over, in this file alone",
-    "april6_2019": "a sentence with the date '2208-1' is refused whole; gpsd takes its place without a time",
+    "april6_2019": "a sentence with the date '2208-1' is rejected; gpsd uses its position without a time",
 }
-"""Where the figures differ, and why."""
+"""Recordings whose values differ, and why."""
 
-LEAST_FILES = 50
-"""Files with positions in NMEA among the recordings, when they were chosen."""
+MIN_FILES = 50
+"""Recordings with NMEA positions."""
 
 STATUS = {2: FixType.DIFFERENTIAL, 3: FixType.RTK_FIXED, 4: FixType.RTK_FLOAT, 5: FixType.DEAD_RECKONING}
-"""gpsd's `status`, where it says more than that there is a fix."""
+"""gpsd's `status`, where it is more than "fix"."""
 
 
 def content(path: Path) -> bytes:
-    """Return the log's bytes without what is meant for gpsd's own test harness."""
+    """Return the log's bytes without the directives for gpsd's own test harness."""
     data = path.read_bytes()
     cookie = re.search(rb"^# Delay-Cookie: (\S)", data, re.MULTILINE)
     if cookie:
@@ -53,7 +53,7 @@ def content(path: Path) -> bytes:
 
 def epochs(data: bytes) -> list[NmeaEpoch]:
     stream = GpsStream()
-    return [each for each in [*stream.feed(data), *stream.idle()] if isinstance(each, NmeaEpoch)]
+    return [each for each in [*stream.feed(data), *stream.flush()] if isinstance(each, NmeaEpoch)]
 
 
 def reports(path: Path) -> list[Report]:
@@ -66,8 +66,8 @@ def utime(report: Report) -> int:
 
 
 def last_of_each_instant(found: list[Report]) -> Iterator[Report]:
-    """Yield the last report of each run of one time; of those with a fix, for gpsd stamps what has no time with the
-    time before it (an epoch that says nothing but "no fix")."""
+    """Yield the last report of each instant, if possible one with a fix: gpsd stamps an epoch without time ("no fix")
+    with the time before it."""
     for _, run in itertools.groupby((each for each in found if "time" in each), key=lambda each: each["time"]):
         of_instant = list(run)
         fixed = [each for each in of_instant if each["mode"] >= 2]
@@ -89,14 +89,14 @@ def logs(data_dir: Path) -> Iterator[Path]:
 
 
 def differences(data: bytes, found: list[Report], later: int = 0) -> Iterator[str]:
-    """Say what differs; `later`: microseconds that gpsd's times are later than the receiver's."""
-    said = epochs(data)
+    """Yield the differences; `later`: microseconds by which gpsd's times exceed the receiver's."""
+    own = epochs(data)
     tolerance = print_precision(data)
     for report in last_of_each_instant(found):
         at = report["time"]
-        of_instant = [each for each in said if each.utime + later == utime(report)]
+        of_instant = [each for each in own if each.utime + later == utime(report)]
         if report["mode"] == 0:
-            continue  # gpsd's word for an instant of which it knows only the time
+            continue  # gpsd knows only the time of this instant
         has_fix = report["mode"] >= 2
         if not of_instant:
             if has_fix:
@@ -110,7 +110,7 @@ def differences(data: bytes, found: list[Report], later: int = 0) -> Iterator[st
         yield from (f"{at}: {what}" for what in differing(mine, report, tolerance))
     # positions before the date was known
     for report in found:
-        if "time" not in report and "lat" in report and not any(_near(each, report, tolerance) for each in said):
+        if "time" not in report and "lat" in report and not any(_near(each, report, tolerance) for each in own):
             yield f"no epoch at {report['lat']}, {report['lon']}"
 
 
@@ -127,7 +127,7 @@ def differing(mine: NmeaEpoch, report: Report, tolerance: float) -> Iterator[str
         ("course", mine.track, report.get("track"), 1e-4),
     ):
         if math.isnan(ours):
-            # fed without pauses nobody knows whose a VTG's course is
+            # without pauses the epoch of a VTG's course is ambiguous
             if theirs is not None and name == "course" and "RMC" in mine.kinds:
                 yield f"no {name}, not {theirs}"
         elif theirs is None or abs(ours - theirs) > bound:
@@ -138,14 +138,14 @@ def differing(mine: NmeaEpoch, report: Report, tolerance: float) -> Iterator[str
         expected = STATUS.get(report.get("status", 1))
         if mine.fix_type is not expected:
             yield f"{mine.fix_type!r}, not {expected!r}"
-    # gpsd never has fewer dimensions than were said
+    # gpsd never has fewer dimensions than the receiver
     if mine.fix_type is FixType.FIX_3D and report["mode"] != 3:
         yield "three dimensions, not two"
     if mine.fix_type is FixType.FIX_2D and report["mode"] == 3 and "GSA" not in mine.kinds and "GGA" in mine.kinds:
         yield "two dimensions, not three"
 
 
-def test_given_gpsds_recordings_when_read_then_they_say_what_gpsd_reports(data_dir: Path):
+def test_given_gpsds_recordings_when_read_then_they_equal_gpsds_reports(data_dir: Path):
     compared = 0
     wrong: dict[str, list[str]] = {}
     for log in logs(data_dir):
@@ -157,7 +157,7 @@ def test_given_gpsds_recordings_when_read_then_they_say_what_gpsd_reports(data_d
         problems = list(differences(data, found))
         if problems:
             wrong[log.stem] = problems
-    assert compared >= LEAST_FILES
+    assert compared >= MIN_FILES
     assert set(wrong) == set(EXCEPTIONS), "\n".join(
         f"{name}: {'; '.join(problems[:3])}" for name, problems in wrong.items() if name not in EXCEPTIONS
     )
@@ -183,16 +183,16 @@ def test_given_no_fix_when_coordinates_are_there_then_the_fix_is_none(data_dir: 
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_given_recordings_when_split_anyhow_then_they_say_the_same(data_dir: Path, seed: int):
+def test_given_recordings_when_split_anyhow_then_the_epochs_are_the_same(data_dir: Path, seed: int):
     number = 0
     for log in logs(data_dir):
         data = log.read_bytes()
         whole, pieces = GpsStream(), GpsStream()
-        expected = [*whole.feed(data), *whole.idle()]
-        parts = [data[n : n + 1] for n in range(len(data))] if seed == 0 else split(data, seed)
-        got = [each for part in parts for each in pieces.feed(part)] + pieces.idle()
+        expected = [*whole.feed(data), *whole.flush()]
+        parts = [data[n : n + 1] for n in range(len(data))] if seed == 0 else split_randomly(data, seed)
+        got = [each for part in parts for each in pieces.feed(part)] + pieces.flush()
         # nan differs from itself, its text does not
         assert repr(got) == repr(expected), log.name
         assert pieces.counts == whole.counts, log.name
         number += 1
-    assert number >= LEAST_FILES
+    assert number >= MIN_FILES

@@ -1,4 +1,4 @@
-"""The Husky recording: imported, replayed, and held against its own fixes."""
+"""The Husky recording: imported, replayed and scored against its own fixes."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ import pytest
 from support_recordings import HUSKY
 
 from benchmarks import protocols, withheld
-from modelserver.config import load_config
-from modelserver.service.daemon import load_vehicle
-from modelserver.service.offline import OfflineRun
+from modelserver.config.vehicle_file import load_config
+from modelserver.server.offline import OfflineRun
+from modelserver.server.vehicle import load_vehicle
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogFile
-from mstools.commands.import_bag import Report, import_bag
+from mstools.commands.import_bag import ImportReport, import_bag
 
 pytestmark = pytest.mark.realdata
 
-ANTENNA = "Antenna:PhaseCentre"
+ANTENNA = "Antenna:PhaseCenter"
 
 
 @pytest.fixture(scope="session")
-def imported(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Report]:
+def husky_log(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ImportReport]:
     log = tmp_path_factory.mktemp("husky") / "test1.lcm"
     return log, import_bag(data_dir / "husky" / "test1.bag", log)
 
 
 @pytest.fixture(scope="session")
-def antenna(imported: tuple[Path, Report]) -> npt.NDArray[np.float64]:
+def antenna(husky_log: tuple[Path, ImportReport]) -> npt.NDArray[np.float64]:
     """Time (s from the first event), east, north, up, valid: the antenna at 10 Hz."""
     vehicle = load_vehicle(load_config(HUSKY))
-    with LogFile(imported[0]) as log:
+    with LogFile(husky_log[0]) as log:
         run = OfflineRun(vehicle, log, ANTENNA)
         rows = [(each.utime, each.easting, each.northing, each.up, each.valid) for each in run.rows(None, 10.0)]
         start = run.first_utime
@@ -43,8 +43,8 @@ def antenna(imported: tuple[Path, Report]) -> npt.NDArray[np.float64]:
     return found
 
 
-def test_given_the_bag_when_imported_then_every_message_is_in_the_log(imported: tuple[Path, Report]) -> None:
-    log, report = imported
+def test_given_the_bag_when_imported_then_every_message_is_in_the_log(husky_log: tuple[Path, ImportReport]) -> None:
+    log, report = husky_log
     assert {each.topic: (each.channel, each.written) for each in report.topics} == {
         "/fix": ("GPS", 989),
         "/imu/data": ("IMU", 11865),
@@ -55,18 +55,18 @@ def test_given_the_bag_when_imported_then_every_message_is_in_the_log(imported: 
         assert recording.damage == []
     assert counts == {"GPS": 989, "IMU": 11865, "WHEELS": 3952}
     assert report.seconds == pytest.approx(395.3, abs=0.1)
-    assert "by gravity it is of kind enu" in report.text()
+    assert "by gravity it is enu" in report.to_text()
 
 
-def test_given_the_bag_when_imported_then_the_units_are_right(imported: tuple[Path, Report]) -> None:
-    with LogFile(imported[0]) as recording:
+def test_given_the_bag_when_imported_then_the_units_are_right(husky_log: tuple[Path, ImportReport]) -> None:
+    with LogFile(husky_log[0]) as recording:
         events = list(recording)
     imu = [decode("imu_t", each.data) for each in events if each.channel == "IMU"]
     force = np.mean([each.specific_force for each in imu], axis=0)
     assert force[1] == pytest.approx(9.8, abs=0.3)  # up is the unit's y axis: the mount in config/husky rests on it
     assert np.hypot(force[0], force[2]) < 1.0
     gps = [decode("gps_t", each.data) for each in events if each.channel == "GPS"]
-    # the geoid lies 28 m below the ellipsoid there and the car park some metres above the sea
+    # the geoid lies 28 m below the ellipsoid there and the car park some meters above the sea
     assert -30.0 < np.median([each.height_ellipsoidal for each in gps]) < -15.0
     wheels = [decode("wheels_t", each.data) for each in events if each.channel == "WHEELS"]
     way = np.mean([wheel.travel for wheel in wheels[-1].wheels])
@@ -84,51 +84,51 @@ def test_given_the_recording_when_replayed_then_the_pose_is_valid_soon_and_stays
 
 
 def test_given_the_recording_when_replayed_then_the_antenna_follows_its_fixes_within_their_noise(
-    imported: tuple[Path, Report], antenna: npt.NDArray[np.float64]
+    husky_log: tuple[Path, ImportReport], antenna: npt.NDArray[np.float64]
 ) -> None:
-    with LogFile(imported[0]) as recording:
+    with LogFile(husky_log[0]) as recording:
         fixes = withheld.read_fixes(recording)
     t = (fixes.utime - fixes.utime[0]) * 1e-6 + antenna[0, 0]
     valid = antenna[antenna[:, 4] > 0]
     scored = (t > valid[0, 0] + 1.0) & (t < valid[-1, 0])
     place = np.column_stack([np.interp(t[scored], valid[:, 0], valid[:, k]) for k in (1, 2)])
-    off = np.hypot(*(place - fixes.place[scored]).T)
+    off = np.hypot(*(place - fixes.positions[scored]).T)
     # the receiver states 0.9 m on each axis: 1.27 m horizontally, one standard deviation
     assert np.sqrt((off**2).mean()) < 0.9
     assert (off < 2 * 1.27).mean() > 0.99
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # the scorer leaves a file open
-def test_given_withheld_fixes_when_replayed_then_the_way_between_fixes_is_carried_better_than_by_holding(
-    imported: tuple[Path, Report], data_dir: Path
+def test_given_withheld_fixes_when_replayed_then_the_path_between_fixes_is_propagated_better_than_by_holding(
+    husky_log: tuple[Path, ImportReport], data_dir: Path
 ) -> None:
-    if withheld.common_scorer(data_dir) is None:
+    if withheld.load_scorer(data_dir) is None:
         pytest.skip(f"no scorer beside {data_dir}")
-    ours = protocols.run(protocols.Job(imported[0], HUSKY, data_dir, "half"))
-    with LogFile(imported[0]) as recording:
+    ours = protocols.run(protocols.ReplayJob(husky_log[0], HUSKY, data_dir, "half"))
+    with LogFile(husky_log[0]) as recording:
         fixes = withheld.read_fixes(recording)
     k = np.flatnonzero(fixes.withheld & (fixes.utime - fixes.utime[0] >= protocols.SKIP_S * 1e6))
-    held = np.hypot(*(fixes.place[k] - fixes.place[k - 1]).T)
+    held = np.hypot(*(fixes.positions[k] - fixes.positions[k - 1]).T)
     assert ours.missing == 0
     assert ours.n > 450
     assert ours.rmse < np.sqrt((held**2).mean())
 
 
-def test_given_the_recording_when_replayed_twice_then_the_same_bits(imported: tuple[Path, Report]) -> None:
+def test_given_the_recording_when_replayed_twice_then_the_same_bits(husky_log: tuple[Path, ImportReport]) -> None:
     vehicle = load_vehicle(load_config(HUSKY))
 
     def lines() -> list[str]:
-        with LogFile(imported[0]) as log:
+        with LogFile(husky_log[0]) as log:
             first_minute = itertools.islice(log, 2500)
-            return [each.csv() for each in OfflineRun(vehicle, first_minute, ANTENNA).rows(None, 20.0)]
+            return [each.to_csv() for each in OfflineRun(vehicle, first_minute, ANTENNA).rows(None, 20.0)]
 
     assert lines() == lines()
 
 
-def test_given_the_page_on_recordings_then_its_example_is_what_comes_out(imported: tuple[Path, Report]) -> None:
+def test_given_the_page_on_recordings_then_its_example_is_what_comes_out(husky_log: tuple[Path, ImportReport]) -> None:
     page = (Path(__file__).parents[2] / "docs" / "recordings.md").read_text(encoding="utf-8")
     (shown,) = [line for line in page.splitlines() if line.startswith("14322")]
-    with LogFile(imported[0]) as log:
+    with LogFile(husky_log[0]) as log:
         run = OfflineRun(load_vehicle(load_config(HUSKY)), log, "Husky:Base")
         (row,) = run.rows([int(shown.partition(",")[0])], 1.0)
-    assert row.csv() == shown
+    assert row.to_csv() == shown

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from modelserver.earth.geodesy import Geodesy
-from modelserver.localization.mounts import Mounts
-from modelserver.localization.raw.localizer import RawLocalizer
+from modelserver.estimation.raw.localizer import RawLocalizer
+from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import FixType, GpsSample, ImuSample, OrientationReference, Quality, SensorHeader
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 pytestmark = pytest.mark.realdata
 
@@ -62,7 +62,7 @@ def replay(recording, withheld, orientation=True):
         if index >= 0 and localizer.origin is not None:
             estimate = localizer.estimate(sample.header.utime)
             geodesy = Geodesy(estimate.origin)
-            place = geodesy.relative(
+            place = geodesy.to_relative_utm(
                 geodesy.utm_from_geodetic(sample.latitude_deg, sample.longitude_deg, sample.height_ellipsoidal)
             )
             antenna = (estimate.utm @ MOUNTS.X_base_antenna).xyz
@@ -71,7 +71,7 @@ def replay(recording, withheld, orientation=True):
             continue
         if index < 0 and not orientation:
             sample = ImuSample(sample.header, sample.angular_velocity, sample.specific_force)
-        localizer, _ = localizer.take(sample)
+        localizer, _ = localizer.process(sample)
     return localizer, found
 
 
@@ -82,7 +82,7 @@ def test_the_pose_becomes_valid_and_follows_the_fixes_within_their_noise(recordi
     assert found[0][2].invalid  # it has not moved yet
     moving = [error for _, error, estimate, _ in valid if Quality.HEADING_FROM_GYRO not in estimate.quality]
     assert math.sqrt(np.mean(np.square(moving))) < 0.9  # the fixes' own sigma
-    assert sum(error > estimate.horizontal_bound for _, error, estimate, _ in valid) <= 0.002 * len(valid)
+    assert sum(error > estimate.horizontal_protection_level for _, error, estimate, _ in valid) <= 0.002 * len(valid)
     assert localizer.pose_epoch == 0
 
 

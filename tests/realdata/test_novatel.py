@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from support_gps import split
+from support_gps import split_randomly
 from support_pcap import streams
 
-from msdrivers.devices.gps.samples import FIX_TYPES
+from msdrivers.devices.gps.fixes import FIX_TYPES
 from msdrivers.protocol.gps_stream import GpsMessage, GpsStream
 from msdrivers.protocol.nmea import NmeaEpoch
 from msdrivers.protocol.novatel import NovatelLog, Position, Prompt, TimeStatus, UtmPosition
@@ -40,7 +40,7 @@ def novatel(data_dir: Path) -> Path:
 def read(data: bytes | Sequence[bytes]) -> tuple[list[GpsMessage], GpsStream]:
     stream = GpsStream()
     parts = [data] if isinstance(data, bytes) else data
-    return [each for part in parts for each in stream.feed(part)] + stream.idle(), stream
+    return [each for part in parts for each in stream.feed(part)] + stream.flush(), stream
 
 
 def names(messages: list[GpsMessage]) -> Counter[str]:
@@ -63,16 +63,16 @@ def test_given_a_capture_when_read_then_every_message_is_there(data_dir: Path, n
 
 
 @pytest.mark.parametrize("name", CAPTURES)
-def test_given_a_capture_when_split_anyhow_then_it_says_the_same(data_dir: Path, name: str):
+def test_given_a_capture_when_split_anyhow_then_the_messages_are_the_same(data_dir: Path, name: str):
     (data,) = streams(novatel(data_dir) / "swri" / name)
     whole, stream = read(data)
-    for parts in ([data[n : n + 1] for n in range(len(data))], split(data, 1), split(data, 2)):
+    for parts in ([data[n : n + 1] for n in range(len(data))], split_randomly(data, 1), split_randomly(data, 2)):
         again, pieces = read(parts)
         assert repr(again) == repr(whole)
         assert pieces.counts == stream.counts
 
 
-def test_given_gga_beside_bestpos_when_read_then_they_tell_the_same_instants_and_places(data_dir: Path):
+def test_given_gga_beside_bestpos_when_read_then_they_report_the_same_instants_and_positions(data_dir: Path):
     (data,) = streams(novatel(data_dir) / "swri" / "gpgga-gprmc-bestpos.pcap")
     messages, _ = read(data)
     epochs = [each for each in messages if isinstance(each, NmeaEpoch)]
@@ -89,13 +89,13 @@ def test_given_gga_beside_bestpos_when_read_then_they_tell_the_same_instants_and
         assert epoch.undulation == log.body.undulation
 
 
-def test_given_streams_made_to_break_a_parser_when_read_then_there_is_no_log_and_nothing_is_kept(data_dir: Path):
+def test_given_streams_made_to_break_a_parser_when_read_then_there_is_no_log_and_nothing_is_buffered(data_dir: Path):
     files = sorted((novatel(data_dir) / "edie").rglob("*sync_error*"))
     assert len(files) == BROKEN
     for file in files:
         messages, stream = read(file.read_bytes())
         assert messages == [], file.name
-        assert stream.waiting <= 1024, file.name
+        assert stream.pending_bytes <= 1024, file.name
 
 
 def test_given_commands_answers_and_logs_when_read_then_each_is_there(data_dir: Path):

@@ -17,8 +17,8 @@ from support_recordings import HUSKY
 
 from benchmarks import accuracy, protocols
 from benchmarks.recordings import dresden, husky, kitti, plaza
-from benchmarks.withheld import Fixes, common_scorer, read_fixes
-from modelserver.config import load_config
+from benchmarks.withheld import FixTable, load_scorer, read_fixes
+from modelserver.config.vehicle_file import load_config
 from modelserver.formats import load_model
 from modelserver.messages import Direction, FixType, GpsSample, ImuSample, WheelsSample
 from modelserver.wire.codec import decode
@@ -32,7 +32,7 @@ STEP = 0.02
 
 @dataclass(frozen=True)
 class Drive:
-    """A converted recording: samples by channel, and what its fixes and its unit tell on an even grid of times."""
+    """A converted recording: samples by channel, and their series on an even grid of times."""
 
     events: list[LogEvent]
     gps: list[GpsSample]
@@ -56,7 +56,7 @@ class Drive:
 
     def motion(self) -> tuple[Array, Array, Array]:
         """Speed, its change, and the turning of the course to the left, from positions."""
-        place = read_fixes(self.events).place
+        place = read_fixes(self.events).positions
         # one fix a second needs a curve between them, ten a second with steps of 0.1 m a line
         seldom = np.median(np.diff(self.gps_t)) > 0.5
         kind = CubicSpline if seldom else lambda t, values: lambda at: np.interp(at, t, values)
@@ -112,7 +112,7 @@ def test_given_kitti_when_converted_then_every_row_is_there_and_distances_are_th
     assert np.median(np.diff(kitti_drive.imu_t)) == pytest.approx(0.01, abs=1e-4)
     assert np.median(np.diff(kitti_drive.gps_t)) == pytest.approx(1.0, abs=1e-3)
     assert np.diff(kitti_drive.imu_t)[0] == pytest.approx(1.9196, abs=1e-3)
-    steps = np.hypot(*np.diff(read_fixes(kitti_drive.events).place, axis=0).T)
+    steps = np.hypot(*np.diff(read_fixes(kitti_drive.events).positions, axis=0).T)
     # UTM shrinks by 0.04 % there
     assert steps.sum() == pytest.approx(np.hypot(*np.diff(table[:, 1:3], axis=0).T).sum(), rel=5e-4)
     heights = np.array([each.height_ellipsoidal for each in kitti_drive.gps])
@@ -169,7 +169,7 @@ def test_given_dresden_when_converted_then_its_axes_are_forward_left_up(dresden_
 
 def test_given_dresden_when_converted_then_the_course_is_the_way_of_the_positions(dresden_drive: Drive) -> None:
     fixes = read_fixes(dresden_drive.events)
-    ve, vn = np.gradient(fixes.place[:, 0]), np.gradient(fixes.place[:, 1])
+    ve, vn = np.gradient(fixes.positions[:, 0]), np.gradient(fixes.positions[:, 1])
     way = np.arctan2(smooth(vn), smooth(ve))
     t = dresden_drive.gps_t
     course = np.interp(t, t - dresden.VELOCITY_LATENCY, np.unwrap([each.course for each in dresden_drive.gps]))
@@ -211,9 +211,9 @@ def test_given_plaza_2_then_the_surveyed_beacons_belong_to_its_first_ranges(data
     if not plaza.files(data_dir, "plaza2")[0].is_file():
         pytest.skip("no plaza2 among the recordings")
     increments, ranges = plaza.read(data_dir, "plaza2")
-    where = plaza.beacons(data_dir, "plaza2")
+    where = plaza.find_beacons(data_dir, "plaza2")
     early = ranges[:, 0] < increments[0, 0] + 20.0
-    off = plaza.misses(plaza.way(increments, where.start), increments[:, 0], ranges[early], where)
+    off = plaza.range_residuals(plaza.dead_reckon(increments, where.start), increments[:, 0], ranges[early], where)
     assert early.sum() > 50
     assert plaza.rms(off) < 1.5
 
@@ -222,8 +222,8 @@ def test_given_the_husky_turned_then_its_wheels_and_mounts_are_the_same_vehicles
     data_dir: Path, tmp_path: Path
 ) -> None:
     before = load_model(load_config(HUSKY).geometry)
-    after = load_model(load_config(husky.turned_vehicle(HUSKY, tmp_path)).geometry)
-    for frame in ("Imu:Origin", "Antenna:PhaseCentre"):
+    after = load_model(load_config(husky.write_turned_vehicle(HUSKY, tmp_path)).geometry)
+    for frame in ("Imu:Origin", "Antenna:PhaseCenter"):
         was, now = (model.get_transformation(frame, "Husky:Base").pose for model in (before, after))
         assert now.xyz == pytest.approx((-was.xyz[0], -was.xyz[1], was.xyz[2]))
         axis = (0.3, -0.2, 0.9) if frame.startswith("Imu") else (0.0, 0.0, 0.0)
@@ -235,7 +235,7 @@ def test_given_the_husky_turned_then_its_wheels_and_mounts_are_the_same_vehicles
     husky.convert(data_dir, tmp_path / "log")
     with LogFile(tmp_path / "log") as recording:
         events = list(itertools.islice(recording, 2000))
-    turned = list(husky.turned_events(events))
+    turned = list(husky.reverse_wheels(events))
     assert [(each.utime, each.channel) for each in turned] == [(each.utime, each.channel) for each in events]
     for was, now in zip(events, turned, strict=True):
         if was.channel != "WHEELS":
@@ -251,36 +251,36 @@ def test_given_the_husky_turned_then_its_wheels_and_mounts_are_the_same_vehicles
 def test_given_gaps_when_scored_then_the_known_error_of_an_estimate_comes_out(
     shift: float, data_dir: Path, tmp_path: Path
 ) -> None:
-    scorer = common_scorer(data_dir)
+    scorer = load_scorer(data_dir)
     if scorer is None:
         pytest.skip(f"no scorer beside {data_dir}")
     t = np.arange(0.0, 395.0, 0.4)
-    fixes = Fixes(np.round(t * 1e6).astype(np.int64), np.column_stack([t, np.zeros(len(t))]))
+    fixes = FixTable(np.round(t * 1e6).astype(np.int64), np.column_stack([t, np.zeros(len(t))]))
     protocol = protocols.Protocol(fixes, shift)
-    assert len(protocol.starts) == (4 if shift == 0.0 else 3)  # the last one would end after the recording
+    assert len(protocol.gap_starts) == (4 if shift == 0.0 else 3)  # the last one would end after the recording
     meta = tmp_path / "meta.json"
-    meta.write_text(json.dumps(protocol.meta()))
-    begin = protocol.starts[0] * protocol.duration
-    gap = (protocol.t > begin) & (protocol.t <= begin + 30.0)
+    meta.write_text(json.dumps(protocol.to_dict()))
+    begin = protocol.gap_starts[0] * protocol.duration
+    gap = (protocol.times > begin) & (protocol.times <= begin + 30.0)
     assert (protocol.withheld & gap).sum() == gap.sum() == 75
     off_by = np.where(gap[protocol.withheld], 3.0, 1.0)
     estimated = np.column_stack([t[protocol.withheld], off_by, *np.zeros((2, len(off_by)))])
-    outcome = protocols._scored(protocol, estimated, np.ones(len(off_by), bool), {}, scorer, tmp_path)
-    assert [each.end_error for each in outcome.gaps] == pytest.approx([3.0, *[1.0] * (len(protocol.starts) - 1)])
+    outcome = protocols._score(protocol, estimated, np.ones(len(off_by), bool), {}, scorer, tmp_path)
+    assert [each.end_error for each in outcome.gaps] == pytest.approx([3.0, *[1.0] * (len(protocol.gap_starts) - 1)])
     count = len(outcome.gaps)
     assert protocols.mean_gap_end([outcome]) == pytest.approx((3.0 + count - 1) / count)
 
 
-def test_given_a_required_figure_when_it_is_missed_then_the_line_says_so() -> None:
+def test_given_a_required_figure_when_it_is_missed_then_the_line_is_marked() -> None:
     recording = accuracy.RECORDINGS[0]
-    good = protocols.Outcome(400, 0, 1.0, rmse=0.40, p95=0.6, max=1.0)
-    assert accuracy.Line(recording, "half", (good,)).holds
+    good = protocols.ReplayScore(400, 0, 1.0, rmse=0.40, p95=0.6, max=1.0)
+    assert accuracy.ResultLine(recording, "half", (good,)).is_met
     for bad in (
-        protocols.Outcome(400, 0, 1.0, rmse=0.46, p95=0.6, max=1.0),
-        protocols.Outcome(400, 1, 1.0, rmse=0.40, p95=0.6, max=1.0),
-        protocols.Outcome(400, 0, 1.0, rmse=0.40, p95=0.6, max=1000.0),
-        protocols.Outcome(0, 400, 0.0),
+        protocols.ReplayScore(400, 0, 1.0, rmse=0.46, p95=0.6, max=1.0),
+        protocols.ReplayScore(400, 1, 1.0, rmse=0.40, p95=0.6, max=1.0),
+        protocols.ReplayScore(400, 0, 1.0, rmse=0.40, p95=0.6, max=1000.0),
+        protocols.ReplayScore(0, 400, 0.0),
     ):
-        line = accuracy.Line(recording, "half", (bad,))
-        assert not line.holds
-        assert "OUT OF BOUNDS" in line.text()
+        line = accuracy.ResultLine(recording, "half", (bad,))
+        assert not line.is_met
+        assert "OUT OF BOUNDS" in line.format()

@@ -63,10 +63,10 @@ def test_masses_shapes_and_text_survive_urdf_and_yaml(robot):
             assert body.mass is None
             continue
         assert body.mass == link.inertial.mass
-        centre = np.zeros(3) if link.inertial.origin is None else link.inertial.origin[:3, 3]
-        np.testing.assert_allclose(body.centre_of_mass, centre, rtol=0, atol=1e-12)
+        center = np.zeros(3) if link.inertial.origin is None else link.inertial.origin[:3, 3]
+        np.testing.assert_allclose(body.center_of_mass, center, rtol=0, atol=1e-12)
     saved = save_model(model, "urdf")
-    assert saved.losses == ()
+    assert saved.unsupported == ()
     assert save_model(read(saved.text), "urdf").text == saved.text
     assert read(save_model(model, "yaml").text).bodies == model.bodies
 
@@ -77,6 +77,6 @@ def test_libbot2s_own_configuration_loads(data_dir):
     assert model.get_body_list() == ["local", "body", "laser", "camera"]
     assert list(model.joints) == ["body"]
     assert model.get_transformation("camera:Origin", "local:Origin").pose.xyz == (1.0, 0.0, 0.0)
-    # where bot_frames puts it after BODY_TO_LOCAL said (1, 2, 3) and half a turn about z
+    # where bot_frames puts it after BODY_TO_LOCAL message (1, 2, 3) and half a turn about z
     values = dict(zip(coordinates_of(model), (0.0, 0.0, np.pi, 1.0, 2.0, 3.0), strict=True))
     assert pose_at(model, "camera:Origin", "local:Origin", values).xyz == pytest.approx((0.0, 2.0, 3.0))

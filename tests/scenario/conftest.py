@@ -12,80 +12,82 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support_lcm import MODELSERVER, PATIENCE_S, Listener, reserved_url, started, wait_until
+from support_lcm import MODELSERVER, TIMEOUT_S, Listener, reserved_url, run_process, wait_until
 from support_samples import GEOMETRY, VEHICLE, drive, write_vehicle
 from support_signing import ALLOWED, write_test_key
 
 from modelserver.client.remote import Platform
 from modelserver.errors import TooNewError
 from modelserver.messages import Health
-from modelserver.signing import AHEAD_S
+from modelserver.signing.signatures import MAX_CLOCK_LEAD_S
 from modelserver.wire.codec import decode, encode
 
-BRISK = VEHICLE + "publish: {rate_hz: 50, health_hz: 20}\n"
+FAST_HEALTH = VEHICLE + "publish: {rate_hz: 50, health_hz: 20}\n"
 """Health comes often, so that a test need not wait for it."""
 
 
 @dataclass
 class Daemon:
-    """A daemon that has begun to speak, and a place on its bus."""
+    """A serving daemon process and a listener on its bus."""
 
     url: str
     folder: Path
     process: subprocess.Popen[str]
     listener: Listener
     last_utime: int = 0
-    """The stamp of the newest sample of `fed`."""
+    """The stamp of the newest sample of `feed`."""
     _platforms: list[Platform] = field(default_factory=list)
 
     def platform(self, **options: Any) -> Platform:
-        """A client with more patience than one outside tests needs."""
-        options = dict[str, Any](timeout=PATIENCE_S, retries=0, name="test") | options
+        """Return a client with a long timeout."""
+        options = dict[str, Any](timeout=TIMEOUT_S, retries=0, name="test") | options
         self._platforms.append(Platform(self.url, **options))
         return self._platforms[-1]
 
     def publish(self, channel: str, data: bytes) -> None:
         self.listener.bus.publish(channel, data)
 
-    def fed(self, seconds: float = 10.0) -> int:
-        """Publish a drive that ends now, and return when the daemon knows it all.
+    def feed(self, seconds: float = 10.0) -> int:
+        """Publish a drive that ends now, and return when the daemon has processed it.
 
-        Levelling on the move takes the first five seconds of it.
+        Leveling on the move takes its first five seconds.
         """
         begin = time.time_ns() // 1000 - round(seconds * 1e6)
         for sample in drive(seconds, begin):
             self.publish("GPS" if type(sample).__name__ == "GpsSample" else "IMU", encode(sample))
             self.last_utime = sample.header.utime
-        deadline = time.monotonic() + PATIENCE_S
-        with Platform(self.url, name="feeder", timeout=PATIENCE_S, retries=0) as platform:
+        deadline = time.monotonic() + TIMEOUT_S
+        with Platform(self.url, name="feeder", timeout=TIMEOUT_S, retries=0) as platform:
             while True:
                 try:
                     platform.get_state_vector(at=self.last_utime, wait_ms=2000)
                 except TooNewError:
-                    # the server waits for so long and no longer; a busy machine may need more
+                    # the server bounds its wait; a busy machine may need more
                     if time.monotonic() > deadline:
                         raise
                 else:
                     return self.last_utime
 
-    def health(self, enough: Callable[[Health], bool] = lambda health: True) -> Health:
-        """Return the first health report from now on that is as wanted."""
+    def health(self, is_enough: Callable[[Health], bool] = lambda health: True) -> Health:
+        """Return the first health report from now on for which `is_enough` holds."""
         while self.listener.bus.handle_timeout(0):
-            pass  # what waits there is of before
-        self.listener.heard.clear()
+            pass  # discard queued reports
+        self.listener.received.clear()
         found: list[Health] = []
 
-        def arrived() -> bool:
-            found.extend(decode("health_t", data) for data in self.listener.heard)
-            self.listener.heard.clear()
-            return any(map(enough, found))
+        def is_found() -> bool:
+            found.extend(decode("health_t", data) for data in self.listener.received)
+            self.listener.received.clear()
+            return any(map(is_enough, found))
 
-        assert wait_until(self.listener.bus, arrived), found[-1:]
-        return next(filter(enough, found))
+        assert wait_until(self.listener.bus, is_found), found[-1:]
+        return next(filter(is_enough, found))
 
-    def rejected(self, enough: Callable[[dict[tuple[str, str], int]], bool]) -> dict[tuple[str, str], int]:
-        """Return what was rejected, by channel and reason, once it is as wanted."""
-        health = self.health(lambda health: enough({(name, why): count for name, why, count in health.rejected}))
+    def wait_for_rejections(
+        self, is_enough: Callable[[dict[tuple[str, str], int]], bool]
+    ) -> dict[tuple[str, str], int]:
+        """Return the rejection counts by channel and reason, once `is_enough` holds for them."""
+        health = self.health(lambda health: is_enough({(name, why): count for name, why, count in health.rejected}))
         return {(name, why): count for name, why, count in health.rejected}
 
     @property
@@ -93,26 +95,26 @@ class Daemon:
         return (self.folder / "daemon.log").read_text()
 
     def end(self, number: signal.Signals = signal.SIGTERM) -> int:
-        """Ask the daemon to end; return its exit code."""
+        """Send the daemon a signal; return its exit code."""
         self.process.send_signal(number)
-        return self.process.wait(PATIENCE_S)
+        return self.process.wait(TIMEOUT_S)
 
 
 @contextmanager
 def daemon_at(
-    url: str, folder: Path, vehicle: str = BRISK, geometry: str = GEOMETRY, prefix: str = ""
+    url: str, folder: Path, vehicle: str = FAST_HEALTH, geometry: str = GEOMETRY, prefix: str = ""
 ) -> Iterator[Daemon]:
-    """Run a daemon until the block ends. A state directory that is there is used again."""
+    """Run a daemon until the block ends, with the state directory of an earlier run if there is one."""
     path = write_vehicle(folder, vehicle, geometry)
     listener = Listener(url, f"{prefix}MODELSERVER_HEALTH")
     with (
         (folder / "daemon.log").open("w") as errors,
-        started([*MODELSERVER, "run", "-c", path], url, stderr=errors) as process,
+        run_process([*MODELSERVER, "run", "-c", path], url, stderr=errors) as process,
     ):
         daemon = Daemon(url, folder, process, listener)
-        # its own log too, for there may be another daemon on the bus
+        # its own log too: there may be another daemon on the bus
         assert wait_until(
-            listener.bus, lambda: process.poll() is not None or (bool(listener.heard) and " serves " in daemon.log)
+            listener.bus, lambda: process.poll() is not None or (bool(listener.received) and " serves " in daemon.log)
         ), daemon.log
         assert process.poll() is None, daemon.log
         try:
@@ -126,10 +128,10 @@ def daemon_at(
 
 @pytest.fixture
 def start_daemon(lcm_url: str, tmp_path: Path) -> Iterator[Callable[..., Daemon]]:
-    """A function that starts a daemon on this test's bus; all end with the test."""
+    """Return a function that starts a daemon on this test's bus; all end with the test."""
     with ExitStack() as stack:
 
-        def start(vehicle: str = BRISK, folder: Path = tmp_path, **options: str) -> Daemon:
+        def start(vehicle: str = FAST_HEALTH, folder: Path = tmp_path, **options: str) -> Daemon:
             folder.mkdir(exist_ok=True)
             return stack.enter_context(daemon_at(lcm_url, folder, vehicle, **options))
 
@@ -140,14 +142,14 @@ def start_daemon(lcm_url: str, tmp_path: Path) -> Iterator[Callable[..., Daemon]
 def start_signed(
     start_daemon: Callable[..., Daemon], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., Daemon]:
-    """A function that starts a daemon that obeys who signs; clients and tools of this test have the key."""
+    """Return a function that starts a daemon with signed commands; clients and tools of this test have the key."""
 
-    def start(vehicle: str = BRISK + ALLOWED, folder: Path = tmp_path, **options: str) -> Daemon:
+    def start(vehicle: str = FAST_HEALTH + ALLOWED, folder: Path = tmp_path, **options: str) -> Daemon:
         folder.mkdir(exist_ok=True)
         monkeypatch.setenv("MODELSERVER_KEY_FILE", str(write_test_key(folder)))
         daemon = start_daemon(vehicle, folder, **options)
-        # before, it takes nothing that it might have taken before it started
-        daemon.health(lambda health: health.uptime > AHEAD_S + 0.1)
+        # replay protection: it accepts no command that may be older than its start
+        daemon.health(lambda health: health.uptime > MAX_CLOCK_LEAD_S + 0.1)
         return daemon
 
     return start
@@ -155,7 +157,7 @@ def start_signed(
 
 @pytest.fixture(scope="module")
 def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """A daemon that has seen a drive; the tests of a module share it and leave it running."""
+    """Yield a daemon that has processed a drive; the tests of a module share it and leave it running."""
     with reserved_url() as url, daemon_at(url, tmp_path_factory.mktemp("daemon")) as daemon:
-        daemon.fed()
+        daemon.feed()
         yield daemon

@@ -14,11 +14,11 @@ import time
 from pathlib import Path
 
 import pytest
-from support_lcm import PATIENCE_S
+from support_lcm import TIMEOUT_S
 
 from modelserver.errors import NoServerError
 from mstools.commands import demo
-from mstools.demo.children import Children, DemoError
+from mstools.demo.processes import ChildProcesses, DemoError
 
 DEMO = [sys.executable, "-c", "from mstools.cli import main; main()", "demo"]
 
@@ -44,7 +44,7 @@ def vehicle_in(text: str) -> str:
     return found[1]
 
 
-def still_running(vehicle: str) -> dict[str, int]:
+def list_running(vehicle: str) -> dict[str, int]:
     """Return the processes that were given this vehicle file, which is the demo's alone: their ids by their names."""
     running = {}
     for place in Path("/proc").glob("[0-9]*/cmdline"):
@@ -80,8 +80,8 @@ def all_started(process: subprocess.Popen[str]) -> tuple[str, dict[str, int]]:
     What a process was given can be seen a little later than that it was started.
     """
     vehicle = vehicle_in(text_until(process, ALL_STARTED))
-    deadline = time.monotonic() + PATIENCE_S
-    while set(running := still_running(vehicle)) != PROCESSES:
+    deadline = time.monotonic() + TIMEOUT_S
+    while set(running := list_running(vehicle)) != PROCESSES:
         assert time.monotonic() < deadline, f"missing: {PROCESSES - set(running)}"
     return vehicle, running
 
@@ -89,47 +89,47 @@ def all_started(process: subprocess.Popen[str]) -> tuple[str, dict[str, int]]:
 def test_given_nothing_else_when_the_demo_runs_then_it_shows_a_valid_pose_and_ends_by_itself():
     process = start("--seconds", "8")
     try:
-        out, err = process.communicate(timeout=2 * PATIENCE_S)
+        out, err = process.communicate(timeout=2 * TIMEOUT_S)
     finally:
         close(process)
     assert process.returncode == 0, err
-    assert re.search(r"all 5 devices are alive: gps \d\.\d Hz, imu \d+\.\d Hz, wheels \d+\.\d Hz, raptor", out)
+    assert re.search(r"all 5 devices are streaming: gps \d\.\d Hz, imu \d+\.\d Hz, wheels \d+\.\d Hz, raptor", out)
     assert "Raptor, FrontNoddingSICK, BackNoddingSICK, Digiclops" in out
     assert "0.2990  -0.0560  0.4330  m" in out
     assert re.search(r"^ +\d\.\d\d s .* valid$", out, re.MULTILINE)
-    # which reason stands first depends on how soon a busy machine hears the GPS
+    # which reason comes first depends on when a busy machine receives the first fix
     assert re.search(r"^ +\d\.\d\d s .* not valid: (no usable GPS fix yet|heading is not known)", out, re.MULTILINE)
     assert "Digiclops:ImagePlane in World:UTM" in out
     assert "Nearest: Digiclops:ImagePlane" in out
     assert err == ""
-    assert still_running(vehicle_in(out)) == {}
+    assert list_running(vehicle_in(out)) == {}
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_given_a_running_demo_when_it_is_told_to_end_then_its_children_end_too(number, code):
+def test_given_a_running_demo_when_it_is_sent_a_signal_then_its_children_end_too(number, code):
     process = start("--seconds", "60")
     try:
         vehicle, _ = all_started(process)
         process.send_signal(number)
-        process.communicate(timeout=PATIENCE_S)
+        process.communicate(timeout=TIMEOUT_S)
     finally:
         close(process)
     assert process.returncode == code
-    assert still_running(vehicle) == {}
+    assert list_running(vehicle) == {}
 
 
-def test_given_a_running_demo_when_one_of_its_processes_dies_then_it_says_which_and_ends_the_others():
+def test_given_a_running_demo_when_one_of_its_processes_dies_then_it_reports_which_and_ends_the_others():
     process = start("--seconds", "60")
     try:
         vehicle, running = all_started(process)
         os.kill(running["driver imu"], signal.SIGKILL)
-        _, err = process.communicate(timeout=PATIENCE_S)
+        _, err = process.communicate(timeout=TIMEOUT_S)
     finally:
         close(process)
     assert process.returncode == 1
-    assert "the driver imu was ended by SIGKILL. It said:" in err
+    assert "the driver imu was killed by SIGKILL. Its output:" in err
     assert "imu: closed:" in err  # from before its device was there
-    assert still_running(vehicle) == {}
+    assert list_running(vehicle) == {}
 
 
 def test_given_a_running_demo_when_it_is_killed_then_nothing_is_left_running():
@@ -143,43 +143,43 @@ def test_given_a_running_demo_when_it_is_killed_then_nothing_is_left_running():
                 stack.callback(os.close, end)
                 ends.register(end, select.POLLIN)
             process.kill()
-            process.communicate(timeout=PATIENCE_S)
-            deadline = time.monotonic() + PATIENCE_S
+            process.communicate(timeout=TIMEOUT_S)
+            deadline = time.monotonic() + TIMEOUT_S
             for _ in running:
                 ((ended, _),) = ends.poll(max(0.0, deadline - time.monotonic()) * 1e3)[:1] or pytest.fail(
-                    f"still running: {sorted(still_running(vehicle))}"
+                    f"still running: {sorted(list_running(vehicle))}"
                 )
                 ends.unregister(ended)
     finally:
         close(process)
-    assert still_running(vehicle) == {}
+    assert list_running(vehicle) == {}
     # a killed demo cannot take its folder away
     shutil.rmtree(Path(vehicle).parent)
 
 
-def test_given_a_daemon_that_fails_when_its_answer_is_waited_for_then_what_it_said_is_told(tmp_path):
+def test_given_a_daemon_that_fails_when_its_answer_is_waited_for_then_what_it_reported_is_reported(tmp_path):
     def nobody() -> list[str]:
         children._started[0].process.wait()
         raise NoServerError("no reply")
 
-    with Children(tmp_path, verbose=False) as children:
+    with ChildProcesses(tmp_path, verbose=False) as children:
         children.start("daemon", "-c", "import sys; sys.exit('the geometry is wrong')")
         with pytest.raises(DemoError, match=r"the daemon ended with exit code 1(.|\n)*the geometry is wrong"):
-            demo.first_answer(nobody, children)
+            demo.wait_for_answer(nobody, children)
 
 
 def test_given_an_error_in_the_demo_when_it_leaves_then_its_children_are_ended(tmp_path):
-    children = Children(tmp_path, verbose=False)
+    children = ChildProcesses(tmp_path, verbose=False)
 
     def fail() -> None:
         with children:
             children.start("patient child", "-c", "import signal; signal.pause()")
-            raise RuntimeError("trouble")
+            raise RuntimeError("failure")
 
-    with pytest.raises(RuntimeError, match="trouble"):
+    with pytest.raises(RuntimeError, match="failure"):
         fail()
     assert [child.process.poll() for child in children._started] == [-signal.SIGTERM]
 
 
 def test_the_vehicle_file_is_found():
-    assert demo.vehicle_file().read_text().startswith("# The DRDC Raptor")
+    assert demo.find_vehicle_file().read_text().startswith("# The DRDC Raptor")

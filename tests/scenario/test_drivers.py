@@ -18,12 +18,12 @@ from typing import Any
 
 import lcm
 import pytest
-from support_lcm import MODELSERVER, PATIENCE_S, invoke, reserved_url, started, wait_until
+from support_lcm import MODELSERVER, TIMEOUT_S, invoke, reserved_url, run_process, wait_until
 
 from modelserver.messages import DriverHealth, DriverPhase, FixType, GpsSample, SensorHeader, VehicleCommand
 from modelserver.wire.codec import decode, encode
 from msdrivers.links.can_bus import CanLink
-from msdrivers.protocol.gx1 import Address
+from msdrivers.protocol.gx1 import EepromAddress
 
 ROOT = Path(__file__).parents[2]
 
@@ -39,13 +39,13 @@ drivers:
     dbc: raptor.dbc
     wheels:
       front_left:
-        count: {{signal: WheelCounts.FrontLeftCount, metres_per_count: 0.0125}}
+        count: {{signal: WheelCounts.FrontLeftCount, meters_per_count: 0.0125}}
         direction: {{signal: WheelCounts.FrontLeftDirection}}
-        steers: true
+        is_steered: true
       front_right:
-        count: {{signal: WheelCounts.FrontRightCount, metres_per_count: 0.0125}}
+        count: {{signal: WheelCounts.FrontRightCount, meters_per_count: 0.0125}}
         direction: {{signal: WheelCounts.FrontRightDirection}}
-        steers: true
+        is_steered: true
   axis:
     device: axis
     address: "127.0.0.1:{port}"
@@ -63,15 +63,15 @@ drivers:
     status:
       mode: VehicleStatus.Mode
       modes: {{manual: 1, autonomous: 2, emergency_stop: 3, fault: 4}}
-      commands_refused: VehicleStatus.CommandsRefused
+      commands_rejected: VehicleStatus.CommandsRefused
       forward_speed: {{signal: VehicleStatus.ForwardSpeed}}
       steering_angle: {{signal: VehicleStatus.SteeringAngle, scale: 0.0174533}}
     command:
       forward_speed: {{signal: VehicleCommand.ForwardSpeed}}
       steering_angle: {{signal: VehicleCommand.SteeringAngle, scale: 0.0174533}}
       alive: VehicleCommand.Alive
-      driving: {{Enable: 1}}
-      stopping: {{Enable: 0}}
+      drive_signals: {{Enable: 1}}
+      stop_signals: {{Enable: 0}}
 """
 
 CHANNELS = {
@@ -87,19 +87,19 @@ RATES_HZ = {"gps": 20, "nmea": 4, "imu": 100, "wheels": 100, "axis": 50}
 
 UNPLUGGED_S, BACK_S = 5.0, 2.0
 WHEEL_COUNTS = 256
-"""The identifier of the frames that the wheels say in."""
+"""CAN identifier of the wheel counts."""
 
 
 @dataclass
 class Bench:
-    """A vehicle file, a bus, and what is heard on it."""
+    """A vehicle file, a bus, and the messages received on it."""
 
     folder: Path
     url: str
     port: int
     samples: list[Any] = field(default_factory=list)
-    heard: list[float] = field(default_factory=list)
-    """When each sample was heard, seconds of the monotonic clock."""
+    received_at: list[float] = field(default_factory=list)
+    """When each sample was received, seconds of the monotonic clock."""
     reports: list[DriverHealth] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -115,19 +115,19 @@ class Bench:
     def vehicle(self) -> Path:
         return self.folder / "vehicle.yaml"
 
-    def hear(self, name: str) -> None:
+    def subscribe(self, name: str) -> None:
         channel, type_name = CHANNELS[name]
 
         def handle(_: str, data: bytes) -> None:
-            self.heard.append(time.monotonic())
+            self.received_at.append(time.monotonic())
             self.samples.append(decode(type_name, data))
 
         self.bus.subscribe(channel, handle).set_queue_capacity(0)
 
     def wait(self, arrived: Callable[[], bool], what: str) -> None:
-        if not wait_until(self.bus, arrived, PATIENCE_S):
-            said = "".join(f"\n{log.name}:\n{log.read_text()}" for log in sorted(self.folder.glob("*.log")))
-            pytest.fail(f"{what} did not come; {self.reports[-1:]}{said}")
+        if not wait_until(self.bus, arrived, TIMEOUT_S):
+            output = "".join(f"\n{log.name}:\n{log.read_text()}" for log in sorted(self.folder.glob("*.log")))
+            pytest.fail(f"{what} did not come; {self.reports[-1:]}{output}")
 
     def elapse(self, seconds: float) -> None:
         wait_until(self.bus, lambda: False, seconds)
@@ -139,7 +139,9 @@ class Bench:
     def driver(self, name: str, *arguments: str) -> Iterator[subprocess.Popen[str]]:
         with (
             (self.folder / "driver.log").open("a") as log,
-            started((*MODELSERVER, "driver", name, "-c", self.vehicle, *arguments), self.url, stderr=log) as process,
+            run_process(
+                (*MODELSERVER, "driver", name, "-c", self.vehicle, *arguments), self.url, stderr=log
+            ) as process,
         ):
             yield process
 
@@ -157,11 +159,11 @@ class Bench:
         command = (*MODELSERVER, "emulate", name, "-c", self.vehicle, *lines[name], *arguments)
         with (
             (self.folder / "device.log").open("a") as log,
-            started(command, self.url, stderr=log, stdout=subprocess.PIPE) as process,
+            run_process(command, self.url, stderr=log, stdout=subprocess.PIPE) as process,
         ):
             assert process.stdout is not None
             with process.stdout:
-                assert "speaks on" in process.stdout.readline(), (self.folder / "device.log").read_text()
+                assert " is on " in process.stdout.readline(), (self.folder / "device.log").read_text()
                 yield process
 
 
@@ -192,7 +194,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 @contextmanager
 def counted_frames(bench: Bench) -> Iterator[list[float]]:
-    """Count what the wheels say on the CAN bus, in the order of its coming, seconds of the monotonic clock."""
+    """Yield the receive times of the wheel frames on the CAN bus, seconds of the monotonic clock."""
     frames: list[float] = []
     ending = threading.Event()
     link = CanLink(f"239.74.163.2:{bench.port}", "udp_multicast")
@@ -217,7 +219,7 @@ def counted_frames(bench: Bench) -> Iterator[list[float]]:
 def test_given_a_device_unplugged_for_5_s_then_it_streams_within_2_s_of_its_return_and_nothing_is_lost(
     bench: Bench, name: str
 ) -> None:
-    bench.hear(name)
+    bench.subscribe(name)
     enough = round(2.0 * RATES_HZ[name]) + 8
     with ExitStack() as stack:
         frames = stack.enter_context(counted_frames(bench)) if name == "wheels" else None
@@ -227,8 +229,8 @@ def test_given_a_device_unplugged_for_5_s_then_it_streams_within_2_s_of_its_retu
             bench.wait(lambda: len(bench.samples) >= enough, "samples")
             bench.wait(lambda: bench.phase() is DriverPhase.STREAMING, "streaming")
             device.kill()
-            device.wait(PATIENCE_S)
-            # as the system does with the name of an adapter that is pulled out
+            device.wait(TIMEOUT_S)
+            # as the system does with the name of an unplugged adapter
             (bench.folder / name).unlink(missing_ok=True)
         bench.elapse(UNPLUGGED_S)
         before = len(bench.samples)
@@ -237,12 +239,12 @@ def test_given_a_device_unplugged_for_5_s_then_it_streams_within_2_s_of_its_retu
             back = time.monotonic()
             bench.wait(lambda: len(bench.samples) >= before + enough, "samples after its return")
             bench.wait(lambda: bench.phase() is DriverPhase.STREAMING, "streaming after its return")
-        assert bench.heard[before] - back < BACK_S
+        assert bench.received_at[before] - back < BACK_S
         if frames is not None:
             bench.wait(lambda: len(bench.samples) >= len(frames), f"a sample for each of {len(frames)} frames")
             assert len(bench.samples) == len(frames)
         driver.send_signal(signal.SIGTERM)
-        assert driver.wait(PATIENCE_S) == 0
+        assert driver.wait(TIMEOUT_S) == 0
     bench.wait(lambda: bench.reports[-1].text == "ended", "the last report")
     health = bench.reports[-1]
     assert (health.source, health.text) == (name, "ended")
@@ -269,8 +271,8 @@ def assert_rate(name: str, samples: list[Any]) -> None:
         assert steps == pytest.approx([period_us] * len(steps), abs=2)
 
 
-def test_given_a_stall_and_damage_then_the_driver_tells_and_recovers(bench: Bench) -> None:
-    bench.hear("imu")
+def test_given_a_stall_and_damage_then_the_driver_reports_and_recovers(bench: Bench) -> None:
+    bench.subscribe("imu")
     with bench.driver("imu"), bench.device("imu", "--fault", "corrupt@3:5", "--fault", "stall@4:1.5"):
         bench.wait(lambda: bool(bench.samples), "samples")
         bench.wait(lambda: any(report.phase is DriverPhase.SILENT for report in bench.reports), "silence")
@@ -279,18 +281,18 @@ def test_given_a_stall_and_damage_then_the_driver_tells_and_recovers(bench: Benc
 
 
 def test_given_a_raw_recording_when_played_then_the_same_is_measured_without_the_device(bench: Bench) -> None:
-    bench.hear("gps")
+    bench.subscribe("gps")
     raw = bench.folder / "gps.raw"
     with bench.device("gps"), bench.driver("gps", "--record-raw", str(raw)) as driver:
         bench.wait(lambda: len(bench.samples) >= 4, "samples")
         driver.send_signal(signal.SIGTERM)
-        assert driver.wait(PATIENCE_S) == 0
-    # what it said before it ended has been heard when its last report has
+        assert driver.wait(TIMEOUT_S) == 0
+    # all its messages have been received once its last report has
     bench.wait(lambda: bool(bench.reports) and bench.reports[-1].text == "ended", "the last report")
     first = list(bench.samples)
     bench.samples.clear()
     with bench.driver("gps", "--play-raw", str(raw)) as driver:
-        assert driver.wait(PATIENCE_S) == 0
+        assert driver.wait(TIMEOUT_S) == 0
     bench.wait(lambda: len(bench.samples) >= 4, "samples of the recording")
     measured = [(each.latitude_deg, each.longitude_deg, each.height_ellipsoidal) for each in first]
     again = [(each.latitude_deg, each.longitude_deg, each.height_ellipsoidal) for each in bench.samples]
@@ -305,10 +307,10 @@ def test_given_a_raw_recording_when_played_then_the_same_is_measured_without_the
         ("axis", "exception@2:4", "exception 4"),
     ],
 )
-def test_given_a_fault_of_the_devices_own_kind_then_the_driver_tells_it_and_recovers(
+def test_given_a_fault_of_the_devices_own_kind_then_the_driver_reports_it_and_recovers(
     bench: Bench, name: str, fault: str, text: str
 ) -> None:
-    bench.hear(name)
+    bench.subscribe(name)
     with bench.driver(name):
         bench.wait(lambda: bool(bench.reports), "a report without a device")
         with bench.device(name, "--fault", fault):
@@ -316,21 +318,21 @@ def test_given_a_fault_of_the_devices_own_kind_then_the_driver_tells_it_and_reco
             # it was silent before there was a device, too
             bench.reports.clear()
             bench.wait(lambda: any(text in report.text for report in bench.reports), text)
-            told = len(bench.samples)
-            bench.wait(lambda: len(bench.samples) > told + 5, "samples after the fault")
+            count_before = len(bench.samples)
+            bench.wait(lambda: len(bench.samples) > count_before + 5, "samples after the fault")
             bench.wait(lambda: bench.phase() is DriverPhase.STREAMING, "streaming after the fault")
 
 
 def test_given_commands_then_the_vehicle_drives_and_when_they_cease_it_stops(bench: Bench) -> None:
-    bench.hear("raptor")
+    bench.subscribe("raptor")
     seq = itertools.count(1)
-    said = [0.0]
+    sent = [0.0]
 
     def command() -> None:
-        if time.monotonic() - said[0] >= 0.1:
-            said[0] = time.monotonic()
-            wish = VehicleCommand(time.time_ns() // 1000, 0.3, next(seq), "operator", 1.0, 0.1)
-            bench.bus.publish("VEHICLE_COMMAND", encode(wish))
+        if time.monotonic() - sent[0] >= 0.1:
+            sent[0] = time.monotonic()
+            command_message = VehicleCommand(time.time_ns() // 1000, 0.3, next(seq), "operator", 1.0, 0.1)
+            bench.bus.publish("VEHICLE_COMMAND", encode(command_message))
 
     def drives() -> bool:
         command()
@@ -343,13 +345,13 @@ def test_given_commands_then_the_vehicle_drives_and_when_they_cease_it_stops(ben
         assert bench.samples[-1].steering_angle == pytest.approx(0.1, abs=0.01)
         bench.wait(lambda: bench.samples[-1].forward_speed == 0.0, "a stop")
         # 0.3 s that the command holds, 0.33 s to brake, and what a loaded machine takes
-        assert bench.heard[-1] - said[0] < 2.0
-        assert bench.samples[-1].commands_refused == 0
+        assert bench.received_at[-1] - sent[0] < 2.0
+        assert bench.samples[-1].commands_rejected == 0
         bench.wait(lambda: any("'operator': stop" in report.text for report in bench.reports), "word of the stop")
         bench.wait(lambda: dict(bench.reports[-1].counters).get("dead_man") == 1, "its count")
 
 
-def test_given_a_log_then_the_emulated_device_measures_what_stands_in_it(bench: Bench) -> None:
+def test_given_a_log_then_the_emulated_device_measures_what_is_stationary_in_it(bench: Bench) -> None:
     log = bench.folder / "drive.lcm"
     start = 1_700_000_000_000_000
     events = lcm.EventLog(str(log), "w", overwrite=True)
@@ -368,7 +370,7 @@ def test_given_a_log_then_the_emulated_device_measures_what_stands_in_it(bench: 
         )
         events.write_event(utime, "GPS", encode(fix))
     events.close()
-    bench.hear("gps")
+    bench.subscribe("gps")
     with bench.driver("gps"):
         bench.wait(lambda: bool(bench.reports), "a report without a device")
         with bench.device("gps", "--from", str(log)):
@@ -382,7 +384,7 @@ def test_given_a_log_then_the_emulated_device_measures_what_stands_in_it(bench: 
     assert_rate("gps", bench.samples)
 
 
-def test_given_iron_when_the_vehicle_is_turned_then_its_own_field_is_found_and_the_device_keeps_it(
+def test_given_iron_when_the_vehicle_is_turned_then_its_own_field_is_found_and_the_device_stores_it(
     bench: Bench,
 ) -> None:
     state = bench.folder / "imu.eeprom"
@@ -395,25 +397,25 @@ def test_given_iron_when_the_vehicle_is_turned_then_its_own_field_is_found_and_t
     offsets = [float(word) for word in done.stdout.splitlines()[0].split()[1:3]]
     assert offsets == pytest.approx([12.0, -7.0], abs=0.5)
     assert "are stored and were read back" in done.stdout
-    kept = dict(tuple(map(int, line.split())) for line in state.read_text().splitlines())
-    counts = [(kept[address] + 32768) % 65536 - 32768 for address in Address.HARD_IRON]
+    stored = dict(tuple(map(int, line.split())) for line in state.read_text().splitlines())
+    counts = [(stored[address] + 32768) % 65536 - 32768 for address in EepromAddress.HARD_IRON]
     assert counts[:2] == pytest.approx([axis * 1e-6 / 1e-4 * 16384 for axis in offsets], abs=1)
-    # switched off and on again it still has them; a vehicle that stands tells nothing, and leaves them
+    # after a power cycle it still has them; a stationary vehicle cannot change them
     with bench.device("imu", "--scenario", "stand", "--state", str(state)):
         vain = run(bench, "driver", "imu", "-c", bench.vehicle, "--hard-iron", "--seconds", "1")
     assert vain.returncode == 1
-    before = [(kept[address] + 32768) % 65536 - 32768 for address in Address.HARD_IRON]
+    before = [(stored[address] + 32768) % 65536 - 32768 for address in EepromAddress.HARD_IRON]
     assert f"offsets before {before} counts" in vain.stderr
     assert "turn the vehicle further" in vain.stderr
-    assert dict(tuple(map(int, line.split())) for line in state.read_text().splitlines()) == kept
+    assert dict(tuple(map(int, line.split())) for line in state.read_text().splitlines()) == stored
 
 
 def run(bench: Bench, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
     command = [*MODELSERVER, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S, check=False)
 
 
-def test_given_mistyped_names_then_the_nearest_is_told(bench: Bench) -> None:
+def test_given_mistyped_names_then_the_nearest_is_reported(bench: Bench) -> None:
     wrong = invoke(bench.url, "driver", "gsp", "-c", bench.vehicle)
     assert wrong.returncode == 2
     assert "did you mean gps?" in wrong.stderr
@@ -428,9 +430,9 @@ def test_given_mistyped_names_then_the_nearest_is_told(bench: Bench) -> None:
     for command in (("driver", "gps", "-c"), ("check",)):
         slip = invoke(bench.url, *command, bench.vehicle)
         assert slip.returncode == 1
-        said = slip.stderr + slip.stdout
-        assert "unknown key 'buads'" in said
-        assert "write bauds" in said
+        output = slip.stderr + slip.stdout
+        assert "unknown key 'buads'" in output
+        assert "write bauds" in output
 
 
 def test_given_list_then_ports_and_drivers_are_shown(bench: Bench) -> None:
@@ -439,7 +441,7 @@ def test_given_list_then_ports_and_drivers_are_shown(bench: Bench) -> None:
     assert "novatel: NovAtel OEM4" in shown.stdout
 
 
-def test_given_a_port_in_use_then_the_emulator_says_so(bench: Bench) -> None:
+def test_given_a_port_in_use_then_the_emulator_reports_it(bench: Bench) -> None:
     with bench.device("nmea"):
         second = invoke(bench.url, "emulate", "nmea", "-c", bench.vehicle, "--tcp", str(bench.port))
     assert second.returncode == 1

@@ -39,11 +39,11 @@ def query(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
     with (folder / f"{language}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        return _built(language, folder / f"client_{language}")
+        return build_client(language, folder / f"client_{language}")
 
 
-def _built(language: str, folder: Path) -> Path:
-    """Build a client outside the source tree, as its README says; make does nothing where it is built already."""
+def build_client(language: str, folder: Path) -> Path:
+    """Build a client outside the source tree, as in its README; make skips what is already built."""
     arguments = [f"BUILD={folder}", f"PYTHON={sys.executable}", "CFLAGS=-O0"]
     done = subprocess.run(
         ["make", "-C", ROOT / "examples" / f"client_{language}", *arguments],
@@ -70,7 +70,7 @@ def _numbers(output: str, key: str) -> list[float]:
     [
         ("Digiclops:ImagePlane", "FrontNoddingSICK:Origin"),
         ("FrontNoddingSICK:Origin", "Digiclops:ImagePlane"),
-        ("GPSAntenna:PhaseCentre", "Raptor:CG"),
+        ("GPSAntenna:PhaseCenter", "Raptor:CG"),
     ],
 )
 def test_given_two_frames_when_asked_then_the_answer_is_the_models(
@@ -86,7 +86,7 @@ def test_given_two_frames_when_asked_then_the_answer_is_the_models(
     assert "\nvalid yes\n" in done.stdout
 
 
-def test_given_a_mistyped_frame_when_asked_then_the_nearest_name_is_said(query: Path, daemon_url: str) -> None:
+def test_given_a_mistyped_frame_when_asked_then_the_nearest_name_is_reported(query: Path, daemon_url: str) -> None:
     done = _run(query, daemon_url, "Digiclops:ImagePlan", "Raptor:CG")
     assert done.returncode == 1
     assert done.stdout == ""
@@ -94,28 +94,30 @@ def test_given_a_mistyped_frame_when_asked_then_the_nearest_name_is_said(query: 
     assert "Nearest: Digiclops:ImagePlane" in done.stderr
 
 
-def test_given_no_pose_yet_when_the_world_is_asked_for_then_the_reason_is_said(query: Path, daemon_url: str) -> None:
+def test_given_no_pose_yet_when_the_world_is_asked_for_then_the_reason_is_reported(
+    query: Path, daemon_url: str
+) -> None:
     done = _run(query, daemon_url, "Raptor:CG", "World:UTM")
     assert done.returncode == 1
     assert "status 4" in done.stderr
     assert "GPS" in done.stderr
 
 
-def test_given_no_server_when_asked_then_it_says_so(query: Path, lcm_url: str) -> None:
+def test_given_no_server_when_asked_then_it_reports_it(query: Path, lcm_url: str) -> None:
     done = _run(query, lcm_url, "Digiclops:ImagePlane", "Raptor:CG")
     assert done.returncode == 1
     assert "is the server running?" in done.stderr
 
 
-def test_given_one_argument_when_run_then_usage_is_said(query: Path, lcm_url: str) -> None:
+def test_given_one_argument_when_run_then_usage_is_reported(query: Path, lcm_url: str) -> None:
     done = _run(query, lcm_url, "Digiclops:ImagePlane")
     assert done.returncode == 2
     assert "usage: query FRAME_OF_INTEREST FRAME_OF_REFERENCE" in done.stderr
 
 
-def test_given_the_example_for_asyncio_then_platform_and_mirror_say_the_same(daemon_url: str) -> None:
+def test_given_the_example_for_asyncio_then_platform_and_mirror_report_the_same(daemon_url: str) -> None:
     path = ROOT / "examples" / "python" / "asyncio_client.py"
-    pair = ("Digiclops:ImagePlane", "GPSAntenna:PhaseCentre")
+    pair = ("Digiclops:ImagePlane", "GPSAntenna:PhaseCenter")
     done = subprocess.run(
         [sys.executable, path, *pair],
         env=os.environ | {"LCM_DEFAULT_URL": daemon_url},
@@ -129,7 +131,7 @@ def test_given_the_example_for_asyncio_then_platform_and_mirror_say_the_same(dae
     np.testing.assert_allclose([list(map(float, each)) for each in (first, second)], [expected] * 2, atol=2e-6)
 
 
-def test_given_the_example_for_asyncio_and_a_mistyped_frame_then_the_nearest_is_said(daemon_url: str) -> None:
+def test_given_the_example_for_asyncio_and_a_mistyped_frame_then_the_nearest_is_reported(daemon_url: str) -> None:
     path = ROOT / "examples" / "python" / "asyncio_client.py"
     done = subprocess.run(
         [sys.executable, path, "Digiclops:ImagePlan", "Raptor:CG"],
@@ -153,7 +155,7 @@ def test_given_a_client_then_it_is_written_without_modelserver(language: str) ->
 def test_given_the_example_of_an_own_measurement_then_it_takes_few_lines_and_helps() -> None:
     path = ROOT / "examples" / "python" / "own_measurement.py"
     _, part = path.read_text(encoding="utf-8").split("# --- the measurement", 1)
-    lines = part.split("# --- a drive", 1)[0].splitlines()[1:]
+    lines = part.split("# --- a simulated drive", 1)[0].splitlines()[1:]
     assert sum(bool(line.strip()) for line in lines) < 40
     done = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=300)
     assert (done.returncode, done.stderr) == (0, "")

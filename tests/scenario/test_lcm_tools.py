@@ -9,12 +9,12 @@ from pathlib import Path
 
 import lcm
 import pytest
-from support_lcm import Listener, running_daemon, started, wait_until
+from support_lcm import Listener, run_process, running_daemon, wait_until
 
 from modelserver.messages import Health, PoseAnswer
 from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode
-from mstools.spy.lcm_wheel import binary
+from mstools.spy.lcm_wheel import find_binary
 
 RAPTOR = Path(__file__).resolve().parents[2] / "config" / "raptor" / "vehicle.yaml"
 POSES = 20
@@ -36,11 +36,14 @@ def recording(daemon_url: str, tmp_path_factory: pytest.TempPathFactory) -> Path
     path = folder / "run.lcmlog"
     with (
         (folder / "errors").open("w+") as errors,
-        started(
-            [binary("lcm-logger"), "--quiet", "--flush-interval=50", path], daemon_url, stdout=errors, stderr=errors
+        run_process(
+            [find_binary("lcm-logger"), "--quiet", "--flush-interval=50", path],
+            daemon_url,
+            stdout=errors,
+            stderr=errors,
         ) as logger,
     ):
-        # the logger does not say when it listens; its file grows once it does
+        # the logger does not report when it listens; its file grows once it does
         listener = Listener(daemon_url, "POSE")
         assert wait_until(listener.bus, lambda: _size(path) > 40_000 or logger.poll() is not None)
         assert logger.poll() is None, (folder / "errors").read_text()
@@ -73,24 +76,24 @@ def test_given_a_running_daemon_when_lcm_logger_records_then_every_event_decodes
         assert isinstance(pose, PoseAnswer)
         assert pose.transformation.frame_of_interest == "Raptor:CG"
         assert pose.transformation.frame_of_reference == "World:UTM"
-        assert not pose.transformation.valid  # no sensor has spoken
+        assert not pose.transformation.is_valid  # no sensor has spoken
     utimes = [pose.transformation.utime for pose in poses if isinstance(pose, PoseAnswer)]
     assert utimes == sorted(utimes)
     assert all(isinstance(each, Health) for each in by_channel.get("MODELSERVER_HEALTH", []))
 
 
-def test_given_a_log_when_lcm_logplayer_plays_it_then_a_subscriber_hears_the_same_poses(
+def test_given_a_log_when_lcm_logplayer_plays_it_then_a_subscriber_receives_the_same_poses(
     recording: Path, lcm_url: str
 ) -> None:
     recorded = [event.data for event in _events(recording) if event.channel == "POSE"]
     listener = Listener(lcm_url, "POSE")
-    with started([binary("lcm-logplayer"), recording], lcm_url, stdout=subprocess.DEVNULL) as player:
+    with run_process([find_binary("lcm-logplayer"), recording], lcm_url, stdout=subprocess.DEVNULL) as player:
         assert listener.wait(POSES)
         assert player.wait(60) == 0
-    assert listener.heard[:POSES] == recorded[:POSES]
+    assert listener.received[:POSES] == recorded[:POSES]
 
 
-def test_given_the_daemon_when_told_to_end_then_it_ends_in_time_with_0(tmp_path: Path) -> None:
+def test_given_the_daemon_when_reported_to_end_then_it_ends_in_time_with_0(tmp_path: Path) -> None:
     with running_daemon(RAPTOR, tmp_path) as url:
         listener = Listener(url, "POSE")
         assert listener.wait()

@@ -16,12 +16,12 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import pytest
-from conftest import BRISK, Daemon
-from support_lcm import MODELSERVER, PATIENCE_S, invoke, started
+from conftest import FAST_HEALTH, Daemon
+from support_lcm import MODELSERVER, TIMEOUT_S, invoke, run_process
 from support_samples import VEHICLE, write_vehicle
 
 from modelserver.messages import Invalid
-from modelserver.service.probing.listening import hears_itself, who_answers
+from modelserver.server.diagnostics.bus_probe import discover_servers, probe_delivery
 
 StartDaemon = Callable[..., Daemon]
 NO_SENSORS = "".join(
@@ -37,7 +37,7 @@ def ran(url: str, *arguments: object, **options: object) -> subprocess.Completed
         env=environment,
         capture_output=True,
         text=True,
-        timeout=2 * PATIENCE_S,
+        timeout=2 * TIMEOUT_S,
         **options,  # type: ignore[call-overload]
     )
 
@@ -45,7 +45,7 @@ def ran(url: str, *arguments: object, **options: object) -> subprocess.Completed
 # --- health -------------------------------------------------------------------------------------------------
 
 
-def test_given_a_real_daemon_then_its_report_tells_of_process_loop_and_sensors(start_daemon: StartDaemon) -> None:
+def test_given_a_real_daemon_then_its_report_reports_of_process_loop_and_sensors(start_daemon: StartDaemon) -> None:
     daemon = start_daemon()
     fresh = daemon.health()
     assert {each.channel: (each.count, each.silent) for each in fresh.channels} == {
@@ -57,11 +57,9 @@ def test_given_a_real_daemon_then_its_report_tells_of_process_loop_and_sensors(s
     later = daemon.health(lambda health: health.cpu_share == health.cpu_share)
     assert 0.0 < later.cpu_share < 1.5
     assert 30_000_000 < later.memory < 1_000_000_000
-    assert (
-        0.0 < later.tick_lateness_p50 <= later.tick_lateness_p90 <= later.tick_lateness_p99 <= later.tick_lateness_max
-    )
+    assert 0.0 < later.tick_latency_p50 <= later.tick_latency_p90 <= later.tick_latency_p99 <= later.tick_latency_max
     # then the sensors speak, and fall silent
-    daemon.fed()
+    daemon.feed()
     silent = daemon.health(
         lambda health: {"sensor:gps", "sensor:imu"} == {each.channel for each in health.channels if each.silent}
     )
@@ -72,24 +70,29 @@ def test_given_a_real_daemon_then_its_report_tells_of_process_loop_and_sensors(s
 # --- status -------------------------------------------------------------------------------------------------
 
 
-def test_given_a_daemon_without_a_pose_then_status_tells_why_and_exits_3(start_daemon: StartDaemon) -> None:
+def test_given_a_daemon_without_a_pose_then_status_reports_why_and_exits_3(start_daemon: StartDaemon) -> None:
     daemon = start_daemon()
     done = ran(daemon.url, "status")
     assert done.returncode == 3, done.stderr
-    for words in ("cart: STARTING", "NOT VALID: no usable GPS fix yet", "never heard", f"process {daemon.process.pid}"):
+    for words in (
+        "cart: STARTING",
+        "NOT VALID: no usable GPS fix yet",
+        "never received",
+        f"process {daemon.process.pid}",
+    ):
         assert words in done.stdout
     data = json.loads(invoke(daemon.url, "status", "--json").stdout)
-    assert (data["state"], data["well"], data["pid"]) == ("STARTING", False, daemon.process.pid)
+    assert (data["state"], data["healthy"], data["pid"]) == ("STARTING", False, daemon.process.pid)
 
 
 def test_given_a_vehicle_without_sensors_then_it_is_well_and_status_exits_0(start_daemon: StartDaemon) -> None:
     done = invoke(start_daemon(NO_SENSORS).url, "status")
     assert done.returncode == 0, done.stderr
-    assert "names no sensor to localize by" in done.stdout
+    assert "no localization sensor is configured" in done.stdout
 
 
-def test_given_the_wrong_prefix_then_status_offers_the_one_that_is_heard(start_daemon: StartDaemon) -> None:
-    daemon = start_daemon(BRISK + "lcm: {channel_prefix: RAPTOR_}\n", prefix="RAPTOR_")
+def test_given_the_wrong_prefix_then_status_offers_the_one_that_is_received(start_daemon: StartDaemon) -> None:
+    daemon = start_daemon(FAST_HEALTH + "lcm: {channel_prefix: RAPTOR_}\n", prefix="RAPTOR_")
     done = invoke(daemon.url, "status", "--prefix", "RAPTR_", "--timeout", "0.5")
     assert (done.returncode, done.stdout) == (1, "")
     assert "Did you mean --prefix 'RAPTOR_'?" in done.stderr
@@ -97,10 +100,10 @@ def test_given_the_wrong_prefix_then_status_offers_the_one_that_is_heard(start_d
     assert invoke(daemon.url, "status", "-c", daemon.folder / "vehicle.yaml").returncode == 3
 
 
-def test_given_an_empty_bus_then_status_says_what_to_look_at_and_exits_1(lcm_url: str) -> None:
+def test_given_an_empty_bus_then_status_reports_what_to_look_at_and_exits_1(lcm_url: str) -> None:
     done = invoke(lcm_url, "status", "--timeout", "0.2")
     assert (done.returncode, done.stdout) == (1, "")
-    assert "modelserver doctor looks at the bus" in done.stderr
+    assert "modelserver doctor checks the bus" in done.stderr
     assert lcm_url in done.stderr
 
 
@@ -108,12 +111,12 @@ def test_given_watch_into_a_pipe_then_there_is_a_line_for_each_report_until_it_i
     start_daemon: StartDaemon,
 ) -> None:
     daemon = start_daemon()
-    with started([*MODELSERVER, "status", "--watch"], daemon.url, stdout=subprocess.PIPE) as process:
+    with run_process([*MODELSERVER, "status", "--watch"], daemon.url, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         with process.stdout:
             lines = [process.stdout.readline() for _ in range(3)]
             process.send_signal(signal.SIGINT)
-            assert process.wait(PATIENCE_S) == 0
+            assert process.wait(TIMEOUT_S) == 0
     assert all("STARTING; pose not valid" in line for line in lines)
 
 
@@ -132,10 +135,10 @@ def test_given_no_screen_then_spy_prints_every_channel_once_and_the_fields_of_on
     assert rows["state"] == ["state", "0", "STARTING"]
 
 
-def test_given_a_mistyped_channel_then_spy_offers_the_nearest_that_is_heard(start_daemon: StartDaemon) -> None:
+def test_given_a_mistyped_channel_then_spy_offers_the_nearest_that_is_received(start_daemon: StartDaemon) -> None:
     done = invoke(start_daemon().url, "spy", "--seconds", "1", "--channel", "POSE_ODON")
     assert done.returncode == 1
-    assert "nothing came on 'POSE_ODON'; nearest: 'POSE_ODOM'" in done.stderr
+    assert "no message on 'POSE_ODON'; nearest: 'POSE_ODOM'" in done.stderr
 
 
 class Screen:
@@ -155,11 +158,11 @@ class Screen:
             env=environment | {"LCM_DEFAULT_URL": url, "TERM": "xterm-256color"},
             start_new_session=True,
         )
-        self.said = ""
+        self.output = ""
 
     def shows(self, pattern: str) -> bool:
         """Return whether what matches comes, from now on, in time."""
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         seen = ""
         while time.monotonic() < deadline:
             ready, _, _ = select.select([self.main], [], [], 0.5)
@@ -170,7 +173,7 @@ class Screen:
                     break  # the program has ended
             if re.search(pattern, seen):
                 return True
-        self.said = seen
+        self.output = seen
         return False
 
     def press(self, keys: bytes) -> None:
@@ -202,12 +205,12 @@ def test_given_a_terminal_then_spy_shows_the_channels_and_keys_open_the_fields(
     screen: Callable[..., Screen],
 ) -> None:
     spy = screen("spy")
-    assert spy.shows(r"POSE_VECTOR +pose_vector_t"), spy.said
+    assert spy.shows(r"POSE_VECTOR +pose_vector_t"), spy.output
     spy.press(b"\x1b[F\x1b[H\r")
     # the first channel by its name is that of the health report
-    assert spy.shows(r"uptime +[0-9.]+ "), spy.said
+    assert spy.shows(r"uptime +[0-9.]+ "), spy.output
     spy.press(b"q")
-    assert spy.process.wait(PATIENCE_S) == 0
+    assert spy.process.wait(TIMEOUT_S) == 0
     # echo and line editing are as they were
     assert termios.tcgetattr(spy.end)[3] == spy.before[3]
 
@@ -217,17 +220,17 @@ def test_given_a_channel_in_a_terminal_then_its_fields_are_open_and_a_signal_end
     screen: Callable[..., Screen], number: signal.Signals
 ) -> None:
     spy = screen("spy", "--channel", "POSE")
-    assert spy.shows(r"frame_of_reference +'World:UTM'"), spy.said
+    assert spy.shows(r"frame_of_reference +'World:UTM'"), spy.output
     spy.process.send_signal(number)
-    assert spy.process.wait(PATIENCE_S) == 0
+    assert spy.process.wait(TIMEOUT_S) == 0
     assert termios.tcgetattr(spy.end)[3] == spy.before[3]
 
 
 def test_given_a_terminal_then_status_watch_shows_the_report_until_ctrl_c(screen: Callable[..., Screen]) -> None:
     watch = screen("status", "--watch")
-    assert watch.shows("cart: STARTING"), watch.said
+    assert watch.shows("cart: STARTING"), watch.output
     watch.process.send_signal(signal.SIGINT)
-    assert watch.process.wait(PATIENCE_S) == 0
+    assert watch.process.wait(TIMEOUT_S) == 0
 
 
 # --- doctor, and the probe at the start ---------------------------------------------------------------------
@@ -237,41 +240,41 @@ def test_given_a_bus_that_is_well_then_our_own_messages_come_back_and_one_daemon
     start_daemon: StartDaemon,
 ) -> None:
     daemon = start_daemon()
-    assert hears_itself(daemon.url) == (True, True)
-    answers = who_answers(daemon.url, "")
+    assert probe_delivery(daemon.url) == (True, True)
+    answers = discover_servers(daemon.url, "")
     assert answers.replies == 1
     (server,) = answers.servers
     assert (server.pid, server.vehicle, server.prefix) == (daemon.process.pid, "cart", "")
     done = ran(daemon.url, "doctor", "-c", daemon.folder / "vehicle.yaml", "--json")
-    said = {each["subject"]: each for each in json.loads(done.stdout)["findings"]}
-    assert said["own message"]["grade"] == "ok"
-    assert f"process {daemon.process.pid} on" in said["daemon"]["seen"]
-    assert said["vehicle file"]["grade"] == said["state"]["grade"] == "ok"
+    output = {each["subject"]: each for each in json.loads(done.stdout)["findings"]}
+    assert output["own message"]["level"] == "ok"
+    assert f"process {daemon.process.pid} on" in output["daemon"]["observed"]
+    assert output["vehicle file"]["level"] == output["state"]["level"] == "ok"
     assert done.returncode in (0, 1)
 
 
-def test_given_two_daemons_on_one_bus_then_each_notices_the_other_until_it_is_gone_and_doctor_finds_both(
+def test_given_two_daemons_on_one_bus_then_each_warns_of_the_other_until_it_ends_and_doctor_finds_both(
     start_daemon: StartDaemon, tmp_path: Path
 ) -> None:
     first = start_daemon()
     second = start_daemon(folder=tmp_path / "second")
     pids = {first.process.pid, second.process.pid}
 
-    def noticed(pid: int, other: int) -> bool:
-        health = first.health(lambda health: health.pid == pid and "servers" in dict(health.notices))
-        return f"process {other} on" in dict(health.notices)["servers"]
+    def is_reported(pid: int, other: int) -> bool:
+        health = first.health(lambda health: health.pid == pid and "servers" in dict(health.warnings))
+        return f"process {other} on" in dict(health.warnings)["servers"]
 
-    assert noticed(first.process.pid, second.process.pid)
-    assert noticed(second.process.pid, first.process.pid)
+    assert is_reported(first.process.pid, second.process.pid)
+    assert is_reported(second.process.pid, first.process.pid)
     done = invoke(first.url, "doctor")
     assert done.returncode == 3
     assert "2 answer at once" in done.stdout
     assert all(f"process {pid} on" in done.stdout for pid in pids)
     assert second.end() == 0
-    first.health(lambda health: health.pid == first.process.pid and "servers" not in dict(health.notices))
+    first.health(lambda health: health.pid == first.process.pid and "servers" not in dict(health.warnings))
 
 
-def unshared() -> list[str]:
+def unshare_command() -> list[str]:
     """The words before a command that give it a network of its own, without any route."""
     words = ["unshare", "--net"] if os.geteuid() == 0 else ["unshare", "--net", "--map-root-user"]
     if shutil.which("unshare") is None or shutil.which("ip") is None:
@@ -284,18 +287,18 @@ def unshared() -> list[str]:
 SCRIPT = """\
 "$@" run -c vehicle.yaml 2>run.log; echo run $?
 "$@" doctor --json >before.json; echo before $?
-python - <<'END' >mend.sh
+python - <<'END' >fix.sh
 import json
 findings = json.load(open("before.json"))["findings"]
-print(next(each["command"] for each in findings if each["grade"] == "error").replace("sudo ", ""))
+print(next(each["command"] for each in findings if each["level"] == "error").replace("sudo ", ""))
 END
-sh -e mend.sh; echo mended $?
+sh -e fix.sh; echo fixed $?
 "$@" doctor --json >after.json; echo after $?
 """
 
 
-def test_given_a_machine_without_a_route_then_the_daemon_refuses_and_doctors_command_mends_it(tmp_path: Path) -> None:
-    words = unshared()
+def test_given_a_machine_without_a_route_then_the_daemon_refuses_and_doctors_command_fixes_it(tmp_path: Path) -> None:
+    words = unshare_command()
     write_vehicle(tmp_path)
     python = MODELSERVER[0]
     done = subprocess.run(
@@ -303,12 +306,12 @@ def test_given_a_machine_without_a_route_then_the_daemon_refuses_and_doctors_com
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=2 * PATIENCE_S,
+        timeout=2 * TIMEOUT_S,
         env=os.environ | {"LCM_DEFAULT_URL": ""},
     )
     codes = dict(line.split() for line in done.stdout.splitlines())
-    assert (codes["run"], codes["before"], codes["mended"]) == ("1", "3", "0"), done.stdout + done.stderr
+    assert (codes["run"], codes["before"], codes["fixed"]) == ("1", "3", "0"), done.stdout + done.stderr
     assert "ip route replace 239.255.76.67/32 dev lo" in (tmp_path / "run.log").read_text()
     assert codes["after"] in ("0", "1")
     found = {each["subject"]: each for each in json.loads((tmp_path / "after.json").read_text())["findings"]}
-    assert (found["own message"]["grade"], found["multicast route"]["grade"]) == ("ok", "ok")
+    assert (found["own message"]["level"], found["multicast route"]["level"]) == ("ok", "ok")

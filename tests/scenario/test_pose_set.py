@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 import lcm
 import pytest
-from conftest import BRISK, Daemon
+from conftest import FAST_HEALTH, Daemon
 from support_samples import GEODESY, ORIGIN, drive, imu
 from support_signing import ALLOWED
 
@@ -97,7 +97,7 @@ def test_given_a_pose_near_the_estimate_then_it_is_used_and_one_far_off_is_rejec
 def test_given_no_heading_yet_then_latitude_longitude_and_heading_set_the_pose_outright(
     start_signed: Callable[..., Daemon], run: Run
 ) -> None:
-    daemon = start_signed(BRISK + ALLOWED + KNOWN_ORIGIN)
+    daemon = start_signed(FAST_HEALTH + ALLOWED + KNOWN_ORIGIN)
     latitude, longitude, height = GEODESY.geodetic_from_enu((300.0, 200.0, 5.0))
     with feeding(daemon, only_imu=True):
         code, out, err = run(
@@ -107,7 +107,7 @@ def test_given_no_heading_yet_then_latitude_longitude_and_heading_set_the_pose_o
         found = json.loads(out)
         set_then = daemon.platform().get_state_vector(at=found["decision"]["utime"] + 40_000)
     assert (found["decision"]["verdict"], found["decision"]["reason"]) == ("set", "position and heading were set")
-    wanted = GEODESY.relative(GEODESY.utm_from_geodetic(latitude, longitude, height))
+    wanted = GEODESY.to_relative_utm(GEODESY.utm_from_geodetic(latitude, longitude, height))
     assert found["state_vector"][:3] == pytest.approx(wanted, abs=1e-3)
     assert set_then.position == pytest.approx(wanted, abs=0.5)
     yaw = math.pi / 2 - math.radians(60) + GEODESY.convergence(latitude, longitude)
@@ -117,12 +117,12 @@ def test_given_no_heading_yet_then_latitude_longitude_and_heading_set_the_pose_o
 def test_given_no_permission_then_the_setting_is_named_and_nothing_is_set(daemon: Daemon, run: Run) -> None:
     code, out, err = run(daemon, "--xyz", 0, 0, 0, "--yaw", 0)
     assert (code, out) == (1, "")
-    assert "the pose was not set: the vehicle file does not allow it" in err
+    assert "the pose was not set: the vehicle file does not permit it" in err
     assert "commands: {set_pose: true}" in err
     assert "key_file" in err
 
 
-def test_given_no_key_or_no_origin_then_the_error_says_what_to_do(
+def test_given_no_key_or_no_origin_then_the_error_reports_what_to_do(
     start_signed: Callable[..., Daemon], run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     daemon = start_signed()
@@ -130,9 +130,9 @@ def test_given_no_key_or_no_origin_then_the_error_says_what_to_do(
     assert (code, out) == (1, "")
     assert "the origin of World:UTM is not known yet" in err
     assert "initial_utm" in err
-    daemon.fed()
+    daemon.feed()
     monkeypatch.delenv("MODELSERVER_KEY_FILE")
     code, out, err = run(daemon, "--xyz", 0, 0, 0, "--yaw", 0)
     assert (code, out) == (1, "")
-    assert "it is not signed" in err
+    assert "the command is not signed" in err
     assert "--key FILE" in err

@@ -1,6 +1,6 @@
 """The installed wheel under a real systemd, in a container: it starts, is killed, hangs, reloads, ends, and is removed.
 
-One container for the module; the tests stand in the order of a service's life, and each leaves it serving.
+One container for the module; the tests follow the life of a service, and each leaves it serving.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import pytest
-from support_nspawn import PREFIX, ROOT, SHARED, Machine, built_wheel, install_wheel, machine, why_not
+from support_nspawn import PREFIX, ROOT, SHARED, Machine, boot_machine, build_wheel, install_wheel, skip_reason
 
 pytestmark = [
-    pytest.mark.skipif(bool(why_not()), reason=f"no systemd in a container here: {why_not()}"),
+    pytest.mark.skipif(bool(skip_reason()), reason=f"no systemd in a container here: {skip_reason()}"),
 ]
 
-PATIENCE_S = 20.0
+TIMEOUT_S = 20.0
 SERVICE, DRIVER = "modelserver.service", "modelserver-driver@gps.service"
 GEOMETRY = "/etc/modelserver/geometry.yaml"
 
@@ -32,7 +32,7 @@ with Platform("", timeout=0.1, retries=0, name="probe") as platform:
     for _ in sys.stdin:
         while True:
             try:
-                platform.get_transformation("Raptor:CG", "Raptor:RearAxleCentre")
+                platform.get_transformation("Raptor:CG", "Raptor:RearAxleCenter")
                 break
             except ModelServerError:
                 pass
@@ -48,8 +48,8 @@ class Site:
     program: str
     probe: subprocess.Popen[str]
 
-    def answered(self) -> float:
-        """Return when, on the monotonic clock, a question that is asked from now on has been answered."""
+    def measure_answer(self) -> float:
+        """Send a query and return the monotonic time of its answer."""
         assert self.probe.stdin is not None
         assert self.probe.stdout is not None
         self.probe.stdin.write("\n")
@@ -57,43 +57,43 @@ class Site:
         return float(self.probe.stdout.readline())
 
     def main_pid(self, unit: str = SERVICE) -> str:
-        return self.machine.shown(unit, "MainPID")
+        return self.machine.get_property(unit, "MainPID")
 
-    def until(self, reached: Callable[[], bool], what: str) -> None:
-        deadline = time.monotonic() + PATIENCE_S
+    def wait_until(self, reached: Callable[[], bool], what: str) -> None:
+        deadline = time.monotonic() + TIMEOUT_S
         while not reached():
             assert time.monotonic() < deadline, f"{what}\n{self.machine.journal('modelserver*')}"
             time.sleep(0.02)
 
-    def another(self, before: str, unit: str = SERVICE) -> None:
-        """Return when another process than `before` serves as a unit."""
-        self.until(lambda: self.main_pid(unit) not in ("0", before), f"{unit} was not started anew")
+    def wait_for_restart(self, before: str, unit: str = SERVICE) -> None:
+        """Wait until another process than `before` serves as a unit."""
+        self.wait_until(lambda: self.main_pid(unit) not in ("0", before), f"{unit} was not restarted")
 
-    def another_model(self, before: str) -> str:
-        """Return the revision that is served, once it is another than `before`."""
+    def wait_for_model(self, before: str) -> str:
+        """Wait for a revision other than `before`, and return it."""
         found: list[str] = []
 
         def is_another() -> bool:
             found[:] = [self.status().partition("serving model ")[2].partition(";")[0]]
             return found[0] not in ("", before)
 
-        self.until(is_another, "no other geometry is served")
+        self.wait_until(is_another, "no other geometry is served")
         return found[0]
 
     def status(self) -> str:
-        return self.machine.shown(SERVICE, "StatusText")
+        return self.machine.get_property(SERVICE, "StatusText")
 
-    def needed(self, kill: float, unit: str = SERVICE) -> float:
-        """Return how long serving again would have taken on a machine of its own: the wait, and the work itself."""
-        started = int(self.machine.shown(unit, "ExecMainStartTimestampMonotonic")) * 1e-6
+    def get_needed_time(self, kill: float, unit: str = SERVICE) -> float:
+        """Return the time to serve again on an idle machine: the wait plus the CPU time."""
+        started = int(self.machine.get_property(unit, "ExecMainStartTimestampMonotonic")) * 1e-6
         times = self.machine.run("cat", f"/proc/{self.main_pid(unit)}/stat").stdout.rpartition(")")[2].split()
         # utime and stime are the 14th and 15th of proc(5), and 12 and 13 after the name
         return started - kill + (int(times[11]) + int(times[12])) / os.sysconf("SC_CLK_TCK")
 
-    def written(self) -> list[str]:
+    def list_files(self) -> list[str]:
         """Return every file that an installation may write, with its size, and every folder."""
         found = self.machine.run("find", "/etc", "/var/lib", "-printf", "%p %y %s %m\n").stdout.splitlines()
-        # folders on a tmpfs have the size of what they hold; in /var/lib systemd makes some of its own
+        # folders on a tmpfs have the size of their content; systemd makes some of its own in /var/lib
         etc = [re.sub(r" d \d+", " d", line) for line in found if line.startswith("/etc")]
         return sorted(etc + [line for line in found if line.startswith("/var/lib") and "modelserver" in line])
 
@@ -102,22 +102,22 @@ class Site:
 def fresh(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Machine, str]]:
     """A machine with the wheel, where nothing is installed yet."""
     folder = tmp_path_factory.mktemp("systemd")
-    # what a container's root sees is a folder of the host's
-    wheel = built_wheel(folder)
+    # shared with the container
+    wheel = build_wheel(folder)
     shutil.copytree(ROOT / "config" / "raptor", folder / "raptor")
-    with machine(folder) as booted:
+    with boot_machine(folder) as booted:
         yield booted, install_wheel(booted, wheel)
 
 
 @pytest.fixture(scope="module")
 def before(fresh: tuple[Machine, str]) -> list[str]:
-    """What the machine held before the installation."""
+    """Return the files of the machine before the installation."""
     booted, program = fresh
     site = Site(booted, program, None)  # type: ignore[arg-type]
-    there = site.written()
+    there = site.list_files()
     shown = booted.run(program, "install", "--vehicle", f"{SHARED}/raptor/vehicle.yaml", "--dry-run").stdout
     assert "write   /etc/systemd/system/modelserver.service" in shown
-    assert site.written() == there
+    assert site.list_files() == there
     return there
 
 
@@ -128,7 +128,10 @@ def site(fresh: tuple[Machine, str], before: list[str]) -> Iterator[Site]:
     vehicle = f"{SHARED}/raptor/vehicle.yaml"
     booted.run(program, "install", "--vehicle", vehicle, "--drivers", "gps", "--serial", "gps=usb-FTDI_FT232R_A1-if00")
     with subprocess.Popen(
-        booted.inside(f"{PREFIX}/bin/python", "-c", PROBE), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        booted.command_line(f"{PREFIX}/bin/python", "-c", PROBE),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as probe:
         try:
             yield Site(booted, program, probe)
@@ -138,16 +141,16 @@ def site(fresh: tuple[Machine, str], before: list[str]) -> Iterator[Site]:
 
 def test_given_an_installation_then_service_and_driver_are_ready_and_a_question_is_answered(site: Site) -> None:
     for unit in (SERVICE, DRIVER):
-        assert site.machine.shown(unit, "ActiveState") == "active"
-        assert site.machine.shown(unit, "UnitFileState") == "enabled"
-    assert site.answered() > 0
+        assert site.machine.get_property(unit, "ActiveState") == "active"
+        assert site.machine.get_property(unit, "UnitFileState") == "enabled"
+    assert site.measure_answer() > 0
     assert site.status().startswith("serving model ")
-    # where the machine can do it: two cores at least, and a kernel that lets units
-    is_realtime = "50-realtime.conf" in site.machine.shown(SERVICE, "DropInPaths")
-    assert (site.machine.shown(SERVICE, "CPUSchedulingPolicy") == "2") is is_realtime
-    # the device is not there: the driver waits for it, and says so
-    assert site.machine.shown(DRIVER, "StatusText").startswith("closed: ")
-    assert site.machine.shown(DRIVER, "NRestarts") == "0"
+    # on machines with two cores and a kernel that permits it to units
+    is_realtime = "50-realtime.conf" in site.machine.get_property(SERVICE, "DropInPaths")
+    assert (site.machine.get_property(SERVICE, "CPUSchedulingPolicy") == "2") is is_realtime
+    # the device is absent: the driver waits for it, and reports that
+    assert site.machine.get_property(DRIVER, "StatusText").startswith("closed: ")
+    assert site.machine.get_property(DRIVER, "NRestarts") == "0"
     rules = site.machine.run("cat", "/etc/udev/rules.d/90-modelserver.rules").stdout
     assert 'SYMLINK=="serial/by-id/usb-FTDI_FT232R_A1-if00"' in rules
 
@@ -156,31 +159,31 @@ def test_given_an_installation_then_service_and_driver_are_ready_and_a_question_
 def test_given_a_unit_then_its_exposure_is_two_at_most(site: Site, unit: str) -> None:
     folder = "/etc/systemd/system"
     file = f"{folder}/modelserver-driver@.service" if unit == DRIVER else f"{folder}/{unit}"
-    said = site.machine.run("systemd-analyze", "security", "--offline=true", "--no-pager", file).stdout
-    exposure = float(said.rsplit("Overall exposure level", 1)[1].split(":")[1].split()[0])
-    assert exposure <= 2.0, said
+    output = site.machine.run("systemd-analyze", "security", "--offline=true", "--no-pager", file).stdout
+    exposure = float(output.rsplit("Overall exposure level", 1)[1].split(":")[1].split()[0])
+    assert exposure <= 2.0, output
 
 
 def test_given_a_kill_then_it_serves_again_within_three_seconds(site: Site) -> None:
     old, begin = site.main_pid(), time.monotonic()
     site.machine.systemctl("kill", "--signal=KILL", SERVICE)
-    site.another(old)
-    took = site.answered() - begin
-    # where others keep this machine busy, what counts is what it takes without them
-    assert min(took, site.needed(begin)) < 3.0
+    site.wait_for_restart(old)
+    took = site.measure_answer() - begin
+    # on a busy machine the time without other load counts
+    assert min(took, site.get_needed_time(begin)) < 3.0
 
 
 def test_given_a_hang_then_the_watchdog_ends_it_and_it_serves_again(site: Site) -> None:
-    site.until(lambda: site.machine.shown(SERVICE, "ActiveState") == "active", "it is not ready again")
+    site.wait_until(lambda: site.machine.get_property(SERVICE, "ActiveState") == "active", "it is not ready again")
     old = site.main_pid()
     site.machine.systemctl("kill", "--signal=STOP", SERVICE)
-    site.another(old)
-    assert site.answered() > 0
-    said = site.machine.journal(SERVICE)
-    assert "Watchdog timeout" in said
-    # where it hung, for those who look why
-    assert "Fatal Python error: Aborted" in said
-    assert "in turn" in said
+    site.wait_for_restart(old)
+    assert site.measure_answer() > 0
+    output = site.machine.journal(SERVICE)
+    assert "Watchdog timeout" in output
+    # the stack trace of the hang
+    assert "Fatal Python error: Aborted" in output
+    assert "in turn" in output
 
 
 def test_given_a_driver_that_hangs_then_the_watchdog_ends_it_and_it_comes_back(site: Site) -> None:
@@ -191,60 +194,65 @@ def test_given_a_driver_that_hangs_then_the_watchdog_ends_it_and_it_comes_back(s
     site.machine.systemctl("restart", DRIVER)
     old = site.main_pid(DRIVER)
     site.machine.systemctl("kill", "--signal=STOP", DRIVER)
-    site.another(old, DRIVER)
-    site.until(lambda: site.machine.shown(DRIVER, "ActiveState") == "active", "the driver is not ready again")
-    # without a device it lives on: signs of life come with its passes
-    assert site.machine.shown(DRIVER, "StatusText").startswith("closed: ")
+    site.wait_for_restart(old, DRIVER)
+    site.wait_until(
+        lambda: site.machine.get_property(DRIVER, "ActiveState") == "active", "the driver is not ready again"
+    )
+    # without a device it keeps running, and pings the watchdog
+    assert site.machine.get_property(DRIVER, "StatusText").startswith("closed: ")
 
 
 def test_given_another_geometry_and_a_reload_then_it_is_used_and_one_that_is_wrong_is_not(site: Site) -> None:
-    revision, pid = site.another_model(""), site.main_pid()
+    revision, pid = site.wait_for_model(""), site.main_pid()
     site.machine.run("sed", "-i", "s/0.24, 0.15, 0.18/0.25, 0.15, 0.18/", GEOMETRY)
     site.machine.run("cp", GEOMETRY, f"{GEOMETRY}.good")
     site.machine.systemctl("reload", SERVICE)
-    fresh = site.another_model(revision)
+    fresh = site.wait_for_model(revision)
 
     site.machine.run("sh", "-c", f"echo 'bodies: [' > {GEOMETRY}")
     site.machine.systemctl("reload", SERVICE)
-    site.until(lambda: "reload refused, the old model stays" in site.status(), "the status does not tell")
+    site.wait_until(lambda: "reload failed, the old model stays" in site.status(), "the status does not report it")
     assert f"model {fresh}" in site.status()
     errors = site.machine.journal(SERVICE, "--priority=err")
     assert f"is not used; that of revision {fresh} stays" in errors
-    assert site.answered() > 0
+    assert site.measure_answer() > 0
 
     site.machine.run("mv", f"{GEOMETRY}.good", GEOMETRY)
     site.machine.systemctl("reload", SERVICE)
-    site.until(lambda: "refused" not in site.status(), "the status still tells")
-    assert (site.main_pid(), site.machine.shown(SERVICE, "ActiveState")) == (pid, "active")
+    site.wait_until(lambda: "refused" not in site.status(), "the status still reports it")
+    assert (site.main_pid(), site.machine.get_property(SERVICE, "ActiveState")) == (pid, "active")
 
 
-def test_given_a_vehicle_file_that_is_wrong_then_the_journal_says_so_and_once_it_is_mended_it_serves(
+def test_given_a_vehicle_file_that_is_wrong_then_the_journal_reports_it_and_once_it_is_fixed_it_serves(
     site: Site,
 ) -> None:
     file = "/etc/modelserver/vehicle.yaml"
     site.machine.run("sed", "-i.good", "s/^base_frame:/base_farme:/", file)
     site.machine.systemctl("restart", "--no-block", SERVICE)
-    site.until(lambda: "base_farme" in site.machine.journal(SERVICE, "--priority=err"), "nothing was said")
-    # it is not started anew for nothing, and says what it waits for
-    site.until(lambda: site.status().startswith("refused, waits for the file to be mended"), "the status does not tell")
+    site.wait_until(lambda: "base_farme" in site.machine.journal(SERVICE, "--priority=err"), "no error in the journal")
+    # it is not restarted in vain, and reports what it waits for
+    site.wait_until(
+        lambda: site.status().startswith("start failed, waiting for the file to be fixed"),
+        "the status does not report it",
+    )
     waiting = site.main_pid()
     site.machine.run("mv", f"{file}.good", file)
-    site.until(lambda: site.machine.shown(SERVICE, "ActiveState") == "active", "it did not come back")
+    site.wait_until(lambda: site.machine.get_property(SERVICE, "ActiveState") == "active", "it did not come back")
     assert site.main_pid() != waiting
-    assert site.answered() > 0
+    assert site.measure_answer() > 0
 
 
 def test_given_the_installed_unit_then_doctor_looks_where_that_keeps_its_state(site: Site) -> None:
-    said = site.machine.run(site.program, "doctor", "-c", "/etc/modelserver/vehicle.yaml", check=False).stdout
-    assert re.search(r"^ok +state +/var/lib/modelserver may be written", said, re.MULTILINE), said
+    output = site.machine.run(site.program, "doctor", "-c", "/etc/modelserver/vehicle.yaml", check=False).stdout
+    assert re.search(r"^ok +state +/var/lib/modelserver may be written", output, re.MULTILINE), output
     journal = r"^ok +journal +/var/lib/modelserver/journal-\S+ may be written; \d+ of 1024 MB are used"
-    assert re.search(journal, said, re.MULTILINE), said
+    assert re.search(journal, output, re.MULTILINE), output
 
 
 def test_given_a_record_then_the_journal_has_its_fields(site: Site) -> None:
-    said = site.machine.journal(SERVICE, "--output=json", "--priority=err")
-    assert '"LOGGER":"modelserver.service.loop"' in said
-    assert '"SYSLOG_IDENTIFIER":"modelserver"' in said
+    output = site.machine.journal(SERVICE, "--output=json", "--priority=err")
+    assert '"LOGGER":"modelserver.server.loop"' in output
+    assert '"SYSLOG_IDENTIFIER":"modelserver"' in output
 
 
 def test_given_a_stop_then_it_ends_cleanly_within_two_seconds(site: Site) -> None:
@@ -252,28 +260,28 @@ def test_given_a_stop_then_it_ends_cleanly_within_two_seconds(site: Site) -> Non
     site.machine.systemctl("stop", SERVICE)
     took = time.monotonic() - begin
     assert took < 2.0
-    assert site.machine.shown(SERVICE, "Result") == "success"
-    assert site.machine.shown(SERVICE, "ExecMainStatus") == "0"
-    assert " ended" in site.machine.journal(SERVICE, "--lines=5")
+    assert site.machine.get_property(SERVICE, "Result") == "success"
+    assert site.machine.get_property(SERVICE, "ExecMainStatus") == "0"
+    assert " stopped" in site.machine.journal(SERVICE, "--lines=5")
     site.machine.systemctl("start", SERVICE)
-    assert site.answered() > 0
+    assert site.measure_answer() > 0
 
 
-def test_given_an_edited_file_then_it_stays_and_a_purge_takes_all_back(site: Site, before: list[str]) -> None:
+def test_given_an_edited_file_then_it_stays_and_a_purge_removes_all(site: Site, before: list[str]) -> None:
     install = (site.program, "install", "--no-start", "--vehicle", f"{SHARED}/raptor/vehicle.yaml", "--drivers")
     again = site.machine.run(*install, "gps")
-    assert f"leave   {GEOMETRY}: it was edited" in again.stdout
+    assert f"leave   {GEOMETRY}: edited" in again.stdout
     site.machine.run("rm", "-rf", f"/run/systemd/system/{DRIVER}.d")
-    said = site.machine.run(site.program, "uninstall").stdout
-    assert f"leave   {GEOMETRY}: it was edited since" in said
-    assert site.machine.shown(SERVICE, "LoadState") == "not-found"
-    assert [line for line in site.written() if "modelserver" in line and "/var" not in line] == [
-        line for line in site.written() if line.startswith("/etc/modelserver")
+    output = site.machine.run(site.program, "uninstall").stdout
+    assert f"leave   {GEOMETRY}: it was edited since" in output
+    assert site.machine.get_property(SERVICE, "LoadState") == "not-found"
+    assert [line for line in site.list_files() if "modelserver" in line and "/var" not in line] == [
+        line for line in site.list_files() if line.startswith("/etc/modelserver")
     ]
     site.machine.run("rm", GEOMETRY)
     site.machine.run("rmdir", "/etc/modelserver")
     site.machine.run(*install, "none")
     site.machine.run(site.program, "uninstall", "--purge")
-    assert site.written() == before
+    assert site.list_files() == before
     nothing = site.machine.run(site.program, "uninstall", check=False)
-    assert (nothing.returncode, "nothing to take back" in nothing.stderr) == (1, True)
+    assert (nothing.returncode, "nothing to uninstall" in nothing.stderr) == (1, True)

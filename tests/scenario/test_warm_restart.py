@@ -1,4 +1,4 @@
-"""The real daemon killed and begun again beside a vehicle that stands: its pose is back before the vehicle moves."""
+"""The real daemon killed and restarted beside a stationary vehicle: its pose is back before the vehicle moves."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from support_lcm import wait_until
 from modelserver.errors import ModelServerError
 from modelserver.formats import save_model
 from modelserver.messages import GpsSample, ImuSample
-from modelserver.service.keeping.form import KeptError, kept_from_bytes
+from modelserver.server.persistence.state import PersistedStateError, decode_state
 from modelserver.simulation import DrivePhase, Event
 from modelserver.wire.codec import encode
 from tests.support_filter import RIG, simulation
@@ -30,15 +30,15 @@ sensors:
   imu: {channel: IMU, frame: Car:Imu}
   wheels: {channel: WHEELS, frames: {left: Car:Left, right: Car:Right}}
 publish: {rate_hz: 50, health_hz: 20}
-restart: {period_s: 0.5}
+warm_start: {period_s: 0.5}
 """
 FIRST, LOST, AGAIN = 34.0, 1.0, 6.0
 AT_ONCE = 100
-"""Messages between two looks at whether the daemon keeps up."""
+"""Messages between two checks that the daemon keeps up."""
 
 
 def feed(daemon: Daemon, events: Iterable[Event]) -> int:
-    """Publish samples as fast as the daemon takes them; return the stamp of the last."""
+    """Publish samples as fast as the daemon processes them; return the stamp of the last."""
     channels: dict[type, str] = {GpsSample: "GPS", ImuSample: "IMU"}
     utime = 0
     for number, event in enumerate(events):
@@ -49,50 +49,50 @@ def feed(daemon: Daemon, events: Iterable[Event]) -> int:
     return utime
 
 
-def started_word(daemon: Daemon, part: str) -> str:
-    return dict(daemon.health(lambda health: part in dict(health.notices).get("start", "")).notices)["start"]
+def wait_for_start_warning(daemon: Daemon, part: str) -> str:
+    return dict(daemon.health(lambda health: part in dict(health.warnings).get("start", "")).warnings)["start"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_given_a_daemon_that_ends_while_the_vehicle_stands_then_its_successor_knows_the_pose_at_once(
+def test_given_a_daemon_that_ends_while_the_vehicle_is_stationary_then_its_successor_has_the_pose_at_once(
     start_daemon: Callable[..., Daemon], tmp_path: Path, number: signal.Signals
 ) -> None:
     geometry = save_model(RIG.model, "yaml").text
     begin = time.time_ns() // 1000 - round((FIRST + LOST + AGAIN) * 1e6)
     sim = simulation((*TO_A_STOP, DrivePhase(60.0)), start_utime=begin)
     first = start_daemon(VEHICLE, geometry=geometry)
-    assert started_word(first, "cold start") == "cold start: nothing is kept of an earlier run"
+    assert wait_for_start_warning(first, "cold start") == "cold start: no state of an earlier run is stored"
     last = feed(first, sim.events(FIRST))
-    kept = tmp_path / "state" / "state-car.json"
+    state_file = tmp_path / "state" / "state-car.json"
 
-    def is_kept() -> bool:
+    def is_stored() -> bool:
         try:
-            pose = kept_from_bytes(kept.read_bytes())
-        except (FileNotFoundError, KeptError):
+            pose = decode_state(state_file.read_bytes())
+        except (FileNotFoundError, PersistedStateError):
             return False
         return pose.pose is not None and pose.sensor_utime > last - 2_000_000
 
-    assert wait_until(first.listener.bus, is_kept)
+    assert wait_until(first.listener.bus, is_stored)
     before = first.platform().get_pose("Car:Base", "World:UTM", at=last - 200_000, wait_ms=2000)
     first.end(number)
 
     for _ in sim.events(LOST):
         pass
     second = start_daemon(VEHICLE, geometry=geometry)
-    assert "waits for the sensors" in started_word(second, "warm start")
+    assert "waits for the sensors" in wait_for_start_warning(second, "warm start")
     last = feed(second, sim.events(AGAIN))
-    assert "3 fixes agree" in started_word(second, "3 fixes agree")
+    assert "3 fixes agree" in wait_for_start_warning(second, "3 fixes agree")
     after = second.platform().get_pose("Car:Base", "World:UTM", at=last - 200_000, wait_ms=2000)
-    assert before.transformation.valid
-    assert after.transformation.valid
+    assert before.transformation.is_valid
+    assert after.transformation.is_valid
     assert after.origin == before.origin
     assert after.transformation.pose.is_close(before.transformation.pose, 1.0, 0.02)
     assert after.transformation.pose_epoch == before.transformation.pose_epoch + 1
     assert "warm start: the pose kept" in second.log
     # a state that is torn is a cold start
     second.end(signal.SIGKILL)
-    kept.write_bytes(kept.read_bytes()[:-40])
+    state_file.write_bytes(state_file.read_bytes()[:-40])
     third = start_daemon(VEHICLE, geometry=geometry)
-    assert "it is damaged" in started_word(third, "cold start")
+    assert "it is damaged" in wait_for_start_warning(third, "cold start")
     with pytest.raises(ModelServerError):
         third.platform().get_transformation("Car:Base", "World:UTM")

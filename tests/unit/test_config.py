@@ -2,36 +2,30 @@
 
 from __future__ import annotations
 
-import ast
-import dataclasses
-import importlib.util
 import random
 import re
 from contextlib import suppress
 from pathlib import Path
-from types import ModuleType
-from typing import get_args, get_type_hints
 
 import pytest
 from support_samples import VEHICLE, write_vehicle
 
-from modelserver.config import (
+from modelserver.config import reader
+from modelserver.config.reader import MAX_BYTES
+from modelserver.config.vehicle_file import (
     AidingConfig,
     CommandsConfig,
     GpsConfig,
     LocalizationConfig,
-    RestartConfig,
     VehicleConfig,
+    WarmStartConfig,
     load_config,
     load_partly,
     parse_config,
 )
-from modelserver.config_reader import MAX_BYTES
 from modelserver.errors import ConfigError, Problem, Severity
-from modelserver.localization.filter.settings import FilterSettings
-from modelserver.localization.raw.settings import RawSettings
-from modelserver.localization.settings import FixSettings
 from modelserver.messages import Mode
+from msdrivers.settings import read_drivers
 
 ROOT = Path(__file__).resolve().parents[2]
 BASE = "vehicle: v\ngeometry: g.yaml\nbase_frame: A:B\n"
@@ -69,29 +63,29 @@ def test_given_the_three_keys_then_the_rest_has_defaults() -> None:
     assert (config.publish.mode, config.publish.rate_hz, config.limits.queued_requests) == ("timer", 50.0, 256)
 
 
-def test_given_nothing_said_of_localization_then_all_sources_count_and_nobody_switches() -> None:
+def test_given_no_localization_then_all_sources_count_and_nobody_switches() -> None:
     config = parse_config((BASE + "sensors: {wheels: {channel: W}}\n").encode())
     assert config.localization == LocalizationConfig()
-    assert (config.localization.first_mode, config.localization.mode_channel) == (Mode.FULL, "")
+    assert (config.localization.initial_mode, config.localization.mode_channel) == (Mode.FULL, "")
     assert config.localization.magnetometer.soft_iron == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
     assert (config.publish.state_hz, config.publish.decisions) == (5.0, True)
     assert config.sensors.wheels is not None
     assert (config.sensors.wheels.kinematics, config.sensors.wheels.latency) == ("differential", 0.0)
 
 
-def test_given_a_restart_section_then_it_is_taken_and_its_ranges_are_held() -> None:
-    assert parse_config(BASE.encode()).restart == RestartConfig(True, 5.0, 86400.0, 20.0)
-    text = BASE + "restart: {keep: false, period_s: 0.5, max_age_s: 3600, max_pose_age_s: 0}\n"
-    assert parse_config(text.encode()).restart == RestartConfig(False, 0.5, 3600.0, 0.0)
+def test_given_a_warm_start_section_then_it_is_read_and_its_ranges_are_checked() -> None:
+    assert parse_config(BASE.encode()).warm_start == WarmStartConfig(True, 5.0, 86400.0, 20.0)
+    text = BASE + "warm_start: {persist: false, period_s: 0.5, max_age_s: 3600, max_pose_age_s: 0}\n"
+    assert parse_config(text.encode()).warm_start == WarmStartConfig(False, 0.5, 3600.0, 0.0)
     for key, value in (("period_s", 0.1), ("max_age_s", -1), ("max_pose_age_s", 601)):
         with pytest.raises(ConfigError, match=f"{key} is between"):
-            parse_config(f"{BASE}restart: {{{key}: {value}}}\n".encode())
+            parse_config(f"{BASE}warm_start: {{{key}: {value}}}\n".encode())
 
 
 @pytest.mark.parametrize("mode", Mode)
 def test_given_any_mode_then_the_vehicle_file_knows_it(mode: Mode) -> None:
     text = f"{BASE}localization: {{mode: {mode.name.lower()}}}\n"
-    assert parse_config(text.encode()).localization.first_mode is mode
+    assert parse_config(text.encode()).localization.initial_mode is mode
 
 
 def test_given_every_key_then_each_is_taken() -> None:
@@ -109,14 +103,14 @@ sensors:
   aiding:
     visual odometry: {channel: VO, type: relative_pose, latency: 0.1}
     map: {channel: MAP, type: absolute_pose}
-origin: {initial_utm: [445000, 5030000.5, 71], zone: 18, hemisphere: south, keep: false}
+origin: {initial_utm: [445000, 5030000.5, 71], zone: 18, hemisphere: south, persist: false}
 localization:
   mode: dead_reckoning
   mode_channel: LOCALIZATION_MODE
   raw: {gps_timeout: 3}
   filter: {minimum_fix_type: 3}
   magnetometer: {hard_iron: [1e-6, -2e-6, 0], soft_iron: [1, 0, 0, 0, 2, 0, 0, 0, 1], declination_deg: -14.5}
-limits: {history_s: 10, parked_requests: 0, wait_ms: 0, queued_requests: 1, requests_per_pass: 1}
+limits: {history_s: 10, waiting_requests: 0, wait_ms: 0, queued_requests: 1, requests_per_pass: 1}
 """
         ).encode()
     )
@@ -132,12 +126,12 @@ limits: {history_s: 10, parked_requests: 0, wait_ms: 0, queued_requests: 1, requ
         "map": AidingConfig("MAP", "absolute_pose"),
     }
     localization = config.localization
-    assert (localization.first_mode, localization.mode_channel) == (Mode.DEAD_RECKONING, "LOCALIZATION_MODE")
+    assert (localization.initial_mode, localization.mode_channel) == (Mode.DEAD_RECKONING, "LOCALIZATION_MODE")
     assert (localization.raw.gps_timeout, localization.filter.minimum_fix_type) == (3.0, 3)
     assert localization.magnetometer.hard_iron == (1e-6, -2e-6, 0.0)
     assert localization.magnetometer.declination_deg == -14.5
     assert (config.publish.state_hz, config.publish.decisions) == (0.0, False)
-    assert config.limits.parked_requests == 0
+    assert config.limits.waiting_requests == 0
 
 
 def test_given_relative_paths_then_they_are_relative_to_the_file(
@@ -192,7 +186,7 @@ def test_given_a_missing_key_then_it_is_named(missing: str) -> None:
             8,
             "second_frame",
         ),
-        ("origin:\n  kepe: true\n", "origin.kepe", 5, "keep"),
+        ("origin:\n  presist: true\n", "origin.presist", 5, "persist"),
         ("localization:\n  raw:\n    gps_timeot: 3\n", "localization.raw.gps_timeot", 6, "gps_timeout"),
         ("localization:\n  mode_chanel: M\n", "localization.mode_chanel", 5, "mode_channel"),
         (
@@ -205,7 +199,7 @@ def test_given_a_missing_key_then_it_is_named(missing: str) -> None:
         ("limits:\n  wait: 3\n", "limits.wait", 5, "wait_ms"),
     ],
 )
-def test_given_an_unknown_key_at_any_level_then_line_key_and_nearest_are_told(
+def test_given_an_unknown_key_at_any_level_then_line_key_and_nearest_are_named(
     text: str, element: str, line: int, near: str
 ) -> None:
     found = problem(text)
@@ -226,11 +220,66 @@ def test_given_an_unknown_key_at_any_level_then_line_key_and_nearest_are_told(
         ("hard_iron: [0, 0, 0]", "hard_iron", "hard_iron", "write hard_iron under localization.magnetometer"),
     ],
 )  # fmt: skip
-def test_given_a_key_that_stands_one_level_deeper_then_where_is_told(text: str, key: str, near: str, fix: str) -> None:
+def test_given_a_key_that_stands_one_level_deeper_then_where_is_named(text: str, key: str, near: str, fix: str) -> None:
     found = problem(f"localization:\n  {text}\n")
     assert (found.element, found.line, found.nearest[0]) == (f"localization.{key}", 5, near)
     assert found.fix.startswith(fix)
     assert f"unknown key '{key}'" in found.message
+
+
+@pytest.mark.parametrize("path", reader.RENAMED_KEYS)
+def test_given_a_key_of_an_earlier_version_then_its_new_name_is_suggested(path: str) -> None:
+    new = reader.RENAMED_KEYS[path]
+    path = path.replace("*", "raw")
+    assert reader.find_renamed_key(path) == new
+    if path.startswith("drivers"):
+        return  # msdrivers reads the section
+    *sections, key = path.split(".")
+    text = "".join(f"{'  ' * depth}{name}:\n" for depth, name in enumerate(sections))
+    value = "{}" if path == "restart" else "1"
+    found = problems(f"{text}{'  ' * len(sections)}{key}: {value}\n")[0]
+    assert (found.element, found.nearest, found.fix) == (path, (new,), f"write {new}, its new name")
+    assert found.message == f"unknown key '{key}'"
+    assert found.edit is not None
+    assert found.edit.apply(f"{BASE}{text}{'  ' * len(sections)}{key}: {value}\n").endswith(f"{new}: {value}\n")
+
+
+def test_given_an_old_section_then_the_keys_in_it_are_examined_under_its_new_name() -> None:
+    found = problems("restart: {keep: false, period_s: 0}\n")
+    assert [each.element for each in found] == ["restart", "warm_start.keep", "warm_start.period_s"]
+
+
+OLD_DRIVER_KEYS = {
+    "meters_per_count:": "metres_per_count:",
+    "is_steered:": "steers:",
+    "over_limit:": "beyond:",
+    "commands_rejected:": "commands_refused:",
+    "drive_signals:": "driving:",
+    "stop_signals:": "stopping:",
+    "sequence:": "number:",
+}
+
+
+@pytest.mark.parametrize("new", OLD_DRIVER_KEYS)
+def test_given_a_driver_with_a_key_of_an_earlier_version_then_its_new_name_is_suggested(new: str) -> None:
+    text = (ROOT / "config" / "raptor" / "vehicle.yaml").read_text(encoding="utf-8")
+    config = parse_config(text.replace(new, OLD_DRIVER_KEYS[new]).encode())
+    _, found = read_drivers(config.drivers)
+    assert found
+    assert {each.nearest for each in found} == {(new[:-1],)}
+    assert {each.replaced for each in found} == {OLD_DRIVER_KEYS[new][:-1]}
+
+
+def test_given_a_key_under_its_old_and_its_new_name_then_the_old_one_is_to_be_removed() -> None:
+    found = problem("origin: {keep: true, persist: true}\n")
+    assert (found.element, found.nearest, found.fix) == ("origin.keep", (), "remove it; persist is its new name")
+
+
+def test_given_the_renamed_keys_then_each_new_name_is_a_key() -> None:
+    for path, new in reader.RENAMED_KEYS.items():
+        if not path.startswith("drivers"):
+            text = path.replace("*", "raw").rpartition(".")[0]
+            assert new in reader._list_known_keys(VehicleConfig, tuple(filter(None, text.split("."))))
 
 
 def test_given_an_unknown_key_like_one_that_is_given_already_then_that_is_not_proposed() -> None:
@@ -238,17 +287,17 @@ def test_given_an_unknown_key_like_one_that_is_given_already_then_that_is_not_pr
     assert (found.element, found.nearest, found.edit) == ("geometri", (), None)
 
 
-def test_given_a_key_of_a_section_at_the_top_then_the_section_is_told() -> None:
+def test_given_a_key_of_a_section_at_the_top_then_the_section_is_named() -> None:
     assert problem("rate_hz: 10\n").fix == "write rate_hz under publish"
 
 
-def test_given_an_unknown_key_like_no_other_then_the_known_ones_are_told() -> None:
+def test_given_an_unknown_key_like_no_other_then_the_known_ones_are_named() -> None:
     assert (
         problem("publish: {zzzzzz: 1}\n").fix == "known here: mode, rate_hz, health_hz, state_hz, decisions, snapshot_s"
     )
 
 
-def test_given_many_problems_then_all_are_told_at_once() -> None:
+def test_given_many_problems_then_all_are_reported_at_once() -> None:
     found = problems("vehicl: x\npublish: {mode: often, rate_hz: 0}\nlimits: {wait_ms: x}\nsensors: {gps: {}}\n")
     assert [each.element for each in found] == [
         "vehicl",
@@ -269,7 +318,7 @@ def test_given_many_problems_then_all_are_told_at_once() -> None:
         ("sensors:\n  gps: {channel: A, channel: B, frame: A:B}\n", "sensors.gps.channel", 5, 5),
     ],
 )
-def test_given_a_key_twice_then_both_lines_are_told(text: str, element: str, line: int, first: int) -> None:
+def test_given_a_key_twice_then_both_lines_are_named(text: str, element: str, line: int, first: int) -> None:
     found = problem(text)
     assert (found.element, found.line) == (element, line)
     assert f"given twice (first on line {first})" in found.message
@@ -303,7 +352,7 @@ def test_given_a_key_twice_then_both_lines_are_told(text: str, element: str, lin
         ("journal:\n  megabytes: -1", "journal.megabytes", "got -1"),
         ("journal:\n  sync_s: 0.1", "journal.sync_s", "between 0.2 and 60 seconds, got 0.1"),
         ("journal:\n  directory: 3", "journal.directory", "string"),
-        ("origin:\n  keep: 'yes'", "origin.keep", "boolean"),
+        ("origin:\n  persist: 'yes'", "origin.persist", "boolean"),
         ("origin:\n  zone: 61", "origin", "given together"),
         ("origin:\n  initial_utm: [1, 2]", "origin.initial_utm", "too few numbers"),
         ("origin:\n  initial_utm: [1, 2, north]", "origin.initial_utm.2", "number"),
@@ -326,7 +375,7 @@ def test_given_a_key_twice_then_both_lines_are_told(text: str, element: str, lin
         ("localization:\n  mode_channel: 'A B'", "localization.mode_channel", "mode_channel has 1 to 39"),
         ("limits:\n  client_hz: 0.5", "limits.client_hz", "between 1 and 100000, got 0.5"),
         ("limits:\n  request_share: 1.5", "limits.request_share", "between 0 and 1, got 1.5"),
-        ("sensors:\n  second_writer: both", "sensors.second_writer", "'ignore' or 'use'.*got 'both'"),
+        ("sensors:\n  publisher_conflict: both", "sensors.publisher_conflict", "'ignore' or 'use'.*got 'both'"),
         ("commands:\n  window_s: 0.01", "commands.window_s", "between 0.1 and 300"),
         ("commands:\n  reload: true", "commands.reload", "key_file.*modelserver key new"),
         ("commands:\n  set_pose: true", "commands.set_pose", "key_file.*modelserver key new"),
@@ -344,7 +393,7 @@ def test_given_a_key_twice_then_both_lines_are_told(text: str, element: str, lin
         (f"sensors:\n  aiding: {{{'v' * 65}: {{channel: V, type: range}}}}", "sensors.aiding", "1 to 64"),
     ],
 )  # fmt: skip
-def test_given_a_value_that_cannot_be_then_line_key_and_why_are_told(text: str, element: str, message: str) -> None:
+def test_given_a_value_that_cannot_be_then_line_key_and_why_are_named(text: str, element: str, message: str) -> None:
     found = problems(text + "\n")[0]
     assert found.element == element
     assert found.line == (5 if "\n" in text and element != "origin" else 4)
@@ -360,14 +409,14 @@ def test_given_a_key_file_then_its_path_starts_from_the_vehicle_file(tmp_path: P
     assert load_config(path).commands == CommandsConfig()
 
 
-def test_given_a_zone_that_is_none_then_it_is_refused() -> None:
+def test_given_a_zone_that_is_none_then_it_is_rejected() -> None:
     found = problem("origin: {initial_utm: [445000, 5030000, 0], zone: 61, hemisphere: north}\n")
     assert "1 to 60, got 61" in found.message
 
 
 @pytest.mark.parametrize("channel", ["''", "'A B'", "Ä", "A" * 40, '"A\\nB"', '"\\x00"'])
 @pytest.mark.parametrize("sensor", ["gps", "imu", "wheels"])
-def test_given_a_channel_that_lcm_cannot_carry_then_it_is_refused(sensor: str, channel: str) -> None:
+def test_given_a_channel_that_lcm_cannot_carry_then_it_is_rejected(sensor: str, channel: str) -> None:
     frame = "" if sensor == "wheels" else ", frame: A:B"
     found = problem(f"sensors:\n  {sensor}: {{channel: {channel}{frame}}}\n")
     assert (found.element, found.line) == (f"sensors.{sensor}.channel", 5)
@@ -375,7 +424,7 @@ def test_given_a_channel_that_lcm_cannot_carry_then_it_is_refused(sensor: str, c
 
 
 @pytest.mark.parametrize("other", ["imu: {channel: X, frame: A:C}", "aiding: {vo: {channel: X, type: relative_pose}}"])
-def test_given_two_sensors_on_one_channel_then_it_is_refused(other: str) -> None:
+def test_given_two_sensors_on_one_channel_then_it_is_rejected(other: str) -> None:
     found = problem(f"sensors:\n  gps: {{channel: X, frame: A:B}}\n  {other}\n")
     assert "'X' is given twice" in found.message
 
@@ -388,15 +437,15 @@ def test_given_two_sensors_on_one_channel_then_it_is_refused(other: str) -> None
     [
         (b"", "empty"),
         (b"\n\n# nothing\n", "empty"),
-        (b"- a\n- b\n", "no mapping"),
-        (b"just words\n", "no mapping"),
+        (b"- a\n- b\n", "not a mapping"),
+        (b"just words\n", "not a mapping"),
         (b"a: 1\n---\nb: 2\n", "another document"),
         (b"\ta: 1\n", "not YAML"),
         (b"a: [1\nb: 2\n", "not YAML"),
         (b"a: \x00\n", "not YAML"),
         (b"a: 1\nb: \xff\xfe\n", "not text in UTF-8: byte 0xff in this line"),
         (b"\x7fELF\x02\x01\x01" + bytes(200), "not YAML"),
-        (b"<?xml version='1.0'?><a/>", "no mapping|not YAML"),
+        (b"<?xml version='1.0'?><a/>", "not a mapping|not YAML"),
         (b"? [a, b]\n: c\n", "a key is a name"),
         (b"? {a: b}\n: c\n", "a key is a name"),
         (b"a: &x 1\nb: *x\n", "aliases"),
@@ -425,24 +474,24 @@ def test_given_bytes_that_are_no_vehicle_file_then_one_clear_problem(text: bytes
         (
             "r.urdf",
             b"<?xml version='1.0'?>\n<robot name='r'/>",
-            "this is a URDF, a form of geometry file",
+            "this is a URDF, a geometry file format",
             "geometry: r.urdf",
         ),
         ("m.xml", b"<config><section/></config>", "this is XML, not a vehicle file", "take it with --model"),
         ("drive.lcm", b"\xed\xa1\xda\x01" + bytes(40), "this is an LCM event log, not", "modelserver replay"),
-        ("photo.png", b"\x89PNG\r\n\x1a\n\0\0\0", "this is no text, not a vehicle file", "which is YAML"),
+        ("photo.png", b"\x89PNG\r\n\x1a\n\0\0\0", "this is not text, not a vehicle file", "which is YAML"),
         ("empty.yaml", b"", "the file is empty", "start with: vehicle, geometry, base_frame"),
         ("notes.yaml", b"# vehicle: x\n\n  # y\n", "nothing in the file but comments", "start with: vehicle"),
     ],
 )
-def test_given_a_file_of_another_kind_then_one_error_says_what_it_is_and_where_it_goes(
+def test_given_a_file_of_another_kind_then_one_error_names_its_type_and_use(
     tmp_path: Path, name: str, content: bytes, message: str, fix: str
 ) -> None:
     path = tmp_path / name
     path.write_bytes(content)
-    for reader in (load_config, load_partly):
+    for load in (load_config, load_partly):
         with pytest.raises(ConfigError) as raised:
-            reader(path)
+            load(path)
         (found,) = raised.value.problems
         assert found.message.startswith(message) or message in found.message
         assert fix in found.fix
@@ -460,7 +509,7 @@ def test_given_a_directory_then_the_vehicle_file_in_it_is_named(tmp_path: Path) 
     assert fix() == f"give {tmp_path / 'vehicle.yaml'}"
 
 
-def test_given_aliases_of_aliases_then_they_are_refused_before_they_are_written_out() -> None:
+def test_given_aliases_of_aliases_then_they_are_rejected_before_they_are_written_out() -> None:
     levels = "".join(f"k{n}: &k{n} [{', '.join([f'*k{n - 1}'] * 10)}]\n" for n in range(1, 15))
     assert "aliases" in problem(f"k0: &k0 [x]\n{levels}").message
 
@@ -491,49 +540,3 @@ def test_given_a_file_that_is_not_there_then_it_is_an_os_error(tmp_path: Path) -
 
 def test_given_the_cart_of_these_tests_then_it_loads(tmp_path: Path) -> None:
     assert load_config(write_vehicle(tmp_path, VEHICLE)).base_frame == "Cart:Base"
-
-
-def keys_of(kind: type) -> set[str]:
-    """The keys of a section and of those in it; the settings of raw mode and of the filter stand on another page."""
-    found = set()
-    for name, hint in get_type_hints(kind).items():
-        if name.startswith("__"):
-            continue
-        found.add(name)
-        for inner in (hint, *get_args(hint)):
-            if dataclasses.is_dataclass(inner) and not issubclass(inner, FixSettings):
-                found |= keys_of(inner)
-    return found
-
-
-def test_given_the_page_on_the_vehicle_file_then_it_names_every_key_and_no_other() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "vehicle-file.md").read_text(encoding="utf-8")
-    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith(("| `", "| **`"))]
-    named = {name.strip("*` ") for row in rows for name in row.split(",")}
-    assert named == keys_of(VehicleConfig) - {"channel", "frame", "frames"}
-
-
-def test_given_the_page_on_localization_then_it_names_every_setting() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "raw-mode.md").read_text(encoding="utf-8")
-    for each in dataclasses.fields(RawSettings):
-        assert f"`{each.name}`" in page
-
-
-def settings_page() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("settings_page", ROOT / "tools" / "settings_page.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_given_the_page_on_the_filters_settings_then_it_is_what_they_say_themselves() -> None:
-    assert settings_page().PAGE.read_text(encoding="utf-8") == settings_page().page(), "run tools/settings_page.py"
-
-
-def test_given_the_filters_settings_then_their_page_names_each_with_its_default() -> None:
-    rows = [line.split(" | ") for line in settings_page().page().splitlines() if line.startswith("| `")]
-    named = {row[0].strip("| `"): ast.literal_eval(row[1].capitalize()) for row in rows}
-    assert named == {each.name: each.default for each in dataclasses.fields(FilterSettings)}
-    assert all(len(row) == 3 and len(row[2]) > 20 for row in rows)

@@ -1,4 +1,4 @@
-"""The health report: what it says, and that it goes out at once when something of weight changes, but no flood."""
+"""The health report: its content, its period, and reports at once on changed conditions, without a flood."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support_moving import rover
-from support_samples import ORIGIN, START, Scripted, cart, gps, imu, now_at, started
+from support_samples import ORIGIN, START, ScriptedLocalizer, cart, gps, imu, instant_at, start_core
 
 from modelserver import core
 from modelserver.core import CoreState, ExpectedSensor, step
+from modelserver.core.commands import ModelLoaded
 from modelserver.core.health import percentile
-from modelserver.core.reload import ModelLoaded
-from modelserver.core.state import CHANGE_PERIOD_NS, SILENT_LEAST_S
+from modelserver.core.state import CHANGE_PERIOD_NS, MIN_SILENCE_S
 from modelserver.messages import (
     Decision,
     Event,
     Gauges,
     GpsSample,
     Health,
+    HealthWarning,
     ImuSample,
     Invalid,
     JointsSample,
     LocalizerSummary,
     Mode,
-    Noticed,
     Phase,
     PublishHealth,
     RangeSample,
@@ -46,15 +46,15 @@ S = 1_000_000
 
 
 class Run:
-    """A core that ticks every 20 ms; `reports` are those that went out, with the seconds since START at which."""
+    """A core with ticks every 20 ms; `reports` are the published ones, with the seconds since START."""
 
-    def __init__(self, localizer: Any = Scripted(), **settings: object):  # noqa: B008
-        self.state: CoreState = started(localizer, **settings)
+    def __init__(self, localizer: Any = ScriptedLocalizer(), **settings: object):  # noqa: B008
+        self.state: CoreState = start_core(localizer, **settings)
         self.reports: list[tuple[float, Health]] = []
         self.ticks = 0
 
     def feed(self, event: Event | ModelLoaded, at: float) -> None:
-        self.state, outputs = step(self.state, event, now_at(START + round(at * S)))
+        self.state, outputs = step(self.state, event, instant_at(START + round(at * S)))
         self.reports += [(at, each.health) for each in outputs if isinstance(each, PublishHealth)]
 
     def until(self, end: float, events: Iterable[tuple[float, Event | ModelLoaded]] = ()) -> None:
@@ -83,10 +83,10 @@ def imus(begin: float, end: float, hz: float = 100.0) -> list[tuple[float, Event
     return [(begin + n / hz, imu(START + round((begin + n / hz) * S))) for n in range(round((end - begin) * hz))]
 
 
-# --- what it says -------------------------------------------------------------------------------------------
+# --- content -----------------------------------------------------------------------------------------------
 
 
-def test_given_sensors_of_the_vehicle_file_then_those_never_heard_are_told() -> None:
+def test_given_configured_sensors_then_those_without_messages_are_reported() -> None:
     sensors = (
         ExpectedSensor("A_GPS", GpsSample),
         ExpectedSensor("A_IMU", ImuSample),
@@ -99,7 +99,7 @@ def test_given_sensors_of_the_vehicle_file_then_those_never_heard_are_told() -> 
     assert (silent["A_GPS"].count, silent["A_GPS"].silent) == (0, True)
     assert math.isnan(silent["A_GPS"].age)
     assert not silent["sensor:imu"].silent
-    # another source of that kind of sample is not the one that was named
+    # another source of this type of sample is not the configured one
     run.until(0.4, [(0.25, RangeSample(SensorHeader(START, "other"), "a", (0.0, 0.0, 0.0), "Cart:Base", 1.0, 0.1))])
     assert "A_RANGE" in {each.channel for each in run.last.channels}
     run.until(0.7, [(0.45, RangeSample(SensorHeader(START, "beacons"), "a", (0.0, 0.0, 0.0), "Cart:Base", 1.0, 0.1))])
@@ -112,7 +112,7 @@ def test_given_a_geometry_without_joints_then_joints_are_not_missed() -> None:
     assert run.last.channels == ()
 
 
-def test_given_gauges_then_the_report_tells_them_and_the_share_of_a_processor() -> None:
+def test_given_gauges_then_the_report_has_them_and_the_share_of_a_processor() -> None:
     run = Run()
     run.until(0.5)
     assert (run.last.host, run.last.pid, run.last.requests_queued, run.last.memory) == ("pc", 7, 3, 1000)
@@ -121,40 +121,40 @@ def test_given_gauges_then_the_report_tells_them_and_the_share_of_a_processor() 
     assert run.last.cpu_share == pytest.approx(0.25)
 
 
-def test_given_no_gauges_then_what_is_not_known_is_told_as_such() -> None:
+def test_given_no_gauges_then_unknown_values_are_reported_as_such() -> None:
     run = Run()
     run.feed(Tick(), 0.0)
     assert (run.last.host, run.last.pid, run.last.memory) == ("", 0, 0)
     assert math.isnan(run.last.cpu_share)
 
 
-def test_given_a_localizer_then_its_mode_bounds_and_age_of_the_fix_are_told() -> None:
-    run = Run(Scripted(newest=START, filtering=True))
+def test_given_a_localizer_then_mode_protection_levels_and_fix_age_are_reported() -> None:
+    run = Run(ScriptedLocalizer(newest=START, has_state=True))
     run.until(0.51)
     run.until(1.1)
-    said = run.last.localization
-    assert (said.mode, said.phase, said.standing) == (Mode.FULL, Phase.ALIGNED, False)
-    assert (said.horizontal_bound, said.heading_bound) == (1.5, 0.1)
-    assert said.fix_age == pytest.approx(1.0)
+    summary = run.last.localization
+    assert (summary.mode, summary.phase, summary.stationary) == (Mode.FULL, Phase.ALIGNED, False)
+    assert (summary.horizontal_protection_level, summary.heading_protection_level) == (1.5, 0.1)
+    assert summary.fix_age == pytest.approx(1.0)
     assert run.last.origin_id == ORIGIN.origin_id
 
 
-def test_given_no_localizer_then_nothing_is_told_of_localization() -> None:
+def test_given_no_localizer_then_nothing_is_reported_of_localization() -> None:
     run = Run(None)
     run.until(0.1)
     assert run.last.localization.mode is None
     assert encode(run.last)
 
 
-def test_given_samples_that_tell_when_they_were_received_then_the_greatest_delay_is_told_once() -> None:
+def test_given_samples_with_receipt_times_then_the_greatest_delay_is_reported_once() -> None:
     run = Run()
     run.until(0.1)
 
-    def received(at: float, utime: int) -> ImuSample:
+    def make_sample(at: float, utime: int) -> ImuSample:
         sample = imu(utime)
         return replace(sample, header=replace(sample.header, host_utime=START + round(at * S)))
 
-    late = [(0.5, received(0.4955, START)), (0.6, received(0.599, START + 1)), (0.7, imu(START + 2))]
+    late = [(0.5, make_sample(0.4955, START)), (0.6, make_sample(0.599, START + 1)), (0.7, imu(START + 2))]
     run.until(1.01, late)
     assert run.channel("sensor:imu").delay_max == pytest.approx(0.0045)
     run.until(2.01)
@@ -174,10 +174,10 @@ def test_given_no_values_then_a_percentile_is_0() -> None:
     assert percentile([], 0.99) == 0.0
 
 
-# --- when it goes out ---------------------------------------------------------------------------------------
+# --- schedule -----------------------------------------------------------------------------------------------
 
 
-def test_given_nothing_that_changes_then_reports_keep_to_their_period() -> None:
+def test_given_unchanged_conditions_then_reports_follow_their_period() -> None:
     run = Run(None)
     run.until(3.5)
     assert run.times() == [0.0, 1.0, 2.0, 3.0]
@@ -185,39 +185,39 @@ def test_given_nothing_that_changes_then_reports_keep_to_their_period() -> None:
 
 def test_given_a_change_then_a_report_goes_out_within_a_tenth_of_a_second_and_the_period_stays() -> None:
     run = Run(None)
-    run.until(2.5, [(0.33, Noticed("journal", "the disk is full"))])
+    run.until(2.5, [(0.33, HealthWarning("journal", "the disk is full"))])
     first, change, *others = run.times()
     assert first == 0.0
     assert 0.33 <= change <= 0.33 + CHANGE_PERIOD_NS * 1e-9
     assert others == [1.0, 2.0]
-    assert run.reports[1][1].notices == (("journal", "the disk is full"),)
+    assert run.reports[1][1].warnings == (("journal", "the disk is full"),)
 
 
-def test_given_validity_that_is_lost_then_it_is_told_at_once_with_the_reason() -> None:
-    run = Run(Scripted(stale_s=0.5))
+def test_given_validity_that_is_lost_then_it_is_reported_at_once_with_the_reason() -> None:
+    run = Run(ScriptedLocalizer(stale_s=0.5))
     run.until(3.0, imus(0.0, 1.25))
     states = {(health.state, health.invalid_reasons) for _, health in run.reports}
     assert (core.RUNNING, Invalid(0)) in states
-    # STALE from 1.74 s on
+    # STALE after 1.74 s
     lost = next(at for at, health in run.reports if health.state == core.DEGRADED)
     assert 1.74 <= lost <= 1.74 + 0.021 + CHANGE_PERIOD_NS * 1e-9
 
 
-def test_given_a_new_geometry_then_its_revision_is_told_at_once() -> None:
+def test_given_a_new_geometry_then_its_revision_is_reported_at_once() -> None:
     other = rover()
     run = Run(None)
     run.until(0.9, [(0.4, ModelLoaded(None, other, None))])
     assert [health.model_revision for _, health in run.reports] == [cart().revision, other.revision]
 
 
-def test_given_a_sensor_that_falls_silent_and_returns_then_both_are_told() -> None:
+def test_given_a_sensor_that_falls_silent_and_returns_then_both_are_reported() -> None:
     run = Run(None)
     run.until(6.0, [*imus(0.0, 2.0), *imus(4.5, 6.0)])
     silent = [(at, next(each.silent for each in health.channels)) for at, health in run.reports if health.channels]
     changes = [(at, now) for (_, before), (at, now) in itertools.pairwise(silent) if before != now]
     (fell, gone), (back, there) = changes
     assert (gone, there) == (True, False)
-    assert 1.99 + SILENT_LEAST_S <= fell <= 1.99 + SILENT_LEAST_S + 0.13
+    assert 1.99 + MIN_SILENCE_S <= fell <= 1.99 + MIN_SILENCE_S + 0.13
     assert 4.5 <= back <= 4.63
 
 
@@ -230,7 +230,7 @@ def test_given_a_slow_source_then_its_usual_interval_is_no_silence() -> None:
     assert run.channel("sensor:gps").silent
 
 
-def test_given_a_long_silence_then_a_second_one_is_told_as_soon_as_the_first() -> None:
+def test_given_a_long_silence_then_a_second_one_is_reported_as_soon_as_the_first() -> None:
     run = Run(None)
     run.until(64.0, [*imus(0.0, 2.0), *imus(60.0, 60.5)])
     assert run.channel("sensor:imu").silent
@@ -238,16 +238,16 @@ def test_given_a_long_silence_then_a_second_one_is_told_as_soon_as_the_first() -
     assert fell[0] < 63.0
 
 
-def test_given_who_commands_then_that_he_has_nothing_to_say_is_no_silence() -> None:
+def test_given_a_commanding_client_then_a_pause_is_no_silence() -> None:
     run = Run(None)
-    wish = SwitchMode(SensorHeader(START, "console"), Mode.FULL)
-    run.until(5.0, [(0.1, wish), (0.2, wish), (0.3, wish), (0.4, wish)])
+    command = SwitchMode(SensorHeader(START, "console"), Mode.FULL)
+    run.until(5.0, [(0.1, command), (0.2, command), (0.3, command), (0.4, command)])
     assert not run.channel("command:console").silent
 
 
 def test_given_changes_to_and_fro_at_every_tick_then_at_most_ten_reports_a_second_go_out_for_them() -> None:
     run = Run(None)
-    flapping = [(n * 0.005, Noticed("x", str(n % 7))) for n in range(2000)]
+    flapping = [(n * 0.005, HealthWarning("x", str(n % 7))) for n in range(2000)]
     run.until(10.0, flapping)
     assert 20 < len(run.reports) <= 10 * 10 + 10
     gaps = [b - a for a, b in itertools.pairwise(run.times())]
@@ -256,7 +256,7 @@ def test_given_changes_to_and_fro_at_every_tick_then_at_most_ten_reports_a_secon
 
 def test_given_a_report_for_a_change_then_rates_are_those_of_the_last_whole_period() -> None:
     run = Run(None)
-    run.until(2.0, [*imus(0.0, 2.0), (1.32, Noticed("x", "y"))])
+    run.until(2.0, [*imus(0.0, 2.0), (1.32, HealthWarning("x", "y"))])
     by_time = dict(run.reports)
     change = next(health for at, health in by_time.items() if 1.3 < at < 1.5)
     assert change.channels[0].rate_hz == pytest.approx(100.0, abs=2.0)
@@ -266,8 +266,8 @@ def test_given_a_report_for_a_change_then_rates_are_those_of_the_last_whole_peri
 # --- sensors that cannot be used ---
 
 
-class Unusable(Scripted):
-    """A localizer with a finding, and decisions on its samples that a test sets."""
+class Unusable(ScriptedLocalizer):
+    """A localizer with findings and decisions that a test sets."""
 
     findings: tuple[SensorFinding, ...] = ()
     verdicts: tuple[Decision, ...] = ()
@@ -275,8 +275,8 @@ class Unusable(Scripted):
     def summary(self, utime: int) -> LocalizerSummary:
         return super().summary(utime)._replace(findings=type(self).findings)
 
-    def take(self, sample: Any) -> tuple[Any, tuple[Any, ...]]:
-        taken, notes = super().take(sample)
+    def process(self, sample: Any) -> tuple[Any, tuple[Any, ...]]:
+        taken, notes = super().process(sample)
         return taken, notes + tuple(each for each in type(self).verdicts if each.source == sample.header.source)
 
 
@@ -298,25 +298,25 @@ def test_given_a_sensor_that_cannot_be_used_then_a_report_goes_out_at_once_with_
     unusable.findings = (SensorFinding("wheels", "steering", "sensors.wheels.steering", "no angle", "start it"), choice)
     run.until(1.8)
     assert len(run.reports) == before + 1
-    assert dict(run.reports[-1][1].notices) == {"sensors.wheels (steering)": "no angle; start it"}
+    assert dict(run.reports[-1][1].warnings) == {"sensors.wheels (steering)": "no angle; start it"}
     unusable.findings = ()
     run.until(2.5)
-    assert run.reports[-1][1].notices == ()
+    assert run.reports[-1][1].warnings == ()
 
 
-def test_given_measurements_that_are_dropped_then_it_is_told_how_many_were_used_of_how_many(unusable) -> None:
+def test_given_dropped_measurements_then_the_used_and_all_are_reported(unusable) -> None:
     run = Run(unusable())
     unusable.verdicts = (verdict("gps", Verdict.REJECTED, "names"), verdict("gps", Verdict.REJECTED, "gate", "imu_yaw"))
     run.until(1.05, [(0.04 * n + 0.01, gps(START + 40_000 * n)) for n in range(19)])
     (channel,) = run.reports[-1][1].channels
     assert (channel.measured, channel.used) == (19, 0)
-    assert run.reports[-1][1].notices == ()
+    assert run.reports[-1][1].warnings == ()
     run.until(1.4, [(1.2, gps(START + S))])
-    ((subject, text),) = run.reports[-1][1].notices
+    ((subject, text),) = run.reports[-1][1].warnings
     assert subject == "sensor:gps"
     assert text == "20 received, 0 of 20 measurements used; the last 20 were dropped: names"
     unusable.verdicts = (verdict("gps", Verdict.USED), verdict("gps", Verdict.MONITORED, "at_rest"))
     run.until(3.05, [(2.5, gps(START + 5 * S // 2))])
-    assert run.reports[-1][1].notices == ()
+    assert run.reports[-1][1].warnings == ()
     (channel,) = run.reports[-1][1].channels
     assert (channel.measured, channel.used) == (22, 1)

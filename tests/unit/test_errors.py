@@ -1,4 +1,4 @@
-"""Errors say where and what to do, cross process borders, and cost a stranger's request little."""
+"""Errors state place and fix, cross process borders, and cost little for a request from a stranger."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from modelserver.errors import (
     UnknownBodyError,
     UnknownFrameError,
     WireError,
-    error_for_status,
-    nearest_names,
-    shown,
+    find_nearest_names,
+    make_status_error,
+    quote,
 )
 from modelserver.geometry import ModelBuilder, names
 
@@ -75,22 +75,22 @@ def test_errors_survive_pickling(error):
 def test_each_status_but_ok_has_one_error_class_that_carries_it():
     for status in Status:
         if status is not Status.OK:
-            error = error_for_status(status, "message", ["near"])
+            error = make_status_error(status, "message", ["near"])
             assert error.status is status
             assert error.nearest == ("near",)
-    assert type(error_for_status(99, "from a newer server")) is errors.ServerError
+    assert type(make_status_error(99, "from a newer server")) is errors.ServerError
     every = {cls for cls in vars(errors).values() if isinstance(cls, type) and issubclass(cls, QueryError)}
-    assert {type(error_for_status(status, "")) for status in Status} == every - {QueryError}
+    assert {type(make_status_error(status, "")) for status in Status} == every - {QueryError}
 
 
 def test_nearest_names_finds_typing_mistakes_whatever_their_case():
     known = ["Raptor:CG", "Digiclops:ImagePlane", "FLEA:Origin", "FrontNoddingSICK:Origin"]
     for typed in ("Digiclops:ImagePlan", "digiclops:imageplane", "Digiclops:ImgaePlane", "DigiclopsImagePlane"):
-        assert nearest_names(typed, known)[0] == "Digiclops:ImagePlane"
-    assert nearest_names("FLEA:Orgin", known)[0] == "FLEA:Origin"
-    assert nearest_names("zzz", known) == ()
-    assert nearest_names("x", []) == nearest_names("", known) == nearest_names(LONG, known) == ()
-    assert len(nearest_names("aaaa", [f"aaa{letter}" for letter in "bcdefgh"], count=2)) == 2
+        assert find_nearest_names(typed, known)[0] == "Digiclops:ImagePlane"
+    assert find_nearest_names("FLEA:Orgin", known)[0] == "FLEA:Origin"
+    assert find_nearest_names("zzz", known) == ()
+    assert find_nearest_names("x", []) == find_nearest_names("", known) == find_nearest_names(LONG, known) == ()
+    assert len(find_nearest_names("aaaa", [f"aaa{letter}" for letter in "bcdefgh"], count=2)) == 2
 
 
 def test_nearest_names_keeps_its_quality_among_ten_thousand():
@@ -102,14 +102,14 @@ def test_nearest_names_keeps_its_quality_among_ten_thousand():
         ("Hub:FrontRial", "Hub:FrontRail"),
         ("Hub:FrontRails", "Hub:FrontRail"),
     ):
-        assert nearest_names(typed, known)[0] == meant
+        assert find_nearest_names(typed, known)[0] == meant
 
 
 @pytest.mark.parametrize("name", ODD)
-def test_odd_names_are_refused_in_a_short_message_fit_for_a_terminal_and_the_wire(name):
+def test_odd_names_are_rejected_in_a_short_message_fit_for_a_terminal_and_the_wire(name):
     builder = ModelBuilder()
-    builder.body("A").frame("a")
-    builder.body("B").frame("b")
+    builder.add_body("A").add_frame("a")
+    builder.add_body("B").add_frame("b")
     model = builder.build()
     for call in (
         lambda: model.get_transformation(name, "A:a"),
@@ -129,10 +129,10 @@ def test_odd_names_are_refused_in_a_short_message_fit_for_a_terminal_and_the_wir
 @pytest.mark.parametrize("name", ODD)
 def test_a_file_of_odd_names_gives_short_messages(name):
     builder = ModelBuilder()
-    builder.body(name).frame(name)
-    builder.body("A").frame(name).frame("a")
-    builder.constraint(name, name, name)
-    builder.constraint("c", name, f"A:{name}")
+    builder.add_body(name).add_frame(name)
+    builder.add_body("A").add_frame(name).add_frame("a")
+    builder.add_constraint(name, name, name)
+    builder.add_constraint("c", name, f"A:{name}")
     _, problems = builder.check()
     _, repaired = builder.check(repair=True)
     for problem in problems + repaired:
@@ -142,7 +142,7 @@ def test_a_file_of_odd_names_gives_short_messages(name):
 
 def test_names_in_files():
     for good in ("A", "Front_Nodding-SICK.2", "é", "x" * names.MAX_LENGTH):
-        assert names.fault(good) == ""
+        assert names.find_problem(good) == ""
     for bad, why in (
         ("", "empty"),
         ("a:b", "colon"),
@@ -152,19 +152,19 @@ def test_names_in_files():
         ("a\u202e", "printable"),
         ("x" * (names.MAX_LENGTH + 1), "at most 200"),
     ):
-        assert why in names.fault(bad)
+        assert why in names.find_problem(bad)
 
 
 def test_shown_is_quoted_escaped_and_cut():
-    assert shown("a\n") == r"'a\n'"
-    assert shown("x" * 100) == f"'{'x' * 80}'... (100 characters)"
+    assert quote("a\n") == r"'a\n'"
+    assert quote("x" * 100) == f"'{'x' * 80}'... (100 characters)"
 
 
 @pytest.mark.slow
 def test_a_file_in_which_everything_is_wrong_gives_each_problem_a_short_message():
     builder = star(4_000)
     for number in range(2_000):
-        builder.constraint(f"Bad{number}", f"Hubb:Mount{number}", f"Hub:Mont{number}")
+        builder.add_constraint(f"Bad{number}", f"Hubb:Mount{number}", f"Hub:Mont{number}")
     _, problems = builder.check()
     assert len(problems) == 4_000
     assert max(len(str(problem)) for problem in problems) < 800
@@ -174,8 +174,8 @@ def test_a_file_in_which_everything_is_wrong_gives_each_problem_a_short_message(
 def test_ten_thousand_orphans_are_sorted_out():
     builder = ModelBuilder()
     for number in range(5_000):
-        builder.body(f"A{number}").frame("x")
-        builder.body(f"B{number}").frame("x")
-        builder.constraint(f"C{number}", f"A{number}:x", f"B{number}:x")
+        builder.add_body(f"A{number}").add_frame("x")
+        builder.add_body(f"B{number}").add_frame("x")
+        builder.add_constraint(f"C{number}", f"A{number}:x", f"B{number}:x")
     model = builder.build()
     assert len(model.assemblies) == 5_000

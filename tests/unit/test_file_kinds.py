@@ -9,20 +9,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support_samples import GEOMETRY, VEHICLE
 
-from modelserver.file_kinds import LOOKED_AT, FileKind, file_kind, geometry_named
+from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind, find_geometry_path
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "config").rglob("vehicle.yaml")), ids=lambda path: path.parent.name)
 def test_given_the_vehicle_files_of_this_project_then_they_are_known(path: Path) -> None:
-    assert file_kind(path.read_bytes()) is FileKind.VEHICLE
-    assert (path.parent / geometry_named(path.read_bytes())).is_file()
+    assert detect_file_kind(path.read_bytes()) is FileKind.VEHICLE
+    assert (path.parent / find_geometry_path(path.read_bytes())).is_file()
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "config").rglob("geometry.yaml")), ids=lambda path: path.parent.name)
 def test_given_the_geometry_files_of_this_project_then_they_are_known(path: Path) -> None:
-    assert file_kind(path.read_bytes()) is FileKind.GEOMETRY
+    assert detect_file_kind(path.read_bytes()) is FileKind.GEOMETRY
 
 
 @pytest.mark.parametrize(
@@ -46,8 +46,8 @@ def test_given_the_geometry_files_of_this_project_then_they_are_known(path: Path
         ("vehicle: x".encode("utf-16"), FileKind.OTHER),
     ],
 )
-def test_given_a_file_then_its_kind_is_told_by_what_stands_in_it(content: bytes, kind: FileKind) -> None:
-    assert file_kind(content) is kind
+def test_given_a_file_then_its_kind_is_detected_from_its_content(content: bytes, kind: FileKind) -> None:
+    assert detect_file_kind(content) is kind
 
 
 @pytest.mark.parametrize(
@@ -60,14 +60,14 @@ def test_given_a_file_then_its_kind_is_told_by_what_stands_in_it(content: bytes,
     ],
 )
 def test_given_a_vehicle_file_then_the_geometry_that_it_names_is_found(content: bytes, name: str) -> None:
-    assert geometry_named(content) == name
+    assert find_geometry_path(content) == name
 
 
 @given(st.binary(max_size=200))
 def test_given_any_bytes_then_they_are_of_some_kind(content: bytes) -> None:
-    assert file_kind(content) in FileKind
-    assert isinstance(geometry_named(content), str)
+    assert detect_file_kind(content) in FileKind
+    assert isinstance(find_geometry_path(content), str)
 
 
 def test_given_a_long_file_of_comments_then_it_is_not_taken_for_nothing() -> None:
-    assert file_kind(b"# a\n" * LOOKED_AT + b"x: 1") is FileKind.OTHER
+    assert detect_file_kind(b"# a\n" * EXAMINED_BYTES + b"x: 1") is FileKind.OTHER

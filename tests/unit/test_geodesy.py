@@ -1,4 +1,4 @@
-"""Geodesy against other routes through PROJ, earth-centred numbers and published points."""
+"""Geodesy against other routes through PROJ, earth-centered numbers and published points."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from modelserver.earth.geodesy import (
     utm_zone,
 )
 from modelserver.messages import Origin
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 PLACES = {
     "Suffield": (50.27, -111.1, 700.0),
@@ -143,7 +143,7 @@ def test_pinned_zone_holds_across_its_border():
     assert geodesy.geodetic_from_utm(*expected, 5.0) == pytest.approx((50.0, -107.9, 5.0), abs=1e-9)
 
 
-def test_a_place_far_from_the_zone_is_refused():
+def test_a_place_far_from_the_zone_is_rejected():
     geodesy = Geodesy(origin_at(50.0, -111.0, 0.0))
     with pytest.raises(GeodesyError, match="zone 12"):
         geodesy.utm_from_geodetic(50.0, 0.0, 0.0)
@@ -238,7 +238,7 @@ def test_origin_is_the_zero_of_both_worlds(latitude, longitude, height):
     assert geodesy.enu_from_geodetic(latitude, longitude, height) == pytest.approx((0, 0, 0), abs=2e-4)
 
 
-def test_pose_in_utm_counts_tilt_and_yaw_at_the_vehicle_ten_kilometres_away():
+def test_pose_in_utm_counts_tilt_and_yaw_at_the_vehicle_ten_kilometers_away():
     geodesy = Geodesy(origin_at(50.0, -110.0, 700.0))
     place = (50.05, -109.9, 720.0)
     # a vehicle level there, facing true north-east there
@@ -256,7 +256,7 @@ def test_pose_in_utm_counts_tilt_and_yaw_at_the_vehicle_ten_kilometres_away():
     expected = (easting - geodesy.origin.easting, northing - geodesy.origin.northing, 20.0)
     assert found.xyz == pytest.approx(expected, abs=1e-4)
     assert found.rpy == pytest.approx((0.0, 0.0, math.radians(45) + convergence), abs=1e-9)
-    # chained through the tangent plane alone it would be metres off
+    # chained through the tangent plane alone it would be meters off
     assert abs(pose.xyz[2] - found.xyz[2]) > 5.0
 
 
@@ -271,8 +271,8 @@ def test_values_are_immutable_equal_and_pickle():
 
 def test_only_localization_and_simulation_pay_for_pyproj():
     code = (
-        "import sys, modelserver, modelserver.geometry.model, modelserver.messages, modelserver.platform, "
-        "modelserver.config, modelserver.localization.mounts, modelserver.localization.interface; "
+        "import sys, modelserver, modelserver.geometry.model, modelserver.messages, modelserver.query, "
+        "modelserver.config.vehicle_file, modelserver.estimation.sensor_rig, modelserver.estimation.interface; "
         "sys.exit('pyproj' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,4 +1,4 @@
-"""History: estimates by time, extended without copying, never changed under the hands of who holds an older one."""
+"""History: estimates by time, appended without copying, with older ones unchanged."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import pytest
 from support_samples import ORIGIN, START
 
 from modelserver.errors import TooNewError, TooOldError
-from modelserver.history import History, at_time, interpolated
+from modelserver.history import History, interpolate, restamp
 from modelserver.messages import Estimate, Invalid, Quality
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 S = 1_000_000
 
@@ -22,7 +22,7 @@ def estimate(seconds: float, x: float = 0.0, epoch: int = 0, **more: object) -> 
 def history(*seconds: float, horizon: float = 60.0) -> History:
     held = History(horizon)
     for each in seconds:
-        held = held.extended(estimate(each, each))
+        held = held.append(estimate(each, each))
     return held
 
 
@@ -33,7 +33,7 @@ def times(held: History) -> list[float]:
         found.append((at - START) / S)
         if at == held.first:
             return found[::-1]
-        at = held.held(at - 1).utime
+        at = held.hold(at - 1).utime
 
 
 def test_given_no_estimate_then_it_is_empty() -> None:
@@ -49,7 +49,7 @@ def test_given_estimates_in_order_then_all_are_held_and_the_newest_is_last() -> 
 
 def test_given_a_history_that_was_extended_then_the_old_one_is_unchanged() -> None:
     old = history(0, 1)
-    new = old.extended(estimate(2))
+    new = old.append(estimate(2))
     assert times(old) == [0, 1]
     assert times(new) == [0, 1, 2]
     with pytest.raises(TooNewError):
@@ -58,24 +58,24 @@ def test_given_a_history_that_was_extended_then_the_old_one_is_unchanged() -> No
 
 def test_given_a_history_when_only_the_recent_is_wanted_then_that_is_held_apart_and_can_be_extended() -> None:
     old = history(0, 1, 2, 3, 4, horizon=3.0)
-    recent = old.recent(1.5)
+    recent = old.copy_recent(1.5)
     assert times(recent) == [3, 4]
-    longer = old.extended(estimate(5))
-    assert times(recent.extended(estimate(4.5))) == [3, 4, 4.5]
+    longer = old.append(estimate(5))
+    assert times(recent.append(estimate(4.5))) == [3, 4, 4.5]
     assert times(longer) == [2, 3, 4, 5]
     assert times(recent) == [3, 4]
     # and it forgets as the other does
-    assert times(recent.extended(estimate(7))) == [4, 7]
-    assert times(old.recent(60.0)) == times(old)
-    assert len(History(60.0).recent(1.0)) == 0
+    assert times(recent.append(estimate(7))) == [4, 7]
+    assert times(old.copy_recent(60.0)) == times(old)
+    assert len(History(60.0).copy_recent(1.0)) == 0
 
 
 def test_given_two_histories_extended_from_one_then_neither_sees_the_other() -> None:
     root = history(0, 1)
-    left = root.extended(estimate(2, -2.0))
-    right = root.extended(estimate(2, +2.0))
-    left = left.extended(estimate(3, -3.0))
-    right = right.extended(estimate(4, +4.0))
+    left = root.append(estimate(2, -2.0))
+    right = root.append(estimate(2, +2.0))
+    left = left.append(estimate(3, -3.0))
+    right = right.append(estimate(4, +4.0))
     assert (times(root), times(left), times(right)) == ([0, 1], [0, 1, 2, 3], [0, 1, 2, 4])
     assert left.at(START + 2 * S).odom.xyz[0] == -2.0
     assert right.at(START + 2 * S).odom.xyz[0] == +2.0
@@ -90,33 +90,33 @@ def test_given_any_forks_and_orders_then_each_history_equals_a_plain_list() -> N
             step = rng.choice((0.0, 0.1, 0.5, 3.0, -0.7, -5.0, 30.0))
             at = round((plain[-1] if plain else 0.0) + step, 3)
             plain = [each for each in plain if at - 10.0 <= each < at] + [at]
-            forks.append((held.extended(estimate(at)), plain))
+            forks.append((held.append(estimate(at)), plain))
         for held, plain in forks[1:]:
             assert times(held) == plain
 
 
 def test_given_an_estimate_at_a_time_held_then_it_takes_the_place_of_the_old_one() -> None:
     held = history(0, 1, 2)
-    newer = held.extended(estimate(2, 99.0))
+    newer = held.append(estimate(2, 99.0))
     assert times(newer) == [0, 1, 2]
     assert newer.newest.odom.xyz[0] == 99.0
     assert held.newest.odom.xyz[0] == 2.0
 
 
 def test_given_a_clock_that_steps_back_then_what_was_after_is_dropped() -> None:
-    assert times(history(0, 1, 2, 3).extended(estimate(1.5))) == [0, 1, 1.5]
-    assert times(history(0, 1, 2, 3).extended(estimate(-3600))) == [-3600]
+    assert times(history(0, 1, 2, 3).append(estimate(1.5))) == [0, 1, 1.5]
+    assert times(history(0, 1, 2, 3).append(estimate(-3600))) == [-3600]
 
 
 def test_given_a_clock_that_steps_forward_then_what_is_beyond_the_horizon_is_dropped() -> None:
-    assert times(history(0, 1, 2).extended(estimate(3600))) == [3600]
-    assert times(history(0, 1, 2).extended(estimate(61.5))) == [2, 61.5]
+    assert times(history(0, 1, 2).append(estimate(3600))) == [3600]
+    assert times(history(0, 1, 2).append(estimate(61.5))) == [2, 61.5]
 
 
 def test_given_more_than_the_horizon_then_only_that_much_is_held_and_memory_stays_bounded() -> None:
     held = History(2.0)
     for n in range(20_000):
-        held = held.extended(estimate(n * 0.01))
+        held = held.append(estimate(n * 0.01))
     assert len(held) == 201
     assert held.first == held.last - 2 * S
     assert len(held._times) < 4 * 1024
@@ -126,8 +126,8 @@ def test_given_more_than_the_horizon_then_only_that_much_is_held_and_memory_stay
 def test_given_a_time_between_two_then_position_and_rotation_lie_between() -> None:
     held = History(60.0)
     covariance = tuple(float(n) for n in range(36))
-    held = held.extended(Estimate(START, Pose.from_rpy((0, 0, 0), 0, 0, 0.2), invalid=Invalid.STALE_GPS))
-    held = held.extended(
+    held = held.append(Estimate(START, Pose.from_rpy((0, 0, 0), 0, 0, 0.2), invalid=Invalid.STALE_GPS))
+    held = held.append(
         Estimate(
             START + 4 * S, Pose.from_rpy((4, 8, 0), 0, 0, 0.6), odom_covariance=covariance, quality=Quality.REVERSING
         )
@@ -151,7 +151,7 @@ def test_given_a_time_that_is_held_exactly_then_it_is_that_estimate() -> None:
 def test_given_a_new_epoch_or_origin_between_then_the_earlier_pose_is_held(change: dict[str, object]) -> None:
     before = Estimate(START, Pose((1, 0, 0)))
     after = Estimate(START + S, Pose((9, 0, 0)), **change)  # type: ignore[arg-type]
-    held = History(60.0).extended(before).extended(after)
+    held = History(60.0).append(before).append(after)
     found = held.at(START + 999_999)
     assert found.odom.xyz[0] == 1.0
     assert found.quality == Quality.HELD
@@ -160,13 +160,13 @@ def test_given_a_new_epoch_or_origin_between_then_the_earlier_pose_is_held(chang
 
 
 def test_given_a_world_pose_known_at_one_end_only_then_there_is_none_between() -> None:
-    found = interpolated(estimate(0), estimate(1, utm=Pose((1, 2, 3)), enu=Pose((1, 2, 3))), START + S // 2)
+    found = interpolate(estimate(0), estimate(1, utm=Pose((1, 2, 3)), enu=Pose((1, 2, 3))), START + S // 2)
     assert found.utm is None
     assert found.enu is None
 
 
 @pytest.mark.parametrize("method", ["at", "check_span"])
-def test_given_a_time_before_all_then_it_is_too_old_and_both_times_are_told(method: str) -> None:
+def test_given_a_time_before_all_then_it_is_too_old_and_both_times_are_reported(method: str) -> None:
     held = history(10, 12)
     with pytest.raises(TooOldError) as caught:
         getattr(held, method)(START + 9 * S)
@@ -176,7 +176,7 @@ def test_given_a_time_before_all_then_it_is_too_old_and_both_times_are_told(meth
 
 
 @pytest.mark.parametrize("method", ["at", "check_span"])
-def test_given_a_time_after_all_then_it_is_too_new_and_the_ways_out_are_told(method: str) -> None:
+def test_given_a_time_after_all_then_it_is_too_new_and_the_remedies_are_reported(method: str) -> None:
     held = history(10, 12)
     with pytest.raises(TooNewError) as caught:
         getattr(held, method)(START + 12 * S + 1500)
@@ -189,15 +189,15 @@ def test_given_a_time_after_all_then_it_is_too_new_and_the_ways_out_are_told(met
 
 def test_given_held_then_the_newest_not_after_is_returned_however_far() -> None:
     held = history(0, 1, 2)
-    assert held.held(START + S + 1).odom.xyz[0] == 1
-    assert held.held(START + 10**15).odom.xyz[0] == 2
-    assert held.held(START).odom.xyz[0] == 0
+    assert held.hold(START + S + 1).odom.xyz[0] == 1
+    assert held.hold(START + 10**15).odom.xyz[0] == 2
+    assert held.hold(START).odom.xyz[0] == 0
     with pytest.raises(TooOldError):
-        held.held(START - 1)
+        held.hold(START - 1)
 
 
 def test_given_an_estimate_restamped_then_reasons_and_flags_are_added_not_replaced() -> None:
-    restamped = at_time(
+    restamped = restamp(
         estimate(0, invalid=Invalid.NO_FIX, quality=Quality.REVERSING), START + 5, Quality.HELD, Invalid.STALE_IMU
     )
     assert restamped.utime == START + 5

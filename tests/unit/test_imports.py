@@ -11,81 +11,73 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-VALUES = {"errors", "version", "spatial"}
+VALUES = {"errors", "version", "transforms"}
 GEOMETRY = VALUES | {"geometry"}
 POSES = VALUES | {"messages", "earth", "history"}
-CORE = GEOMETRY | POSES | {"joints", "localization", "platform"}
-WIRE = VALUES | {"messages", "wire", "mslcm", "regular_files"}
-SIGNING = {"keys", "signing"}
-SERVICE = CORE | WIRE | {"core", "config", "file_kinds", "formats"} | SIGNING
+CORE = GEOMETRY | POSES | {"joints", "estimation", "query"}
+FILES = {"files.kinds", "files.regular"}
+WIRE = VALUES | {"messages", "wire", "mslcm", "files.regular"}
+SIGNING = {"signing.signatures", "signing.key_files"}
+CONFIG = {"config.vehicle_file", "config.reader"}
+DRIVERS = {"msdrivers.protocol", "msdrivers.endpoint", "msdrivers.devices", "msdrivers.emulate"}
+SERVER = CORE | WIRE | CONFIG | FILES | SIGNING | {"core", "formats"}
 
 MAY_IMPORT: dict[str, set[str]] = {
     "version": set(),
+    # folders
+    "config": set(),
+    "files": set(),
+    "signing": set(),
     "errors": set(),
-    "spatial": {"errors"},
+    "transforms": {"errors"},
     "geometry": VALUES,
     "messages": VALUES,
-    "signing": VALUES | {"messages"},
-    "keys": VALUES | {"messages", "signing", "regular_files"},
+    "signing.signatures": VALUES | {"messages"},
+    "signing.key_files": VALUES | {"messages", "signing.signatures", "files.regular"},
     "earth": VALUES | {"messages"},
     "history": VALUES | {"messages"},
     "joints": GEOMETRY | {"messages"},
-    "file_kinds": set(),
-    "regular_files": set(),
+    "files.kinds": set(),
+    "files.regular": set(),
     # loads code, and neither computes nor reads anything
-    "filterpy_import": set(),
-    "formats": GEOMETRY | {"file_kinds", "regular_files"},
-    "localization": GEOMETRY | POSES | {"filterpy_import"},
-    "platform": CORE,
+    "estimation.filterpy_import": set(),
+    "formats": GEOMETRY | FILES,
+    "estimation": GEOMETRY | POSES | {"estimation.filterpy_import"},
+    "query": CORE,
     "core": CORE,
     "simulation": GEOMETRY | {"messages", "earth"},
-    "config": GEOMETRY | {"messages", "localization", "config_reader", "file_kinds", "regular_files"},
-    "config_reader": {"errors"},
+    "config.vehicle_file": GEOMETRY | FILES | {"messages", "estimation", "config.reader"},
+    "config.reader": {"errors"},
     "wire": WIRE,
-    "service": SERVICE,
-    "client": WIRE | GEOMETRY | POSES | {"formats", "joints", "platform"} | SIGNING,
+    "server": SERVER,
+    "client": WIRE | GEOMETRY | POSES | SIGNING | {"formats", "joints", "query"},
     "msdrivers.protocol": VALUES | {"messages"},
-    "msdrivers.station": VALUES | {"messages"},
-    "msdrivers.devices": VALUES | {"messages", "msdrivers.protocol", "msdrivers.station"},
-    "msdrivers.emulate": VALUES | {"messages", "earth", "simulation", "msdrivers.protocol", "msdrivers.station"},
-    "msdrivers": WIRE
-    | {"config_reader", "earth", "msdrivers.protocol", "msdrivers.station", "msdrivers.devices", "msdrivers.emulate"},
+    "msdrivers.endpoint": VALUES | {"messages"},
+    "msdrivers.devices": VALUES | {"messages", "msdrivers.protocol", "msdrivers.endpoint"},
+    "msdrivers.emulate": VALUES | {"messages", "earth", "simulation", "msdrivers.protocol", "msdrivers.endpoint"},
+    "msdrivers": WIRE | DRIVERS | {"config.reader", "earth"},
     "mslcm": set(),
-    "mstools": SERVICE
-    | {
-        "service",
-        "client",
-        "simulation",
-        "msdrivers",
-        "msdrivers.protocol",
-        "msdrivers.station",
-        "msdrivers.devices",
-        "msdrivers.emulate",
-    },
+    "mstools": SERVER | DRIVERS | {"server", "client", "simulation", "msdrivers"},
     # the public names, loaded when they are first used
-    "modelserver": VALUES | {"geometry", "messages", "formats", "client", "config"},
+    "modelserver": VALUES | CONFIG | {"geometry", "messages", "formats", "client"},
 }
-"""Package -> packages it may import, besides itself. Anything in modelserver/ goes by its name inside it."""
+"""Package -> packages it may import, besides itself. A name without the package is inside modelserver."""
 
 PURE = {
     "errors",
-    "file_kinds",
-    "spatial",
+    "files.kinds",
+    "transforms",
     "geometry",
     "earth",
-    "localization",
+    "estimation",
     "messages",
-    "signing",
+    "signing.signatures",
     "history",
     "joints",
-    "platform",
+    "query",
     "core",
     "simulation",
-    "msdrivers.protocol",
-    "msdrivers.station",
-    "msdrivers.devices",
-    "msdrivers.emulate",
-}
+} | DRIVERS
 
 IMPURE_MODULES = {
     "asyncio", "concurrent", "ctypes", "fcntl", "glob", "http", "importlib", "io", "lcm", "logging", "mmap",
@@ -118,13 +110,14 @@ def package_of(module: str) -> str:
     """Return the key of MAY_IMPORT that a module of this project belongs to, empty for a foreign one."""
     parts = module.split(".")
     if parts[0] == "modelserver":
-        return parts[1] if len(parts) > 1 else "modelserver"
+        deeper = ".".join(parts[1:3])
+        return deeper if deeper in MAY_IMPORT else parts[1] if len(parts) > 1 else "modelserver"
     if parts[0] == "msdrivers" and parts[1:2] and f"msdrivers.{parts[1]}" in MAY_IMPORT:
         return f"msdrivers.{parts[1]}"
     return parts[0] if parts[0] in MAY_IMPORT else ""
 
 
-def imported(tree: ast.AST, module: str, is_package: bool) -> list[tuple[int, str]]:
+def iterate_imports(tree: ast.AST, module: str, is_package: bool) -> list[tuple[int, str]]:
     """Return line and dotted name of everything imported, inside functions and TYPE_CHECKING blocks too."""
     found = []
     for node in ast.walk(tree):
@@ -148,7 +141,7 @@ def imported(tree: ast.AST, module: str, is_package: bool) -> list[tuple[int, st
     return found
 
 
-def misdirected(tree: ast.AST, module: str, is_package: bool) -> list[tuple[int, str]]:
+def find_misdirected(tree: ast.AST, module: str, is_package: bool) -> list[tuple[int, str]]:
     package = package_of(module)
     if not package:
         return []  # a script beside the packages
@@ -158,7 +151,7 @@ def misdirected(tree: ast.AST, module: str, is_package: bool) -> list[tuple[int,
         ]
     allowed = MAY_IMPORT[package] | {package}
     wrong = []
-    for line, name in imported(tree, module, is_package):
+    for line, name in iterate_imports(tree, module, is_package):
         other = package_of(name)
         if name.startswith("modelserver.") and other not in MAY_IMPORT:
             other = "modelserver"  # a name that the package itself exports, e.g. __version__
@@ -172,7 +165,7 @@ def impure(tree: ast.AST, module: str, is_package: bool) -> list[tuple[int, str]
         return []
     wrong = [
         (line, f"{module} is pure and imports {name}")
-        for line, name in imported(tree, module, is_package)
+        for line, name in iterate_imports(tree, module, is_package)
         if name.split(".")[0] in IMPURE_MODULES
     ]
     for node in ast.walk(tree):
@@ -197,14 +190,14 @@ def impure(tree: ast.AST, module: str, is_package: bool) -> list[tuple[int, str]
 
 
 @cache
-def parsed(path: Path) -> ast.Module:
+def parse(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"), str(path))
 
 
 def findings(rule) -> list[str]:
     report = []
     for path in sources():
-        tree = parsed(path)
+        tree = parse(path)
         report += [
             f"{path.relative_to(ROOT)}:{line}: {message}"
             for line, message in rule(tree, module_of(path), path.name == "__init__.py")
@@ -218,7 +211,7 @@ def complain(report: list[str], rule: str) -> None:
 
 
 def test_imports_point_one_way():
-    complain(findings(misdirected), "Imports point one way (table MAY_IMPORT). These do not:")
+    complain(findings(find_misdirected), "Imports point one way (table MAY_IMPORT). These do not:")
 
 
 def test_pure_packages_touch_no_clock_bus_disk_thread_or_log():
@@ -232,36 +225,36 @@ def test_no_module_imports_itself_through_others() -> None:
         tree = ast.parse(path.read_text(encoding="utf-8"))
         found = {
             name if name in modules else name.rpartition(".")[0]
-            for _, name in imported(tree, module, path.name == "__init__.py")
+            for _, name in iterate_imports(tree, module, path.name == "__init__.py")
         }
         # a package that a module is inside of is loaded before it in any case
         graph[module] = {name for name in found & modules.keys() if not f"{module}.".startswith(f"{name}.")}
     graphlib.TopologicalSorter(graph).prepare()
 
 
-def test_the_table_itself_has_no_circle():
+def test_the_table_itself_has_no_cycle():
     graphlib.TopologicalSorter({package: others - {package} for package, others in MAY_IMPORT.items()}).prepare()
     assert set(MAY_IMPORT) >= PURE
     assert set().union(*MAY_IMPORT.values()) <= set(MAY_IMPORT)
     # what is pure imports only what is pure, the version, or the module that loads filterpy
-    assert set().union(*(MAY_IMPORT[package] for package in PURE)) <= PURE | {"version", "filterpy_import"}
+    assert set().union(*(MAY_IMPORT[package] for package in PURE)) <= PURE | {"version", "estimation.filterpy_import"}
 
 
 @pytest.mark.parametrize(
-    ("module", "code", "said"),
+    ("module", "code", "message"),
     [
         (
-            "modelserver.spatial.pose",
+            "modelserver.transforms.pose",
             "from modelserver.geometry import Model",
-            "spatial imports modelserver.geometry.Model",
+            "transforms imports modelserver.geometry.Model",
         ),
-        ("modelserver.core", "def f():\n    from modelserver import service", "core imports modelserver.service"),
-        ("modelserver.core", "from . import service", "core imports modelserver.service"),
+        ("modelserver.core", "def f():\n    from modelserver import server", "core imports modelserver.server"),
+        ("modelserver.core", "from . import server", "core imports modelserver.server"),
         ("modelserver.core", "from .wire import codec", "core imports modelserver.wire.codec"),
         ("modelserver.core", "if TYPE_CHECKING:\n    import modelserver.wire", "core imports modelserver.wire"),
         ("modelserver.core", "import mslcm", "core imports mslcm"),
-        ("modelserver.service.loop", "from mstools import cli", "service imports mstools.cli"),
-        ("modelserver.service.loop", "from ..client import remote", "service imports modelserver.client.remote"),
+        ("modelserver.server.loop", "from mstools import cli", "server imports mstools.cli"),
+        ("modelserver.server.loop", "from ..client import remote", "server imports modelserver.client.remote"),
         (
             "modelserver.geometry.model",
             "import importlib\nimportlib.import_module('modelserver.wire')",
@@ -271,22 +264,22 @@ def test_the_table_itself_has_no_circle():
         ("modelserver.novelty", "import math", "package novelty is not in the table"),
     ],
 )
-def test_the_check_sees_what_points_the_wrong_way(module, code, said):
-    ((_, message),) = misdirected(ast.parse(code), module, False)
-    assert said in message
+def test_the_check_sees_what_points_the_wrong_way(module, code, message):
+    ((_, found),) = find_misdirected(ast.parse(code), module, False)
+    assert message in found
 
 
 @pytest.mark.parametrize(
     ("module", "code"),
     [
-        ("modelserver.spatial.pose", "from modelserver.spatial import so3\nfrom . import so3\nimport numpy"),
+        ("modelserver.transforms.pose", "from modelserver.transforms import so3\nfrom . import so3\nimport numpy"),
         ("modelserver.core", "from modelserver import messages\nfrom modelserver.geometry.model import Model"),
         ("modelserver.wire.codec", "from mslcm.gps_t import gps_t\nfrom modelserver import messages"),
         ("msdrivers.gps", "from msdrivers.protocol import nmea\nfrom msdrivers import transport"),
     ],
 )
 def test_the_check_lets_pass_what_points_the_right_way(module, code):
-    assert misdirected(ast.parse(code), module, False) == []
+    assert find_misdirected(ast.parse(code), module, False) == []
 
 
 @pytest.mark.parametrize(
@@ -311,7 +304,7 @@ def test_the_check_lets_pass_what_points_the_right_way(module, code):
 )
 def test_the_check_sees_what_is_not_pure(code):
     assert len(impure(ast.parse(code), "modelserver.core", False)) == 1
-    assert impure(ast.parse(code), "modelserver.service.loop", False) == []
+    assert impure(ast.parse(code), "modelserver.server.loop", False) == []
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Joints by time: what is held, what is told at an instant, and what of a sample is refused, with words."""
+"""History of joints: storage, positions at an instant, and rejected samples."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from modelserver.geometry.joint import Joint, JointType
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Constraint
 from modelserver.history import History
-from modelserver.joints.joints import (
-    ABSURD,
-    AHEAD_S,
-    LONGEST_GAP_S,
-    MOST_EXPLAINED,
-    MOST_READINGS,
+from modelserver.joints.history import (
+    MAX_CLOCK_LEAD_S,
+    MAX_GAP_S,
+    MAX_PLAUSIBLE,
+    MAX_READINGS,
+    MAX_SUGGESTIONS,
     PREDICTION_LIMIT_S,
-    How,
-    Joints,
+    JointHistory,
     JointTrack,
+    Provenance,
 )
-from modelserver.joints.track import BLOCK, LEAST_CHANGE
+from modelserver.joints.track import BLOCK_SIZE, MIN_ACCELERATION
 from modelserver.messages import NAN, Invalid, JointSample, JointsSample, Policy, Quality, SensorHeader, TimeQuery
-from modelserver.platform import PlatformView
-from modelserver.platform.many import many
-from modelserver.platform.moving import motion
+from modelserver.query import PlatformView
+from modelserver.query.batch import lookup_batch
+from modelserver.query.motion import compute_motion
 
 
 def at(seconds: float) -> int:
@@ -43,7 +43,7 @@ def track(*readings: tuple[float, ...], horizon: float = 60.0) -> JointTrack:
     held = JointTrack(horizon)
     for seconds, *values in readings:
         position, sigma, rate, rate_sigma = (*values, NAN, NAN, NAN)[:4]
-        held = held.extended(at(seconds), (position, sigma, rate, rate_sigma))
+        held = held.insert(at(seconds), (position, sigma, rate, rate_sigma))
     return held
 
 
@@ -55,39 +55,39 @@ def constraints() -> list[Constraint]:
     return list(rover().joints.values())
 
 
-def taken(
-    joints: Joints, seconds: float, *told: JointSample, now: float | None = None
-) -> tuple[Joints, tuple[str, ...]]:
-    return joints.taken(sample(seconds, *told), at(seconds if now is None else now))
+def update(
+    joints: JointHistory, seconds: float, *readings: JointSample, now: float | None = None
+) -> tuple[JointHistory, tuple[str, ...]]:
+    return joints.update(sample(seconds, *readings), at(seconds if now is None else now))
 
 
 # --- a track ------------------------------------------------------------------------------------------------
 
 
 def test_given_two_readings_then_between_them_position_and_rate_are_linear_and_sigmas_the_worse() -> None:
-    found = track((0, 1.0, 0.1, 2.0, 0.3), (1, 2.0, 0.2, 4.0, 0.1)).interpolated(at(0.25))
+    found = track((0, 1.0, 0.1, 2.0, 0.3), (1, 2.0, 0.2, 4.0, 0.1)).interpolate(at(0.25))
     assert found[1:5] == pytest.approx((1.25, 0.2, 2.5, 0.3))
-    assert (found.how, found.stamp, found.apart) == (How.INTERPOLATED, at(1), 1.0)
+    assert (found.provenance, found.stamp, found.gap) == (Provenance.INTERPOLATED, at(1), 1.0)
 
 
 def test_given_no_rates_then_the_rate_is_the_slope() -> None:
-    assert track((0, 1.0), (0.5, 2.0)).interpolated(at(0.1)).rate == pytest.approx(2.0)
+    assert track((0, 1.0), (0.5, 2.0)).interpolate(at(0.1)).rate == pytest.approx(2.0)
 
 
-def test_given_a_time_of_a_reading_then_that_is_told_as_measured() -> None:
+def test_given_a_time_of_a_reading_then_it_is_measured() -> None:
     held = track((0, 1.0), (1, 2.0), (2, 4.0))
     for seconds, position in ((0, 1.0), (1, 2.0), (2, 4.0)):
-        found = held.interpolated(at(seconds))
-        assert (found.how, found.position, found.stamp) == (How.MEASURED, position, at(seconds))
+        found = held.interpolate(at(seconds))
+        assert (found.provenance, found.position, found.stamp) == (Provenance.MEASURED, position, at(seconds))
 
 
 @pytest.mark.parametrize(("seconds", "kind", "side"), [(-0.5, TooOldError, "before"), (2.5, TooNewError, "after")])
-def test_given_a_time_that_is_not_held_then_the_error_says_which_was_wanted_and_what_is_held(
+def test_given_a_time_that_is_not_held_then_the_error_states_it_and_the_time_covered(
     seconds: float, kind: type[Exception], side: str
 ) -> None:
     held = track((0, 1.0), (2, 2.0))
-    with pytest.raises(kind, match=rf"{at(seconds)} is 0.500 s {side} what is held: {at(0)} to {at(2)} \(2.0 s\)"):
-        held.interpolated(at(seconds))
+    with pytest.raises(kind, match=rf"{at(seconds)} is 0.500 s {side} the time covered: {at(0)} to {at(2)} \(2.0 s\)"):
+        held.interpolate(at(seconds))
 
 
 def test_given_a_route_then_the_error_names_the_joint() -> None:
@@ -95,19 +95,19 @@ def test_given_a_route_then_the_error_names_the_joint() -> None:
         view(1.0).transformation(SCAN, BASE, TimeQuery(at(2.0)))
 
 
-def test_given_policy_held_then_the_newest_reading_before_is_told_with_its_age() -> None:
+def test_given_policy_held_then_the_newest_reading_before_is_held_with_its_age() -> None:
     held = track((0, 1.0, 0.1, 2.0, 0.3), (1, 2.0))
-    found = held.held(at(0.75))
-    assert (found.position, found.how, found.apart, found.stamp) == (1.0, How.HELD, 0.75, at(0))
-    assert held.held(at(1)).how is How.MEASURED
+    found = held.hold(at(0.75))
+    assert (found.position, found.provenance, found.gap, found.stamp) == (1.0, Provenance.HELD, 0.75, at(0))
+    assert held.hold(at(1)).provenance is Provenance.MEASURED
     with pytest.raises(TooOldError):
-        held.held(at(-1))
+        held.hold(at(-1))
 
 
 @pytest.mark.parametrize("limit", [1.5, math.inf])
 def test_given_policy_predicted_then_the_rate_carries_on_and_it_is_ever_less_sure(limit: float) -> None:
     held = track((0, 1.0, 0.01, 0.5, 0.02))
-    found = [held.predicted(at(ahead), limit) for ahead in (0.0, 0.1, 0.5, 1.0)]
+    found = [held.predict(at(ahead), limit) for ahead in (0.0, 0.1, 0.5, 1.0)]
     assert [each.position for each in found] == pytest.approx([1.0, 1.05, 1.25, 1.5])
     assert [each.sigma for each in found] == sorted({each.sigma for each in found})
     assert [each.rate_sigma for each in found] == sorted({each.rate_sigma for each in found})
@@ -116,36 +116,36 @@ def test_given_policy_predicted_then_the_rate_carries_on_and_it_is_ever_less_sur
 
 
 def test_given_a_time_too_far_ahead_then_it_is_not_predicted() -> None:
-    with pytest.raises(TooNewError, match=f"carried on {PREDICTION_LIMIT_S:g} s at most"):
-        track((0, 1.0)).predicted(at(PREDICTION_LIMIT_S + 0.1), 1.0)
+    with pytest.raises(TooNewError, match=f"predicted {PREDICTION_LIMIT_S:g} s at most"):
+        track((0, 1.0)).predict(at(PREDICTION_LIMIT_S + 0.1), 1.0)
 
 
-def test_given_one_reading_without_a_rate_then_only_a_limit_says_how_sure_its_prediction_is() -> None:
+def test_given_one_reading_without_a_rate_then_only_a_limit_gives_a_sigma_of_its_prediction() -> None:
     held = track((0, 1.0, 0.01))
-    assert math.isnan(held.predicted(at(0.5), math.inf).sigma)
-    assert held.predicted(at(0.5), 2.0).sigma == pytest.approx(math.hypot(0.01, 1.0, 0.25))
+    assert math.isnan(held.predict(at(0.5), math.inf).sigma)
+    assert held.predict(at(0.5), 2.0).sigma == pytest.approx(math.hypot(0.01, 1.0, 0.25))
 
 
-def test_given_readings_without_rates_then_their_slope_is_carried_on() -> None:
-    assert track((0, 1.0), (0.1, 1.1)).predicted(at(0.2), math.inf).position == pytest.approx(1.2)
+def test_given_readings_without_rates_then_they_are_extrapolated_by_their_slope() -> None:
+    assert track((0, 1.0), (0.1, 1.1)).predict(at(0.2), math.inf).position == pytest.approx(1.2)
 
 
 def test_given_an_old_track_that_is_extended_again_then_both_successors_and_it_stay_what_they_were() -> None:
     old = track((0, 0.0), (1, 1.0))
-    first = old.extended(at(2), (2.0, NAN, NAN, NAN))
-    second = old.extended(at(2), (-2.0, NAN, NAN, NAN))
-    third = old.extended(at(0.5), (9.0, NAN, NAN, NAN))
+    first = old.insert(at(2), (2.0, NAN, NAN, NAN))
+    second = old.insert(at(2), (-2.0, NAN, NAN, NAN))
+    third = old.insert(at(0.5), (9.0, NAN, NAN, NAN))
     assert [len(each) for each in (old, first, second, third)] == [2, 3, 3, 3]
     assert (old.last, old.newest.position) == (at(1), 1.0)
     assert (first.newest.position, second.newest.position) == (2.0, -2.0)
-    assert (first.interpolated(at(0.5)).position, third.interpolated(at(0.5)).position) == (0.5, 9.0)
-    longer = first.extended(at(3), (3.0, NAN, NAN, NAN))
+    assert (first.interpolate(at(0.5)).position, third.interpolate(at(0.5)).position) == (0.5, 9.0)
+    longer = first.insert(at(3), (3.0, NAN, NAN, NAN))
     assert (first.last, longer.last) == (at(2), at(3))
 
 
 def test_given_a_reading_older_than_what_may_be_held_then_the_track_is_the_same() -> None:
     held = track((0, 0.0), (10, 1.0), horizon=10.0)
-    assert held.extended(at(-0.1), (5.0, NAN, NAN, NAN)) is held
+    assert held.insert(at(-0.1), (5.0, NAN, NAN, NAN)) is held
 
 
 def test_given_two_readings_of_one_instant_then_the_surer_counts() -> None:
@@ -156,26 +156,26 @@ def test_given_two_readings_of_one_instant_then_the_surer_counts() -> None:
 def test_given_a_horizon_then_what_is_older_is_forgotten_and_the_memory_bounded() -> None:
     held = JointTrack(2.0)
     for n in range(50_000):
-        held = held.extended(T0 + n * 10_000, (float(n), NAN, NAN, NAN))
+        held = held.insert(T0 + n * 10_000, (float(n), NAN, NAN, NAN))
         assert len(held) <= 201
     assert held.first == held.last - 2 * S
-    assert sum(len(block.times) for block in held._blocks) <= 201 + BLOCK
+    assert sum(len(block.times) for block in held._blocks) <= 201 + BLOCK_SIZE
 
 
 def test_given_a_flood_then_the_time_held_is_shorter_and_not_the_memory_larger() -> None:
     held = JointTrack(3600.0)
-    for n in range(3 * MOST_READINGS):
-        held = held.extended(T0 + n, (float(n), NAN, NAN, NAN))
-    assert len(held) == MOST_READINGS
-    assert sum(len(block.times) for block in held._blocks) <= MOST_READINGS + BLOCK
-    assert held.interpolated(held.first).position == 2 * MOST_READINGS
+    for n in range(3 * MAX_READINGS):
+        held = held.insert(T0 + n, (float(n), NAN, NAN, NAN))
+    assert len(held) == MAX_READINGS
+    assert sum(len(block.times) for block in held._blocks) <= MAX_READINGS + BLOCK_SIZE
+    assert held.interpolate(held.first).position == 2 * MAX_READINGS
 
 
 # --- all joints ---------------------------------------------------------------------------------------------
 
 
 def test_given_joints_then_those_that_follow_are_not_driven() -> None:
-    names = Joints(constraints(), 60.0).names
+    names = JointHistory(constraints(), 60.0).names
     assert {"Nod", "Slide", "Ball.rx", "Table.turn"} < set(names)
     assert "Finger" not in names
 
@@ -187,99 +187,99 @@ def test_given_joints_then_those_that_follow_are_not_driven() -> None:
         (JointSample("Finger", 0.1), "unknown joint 'Finger'"),
         (JointSample("", 0.1), "unknown joint"),
         (JointSample("\x1b[2J" * 100, 0.1), "unknown joint"),
-        (JointSample("Nod", math.inf), "absurd position of Nod"),
-        (JointSample("Nod", -ABSURD), "absurd position of Nod"),
-        (JointSample("Nod", 0.1, -0.1), "bad sigma of Nod"),
-        (JointSample("Nod", 0.1, math.inf), "bad sigma of Nod"),
-        (JointSample("Nod", 0.1, 1e200), "bad sigma of Nod"),
-        (JointSample("Nod", 0.1, 0.1, math.inf), "bad rate of Nod"),
-        (JointSample("Nod", 0.1, 0.1, -1e300), "bad rate of Nod"),
-        (JointSample("Nod", 0.1, 0.1, 0.1, -1.0), "bad rate of Nod"),
-        (JointSample("Nod", 0.1, 0.1, 0.1, 1e300), "bad rate of Nod"),
+        (JointSample("Nod", math.inf), "implausible position of Nod"),
+        (JointSample("Nod", -MAX_PLAUSIBLE), "implausible position of Nod"),
+        (JointSample("Nod", 0.1, -0.1), "invalid sigma of Nod"),
+        (JointSample("Nod", 0.1, math.inf), "invalid sigma of Nod"),
+        (JointSample("Nod", 0.1, 1e200), "invalid sigma of Nod"),
+        (JointSample("Nod", 0.1, 0.1, math.inf), "invalid rate of Nod"),
+        (JointSample("Nod", 0.1, 0.1, -1e300), "invalid rate of Nod"),
+        (JointSample("Nod", 0.1, 0.1, 0.1, -1.0), "invalid rate of Nod"),
+        (JointSample("Nod", 0.1, 0.1, 0.1, 1e300), "invalid rate of Nod"),
     ],
 )
-def test_given_what_cannot_be_then_it_is_refused_in_words_and_the_rest_of_the_sample_taken(
+def test_given_invalid_readings_then_they_are_rejected_with_reasons_and_the_others_used(
     joint: JointSample, why: str
 ) -> None:
-    known, refused = taken(Joints(constraints(), 60.0), 0.0, joint, JointSample("Slide", 0.2))
-    assert len(refused) == 1
-    assert refused[0].startswith(why)
-    assert len(refused[0]) < 200
-    assert refused[0].isprintable()
+    known, rejected = update(JointHistory(constraints(), 60.0), 0.0, joint, JointSample("Slide", 0.2))
+    assert len(rejected) == 1
+    assert rejected[0].startswith(why)
+    assert len(rejected[0]) < 200
+    assert rejected[0].isprintable()
     assert list(known.tracks) == ["Slide"]
 
 
-def test_given_what_was_not_measured_then_nothing_is_said() -> None:
-    before = Joints(constraints(), 60.0)
-    assert taken(before, 0.0, JointSample("Nod", NAN, 0.1)) == (before, ())
+def test_given_what_was_not_measured_then_nothing_is_reported() -> None:
+    before = JointHistory(constraints(), 60.0)
+    assert update(before, 0.0, JointSample("Nod", NAN, 0.1)) == (before, ())
 
 
 def test_given_no_sigma_then_that_of_the_geometry_holds() -> None:
-    known, _ = taken(Joints(constraints(), 60.0), 0.0, JointSample("Nod", 0.1), JointSample("Ball.ry", 0.1))
+    known, _ = update(JointHistory(constraints(), 60.0), 0.0, JointSample("Nod", 0.1), JointSample("Ball.ry", 0.1))
     assert known.tracks["Nod"].newest.sigma == 0.001
     assert known.tracks["Ball.ry"].newest.sigma == 0.002
 
 
-def test_given_a_late_reading_then_it_is_refused_as_late() -> None:
-    known, _ = taken(Joints(constraints(), 10.0), 20.0, JointSample("Nod", 0.1))
-    assert taken(known, 5.0, JointSample("Nod", 0.2), now=20.0) == (known, ("late",))
+def test_given_a_late_reading_then_it_is_rejected_as_late() -> None:
+    known, _ = update(JointHistory(constraints(), 10.0), 20.0, JointSample("Nod", 0.1))
+    assert update(known, 5.0, JointSample("Nod", 0.2), now=20.0) == (known, ("too_old",))
 
 
 def test_given_a_clock_set_back_by_an_hour_then_nothing_of_the_two_times_is_mixed() -> None:
-    known = Joints(constraints(), 7200.0)
+    known = JointHistory(constraints(), 7200.0)
     for n in range(10):
-        known, _ = known.taken(joints_at(3600.0 + n * 0.1), at(3600.0 + n * 0.1))
+        known, _ = known.update(joints_at(3600.0 + n * 0.1), at(3600.0 + n * 0.1))
     before = known
-    known, refused = taken(known, 0.5, JointSample("Nod", 0.1))
-    assert refused == ()
-    # what was told of the others is of the other time, too
+    known, rejected = update(known, 0.5, JointSample("Nod", 0.1))
+    assert rejected == ()
+    # readings of the others are of the other time scale, too
     assert list(known.tracks) == ["Nod"]
     assert (known.tracks["Nod"].first, len(known.tracks["Nod"])) == (at(0.5), 1)
     assert len(before.tracks) == len(before.names)
 
 
-def test_given_a_clock_set_forward_by_an_hour_then_only_what_is_told_since_is_held() -> None:
-    known, _ = taken(Joints(constraints(), 60.0), 0.0, JointSample("Nod", 0.1))
-    known, _ = taken(known, 3600.0, JointSample("Nod", 0.2))
+def test_given_a_clock_set_forward_by_an_hour_then_only_readings_since_are_stored() -> None:
+    known, _ = update(JointHistory(constraints(), 60.0), 0.0, JointSample("Nod", 0.1))
+    known, _ = update(known, 3600.0, JointSample("Nod", 0.2))
     assert len(known.tracks["Nod"]) == 1
 
 
-def test_given_another_model_then_what_it_also_has_is_kept() -> None:
-    known, _ = Joints(constraints(), 60.0).taken(joints_at(0.0), T0)
+def test_given_another_model_then_common_joints_are_retained() -> None:
+    known, _ = JointHistory(constraints(), 60.0).update(joints_at(0.0), T0)
     assert set(known.for_model(rover()).tracks) == set(known.names)
 
 
-# --- what is told of them -----------------------------------------------------------------------------------
+# --- positions -----------------------------------------------------------------------------------
 
 
-def test_given_a_joint_beyond_its_limits_then_the_answer_says_so() -> None:
+def test_given_a_joint_beyond_its_limits_then_the_answer_is_flagged() -> None:
     platform = view(1.0)
-    joints, _ = taken(platform.joints, 1.1, JointSample("Nod", 0.61))
+    joints, _ = update(platform.joints, 1.1, JointSample("Nod", 0.61))
     answer = replace(platform, joints=joints).transformation(SCAN, BASE, TimeQuery(), at(1.1))
     assert Quality.OUT_OF_LIMITS in answer.quality
-    assert answer.transformation.valid
+    assert answer.transformation.is_valid
 
 
 def test_given_a_joint_that_was_silent_then_the_answer_around_it_may_not_be_used() -> None:
     platform = view(1.0)
-    joints, _ = taken(platform.joints, 1.5 + LONGEST_GAP_S, JointSample("Nod", 0.1))
+    joints, _ = update(platform.joints, 1.5 + MAX_GAP_S, JointSample("Nod", 0.1))
     platform = replace(platform, joints=joints)
-    now = at(1.5 + LONGEST_GAP_S)
+    now = at(1.5 + MAX_GAP_S)
     inside = platform.transformation(SCAN, BASE, TimeQuery(at(1.2)), now).transformation
     assert Invalid(inside.invalid_reasons) == Invalid.STALE_JOINT
-    assert platform.transformation(SCAN, BASE, TimeQuery(at(0.9)), now).transformation.valid
+    assert platform.transformation(SCAN, BASE, TimeQuery(at(0.9)), now).transformation.is_valid
     held = platform.transformation(SCAN, BASE, TimeQuery(at(1.2), Policy.HELD), now)
-    assert held.transformation.valid
+    assert held.transformation.is_valid
     assert Quality.HELD in held.quality
 
 
 def test_given_a_joint_silent_up_to_now_then_the_latest_common_time_is_its_last_and_stale() -> None:
     platform = view(3.0)
-    joints = Joints(constraints(), 60.0)
+    joints = JointHistory(constraints(), 60.0)
     for n in range(151):
-        told = joints_at(n * 0.02)
-        some = tuple(each for each in told.joints if each.name != "Nod" or n <= 50)
-        joints, _ = joints.taken(replace(told, joints=some), at(n * 0.02))
+        message = joints_at(n * 0.02)
+        some = tuple(each for each in message.joints if each.name != "Nod" or n <= 50)
+        joints, _ = joints.update(replace(message, joints=some), at(n * 0.02))
     platform = replace(platform, joints=joints)
     for pair in ((SCAN, BASE), (SCAN, UTM), (DEEP, SCAN)):
         answer = platform.transformation(*pair, TimeQuery(), at(3.0))
@@ -290,63 +290,63 @@ def test_given_a_joint_silent_up_to_now_then_the_latest_common_time_is_its_last_
 
 def test_given_a_joint_silent_for_so_long_that_nothing_common_is_held_then_the_error_names_it() -> None:
     platform = view(1.0)
-    joints = Joints(constraints(), 10.0)
-    joints, _ = joints.taken(joints_at(0.0), T0)
-    told = joints_at(100.0)
+    joints = JointHistory(constraints(), 10.0)
+    joints, _ = joints.update(joints_at(0.0), T0)
+    message = joints_at(100.0)
     for n in range(3):
-        some = tuple(each for each in told.joints if each.name != "Nod")
-        joints, _ = joints.taken(JointsSample(SensorHeader(at(100.0 + n), "arm"), some), at(100.0 + n))
-    with pytest.raises(TooOldError, match="joint Nod was heard last at"):
+        some = tuple(each for each in message.joints if each.name != "Nod")
+        joints, _ = joints.update(JointsSample(SensorHeader(at(100.0 + n), "arm"), some), at(100.0 + n))
+    with pytest.raises(TooOldError, match="joint Nod was received last at"):
         replace(platform, joints=joints).transformation(DEEP, SCAN, TimeQuery(), at(102.0))
 
 
-def test_given_joints_never_heard_then_they_rest_and_only_a_default_makes_that_valid() -> None:
-    platform = replace(view(1.0), joints=Joints(constraints(), 60.0))
+def test_given_joints_never_received_then_they_are_at_defaults_and_only_a_default_makes_that_valid() -> None:
+    platform = replace(view(1.0), joints=JointHistory(constraints(), 60.0))
     nod = platform.transformation(SCAN, BASE, TimeQuery(at(0.5)))
     assert Invalid(nod.transformation.invalid_reasons) == Invalid.JOINT_UNKNOWN
-    assert Quality.AT_REST in nod.quality
+    assert Quality.JOINT_DEFAULT in nod.quality
     slide = platform.transformation("Upper:Root", BASE, TimeQuery(at(0.5)))
-    assert slide.transformation.valid
-    assert Quality.AT_REST in slide.quality
+    assert slide.transformation.is_valid
+    assert Quality.JOINT_DEFAULT in slide.quality
 
 
-def test_given_a_joint_without_limits_whose_angle_begins_anew_then_it_goes_the_short_way_round():
+def test_given_a_joint_without_limits_whose_angle_wraps_then_it_takes_the_shorter_arc():
     builder = ModelBuilder()
-    builder.body("Rover").frame("Mast")
-    builder.body("Head").frame("Root")
-    builder.constraint("Pan", "Rover:Mast", "Head:Root", joint=Joint(JointType.REVOLUTE))
+    builder.add_body("Rover").add_frame("Mast")
+    builder.add_body("Head").add_frame("Root")
+    builder.add_constraint("Pan", "Rover:Mast", "Head:Root", joint=Joint(JointType.REVOLUTE))
     for begin, end, middle, rate in ((3.1, -3.1, math.pi, 0.0832), (6.2, 0.1, 6.2916, 0.1832), (12.5, 6.1, 9.3, -6.4)):
-        joints = Joints(builder.build().joints.values(), 60.0)
+        joints = JointHistory(builder.build().joints.values(), 60.0)
         for second, angle in enumerate((begin, end)):
             sample = JointsSample(SensorHeader(1 + second * S, "pan"), (JointSample("Pan", angle),))
-            joints, refused = joints.taken(sample, 1 + second * S)
-            assert not refused
+            joints, rejected = joints.update(sample, 1 + second * S)
+            assert not rejected
         track = joints.tracks["Pan"]
-        found = track.interpolated(1 + S // 2)
+        found = track.interpolate(1 + S // 2)
         assert math.isclose(math.remainder(found.position - middle, math.tau), 0.0, abs_tol=1e-3)
         assert math.isclose(found.rate, rate, abs_tol=1e-3)
-        assert math.isclose(track.columns(np.array([1 + S // 2]))[0][0], found.position, abs_tol=1e-12)
-        assert math.isclose(track.predicted(1 + S + S // 2, math.inf).rate, rate, abs_tol=1e-3)
+        assert math.isclose(track.interpolate_batch(np.array([1 + S // 2]))[0][0], found.position, abs_tol=1e-12)
+        assert math.isclose(track.predict(1 + S + S // 2, math.inf).rate, rate, abs_tol=1e-3)
 
 
-# --- what goes round ----------------------------------------------------------------------------------------
+# --- continuous angles --------------------------------------------------------------------------------------
 
 
-def jointed(joint: Joint) -> Model:
+def model_with(joint: Joint) -> Model:
     builder = ModelBuilder()
-    builder.body("Rover").frame("Mast")
-    builder.body("Head").frame("Root")
-    builder.constraint("J", "Rover:Mast", "Head:Root", joint=joint)
+    builder.add_body("Rover").add_frame("Mast")
+    builder.add_body("Head").add_frame("Root")
+    builder.add_constraint("J", "Rover:Mast", "Head:Root", joint=joint)
     return builder.build()
 
 
-def told(model: Model, *readings: tuple[float, dict[str, float]], rate: float = NAN) -> PlatformView:
-    """Return a view of a model whose joints were told so: seconds, positions."""
-    joints = Joints(model.joints.values(), 60.0)
+def view_of(model: Model, *readings: tuple[float, dict[str, float]], rate: float = NAN) -> PlatformView:
+    """Return a view of a model with readings: seconds, positions."""
+    joints = JointHistory(model.joints.values(), 60.0)
     for seconds, positions in readings:
         some = tuple(JointSample(name, value, 0.001, rate) for name, value in positions.items())
-        joints, refused = joints.taken(sample(seconds, *some), at(seconds))
-        assert not refused
+        joints, rejected = joints.update(sample(seconds, *some), at(seconds))
+        assert not rejected
     return PlatformView(model, "Rover:Mast", None, History(60.0), joints=joints)
 
 
@@ -360,41 +360,41 @@ def yaw(view: PlatformView, query: TimeQuery, now: float = 1.0) -> float:
 
 
 @pytest.mark.parametrize("kind", [JointType.SPHERICAL, JointType.FLOATING])
-def test_given_a_rotation_vector_that_begins_anew_then_it_goes_the_short_way_round(kind: JointType) -> None:
+def test_given_a_rotation_vector_that_wraps_then_it_takes_the_shorter_arc(kind: JointType) -> None:
     place = {"J.x": 1.0, "J.y": 2.0, "J.z": 3.0} if kind is JointType.FLOATING else {}
-    platform = told(jointed(Joint(kind)), (0.0, {**place, **ball(179)}), (0.1, {**place, **ball(-179)}))
+    platform = view_of(model_with(Joint(kind)), (0.0, {**place, **ball(179)}), (0.1, {**place, **ball(-179)}))
     for seconds, degrees in ((0.0, 179.0), (0.025, 179.5), (0.05, 180.0), (0.075, 180.5), (0.1, 181.0)):
         found = yaw(platform, TimeQuery(at(seconds)))
         assert math.remainder(found - degrees, 360.0) == pytest.approx(0.0, abs=1e-9)
-        column = many(platform, "Head:Root", "Rover:Mast", np.array([at(seconds)])).vectors[0]
+        column = lookup_batch(platform, "Head:Root", "Rover:Mast", np.array([at(seconds)])).vectors[0]
         assert 2.0 * abs(math.degrees(math.atan2(column[6], column[3]))) == pytest.approx(
             degrees if column[3] * column[6] > 0 or degrees <= 180 else 360 - degrees, abs=1e-9
         )
-        moved = motion(platform, "Head:Root", "Rover:Mast", "", TimeQuery(at(seconds)), at(1.0))
-        assert moved.rate == pytest.approx((0.0, 0.0, math.radians(20.0)))
-    carried = yaw(platform, TimeQuery(at(0.2), Policy.PREDICTED))
-    assert math.remainder(carried - 183.0, 360.0) == pytest.approx(0.0, abs=1e-9)
+        moved = compute_motion(platform, "Head:Root", "Rover:Mast", "", TimeQuery(at(seconds)), at(1.0))
+        assert moved.angular_velocity == pytest.approx((0.0, 0.0, math.radians(20.0)))
+    predicted = yaw(platform, TimeQuery(at(0.2), Policy.PREDICTED))
+    assert math.remainder(predicted - 183.0, 360.0) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_given_a_ball_with_rates_then_its_angular_velocity_and_its_change_are_between_those_told() -> None:
-    joints = Joints(jointed(Joint(JointType.SPHERICAL)).joints.values(), 60.0)
+def test_given_a_ball_with_rates_then_its_angular_velocity_and_its_change_are_interpolated() -> None:
+    joints = JointHistory(model_with(Joint(JointType.SPHERICAL)).joints.values(), 60.0)
     for seconds, degrees, rate in ((0.0, 179, 1.0), (0.1, -179, 2.0)):
         some = (JointSample("J.rx", 0.0, NAN, 0.0), JointSample("J.ry", 0.0, NAN, 0.0))
         some += (JointSample("J.rz", math.radians(degrees), NAN, rate),)
-        joints, _ = taken(joints, seconds, *some)
-    platform = replace(told(jointed(Joint(JointType.SPHERICAL))), joints=joints)
-    moved = motion(platform, "Head:Root", "Rover:Mast", "", TimeQuery(at(0.05)), at(1.0))
-    assert moved.rate == pytest.approx((0.0, 0.0, 1.5))
-    assert moved.turn_acceleration == pytest.approx((0.0, 0.0, 10.0))
+        joints, _ = update(joints, seconds, *some)
+    platform = replace(view_of(model_with(Joint(JointType.SPHERICAL))), joints=joints)
+    moved = compute_motion(platform, "Head:Root", "Rover:Mast", "", TimeQuery(at(0.05)), at(1.0))
+    assert moved.angular_velocity == pytest.approx((0.0, 0.0, 1.5))
+    assert moved.angular_acceleration == pytest.approx((0.0, 0.0, 10.0))
 
 
-def test_given_a_ball_whose_coordinates_are_told_at_different_times_then_each_goes_by_itself() -> None:
-    model = jointed(Joint(JointType.SPHERICAL))
-    platform = told(model, (0.0, ball(10)), (0.1, {"J.rx": 0.0, "J.ry": 0.0}), (0.2, {"J.rz": math.radians(20)}))
-    platform = replace(platform, joints=taken(platform.joints, 0.2, JointSample("J.rx", 0.0))[0])
-    platform = replace(platform, joints=taken(platform.joints, 0.2, JointSample("J.ry", 0.0))[0])
+def test_given_a_ball_whose_coordinates_have_different_times_then_each_is_interpolated_by_itself() -> None:
+    model = model_with(Joint(JointType.SPHERICAL))
+    platform = view_of(model, (0.0, ball(10)), (0.1, {"J.rx": 0.0, "J.ry": 0.0}), (0.2, {"J.rz": math.radians(20)}))
+    platform = replace(platform, joints=update(platform.joints, 0.2, JointSample("J.rx", 0.0))[0])
+    platform = replace(platform, joints=update(platform.joints, 0.2, JointSample("J.ry", 0.0))[0])
     assert yaw(platform, TimeQuery(at(0.05))) == pytest.approx(12.5)
-    column = many(platform, "Head:Root", "Rover:Mast", np.array([at(0.05)])).vectors[0]
+    column = lookup_batch(platform, "Head:Root", "Rover:Mast", np.array([at(0.05)])).vectors[0]
     assert math.degrees(2.0 * math.atan2(column[6], column[3])) == pytest.approx(12.5)
 
 
@@ -402,14 +402,14 @@ def test_given_a_planar_joint_with_limits_in_the_plane_only_then_it_turns() -> N
     joint = Joint(JointType.PLANAR, lower=(-2.0, -math.inf, -math.inf), upper=(2.0, math.inf, math.inf))
     ways = ((0.0, 179.0), (0.1, -179.0))
     readings = [(t, {"J.x": 0.0, "J.y": 0.0, "J.turn": math.radians(degrees)}) for t, degrees in ways]
-    assert abs(yaw(told(jointed(joint), *readings), TimeQuery(at(0.05)))) == pytest.approx(180.0)
+    assert abs(yaw(view_of(model_with(joint), *readings), TimeQuery(at(0.05)))) == pytest.approx(180.0)
 
 
-def test_given_rates_then_a_joint_without_limits_goes_the_way_that_they_tell() -> None:
-    platform = told(jointed(Joint(JointType.REVOLUTE)), (0.0, {"J": 0.0}), (1.0, {"J": 4.0}), rate=4.0)
+def test_given_rates_then_a_joint_without_limits_is_unwrapped_by_them() -> None:
+    platform = view_of(model_with(Joint(JointType.REVOLUTE)), (0.0, {"J": 0.0}), (1.0, {"J": 4.0}), rate=4.0)
     track = platform.joints.tracks["J"]
-    assert track.interpolated(at(0.5)).position == pytest.approx(2.0)
-    assert track.columns(np.array([at(0.5)]))[0][0] == pytest.approx(2.0)
+    assert track.interpolate(at(0.5)).position == pytest.approx(2.0)
+    assert track.interpolate_batch(np.array([at(0.5)]))[0][0] == pytest.approx(2.0)
 
 
 # --- slopes and predictions ---------------------------------------------------------------------------------
@@ -417,111 +417,115 @@ def test_given_rates_then_a_joint_without_limits_goes_the_way_that_they_tell() -
 
 def test_given_readings_too_near_each_other_then_their_slope_is_no_rate() -> None:
     held = track((0, 1.0), (1, 1.0), (1.000_002, 1.002))
-    assert math.isnan(held.interpolated(at(1.000_001)).rate)
-    assert math.isnan(held.changes(held.interpolated(at(1.000_001)))[0])
-    assert held.predicted(at(1.1), math.inf).rate == pytest.approx(0.002, abs=1e-4)
+    assert math.isnan(held.interpolate(at(1.000_001)).rate)
+    assert math.isnan(held.estimate_derivatives(held.interpolate(at(1.000_001)))[0])
+    assert held.predict(at(1.1), math.inf).rate == pytest.approx(0.002, abs=1e-4)
 
 
-def test_given_a_slope_beyond_the_rate_limit_then_it_is_carried_on_by_the_limit() -> None:
-    assert track((0, 0.0), (0.01, 1.0)).predicted(at(0.11), 2.0).position == pytest.approx(1.2)
+def test_given_a_slope_beyond_the_rate_limit_then_it_is_extrapolated_by_the_limit() -> None:
+    assert track((0, 0.0), (0.01, 1.0)).predict(at(0.11), 2.0).position == pytest.approx(1.2)
 
 
 @pytest.mark.parametrize("rates", [(0.0, NAN), (NAN, NAN), (0.0, 0.0)])
-def test_given_a_joint_that_stands_then_its_prediction_is_ever_less_sure(rates: tuple[float, float]) -> None:
+def test_given_a_stationary_joint_then_the_sigma_of_its_prediction_grows(rates: tuple[float, float]) -> None:
     held = track((0, 1.0, 0.01, *rates), (0.1, 1.0, 0.01, *rates))
-    found = [held.predicted(at(0.1 + ahead), math.inf) for ahead in (0.0, 0.5, 1.0)]
+    found = [held.predict(at(0.1 + ahead), math.inf) for ahead in (0.0, 0.5, 1.0)]
     assert [each.position for each in found] == [1.0, 1.0, 1.0]
-    assert found[-1].sigma == pytest.approx(math.hypot(0.01, 0.5 * LEAST_CHANGE))
+    assert found[-1].sigma == pytest.approx(math.hypot(0.01, 0.5 * MIN_ACCELERATION))
     assert found[0].sigma < found[1].sigma < found[2].sigma
-    assert found[-1].rate_sigma == pytest.approx(LEAST_CHANGE)
+    assert found[-1].rate_sigma == pytest.approx(MIN_ACCELERATION)
 
 
 # --- clocks, reloads and what comes late --------------------------------------------------------------------
 
 
-def test_given_a_sample_of_the_future_then_it_is_refused_and_nothing_forgotten() -> None:
-    known, _ = taken(Joints(constraints(), 60.0), 0.0, JointSample("Nod", 0.1))
-    assert taken(known, 2.0 + AHEAD_S + 0.01, JointSample("Nod", 0.2), now=2.0) == (known, ("future",))
-    assert taken(known, 2.0 + AHEAD_S - 0.01, JointSample("Nod", 0.2), now=2.0)[1] == ()
+def test_given_a_sample_of_the_future_then_it_is_rejected_and_nothing_forgotten() -> None:
+    known, _ = update(JointHistory(constraints(), 60.0), 0.0, JointSample("Nod", 0.1))
+    assert update(known, 2.0 + MAX_CLOCK_LEAD_S + 0.01, JointSample("Nod", 0.2), now=2.0) == (known, ("future",))
+    assert update(known, 2.0 + MAX_CLOCK_LEAD_S - 0.01, JointSample("Nod", 0.2), now=2.0)[1] == ()
 
 
 def test_given_a_clock_set_back_by_less_than_a_second_then_two_times_are_not_mixed() -> None:
-    known = Joints(constraints(), 60.0)
+    known = JointHistory(constraints(), 60.0)
     for n in range(50):
-        known, _ = taken(known, n * 0.02, JointSample("Nod", 1.0))
-    known, _ = taken(known, 0.18, JointSample("Nod", -1.0))
+        known, _ = update(known, n * 0.02, JointSample("Nod", 1.0))
+    known, _ = update(known, 0.18, JointSample("Nod", -1.0))
     assert (len(known.tracks["Nod"]), known.tracks["Nod"].newest.position) == (1, -1.0)
 
 
-def test_given_a_clock_set_back_and_a_joint_not_heard_since_then_the_latest_is_stale() -> None:
-    platform = told(jointed(Joint(JointType.REVOLUTE)), (100.0, {"J": 1.0}))
+def test_given_a_clock_set_back_and_a_joint_not_received_since_then_the_latest_is_stale() -> None:
+    platform = view_of(model_with(Joint(JointType.REVOLUTE)), (100.0, {"J": 1.0}))
     for now, reason in ((50.0, Invalid.STALE_JOINT), (99.8, Invalid.STALE_JOINT), (99.95, Invalid(0))):
         answer = platform.transformation("Head:Root", "Rover:Mast", TimeQuery(), at(now))
         assert Invalid(answer.transformation.invalid_reasons) == reason
 
 
 def test_given_a_joint_of_another_type_after_a_reload_then_nothing_is_known_of_it() -> None:
-    known = told(jointed(Joint(JointType.REVOLUTE)), (0.0, {"J": 1.5})).joints
-    other = known.for_model(jointed(Joint(JointType.PRISMATIC, axis=(1.0, 0.0, 0.0))))
+    known = view_of(model_with(Joint(JointType.REVOLUTE)), (0.0, {"J": 1.5})).joints
+    other = known.for_model(model_with(Joint(JointType.PRISMATIC, axis=(1.0, 0.0, 0.0))))
     assert dict(other.tracks) == {}
 
 
 def test_given_a_joint_that_lost_its_limits_in_a_reload_then_it_goes_round() -> None:
-    limited = jointed(Joint(JointType.REVOLUTE, lower=(-7.0,), upper=(7.0,)))
-    known = told(limited, (0.0, {"J": 3.1}), (0.1, {"J": -3.1})).joints
-    free = known.for_model(jointed(Joint(JointType.REVOLUTE)))
-    assert known.tracks["J"].interpolated(at(0.05)).position == pytest.approx(0.0)
-    assert free.tracks["J"].interpolated(at(0.05)).position == pytest.approx(math.pi)
+    limited = model_with(Joint(JointType.REVOLUTE, lower=(-7.0,), upper=(7.0,)))
+    known = view_of(limited, (0.0, {"J": 3.1}), (0.1, {"J": -3.1})).joints
+    free = known.for_model(model_with(Joint(JointType.REVOLUTE)))
+    assert known.tracks["J"].interpolate(at(0.05)).position == pytest.approx(0.0)
+    assert free.tracks["J"].interpolate(at(0.05)).position == pytest.approx(math.pi)
 
 
 def test_given_a_name_twice_in_a_message_then_the_first_counts() -> None:
-    known, refused = taken(Joints(constraints(), 60.0), 0.0, JointSample("Nod", 0.1), JointSample("Nod", 0.2))
-    assert refused == ("Nod twice",)
+    known, rejected = update(JointHistory(constraints(), 60.0), 0.0, JointSample("Nod", 0.1), JointSample("Nod", 0.2))
+    assert rejected == ("duplicate Nod",)
     assert known.tracks["Nod"].newest.position == 0.1
 
 
-def test_given_a_message_that_comes_again_then_nothing_changes_and_nothing_is_refused() -> None:
-    known, _ = Joints(constraints(), 60.0).taken(joints_at(0.0), T0)
-    assert known.taken(joints_at(0.0), T0) == (known, ())
+def test_given_a_message_that_comes_again_then_nothing_changes_and_nothing_is_rejected() -> None:
+    known, _ = JointHistory(constraints(), 60.0).update(joints_at(0.0), T0)
+    assert known.update(joints_at(0.0), T0) == (known, ())
 
 
 def test_given_a_late_reading_then_no_more_than_a_block_is_copied() -> None:
     held = JointTrack(60.0)
-    for n in range(10 * BLOCK):
-        held = held.extended(T0 + 2 * n, (float(n), NAN, NAN, NAN))
-    late = held.extended(T0 + 5 * BLOCK, (0.25, NAN, NAN, NAN)).extended(T0 + 5 * BLOCK + 1, (0.5, NAN, NAN, NAN))
+    for n in range(10 * BLOCK_SIZE):
+        held = held.insert(T0 + 2 * n, (float(n), NAN, NAN, NAN))
+    late = held.insert(T0 + 5 * BLOCK_SIZE, (0.25, NAN, NAN, NAN)).insert(T0 + 5 * BLOCK_SIZE + 1, (0.5, NAN, NAN, NAN))
     assert len(late) == len(held) + 1
     fresh = [block for block in late._blocks if all(block is not each for each in held._blocks)]
     assert len(fresh) == 1
-    assert len(fresh[0].times) == BLOCK + 1
-    assert late.held(T0 + 5 * BLOCK + 1).position == 0.5
+    assert len(fresh[0].times) == BLOCK_SIZE + 1
+    assert late.hold(T0 + 5 * BLOCK_SIZE + 1).position == 0.5
 
 
-def test_given_a_question_of_a_moment_then_only_the_readings_around_it_are_copied() -> None:
+def test_given_a_query_of_a_moment_then_only_the_readings_around_it_are_copied() -> None:
     held = JointTrack(60.0)
-    for n in range(5 * BLOCK):
-        held = held.extended(T0 + n * 1000, (float(n), NAN, NAN, NAN))
+    for n in range(5 * BLOCK_SIZE):
+        held = held.insert(T0 + n * 1000, (float(n), NAN, NAN, NAN))
     with mock.patch.object(np, "frombuffer", wraps=np.frombuffer) as copied:
-        held.columns(np.array([T0 + 1_000_500, T0 + 1_010_500]))
+        held.interpolate_batch(np.array([T0 + 1_000_500, T0 + 1_010_500]))
     assert 12 <= len(copied.call_args_list[0].args[0]) <= 13
 
 
-@pytest.mark.parametrize(("utime", "why"), [(T0 // S, "seconds"), (T0 // 1000, "milliseconds"), (T0 - 61 * S, "late")])
-def test_given_a_stamp_older_than_what_is_held_then_also_the_first_is_refused_and_the_unit_told(utime: int, why: str):
-    joints, refused = Joints(constraints(), 60.0).taken(
+@pytest.mark.parametrize(
+    ("utime", "why"), [(T0 // S, "seconds"), (T0 // 1000, "milliseconds"), (T0 - 61 * S, "too_old")]
+)
+def test_given_a_stamp_older_than_what_is_held_then_also_the_first_is_rejected_with_the_unit(utime: int, why: str):
+    joints, rejected = JointHistory(constraints(), 60.0).update(
         JointsSample(SensorHeader(utime, "arm"), (JointSample("Nod", 0.1),)), T0
     )
     assert not joints.tracks
-    assert why in refused[0]
+    assert why in rejected[0]
 
 
 def test_given_a_thousand_unknown_joints_in_one_message_then_the_nearest_name_of_a_few_is_searched(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     searched: list[str] = []
-    monkeypatch.setattr("modelserver.joints.joints.nearest_names", lambda name, known: searched.append(name) or [])
+    monkeypatch.setattr(
+        "modelserver.joints.history.find_nearest_names", lambda name, known: searched.append(name) or []
+    )
     unknown = [JointSample(f"x{n}", 0.1) for n in range(1024)]
-    _, refused = Joints(constraints(), 60.0).taken(sample(1.0, *unknown), at(1.0))
-    assert len(refused) == 1024
-    assert len(searched) == MOST_EXPLAINED
-    assert refused[-1] == "unknown joint"
+    _, rejected = JointHistory(constraints(), 60.0).update(sample(1.0, *unknown), at(1.0))
+    assert len(rejected) == 1024
+    assert len(searched) == MAX_SUGGESTIONS
+    assert rejected[-1] == "unknown joint"

@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from modelserver.errors import KeyFileError
-from modelserver.keys import KEY_BYTES, new_key, read_keys, shared_folder, write_key
+from modelserver.signing.key_files import KEY_BYTES, find_group_writable_folder, generate_key, read_keys, write_key
 from mstools.cli import main
 
 HEX = "00112233445566778899aabbccddeeff"
 
 
-def written(folder: Path, text: str, mode: int = 0o600) -> Path:
+def write_file(folder: Path, text: str, mode: int = 0o600) -> Path:
     path = folder / "some.key"
     path.write_text(text)
     path.chmod(mode)
@@ -43,15 +43,15 @@ def test_given_a_new_key_then_its_file_is_its_owners_and_reads_back(
 
 
 def test_given_two_new_keys_then_secrets_and_names_differ() -> None:
-    one, other = new_key(), new_key()
+    one, other = generate_key(), generate_key()
     assert one.secret != other.secret
     assert one.name != other.name
     with pytest.raises(KeyFileError):
-        new_key("with space")
+        generate_key("with space")
 
 
 def test_given_several_keys_then_all_are_read_in_order(tmp_path: Path) -> None:
-    path = written(tmp_path, f"# ours\n\nold {HEX}\n  new {HEX}00\n")
+    path = write_file(tmp_path, f"# ours\n\nold {HEX}\n  new {HEX}00\n")
     assert [key.name for key in read_keys(path)] == ["old", "new"]
 
 
@@ -70,24 +70,24 @@ def test_given_several_keys_then_all_are_read_in_order(tmp_path: Path) -> None:
         ("\x00\xff\x1b[31m", "the name of a key"),
     ],
 )
-def test_given_a_file_that_is_no_key_file_then_it_says_why_and_repeats_nothing_of_it(
+def test_given_a_file_that_is_no_key_file_then_it_is_rejected_without_quoting_it(
     tmp_path: Path, text: str, why: str
 ) -> None:
     with pytest.raises(KeyFileError, match=why) as caught:
-        read_keys(written(tmp_path, text))
+        read_keys(write_file(tmp_path, text))
     assert HEX[:30] not in str(caught.value)
     assert str(caught.value).isprintable()
 
 
 @pytest.mark.parametrize("mode", [0o604, 0o644, 0o602, 0o601, 0o620, 0o777])
-def test_given_a_file_that_others_may_touch_then_it_is_refused(tmp_path: Path, mode: int) -> None:
+def test_given_a_file_that_others_may_touch_then_it_is_rejected(tmp_path: Path, mode: int) -> None:
     with pytest.raises(KeyFileError, match="chmod 600"):
-        read_keys(written(tmp_path, f"a {HEX}\n", mode))
+        read_keys(write_file(tmp_path, f"a {HEX}\n", mode))
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o400, 0o640, 0o440])
 def test_given_a_file_of_its_owner_and_group_then_it_is_read(tmp_path: Path, mode: int) -> None:
-    assert read_keys(written(tmp_path, f"a {HEX}\n", mode))[0].name == "a"
+    assert read_keys(write_file(tmp_path, f"a {HEX}\n", mode))[0].name == "a"
 
 
 def test_given_what_systemd_hands_over_then_that_is_read_whatever_its_mode(
@@ -95,20 +95,20 @@ def test_given_what_systemd_hands_over_then_that_is_read_whatever_its_mode(
 ) -> None:
     handed = tmp_path / "credentials"
     handed.mkdir()
-    written(handed, f"handed {HEX}\n", 0o444)
+    write_file(handed, f"handed {HEX}\n", 0o444)
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(handed))
     assert read_keys("/etc/modelserver/some.key")[0].name == "handed"
     with pytest.raises(KeyFileError, match="there is no key file"):
         read_keys(tmp_path / "other.key")
 
 
-def test_given_no_file_then_it_says_what_makes_one(tmp_path: Path) -> None:
+def test_given_no_file_then_the_error_names_the_command_that_makes_one(tmp_path: Path) -> None:
     with pytest.raises(KeyFileError, match="modelserver key new"):
         read_keys(tmp_path / "none")
     with pytest.raises(KeyFileError, match="cannot be read"):
         read_keys(tmp_path)
     with pytest.raises(KeyFileError, match="cannot be written"):
-        write_key(tmp_path / "none" / "a.key", new_key())
+        write_key(tmp_path / "none" / "a.key", generate_key())
 
 
 # --- who can put another file in its place ------------------------------------------------------------------
@@ -118,7 +118,7 @@ def test_given_no_file_then_it_says_what_makes_one(tmp_path: Path) -> None:
 def test_given_a_key_in_a_folder_that_everyone_may_write_then_it_is_not_read_nor_made(tmp_path: Path, by: str) -> None:
     folder = tmp_path / "open"
     folder.mkdir()
-    path = written(folder, f"a {HEX}")
+    path = write_file(folder, f"a {HEX}")
     if by == "link":
         path = tmp_path / "link.key"
         path.symlink_to(folder / "some.key")
@@ -127,7 +127,7 @@ def test_given_a_key_in_a_folder_that_everyone_may_write_then_it_is_not_read_nor
     with pytest.raises(KeyFileError, match=r"open, which everyone may write \(mode 0777\): chmod o-w it"):
         read_keys(path)
     with pytest.raises(KeyFileError, match="everyone may write"):
-        write_key(folder / "new.key", new_key())
+        write_key(folder / "new.key", generate_key())
     assert not (folder / "new.key").exists()
     # files in one with the sticky bit are their owners'
     folder.chmod(0o1777)
@@ -137,7 +137,7 @@ def test_given_a_key_in_a_folder_that_everyone_may_write_then_it_is_not_read_nor
 def test_given_a_key_or_a_folder_of_another_user_then_it_is_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = written(tmp_path, f"a {HEX}")
+    path = write_file(tmp_path, f"a {HEX}")
     stranger = os.geteuid() + 12345
     if os.geteuid() == 0:
         os.chown(path, stranger, -1)
@@ -159,8 +159,8 @@ def test_given_a_key_or_a_folder_of_another_user_then_it_is_not_read(
 def test_given_a_folder_that_a_group_may_write_then_it_is_named(tmp_path: Path) -> None:
     folder = tmp_path / "team"
     folder.mkdir(mode=0o755)
-    path = written(folder, f"a {HEX}")
-    assert shared_folder(path) == ""
+    path = write_file(folder, f"a {HEX}")
+    assert find_group_writable_folder(path) == ""
     folder.chmod(0o775)
-    assert shared_folder(path) == str(folder)
+    assert find_group_writable_folder(path) == str(folder)
     assert read_keys(path)[0].name == "a"

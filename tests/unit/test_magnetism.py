@@ -88,7 +88,7 @@ def test_given_the_last_microsecond_of_the_models_when_asked_then_it_answers() -
 
 
 @pytest.mark.parametrize("utime", [0, -1, utime_of(2010.0) - 1, utime_of(2030.0), 1 << 62])
-def test_given_a_time_that_no_model_covers_when_asked_then_it_says_what_to_do(utime: int) -> None:
+def test_given_a_time_that_no_model_covers_when_asked_then_it_reports_what_to_do(utime: int) -> None:
     with pytest.raises(MagnetismError, match=r"outside 2010 to 2029.*clock"):
         field_at(50.0, 10.0, 0.0, utime)
 
@@ -103,7 +103,7 @@ def test_given_a_time_that_no_model_covers_when_asked_then_it_says_what_to_do(ut
         ((0.0, 0.0, -6e6), "ends at heights"),
     ],
 )
-def test_given_no_place_when_asked_then_it_is_told(place: tuple[float, float, float], words: str) -> None:
+def test_given_no_place_when_asked_then_it_is_reported(place: tuple[float, float, float], words: str) -> None:
     with pytest.raises(MagnetismError, match=words):
         declination(*place, START)
 

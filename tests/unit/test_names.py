@@ -28,6 +28,6 @@ def test_no_two_public_classes_share_a_name() -> None:
     shared = {
         name: places
         for name, places in classes.items()
-        if len(places) > 1 and not any("/localization/" in place for place in places)
+        if len(places) > 1 and not any("/estimation/" in place for place in places)
     }
     assert shared == {}

@@ -1,4 +1,4 @@
-"""Platform: every pair of frames, at every kind of time, and each way in which there is no answer."""
+"""PlatformView: every pair of frames, with every time policy, and every error."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from support_samples import ORIGIN, START, Scripted, cart
+from support_samples import ORIGIN, START, ScriptedLocalizer, cart
 
 from modelserver.errors import (
     LimitError,
@@ -23,8 +23,8 @@ from modelserver.errors import (
 from modelserver.geometry import names
 from modelserver.history import History
 from modelserver.messages import Invalid, Policy, PoseAnswer, Quality, TimeQuery
-from modelserver.platform import HISTORY_LIMIT, PREDICTION_LIMIT_S, PlatformView
-from modelserver.spatial import Pose, so3
+from modelserver.query import HISTORY_LIMIT, PREDICTION_LIMIT_S, PlatformView
+from modelserver.transforms import Pose, so3
 
 S = 1_000_000
 NOW = TimeQuery()
@@ -35,16 +35,16 @@ WORLDS = (UTM, ENU, ODOM)
 
 
 def view(
-    seconds: int = 10, localizer: Scripted | None = None, sigma: bool = False, horizon: float = 60.0
+    seconds: int = 10, localizer: ScriptedLocalizer | None = None, sigma: bool = False, horizon: float = 60.0
 ) -> PlatformView:
     """The platform after `seconds` with a sample in each."""
-    localizer = localizer or Scripted()
+    localizer = localizer or ScriptedLocalizer()
     held = History(horizon)
     for n in range(seconds + 1):
-        localizer = Scripted(
-            START + n * S, n + 1, localizer.known, localizer.epoch, localizer.stale_s, localizer.invalid
+        localizer = ScriptedLocalizer(
+            START + n * S, n + 1, localizer.origin, localizer.epoch, localizer.stale_s, localizer.invalid
         )
-        held = held.extended(localizer.estimate(localizer.utime))
+        held = held.append(localizer.estimate(localizer.utime))
     return PlatformView(cart(sigma), BASE, localizer, held)
 
 
@@ -59,7 +59,7 @@ def ask(platform: PlatformView, interest: str, reference: str, time: TimeQuery =
 def test_given_any_pair_then_the_reverse_is_its_inverse_in_pose_covariance_and_validity(
     interest: str, reference: str
 ) -> None:
-    platform = view(localizer=Scripted(invalid=Invalid.STALE_GPS | Invalid.NOT_MOVED_YET), sigma=True)
+    platform = view(localizer=ScriptedLocalizer(invalid=Invalid.STALE_GPS | Invalid.NOT_MOVED_YET), sigma=True)
     there, back = ask(platform, interest, reference), ask(platform, reference, interest)
     assert there.transformation.frame_of_interest == interest
     assert there.transformation.frame_of_reference == reference
@@ -69,7 +69,7 @@ def test_given_any_pair_then_the_reverse_is_its_inverse_in_pose_covariance_and_v
     forth, inverted = there.transformation.covariance, back.transformation.inverse().covariance
     assert (forth is None) == (inverted is None)
     if forth is not None and inverted is not None:
-        # `inverse` is of first order; the arc on which a far world swings is off that by a turn squared
+        # `inverse` is of first order; the large-angle lever-arm error differs by the square of the angle
         off = float(np.trace(forth[3:, 3:])) * float(np.linalg.norm(there.transformation.pose.position))
         assert np.allclose(forth, inverted, rtol=0.0, atol=1e-12 + 2.0 * off * max(off, 0.1))
         assert np.allclose(forth[3:, 3:], inverted[3:, 3:], atol=1e-12)
@@ -90,7 +90,7 @@ def test_given_frames_of_the_vehicle_then_the_answer_is_static_and_needs_no_pose
     answer = ask(platform, interest, reference)
     assert answer.transformation.pose == cart().get_transformation(interest, reference).pose
     assert (answer.transformation.utime, answer.transformation.origin_id, answer.origin) == (0, 0, None)
-    assert answer.transformation.valid
+    assert answer.transformation.is_valid
 
 
 def test_given_the_base_frame_then_its_world_pose_is_the_localizers_own() -> None:
@@ -119,7 +119,7 @@ def test_given_a_frame_in_itself_then_it_is_exact_even_without_a_pose(world: str
     platform = PlatformView(cart(), BASE, None, History(1.0))
     answer = ask(platform, world, world)
     assert answer.transformation.pose == Pose.identity()
-    assert answer.transformation.valid
+    assert answer.transformation.is_valid
     covariance = answer.transformation.covariance
     assert covariance is not None
     assert not covariance.any()
@@ -133,7 +133,7 @@ def test_given_a_rolling_frame_then_the_estimates_are_of_it_and_the_base_frame_i
     assert rolling.transformation.pose == ask(plain, BASE, world).transformation.pose
     mounted = cart().get_transformation(BASE, MAST).pose
     assert base.transformation.pose.is_close(rolling.transformation.pose @ mounted)
-    published = platform.broadcast(platform.history.newest, world)
+    published = platform.get_published_pose(platform.history.newest, world)
     assert published.transformation.frame_of_interest == BASE
     assert published.transformation.pose == base.transformation.pose
     covariance = published.transformation.covariance
@@ -145,15 +145,15 @@ def test_given_bounds_then_they_stand_beside_the_base_frame_in_the_world_alone()
     platform = view()
     for pair in ((BASE, UTM), (ENU, BASE)):
         answer = ask(platform, *pair)
-        assert (answer.horizontal_bound, answer.heading_bound) == (1.5, 0.1)
+        assert (answer.horizontal_protection_level, answer.heading_protection_level) == (1.5, 0.1)
     for pair in ((CAMERA, UTM), (BASE, ODOM), (ODOM, BASE), (ENU, UTM), (CAMERA, BASE)):
         answer = ask(platform, *pair)
-        assert math.isnan(answer.horizontal_bound)
-        assert math.isnan(answer.heading_bound)
-    # a heading error swings the base frame about the rolling frame
-    swung = ask(PlatformView(platform.model, BASE, platform.localizer, platform.history, MAST), BASE, UTM)
-    assert 1.5 < swung.horizontal_bound <= 1.5 + 0.1 * 1.2
-    assert swung.heading_bound == 0.1
+        assert math.isnan(answer.horizontal_protection_level)
+        assert math.isnan(answer.heading_protection_level)
+    # a heading error moves the base frame about the rolling frame
+    moved = ask(PlatformView(platform.model, BASE, platform.localizer, platform.history, MAST), BASE, UTM)
+    assert 1.5 < moved.horizontal_protection_level <= 1.5 + 0.1 * 1.2
+    assert moved.heading_protection_level == 0.1
 
 
 # --- covariance ---------------------------------------------------------------------------------------------
@@ -177,21 +177,21 @@ def test_given_a_mounted_frame_then_its_covariance_agrees_with_monte_carlo(world
     exact = answer.transformation.pose
     errors = []
     for d in rng.multivariate_normal(np.zeros(6), np.array(numbers).reshape(6, 6), 20_000):
-        turned = so3.normalized(so3.multiply(so3.exponential(tuple(d[3:])), X_WB.wxyz))
+        turned = so3.normalize(so3.multiply(so3.exponential(tuple(d[3:])), X_WB.wxyz))
         pose = Pose(np.add(X_WB.xyz, d[:3]), turned) @ X_BC
         pose = pose.inverse() if inverse else pose
-        turn = so3.logarithm(so3.normalized(so3.multiply(pose.wxyz, so3.conjugate(exact.wxyz))))
+        turn = so3.logarithm(so3.normalize(so3.multiply(pose.wxyz, so3.conjugate(exact.wxyz))))
         errors.append([*np.subtract(pose.xyz, exact.xyz), *turn])
     sampled = np.cov(np.array(errors).T)
     scale = np.sqrt(np.outer(np.diag(found), np.diag(found)))
-    # second-order terms: with 0.03 rad at 100 m they are metres times 5e-4
+    # second-order terms: with 0.03 rad at 100 m they are meters times 5e-4
     assert np.max(np.abs(sampled - found) / scale) < (0.06 if inverse else 0.04)
 
 
 def test_given_no_covariance_then_none_is_made_up() -> None:
-    localizer = Scripted(START, 1)
+    localizer = ScriptedLocalizer(START, 1)
     bare = localizer.estimate(START)
-    held = History(60.0).extended(type(bare)(START, bare.odom, bare.enu, bare.utm, origin=ORIGIN))
+    held = History(60.0).append(type(bare)(START, bare.odom, bare.enu, bare.utm, origin=ORIGIN))
     platform = PlatformView(cart(), BASE, localizer, held)
     for interest, reference in ((BASE, UTM), (CAMERA, UTM), (UTM, CAMERA), (CAMERA, ODOM)):
         assert ask(platform, interest, reference).transformation.covariance is None
@@ -212,7 +212,7 @@ def test_given_a_surveyed_mount_then_its_sigmas_add_to_the_vehicles() -> None:
     [
         (Invalid.NO_FIX | Invalid.NO_ORIGIN, Invalid(0)),
         (Invalid.STALE_GPS | Invalid.GPS_REJECTED, Invalid(0)),
-        (Invalid.NOT_MOVED_YET | Invalid.STATIONARY_HEADING | Invalid.BOUND_EXCEEDED, Invalid(0)),
+        (Invalid.NOT_MOVED_YET | Invalid.STATIONARY_HEADING | Invalid.PROTECTION_LEVEL_EXCEEDED, Invalid(0)),
         (Invalid.STALE_IMU | Invalid.STALE_GPS, Invalid.STALE_IMU),
         (Invalid.CLOCK_STEPPED, Invalid.CLOCK_STEPPED),
     ],
@@ -220,7 +220,7 @@ def test_given_a_surveyed_mount_then_its_sigmas_add_to_the_vehicles() -> None:
 def test_given_reasons_that_touch_only_the_world_then_odom_stays_valid_both_ways(
     invalid: Invalid, odom: Invalid
 ) -> None:
-    platform = view(localizer=Scripted(invalid=invalid))
+    platform = view(localizer=ScriptedLocalizer(invalid=invalid))
     for frame in (BASE, CAMERA):
         assert ask(platform, frame, ODOM).transformation.invalid_reasons == odom
         assert ask(platform, ODOM, frame).transformation.invalid_reasons == odom
@@ -229,10 +229,10 @@ def test_given_reasons_that_touch_only_the_world_then_odom_stays_valid_both_ways
     # between Odom and the earth both count
     assert ask(platform, ODOM, UTM).transformation.invalid_reasons == invalid
     assert ask(platform, ENU, ODOM).transformation.invalid_reasons == invalid
-    assert platform.broadcast(platform.history.newest, ODOM).transformation.invalid_reasons == odom
+    assert platform.get_published_pose(platform.history.newest, ODOM).transformation.invalid_reasons == odom
 
 
-def test_given_no_sensors_then_world_frames_say_that_the_vehicle_file_names_none() -> None:
+def test_given_no_sensors_then_world_frames_report_that_the_vehicle_file_names_none() -> None:
     platform = PlatformView(cart(), BASE, None, History(1.0))
     for interest, reference in ((CAMERA, UTM), (ENU, CAMERA), (BASE, ODOM), (UTM, ENU)):
         with pytest.raises(NoPoseError, match="names no GPS and IMU"):
@@ -241,8 +241,8 @@ def test_given_no_sensors_then_world_frames_say_that_the_vehicle_file_names_none
         platform.vehicle_history(START, START + S, 1.0)
 
 
-def test_given_no_sample_yet_then_there_is_no_pose_and_the_reasons_are_told() -> None:
-    platform = PlatformView(cart(), BASE, Scripted(), History(1.0))
+def test_given_no_sample_yet_then_there_is_no_pose_and_the_reasons_are_reported() -> None:
+    platform = PlatformView(cart(), BASE, ScriptedLocalizer(), History(1.0))
     for time in (NOW, TimeQuery(START), TimeQuery(START, Policy.PREDICTED), TimeQuery(START, Policy.HELD)):
         with pytest.raises(NoPoseError, match="no usable GPS fix yet; no inertial sample yet"):
             ask(platform, CAMERA, UTM, time)
@@ -251,14 +251,14 @@ def test_given_no_sample_yet_then_there_is_no_pose_and_the_reasons_are_told() ->
 
 
 def test_given_no_origin_yet_then_odom_answers_and_the_world_does_not() -> None:
-    platform = view(localizer=Scripted(known=None))
-    assert ask(platform, CAMERA, ODOM).transformation.valid
+    platform = view(localizer=ScriptedLocalizer(origin=None))
+    assert ask(platform, CAMERA, ODOM).transformation.is_valid
     assert ask(platform, CAMERA, ODOM).origin is None
     for pair in ((CAMERA, UTM), (ENU, CAMERA), (UTM, ENU), (ODOM, UTM)):
         with pytest.raises(NoPoseError, match="the origin is not set yet"):
             ask(platform, *pair)
-    broadcast = platform.broadcast(platform.history.newest, UTM)
-    assert not broadcast.transformation.valid
+    broadcast = platform.get_published_pose(platform.history.newest, UTM)
+    assert not broadcast.transformation.is_valid
     assert broadcast.transformation.covariance is None
 
 
@@ -300,7 +300,7 @@ def test_given_both_names_mistyped_then_it_is_an_error_even_without_a_pose() -> 
 
 def test_given_a_frame_that_nothing_joins_to_the_base_then_the_world_is_not_connected() -> None:
     platform = view()
-    assert ask(platform, "Lamp:Origin", "Lamp:Origin").transformation.valid
+    assert ask(platform, "Lamp:Origin", "Lamp:Origin").transformation.is_valid
     with pytest.raises(NotConnectedError, match="the world is known at Cart:Base only"):
         ask(platform, "Lamp:Origin", UTM)
     with pytest.raises(NotConnectedError, match="the world is known at Cart:Base only"):
@@ -333,7 +333,7 @@ def test_given_a_time_between_two_samples_then_policies_interpolate_or_hold() ->
     assert answer.transformation.utime == at
 
 
-def test_given_a_time_past_the_newest_then_policies_refuse_predict_or_hold() -> None:
+def test_given_a_time_past_the_newest_then_policies_reject_predict_or_hold() -> None:
     at = START + 11 * S + S // 2
     platform = view(10)
     with pytest.raises(TooNewError, match=r"1\.500 s after"):
@@ -341,7 +341,7 @@ def test_given_a_time_past_the_newest_then_policies_refuse_predict_or_hold() -> 
     predicted = ask(platform, BASE, ODOM, TimeQuery(at, Policy.PREDICTED))
     assert predicted.transformation.pose.xyz[0] == pytest.approx(11.5)
     assert predicted.quality == Quality.PREDICTED
-    assert not predicted.transformation.valid
+    assert not predicted.transformation.is_valid
     assert ask(platform, BASE, UTM, TimeQuery(at, Policy.LATEST)).transformation.utime == START + 10 * S
 
 
@@ -349,14 +349,14 @@ def test_given_a_pose_held_past_the_newest_sample_then_silence_makes_it_invalid(
     platform = view(10)
     soon = ask(platform, BASE, UTM, TimeQuery(START + 10 * S + S // 2, Policy.HELD))
     late = ask(platform, BASE, UTM, TimeQuery(START + 3600 * S, Policy.HELD))
-    assert soon.transformation.valid
+    assert soon.transformation.is_valid
     assert Invalid.STALE_GPS & late.transformation.invalid_reasons
     assert late.transformation.pose == soon.transformation.pose
 
 
 @pytest.mark.parametrize("policy", [Policy.INTERPOLATED, Policy.HELD, Policy.PREDICTED])
 def test_given_a_time_before_all_then_it_is_too_old(policy: Policy) -> None:
-    with pytest.raises(TooOldError, match="before what is held"):
+    with pytest.raises(TooOldError, match="before the time covered"):
         ask(view(10), BASE, UTM, TimeQuery(START - 1, policy))
 
 
@@ -373,12 +373,12 @@ def test_given_static_frames_then_the_time_asked_plays_no_part() -> None:
     assert ask(view(10), CAMERA, BASE, TimeQuery(1)).transformation.utime == 0
 
 
-def test_given_times_then_what_is_covered_is_told() -> None:
+def test_given_times_then_coverage_is_reported() -> None:
     platform = view(10)
-    assert platform.covers(START + 10 * S)
-    assert platform.covers(START - S)
-    assert not platform.covers(START + 10 * S + 1)
-    assert not PlatformView(cart(), BASE, Scripted(), History(1.0)).covers(START)
+    assert platform.is_covered(START + 10 * S)
+    assert platform.is_covered(START - S)
+    assert not platform.is_covered(START + 10 * S + 1)
+    assert not PlatformView(cart(), BASE, ScriptedLocalizer(), History(1.0)).is_covered(START)
 
 
 # --- history ------------------------------------------------------------------------------------------------
@@ -429,21 +429,21 @@ def test_given_sensors_that_went_silent_then_the_latest_pose_is_not_valid_any_mo
     platform = view(10)
     newest = START + 10 * S
     soon = platform.transformation(BASE, UTM, NOW, newest + 100_000)
-    assert soon.transformation.valid
+    assert soon.transformation.is_valid
     late = platform.transformation(BASE, UTM, NOW, newest + 600 * S)
     assert late.transformation.utime == newest
     assert Invalid.STALE_IMU in Invalid(late.transformation.invalid_reasons)
     assert late.transformation.pose == soon.transformation.pose
-    # a question about a time is about that time, whenever it is asked
+    # a query for a time does not depend on when it is made
     then = platform.transformation(BASE, UTM, TimeQuery(newest - S), newest + 600 * S)
-    assert then.transformation.valid
+    assert then.transformation.is_valid
 
 
 def test_given_a_gap_in_the_history_then_what_is_held_in_it_is_no_better_than_what_came_after() -> None:
-    good, late = Scripted(START, 1), Scripted(START + 30 * S, 2, invalid=Invalid.STALE_IMU)
-    history = History(60.0).extended(good.estimate(START)).extended(late.estimate(START + 30 * S))
+    good, late = ScriptedLocalizer(START, 1), ScriptedLocalizer(START + 30 * S, 2, invalid=Invalid.STALE_IMU)
+    history = History(60.0).append(good.estimate(START)).append(late.estimate(START + 30 * S))
     platform = PlatformView(cart(), BASE, late, history)
     within = ask(platform, BASE, UTM, TimeQuery(START + 10 * S, Policy.HELD))
     assert Invalid.STALE_IMU in Invalid(within.transformation.invalid_reasons)
     exact = ask(platform, BASE, UTM, TimeQuery(START, Policy.HELD))
-    assert exact.transformation.valid
+    assert exact.transformation.is_valid

@@ -1,4 +1,4 @@
-"""The report's vehicle: every pair of frames three ways, eq. 13 by hand, and its two files held equal."""
+"""The report's vehicle: every pair of frames three ways, eq. 13 by hand, and the equality of its two files."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from modelserver.config import load_config
+from modelserver.config.vehicle_file import load_config
 from modelserver.formats import check_file, load_model
 from modelserver.geometry import JointType, Model, Search, Sigma
 from modelserver.geometry.joint import FIXED
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 ROOT = Path(__file__).resolve().parents[2]
 RAPTOR = ROOT / "config" / "raptor"
@@ -42,11 +42,11 @@ def matrix(element):
 
 
 def nearest(m):
-    """Mend the rounded rotation: of all rotations the one nearest to it."""
+    """Return the rotation nearest to a rounded one."""
     U, _, Vt = np.linalg.svd(m[:3, :3])
-    mended = m.copy()
-    mended[:3, :3] = U @ Vt
-    return mended
+    corrected = m.copy()
+    corrected[:3, :3] = U @ Vt
+    return corrected
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_every_pair_of_frames_agrees_between_both_searches_the_answer_and_a_nump
         foi, foreign = ":".join(interest), ":".join(reference)
         X = np.linalg.inv(frames[reference]) @ from_origins[reference[0]][interest[0]] @ frames[interest]
         answers = [raptor.get_transformation(foi, foreign)]
-        answers += [raptor.along(raptor.find_path(foi, foreign, search), foi, foreign) for search in Search]
+        answers += [raptor.compose_path(raptor.find_path(foi, foreign, search), foi, foreign) for search in Search]
         for answer in answers:
             assert np.abs(answer.matrix - X).max() <= 1e-12, f"{foi} in {foreign}"
 
@@ -130,14 +130,14 @@ def test_equation_13_by_hand(raptor):
     np.testing.assert_allclose(raptor.get_transformation(interest, reference).matrix, X, rtol=0, atol=1e-12)
     for search in Search:
         path = raptor.find_path(interest, reference, search)
-        assert [(step.enters, step.leaves) for step in path] == [
-            ("Raptor:CabFrontRailCentre", "FrontNoddingSICK:BottomPlateCenter"),
+        assert [(step.near_frame, step.far_frame) for step in path] == [
+            ("Raptor:CabFrontRailCenter", "FrontNoddingSICK:BottomPlateCenter"),
             ("FrontNoddingSICK:BottomPlateCorner", "Digiclops:MountingPlateCorner"),
         ]
         assert all(step.forward for step in path)
 
 
-def test_annex_C_answers_as_before_it_stood_on_a_vehicle(raptor):
+def test_annex_C_answers_are_independent_of_the_vehicle(raptor):
     X = raptor.get_transformation("Digiclops:ImagePlane", "FrontNoddingSICK:Origin")
     np.testing.assert_allclose(X.position, (0.299, -0.056, 0.433), atol=1e-12)
     np.testing.assert_allclose(np.degrees(X.rpy), (0.0, -19.25, 0.0), atol=1e-2)
@@ -146,7 +146,7 @@ def test_annex_C_answers_as_before_it_stood_on_a_vehicle(raptor):
 # --- the vehicle --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("side", ["Left", "Centre", "Right"])
+@pytest.mark.parametrize("side", ["Left", "Center", "Right"])
 def test_the_cabin_front_rail_is_tilted_forward_by_12_degrees(raptor, side):
     R = raptor.get_transformation(f"Raptor:CabFrontRail{side}", "Raptor:Origin").rotation
     # forward: its x axis points down, and what stands upright on it leans ahead
@@ -155,7 +155,7 @@ def test_the_cabin_front_rail_is_tilted_forward_by_12_degrees(raptor, side):
     np.testing.assert_allclose(R @ (0, 1, 0), (0, 1, 0), atol=1e-12)
 
 
-def test_frames_stand_where_their_names_say(raptor):
+def test_frames_are_where_their_names_state(raptor):
     def at(frame, reference="Raptor:Origin"):
         return raptor.get_transformation(frame, reference).position
 
@@ -167,14 +167,14 @@ def test_frames_stand_where_their_names_say(raptor):
     assert (np.sign(corner("RearLeftCorner")[:2]) == (-1, 1)).all()
     assert (np.sign(corner("RearRightCorner")[:2]) == (-1, -1)).all()
     np.testing.assert_allclose(at("Raptor:FrontLeftCorner") - at("Raptor:RearRightCorner"), (2.5, 1.4, 0.0), atol=1e-12)
-    ground = at("Raptor:RearAxleCentre")[2]
+    ground = at("Raptor:RearAxleCenter")[2]
     assert at("Raptor:CG")[2] - ground == pytest.approx(1.9 / 3.0, abs=1e-3)
     for end in ("Front", "Rear"):
         left, right = at(f"Raptor:{end}LeftWheelContact"), at(f"Raptor:{end}RightWheelContact")
         np.testing.assert_allclose(left - right, (0.0, 1.15, 0.0), atol=1e-12)
     for rail in ("CabFront", "CabRear", "BoxFront", "BoxRear"):
-        left, centre, right = (at(f"Raptor:{rail}Rail{side}") for side in ("Left", "Centre", "Right"))
-        np.testing.assert_allclose((left + right) / 2, centre, atol=1e-12)
+        left, center, right = (at(f"Raptor:{rail}Rail{side}") for side in ("Left", "Center", "Right"))
+        np.testing.assert_allclose((left + right) / 2, center, atol=1e-12)
         assert left[1] > right[1]
     assert (raptor.get_transformation("Microstrain:Sensor", "Raptor:CG").rotation @ (0, 0, 1))[2] == pytest.approx(-1)
     assert raptor.get_transformation("BackNoddingSICK:Origin", "Raptor:CG").rotation[0, 0] == pytest.approx(-1)
@@ -184,7 +184,7 @@ def test_frames_stand_where_their_names_say(raptor):
 
 
 def test_what_the_report_does_not_give_is_marked(raptor):
-    """A pose that is not the identity is the report's, or says that it is estimated."""
+    """A pose that is not the identity is the report's, or is marked as estimated."""
     sick = {"AxleCenterFreeEnd", "BottomPlateCorner"}
     given = {"FrontNoddingSICK": sick, "BackNoddingSICK": sick, "Digiclops": {"ImagePlane"}}
     for body in raptor.bodies:
@@ -206,7 +206,7 @@ def test_the_file_checks_clean(file):
     assert problems == ()
 
 
-def test_both_files_say_the_same():
+def test_both_files_are_equal():
     xml, yaml = (load_model(RAPTOR / file) for file in FILES)
     assert [body.name for body in xml.bodies] == [body.name for body in yaml.bodies]
     for mine, theirs in zip(xml.bodies, yaml.bodies, strict=True):
@@ -221,8 +221,8 @@ def test_both_files_say_the_same():
         )  # fmt: skip
         # the form of 2005 has no joints: what nods is fixed there where it rests
         assert mine.joint == FIXED
-        np.testing.assert_allclose(mine.pose.matrix, theirs.at_rest.matrix, rtol=0, atol=1e-12)
-    assert [each.name for each in yaml.constraints if each.joint.moves] == [
+        np.testing.assert_allclose(mine.pose.matrix, theirs.default_pose.matrix, rtol=0, atol=1e-12)
+    assert [each.name for each in yaml.constraints if each.joint.is_movable] == [
         "FLEALateral",
         "FrontNoddingSICKAxis",
         "BackNoddingSICKAxis",
@@ -247,13 +247,15 @@ def test_given_a_positive_angle_when_the_flea_is_turned_then_it_looks_left_about
     raptor = load_model(RAPTOR / "geometry.yaml")
     joint = raptor.joints["FLEALateral"].joint
     assert joint.type is JointType.REVOLUTE
-    np.testing.assert_allclose(np.degrees((*joint.lower, *joint.upper, *joint.rest)), (-90, 90, 0), atol=1e-12)
+    np.testing.assert_allclose(
+        np.degrees((*joint.lower, *joint.upper, *joint.default_position)), (-90, 90, 0), atol=1e-12
+    )
     assert joint.sigma is not None
-    route = raptor.route("FLEA:Lens", "Raptor:CabFrontRailRight")
-    ahead = route.pose(((0.0,),))
+    route = raptor.get_kinematic_path("FLEA:Lens", "Raptor:CabFrontRailRight")
+    ahead = route.compute_pose(((0.0,),))
     assert ahead.is_close(raptor.get_transformation("FLEA:Lens", "Raptor:CabFrontRailRight").pose)
     c, s = np.cos(np.radians(30.0)), np.sin(np.radians(30.0))
-    turned = route.pose(((np.radians(30.0),),))
+    turned = route.compute_pose(((np.radians(30.0),),))
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     np.testing.assert_allclose(turned.rotation, R @ ahead.rotation, atol=1e-12)
     np.testing.assert_allclose(turned.position, (0.03 + 0.05 * c, 0.05 * s, 0.06), atol=1e-12)
@@ -271,8 +273,8 @@ def test_given_a_positive_angle_when_a_laser_nods_then_it_looks_up_and_stays_on_
     np.testing.assert_allclose(np.degrees((*joint.lower, *joint.upper, *joint.rate_limit)), (-30, 20, 90), atol=1e-12)
     # the resolution, read as an even spread over one step
     assert np.degrees(joint.sigma[0]) == pytest.approx(0.072 / 12**0.5, abs=5e-4)
-    route = raptor.route(f"{side}SICKLaser:Scan", f"{side}NoddingSICK:Origin")
-    nodded = route.pose(((np.radians(10.0),),))
+    route = raptor.get_kinematic_path(f"{side}SICKLaser:Scan", f"{side}NoddingSICK:Origin")
+    nodded = route.compute_pose(((np.radians(10.0),),))
     np.testing.assert_allclose(nodded.position, (0.24, 0.0, 0.18), atol=1e-12)
     np.testing.assert_allclose(
         nodded.rotation @ (1, 0, 0), (np.cos(np.radians(10)), 0, np.sin(np.radians(10))), atol=1e-12
@@ -289,7 +291,7 @@ def test_given_the_vehicle_file_then_its_axis_drives_a_joint_of_the_geometry_wit
     axis = load_config(RAPTOR / "vehicle.yaml").drivers["front_axis"]
     joint = raptor.joints[axis["joint"]].joint
     for key in ("lower_deg", "upper_deg"):
-        assert not joint.out_of_limits((np.radians(axis["nod"][key]),))
+        assert not joint.is_out_of_limits((np.radians(axis["nod"][key]),))
     assert axis["nod"]["rate_deg"] <= np.degrees(joint.rate_limit[0])
 
 
@@ -306,28 +308,28 @@ def surveyed_alike(model: Model, sigma: Sigma) -> Model:
     return Model(bodies, tuple(again(each) for each in model.constraints))
 
 
-def test_given_1_mm_and_a_fifth_of_a_degree_at_each_step_then_the_longest_path_is_off_by_centimetres():
+def test_given_1_mm_and_a_fifth_of_a_degree_at_each_step_then_the_longest_path_is_off_by_centimeters():
     raptor = surveyed_alike(load_model(RAPTOR / "geometry.yaml"), Sigma((0.001,) * 3, (np.radians(0.2),) * 3))
     frames = [f"{body.name}:{frame.name}" for body in raptor.bodies for frame in body]
 
-    def doubt(pair):
+    def sigma_of(pair):
         return float(np.sqrt(np.trace(raptor.get_transformation(*pair).covariance[:3, :3])))
 
-    count = {pair: len(raptor.route(*pair).edges) for pair in product(frames, repeat=2)}
+    count = {pair: len(raptor.get_kinematic_path(*pair).edges) for pair in product(frames, repeat=2)}
     longest = max(count.values())
-    most = max((pair for pair in count if count[pair] == longest), key=doubt)
-    metres = doubt(most)
-    print(f"A11: {most[0]} in {most[1]}, {longest} edges: 1 sigma of position {metres * 100:.1f} cm")
-    # docs/geometry-files.md tells these
+    most = max((pair for pair in count if count[pair] == longest), key=sigma_of)
+    meters = sigma_of(most)
+    print(f"A11: {most[0]} in {most[1]}, {longest} edges: 1 sigma of position {meters * 100:.1f} cm")
+    # docs/geometry-files.md quotes these
     assert (*most, longest) == ("FrontSICKLaser:Scan", "BackSICKLaser:Scan", 12)
-    assert metres == pytest.approx(0.0222, abs=1e-4)
-    # without the angles it would be millimetres: it is the arms that make centimetres of it
+    assert meters == pytest.approx(0.0222, abs=1e-4)
+    # without the angles it would be millimeters: it is the arms that make centimeters of it
     lengths_alone = surveyed_alike(raptor, Sigma((0.001,) * 3)).get_transformation(*most).covariance
     assert np.sqrt(np.trace(lengths_alone[:3, :3])) == pytest.approx(0.0047, abs=1e-4)
 
 
-def test_the_yaml_says_how_sure_it_is_and_errors_grow_along_the_path():
-    """The report's 4.6.3: +-1 mm at each step comes to more at the end of a path."""
+def test_the_yaml_states_its_sigmas_and_errors_grow_along_the_path():
+    """The report's 4.6.3: +-1 mm at each step adds up to more at the end of a path."""
     raptor = load_model(RAPTOR / "geometry.yaml")
     surveyed = raptor.get_transformation("Digiclops:ImagePlane", "FrontNoddingSICK:Origin").covariance
     estimated = raptor.get_transformation("Digiclops:ImagePlane", "Raptor:Origin").covariance

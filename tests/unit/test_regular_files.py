@@ -13,23 +13,23 @@ from pathlib import Path
 
 import pytest
 
-from modelserver.config import load_config
+from modelserver.config.vehicle_file import load_config
 from modelserver.errors import ConfigError, GeometryError, KeyFileError, RecordingError
-from modelserver.formats import load_model
-from modelserver.keys import read_keys
-from modelserver.regular_files import (
+from modelserver.files.regular import (
     FileTooLargeError,
     NotRegularFileError,
     open_regular,
     read_regular,
     read_start,
 )
-from modelserver.service.journal.files import files_of
+from modelserver.formats import load_model
+from modelserver.server.journal.segments import files_of
+from modelserver.signing.key_files import read_keys
 from modelserver.wire.eventlog import LogFile
-from msdrivers.gx1_memory import read_eeprom
-from msdrivers.making import station_of
-from msdrivers.raw_log import open_for_reading, recording
-from msdrivers.settings import Place, read_driver
+from msdrivers.factory import make_driver
+from msdrivers.gx1_eeprom_file import read_eeprom
+from msdrivers.raw_log import open_for_reading, open_for_writing
+from msdrivers.settings import SourceMap, read_driver
 from mstools.commands.replay import read_times
 
 
@@ -57,11 +57,11 @@ def open_log(path: Path) -> None:
 def read_dbc(path: Path) -> None:
     wheel = {"speed": {"signal": "Wheels.left"}}
     section = {"device": "wheels", "can": "vcan0", "dbc": str(path), "wheels": {"left": wheel}}
-    station_of(read_driver("wheels", section, Place()), Path("/"))
+    make_driver(read_driver("wheels", section, SourceMap()), Path("/"))
 
 
 def record(path: Path) -> None:
-    with recording(path, 1000):
+    with open_for_writing(path, 1000):
         pass
 
 
@@ -115,7 +115,7 @@ def test_given_a_file_beyond_its_limit_when_it_is_to_be_read_then_it_is_rejected
     huge.touch(mode=0o600)
     # sparse: reading it all would take the memory
     os.truncate(huge, 1 << 40)
-    with deadline(), pytest.raises((*REJECTED,), match=r"larger|too large|longer|no text"):
+    with deadline(), pytest.raises((*REJECTED,), match=r"larger|too large|longer|not text"):
         read(huge)
 
 

@@ -10,12 +10,12 @@ from modelserver import core
 from modelserver.core import CoreSettings, Instant
 from modelserver.earth.geodesy import origin_at
 from modelserver.errors import NotConnectedError, UnknownFrameError
+from modelserver.estimation.raw.localizer import RawLocalizer
+from modelserver.estimation.sensor_rig import Mounts
 from modelserver.geometry.builder import ModelBuilder
-from modelserver.localization.mounts import Mounts
-from modelserver.localization.raw.localizer import RawLocalizer
 from modelserver.messages import GpsSample, ImuSample, PublishPose, Tick
 from modelserver.simulation import Simulation, Trajectory, figure_eight
-from modelserver.spatial.pose import Pose
+from modelserver.transforms.pose import Pose
 
 BASE, AXLE, GPS, IMU = "Car:CG", "Car:RearAxle", "Car:Antenna", "Car:Imu"
 START = 1_700_000_000_000_000
@@ -23,20 +23,20 @@ START = 1_700_000_000_000_000
 
 def car() -> ModelBuilder:
     builder = ModelBuilder("car")
-    body = builder.body("Car")
-    body.frame("CG").frame("RearAxle", Pose((-0.8, 0.0, -0.5))).frame("Antenna", Pose((0.3, 0.2, 1.2)))
-    body.frame("Imu", Pose((0.1, 0.0, 0.4))).frame("Top", Pose((0.0, 0.0, 1.0)))
-    builder.body("Unit").frame("Origin")
-    return builder.constraint("UnitFixed", "Car:Top", "Unit:Origin")
+    body = builder.add_body("Car")
+    body.add_frame("CG").add_frame("RearAxle", Pose((-0.8, 0.0, -0.5))).add_frame("Antenna", Pose((0.3, 0.2, 1.2)))
+    body.add_frame("Imu", Pose((0.1, 0.0, 0.4))).add_frame("Top", Pose((0.0, 0.0, 1.0)))
+    builder.add_body("Unit").add_frame("Origin")
+    return builder.add_constraint("UnitFixed", "Car:Top", "Unit:Origin")
 
 
 def errors_in_turns(rolling_frame: str) -> tuple[float, float]:
-    """Return the largest yaw error (degrees) and position error (metres) of POSE while valid, late in the drive."""
+    """Return the largest yaw error (degrees) and position error (meters) of POSE while valid, late in the drive."""
     model = car().build()
     simulation = Simulation(
         model,
         BASE,
-        Trajectory(figure_eight(speed=3.0, radius=6.0, stand=2.0, ramp=2.0, laps=1), yaw=0.5),
+        Trajectory(figure_eight(speed=3.0, radius=6.0, stationary=2.0, ramp=2.0, laps=1), yaw=0.5),
         origin_at(50.27, -111.18, 700.0),
         gps_frame=GPS,
         imu_frame=IMU,
@@ -60,12 +60,12 @@ def errors_in_turns(rolling_frame: str) -> tuple[float, float]:
         state, outputs = core.step(state, Tick(), now)
         (pose,) = [each for each in outputs if isinstance(each, PublishPose)]
         assert pose.world.transformation.frame_of_interest == BASE
-        if pose.world.transformation.valid:
+        if pose.world.transformation.is_valid:
             truth = simulation.truth(now.utime).utm
             moved, _ = pose.world.transformation.pose.distance(truth)
             yaw = math.remainder(pose.world.transformation.rpy[2] - truth.rpy[2], math.tau)
             worst_yaw, worst_place = max(worst_yaw, abs(math.degrees(yaw))), max(worst_place, moved)
-            assert abs(yaw) <= pose.world.heading_bound or rolling_frame == BASE
+            assert abs(yaw) <= pose.world.heading_protection_level or rolling_frame == BASE
     return worst_yaw, worst_place
 
 
@@ -83,6 +83,6 @@ def test_given_a_rolling_frame_that_is_none_then_the_core_does_not_start() -> No
     with pytest.raises(UnknownFrameError):
         core.start(CoreSettings(BASE, "Car:RearAxel"), model, None, Instant(0, 1))
     builder = car()
-    builder.body("Other").frame("x")
+    builder.add_body("Other").add_frame("x")
     with pytest.raises(NotConnectedError):
         core.start(CoreSettings(BASE, "Other:x"), builder.check()[0], None, Instant(0, 1))

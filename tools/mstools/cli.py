@@ -1,7 +1,7 @@
-"""The `modelserver` command: runs the subcommand's module, and turns errors into one readable line.
+"""The `modelserver` command: runs the module of a subcommand, and prints errors as one line.
 
-Exit codes: 0 done, 1 the input is wrong or nobody answered, 2 wrong usage, 130 interrupted. `doctor` grades what it
-finds by its own: 1 warnings, 3 errors.
+Exit codes: 0 success, 1 wrong input or no answer, 2 wrong usage, 130 interrupted. `doctor` has its own: 1 warnings, 3
+errors.
 """
 
 from __future__ import annotations
@@ -14,41 +14,40 @@ from typing import Annotated
 
 import typer
 
-from modelserver.errors import ConfigError, GeometryError, ModelServerError, QueryError, nearest_names, shown
+from modelserver.errors import ConfigError, GeometryError, ModelServerError, QueryError, find_nearest_names, quote
 from modelserver.version import __version__
-from mstools.terminal.missing import meant
-from mstools.terminal.output import print_problem, safe
+from mstools.terminal.output import escape, print_problem
+from mstools.terminal.problems import suggest_path
 
 COMMANDS = {
-    "demo": "Run the whole service on simulated sensors and watch it answer.",
+    "demo": "Run the whole service on simulated sensors and show its answers.",
     "run": "Run the service for a vehicle file.",
-    "check": "Say everything that is wrong with a geometry or vehicle file.",
-    "convert": "Write a geometry file in another form, Miro's process configuration as vehicle file.",
+    "check": "Report every problem of a geometry or vehicle file.",
+    "convert": "Convert a geometry file to another format, or Miro's process configuration to a vehicle file.",
     "query": "Where is one frame in another?",
     "bodies": "List the bodies.",
     "frames": "List the frames of a body.",
-    "tree": "Draw how bodies hang together: constraints, joints, loops, orphans.",
-    "reload": "Have the running daemon read its geometry file anew.",
+    "tree": "Draw the kinematic tree: constraints, joints, loops, orphans.",
+    "reload": "Reload the geometry file of the running daemon.",
     "set-pose": "Set the pose of the vehicle in the running daemon.",
-    "key": "Make the key that commands are signed with.",
-    "replay": "Feed a recorded log to the bus, or straight through the localization.",
-    "mode": "Tell the running daemon which sources its localization is to use.",
-    "tune": "Propose noise settings of the filter from a log, by fixes that were withheld.",
-    "calibrate": "Find an inertial unit's noise, or the iron around its magnetometer, from a log.",
-    "import-bag": "Turn a ROS bag into an LCM log of this project's types.",
-    "driver": "Read a device and publish what it measures.",
-    "emulate": "Be a device, for its driver to read.",
-    "status": "How is the running daemon?",
-    "spy": "Watch the channels, decoded: with lcm-spy, or in the terminal.",
-    "doctor": "Is this machine fit for the service? Prints the commands that mend it.",
-    "install": "Have systemd run the service and its drivers.",
-    "uninstall": "Take back what install did.",
+    "key": "Create a key to sign commands with.",
+    "replay": "Replay a log on the bus, or offline through the localization.",
+    "mode": "Switch the localization mode of the running daemon.",
+    "tune": "Tune the filter's noise settings on a log, with withheld fixes.",
+    "calibrate": "Calibrate an IMU's noise, or its magnetometer, from a log.",
+    "import-bag": "Convert a ROS bag to an LCM log of this project's types.",
+    "driver": "Run the driver of a device: read it and publish its samples.",
+    "emulate": "Emulate a device for its driver.",
+    "status": "Show the health of the running daemon.",
+    "spy": "Show all channels decoded: with lcm-spy, or in the terminal.",
+    "doctor": "Diagnose bus, clock and machine, and print the commands that fix problems.",
+    "install": "Install the service and its drivers under systemd.",
+    "uninstall": "Remove what install wrote.",
 }
-"""Subcommands and what each is for. `import-bag` is function `command` of module `mstools.commands.import_bag`, and so
-on; a command with subcommands of its own has a Typer application there instead."""
+"""Subcommands with their summary. `import-bag` is function `command` of module `mstools.commands.import_bag`; a command
+with subcommands of its own has a Typer application there instead."""
 
-
-OTHER_WORDS = {
+COMMAND_ALIASES = {
     "serve": "run",
     "server": "run",
     "start": "run",
@@ -78,7 +77,7 @@ OTHER_WORDS = {
     "explain": "query",
     "motion": "query",
 }
-"""What others call our commands."""
+"""Other words for the commands."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -86,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     _check_command(_command_of(arguments))
     try:
-        build(arguments)(arguments, prog_name="modelserver")
+        build_app(arguments)(arguments, prog_name="modelserver")
     except (GeometryError, ConfigError) as error:
         for problem in error.problems:
             print_problem(problem, err=True)
@@ -98,18 +97,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _fail(str(error))
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
-        _fail(f"{place}{error.strerror or error}{meant(error)}")
+        _fail(f"{place}{error.strerror or error}{suggest_path(error)}")
     except KeyboardInterrupt:
         sys.exit(130)
 
 
-def build(arguments: Sequence[str]) -> typer.Typer:
-    """Return the application; only the subcommand that `arguments` name is imported.
-
-    `query` must not pay for what `replay` needs, so the others stand in it as stubs that carry their help.
-    """
+def build_app(arguments: Sequence[str]) -> typer.Typer:
+    """Return the application. Only the subcommand in `arguments` is imported, the others are stubs, for speed."""
     app = typer.Typer(
-        help="Where is A relative to B, now or at time t, and how sure are we?",
+        help="Where is A relative to B, now or at time t, and with which uncertainty?",
         epilog="Start with: modelserver demo",
         add_completion=False,
         no_args_is_help=True,
@@ -130,8 +126,7 @@ def build(arguments: Sequence[str]) -> typer.Typer:
 
 
 def _import_command(name: str) -> Callable[..., None] | typer.Typer:
-    """Import a subcommand, without the garbage collector: what is imported stays, and looking for garbage in it takes
-    a sixth of the time."""
+    """Import a subcommand with the garbage collector off, which saves a sixth of the time."""
     was_on = gc.isenabled()
     gc.disable()
     try:
@@ -149,17 +144,17 @@ def _command_of(arguments: Sequence[str]) -> str:
 
 
 def _check_command(wanted: str) -> None:
-    """Exit as for wrong usage, with the nearest command, where there is none of that name."""
+    """Exit with 2 and the nearest command if there is none of that name."""
     if not wanted or wanted in COMMANDS:
         return
-    near = OTHER_WORDS.get(wanted.casefold()) or next(iter(nearest_names(wanted, COMMANDS)), "")
-    offer = f"did you mean {near}? {COMMANDS[near]}" if near else f"there are: {', '.join(COMMANDS)}"
-    typer.echo(safe(f"modelserver: there is no command {shown(wanted, 40)}; {offer} (modelserver --help)"), err=True)
+    near = COMMAND_ALIASES.get(wanted.casefold()) or next(iter(find_nearest_names(wanted, COMMANDS)), "")
+    hint = f"did you mean {near}? {COMMANDS[near]}" if near else f"commands: {', '.join(COMMANDS)}"
+    typer.echo(escape(f"modelserver: unknown command {quote(wanted, 40)}; {hint} (modelserver --help)"), err=True)
     sys.exit(2)
 
 
 def _stub() -> None:
-    """Stand in for a subcommand that is listed but not run."""
+    """Placeholder of a subcommand that is not run."""
 
 
 def _show_version(wanted: bool) -> None:
@@ -177,5 +172,5 @@ def _options(
 
 
 def _fail(message: str) -> None:
-    typer.echo(safe(f"modelserver: {message}"), err=True)
+    typer.echo(escape(f"modelserver: {message}"), err=True)
     sys.exit(1)

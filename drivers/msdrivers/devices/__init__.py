@@ -1,1 +1,1 @@
-"""Drivers of devices: each a `Station` at the host's end of a line."""
+"""Drivers of devices: each an `Endpoint` at the host's end of a line."""

@@ -1,38 +1,211 @@
-"""The driver of a nodding axis on Modbus/TCP: reads angle and rate, and tells it how to nod."""
+"""Driver of a nodding axis on Modbus/TCP: polls angle and rate, and sets the nodding motion.
+
+Polling: one request at a time, at `poll_hz`. The angle is stamped in the middle between request and reply; delay and
+delay_sigma are half the round trip and the deviation of a uniform distribution over it.
+
+Validation (`ReadingValidator`): an angle is plausible if an axis of at most `fastest_deg` could have reached it from
+the last plausible one. An implausible one becomes the suspect; if the next is plausible from it, it was the earlier
+one that was wrong.
+
+Setup (`NodSetup`): read the commanded registers, write the settings, read them back; between two polls. The values
+found first are restored on close.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
-from modelserver.messages import JointsSample, SensorHeader
-from msdrivers.devices.axis_nod import Nodding
-from msdrivers.devices.axis_readings import Readings
-from msdrivers.devices.axis_settings import AxisSettings, NodMap
+from modelserver.messages import NAN, JointSample, JointsSample, SensorHeader
+from msdrivers.devices.axis_settings import AxisSettings, NodSettings
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
 from msdrivers.protocol.bounded_counter import BoundedCounter
 from msdrivers.protocol.modbus.registers import (
     FailureKind,
     ModbusFailure,
     ModbusUnit,
     ReadRegisters,
+    RegisterMap,
     Registers,
-    Table,
+    RegistersWritten,
+    RegisterTable,
     WriteRegisters,
-    Written,
-    described,
-    explain,
-    fits,
+    describe_request,
+    explain_exception,
+    is_reply_to,
 )
-from msdrivers.station import Measured, Now, Output, Reopen, Send, StationPhase, StationStatus
-
-BUSY = (5, 6)
-"""Exceptions of a device that will do it later."""
 
 
-class _Asked(NamedTuple):
-    """The request that waits for its reply."""
+class _ReadStep(NamedTuple):
+    """Read a commanded register; `expected` in degrees, None to record what is found."""
+
+    name: str
+    expected: float | None
+
+
+class _WriteStep(NamedTuple):
+    """Write a commanded register."""
+
+    name: str
+    degrees: float
+
+
+_Step: TypeAlias = _ReadStep | _WriteStep
+
+
+class NodSetup:
+    """The remaining steps of the setup; one request at a time, completed by `on_reply` or repeated."""
+
+    def __init__(self, settings: AxisSettings):
+        self._registers: Mapping[str, RegisterMap] = settings.registers.commanded
+        self._steps: deque[_Step] = deque()
+        self._nod: NodSettings | None = None
+        self.found: dict[str, tuple[int, ...]] = {}
+        """Original contents of the commanded registers, by name."""
+        self._current: dict[str, float] = {}
+
+    def start(self, nod: NodSettings) -> None:
+        """Start to set a nodding motion, instead of the one in progress."""
+        self._nod = nod
+        self._steps = deque(_ReadStep(name, None) for name in self._registers)
+
+    def cancel(self) -> None:
+        """Discard the remaining steps."""
+        self._steps.clear()
+
+    @property
+    def step_text(self) -> str:
+        """Description of the next step; empty when done."""
+        if not self._steps:
+            return ""
+        step = self._steps[0]
+        mapped = self._registers[step.name]
+        verb = "reading" if isinstance(step, _ReadStep) else f"writing {step.degrees:g} to"
+        return f"{verb} {step.name} (register {mapped.address})"
+
+    def make_request(self, transaction: int) -> ReadRegisters | WriteRegisters | None:
+        """Make the request of the next step; None when done."""
+        if not self._steps:
+            return None
+        step = self._steps[0]
+        mapped = self._registers[step.name]
+        if isinstance(step, _ReadStep):
+            return ReadRegisters(mapped.address, mapped.registers, transaction=transaction)
+        return WriteRegisters(mapped.address, mapped.from_degrees(step.degrees), transaction)
+
+    def on_reply(self, reply: Registers | RegistersWritten) -> str:
+        """Complete a step; return a warning if the axis holds another value than was written, else empty."""
+        step = self._steps.popleft()
+        warning = ""
+        if isinstance(step, _WriteStep):
+            self._current[step.name] = step.degrees
+        if isinstance(step, _ReadStep) and isinstance(reply, Registers):
+            mapped = self._registers[step.name]
+            self._current[step.name] = mapped.to_degrees(reply.values)
+            if step.expected is None:
+                self.found.setdefault(step.name, reply.values)
+            elif tuple(reply.values) != mapped.from_degrees(step.expected):
+                actual = self._current[step.name]
+                warning = f"{step.name} is {actual:g} where {step.expected:g} was written: the axis's own limit"
+        if not self._steps and self._nod is not None:
+            self._plan_writes(self._nod)
+        return warning
+
+    def make_restore_requests(self) -> list[WriteRegisters]:
+        """Make the requests that restore the registers."""
+        if not self.found or self.found.keys() != self._registers.keys():
+            return []
+        degrees = {name: self._registers[name].to_degrees(words) for name, words in self.found.items()}
+        order = _order_writes(degrees["lower_limit"], self._current["upper_limit"])
+        return [WriteRegisters(self._registers[name].address, self.found[name]) for name in order]
+
+    def _plan_writes(self, nod: NodSettings) -> None:
+        wanted = {"lower_limit": nod.lower_deg, "upper_limit": nod.upper_deg, "nod_rate": nod.rate_deg}
+        order = _order_writes(nod.lower_deg, self._current["upper_limit"])
+        self._steps.extend(_WriteStep(name, wanted[name]) for name in order)
+        self._steps.extend(_ReadStep(name, wanted[name]) for name in order)
+        self._nod = None
+
+
+def _order_writes(lower: float, present_upper: float) -> tuple[str, ...]:
+    """Return the order of writes in which the lower limit is never above the upper one."""
+    if lower >= present_upper:
+        return ("upper_limit", "lower_limit", "nod_rate")
+    return ("lower_limit", "upper_limit", "nod_rate")
+
+
+RATE_MARGIN = 1.1
+"""An axis at its highest rate overshoots a little where it reverses."""
+
+
+class _TimedAngle(NamedTuple):
+    degrees: float
+    at_ns: int
+    half_interval_ns: int
+
+
+class ReadingValidator:
+    """Validates consecutive readings; see the module."""
+
+    def __init__(self, settings: AxisSettings):
+        self._settings = settings
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the previous readings."""
+        self._last: _TimedAngle | None = None
+        self._suspect: _TimedAngle | None = None
+        self._number: int | None = None
+
+    def validate(self, values: Sequence[int], at_ns: int, half_interval_ns: int) -> tuple[JointSample | None, str]:
+        """Return the sample of a reading and a warning; None without a valid angle. `rate` is a warning about the rate.
+
+        `at_ns` is when they were read, give or take `half_interval_ns`. Words: `repeated`, `range`, `jump`, `rate`.
+        """
+        settings, registers = self._settings, self._settings.registers
+
+        def get_words(name: str) -> Sequence[int]:
+            mapped = registers.measured[name]
+            begin = mapped.address - registers.begin
+            return values[begin : begin + mapped.registers]
+
+        if registers.sequence is not None:
+            number = registers.sequence.to_number(get_words("sequence"))
+            if number == self._number:
+                return None, "repeated"
+            self._number = number
+        degrees = registers.angle.to_degrees(get_words("angle"))
+        if not settings.lowest_deg - settings.step_deg <= degrees <= settings.highest_deg + settings.step_deg:
+            return None, "range"
+        place = _TimedAngle(degrees, at_ns, half_interval_ns)
+        believed = self._last is None or self._can_reach(self._last, place)
+        if not believed and not (self._suspect is not None and self._can_reach(self._suspect, place)):
+            self._suspect = place
+            return None, "jump"
+        self._last, self._suspect = place, None
+        rate, word = NAN, ""
+        if registers.rate is not None:
+            rate = registers.rate.to_degrees(get_words("rate"))
+            if abs(rate) > RATE_MARGIN * settings.fastest_deg:
+                rate, word = NAN, "rate"
+        sigma = settings.step_deg / math.sqrt(12.0)
+        return JointSample(settings.joint, math.radians(degrees), math.radians(sigma), math.radians(rate)), word
+
+    def _can_reach(self, before: _TimedAngle, after: _TimedAngle) -> bool:
+        seconds = (after.at_ns - before.at_ns + before.half_interval_ns + after.half_interval_ns) * 1e-9
+        reach = RATE_MARGIN * self._settings.fastest_deg * seconds + 2.0 * self._settings.step_deg
+        return abs(after.degrees - before.degrees) <= reach
+
+
+BUSY_EXCEPTIONS = (5, 6)
+"""Exception codes after which a retry makes sense: acknowledge, busy."""
+
+
+class _PendingRequest(NamedTuple):
+    """The request that awaits its reply."""
 
     request: ReadRegisters | WriteRegisters
     sent_ns: int
@@ -40,127 +213,129 @@ class _Asked(NamedTuple):
 
 
 class AxisDriver:
-    """A `Station` of `ModbusUnit`; see `AxisSettings`. One request is under way at a time.
+    """An `Endpoint` of `ModbusUnit`; see `AxisSettings`.
 
     A reading is taken in the middle between request and reply: a sample's delay is half the time between, its sigma
     that of an instant anywhere between. On leaving, the registers that were written get back what was found in them.
     """
 
     def __init__(self, settings: AxisSettings):
-        """Take the settings."""
         self.settings = settings
         registers = settings.registers
-        self._table = Table(registers.table)
+        self._table = RegisterTable(registers.table)
         self._length = max(each.address + each.registers for each in registers.measured.values()) - registers.begin
-        self._readings = Readings(settings)
-        self._nodding = Nodding(settings)
+        self._readings = ReadingValidator(settings)
+        self._nod_setup = NodSetup(settings)
         self._nod = settings.nod
-        self._asked: _Asked | None = None
+        self._pending: _PendingRequest | None = None
         self._transaction = 0
         self._period_ns = round(1e9 / settings.poll_hz)
         self._next_ns = 0
         self._step_ns = 0
-        self._heard_ns = self._usable_ns = 0
+        self._received_ns = self._usable_ns = 0
         self._silent_ns: int | None = None
         self._is_open = False
-        self._told: set[str] = set()
-        self._phase = StationPhase.WAITING
+        self._reported: set[str] = set()
+        self._phase = EndpointPhase.WAITING
         self._seq = 0
         self._counts = BoundedCounter()
 
-    def opened(self, now: Now) -> list[Output[ModbusUnit]]:
+    def on_open(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Begin: set the nodding up, then read."""
-        self._is_open, self._asked = True, None
+        self._is_open, self._pending = True, None
         self._readings.clear()
-        self._told.clear()
-        self._phase = StationPhase.WAITING
-        self._next_ns = self._step_ns = self._heard_ns = self._usable_ns = now.monotonic_ns
+        self._reported.clear()
+        self._phase = EndpointPhase.WAITING
+        self._next_ns = self._step_ns = self._received_ns = self._usable_ns = now.monotonic_ns
         self._silent_ns = now.monotonic_ns + self._silence_ns
         if self._nod is not None:
-            self._nodding.begin(self._nod)
-        return [StationStatus(self._phase, f"asking the axis for joint {self.settings.joint}"), *self._ask(now)]
+            self._nod_setup.start(self._nod)
+        return [EndpointStatus(self._phase, f"asking the axis for joint {self.settings.joint}"), *self._send_next(now)]
 
-    def nod(self, nod: NodMap, now: Now) -> list[Output[ModbusUnit]]:
-        """Nod otherwise from now on; what the axis cannot do is refused and told."""
-        why = self.settings.against(nod)
+    def set_nod(self, nod: NodSettings, now: HostTime) -> list[Output[ModbusUnit]]:
+        """Change the nodding motion; one that the axis cannot do is rejected with a warning."""
+        why = self.settings.find_nod_problem(nod)
         if why:
             self._counts["rejected.nod"] += 1
-            return [StationStatus(self._phase, f"nodding refused: {why}", is_trouble=True)]
+            return [EndpointStatus(self._phase, f"nodding rejected: {why}", is_warning=True)]
         self._nod = nod
-        self._told -= {"nod"}
+        self._reported -= {"nod"}
         if not self._is_open:
             return []
-        self._nodding.begin(nod)
-        # a step that is under way belongs to the wish before
-        if self._asked is not None and not self._asked.is_poll:
-            self._asked = None
-        return self._ask(now)
+        self._nod_setup.start(nod)
+        # a pending step belongs to the previous request
+        if self._pending is not None and not self._pending.is_poll:
+            self._pending = None
+        return self._send_next(now)
 
-    def received(self, unit: ModbusUnit, now: Now) -> list[Output[ModbusUnit]]:
-        """Take a reply, or the word that there is none."""
+    def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
+        """Process a reply or a failure."""
         if isinstance(unit, ModbusFailure) and unit.kind is FailureKind.LINE:
-            return self._broken(f"the line to the axis broke: {unit.text}")
-        asked = self._asked
-        if asked is None or unit.transaction != asked.request.transaction or not self._is_open:
+            return self._on_line_error(f"the line to the axis broke: {unit.text}")
+        pending = self._pending
+        if pending is None or unit.transaction != pending.request.transaction or not self._is_open:
             self._counts["rejected.stale"] += 1
             return []
         if isinstance(unit, ModbusFailure):
-            if unit.kind is FailureKind.SILENCE:
-                return self._unanswered(now)
-            return self._refused(asked, unit, now)
-        self._asked = None
-        self._heard_ns = now.monotonic_ns
-        if not fits(unit, asked.request):
+            if unit.kind is FailureKind.TIMEOUT:
+                return self._on_timeout(now)
+            return self._on_exception(pending, unit, now)
+        self._pending = None
+        self._received_ns = now.monotonic_ns
+        if not is_reply_to(unit, pending.request):
             self._counts["rejected.length"] += 1
-            return self._tell(
+            return self._warn_once(
                 "length",
-                f"the reply to {described(asked.request)} has another address or number of registers; it is not used",
-            ) + self._ask(now)
-        if asked.is_poll and isinstance(unit, Registers):
-            return self._measured(unit, asked, now) + self._ask(now)
+                f"the reply to {describe_request(pending.request)} has another address or length; it is not used",
+            ) + self._send_next(now)
+        if pending.is_poll and isinstance(unit, Registers):
+            return self._publish_reading(unit, pending, now) + self._send_next(now)
         outputs: list[Output[ModbusUnit]] = []
-        if isinstance(unit, Registers | Written):
-            said = self._nodding.done(unit)
-            if said:
+        if isinstance(unit, Registers | RegistersWritten):
+            warning = self._nod_setup.on_reply(unit)
+            if warning:
                 self._counts["readback"] += 1
-                outputs.append(StationStatus(self._phase, said, is_trouble=True))
-            elif not self._nodding.step:
-                outputs.append(StationStatus(self._phase, "the axis nods as it was told"))
-        return outputs + self._ask(now)
+                outputs.append(EndpointStatus(self._phase, warning, is_warning=True))
+            elif not self._nod_setup.step_text:
+                outputs.append(EndpointStatus(self._phase, "the nodding motion is set"))
+        return outputs + self._send_next(now)
 
-    def woken(self, now: Now) -> list[Output[ModbusUnit]]:
-        """Ask, or see that nothing comes."""
+    def on_timer(self, now: HostTime) -> list[Output[ModbusUnit]]:
+        """Process timeouts; send the next request."""
         outputs: list[Output[ModbusUnit]] = []
-        if self._asked is not None and now.monotonic_ns >= self._asked.sent_ns + self._reply_ns:
-            outputs += self._unanswered(now)
+        if self._pending is not None and now.monotonic_ns >= self._pending.sent_ns + self._reply_ns:
+            outputs += self._on_timeout(now)
         if self._silent_ns is not None and now.monotonic_ns >= self._silent_ns:
             self._silent_ns = None
-            # an axis that does not answer at all is told by and by, when the line is opened anew
-            if self._heard_ns > self._usable_ns:
-                self._phase = StationPhase.SILENT
+            # an axis that does not answer at all is reported by the reply timeout, when the line is reopened
+            if self._received_ns > self._usable_ns:
+                self._phase = EndpointPhase.SILENT
                 self._counts["silences"] += 1
                 why = f"no usable reading for {self.settings.silence:g} s although the axis answers"
-                outputs.append(StationStatus(StationPhase.SILENT, f"{why}; the counters say what was rejected"))
-        return outputs + self._ask(now)
+                outputs.append(EndpointStatus(EndpointPhase.SILENT, f"{why}; see the counters rejected.*"))
+        return outputs + self._send_next(now)
 
-    def due(self) -> int | None:
-        """Return when to be woken."""
+    def get_deadline(self) -> int | None:
+        """Return when to call `on_timer`, monotonic nanoseconds."""
         if not self._is_open:
             return None
-        if self._asked is not None:
-            next_ns = self._asked.sent_ns + self._reply_ns
+        if self._pending is not None:
+            next_ns = self._pending.sent_ns + self._reply_ns
         else:
-            next_ns = min(self._next_ns, self._step_ns) if self._nodding.step else self._next_ns
+            next_ns = min(self._next_ns, self._step_ns) if self._nod_setup.step_text else self._next_ns
         return next_ns if self._silent_ns is None else min(next_ns, self._silent_ns)
 
-    def leaving(self, now: Now) -> list[Output[ModbusUnit]]:
+    def on_close(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Write back what was found before this driver wrote."""
         self._is_open = False
-        return [Send(replace(request, transaction=self._new_transaction())) for request in self._nodding.restored()]
+        return [
+            Send(replace(request, transaction=self._new_transaction()))
+            for request in self._nod_setup.make_restore_requests()
+        ]
 
     @property
-    def quiet(self) -> float:
-        """Seconds for which nothing need come."""
+    def max_silence(self) -> float:
+        """Longest normal silence, seconds."""
         return self.settings.silence
 
     @property
@@ -170,99 +345,106 @@ class AxisDriver:
 
     @property
     def _reply_ns(self) -> int:
-        return round(self.settings.reply * 1e9)
+        return round(self.settings.reply_timeout * 1e9)
 
     @property
     def _silence_ns(self) -> int:
         return round(self.settings.silence * 1e9)
 
-    def _ask(self, now: Now) -> list[Output[ModbusUnit]]:
+    def _send_next(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Send what is due, if nothing is under way: a reading, else a step of the nodding's set-up between two."""
         at = now.monotonic_ns
-        if self._asked is not None or not self._is_open:
+        if self._pending is not None or not self._is_open:
             return []
         is_poll = at >= self._next_ns
-        if not is_poll and not (self._nodding.step and at >= self._step_ns):
+        if not is_poll and not (self._nod_setup.step_text and at >= self._step_ns):
             return []
         transaction = self._new_transaction()
-        request = None if is_poll else self._nodding.request(transaction)
+        request = None if is_poll else self._nod_setup.make_request(transaction)
         if request is None:
             request = ReadRegisters(self.settings.registers.begin, self._length, self._table, transaction)
             self._counts["polls"] += 1
             late = (at - self._next_ns) // self._period_ns
             self._counts["skipped"] += late
             self._next_ns += (late + 1) * self._period_ns
-        self._asked = _Asked(request, at, is_poll)
+        self._pending = _PendingRequest(request, at, is_poll)
         return [Send(request)]
 
     def _new_transaction(self) -> int:
         self._transaction = self._transaction % 0xFFFF + 1
         return self._transaction
 
-    def _measured(self, unit: Registers, asked: _Asked, now: Now) -> list[Output[ModbusUnit]]:
-        turn_ns = now.monotonic_ns - asked.sent_ns
-        joint, word = self._readings.take(unit.values, asked.sent_ns + turn_ns // 2, turn_ns // 2)
+    def _publish_reading(self, unit: Registers, pending: _PendingRequest, now: HostTime) -> list[Output[ModbusUnit]]:
+        round_trip_ns = now.monotonic_ns - pending.sent_ns
+        joint, word = self._readings.validate(unit.values, pending.sent_ns + round_trip_ns // 2, round_trip_ns // 2)
         if word:
             self._counts[word if word == "repeated" else f"rejected.{word}"] += 1
-        told = self._tell(word, _WORDS[word]) if word else []
+        outputs = self._warn_once(word, _WARNINGS[word]) if word else []
         if joint is None:
-            return told
+            return outputs
         self._usable_ns = now.monotonic_ns
         self._silent_ns = now.monotonic_ns + self._silence_ns
         header = SensorHeader(now.utime, self.settings.source, self._seq, now.utime)
         self._seq += 1
         self._counts["samples"] += 1
-        if self._phase is not StationPhase.STREAMING:
-            self._phase = StationPhase.STREAMING
-            told = [StationStatus(self._phase, f"the axis tells joint {self.settings.joint}"), *told]
-            self._told -= {"refused", "length"}
-        turn = turn_ns * 1e-9
-        return [*told, Measured(JointsSample(header, (joint,)), turn / 2.0, turn / math.sqrt(12.0))]
+        if self._phase is not EndpointPhase.STREAMING:
+            self._phase = EndpointPhase.STREAMING
+            outputs = [EndpointStatus(self._phase, f"the axis reports joint {self.settings.joint}"), *outputs]
+            self._reported -= {"rejected", "length"}
 
-    def _unanswered(self, now: Now) -> list[Output[ModbusUnit]]:
+        round_trip = round_trip_ns * 1e-9
+        return [
+            *outputs,
+            MeasuredSample(JointsSample(header, (joint,)), round_trip / 2.0, round_trip / math.sqrt(12.0)),
+        ]
+
+    def _on_timeout(self, now: HostTime) -> list[Output[ModbusUnit]]:
         self._counts["unanswered"] += 1
-        self._asked = None
-        if now.monotonic_ns - self._heard_ns < self._silence_ns:
-            return self._ask(now)
+        self._pending = None
+        if now.monotonic_ns - self._received_ns < self._silence_ns:
+            return self._send_next(now)
         why = f"the axis has not answered for {self.settings.silence:g} s"
-        return self._broken(f"{why}; check its power, the network cable, address and port")
+        return self._on_line_error(f"{why}; check its power, the network cable, address and port")
 
-    def _refused(self, asked: _Asked, failure: ModbusFailure, now: Now) -> list[Output[ModbusUnit]]:
+    def _on_exception(
+        self, pending: _PendingRequest, failure: ModbusFailure, now: HostTime
+    ) -> list[Output[ModbusUnit]]:
         self._counts.add(f"rejected.exception_{failure.code}")
-        self._asked = None
-        self._heard_ns = now.monotonic_ns
-        again_ns = now.monotonic_ns + round(self.settings.retry * 1e9)
-        if asked.is_poll:
+        self._pending = None
+        self._received_ns = now.monotonic_ns
+        again_ns = now.monotonic_ns + round(self.settings.retry_delay * 1e9)
+        if pending.is_poll:
             self._next_ns = again_ns
-            if failure.code not in BUSY:
-                self._phase = StationPhase.SILENT
-            text = f"the axis refuses {described(asked.request)}: {explain(failure.code)}; asked again every"
-            return self._tell("refused", f"{text} {self.settings.retry:g} s, nothing is published")
-        text = f"the axis refuses {self._nodding.step}: {explain(failure.code)}"
-        if failure.code in BUSY:
+            if failure.code not in BUSY_EXCEPTIONS:
+                self._phase = EndpointPhase.SILENT
+            text = f"the axis rejects {describe_request(pending.request)}: {explain_exception(failure.code)}"
+            retry = f"retried every {self.settings.retry_delay:g} s, nothing is published"
+            return self._warn_once("rejected", f"{text}; {retry}")
+        text = f"the axis rejects {self._nod_setup.step_text}: {explain_exception(failure.code)}"
+        if failure.code in BUSY_EXCEPTIONS:
             self._step_ns = again_ns
-            return [*self._tell("nod", f"{text}; trying again"), *self._ask(now)]
-        self._nodding.drop()
-        return [*self._tell("nod", f"{text}; it is read and not told how to nod"), *self._ask(now)]
+            return [*self._warn_once("nod", f"{text}; trying again"), *self._send_next(now)]
+        self._nod_setup.cancel()
+        return [*self._warn_once("nod", f"{text}; its nodding motion is not changed"), *self._send_next(now)]
 
-    def _broken(self, why: str) -> list[Output[ModbusUnit]]:
+    def _on_line_error(self, why: str) -> list[Output[ModbusUnit]]:
         if not self._is_open:
             return []
-        self._is_open, self._asked, self._silent_ns = False, None, None
-        self._phase = StationPhase.SILENT
-        self._counts["broken"] += 1
-        return [StationStatus(StationPhase.SILENT, why), Reopen(why)]
+        self._is_open, self._pending, self._silent_ns = False, None, None
+        self._phase = EndpointPhase.SILENT
+        self._counts["line_errors"] += 1
+        return [EndpointStatus(EndpointPhase.SILENT, why), Reopen(why)]
 
-    def _tell(self, word: str, text: str) -> list[Output[ModbusUnit]]:
-        if word in self._told:
+    def _warn_once(self, word: str, text: str) -> list[Output[ModbusUnit]]:
+        if word in self._reported:
             return []
-        self._told.add(word)
-        return [StationStatus(self._phase, text, is_trouble=True)]
+        self._reported.add(word)
+        return [EndpointStatus(self._phase, text, is_warning=True)]
 
 
-_WORDS = {
-    "repeated": "the axis's number of measurements stands still; a reading with the same number is not published",
-    "range": "an angle beyond lowest_deg and highest_deg; are scale_deg, is_signed and high_word_first right?",
-    "jump": "an angle that the axis cannot have come to since the last reading; it is not published",
+_WARNINGS = {
+    "repeated": "the sequence number does not change; a reading with the same number is not published",
+    "range": "an angle outside lowest_deg and highest_deg; are scale_deg, is_signed and high_word_first right?",
+    "jump": "an angle that the axis cannot have reached since the last reading; it is not published",
     "rate": "a rate above fastest_deg; is the scale of `rate` right? It is published as not measured",
 }

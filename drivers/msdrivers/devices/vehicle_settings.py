@@ -1,4 +1,4 @@
-"""How the vehicle controller is to be used."""
+"""Settings of the driver of the vehicle controller."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from msdrivers.protocol.can.mapping import STRICT, CommandMap, StatusMap
 
 
 @dataclass(frozen=True, slots=True)
-class LimitsMap:
-    """What may be wished for. Zero forbids it."""
+class CommandLimits:
+    """Limits of commands; 0 forbids the motion."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
@@ -20,8 +20,8 @@ class LimitsMap:
     """Highest speed backward, m/s, as a positive number."""
     steering_angle: float = 0.5
     """Greatest steering angle to either side, radians."""
-    beyond: Literal["clamp", "refuse"] = "clamp"
-    """What becomes of a wish beyond: the limit is commanded in its place, or nothing is."""
+    over_limit: Literal["clamp", "reject"] = "clamp"
+    """What happens to a command above a limit: clamp it, or reject it."""
 
     def __post_init__(self) -> None:
         for key, value, high in (
@@ -31,40 +31,40 @@ class LimitsMap:
         ):
             if not 0.0 <= value <= high:
                 raise ValueError(f"{key} is between 0 and {high:g}, got {value:g}")
-        if self.beyond not in ("clamp", "refuse"):
-            raise ValueError(f"beyond is clamp or refuse, got {self.beyond!r}")
+        if self.over_limit not in ("clamp", "reject"):
+            raise ValueError(f"over_limit is clamp or reject, got {self.over_limit!r}")
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleSettings:
-    """How to read and command the vehicle controller. Raises ValueError for what cannot be, naming the key."""
+    """Settings of the vehicle controller. Raises ValueError with the key for an invalid value."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     source: str
-    """Name that the samples give as theirs."""
+    """Source of the samples."""
     dbc: str
     """Path of the DBC file, relative to the file that holds these settings."""
     status: StatusMap | None = None
-    """What the bus tells of the controller; None: nothing is published."""
+    """Signals of the status; None: nothing is published."""
     command: CommandMap | None = None
-    """How commands are said; None: the vehicle is not commanded."""
-    limits: LimitsMap = LimitsMap()
-    """What may be wished for."""
+    """Signals of the command; None: the vehicle is not commanded."""
+    limits: CommandLimits = CommandLimits()
+    """Limits of commands."""
     commander: str = ""
-    """The only source whose commands are taken; empty: any, but one at a time."""
+    """The only source whose commands are accepted; empty: any, but one at a time."""
     dead_man: float = 0.5
-    """Seconds after its arrival for which a command counts at most; then stop is commanded."""
+    """Dead-man timeout: seconds after its arrival until a command expires and stop is sent."""
     max_validity: float = 1.0
-    """Seconds after its `utime` for which a command counts at most, whatever its `valid_for`: later it came late."""
+    """Longest validity of a command after its `utime`, whatever its `valid_for`, seconds."""
     command_period: float = 0.05
-    """Seconds between the frames in which a command, or the stop after it, is said again."""
+    """Period of the frames of a command, or of the stop after it, seconds."""
     clock_slack: float = 0.2
-    """Seconds by which the clock of whoever commands may be ahead of ours."""
+    """Seconds by which the clock of a command's source may be ahead of ours."""
     window: float = 0.02
     """Seconds to wait for the other frames of a status; shorter than the time between two."""
     silence: float = 1.0
-    """Seconds without a usable frame after which the driver says so."""
+    """Timeout for usable frames, seconds."""
     delay: float = 0.0
     """Seconds from the measurement to the frame's arrival, as far as known."""
     delay_sigma: float = 0.0

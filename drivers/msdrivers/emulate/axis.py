@@ -1,6 +1,6 @@
-"""A nodding axis on Modbus/TCP in software: a map of registers, and an axis that turns between its limits.
+"""Emulator of a nodding axis on Modbus/TCP: a register map and an axis that moves between its limits.
 
-It turns at the rate it was told, turns back where it reaches a limit, and measures itself in whole steps.
+It turns at the commanded rate, reverses at the limits, and measures its angle in whole steps.
 """
 
 from __future__ import annotations
@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
 
+from msdrivers.emulate import InjectedFault
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Send
 from msdrivers.protocol.modbus.axis_map import AxisRegisters
 from msdrivers.protocol.modbus.registers import (
     MAX_READ,
@@ -19,30 +20,13 @@ from msdrivers.protocol.modbus.registers import (
     ModbusUnit,
     ReadRegisters,
     Registers,
-    Table,
+    RegistersWritten,
+    RegisterTable,
     WriteRegisters,
-    Written,
-    explain,
+    explain_exception,
 )
-from msdrivers.station import Now, Output, Send, StationPhase, StationStatus
 
 ILLEGAL_ADDRESS, ILLEGAL_VALUE = 2, 3
-
-AxisFaultKind: TypeAlias = Literal["drop", "corrupt", "stall", "restart", "jump", "exception"]
-
-
-@dataclass(frozen=True, slots=True)
-class AxisFault:
-    """Something that goes wrong `at` seconds after the start.
-
-    drop: `amount` requests are not answered. corrupt: `amount` replies have a register too few. stall: no answer for
-    `amount` seconds. restart: the same, and the axis begins anew at its first limits and rate. jump: its angle jumps by
-    `amount` degrees. exception: the next request is refused with code `amount`.
-    """
-
-    at: float
-    kind: AxisFaultKind
-    amount: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +38,10 @@ class AxisUnit:
     rate_deg: float = 0.0
     angle_deg: float = 0.0
     lowest_deg: float = -90.0
-    """Limits below are refused."""
+    """Lower limits are rejected."""
     highest_deg: float = 90.0
     slowest_deg: float = 2.0
-    """Rates below are refused, but for 0."""
+    """Lower rates except 0 are rejected."""
     fastest_deg: float = 90.0
     step_deg: float = 0.072
     measure_hz: float = 500.0
@@ -65,58 +49,62 @@ class AxisUnit:
 
 
 class AxisEmulator:
-    """A `Station` of `ModbusUnit` that answers requests."""
+    """An `Endpoint` of `ModbusUnit` that answers requests.
 
-    def __init__(self, registers: AxisRegisters, unit: AxisUnit | None = None, faults: Iterable[AxisFault] = ()):
-        """Take the registers as the driver has them, the axis, and the faults."""
+    Faults: drop: `amount` requests are not answered. corrupt: `amount` replies lack a register. stall: no answer for
+    `amount` seconds. restart: the same, and the axis restarts with its first limits and rate. jump: its angle jumps by
+    `amount` degrees. exception: the next request gets exception code `amount`.
+    """
+
+    def __init__(self, registers: AxisRegisters, unit: AxisUnit | None = None, faults: Iterable[InjectedFault] = ()):
         self.unit = unit or AxisUnit()
         self._registers = registers
         self._faults = deque(sorted(faults, key=lambda fault: fault.at))
-        self._begun_ns: int | None = None
+        self._started_ns: int | None = None
         self._drop = self._corrupt = 0
-        self._quiet_until_ns = 0
+        self._silent_until_ns = 0
         self._exceptions: deque[int] = deque()
         self.counts: Counter[str] = Counter()
         self._switch_on(0)
 
-    def opened(self, now: Now) -> list[Output[ModbusUnit]]:
-        """Switch on at the first time; later the axis has gone on."""
-        if self._begun_ns is None:
-            self._begun_ns = self._moved_ns = now.monotonic_ns
-        return [StationStatus(StationPhase.STREAMING, "axis emulated")]
+    def on_open(self, now: HostTime) -> list[Output[ModbusUnit]]:
+        """Power on at the first opening; later the axis has continued."""
+        if self._started_ns is None:
+            self._started_ns = self._updated_ns = now.monotonic_ns
+        return [EndpointStatus(EndpointPhase.STREAMING, "axis emulated")]
 
-    def received(self, unit: ModbusUnit, now: Now) -> list[Output[ModbusUnit]]:
+    def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
         """Answer a request."""
-        self._suffer(now.monotonic_ns)
-        if now.monotonic_ns < self._quiet_until_ns or not isinstance(unit, ReadRegisters | WriteRegisters):
+        self._apply_due_faults(now.monotonic_ns)
+        if now.monotonic_ns < self._silent_until_ns or not isinstance(unit, ReadRegisters | WriteRegisters):
             return []
         if self._drop:
             self._drop -= 1
             return []
-        self._move(now.monotonic_ns)
+        self._advance(now.monotonic_ns)
         code = self._exceptions.popleft() if self._exceptions else 0
-        reply = self._refusal(unit, code) if code else self._answer(unit)
+        reply = self._make_exception(unit, code) if code else self._answer(unit)
         self.counts["exceptions" if isinstance(reply, ModbusFailure) else "replies"] += 1
         if self._corrupt and isinstance(reply, Registers):
             self._corrupt -= 1
             reply = Registers(reply.address, reply.values[:-1], reply.transaction)
         return [Send(reply)]
 
-    def woken(self, now: Now) -> list[Output[ModbusUnit]]:
+    def on_timer(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Do nothing: it only answers."""
         return []
 
-    def due(self) -> int | None:
+    def get_deadline(self) -> int | None:
         """Return None: it only answers."""
         return None
 
-    def leaving(self, now: Now) -> list[Output[ModbusUnit]]:
-        """Leave."""
+    def on_close(self, now: HostTime) -> list[Output[ModbusUnit]]:
+        """Send nothing."""
         return []
 
     @property
     def degrees(self) -> float:
-        """Where the axis is, as it was last asked, without steps."""
+        """True angle at the last request."""
         return self._angle
 
     @property
@@ -128,18 +116,18 @@ class AxisEmulator:
         unit = self.unit
         self._commanded = {"lower_limit": unit.lower_deg, "upper_limit": unit.upper_deg, "nod_rate": unit.rate_deg}
         self._angle = unit.angle_deg
-        self._sense = 1.0
-        self._moved_ns = at_ns
+        self._direction = 1.0
+        self._updated_ns = at_ns
         self._number = 0
-        self._told = self._angle
-        self._told_rate = 0.0
+        self._measured_deg = self._angle
+        self._measured_rate = 0.0
 
-    def _suffer(self, at_ns: int) -> None:
-        """Let the faults come whose time it is."""
-        begun = self._begun_ns or 0
-        while self._faults and begun + round(self._faults[0].at * 1e9) <= at_ns:
+    def _apply_due_faults(self, at_ns: int) -> None:
+        """Apply the faults that are due."""
+        started = self._started_ns or 0
+        while self._faults and started + round(self._faults[0].at * 1e9) <= at_ns:
             fault = self._faults.popleft()
-            due = begun + round(fault.at * 1e9)
+            due = started + round(fault.at * 1e9)
             if fault.kind == "drop":
                 self._drop += round(fault.amount)
             elif fault.kind == "corrupt":
@@ -147,27 +135,27 @@ class AxisEmulator:
             elif fault.kind == "exception":
                 self._exceptions.append(round(fault.amount))
             elif fault.kind == "jump":
-                self._move(due)
+                self._advance(due)
                 self._angle += fault.amount
             else:
-                self._quiet_until_ns = due + round(fault.amount * 1e9)
+                self._silent_until_ns = due + round(fault.amount * 1e9)
                 if fault.kind == "restart":
-                    self._switch_on(self._quiet_until_ns)
+                    self._switch_on(self._silent_until_ns)
 
-    def _move(self, at_ns: int) -> None:
+    def _advance(self, at_ns: int) -> None:
         """Turn on to an instant, and measure at the last instant of its own before."""
         tick_ns = round(1e9 / self.unit.measure_hz)
-        ticks = (at_ns - (self._begun_ns or 0)) // tick_ns
-        measured_ns = (self._begun_ns or 0) + ticks * tick_ns
-        if measured_ns > self._moved_ns:
+        ticks = (at_ns - (self._started_ns or 0)) // tick_ns
+        measured_ns = (self._started_ns or 0) + ticks * tick_ns
+        if measured_ns > self._updated_ns:
             self._number = ticks & 0xFFFF
-            turned = self._turn((measured_ns - self._moved_ns) * 1e-9)
-            self._moved_ns = measured_ns
-            self._told = round(self._angle / self.unit.step_deg) * self.unit.step_deg
-            self._told_rate = turned
+            turned = self._rotate((measured_ns - self._updated_ns) * 1e-9)
+            self._updated_ns = measured_ns
+            self._measured_deg = round(self._angle / self.unit.step_deg) * self.unit.step_deg
+            self._measured_rate = turned
 
-    def _turn(self, seconds: float) -> float:
-        """Turn for so long; return the rate at the end, with its sign."""
+    def _rotate(self, seconds: float) -> float:
+        """Rotate for a time; return the signed rate at its end."""
         lower, upper, rate = self._commanded["lower_limit"], self._commanded["upper_limit"], self._commanded["nod_rate"]
         if rate == 0.0:
             return 0.0
@@ -175,58 +163,58 @@ class AxisEmulator:
         if not lower <= self._angle <= upper:
             # the limits were moved, or it was pushed: back between them first
             near = min(max(self._angle, lower), upper)
-            self._sense = 1.0 if near > self._angle else -1.0
+            self._direction = 1.0 if near > self._angle else -1.0
             way = min(left, abs(near - self._angle))
-            self._angle += self._sense * way
+            self._angle += self._direction * way
             left -= way
         if left > 0.0:
-            # unfolded, nodding goes round a circle of twice the span
+            # unfolded, the nodding motion is periodic in twice the span
             span = upper - lower
-            phase = self._angle - lower if self._sense > 0.0 else 2.0 * span - (self._angle - lower)
+            phase = self._angle - lower if self._direction > 0.0 else 2.0 * span - (self._angle - lower)
             phase = (phase + left) % (2.0 * span)
-            self._sense = 1.0 if phase < span else -1.0
+            self._direction = 1.0 if phase < span else -1.0
             self._angle = lower + (phase if phase < span else 2.0 * span - phase)
-        return self._sense * rate
+        return self._direction * rate
 
     def _answer(self, unit: ReadRegisters | WriteRegisters) -> ModbusUnit:
         if isinstance(unit, WriteRegisters):
-            return self._written(unit)
-        table = self._table(unit.table)
+            return self._write(unit)
+        table = self._make_table(unit.table)
         wanted = range(unit.address, unit.address + unit.count)
         # between its registers it has others, which are 0
         if not 0 < unit.count <= MAX_READ or not table or wanted[0] < min(table) or wanted[-1] > max(table):
-            return self._refusal(unit, ILLEGAL_ADDRESS)
+            return self._make_exception(unit, ILLEGAL_ADDRESS)
         return Registers(unit.address, tuple(table.get(address, 0) for address in wanted), unit.transaction)
 
-    def _table(self, table: Table) -> dict[int, int]:
+    def _make_table(self, table: RegisterTable) -> dict[int, int]:
         registers = self._registers
         words: dict[int, int] = {}
-        if table is Table(registers.table):
-            values = {"angle": self._told, "rate": self._told_rate}
+        if table is RegisterTable(registers.table):
+            values = {"angle": self._measured_deg, "rate": self._measured_rate}
             for name, mapped in registers.measured.items():
-                found = mapped.words(self._number) if name == "number" else mapped.of_degrees(values[name])
+                found = mapped.to_words(self._number) if name == "sequence" else mapped.from_degrees(values[name])
                 words |= {mapped.address + index: word for index, word in enumerate(found)}
-        if table is Table.HOLDING:
+        if table is RegisterTable.HOLDING:
             for name, mapped in registers.commanded.items():
-                found = mapped.of_degrees(self._commanded[name])
+                found = mapped.from_degrees(self._commanded[name])
                 words |= {mapped.address + index: word for index, word in enumerate(found)}
         return words
 
-    def _written(self, unit: WriteRegisters) -> ModbusUnit:
+    def _write(self, unit: WriteRegisters) -> ModbusUnit:
         places = {(mapped.address, mapped.registers): name for name, mapped in self._registers.commanded.items()}
         name = places.get((unit.address, len(unit.values)))
         if name is None or len(unit.values) > MAX_WRITE:
-            return self._refusal(unit, ILLEGAL_ADDRESS)
-        after = self._commanded | {name: self._registers.commanded[name].degrees(unit.values)}
+            return self._make_exception(unit, ILLEGAL_ADDRESS)
+        after = self._commanded | {name: self._registers.commanded[name].to_degrees(unit.values)}
         axis, rate = self.unit, after["nod_rate"]
         slack = 0.5 * axis.step_deg
         fits = axis.lowest_deg - slack <= after["lower_limit"] < after["upper_limit"] <= axis.highest_deg + slack and (
             rate == 0.0 or axis.slowest_deg - slack <= rate <= axis.fastest_deg + slack
         )
         if not fits:
-            return self._refusal(unit, ILLEGAL_VALUE)
+            return self._make_exception(unit, ILLEGAL_VALUE)
         self._commanded = after
-        return Written(unit.address, len(unit.values), unit.transaction)
+        return RegistersWritten(unit.address, len(unit.values), unit.transaction)
 
-    def _refusal(self, unit: ReadRegisters | WriteRegisters, code: int) -> ModbusFailure:
-        return ModbusFailure(FailureKind.EXCEPTION, explain(code), code, unit.transaction)
+    def _make_exception(self, unit: ReadRegisters | WriteRegisters, code: int) -> ModbusFailure:
+        return ModbusFailure(FailureKind.EXCEPTION, explain_exception(code), code, unit.transaction)

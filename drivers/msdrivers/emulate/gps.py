@@ -1,4 +1,4 @@
-"""A satellite receiver in software, from the device's side: it says what a series of samples lets it measure.
+"""Emulator of a satellite receiver: sends logs and sentences of a series of samples.
 
 It takes the commands of a NovAtel OEM4 that a driver needs (`log`, `unlog`, `unlogall`, and some without effect here),
 answers and prompts as it does, and forgets what was asked for when it restarts. With `answers` off and `saved` logs it
@@ -13,16 +13,16 @@ from dataclasses import dataclass
 
 from modelserver.messages import GpsSample
 from msdrivers.emulate import gps_logs
-from msdrivers.station import Now, Output, Send, StationPhase, StationStatus
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Send
 
-_LONGEST_COMMAND = 200
-_EFFECTLESS = frozenset({"fix", "com", "datum", "saveconfig", "undulationauto", "ecutoff", "dgpstimeout"})
+_MAX_COMMAND_BYTES = 200
+_NO_EFFECT_COMMANDS = frozenset({"fix", "com", "datum", "saveconfig", "undulationauto", "ecutoff", "dgpstimeout"})
 """Commands that are accepted and change nothing here."""
 
 
 @dataclass(frozen=True, slots=True)
 class GpsUnit:
-    """How the receiver is. Seconds; `shift`: microseconds added to the samples' stamps, which then are host time.
+    """Configuration of the receiver. Seconds; `shift`: microseconds added to the samples' stamps to get host time.
 
     saved: lines of its saved configuration, e.g. "log com1 gpgga ontime 0.25", carried out when it starts.
     latency: from the instant of a sample to the first byte of its logs. boot: from a restart to the prompt.
@@ -32,13 +32,13 @@ class GpsUnit:
     port: str = "COM1"
     saved: tuple[str, ...] = ()
     latency: float = 0.02
-    boot: float = 2.0
-    answers: bool = True
+    boot_time: float = 2.0
+    is_answering: bool = True
     shift: int = 0
 
 
 @dataclass(slots=True)
-class _Wanted:
+class _LogRequest:
     """A log that was asked for: its period in microseconds, 0 for each sample, and when it was last written."""
 
     period: int
@@ -46,22 +46,22 @@ class _Wanted:
 
 
 class GpsEmulator:
-    """A `Station` of bytes that speaks as the receiver does. `samples` are in the order of their stamps."""
+    """An `Endpoint` of bytes that speaks as the receiver does. `samples` are in the order of their stamps."""
 
     def __init__(self, samples: Iterable[GpsSample], unit: GpsUnit | None = None) -> None:
         self._unit = GpsUnit() if unit is None else unit
         self._samples: Iterator[GpsSample] = iter(samples)
         self._next = next(self._samples, None)
-        self._logs: dict[str, _Wanted] = {}
+        self._logs: dict[str, _LogRequest] = {}
         self._line = bytearray()
-        self._now: Now | None = None
-        self._boots_at_ns: int | None = None
+        self._now: HostTime | None = None
+        self._boot_done_ns: int | None = None
         self._counts: Counter[str] = Counter()
-        self._carry_out_saved()
+        self._run_saved_commands()
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Commands accepted and refused, logs by name, restarts."""
+        """Commands accepted and rejected, logs by name, restarts."""
         return dict(self._counts)
 
     @property
@@ -69,100 +69,100 @@ class GpsEmulator:
         """The logs that are on, e.g. "bestposb"."""
         return tuple(self._logs)
 
-    def opened(self, now: Now) -> Sequence[Output[bytes]]:
+    def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
         """The host's end of the line is open. A receiver does not notice, but greets when it was just switched on."""
         first = self._now is None
         self._now = now
         self._line.clear()
-        return self._greet() if first else []
+        return self._make_prompt() if first else []
 
-    def restart(self, now: Now) -> Sequence[Output[bytes]]:
+    def restart(self, now: HostTime) -> Sequence[Output[bytes]]:
         """Lose power and start again: silent for `boot`, then the prompt, and only what is saved is on."""
         self._now = now
         self._counts["restarts"] += 1
-        self._boots_at_ns = now.monotonic_ns + round(self._unit.boot * 1e9)
+        self._boot_done_ns = now.monotonic_ns + round(self._unit.boot_time * 1e9)
         self._logs.clear()
         self._line.clear()
-        return [StationStatus(StationPhase.SILENT, "the emulated receiver restarts")]
+        return [EndpointStatus(EndpointPhase.SILENT, "the emulated receiver restarts")]
 
-    def received(self, unit: bytes, now: Now) -> Sequence[Output[bytes]]:
-        """Take what the host sends: lines of commands, ended by CR or LF."""
+    def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
+        """Process commands: lines that end with CR or LF."""
         self._now = now
-        if not self._unit.answers or self._boots_at_ns is not None:
+        if not self._unit.is_answering or self._boot_done_ns is not None:
             return []
         out: list[Output[bytes]] = []
         for byte in unit:
             if byte not in b"\r\n":
-                if len(self._line) < _LONGEST_COMMAND:
+                if len(self._line) < _MAX_COMMAND_BYTES:
                     self._line.append(byte)
                 continue
             line = self._line.decode("latin-1").strip()
             self._line.clear()
             if line:
-                error = self._obey(line)
-                self._counts["refused" if error else "accepted"] += 1
+                error = self._execute(line)
+                self._counts["rejected" if error else "accepted"] += 1
                 answer = f"<ERROR:{error}" if error else "<OK"
                 out.append(Send(f"\r\n{answer}\r\n{self._prompt}".encode("ascii")))
         return out
 
-    def woken(self, now: Now) -> Sequence[Output[bytes]]:
-        """Start, if it is time, and say what the samples up to now let it say."""
+    def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
+        """Finish a restart that is due; send the logs of the samples up to now."""
         self._now = now
         out: list[Output[bytes]] = []
-        if self._boots_at_ns is not None and now.monotonic_ns >= self._boots_at_ns:
-            self._boots_at_ns = None
-            self._carry_out_saved()
-            out += self._greet()
-        while self._next is not None and self._said_at(self._next) <= now.utime:
-            if self._boots_at_ns is None:
-                said = self._say(self._next)
-                if said:
-                    out.append(Send(said))
+        if self._boot_done_ns is not None and now.monotonic_ns >= self._boot_done_ns:
+            self._boot_done_ns = None
+            self._run_saved_commands()
+            out += self._make_prompt()
+        while self._next is not None and self._get_send_utime(self._next) <= now.utime:
+            if self._boot_done_ns is None:
+                logs = self._make_logs(self._next)
+                if logs:
+                    out.append(Send(logs))
             self._next = next(self._samples, None)
         return out
 
-    def due(self) -> int | None:
-        """Return when the next sample is to be said, or the receiver has started."""
+    def get_deadline(self) -> int | None:
+        """Return when the next sample is due, or the restart is complete."""
         if self._now is None:
             return None
-        times = [] if self._boots_at_ns is None else [self._boots_at_ns]
+        times = [] if self._boot_done_ns is None else [self._boot_done_ns]
         if self._next is not None:
-            times.append(self._now.monotonic_ns + (self._said_at(self._next) - self._now.utime) * 1000)
+            times.append(self._now.monotonic_ns + (self._get_send_utime(self._next) - self._now.utime) * 1000)
         return min(times, default=None)
 
-    def leaving(self, now: Now) -> Sequence[Output[bytes]]:
-        """Nothing: a receiver does not say good-bye."""
+    def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
+        """Send nothing."""
         return []
 
     @property
     def _prompt(self) -> str:
         return f"[{self._unit.port}]"
 
-    def _greet(self) -> list[Output[bytes]]:
-        return [Send(f"\r\n{self._prompt}".encode("ascii"))] if self._unit.answers else []
+    def _make_prompt(self) -> list[Output[bytes]]:
+        return [Send(f"\r\n{self._prompt}".encode("ascii"))] if self._unit.is_answering else []
 
-    def _said_at(self, sample: GpsSample) -> int:
+    def _get_send_utime(self, sample: GpsSample) -> int:
         return sample.header.utime + self._unit.shift + round(self._unit.latency * 1e6)
 
-    def _say(self, sample: GpsSample) -> bytes:
+    def _make_logs(self, sample: GpsSample) -> bytes:
         utime = sample.header.utime + self._unit.shift
-        said = b""
+        logs = b""
         for name, wanted in self._logs.items():
             # half a millisecond of grace: stamps are rounded
             if wanted.last is not None and utime - wanted.last < wanted.period - 500:
                 continue
             wanted.last = utime
-            said += gps_logs.write(name, sample, utime, self._unit.port)
+            logs += gps_logs.encode_sample(name, sample, utime, self._unit.port)
             self._counts[name] += 1
-        return said
+        return logs
 
-    def _carry_out_saved(self) -> None:
+    def _run_saved_commands(self) -> None:
         for line in self._unit.saved:
-            error = self._obey(line)
+            error = self._execute(line)
             if error:
                 raise ValueError(f"saved configuration, '{line}': {error}")
 
-    def _obey(self, line: str) -> str:
+    def _execute(self, line: str) -> str:
         """Carry a command out. Return what is wrong with it; empty if nothing is."""
         words = line.lower().split()
         command, fields = words[0], words[1:]
@@ -171,21 +171,21 @@ class GpsEmulator:
         if command == "unlogall":
             self._logs.clear()
             return ""
-        if command in _EFFECTLESS:
+        if command in _NO_EFFECT_COMMANDS:
             return ""
         if command not in ("log", "unlog"):
             return f"Invalid Message. Field = {command}"
-        if not fields or not gps_logs.known(fields[0]):
+        if not fields or not gps_logs.is_known(fields[0]):
             return f"Invalid Message. Field = {fields[0] if fields else ''}"
         if command == "unlog":
             self._logs.pop(fields[0], None)
             return ""
-        return self._log(fields)
+        return self._execute_log(fields)
 
-    def _log(self, fields: Sequence[str]) -> str:
+    def _execute_log(self, fields: Sequence[str]) -> str:
         trigger = fields[1] if len(fields) > 1 else "onchanged"
         if trigger in ("onnew", "onchanged"):
-            self._logs[fields[0]] = _Wanted(0)
+            self._logs[fields[0]] = _LogRequest(0)
             return ""
         if trigger != "ontime" or len(fields) < 3:
             return "Invalid trigger"
@@ -195,7 +195,7 @@ class GpsEmulator:
             period = 0.0
         if not 0.05 <= period <= 86_400.0:
             return "Invalid period"
-        self._logs[fields[0]] = _Wanted(round(period * 1e6))
+        self._logs[fields[0]] = _LogRequest(round(period * 1e6))
         return ""
 
     def _is_port(self, word: str) -> bool:

@@ -1,4 +1,4 @@
-"""What a satellite receiver in software says of a sample: one log or sentence at a time."""
+"""Logs and sentences that an emulated satellite receiver sends for a sample."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ _MODE = {
 _WGS84 = 61
 
 
-def known(name: str) -> bool:
+def is_known(name: str) -> bool:
     """Return whether a log or sentence is written here, e.g. "bestposb" or "gpgga"."""
     return name in NMEA or (name[:-1] in NOVATEL and name[-1] in "ab")
 
 
-def write(name: str, sample: GpsSample, utime: int, port: str = "COM1") -> bytes:
-    """Return the bytes of a log or sentence that says a sample at `utime`."""
+def encode_sample(name: str, sample: GpsSample, utime: int, port: str = "COM1") -> bytes:
+    """Encode a sample at `utime` as a log or sentence."""
     if name in NMEA:
         return NMEA[name](sample, utime)
     week, microseconds = gps_time.gps_of(utime)
@@ -68,140 +68,161 @@ def write(name: str, sample: GpsSample, utime: int, port: str = "COM1") -> bytes
     return encode(NovatelLog(header, NOVATEL[name[:-1]](sample)))
 
 
-def _zero(value: float) -> float:
+def _nan_to_zero(value: float) -> float:
     return 0.0 if value != value else value
 
 
-def _height(sample: GpsSample) -> float:
-    """Above mean sea level; where the sample has only the ellipsoid's, the geoid is taken to lie on it."""
+def _get_height_msl(sample: GpsSample) -> float:
+    """Return the height above mean sea level; without a geoid undulation the ellipsoidal height."""
     if sample.height_msl == sample.height_msl:
         return sample.height_msl
-    return sample.height_ellipsoidal - _zero(sample.undulation)
+    return sample.height_ellipsoidal - _nan_to_zero(sample.undulation)
 
 
-def _sigmas(sample: GpsSample) -> tuple[float, float, float]:
-    """North, east, up."""
+def _get_sigmas(sample: GpsSample) -> tuple[float, float, float]:
+    """Return the standard deviations north, east, up."""
     if sample.position_covariance is None:
         return 0.0, 0.0, 0.0
     east, north, up = sample.position_covariance[::4]
     return math.sqrt(north), math.sqrt(east), math.sqrt(up)
 
 
-def _track(course: float) -> float:
+def _track_from_course(course: float) -> float:
     """Return degrees clockwise from north, 0 to 360."""
     return (90.0 - math.degrees(course)) % 360.0
 
 
-def _motion(sample: GpsSample) -> tuple[float, float, float]:
-    """Speed, course and climb; nan where the sample does not tell."""
+def _get_motion(sample: GpsSample) -> tuple[float, float, float]:
+    """Return speed, course and climb; nan if missing."""
     if sample.velocity is not None:
         east, north, up = sample.velocity
         return math.hypot(east, north), math.atan2(north, east), up
     return sample.speed, sample.course, math.nan
 
 
-def _position(sample: GpsSample) -> Position:
+def _make_position(sample: GpsSample) -> Position:
     if sample.fix_type is FixType.NONE:
         status, zeros = SolutionStatus.INSUFFICIENT_OBS, (0.0,) * 4
         return Position(status, PositionType.NONE, *zeros, _WGS84, 0.0, 0.0, 0.0, "", 0.0, 0.0, 0, 0)
     used = max(0, sample.satellites)
-    place = (sample.latitude_deg, sample.longitude_deg, _zero(_height(sample)), _zero(sample.undulation))
+    place = (
+        sample.latitude_deg,
+        sample.longitude_deg,
+        _nan_to_zero(_get_height_msl(sample)),
+        _nan_to_zero(sample.undulation),
+    )
     kind = _TYPES[sample.fix_type]
-    return Position(SolutionStatus.SOL_COMPUTED, kind, *place, _WGS84, *_sigmas(sample), "", 0.0, 0.0, used, used)
+    return Position(SolutionStatus.SOL_COMPUTED, kind, *place, _WGS84, *_get_sigmas(sample), "", 0.0, 0.0, used, used)
 
 
-def _velocity(sample: GpsSample) -> Velocity:
-    speed, course, climb = _motion(sample)
+def _make_velocity(sample: GpsSample) -> Velocity:
+    speed, course, climb = _get_motion(sample)
     if sample.fix_type is FixType.NONE or speed != speed:
         return Velocity(SolutionStatus.INSUFFICIENT_OBS, PositionType.NONE, 0.0, 0.0, 0.0, 0.0, 0.0)
     kind = PositionType.DOPPLER_VELOCITY
-    latency = _zero(sample.velocity_latency)
-    return Velocity(SolutionStatus.SOL_COMPUTED, kind, latency, 0.0, speed, _track(_zero(course)), _zero(climb))
+    latency = _nan_to_zero(sample.velocity_latency)
+    return Velocity(
+        SolutionStatus.SOL_COMPUTED,
+        kind,
+        latency,
+        0.0,
+        speed,
+        _track_from_course(_nan_to_zero(course)),
+        _nan_to_zero(climb),
+    )
 
 
-def _heading(sample: GpsSample) -> HeadingLog:
+def _make_heading(sample: GpsSample) -> HeadingLog:
     if sample.baseline_yaw != sample.baseline_yaw:
         return HeadingLog(SolutionStatus.INSUFFICIENT_OBS, PositionType.NONE, -1.0, 0.0, 0.0, 0.0, 0.0, "", 0, 0)
-    sigma = math.degrees(_zero(sample.baseline_yaw_sigma))
+    sigma = math.degrees(_nan_to_zero(sample.baseline_yaw_sigma))
     used = max(0, sample.satellites)
     kind = PositionType.NARROW_INT
-    heading = _track(sample.baseline_yaw)
+    heading = _track_from_course(sample.baseline_yaw)
     return HeadingLog(SolutionStatus.SOL_COMPUTED, kind, 1.0, heading, 0.0, sigma, sigma, "", used, used)
 
 
 NOVATEL: dict[str, Callable[[GpsSample], Body]] = {
-    "bestpos": _position,
-    "psrpos": _position,
-    "rtkpos": _position,
-    "bestvel": _velocity,
-    "heading": _heading,
-    "heading2": _heading,
+    "bestpos": _make_position,
+    "psrpos": _make_position,
+    "rtkpos": _make_position,
+    "bestvel": _make_velocity,
+    "heading": _make_heading,
+    "heading2": _make_heading,
 }
 """Log without its format's letter -> the body."""
 
 
-def _clock(utime: int) -> str:
-    return nmea.time_of_day(utime % gps_time.DAY)
+def _format_clock(utime: int) -> str:
+    return nmea.format_time_of_day(utime % gps_time.DAY)
 
 
-def _date(utime: int) -> datetime:
+def _to_datetime(utime: int) -> datetime:
     return datetime.fromtimestamp(utime // gps_time.SECOND, UTC)
 
 
-def _place(sample: GpsSample) -> tuple[str, str, str, str]:
-    return (*nmea.angle(sample.latitude_deg, "NS", 2), *nmea.angle(sample.longitude_deg, "EW", 3))
+def _format_position(sample: GpsSample) -> tuple[str, str, str, str]:
+    return (*nmea.format_angle(sample.latitude_deg, "NS", 2), *nmea.format_angle(sample.longitude_deg, "EW", 3))
 
 
-def _gga(sample: GpsSample, utime: int) -> bytes:
+def _format_gga(sample: GpsSample, utime: int) -> bytes:
     count = str(sample.satellites) if sample.satellites >= 0 else ""
-    heights = (nmea.number(_height(sample), 4), "M", nmea.number(sample.undulation, 4), "M")
-    fields = (_clock(utime), *_place(sample), _QUALITY[sample.fix_type], count, nmea.number(sample.hdop, 2))
+    heights = (nmea.format_number(_get_height_msl(sample), 4), "M", nmea.format_number(sample.undulation, 4), "M")
+    fields = (
+        _format_clock(utime),
+        *_format_position(sample),
+        _QUALITY[sample.fix_type],
+        count,
+        nmea.format_number(sample.hdop, 2),
+    )
     return nmea.encode("GP", "GGA", (*fields, *heights, "", ""))
 
 
-def _rmc(sample: GpsSample, utime: int) -> bytes:
-    speed, course, _ = _motion(sample)
+def _format_rmc(sample: GpsSample, utime: int) -> bytes:
+    speed, course, _ = _get_motion(sample)
     status = "V" if sample.fix_type is FixType.NONE else "A"
-    motion = (nmea.number(speed / KNOT, 4), nmea.number(_track(course), 4))
-    date = _date(utime).strftime("%d%m%y")
-    fields = (_clock(utime), status, *_place(sample), *motion, date, "", "", _MODE[sample.fix_type])
+    motion = (nmea.format_number(speed / KNOT, 4), nmea.format_number(_track_from_course(course), 4))
+    date = _to_datetime(utime).strftime("%d%m%y")
+    fields = (_format_clock(utime), status, *_format_position(sample), *motion, date, "", "", _MODE[sample.fix_type])
     return nmea.encode("GP", "RMC", fields)
 
 
-def _vtg(sample: GpsSample, utime: int) -> bytes:
-    speed, course, _ = _motion(sample)
-    track = nmea.number(_track(course), 4)
-    speeds = (nmea.number(speed / KNOT, 4), "N", nmea.number(speed / KMH, 4), "K")
+def _format_vtg(sample: GpsSample, utime: int) -> bytes:
+    speed, course, _ = _get_motion(sample)
+    track = nmea.format_number(_track_from_course(course), 4)
+    speeds = (nmea.format_number(speed / KNOT, 4), "N", nmea.format_number(speed / KMH, 4), "K")
     return nmea.encode("GP", "VTG", (track, "T", "", "M", *speeds, _MODE[sample.fix_type]))
 
 
-def _gsa(sample: GpsSample, utime: int) -> bytes:
+def _format_gsa(sample: GpsSample, utime: int) -> bytes:
     dimension = {FixType.NONE: "1", FixType.FIX_2D: "2"}.get(sample.fix_type, "3")
-    dilution = (nmea.number(each, 2) for each in (sample.pdop, sample.hdop, sample.vdop))
+    dilution = (nmea.format_number(each, 2) for each in (sample.pdop, sample.hdop, sample.vdop))
     return nmea.encode("GP", "GSA", ("A", dimension, *[""] * 12, *dilution))
 
 
-def _gst(sample: GpsSample, utime: int) -> bytes:
-    sigmas = _sigmas(sample) if sample.position_covariance else (math.nan,) * 3
-    return nmea.encode("GP", "GST", (_clock(utime), *[""] * 4, *(nmea.number(each, 3) for each in sigmas)))
+def _format_gst(sample: GpsSample, utime: int) -> bytes:
+    sigmas = _get_sigmas(sample) if sample.position_covariance else (math.nan,) * 3
+    return nmea.encode(
+        "GP", "GST", (_format_clock(utime), *[""] * 4, *(nmea.format_number(each, 3) for each in sigmas))
+    )
 
 
-def _hdt(sample: GpsSample, utime: int) -> bytes:
-    return nmea.encode("GP", "HDT", (nmea.number(_track(sample.baseline_yaw), 4), "T"))
+def _format_hdt(sample: GpsSample, utime: int) -> bytes:
+    return nmea.encode("GP", "HDT", (nmea.format_number(_track_from_course(sample.baseline_yaw), 4), "T"))
 
 
-def _zda(sample: GpsSample, utime: int) -> bytes:
-    day = _date(utime)
-    return nmea.encode("GP", "ZDA", (_clock(utime), f"{day:%d}", f"{day:%m}", f"{day:%Y}", "00", "00"))
+def _format_zda(sample: GpsSample, utime: int) -> bytes:
+    day = _to_datetime(utime)
+    return nmea.encode("GP", "ZDA", (_format_clock(utime), f"{day:%d}", f"{day:%m}", f"{day:%Y}", "00", "00"))
 
 
 NMEA: dict[str, Callable[[GpsSample, int], bytes]] = {
-    "gpgga": _gga,
-    "gprmc": _rmc,
-    "gpvtg": _vtg,
-    "gpgsa": _gsa,
-    "gpgst": _gst,
-    "gphdt": _hdt,
-    "gpzda": _zda,
+    "gpgga": _format_gga,
+    "gprmc": _format_rmc,
+    "gpvtg": _format_vtg,
+    "gpgsa": _format_gsa,
+    "gpgst": _format_gst,
+    "gphdt": _format_hdt,
+    "gpzda": _format_zda,
 }
 """Sentence -> its bytes."""

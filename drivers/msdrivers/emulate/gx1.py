@@ -1,40 +1,107 @@
-"""A MicroStrain 3DM-GX1 in software, from the device's side: it says what a series of samples lets it measure.
+"""Emulator of a MicroStrain 3DM-GX1: measures the linear interpolation of a series of samples.
 
-What its documents leave open is chosen here: it starts without continuous mode, keeps silent while it starts and while
-it captures its gyros' biases, and reads its timer words when it starts. The sample at an instant is interpolated
-between those around it.
+Choices where its documents are silent: it starts without continuous mode, sends nothing while it starts and while it
+captures its gyro biases, and reads its timer words at start.
 """
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
-from modelserver.messages import ImuSample
-from modelserver.spatial.so3 import Vector3
-from msdrivers.emulate.gx1_samples import Samples, SensedState
-from msdrivers.emulate.gx1_unit import GAINS, Eeprom, Gx1Unit, UnitClock, UnitFault
-from msdrivers.protocol.gx1 import DATA, Address, CommandByte, Gains, Packet, Request, RequestParser
+from modelserver.messages import ImuSample, OrientationReference
+from modelserver.transforms import so3
+from modelserver.transforms.so3 import Quaternion, Vector3
+from msdrivers.emulate import InjectedFault
+from msdrivers.emulate.gx1_unit import GAINS, Eeprom, Gx1Unit, UnitClock
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Send
+from msdrivers.protocol.gx1 import MEASUREMENTS, CommandByte, EepromAddress, Gains, Gx1Packet, Gx1Request, RequestParser
 from msdrivers.protocol.gx1.scaling import (
     G0,
-    HIGHEST,
-    LOWEST,
+    MAX_WORD,
+    MIN_WORD,
     TESLA,
-    euler_words,
-    quaternion_words,
-    temperature_word,
-    vector,
-    vector_words,
+    euler_to_words,
+    quaternion_to_words,
+    temperature_to_word,
+    vector_from_words,
+    vector_to_words,
 )
-from msdrivers.station import Now, Output, Send, StationPhase, StationStatus
 
-BACKLOG = 100
-"""Cycles that are made up for when the emulator was woken late."""
+_ZERO: Vector3 = (0.0, 0.0, 0.0)
+_NED_FROM_ENU: Quaternion = (0.0, 0.5**0.5, 0.5**0.5, 0.0)
+"""Rotation by 180 degrees about the axis between east and north."""
+
+
+class SensedState(NamedTuple):
+    """True state along the sensor's axes, SI units; orientation in north, east, down."""
+
+    rate: Vector3
+    force: Vector3
+    field: Vector3
+    orientation: Quaternion
+
+
+class SampleInterpolator:
+    """Interpolates samples linearly by their stamps; the first before it, nothing after the last.
+
+    Missing vectors are zero, a missing orientation is level and north.
+    """
+
+    __slots__ = ("_after", "_before", "_remaining")
+
+    def __init__(self, samples: Iterable[ImuSample]):
+        """`samples` have increasing stamps."""
+        self._remaining: Iterator[ImuSample] = iter(samples)
+        self._before: tuple[int, SensedState] | None = None
+        self._after = self._next()
+
+    def sense_at(self, utime: int) -> SensedState | None:
+        """Return the state at an instant, None after the last sample; instants must not decrease."""
+        while self._after is not None and self._after[0] <= utime:
+            self._before, self._after = self._after, self._next()
+        if self._after is None:
+            return self._before[1] if self._before is not None and self._before[0] == utime else None
+        if self._before is None:
+            return self._after[1]
+        (begin, a), (end, b) = self._before, self._after
+        return _interpolate(a, b, (utime - begin) / (end - begin)) if utime > begin else a
+
+    def _next(self) -> tuple[int, SensedState] | None:
+        sample = next(self._remaining, None)
+        return None if sample is None else (sample.header.utime, _sense(sample))
+
+
+def _sense(sample: ImuSample) -> SensedState:
+    orientation = so3.IDENTITY if sample.orientation is None else sample.orientation
+    if sample.orientation_reference is OrientationReference.ENU:
+        orientation = so3.normalize(so3.multiply(_NED_FROM_ENU, orientation))
+    return SensedState(
+        sample.angular_velocity or _ZERO, sample.specific_force or _ZERO, sample.magnetic_field or _ZERO, orientation
+    )
+
+
+def _interpolate(a: SensedState, b: SensedState, share: float) -> SensedState:
+    return SensedState(
+        _interpolate_vector(a.rate, b.rate, share),
+        _interpolate_vector(a.force, b.force, share),
+        _interpolate_vector(a.field, b.field, share),
+        so3.slerp(a.orientation, b.orientation, share),
+    )
+
+
+def _interpolate_vector(a: Vector3, b: Vector3, share: float) -> Vector3:
+    return (a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * (b[2] - a[2]))
+
+
+MAX_BACKLOG_CYCLES = 100
+"""Largest number of cycles to catch up after a late timer."""
 
 
 class Gx1Emulator:
-    """A `Station` of bytes that answers as the device does. `samples` are in the order of their stamps.
+    """An `Endpoint` of bytes that answers as the device does. `samples` are in the order of their stamps.
 
     After the last sample it measures nothing any more: it streams no longer and answers no poll for a measurement.
     """
@@ -44,226 +111,228 @@ class Gx1Emulator:
         samples: Iterable[ImuSample],
         eeprom: Eeprom | None = None,
         unit: Gx1Unit | None = None,
-        keep: Callable[[Eeprom], object] = lambda eeprom: None,
+        save_eeprom: Callable[[Eeprom], object] = lambda eeprom: None,
     ):
-        """Take what is measured, the memory and the device. `keep` is called with the memory when it has changed."""
-        self.eeprom = Eeprom.factory() if eeprom is None else eeprom
+        """`save_eeprom` is called with the memory after each change."""
+        self.eeprom = Eeprom.make_factory() if eeprom is None else eeprom
         self.unit = Gx1Unit() if unit is None else unit
-        self.streamed = self.unit.streams
+        self.streamed = self.unit.streamed_at_start
         """The command that is streamed now, 0 for none."""
-        self._keep = keep
-        self._samples = Samples(samples)
+        self._save_eeprom = save_eeprom
+        self._samples = SampleInterpolator(samples)
         self._requests = RequestParser()
         self._outbox: deque[tuple[int, bytes]] = deque()
         self._faults = deque(sorted(self.unit.faults, key=lambda fault: fault.at))
         self._opened_ns: int | None = None
         self._stalled_until_ns = 0
-        self._clock = UnitClock.of(self.eeprom, self.unit, 0, 0)
+        self._clock = UnitClock.make(self.eeprom, self.unit, 0, 0)
         self._tick = 0
         self._gains = GAINS
         self._bias: Vector3 = (0.0, 0.0, 0.0)
         self._capture: tuple[int, list[Vector3]] | None = None
-        self._extremes: tuple[list[int], list[int]] = ([HIGHEST] * 3, [LOWEST] * 3)
+        self._extremes: tuple[list[int], list[int]] = ([MAX_WORD] * 3, [MIN_WORD] * 3)
         self._pending = Counter[str]()
         self._utime_offset_us = 0
         self.counts: Counter[str] = Counter()
 
-    def opened(self, now: Now) -> list[Output[bytes]]:
+    def on_open(self, now: HostTime) -> list[Output[bytes]]:
         """Switch on at the first time; later the device has run on."""
         if self._opened_ns is None:
             self._opened_ns = now.monotonic_ns
             self._switch_on(now.monotonic_ns, self.unit.tick_offset)
         return [
-            StationStatus(
-                StationPhase.STREAMING if self.streamed else StationPhase.WAITING,
+            EndpointStatus(
+                EndpointPhase.STREAMING if self.streamed else EndpointPhase.WAITING,
                 f"3DM-GX1 {self.unit.serial} emulated",
             )
         ]
 
-    def received(self, unit: bytes, now: Now) -> list[Output[bytes]]:
-        """Take bytes from the host."""
-        outputs = self.woken(now)
+    def on_receive(self, unit: bytes, now: HostTime) -> list[Output[bytes]]:
+        """Process received bytes."""
+        outputs = self.on_timer(now)
         if now.monotonic_ns < max(self._clock.started_ns, self._stalled_until_ns):
             return outputs
         for request in self._requests.feed(unit):
             self.counts[f"request.{CommandByte(request.command).name.lower()}"] += 1
-            self._handle(request, now)
-        return outputs + self._sent(now.monotonic_ns)
+            self._on_request(request, now)
+        return outputs + self._pop_sent(now.monotonic_ns)
 
-    def woken(self, now: Now) -> list[Output[bytes]]:
+    def on_timer(self, now: HostTime) -> list[Output[bytes]]:
         """Do what is due."""
         if self._opened_ns is None:
             return []
         self._utime_offset_us = now.utime - now.monotonic_ns // 1000
         while self._faults and self._opened_ns + round(self._faults[0].at * 1e9) <= now.monotonic_ns:
-            self.strike(self._faults.popleft(), now)
-        self._run(now.monotonic_ns)
-        return self._sent(now.monotonic_ns)
+            self.apply_fault(self._faults.popleft(), now)
+        self._run_cycles(now.monotonic_ns)
+        return self._pop_sent(now.monotonic_ns)
 
-    def due(self) -> int | None:
-        """Return when to be woken."""
+    def get_deadline(self) -> int | None:
+        """Return when to call `on_timer`, monotonic nanoseconds."""
         if self._opened_ns is None:
             return None
-        instants = [self._clock.instant(self._tick)]
+        instants = [self._clock.instant_of(self._tick)]
         if self._outbox:
             instants.append(max(self._outbox[0][0], self._stalled_until_ns))
         if self._faults:
             instants.append(self._opened_ns + round(self._faults[0].at * 1e9))
         return min(instants)
 
-    def leaving(self, now: Now) -> list[Output[bytes]]:
-        """Leave: a device does nothing about it."""
+    def on_close(self, now: HostTime) -> list[Output[bytes]]:
+        """Send nothing."""
         return []
 
-    def strike(self, fault: UnitFault, now: Now) -> None:
-        """Let something go wrong now."""
+    def apply_fault(self, fault: InjectedFault, now: HostTime) -> None:
+        """Apply a fault."""
         if fault.kind == "stall":
             self._stalled_until_ns = now.monotonic_ns + round(fault.amount * 1e9)
         elif fault.kind == "jump":
             self._clock = replace(self._clock, offset=self._clock.offset + round(fault.amount))
         elif fault.kind == "restart":
-            self._switch_on(now.monotonic_ns + round(self.unit.start * 1e9), 0)
+            self._switch_on(now.monotonic_ns + round(self.unit.boot_time * 1e9), 0)
             self.streamed, self._bias = 0, (0.0, 0.0, 0.0)
         else:
             self._pending[fault.kind] += round(fault.amount)
 
     def _switch_on(self, at_ns: int, ticks: int) -> None:
-        self._clock = UnitClock.of(self.eeprom, self.unit, at_ns, ticks)
+        self._clock = UnitClock.make(self.eeprom, self.unit, at_ns, ticks)
         self._tick, self._capture = 0, None
         self._outbox.clear()
         self._requests.clear()
-        addresses = (Address.GYRO_GAIN, Address.ACCELEROMETER_GAIN, Address.MAGNETOMETER_GAIN)
-        # its own scales are in its firmware: a zero word misleads the host, not the device
-        gyro, accelerometer, magnetometer = (self.eeprom.word(address) or 1000 for address in addresses)
+        addresses = (EepromAddress.GYRO_GAIN, EepromAddress.ACCELEROMETER_GAIN, EepromAddress.MAGNETOMETER_GAIN)
+        # its own scales are in its firmware: a zero word affects only the host
+        gyro, accelerometer, magnetometer = (self.eeprom.read_word(address) or 1000 for address in addresses)
         self._gains = Gains(gyro, accelerometer, magnetometer)
 
-    def _run(self, now_ns: int) -> None:
-        """Go through the calculation cycles up to now."""
+    def _run_cycles(self, now_ns: int) -> None:
+        """Run the calculation cycles up to now."""
         clock, step = self._clock, self.unit.cycle_ticks
-        period_ns = clock.instant(step) - clock.instant(0)
-        behind = (now_ns - clock.instant(self._tick)) // period_ns - BACKLOG
+        period_ns = clock.instant_of(step) - clock.instant_of(0)
+        behind = (now_ns - clock.instant_of(self._tick)) // period_ns - MAX_BACKLOG_CYCLES
         self._tick += max(behind, 0) * step
-        while (at_ns := clock.instant(self._tick)) <= now_ns:
+        while (at_ns := clock.instant_of(self._tick)) <= now_ns:
             self._tick += step
             if self._capture is not None:
-                self._captured(at_ns)
+                self._capture_bias(at_ns)
             elif self.streamed:
-                self._measure(self.streamed, at_ns)
+                self._send_measurement(self.streamed, at_ns)
 
-    def _measured(self, at_ns: int) -> SensedState | None:
-        return self._samples.at(at_ns // 1000 + self._utime_offset_us)
+    def _sense(self, at_ns: int) -> SensedState | None:
+        return self._samples.sense_at(at_ns // 1000 + self._utime_offset_us)
 
-    def _measure(self, command: int, at_ns: int) -> None:
+    def _send_measurement(self, command: int, at_ns: int) -> None:
         """Send a measurement made at an instant."""
-        instant = self._measured(at_ns)
+        instant = self._sense(at_ns)
         if instant is None:
             return
         words: tuple[int, ...]
         vectors = {
-            "field": self._field_words(instant, self._offsets()),
-            "acceleration": vector_words(_scaled(instant.force, self.unit.force_sign), self._gains.accelerometer, G0),
-            "rate": vector_words(_difference(self._rate(instant), self._bias), self._gains.gyro),
+            "field": self._get_field_words(instant, self._get_offsets()),
+            "acceleration": vector_to_words(_scale(instant.force, self.unit.force_sign), self._gains.accelerometer, G0),
+            "rate": vector_to_words(_subtract(self._get_rate(instant), self._bias), self._gains.gyro),
         }
         if command == CommandByte.EULER_VECTORS:
-            words = (*euler_words(instant.orientation), *vectors["acceleration"], *vectors["rate"])
-        elif command in (CommandByte.INSTANTANEOUS_EULER, CommandByte.STABILISED_EULER):
-            words = euler_words(instant.orientation)
+            words = (*euler_to_words(instant.orientation), *vectors["acceleration"], *vectors["rate"])
+        elif command in (CommandByte.INSTANTANEOUS_EULER, CommandByte.STABILIZED_EULER):
+            words = euler_to_words(instant.orientation)
         else:
             words = (*vectors["field"], *vectors["acceleration"], *vectors["rate"])
             if command == CommandByte.QUATERNION_VECTORS:
-                words = (*quaternion_words(instant.orientation), *words)
-        self._reply(command, words, at_ns)
+                words = (*quaternion_to_words(instant.orientation), *words)
+        self._queue_reply(command, words, at_ns)
 
-    def _rate(self, instant: SensedState) -> Vector3:
+    def _get_rate(self, instant: SensedState) -> Vector3:
         x, y, z = instant.rate
         a, b, c = self.unit.gyro_bias
         return (x + a, y + b, z + c)
 
-    def _field_words(self, instant: SensedState, offsets: Vector3) -> tuple[int, int, int]:
+    def _get_field_words(self, instant: SensedState, offsets: Vector3) -> tuple[int, int, int]:
         x, y, z = instant.field
         a, b, c = self.unit.field_offset
-        return vector_words(_difference((x + a, y + b, z + c), offsets), self._gains.magnetometer, TESLA)
+        return vector_to_words(_subtract((x + a, y + b, z + c), offsets), self._gains.magnetometer, TESLA)
 
-    def _offsets(self) -> Vector3:
-        words = (_signed(self.eeprom.word(address)) for address in Address.HARD_IRON)
-        return vector(words, self._gains.magnetometer, TESLA)
+    def _get_offsets(self) -> Vector3:
+        words = (_to_signed(self.eeprom.read_word(address)) for address in EepromAddress.HARD_IRON)
+        return vector_from_words(words, self._gains.magnetometer, TESLA)
 
-    def _captured(self, at_ns: int) -> None:
+    def _capture_bias(self, at_ns: int) -> None:
         assert self._capture is not None
         until_ns, rates = self._capture
-        instant = self._measured(at_ns)
+        instant = self._sense(at_ns)
         if instant is not None:
-            rates.append(self._rate(instant))
+            rates.append(self._get_rate(instant))
         if at_ns < until_ns:
             return
         if rates:
             x, y, z = (sum(axis) / len(rates) for axis in zip(*rates, strict=True))
             self._bias = (x, y, z)
         self._capture = None
-        self._reply(CommandByte.CAPTURE_BIAS, (), at_ns)
+        self._queue_reply(CommandByte.CAPTURE_BIAS, (), at_ns)
 
-    def _handle(self, request: Request, now: Now) -> None:
+    def _on_request(self, request: Gx1Request, now: HostTime) -> None:
         command, data, at_ns = request.command, request.data, now.monotonic_ns
         if self._capture is not None:
             return
-        if command in DATA:
-            self._measure(command, at_ns)
+        if command in MEASUREMENTS:
+            self._send_measurement(command, at_ns)
         elif command == CommandByte.TEMPERATURE:
-            self._reply(command, (temperature_word(self.unit.celsius),), at_ns)
+            self._queue_reply(command, (temperature_to_word(self.unit.celsius),), at_ns)
         elif command == CommandByte.CAPTURE_BIAS:
             self._capture = (at_ns + round(self.unit.bias_capture * 1e9), [])
         elif command == CommandByte.CONTINUOUS:
-            if data[0] == 0 or data[0] in DATA:
+            if data[0] == 0 or data[0] in MEASUREMENTS:
                 self.streamed = data[0]
-                self._reply(command, (data[0], self._clock.ticks(at_ns)), at_ns)
+                self._queue_reply(command, (data[0], self._clock.ticks_at(at_ns)), at_ns)
         elif command in (CommandByte.READ_EEPROM, CommandByte.WRITE_EEPROM):
             address = int.from_bytes(data[:2], "big")
             if command == CommandByte.WRITE_EEPROM and address % 2 == 0 and address < 256:
                 self._write({address: int.from_bytes(data[2:], "big")})
-            self._reply(command, (self.eeprom.word(address),), at_ns)
+            self._queue_reply(command, (self.eeprom.read_word(address),), at_ns)
         elif command == CommandByte.FIRMWARE:
-            self._reply(command, (self.unit.firmware,), at_ns)
+            self._queue_reply(command, (self.unit.firmware,), at_ns)
         elif command == CommandByte.SERIAL:
-            self._reply(command, (self.unit.serial,), at_ns)
+            self._queue_reply(command, (self.unit.serial,), at_ns)
         else:
-            self._hard_iron(command, data, at_ns)
+            self._on_hard_iron(command, data, at_ns)
 
-    def _hard_iron(self, command: int, data: bytes, at_ns: int) -> None:
+    def _on_hard_iron(self, command: int, data: bytes, at_ns: int) -> None:
         if command == CommandByte.HARD_IRON_START:
-            self._extremes = ([HIGHEST] * 3, [LOWEST] * 3)
+            self._extremes = ([MAX_WORD] * 3, [MIN_WORD] * 3)
             self._store_offsets((0, 0, 0))
-            self._reply(command, (), at_ns)
+            self._queue_reply(command, (), at_ns)
             return
         low, high = self._extremes
         if command == CommandByte.HARD_IRON_COLLECT:
-            instant = self._measured(at_ns)
+            instant = self._sense(at_ns)
             if instant is None:
                 return
-            words = self._field_words(instant, (0.0, 0.0, 0.0))
+            words = self._get_field_words(instant, (0.0, 0.0, 0.0))
             low = [min(pair) for pair in zip(low, words, strict=True)]
             high = [max(pair) for pair in zip(high, words, strict=True)]
             self._extremes = (low, high)
-            self._reply(command, (*words, *low, *high), at_ns)
+            self._queue_reply(command, (*words, *low, *high), at_ns)
             return
-        two_dimensional, magnitude_z = data[0] == 1, _signed(int.from_bytes(data[1:], "big"))
+        two_dimensional, magnitude_z = data[0] == 1, _to_signed(int.from_bytes(data[1:], "big"))
         x, y, z = ((a + b) // 2 for a, b in zip(low, high, strict=True))
         self._store_offsets((x, y, z - magnitude_z if two_dimensional else z))
-        self._reply(command, tuple(_signed(self.eeprom.word(address)) for address in Address.HARD_IRON), at_ns)
+        self._queue_reply(
+            command, tuple(_to_signed(self.eeprom.read_word(address)) for address in EepromAddress.HARD_IRON), at_ns
+        )
 
     def _store_offsets(self, words: tuple[int, int, int]) -> None:
-        self._write(dict(zip(Address.HARD_IRON, words, strict=True)))
+        self._write(dict(zip(EepromAddress.HARD_IRON, words, strict=True)))
 
     def _write(self, changes: Mapping[int, int]) -> None:
-        self.eeprom = self.eeprom.written(changes)
-        self._keep(self.eeprom)
+        self.eeprom = self.eeprom.write(changes)
+        self._save_eeprom(self.eeprom)
 
-    def _reply(self, command: int, words: tuple[int, ...], at_ns: int) -> None:
+    def _queue_reply(self, command: int, words: tuple[int, ...], at_ns: int) -> None:
         ticks = (
             None
             if command in (CommandByte.CONTINUOUS, CommandByte.FIRMWARE, CommandByte.SERIAL)
-            else self._clock.ticks(at_ns)
+            else self._clock.ticks_at(at_ns)
         )
-        raw = Packet(command, words, ticks).to_bytes()
+        raw = Gx1Packet(command, words, ticks).to_bytes()
         if self._pending["drop"] > 0:
             self._pending["drop"] -= 1
             return
@@ -275,10 +344,10 @@ class Gx1Emulator:
             send_ns = max(send_ns, self._outbox[-1][0])
         self._outbox.append((send_ns, raw))
 
-    def _sent(self, now_ns: int) -> list[Output[bytes]]:
+    def _pop_sent(self, now_ns: int) -> list[Output[bytes]]:
         outputs: list[Output[bytes]] = []
         if now_ns < self._stalled_until_ns:
-            # what it would have said is lost
+            # replies during a stall are lost
             self._outbox.clear()
         while self._outbox and self._outbox[0][0] <= now_ns:
             self.counts["sent"] += 1
@@ -286,14 +355,14 @@ class Gx1Emulator:
         return outputs
 
 
-def _signed(word: int) -> int:
+def _to_signed(word: int) -> int:
     return (word + 32768) % 65536 - 32768
 
 
-def _scaled(value: Vector3, factor: float) -> Vector3:
+def _scale(value: Vector3, factor: float) -> Vector3:
     x, y, z = value
     return (x * factor, y * factor, z * factor)
 
 
-def _difference(value: Vector3, less: Vector3) -> Vector3:
+def _subtract(value: Vector3, less: Vector3) -> Vector3:
     return (value[0] - less[0], value[1] - less[1], value[2] - less[2])

@@ -1,12 +1,12 @@
-"""Lines to devices: what carries units between a station and the world.
+"""Links to devices: the I/O that transports units between an endpoint and its device.
 
-A link is opened, polled, sent on and closed by one thread. Everything that goes wrong is a `LinkError`.
+A link is opened, polled, written and closed by one thread. Every failure is a `LinkError`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from modelserver.errors import ModelServerError
 
@@ -14,42 +14,59 @@ U = TypeVar("U")
 
 
 class LinkError(ModelServerError):
-    """A line cannot be opened, or is lost: `what` happened, `why`, and `fix`, what to do about it."""
+    """A line cannot be opened or was lost: what happened, the reason, the fix."""
 
     def __init__(self, what: str, why: str, fix: str = ""):
-        self.what, self.why, self.fix = what, why, fix
+        self.what, self.reason, self.fix = what, why, fix
         super().__init__(f"{what}: {why}{f'; {fix}' if fix else ''}")
 
 
-class PlayedOutError(LinkError):
-    """A recording has come to its end: nothing more will come on this line."""
+class EndOfRecordingError(LinkError):
+    """A recording has ended."""
 
 
 class Link(Protocol[U]):
-    """A line that carries units: bytes, CAN frames, or Modbus requests and replies."""
+    """A line of units: bytes, CAN frames, or Modbus requests and replies."""
 
     @property
     def description(self) -> str:
-        """The line, for people: a path, an address."""
+        """Path or address of the line."""
         ...
 
     @property
     def baud(self) -> int:
-        """Symbols a second, 0 where that makes no sense."""
+        """Baud rate, 0 without one."""
         ...
 
     def open(self, baud: int | None = None) -> None:
-        """Open the line, at another rate than before where one is given. Raises LinkError."""
+        """Open the line, at another baud rate if one is given. Raises LinkError."""
         ...
 
     def close(self) -> None:
-        """Send what is still to be sent, and close; closing twice is no error."""
+        """Flush the output and close; closing twice is no error."""
         ...
 
     def poll(self, timeout: float) -> Sequence[U]:
-        """Return what came in, waiting `timeout` seconds at most for the first of it. Raises LinkError."""
+        """Return received units; wait at most `timeout` seconds for the first. Raises LinkError."""
         ...
 
     def send(self, unit: U) -> None:
-        """Put a unit on the line. Raises LinkError."""
+        """Send a unit. Raises LinkError."""
         ...
+
+
+class LinkWrapper(Generic[U]):
+    """Base of links that wrap another one."""
+
+    def __init__(self, link: Link[U]):
+        self._link = link
+
+    @property
+    def description(self) -> str:
+        """Path or address of the wrapped link."""
+        return self._link.description
+
+    @property
+    def baud(self) -> int:
+        """Baud rate of the wrapped link."""
+        return self._link.baud

@@ -1,4 +1,4 @@
-"""TCP, for drivers that call a device server, and for emulators that are called."""
+"""TCP links: clients for drivers, servers for emulators."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import socket
 from collections.abc import Sequence
 
 from msdrivers.links import LinkError
-from msdrivers.links.files import lost, read_some, wait_readable, write_all
+from msdrivers.links.descriptors import make_lost_error, read_available, wait_readable, write_all
 
-CONNECT_S = 1.0
-"""How long a server may take to answer a call."""
+CONNECT_TIMEOUT_S = 1.0
+"""Connect timeout."""
 
 
 class TcpLink:
-    """A call to a device server: a receiver with a network port, or a serial port on the network."""
+    """A connection to a device server: a receiver with a network port, or a serial port on the network."""
 
     baud = 0
 
@@ -26,9 +26,9 @@ class TcpLink:
         self._socket: socket.socket | None = None
 
     def open(self, baud: int | None = None) -> None:
-        """Call the server. Raises LinkError. The rate is the server's business."""
+        """Connect; the baud rate is that of the server. Raises LinkError."""
         try:
-            self._socket = socket.create_connection(self._address, CONNECT_S)
+            self._socket = socket.create_connection(self._address, CONNECT_TIMEOUT_S)
         except socket.gaierror as error:
             raise LinkError(self.description, f"no such host ({error.strerror})", "look at address") from None
         except UnicodeError as error:
@@ -45,28 +45,28 @@ class TcpLink:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
 
     def close(self) -> None:
-        """Hang up."""
+        """Disconnect."""
         connection, self._socket = self._socket, None
         if connection is not None:
             connection.close()
 
     def poll(self, timeout: float) -> Sequence[bytes]:
-        """Return what came in. Raises LinkError where the server has hung up."""
-        file = self._file()
-        return read_some(file, self.description) if wait_readable(file, timeout) else ()
+        """Return received bytes. Raises LinkError if the server has disconnected."""
+        file = self._get_file_descriptor()
+        return read_available(file, self.description) if wait_readable(file, timeout) else ()
 
     def send(self, unit: bytes) -> None:
         """Send bytes. Raises LinkError."""
-        write_all(self._file(), unit, self.description)
+        write_all(self._get_file_descriptor(), unit, self.description)
 
-    def _file(self) -> int:
+    def _get_file_descriptor(self) -> int:
         if self._socket is None:
             raise LinkError(self.description, "the line is not open")
         return self._socket.fileno()
 
 
 class TcpServerLink:
-    """The emulator's side: takes one caller at a time, the latest. What is sent while nobody listens is lost."""
+    """A server for one client at a time, the latest. Bytes sent without a client are lost."""
 
     baud = 0
 
@@ -74,75 +74,75 @@ class TcpServerLink:
         """Listen on `port`; 0 takes a free one when the link is opened."""
         self._host, self._port = host, port
         self._server: socket.socket | None = None
-        self._caller: socket.socket | None = None
-        self.callers = 0
-        """How many have called so far."""
+        self._client: socket.socket | None = None
+        self.clients_accepted = 0
+        """Number of clients so far."""
 
     @property
     def description(self) -> str:
-        """The address to call."""
+        """Address of the server."""
         return f"tcp {self._host}:{self._port}"
 
     def open(self, baud: int | None = None) -> None:
-        """Listen, if that is not done yet. Raises LinkError where another program does on this port."""
+        """Listen. Raises LinkError if the port is in use."""
         if self._server is not None:
             return
-        self._server = listening(self._host, self._port)
+        self._server = open_server_socket(self._host, self._port)
         self._port = self._server.getsockname()[1]
 
     def close(self) -> None:
-        """Hang up and listen no more."""
-        self.hang_up()
+        """Disconnect and stop listening."""
+        self.disconnect_client()
         if self._server is not None:
             self._server.close()
             self._server = None
 
     def poll(self, timeout: float) -> Sequence[bytes]:
-        """Return what the caller sent. A caller who goes is no error: another may come."""
+        """Return bytes from the client. A disconnect is no error: another client may connect."""
         if self._server is None:
             raise LinkError(self.description, "the line is not open")
-        caller = self._caller
-        ready = ready_of([self._server] if caller is None else [self._server, caller], timeout)
+        caller = self._client
+        ready = wait_ready([self._server] if caller is None else [self._server, caller], timeout)
         data: Sequence[bytes] = ()
         if caller in ready and caller is not None:
             try:
-                data = read_some(caller.fileno(), self.description)
+                data = read_available(caller.fileno(), self.description)
             except LinkError:
-                self.hang_up()
+                self.disconnect_client()
         if self._server in ready:
-            self._take_caller()
+            self._accept_client()
         return data
 
     def send(self, unit: bytes) -> None:
-        """Send bytes to the caller; nobody there, or nobody who takes them, is no error."""
-        if self._caller is None:
+        """Send bytes to the client; a missing or blocked client is no error."""
+        if self._client is None:
             return
         try:
-            self._caller.sendall(unit)
+            self._client.sendall(unit)
         except BlockingIOError:
             pass
         except OSError:
-            self.hang_up()
+            self.disconnect_client()
 
-    def _take_caller(self) -> None:
+    def _accept_client(self) -> None:
         assert self._server is not None
         with contextlib.suppress(OSError):
             caller, _ = self._server.accept()
-            self.hang_up()
+            self.disconnect_client()
             caller.setblocking(False)
             caller.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._caller = caller
-            self.callers += 1
+            self._client = caller
+            self.clients_accepted += 1
 
-    def hang_up(self) -> None:
-        """End the call of the one who is there."""
-        if self._caller is not None:
-            self._caller.close()
-            self._caller = None
+    def disconnect_client(self) -> None:
+        """Disconnect the client."""
+        if self._client is not None:
+            self._client.close()
+            self._client = None
 
 
-def listening(host: str, port: int) -> socket.socket:
-    """Return a socket that listens. Raises LinkError."""
+def open_server_socket(host: str, port: int) -> socket.socket:
+    """Open a listening socket. Raises LinkError."""
     try:
         return socket.create_server((host, port), backlog=1)
     except OSError as error:
@@ -152,10 +152,10 @@ def listening(host: str, port: int) -> socket.socket:
         if error.errno == errno.EACCES:
             what = f"port {port} may not be used"
             raise LinkError(what, "ports below 1024 are the system's", "take another port") from None
-        raise lost(f"tcp {host}:{port}", error) from None
+        raise make_lost_error(f"tcp {host}:{port}", error) from None
 
 
-def ready_of(sockets: Sequence[socket.socket], timeout: float) -> list[socket.socket]:
-    """Return those of `sockets` with something to read, within `timeout` seconds."""
+def wait_ready(sockets: Sequence[socket.socket], timeout: float) -> list[socket.socket]:
+    """Return the readable `sockets`; wait at most `timeout` seconds."""
     ready, _, _ = select.select(sockets, (), (), max(0.0, timeout))
     return ready

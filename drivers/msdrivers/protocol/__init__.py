@@ -1,1 +1,1 @@
-"""What devices say, byte by byte: parsers and writers without clock, socket, file, thread or log."""
+"""Wire protocols of the devices: parsers and encoders without clock, socket, file, thread or log."""

@@ -1,7 +1,8 @@
-"""Cuts a stream of bytes into frames of several formats, and finds its way back after noise.
+"""Frame a byte stream that mixes several formats, with resynchronization after noise.
 
-After a frame that is refused the search goes on one byte further, so that a good frame which began inside a broken
-one is still found. What is kept is bounded: every format refuses a frame that would be longer than its limit.
+The scanner searches the next start byte and lets its format check the frame there: length, checksum, values. After a
+rejected frame the search continues one byte further, so that a valid frame that began inside a damaged one is found.
+The buffer is bounded: every format rejects a frame that would be longer than its limit.
 """
 
 from __future__ import annotations
@@ -19,11 +20,8 @@ M_co = TypeVar("M_co", covariant=True)
 
 
 @dataclass(frozen=True, slots=True)
-class Taken(Generic[M_co]):
-    """A good frame: where it ends in the buffer, its kind for the counters, and its message.
-
-    None is a message that is well formed and of no use here.
-    """
+class ParsedFrame(Generic[M_co]):
+    """A valid frame: its end in the buffer, its kind for the counters, its message (None: valid but not used here)."""
 
     end: int
     kind: str
@@ -31,32 +29,32 @@ class Taken(Generic[M_co]):
 
 
 @dataclass(frozen=True, slots=True)
-class Refused:
-    """No good frame begins here. An empty reason is chance: a byte that only looked like a beginning."""
+class RejectedFrame:
+    """No valid frame starts here. An empty reason means chance: a byte that only looked like a start."""
 
     reason: str
 
 
-CHANCE = Refused("")
+NO_FRAME = RejectedFrame("")
 
 
-class Format(Protocol[M_co]):
-    """One way to frame messages."""
+class FrameFormat(Protocol[M_co]):
+    """A frame format."""
 
     @property
-    def leads(self) -> bytes:
-        """The bytes that a frame may begin with; no two formats of one scanner share one."""
+    def start_bytes(self) -> bytes:
+        """First bytes of a frame; formats of one scanner share none."""
 
-    def scan(self, buffer: bytearray, at: int, start: int) -> Taken[M_co] | Refused | None:
-        """Judge what begins at `at`, `start` bytes after the beginning of the stream; None: more bytes are needed."""
+    def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[M_co] | RejectedFrame | None:
+        """Parse the frame at `at`, `start` bytes after the beginning of the stream; None: more bytes are needed."""
 
 
-class Scanner(Generic[M]):
-    """Feeds bytes to formats. `feed` never raises, whatever the bytes."""
+class FrameScanner(Generic[M]):
+    """Finds the frames of several formats in a byte stream; `feed` never raises."""
 
-    def __init__(self, formats: Sequence[Format[M]]) -> None:
-        self._format = {lead: each for each in formats for lead in each.leads}
-        self._lead = re.compile(b"[" + re.escape(bytes(self._format)) + b"]")
+    def __init__(self, formats: Sequence[FrameFormat[M]]) -> None:
+        self._formats = {lead: each for each in formats for lead in each.start_bytes}
+        self._start_pattern = re.compile(b"[" + re.escape(bytes(self._formats)) + b"]")
         self._buffer = bytearray()
         self._offset = 0
         self._skipped = 0
@@ -65,12 +63,12 @@ class Scanner(Generic[M]):
 
     @property
     def offset(self) -> int:
-        """Bytes that were fed up to now."""
+        """Number of bytes fed so far."""
         return self._offset + len(self._buffer)
 
     @property
-    def waiting(self) -> int:
-        """Bytes that are kept because the frame they begin is not complete."""
+    def pending_bytes(self) -> int:
+        """Number of buffered bytes of an incomplete frame."""
         return len(self._buffer)
 
     @property
@@ -80,29 +78,29 @@ class Scanner(Generic[M]):
         return {**self._frames, **rejected, "skipped": self._skipped}
 
     def reject(self, reason: str) -> None:
-        """Count a message that was refused for what it says, its frame being good."""
+        """Count a message that was rejected for its content."""
         self._rejected[reason] += 1
 
     def clear(self) -> None:
-        """Forget the incomplete frame, for the line was interrupted. Counters and offsets go on."""
+        """Discard the incomplete frame after an interruption; counters and offsets continue."""
         self._skip(0, len(self._buffer))
         self._offset += len(self._buffer)
         self._buffer.clear()
 
     def feed(self, data: bytes) -> list[M]:
-        """Return the messages that `data` completes, in the order of their beginnings."""
+        """Return the messages that `data` completes, in stream order."""
         buffer = self._buffer
         buffer += data
         messages = []
         at = 0
-        while found := self._lead.search(buffer, at):
+        while found := self._start_pattern.search(buffer, at):
             if found.start() > at:
                 self._skip(at, found.start())
                 at = found.start()
-            verdict = self._judged(at)
+            verdict = self._scan_at(at)
             if verdict is None:
                 break
-            if isinstance(verdict, Refused):
+            if isinstance(verdict, RejectedFrame):
                 if verdict.reason:
                     self._rejected[verdict.reason] += 1
                 self._skip(at, at + 1)
@@ -119,12 +117,12 @@ class Scanner(Generic[M]):
         del buffer[:at]
         return messages
 
-    def _judged(self, at: int) -> Taken[M] | Refused | None:
-        """Ask the format of the frame. An error of its own costs this frame, not all that follow it."""
+    def _scan_at(self, at: int) -> ParsedFrame[M] | RejectedFrame | None:
+        """Scan with the format of the start byte; an exception rejects this frame only."""
         try:
-            return self._format[self._buffer[at]].scan(self._buffer, at, self._offset + at)
+            return self._formats[self._buffer[at]].scan(self._buffer, at, self._offset + at)
         except Exception:
-            return Refused("error")
+            return RejectedFrame("error")
 
     def _skip(self, begin: int, end: int) -> None:
         part = self._buffer[begin:end]

@@ -5,37 +5,37 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TypeAlias
 
-from msdrivers.protocol.framing import Format, Scanner
+from msdrivers.protocol.framing import FrameFormat, FrameScanner
 from msdrivers.protocol.nmea import EpochAssembler, NmeaEpoch, NmeaSentence, SentenceFormat
 from msdrivers.protocol.novatel import (
-    Answer,
     AsciiFormat,
     BinaryFormat,
+    CommandResponse,
     NovatelLog,
     Prompt,
     PromptFormat,
     TextFormat,
 )
 
-GpsMessage: TypeAlias = NmeaEpoch | NovatelLog | Answer | Prompt
-"""Each has `start`: bytes from the beginning of the stream to its first byte, to find when that came in."""
+GpsMessage: TypeAlias = NmeaEpoch | NovatelLog | CommandResponse | Prompt
+"""Each has `start`: offset of its first byte in the stream, to find its receive time."""
 
 
 class GpsStream:
-    """Bytes in, messages out, in the order in which they are complete. Never raises; memory is bounded.
+    """Parses bytes to messages in the order of their completion. Never raises; memory is bounded.
 
-    What comes out does not depend on how the bytes were cut, as long as nobody says `idle`.
+    The messages do not depend on how the bytes are split, except for calls of `flush`.
     """
 
     def __init__(self) -> None:
-        formats: tuple[Format[NmeaSentence | NovatelLog | Answer | Prompt], ...] = (
+        formats: tuple[FrameFormat[NmeaSentence | NovatelLog | CommandResponse | Prompt], ...] = (
             SentenceFormat(),
             BinaryFormat(),
             AsciiFormat(),
             TextFormat(),
             PromptFormat(),
         )
-        self._scanner = Scanner(formats)
+        self._scanner = FrameScanner(formats)
         self._epochs = EpochAssembler()
 
     @property
@@ -44,9 +44,9 @@ class GpsStream:
         return self._scanner.offset
 
     @property
-    def waiting(self) -> int:
+    def pending_bytes(self) -> int:
         """Bytes kept of an incomplete frame."""
-        return self._scanner.waiting
+        return self._scanner.pending_bytes
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -63,11 +63,11 @@ class GpsStream:
                 messages.append(each)
         return messages
 
-    def idle(self) -> list[NmeaEpoch]:
-        """Return the epoch under way: the line has been silent long enough that no more of it will come."""
+    def flush(self) -> list[NmeaEpoch]:
+        """Return the pending epoch: the line has been silent long enough for it to be complete."""
         return self._epochs.flush()
 
     def clear(self) -> None:
-        """Forget what is incomplete: the line was closed. Counters and offsets go on."""
+        """Discard what is incomplete after the line was closed; counters and offsets continue."""
         self._scanner.clear()
         self._epochs.clear()

@@ -1,4 +1,4 @@
-"""GPS weeks to UTC: leap seconds, and weeks or dates that have rolled over.
+"""Convert GPS weeks to UTC: leap seconds, week rollovers.
 
 GPS time counts weeks from 1980-01-06 00:00 UTC and has no leap seconds. The signal carries the week modulo 1024: a
 receiver whose firmware is old reports times 1024 weeks (about 19.6 years) early.
@@ -45,7 +45,7 @@ _LEAP_GPS = tuple(utime - GPS_EPOCH + (number + 1) * SECOND for number, utime in
 """GPS microseconds at which UTC's day begins after each inserted second."""
 
 
-def leap_seconds(utime: int) -> int:
+def count_leap_seconds(utime: int) -> int:
     """Return by how many seconds GPS time is ahead of UTC at an instant of UTC."""
     return bisect_right(_LEAP_UTC, utime)
 
@@ -53,38 +53,38 @@ def leap_seconds(utime: int) -> int:
 def utime_of(week: int, microseconds: int, pivot: int) -> int:
     """Return the utime of a GPS week (rolled over or not) and microseconds into it.
 
-    pivot: the host's date as utime, see `unrolled`. Inside an inserted leap second, which utime cannot tell from the
-    second after it, the result is that of the second after it; see `in_leap_second`.
+    pivot: the host's date as utime, see `resolve_rollover`. Within an inserted leap second, which utime cannot
+    distinguish from the second after it, the result is that of the second after it; see `is_in_leap_second`.
     """
-    return _utc(_gps(week, microseconds, pivot))
+    return _to_utc(_to_gps(week, microseconds, pivot))
 
 
-def in_leap_second(week: int, microseconds: int, pivot: int) -> bool:
+def is_in_leap_second(week: int, microseconds: int, pivot: int) -> bool:
     """Return whether the instant lies in an inserted second, 23:59:60, whose utime is ambiguous."""
-    gps = _gps(week, microseconds, pivot)
+    gps = _to_gps(week, microseconds, pivot)
     following = bisect_right(_LEAP_GPS, gps)
     return following < len(_LEAP_GPS) and gps >= _LEAP_GPS[following] - SECOND
 
 
 def gps_of(utime: int) -> tuple[int, int]:
     """Return the GPS week since 1980, not rolled over, and microseconds into it, of an instant of UTC."""
-    return divmod(utime - GPS_EPOCH + leap_seconds(utime) * SECOND, WEEK)
+    return divmod(utime - GPS_EPOCH + count_leap_seconds(utime) * SECOND, WEEK)
 
 
-def unrolled(utime: int, pivot: int) -> int:
+def resolve_rollover(utime: int, pivot: int) -> int:
     """Return `utime` set later by as many rollovers as bring it within half a rollover of `pivot`.
 
-    Only a time that is too early is mended: a rolled-over receiver is never ahead. A host without a date (1970) hence
-    changes nothing. A recording more than 9.8 years old needs a pivot of its own days.
+    Only a time that is too early is corrected: a rolled-over receiver is never ahead. So a host without a date (1970)
+    changes nothing. A recording more than 9.8 years old needs a pivot of its own time.
     """
     if utime >= pivot - ROLLOVER // 2:
         return utime
     return utime + -(-(pivot - ROLLOVER // 2 - utime) // ROLLOVER) * ROLLOVER
 
 
-def _gps(week: int, microseconds: int, pivot: int) -> int:
-    return unrolled(week * WEEK + microseconds, pivot - GPS_EPOCH)
+def _to_gps(week: int, microseconds: int, pivot: int) -> int:
+    return resolve_rollover(week * WEEK + microseconds, pivot - GPS_EPOCH)
 
 
-def _utc(gps: int) -> int:
+def _to_utc(gps: int) -> int:
     return gps + GPS_EPOCH - bisect_right(_LEAP_GPS, gps) * SECOND

@@ -12,29 +12,30 @@ from support_vehicle_bus import AXIS_REGISTERS, DEG, START_UTIME, Wire, at, axis
 
 from modelserver.messages import DriverHealth, DriverPhase, JointsSample
 from msdrivers.devices.axis import AxisDriver
-from msdrivers.devices.axis_settings import AxisSettings, NodMap
-from msdrivers.emulate.axis import AxisEmulator, AxisFault, AxisUnit
-from msdrivers.links.fake import FakeLink, FakeTime
+from msdrivers.devices.axis_settings import AxisSettings, NodSettings
+from msdrivers.emulate.axis import AxisEmulator, AxisUnit
+from msdrivers.endpoint import EndpointPhase, HostTime, MeasuredSample, Reopen, Send
+from msdrivers.fault_injection import InjectedFault
+from msdrivers.links.fake import FakeLink, FakeTimeSource
 from msdrivers.protocol.modbus.axis_map import AxisRegisters
-from msdrivers.protocol.modbus.numbers import RegisterMap
 from msdrivers.protocol.modbus.registers import (
     FailureKind,
     ModbusFailure,
     ModbusUnit,
     ReadRegisters,
+    RegisterMap,
     Registers,
-    Table,
+    RegistersWritten,
+    RegisterTable,
     WriteRegisters,
-    Written,
 )
 from msdrivers.runner import Runner, RunnerSettings
-from msdrivers.station import Measured, Now, Reopen, Send, StationPhase
 
 STEP = 0.072 * DEG
 
 
-def wired(
-    *faults: AxisFault, settings: AxisSettings | None = None, unit: AxisUnit | None = None, flight_s: float = 0.001
+def connect(
+    *faults: InjectedFault, settings: AxisSettings | None = None, unit: AxisUnit | None = None, flight_s: float = 0.001
 ) -> tuple[Wire[ModbusUnit], AxisDriver, AxisEmulator]:
     settings = settings or axis_settings()
     driver = AxisDriver(settings)
@@ -59,7 +60,7 @@ def degrees(wire: Wire[ModbusUnit], begin: float = 0.0) -> list[float]:
 def test_given_a_nodding_axis_then_angles_come_at_50_hz_or_more_and_are_true(
     flight_s: float, poll_hz: float, least: int
 ) -> None:
-    wire, driver, _ = wired(settings=axis_settings(poll_hz=poll_hz), flight_s=flight_s)
+    wire, driver, _ = connect(settings=axis_settings(poll_hz=poll_hz), flight_s=flight_s)
     wire.run(21.0)
     samples = [(t, measured) for t, measured in wire.samples if 1.0 <= t < 21.0]
     assert len(samples) >= 20 * least
@@ -83,7 +84,7 @@ def test_given_a_nodding_axis_then_angles_come_at_50_hz_or_more_and_are_true(
 
 @pytest.mark.parametrize("rate", [2.0, 30.0, 90.0])
 def test_given_the_lowest_and_the_highest_rate_then_the_axis_turns_so(rate: float) -> None:
-    wire, _, emulator = wired(settings=axis_settings(nod=NodMap(-20.16, 20.16, rate)))
+    wire, _, emulator = connect(settings=axis_settings(nod=NodSettings(-20.16, 20.16, rate)))
     wire.run(3.0)
     assert emulator.commanded["nod_rate"] == rate
     # per stretch without a turning point
@@ -94,7 +95,7 @@ def test_given_the_lowest_and_the_highest_rate_then_the_axis_turns_so(rate: floa
 
 
 def test_given_the_time_of_a_turn_then_the_delay_is_its_half() -> None:
-    wire, _, _ = wired(flight_s=0.003)
+    wire, _, _ = connect(flight_s=0.003)
     wire.run(1.0)
     for t, measured in wire.samples:
         assert measured.sample.header.host_utime == START_UTIME + round(t * 1e6)
@@ -103,7 +104,7 @@ def test_given_the_time_of_a_turn_then_the_delay_is_its_half() -> None:
 
 
 def test_given_an_axis_that_measures_more_slowly_than_it_is_read_then_nothing_is_published_twice() -> None:
-    wire, driver, _ = wired(unit=AxisUnit(measure_hz=25.0))
+    wire, driver, _ = connect(unit=AxisUnit(measure_hz=25.0))
     wire.run(2.0)
     assert 45 <= len(wire.samples) <= 51
     assert driver.counts["repeated"] > 100
@@ -111,33 +112,33 @@ def test_given_an_axis_that_measures_more_slowly_than_it_is_read_then_nothing_is
 
 def test_given_no_rate_and_no_number_then_rate_is_nan() -> None:
     registers = AxisRegisters(RegisterMap(7, scale_deg=0.072), table="input")
-    wire, driver, _ = wired(settings=axis_settings(registers=registers, nod=None), unit=AxisUnit(angle_deg=7.2))
+    wire, driver, _ = connect(settings=axis_settings(registers=registers, nod=None), unit=AxisUnit(angle_deg=7.2))
     wire.run(1.0)
     assert degrees(wire)[0] == pytest.approx(7.2)
     assert math.isnan(joints(wire)[0].joints[0].rate)
-    assert wire.sent[0][1] == ReadRegisters(7, 1, Table.INPUT, 1)
-    assert driver.leaving(at(1.0)) == []
+    assert wire.sent[0][1] == ReadRegisters(7, 1, RegisterTable.INPUT, 1)
+    assert driver.on_close(at(1.0)) == []
 
 
 # --- nodding ---------------------------------------------------------------------------------------------------
 
 
-def test_given_a_wish_to_nod_then_it_is_written_read_back_and_told() -> None:
-    wire, driver, emulator = wired()
+def test_given_a_nodding_motion_then_it_is_written_read_back_and_reported() -> None:
+    wire, driver, emulator = connect()
     wire.run(0.5)
     assert emulator.commanded == pytest.approx({"lower_limit": -30.24, "upper_limit": 20.16, "nod_rate": 45.0})
-    assert "the axis nods as it was told" in wire.texts()
+    assert "the nodding motion is set" in wire.status_text()
     # measuring does not wait for the set-up
     assert wire.samples[0][0] < 0.01
     assert driver.counts.get("readback", 0) == 0
 
 
-def test_given_other_wishes_then_limits_never_cross_on_the_way() -> None:
-    wire, driver, emulator = wired()
+def test_given_other_nodding_motions_then_limits_never_cross_on_the_way() -> None:
+    wire, driver, emulator = connect()
     wire.run(0.5)
     for n, (lower, upper) in enumerate([(36.0, 72.0), (-72.0, -36.0), (-3.6, 3.6), (7.2, 14.4)]):
-        nod = NodMap(lower, upper, 90.0)
-        wire.command(lambda now, nod=nod: driver.nod(nod, now))  # type: ignore[misc]
+        nod = NodSettings(lower, upper, 90.0)
+        wire.send_command(lambda now, nod=nod: driver.set_nod(nod, now))  # type: ignore[misc]
         wire.run(4.0 * (n + 1))
         assert emulator.commanded["lower_limit"] == pytest.approx(lower)
         assert emulator.commanded["upper_limit"] == pytest.approx(upper)
@@ -149,135 +150,138 @@ def test_given_other_wishes_then_limits_never_cross_on_the_way() -> None:
 
 
 @pytest.mark.parametrize(
-    ("nod", "said"),
+    ("nod", "expected"),
     [
-        (NodMap(-10.0, 10.0, 1.0), "rate_deg 1 is not 2 to 90 deg/s, or 0 to stand"),
-        (NodMap(-10.0, 10.0, 91.0), "rate_deg 91 is not"),
-        (NodMap(-100.0, 10.0, 30.0), "-100 to 10 degrees is not within -90 to 90"),
+        (NodSettings(-10.0, 10.0, 1.0), "rate_deg 1 is not 2 to 90 deg/s, or 0 (stationary)"),
+        (NodSettings(-10.0, 10.0, 91.0), "rate_deg 91 is not"),
+        (NodSettings(-100.0, 10.0, 30.0), "-100 to 10 degrees is not within -90 to 90"),
     ],
 )
-def test_given_a_wish_that_the_axis_cannot_do_then_it_is_refused(nod: NodMap, said: str) -> None:
-    wire, driver, emulator = wired()
+def test_given_a_motion_that_the_axis_cannot_do_then_it_is_rejected(nod: NodSettings, expected: str) -> None:
+    wire, driver, emulator = connect()
     wire.run(0.5)
-    wire.command(lambda now: driver.nod(nod, now))
+    wire.send_command(lambda now: driver.set_nod(nod, now))
     wire.run(1.0)
-    assert f"nodding refused: {said}" in wire.texts()
+    assert f"nodding rejected: {expected}" in wire.status_text()
     assert driver.counts["rejected.nod"] == 1
     assert emulator.commanded["nod_rate"] == 45.0
     with pytest.raises(ValueError, match="nod cannot be done"):
         axis_settings(nod=nod)
 
 
-def test_given_rate_zero_then_the_axis_stands_and_is_still_measured() -> None:
-    wire, driver, _ = wired()
+def test_given_rate_zero_then_the_axis_is_stationary_and_measured() -> None:
+    wire, driver, _ = connect()
     wire.run(1.0)
-    wire.command(lambda now: driver.nod(NodMap(-30.24, 20.16, 0.0), now))
+    wire.send_command(lambda now: driver.set_nod(NodSettings(-30.24, 20.16, 0.0), now))
     wire.run(2.0)
     assert len(set(degrees(wire, 1.1))) == 1
     assert len(wire.samples) > 190
 
 
-def test_given_limits_that_the_axis_does_not_take_then_it_is_told_and_measured_on() -> None:
-    wire, driver, _ = wired(unit=AxisUnit(lowest_deg=-20.0, highest_deg=20.0))
+def test_given_limits_that_the_axis_does_not_take_then_it_is_reported_and_measured_on() -> None:
+    wire, driver, _ = connect(unit=AxisUnit(lowest_deg=-20.0, highest_deg=20.0))
     wire.run(2.0)
-    assert "the axis refuses writing -30.24 to lower_limit (register 16): exception 3: it does not take" in wire.texts()
-    assert wire.texts().count("refuses") == 1
+    assert (
+        "the axis rejects writing -30.24 to lower_limit (register 16): exception 3: it does not take"
+        in wire.status_text()
+    )
+    assert wire.status_text().count("rejects") == 1
     assert driver.counts["rejected.exception_3"] == 1
     assert len(wire.samples) > 190
 
 
-def test_given_an_axis_that_takes_another_limit_than_written_then_it_is_told() -> None:
-    wire, driver, _ = wired()
+def test_given_an_axis_that_takes_another_limit_than_written_then_it_is_reported() -> None:
+    wire, driver, _ = connect()
 
     def spoil(unit: ModbusUnit, t: float) -> list[ModbusUnit]:
         if isinstance(unit, Registers) and unit.address == 18 and len(wire.sent) > 8:
-            return [Registers(18, AXIS_REGISTERS.commanded["upper_limit"].of_degrees(14.4), unit.transaction)]
+            return [Registers(18, AXIS_REGISTERS.commanded["upper_limit"].from_degrees(14.4), unit.transaction)]
         return [unit]
 
-    wire.spoil = spoil
+    wire.corrupt = spoil
     wire.run(1.0)
-    assert "upper_limit is 14.4 where 20.16 was written" in wire.texts()
+    assert "upper_limit is 14.4 where 20.16 was written" in wire.status_text()
     assert driver.counts["readback"] == 1
 
 
 def test_given_that_the_driver_leaves_then_the_axis_is_as_it_was_found() -> None:
     found = AxisUnit(lower_deg=36.0, upper_deg=54.0, rate_deg=10.0, angle_deg=40.0)
-    wire, driver, emulator = wired(unit=found)
+    wire, driver, emulator = connect(unit=found)
     wire.run(3.0)
     assert emulator.commanded["lower_limit"] == pytest.approx(-30.24)
-    for output in driver.leaving(at(3.0)):
+    for output in driver.on_close(at(3.0)):
         assert isinstance(output, Send)
-        (reply,) = emulator.received(output.unit, at(3.0))
+        (reply,) = emulator.on_receive(output.unit, at(3.0))
         assert isinstance(reply, Send)
-        assert isinstance(reply.unit, Written)
+        assert isinstance(reply.unit, RegistersWritten)
     assert emulator.commanded == pytest.approx({"lower_limit": 36.0, "upper_limit": 54.0, "nod_rate": 10.0})
-    assert driver.due() is None
+    assert driver.get_deadline() is None
 
 
 # --- what goes wrong -------------------------------------------------------------------------------------------
 
 
-def test_given_replies_that_are_lost_then_no_reading_is_said_twice_and_reading_goes_on() -> None:
-    wire, driver, _ = wired(AxisFault(2.0, "drop", 3))
+def test_given_replies_that_are_lost_then_no_reading_is_published_twice_and_reading_goes_on() -> None:
+    wire, driver, _ = connect(InjectedFault(2.0, "drop", 3))
     wire.run(4.0)
     assert driver.counts["unanswered"] == 3
     assert not [t for t, _ in wire.samples if 2.02 < t < 2.29]
     assert wire.samples[-1][0] > 3.98
-    assert [reopen for _, reopen in wire.reopened] == []
+    assert [reopen for _, reopen in wire.reopens] == []
 
 
-def test_given_silence_then_the_line_is_opened_anew_and_the_axis_set_up_again() -> None:
-    wire, driver, emulator = wired(AxisFault(2.0, "restart", 3.0))
+def test_given_silence_then_the_line_is_reopened_and_the_axis_set_up_again() -> None:
+    wire, driver, emulator = connect(InjectedFault(2.0, "restart", 3.0))
     wire.run(8.0)
-    assert wire.reopened
-    assert "has not answered for 1 s; check its power, the network cable, address and port" in wire.texts()
+    assert wire.reopens
+    assert "has not answered for 1 s; check its power, the network cable, address and port" in wire.status_text()
     assert not [t for t, _ in wire.samples if 2.01 < t < 5.0]
     assert emulator.commanded["nod_rate"] == 45.0
     assert wire.samples[-1][0] > 7.98
-    assert [told.phase for _, told in wire.told][-1] is StationPhase.STREAMING
+    assert [status.phase for _, status in wire.statuses][-1] is EndpointPhase.STREAMING
     # what was found first is what is left
-    left = [output.unit for output in driver.leaving(at(8.0)) if isinstance(output, Send)]
+    left = [output.unit for output in driver.on_close(at(8.0)) if isinstance(output, Send)]
     assert all(isinstance(unit, WriteRegisters) for unit in left)
     assert len({unit.transaction for unit in left}) == 3
     assert (left[2].address, left[2].values) == (20, (0,))  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(
-    ("code", "said"),
+    ("code", "expected"),
     [(2, "it has no such register"), (6, "it is busy"), (77, "a code that the standard does not have")],
 )
-def test_given_exceptions_then_they_are_told_once_in_words_and_tried_again(code: int, said: str) -> None:
-    wire, driver, _ = wired(*[AxisFault(2.0, "exception", code)] * 3)
+def test_given_exceptions_then_they_are_reported_once_in_words_and_tried_again(code: int, expected: str) -> None:
+    wire, driver, _ = connect(*[InjectedFault(2.0, "exception", code)] * 3)
     wire.run(6.0)
-    assert wire.texts().count(said) == 1
+    assert wire.status_text().count(expected) == 1
     assert driver.counts[f"rejected.exception_{code}"] == 3
     assert not [t for t, _ in wire.samples if 2.01 < t < 3.4]
     assert wire.samples[-1][0] > 5.98
 
 
-def test_given_an_axis_that_refuses_to_be_read_then_the_refusal_still_stands_when_nothing_usable_came() -> None:
+def test_given_an_axis_that_rejects_to_be_read_then_the_rejection_is_reported_when_nothing_usable_came() -> None:
     driver = AxisDriver(axis_settings(nod=None))
-    time = FakeTime()
+    time = FakeTimeSource()
     link: FakeLink[ModbusUnit] = FakeLink(time)
     send = link.send
 
     def refuses(unit: ModbusUnit) -> None:
         send(unit)
         at_s = time.monotonic_ns * 1e-9 + 0.001
-        link.coming.append((at_s, ModbusFailure(FailureKind.EXCEPTION, code=2, transaction=unit.transaction)))
+        link.incoming.append((at_s, ModbusFailure(FailureKind.EXCEPTION, code=2, transaction=unit.transaction)))
 
     link.send = refuses  # type: ignore[method-assign]
     reports: list[DriverHealth] = []
-    runner = Runner(driver, link, RunnerSettings("axis", "axis"), time, report=reports.append)
+    runner = Runner(driver, link, RunnerSettings("axis", "axis"), time, publish_health=reports.append)
     while time.monotonic_ns < 4_000_000_000:
-        runner.turn()
+        runner.run_once()
     assert reports[-1].phase is DriverPhase.SILENT
     assert "no usable reading for 1 s although the axis answers" in reports[-1].text
-    assert "before that: the axis refuses reading 4 holding registers from 0: exception 2" in reports[-1].text
+    assert "before that: the axis rejects reading 4 holding registers from 0: exception 2" in reports[-1].text
 
 
 def test_given_an_axis_that_is_busy_while_it_is_set_up_then_it_is_tried_again() -> None:
-    wire, driver, emulator = wired(AxisFault(0.0, "exception", 6), AxisFault(0.0, "exception", 6))
+    wire, driver, emulator = connect(InjectedFault(0.0, "exception", 6), InjectedFault(0.0, "exception", 6))
     wire.run(3.0)
     assert emulator.commanded["nod_rate"] == 45.0
     assert driver.counts["rejected.exception_6"] == 2
@@ -285,64 +289,64 @@ def test_given_an_axis_that_is_busy_while_it_is_set_up_then_it_is_tried_again() 
     assert second - first == pytest.approx(0.502)
 
 
-def test_given_wrong_lengths_then_they_are_told_once_and_not_used() -> None:
-    wire, driver, _ = wired(AxisFault(2.0, "corrupt", 5))
+def test_given_wrong_lengths_then_they_are_reported_once_and_not_used() -> None:
+    wire, driver, _ = connect(InjectedFault(2.0, "corrupt", 5))
     wire.run(4.0)
     assert driver.counts["rejected.length"] == 5
-    assert wire.texts().count("another address or number of registers") == 1
+    assert wire.status_text().count("another address or length") == 1
 
 
-def test_given_an_angle_that_jumps_then_one_reading_is_not_believed() -> None:
-    wire, driver, _ = wired(AxisFault(2.0, "jump", -30.0))
+def test_given_an_angle_that_jumps_then_one_reading_is_rejected() -> None:
+    wire, driver, _ = connect(InjectedFault(2.0, "jump", -30.0))
     wire.run(4.0)
     assert driver.counts["rejected.jump"] == 1
-    assert "an angle that the axis cannot have come to" in wire.texts()
+    assert "an angle that the axis cannot have reached" in wire.status_text()
 
 
 def test_given_replies_that_do_not_belong_to_the_request_then_they_are_not_used() -> None:
     driver = AxisDriver(axis_settings(nod=None))
-    (_, request) = driver.opened(at(0.0))
-    assert request == Send(ReadRegisters(0, 4, Table.HOLDING, 1))
-    assert driver.received(Registers(0, (0, 0, 0, 1), 7), at(0.001)) == []
+    (_, request) = driver.on_open(at(0.0))
+    assert request == Send(ReadRegisters(0, 4, RegisterTable.HOLDING, 1))
+    assert driver.on_receive(Registers(0, (0, 0, 0, 1), 7), at(0.001)) == []
     assert driver.counts["rejected.stale"] == 1
-    assert any(isinstance(each, Measured) for each in driver.received(Registers(0, (0, 0, 0, 1), 1), at(0.002)))
-    assert driver.received(Registers(0, (0, 0, 0, 2), 1), at(0.003)) == []
+    assert any(isinstance(each, MeasuredSample) for each in driver.on_receive(Registers(0, (0, 0, 0, 1), 1), at(0.002)))
+    assert driver.on_receive(Registers(0, (0, 0, 0, 2), 1), at(0.003)) == []
 
 
-def test_given_a_line_that_breaks_then_it_is_opened_anew_once() -> None:
+def test_given_a_line_that_breaks_then_it_is_reopened_once() -> None:
     driver = AxisDriver(axis_settings())
-    driver.opened(at(0.0))
+    driver.on_open(at(0.0))
     broken = ModbusFailure(FailureKind.LINE, "connection reset by the device")
-    (told, reopen) = driver.received(broken, at(0.1))
+    (status, reopen) = driver.on_receive(broken, at(0.1))
     assert isinstance(reopen, Reopen)
-    assert "connection reset by the device" in told.text  # type: ignore[union-attr]
-    assert driver.received(broken, at(0.2)) == []
-    assert driver.due() is None
+    assert "connection reset by the device" in status.text  # type: ignore[union-attr]
+    assert driver.on_receive(broken, at(0.2)) == []
+    assert driver.get_deadline() is None
 
 
-def test_given_a_transport_that_tells_silence_itself_then_it_is_as_a_reply_that_did_not_come() -> None:
+def test_given_a_transport_that_reports_silence_itself_then_it_is_as_a_reply_that_did_not_come() -> None:
     driver = AxisDriver(axis_settings(nod=None))
-    driver.opened(at(0.0))
-    outputs = driver.received(ModbusFailure(FailureKind.SILENCE, transaction=1), at(0.05))
-    assert outputs == [Send(ReadRegisters(0, 4, Table.HOLDING, 2))]
+    driver.on_open(at(0.0))
+    outputs = driver.on_receive(ModbusFailure(FailureKind.TIMEOUT, transaction=1), at(0.05))
+    assert outputs == [Send(ReadRegisters(0, 4, RegisterTable.HOLDING, 2))]
     assert driver.counts["unanswered"] == 1
 
 
-def test_given_registers_of_another_scale_then_angles_out_of_range_are_told() -> None:
+def test_given_registers_of_another_scale_then_angles_out_of_range_are_reported() -> None:
     registers = AxisRegisters(RegisterMap(0, 2, high_word_first=False, scale_deg=0.072))
     driver = AxisDriver(axis_settings(registers=registers, nod=None))
-    driver.opened(at(0.0))
-    (told, *_) = driver.received(Registers(0, (0, 100), 1), at(0.001))
-    assert "are scale_deg, is_signed and high_word_first right?" in told.text  # type: ignore[union-attr]
+    driver.on_open(at(0.0))
+    (status, *_) = driver.on_receive(Registers(0, (0, 100), 1), at(0.001))
+    assert "are scale_deg, is_signed and high_word_first right?" in status.text  # type: ignore[union-attr]
     now = at(1.0)
-    assert any("although the axis answers" in getattr(each, "text", "") for each in driver.woken(now))
+    assert any("although the axis answers" in getattr(each, "text", "") for each in driver.on_timer(now))
 
 
 @pytest.mark.slow
 def test_given_random_replies_then_nothing_is_raised_and_memory_stays_flat() -> None:
     rng = random.Random(5)
     driver = AxisDriver(axis_settings())
-    driver.opened(at(0.0))
+    driver.on_open(at(0.0))
 
     def reply(transaction: int) -> ModbusUnit:
         kind = rng.randrange(6)
@@ -351,9 +355,9 @@ def test_given_random_replies_then_nothing_is_raised_and_memory_stays_flat() -> 
                 rng.choice(list(FailureKind)[:2]), "x" * rng.randrange(99), rng.randrange(256), transaction
             )
         if kind == 1:
-            return Written(rng.choice((16, 18, 20)), rng.randrange(4), transaction)
+            return RegistersWritten(rng.choice((16, 18, 20)), rng.randrange(4), transaction)
         if kind == 2:
-            return ReadRegisters(0, 4, Table.HOLDING, transaction)
+            return ReadRegisters(0, 4, RegisterTable.HOLDING, transaction)
         words = tuple(
             rng.choice((0, 1, 0xFFFF, 70_000, -1, rng.randrange(1 << 16))) for _ in range(rng.choice((1, 2, 4, 200)))
         )
@@ -362,15 +366,15 @@ def test_given_random_replies_then_nothing_is_raised_and_memory_stays_flat() -> 
     def flood(begin: int, count: int) -> None:
         transaction = 1
         for n in range(begin, begin + count):
-            now: Now = at(0.004 * n)
-            outputs = driver.received(reply(rng.choice((transaction, transaction, 0))), now) + driver.woken(now)
+            now: HostTime = at(0.004 * n)
+            outputs = driver.on_receive(reply(rng.choice((transaction, transaction, 0))), now) + driver.on_timer(now)
             for output in outputs:
                 if isinstance(output, Send):
                     assert isinstance(output.unit, ReadRegisters | WriteRegisters)
                     transaction = output.unit.transaction
                 elif isinstance(output, Reopen):
-                    outputs += driver.opened(now)
-                elif isinstance(output, Measured):
+                    outputs += driver.on_open(now)
+                elif isinstance(output, MeasuredSample):
                     assert isinstance(output.sample, JointsSample)
                     assert abs(output.sample.joints[0].position) <= 90.1 * DEG
 
@@ -398,7 +402,7 @@ def test_given_random_replies_then_nothing_is_raised_and_memory_stays_flat() -> 
         (ReadRegisters(100, 1, transaction=4), 2),
         (ReadRegisters(0, 0, transaction=4), 2),
         (ReadRegisters(0, 126, transaction=4), 2),
-        (ReadRegisters(0, 4, Table.INPUT, 4), 2),
+        (ReadRegisters(0, 4, RegisterTable.INPUT, 4), 2),
         (WriteRegisters(0, (1, 2), 4), 2),
         (WriteRegisters(20, (100,), 4), 3),
         (WriteRegisters(16, (0, 5000), 4), 3),
@@ -408,45 +412,45 @@ def test_given_a_request_that_the_axis_does_not_take_then_it_answers_with_the_ex
     request_: ModbusUnit, code: int
 ) -> None:
     emulator = AxisEmulator(AXIS_REGISTERS)
-    emulator.opened(at(0.0))
-    (reply,) = emulator.received(request_, at(0.1))
+    emulator.on_open(at(0.0))
+    (reply,) = emulator.on_receive(request_, at(0.1))
     assert isinstance(reply, Send)
     assert isinstance(reply.unit, ModbusFailure)
     assert (reply.unit.kind, reply.unit.code, reply.unit.transaction) == (FailureKind.EXCEPTION, code, 4)
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "expected"),
     [
         ({"joint": ""}, "joint is the name"),
         ({"poll_hz": 49.0}, "poll_hz is between 50 and 1000"),
-        ({"reply": 0.0}, "reply is between"),
+        ({"reply_timeout": 0.0}, "reply_timeout is between"),
         ({"silence": math.nan}, "silence is between"),
         ({"lowest_deg": 95.0}, "lowest_deg is below highest_deg"),
         ({"slowest_deg": 100.0}, "slowest_deg is at most fastest_deg"),
-        ({"nod": NodMap(-1.0, 1.0, 700.0), "fastest_deg": 900.0}, "the registers of nod_rate cannot hold 700"),
+        ({"nod": NodSettings(-1.0, 1.0, 700.0), "fastest_deg": 900.0}, "the registers of nod_rate cannot hold 700"),
         ({"registers": AxisRegisters(RegisterMap(0))}, "nod cannot be done: registers names no lower_limit"),
     ],
 )
-def test_given_settings_that_cannot_be_then_the_key_is_named(changes: dict[str, object], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_given_settings_that_cannot_be_then_the_key_is_named(changes: dict[str, object], expected: str) -> None:
+    with pytest.raises(ValueError, match=expected):
         axis_settings(**changes)
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "expected"),
     [
         (lambda: RegisterMap(0, 3), "registers is 1"),
         (lambda: RegisterMap(-1), "address is 0 to 65535"),
         (lambda: RegisterMap(65535, 2), "address is 0 to 65534"),
         (lambda: RegisterMap(40001, scale_deg=0.0), "scale_deg is a number and not 0"),
         (lambda: RegisterMap(0, offset_deg=math.nan), "offset_deg is a number"),
-        (lambda: NodMap(1.0, 1.0), "lower_deg is below upper_deg"),
+        (lambda: NodSettings(1.0, 1.0), "lower_deg is below upper_deg"),
         (lambda: AxisRegisters(RegisterMap(0), RegisterMap(125)), "lie 126 registers apart; at most 125"),
         (lambda: AxisRegisters(RegisterMap(0), nod_rate=RegisterMap(1)), "given together"),
         (lambda: AxisRegisters(RegisterMap(0), table="coils"), "table is holding or input"),  # type: ignore[arg-type]
     ],
 )
-def test_given_registers_that_cannot_be_then_the_key_is_named(make: object, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_given_registers_that_cannot_be_then_the_key_is_named(make: object, expected: str) -> None:
+    with pytest.raises(ValueError, match=expected):
         make()  # type: ignore[operator]

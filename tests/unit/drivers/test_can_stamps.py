@@ -13,11 +13,11 @@ from support_vehicle_bus import START_UTIME, at, raptor_dbc, wheels_settings
 
 from modelserver.messages import WheelsSample
 from msdrivers.devices.wheels import WheelsDriver
+from msdrivers.endpoint import MeasuredSample
 from msdrivers.links import LinkError
 from msdrivers.links import can_bus as can_module
 from msdrivers.links.can_bus import CanLink
 from msdrivers.protocol.can.frame import CanFrame
-from msdrivers.station import Measured
 
 
 def pair(n: int, t: float) -> list[CanFrame]:
@@ -30,9 +30,9 @@ def pair(n: int, t: float) -> list[CanFrame]:
 def samples(frames: list[CanFrame], read: float) -> tuple[WheelsDriver, list[WheelsSample]]:
     """Return what a driver publishes that reads all frames at one instant."""
     driver = WheelsDriver(wheels_settings(frame_delay=0.0), raptor_dbc())
-    driver.opened(at(0.0))
-    outputs = [output for frame in frames for output in driver.received(frame, at(read))]
-    return driver, [output.sample for output in outputs if isinstance(output, Measured)]  # type: ignore[misc]
+    driver.on_open(at(0.0))
+    outputs = [output for frame in frames for output in driver.on_receive(frame, at(read))]
+    return driver, [output.sample for output in outputs if isinstance(output, MeasuredSample)]  # type: ignore[misc]
 
 
 def test_given_frames_that_waited_to_be_read_then_each_sample_has_the_instant_of_its_own() -> None:
@@ -61,7 +61,7 @@ def test_given_no_stamp_or_one_of_the_future_then_a_frame_came_when_it_was_read(
 
 
 class Bus:
-    """A bus of python-can's that brings what it is told to."""
+    """A scripted python-can bus."""
 
     def __init__(self) -> None:
         self.coming: list[can.Message] = []
@@ -88,14 +88,14 @@ def bus(monkeypatch: pytest.MonkeyPatch) -> Bus:
     return made
 
 
-def stamped(seconds_ago: float) -> can.Message:
+def make_stamped(seconds_ago: float) -> can.Message:
     return can.Message(arbitration_id=1, timestamp=time.time() - seconds_ago)
 
 
 def test_given_stamps_of_the_hosts_clock_then_they_are_taken_where_they_can_be(bus: Bus) -> None:
     link = CanLink("can0")
     link.open()
-    bus.coming = [stamped(0.0), stamped(-60.0), stamped(60.0), can.Message(arbitration_id=1)]
+    bus.coming = [make_stamped(0.0), make_stamped(-60.0), make_stamped(60.0), can.Message(arbitration_id=1)]
     sound, ahead, past, none = link.poll(0.0)
     assert abs(sound.utime - time.time_ns() // 1000) < 10_000_000
     assert (ahead.utime, past.utime, none.utime) == (0, 0, 0)
@@ -104,11 +104,11 @@ def test_given_stamps_of_the_hosts_clock_then_they_are_taken_where_they_can_be(b
 def test_given_an_interface_that_stamps_by_a_clock_of_its_own_then_its_stamps_are_not_taken(bus: Bus) -> None:
     link = CanLink("PCAN_USBBUS1", "pcan")
     link.open()
-    bus.coming = [stamped(0.0)]
+    bus.coming = [make_stamped(0.0)]
     assert link.poll(0.0)[0].utime == 0
 
 
-def test_given_multicast_then_ones_own_frames_are_not_heard_and_those_of_others_are(bus: Bus) -> None:
+def test_given_multicast_then_own_frames_are_not_received_and_those_of_others_are(bus: Bus) -> None:
     link = CanLink("239.74.163.2:5000", "udp_multicast")
     link.open()
     one, two = CanFrame(0x300, b"1"), CanFrame(0x300, b"2")
@@ -122,14 +122,14 @@ def test_given_multicast_then_ones_own_frames_are_not_heard_and_those_of_others_
     assert link.poll(0.0) == [CanFrame(0x300, b"3"), one]
 
 
-@pytest.mark.parametrize(("interface", "heard"), [("socketcan", 1), ("gs_usb", 0)])
-def test_given_a_frame_that_was_sent_on_this_machine_then_it_is_heard_where_another_program_can_have_sent_it(
-    interface: str, heard: int, bus: Bus
+@pytest.mark.parametrize(("interface", "received"), [("socketcan", 1), ("gs_usb", 0)])
+def test_given_a_frame_that_was_sent_on_this_machine_then_it_is_received_where_another_program_can_have_sent_it(
+    interface: str, received: int, bus: Bus
 ) -> None:
     link = CanLink("can0", interface)
     link.open()
     bus.coming = [can.Message(arbitration_id=1, is_rx=False)]
-    assert len(link.poll(0.0)) == heard
+    assert len(link.poll(0.0)) == received
 
 
 @pytest.mark.parametrize("error", [TypeError("missing 2 arguments"), NameError("name 'canlib'"), ImportError("no lib")])

@@ -23,7 +23,7 @@ def uniform(rng: random.Random) -> float:
 
 @dataclass
 class Device:
-    """A device that measures now and then, and says so some time later. Times in microseconds."""
+    """A device that measures periodically and sends with a delay. Times in microseconds."""
 
     clock: DeviceClock
     seed: int
@@ -43,7 +43,7 @@ class Device:
         true = at * 1e6
         device = math.floor((true * (1.0 + self.drift) + self.offset) / self.tick) * self.tick
         host = UTIME + round(true + self.delay(self.rng)) + self.host_step
-        self.clock, utime, sigma = self.clock.take(int(device), host)
+        self.clock, utime, sigma = self.clock.update(int(device), host)
         self.errors.append((at, (utime - UTIME - self.host_step - true) * 1e-6, sigma))
         return utime, sigma
 
@@ -116,14 +116,14 @@ def test_given_no_sample_then_nothing_is_known() -> None:
 
 
 def test_given_the_first_sample_then_it_lies_within_the_delays_that_are_thought_of() -> None:
-    _, utime, sigma = DeviceClock().take(123_456, UTIME)
+    _, utime, sigma = DeviceClock().update(123_456, UTIME)
     assert UTIME - 20_000 <= utime <= UTIME
     # and it may have been held up besides
     assert 0.1 < sigma < 0.2
 
 
 @pytest.mark.parametrize("jump", [-3_600_000_000, -200_000, 3_600_000_000, 400_000_000_000])
-def test_given_a_device_that_starts_anew_then_its_new_time_is_used_at_once(jump: int) -> None:
+def test_given_a_device_that_restarts_then_its_new_time_is_used_at_once(jump: int) -> None:
     device = Device(DeviceClock(), 5).run(10.0, 20.0)
     device.offset += jump
     device.errors.clear()
@@ -166,7 +166,7 @@ def test_given_a_stall_that_delivers_late_then_the_instants_stay_and_nothing_res
     assert max(error for error, _ in device.after(5.0)) < 2e-3
 
 
-def test_given_a_gap_then_the_clock_goes_on_with_more_doubt() -> None:
+def test_given_a_gap_then_the_clock_goes_on_with_more_uncertainty() -> None:
     device = Device(DeviceClock(), 9, drift=5e-5).run(30.0, 20.0)
     before = device.errors[-1][2]
     _, sigma = device.measure(90.0)
@@ -183,7 +183,7 @@ def test_given_duplicates_then_they_count_once() -> None:
         twice.measure(at)
         last = round((at * 1e6) + twice.offset)
         # the same time, delivered again a little later
-        twice.clock, _, _ = twice.clock.take(
+        twice.clock, _, _ = twice.clock.update(
             math.floor(at * 1e6 + twice.offset), UTIME + last - twice.offset + rng.randrange(20_000, 25_000)
         )
     assert twice.clock.restarts == 0
@@ -199,20 +199,20 @@ def test_given_samples_out_of_order_then_each_has_its_own_instant() -> None:
     assert device.clock.restarts == 0
 
 
-def test_given_many_minutes_then_what_is_kept_is_bounded() -> None:
+def test_given_many_minutes_then_the_memory_is_bounded() -> None:
     device = Device(DeviceClock(), 12, drift=5e-5).run(1000.0, 1.0)
     assert len(device.clock._blocks) <= WINDOW_US // BLOCK_US + 1
     assert max(error for error, _ in device.after(60.0)) < 6e-3
 
 
 def test_given_one_clock_when_two_samples_follow_it_then_it_is_itself_unchanged() -> None:
-    clock, _, _ = DeviceClock().take(0, UTIME)
-    first = clock.take(100_000, UTIME + 100_500)
-    clock.take(100_000, UTIME + 99_000)
-    assert clock.take(100_000, UTIME + 100_500) == first
+    clock, _, _ = DeviceClock().update(0, UTIME)
+    first = clock.update(100_000, UTIME + 100_500)
+    clock.update(100_000, UTIME + 99_000)
+    assert clock.update(100_000, UTIME + 100_500) == first
 
 
-def covered(device: Device, since: float = 0.0) -> float:
+def get_coverage(device: Device, since: float = 0.0) -> float:
     """Return the share of samples whose error is within two sigmas."""
     pairs = device.after(since)
     return sum(error <= 2.0 * sigma for error, sigma in pairs) / len(pairs)
@@ -236,7 +236,7 @@ def test_given_a_way_that_becomes_longer_or_a_clock_set_back_then_sigma_covers_e
     # less than the slack is believed some time after the window, more never
     seconds = 150.0 if longer_us < 5000 else 600.0
     device.run(seconds, 4.0, start=60.0)
-    assert covered(device) >= 0.97
+    assert get_coverage(device) >= 0.97
     device.delay = small
     device.run(20.0, 4.0, start=60.0 + seconds)
     # what comes early again shows that it was the way
@@ -247,7 +247,7 @@ def test_given_a_receiver_that_learns_of_a_leap_second_then_it_is_believed_after
     device = Device(DeviceClock(), 14, delay=small).run(10.0, 4.0)
     device.offset -= 2_000_000
     device.run(150.0, 4.0, start=10.0)
-    assert covered(device) >= 0.97
+    assert get_coverage(device) >= 0.97
     error, sigma = device.after(155.0)[-1]
     assert error < 1e-3
     assert sigma < 1e-3
@@ -256,7 +256,7 @@ def test_given_a_receiver_that_learns_of_a_leap_second_then_it_is_believed_after
 @pytest.mark.parametrize("drift", [-1e-3, -3e-4, 3e-4, 1e-3])
 def test_given_a_clock_that_is_off_by_more_than_a_crystal_then_that_is_learned_and_sigma_covers(drift: float) -> None:
     device = Device(DeviceClock(), 15, drift=drift, delay=small).run(60.0, 20.0)
-    assert covered(device) >= 0.9
+    assert get_coverage(device) >= 0.9
     assert device.clock.drift == pytest.approx(-drift, rel=0.05)
     assert max(error for error, _ in device.after(40.0)) < 2e-3
 
@@ -267,7 +267,7 @@ def test_given_a_clock_whose_drift_changes_then_sigma_covers_most(slew: float) -
     device.drift = slew
     device.offset -= round(100e6 * slew)
     device.run(200.0, 4.0, start=100.0)
-    assert covered(device) >= 0.85
+    assert get_coverage(device) >= 0.85
     assert all(error <= 15.0 * sigma for error, sigma in device.after(0.0))
 
 
@@ -276,4 +276,4 @@ def test_given_a_first_sample_that_was_held_up_then_its_sigma_covers_that() -> N
     device.measure(0.0)
     device.delay = small
     device.run(10.0, 4.0, start=0.25)
-    assert covered(device) >= 0.97
+    assert get_coverage(device) >= 0.97

@@ -5,30 +5,30 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msdrivers.protocol.framing import Refused, Scanner, Taken
+from msdrivers.protocol.framing import FrameScanner, ParsedFrame, RejectedFrame
 
 
 class Failing:
     """A format with an error of its own: frames of two bytes, the second of which is divided by."""
 
-    leads = b"#"
+    start_bytes = b"#"
 
-    def scan(self, buffer: bytearray, at: int, start: int) -> Taken[int] | Refused | None:
+    def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[int] | RejectedFrame | None:
         if len(buffer) < at + 2:
             return None
-        return Taken(at + 2, "frame", 100 // (buffer[at + 1] - 48))
+        return ParsedFrame(at + 2, "frame", 100 // (buffer[at + 1] - 48))
 
 
-def test_given_a_format_that_fails_on_a_frame_then_that_is_refused_and_the_next_is_taken() -> None:
-    scanner = Scanner((Failing(),))
+def test_given_a_format_that_fails_on_a_frame_then_that_is_rejected_and_the_next_is_taken() -> None:
+    scanner = FrameScanner((Failing(),))
     assert scanner.feed(b"#1#0#2") == [100, 50]
     assert scanner.counts == {"frame": 2, "rejected.error": 1, "skipped": 2}
-    assert scanner.waiting == 0
+    assert scanner.pending_bytes == 0
 
 
 @given(st.lists(st.binary(max_size=50)))
-def test_given_any_bytes_and_a_format_that_fails_then_nothing_is_raised_or_kept(parts: list[bytes]) -> None:
-    scanner = Scanner((Failing(),))
+def test_given_any_bytes_and_a_format_that_fails_then_nothing_is_raised_or_buffered(parts: list[bytes]) -> None:
+    scanner = FrameScanner((Failing(),))
     for part in parts:
         scanner.feed(part)
-        assert scanner.waiting <= 1
+        assert scanner.pending_bytes <= 1

@@ -6,21 +6,29 @@ import math
 from dataclasses import replace
 
 import pytest
-from support_gps import SECOND, START, Line, drive, halves, noisy, now_at
+from support_gps import SECOND, START, Line, add_noise, drive, now_at, split_in_half
 
 from modelserver.messages import FixType, SensorHeader
 from msdrivers.devices.gps import GpsDriver, GpsSettings
-from msdrivers.devices.gps.samples import novatel_sample
-from msdrivers.devices.gps.set_up import SetUp, SetupProgress
+from msdrivers.devices.gps.fixes import sample_from_novatel
+from msdrivers.devices.gps.setup_dialogue import SetupDialogue, SetupProgress
 from msdrivers.emulate.gps import GpsEmulator, GpsUnit
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Send
 from msdrivers.protocol.nmea.encode import encode as nmea
-from msdrivers.protocol.novatel import Answer, HeadingLog, LogHeader, NovatelLog, Position, PositionType, TimeStatus
-from msdrivers.protocol.novatel.crc import crc32
+from msdrivers.protocol.novatel import (
+    CommandResponse,
+    HeadingLog,
+    LogHeader,
+    NovatelLog,
+    Position,
+    PositionType,
+    TimeStatus,
+)
+from msdrivers.protocol.novatel.binary import crc32
 from msdrivers.protocol.novatel.encode import encode
-from msdrivers.station import Measured, Send, StationPhase, StationStatus
 
 NMEA_UNIT = GpsUnit(
-    saved=tuple(f"log com1 {name} ontime 0.25" for name in ("gpgga", "gpgsa", "gpgst", "gprmc")), answers=False
+    saved=tuple(f"log com1 {name} ontime 0.25" for name in ("gpgga", "gpgsa", "gpgst", "gprmc")), is_answering=False
 )
 
 
@@ -38,10 +46,10 @@ def position(utime_s: float = 0.0, **changes) -> bytes:
 
 
 def alone(*data: bytes, **settings) -> Line:
-    """A driver that hears some bytes, each chunk half a second later, from nobody that answers."""
-    one = Line(GpsDriver(GpsSettings("gps", **settings)), GpsEmulator([], GpsUnit(answers=False))).open()
+    """A driver that receives chunks of bytes every half second, without answers to its commands."""
+    one = Line(GpsDriver(GpsSettings("gps", **settings)), GpsEmulator([], GpsUnit(is_answering=False))).open()
     for chunk in data:
-        one.hear(chunk)
+        one.deliver(chunk)
         one.run(0.5)
     return one
 
@@ -50,7 +58,7 @@ def alone(*data: bytes, **settings) -> Line:
 @pytest.mark.parametrize("rate", [4.0, 10.0, 20.0])
 def test_given_a_receiver_when_set_up_then_every_fix_comes_with_its_velocity(rate: float, log_format: str):
     one = line(GpsSettings("gps", rate_hz=rate, log_format=log_format)).run(5.0)
-    assert one.phases == [StationPhase.WAITING, StationPhase.CONFIGURING, StationPhase.STREAMING], one.words
+    assert one.phases == [EndpointPhase.WAITING, EndpointPhase.CONFIGURING, EndpointPhase.STREAMING], one.status_text
     assert abs(len(one.samples) - 5.0 * rate) <= 2
     assert one.device.logs == tuple(f"best{what}{log_format[0]}" for what in ("pos", "vel"))
     truth = {each.header.utime: each for each in drive(30.0)}
@@ -83,7 +91,7 @@ def test_given_two_antennas_when_the_heading_is_asked_for_then_it_comes_with_the
 
 
 def test_given_a_restart_when_the_prompt_comes_then_the_receiver_is_set_up_again():
-    one = line(unit=GpsUnit(boot=1.5)).run(5.0)
+    one = line(unit=GpsUnit(boot_time=1.5)).run(5.0)
     one.from_device(one.device.restart(one.now))
     before = len(one.samples)
     one.run(1.0)
@@ -92,26 +100,26 @@ def test_given_a_restart_when_the_prompt_comes_then_the_receiver_is_set_up_again
     assert one.device.counts["restarts"] == 1
     assert one.driver.counts["restarts"] == 1
     assert len(one.samples) - before > 10
-    assert one.phases[-2:] == [StationPhase.CONFIGURING, StationPhase.STREAMING], one.words
-    assert "started anew" in one.words
+    assert one.phases[-2:] == [EndpointPhase.CONFIGURING, EndpointPhase.STREAMING], one.status_text
+    assert "has restarted" in one.status_text
 
 
 def test_given_a_restart_without_a_prompt_when_the_logs_stay_away_then_the_receiver_is_set_up_again():
-    one = line(unit=GpsUnit(boot=4.0)).run(5.0)
+    one = line(unit=GpsUnit(boot_time=4.0)).run(5.0)
     one.from_device(one.device.restart(one.now))
-    one.dead = True
+    one.is_broken = True
     one.run(4.5)  # the prompt is lost
-    one.dead = False
+    one.is_broken = False
     before = len(one.samples)
     one.run(6.0)
-    assert len(one.samples) - before > 8, one.words
-    assert StationPhase.SILENT in one.phases
-    assert "no BESTPOS for 2 s" in one.words
+    assert len(one.samples) - before > 8, one.status_text
+    assert EndpointPhase.SILENT in one.phases
+    assert "no BESTPOS for 2 s" in one.status_text
 
 
-def test_given_noise_and_half_packets_when_streaming_then_only_what_was_said_is_published():
-    shake = noisy(7)
-    one = line(to_host=lambda data: [half for part in shake(data) for half in halves(part)]).run(25.0)
+def test_given_noise_and_half_packets_when_streaming_then_only_valid_data_is_published():
+    shake = add_noise(7)
+    one = line(to_host=lambda data: [half for part in shake(data) for half in split_in_half(part)]).run(25.0)
     truth = {each.header.utime: each for each in drive(30.0)}
     assert len(one.samples) > 75
     assert len({each.header.device_utime for each in one.samples}) == len(one.samples)
@@ -130,48 +138,48 @@ def test_given_a_packet_whose_second_half_is_late_when_it_comes_then_nothing_is_
 @pytest.mark.parametrize("bauds", [(9600, 115200, 38400), (115200, 9600)])
 def test_given_another_baud_rate_when_nothing_is_understood_then_the_others_are_tried(bauds: tuple[int, ...]):
     unit = GpsUnit(saved=("log com1 bestposb ontime 0.25",))
-    one = line(GpsSettings("gps", bauds=bauds), unit, right_baud=9600, baud=bauds[0]).run(12.0)
-    assert one.baud == 9600, one.words
-    assert one.phases[-1] is StationPhase.STREAMING
-    assert len(one.reopened) == bauds.index(9600)
+    one = line(GpsSettings("gps", bauds=bauds), unit, device_baud=9600, baud=bauds[0]).run(12.0)
+    assert one.baud == 9600, one.status_text
+    assert one.phases[-1] is EndpointPhase.STREAMING
+    assert len(one.reopens) == bauds.index(9600)
 
 
-def test_given_a_wrong_device_when_all_rates_are_tried_then_it_says_what_was_heard_and_tried():
+def test_given_a_wrong_device_when_all_rates_are_tried_then_received_data_and_attempts_are_reported():
     driver = GpsDriver(GpsSettings("gps", bauds=(9600, 115200)))
-    one = Line(driver, GpsEmulator([]), dead=True).open()
+    one = Line(driver, GpsEmulator([]), is_broken=True).open()
     for _ in range(100):
-        one.hear(b"\x02LMS200 \x80\x81\x00\x03")
+        one.deliver(b"\x02LMS200 \x80\x81\x00\x03")
         one.run(0.1)
-    silent = [each.text for each in one.told if each.phase is StationPhase.SILENT]
+    silent = [each.text for each in one.statuses if each.phase is EndpointPhase.SILENT]
     assert silent
     assert "no NovAtel receiver" in silent[0]
-    assert "at 9600 baud heard" in silent[0]
-    assert "at 115200 baud heard" in silent[0]
+    assert "at 9600 baud received" in silent[0]
+    assert "at 115200 baud received" in silent[0]
     assert "LMS200" in silent[0]
     assert "another device" in silent[0]
     assert not one.samples
-    assert [each.baud for each in one.reopened[:3]] == [115200, 9600, 115200]
+    assert [each.baud for each in one.reopens[:3]] == [115200, 9600, 115200]
 
 
-def test_given_a_dead_line_when_nothing_is_heard_then_power_and_cable_are_named():
-    one = line(dead=True).run(5.0)
-    assert "heard nothing; check the receiver's power, the cable" in one.words
-    assert len(one.told) < 6, one.words
+def test_given_a_dead_line_when_nothing_is_received_then_power_and_cable_are_named():
+    one = line(is_broken=True).run(5.0)
+    assert "received nothing; check the receiver's power, the cable" in one.status_text
+    assert len(one.statuses) < 6, one.status_text
 
 
-def test_given_a_refused_command_when_set_up_then_the_words_of_the_receiver_are_told():
+def test_given_a_rejected_command_when_set_up_then_the_text_of_the_receiver_is_reported():
     one = line(GpsSettings("gps", commands=("frobnicate 1",))).run(3.0)
-    assert "refused 'frobnicate 1': Invalid Message. Field = frobnicate" in one.words
-    assert one.phases[-1] is StationPhase.STREAMING
+    assert "rejected 'frobnicate 1': Invalid Message. Field = frobnicate" in one.status_text
+    assert one.phases[-1] is EndpointPhase.STREAMING
     assert one.samples
 
 
-def test_given_a_receiver_that_cannot_hear_when_it_sends_then_its_fixes_are_used_and_it_is_told():
-    unit = GpsUnit(saved=("log com1 bestposb ontime 0.25",), answers=False)
+def test_given_a_receiver_that_cannot_receive_when_it_sends_then_its_fixes_are_used_and_it_is_reported():
+    unit = GpsUnit(saved=("log com1 bestposb ontime 0.25",), is_answering=False)
     one = line(unit=unit).run(8.0)
     assert len(one.samples) > 28
-    assert "does not answer commands" in one.words
-    assert len(one.told) < 6, one.words
+    assert "does not answer commands" in one.status_text
+    assert len(one.statuses) < 6, one.status_text
 
 
 def test_given_nmea_beside_bestpos_when_both_come_then_bestpos_is_used():
@@ -194,24 +202,24 @@ def test_given_a_plain_nmea_receiver_when_it_sends_then_epochs_come_with_their_d
     assert last.speed == pytest.approx(2.0, abs=1e-4)
     assert last.position_covariance == pytest.approx((0.04, 0, 0, 0, 0.09, 0, 0, 0, 0.16), abs=1e-9)
     assert last.velocity is None
-    assert one.phases == [StationPhase.WAITING, StationPhase.STREAMING]
+    assert one.phases == [EndpointPhase.WAITING, EndpointPhase.STREAMING]
 
 
 def test_given_nmea_at_the_wrong_rate_when_nothing_is_understood_then_the_next_rate_is_tried():
     settings = GpsSettings("gps", protocol="nmea", bauds=(4800, 9600))
-    one = line(settings, NMEA_UNIT, right_baud=9600, baud=4800).run(5.0)
+    one = line(settings, NMEA_UNIT, device_baud=9600, baud=4800).run(5.0)
     assert one.baud == 9600
     assert one.samples
-    assert "at 4800 baud" in one.reopened[0].why
+    assert "at 4800 baud" in one.reopens[0].reason
 
 
-def test_given_no_fix_with_coordinates_when_bestpos_says_so_then_the_sample_says_none_and_keeps_them():
+def test_given_no_fix_with_coordinates_in_bestpos_then_the_sample_has_none_and_keeps_them():
     (each,) = alone(position(status=1)).samples
     assert each.fix_type is FixType.NONE
     assert (each.latitude_deg, each.longitude_deg) == (50.0, -111.0)
 
 
-def test_given_no_fix_and_zeros_when_bestpos_says_so_then_there_are_no_coordinates():
+def test_given_no_fix_and_zeros_in_bestpos_then_there_are_no_coordinates():
     empty = position(status=1, type=0, latitude=0.0, longitude=0.0, height=0.0, undulation=0.0)
     (each,) = alone(empty).samples
     assert each.fix_type is FixType.NONE
@@ -224,7 +232,7 @@ def test_given_the_same_log_again_when_it_comes_then_it_is_not_published_again()
     assert one.driver.counts["repeated"] == 1
 
 
-def test_given_an_old_solution_stamped_anew_when_it_comes_then_it_is_not_published_again():
+def test_given_an_old_solution_stamped_again_when_it_comes_then_it_is_not_published_again():
     one = alone(position(), position(0.5, solution_age=0.5), position(1.0, solution_age=0.25))
     assert len(one.measured) == 2
     assert one.measured[1].delay == 0.25
@@ -250,9 +258,9 @@ def test_given_a_rolled_over_week_when_it_comes_then_the_time_is_of_these_days()
     log = position()
     body = bytearray(log[:-4])
     body[14:16] = (2288 - 1024).to_bytes(2, "little")
-    (mended,) = alone(bytes(body) + crc32(bytes(body)).to_bytes(4, "little")).samples
+    (corrected,) = alone(bytes(body) + crc32(bytes(body)).to_bytes(4, "little")).samples
     (right,) = alone(log).samples
-    assert mended.header.device_utime == right.header.device_utime
+    assert corrected.header.device_utime == right.header.device_utime
     assert abs(right.header.device_utime - START) < 10 * SECOND
 
 
@@ -261,7 +269,7 @@ def test_given_logs_of_both_antennas_when_they_come_then_only_those_of_the_prima
     body = Position(0, PositionType.SINGLE, 50.0, -111.0, 700.0, -20.0, 61, 1.0, 2.0, 3.0, "", 0.0, 0.0, 9, 8)
     sent = []
     for n in range(6):
-        # the secondary antenna is logged in between, a metre away
+        # the secondary antenna is logged in between, a meter away
         at = 252_818_000 + n * 500
         header = LogHeader("BESTPOS", 2288, at, TimeStatus.FINESTEERING, "COM1", 0, 0, binary, n % 2)
         sent.append(encode(NovatelLog(header, body._replace(latitude=50.0 + (n % 2) * 1e-5))))
@@ -269,7 +277,7 @@ def test_given_logs_of_both_antennas_when_they_come_then_only_those_of_the_prima
     assert {each.latitude_deg for each in driven.samples} == {50.0}
     assert len(driven.samples) == 3
     assert driven.driver.counts["rejected.secondary_antenna"] == 3
-    assert sum("secondary antenna" in each for each in driven.words.splitlines()) == 1
+    assert sum("secondary antenna" in each for each in driven.status_text.splitlines()) == 1
 
 
 def test_given_a_leap_second_when_it_comes_then_the_fix_is_published_without_a_device_time():
@@ -285,45 +293,45 @@ def test_given_a_leap_second_when_it_comes_then_the_fix_is_published_without_a_d
 
 @pytest.mark.parametrize("date", ["141123", "300304"])
 def test_given_an_nmea_date_that_rolled_over_when_it_comes_then_the_time_is_of_these_days(date: str):
-    said = ("221320.00", "A", "5000.0", "N", "11100.0", "W", "1.0", "90.0", date, "", "", "A")
-    (each,) = alone(nmea("GP", "RMC", said), protocol="nmea").samples
+    fields = ("221320.00", "A", "5000.0", "N", "11100.0", "W", "1.0", "90.0", date, "", "", "A")
+    (each,) = alone(nmea("GP", "RMC", fields), protocol="nmea").samples
     assert each.header.device_utime == START
 
 
-def test_given_a_position_type_that_is_not_known_when_it_comes_then_it_is_no_fix_and_told_once():
+def test_given_a_position_type_that_is_not_known_when_it_comes_then_it_is_no_fix_and_reported_once():
     one = alone(position(type=99), position(0.25, type=99))
     assert [each.fix_type for each in one.samples] == [FixType.NONE, FixType.NONE]
-    assert one.words.count("position type") == 1
+    assert one.status_text.count("position type") == 1
 
 
-def test_given_an_emulated_receiver_that_is_made_anew_when_it_greets_then_it_is_set_up_again():
+def test_given_an_emulated_receiver_that_is_replaced_when_it_greets_then_it_is_set_up_again():
     one = line().run(5.0)
     one.device = GpsEmulator(drive(30.0))
-    one.from_device(one.device.opened(one.now))
+    one.from_device(one.device.on_open(one.now))
     one.run(3.0)
     assert one.driver.counts["restarts"] == 1
     assert one.device.counts["bestposb"] > 8
 
 
-def test_given_another_datum_when_it_comes_then_it_is_refused_and_told_once():
+def test_given_another_datum_when_it_comes_then_it_is_rejected_and_reported_once():
     one = alone(*(position(n, datum=63) for n in range(4)))
     assert one.samples == []
     assert one.driver.counts["rejected.datum"] == 4
-    assert one.words.count("not on WGS 84") == 1
+    assert one.status_text.count("not on WGS 84") == 1
 
 
 def test_given_a_log_that_stands_alone_when_no_velocity_comes_then_it_is_published_after_a_while():
     one = alone()
-    one.hear(position())
+    one.deliver(position())
     assert one.samples == []
     one.run(0.15)
     assert len(one.samples) == 1
     assert one.samples[0].velocity is None
 
 
-def test_given_nmea_without_a_date_when_it_comes_then_the_host_tells_the_day():
-    said = ("221320.00", "5000.00", "N", "11100.00", "W", "1", "05", "1.0", "700.0", "M", "-20.0", "M", "", "")
-    one = alone(nmea("GP", "GGA", said), protocol="nmea")
+def test_given_nmea_without_a_date_when_it_comes_then_the_day_is_the_hosts():
+    fields = ("221320.00", "5000.00", "N", "11100.00", "W", "1", "05", "1.0", "700.0", "M", "-20.0", "M", "", "")
+    one = alone(nmea("GP", "GGA", fields), protocol="nmea")
     (each,) = one.samples
     assert each.header.device_utime == START
     assert math.isnan(each.speed)
@@ -331,10 +339,10 @@ def test_given_nmea_without_a_date_when_it_comes_then_the_host_tells_the_day():
 
 def test_given_a_driver_that_leaves_when_it_has_set_up_then_its_logs_are_stopped():
     one = line().run(3.0)
-    one.from_driver(one.driver.leaving(one.now))
+    one.from_driver(one.driver.on_close(one.now))
     assert one.device.logs == ()
-    kept = GpsDriver(GpsSettings("gps", restore_on_leaving=False))
-    assert list(kept.leaving(now_at(START))) == []
+    driver = GpsDriver(GpsSettings("gps", restore_on_exit=False))
+    assert list(driver.on_close(now_at(START))) == []
 
 
 def test_given_samples_and_counts_when_compared_then_they_agree():
@@ -345,73 +353,73 @@ def test_given_samples_and_counts_when_compared_then_they_agree():
 
 
 @pytest.mark.parametrize(
-    ("wrong", "says"),
+    ("wrong", "expected"),
     [
         ({"protocol": "garmin"}, "protocol: must be one of novatel, nmea, got 'garmin'"),
         ({"rate_hz": 50.0}, "rate_hz: must be 0.1 to 20 Hz"),
         ({"rate_hz": 0.2}, "silence: 2 s is less than one and a half periods"),
         ({"commands": ("log\x00",)}, "is no line of text"),
         ({"bauds": (0,)}, "bauds: must be above 0"),
-        ({"answer": math.nan}, "answer: must be"),
+        ({"answer_timeout": math.nan}, "answer_timeout: must be"),
     ],
 )
-def test_given_a_setting_that_cannot_be_when_made_then_it_is_named(wrong: dict[str, object], says: str):
-    with pytest.raises(ValueError, match=says):
+def test_given_a_setting_that_cannot_be_when_made_then_it_is_named(wrong: dict[str, object], expected: str):
+    with pytest.raises(ValueError, match=expected):
         GpsSettings("gps", **wrong)  # type: ignore[arg-type]
 
 
 def test_given_outputs_when_opened_then_the_first_word_is_waiting():
-    outputs = GpsDriver(GpsSettings("gps", bauds=(9600,))).opened(now_at(START))
-    assert outputs[0] == StationStatus(StationPhase.WAITING, "listening for a receiver at 9600 baud")
+    outputs = GpsDriver(GpsSettings("gps", bauds=(9600,))).on_open(now_at(START))
+    assert outputs[0] == EndpointStatus(EndpointPhase.WAITING, "waiting for a receiver at 9600 baud")
     assert outputs[1] == Send(b"\r\nunlogall thisport\r\n")
-    assert not any(isinstance(each, Measured) for each in outputs)
+    assert not any(isinstance(each, MeasuredSample) for each in outputs)
 
 
 def test_given_a_wrong_device_that_keeps_talking_when_minutes_pass_then_the_words_do_not_pile_up():
-    one = Line(GpsDriver(GpsSettings("gps", bauds=(9600, 115200))), GpsEmulator([]), dead=True).open()
+    one = Line(GpsDriver(GpsSettings("gps", bauds=(9600, 115200))), GpsEmulator([]), is_broken=True).open()
     for n in range(1300):
-        one.hear(b"\x02noise %d\r\n" % n)
+        one.deliver(b"\x02noise %d\r\n" % n)
         one.run(0.1)
-    assert 2 <= len([each for each in one.told if each.phase is StationPhase.SILENT]) <= 4, one.words
-    assert len(one.reopened) > 20
+    assert 2 <= len([each for each in one.statuses if each.phase is EndpointPhase.SILENT]) <= 4, one.status_text
+    assert len(one.reopens) > 20
 
 
-def spoken(*sentences: str) -> bytes:
+def make_sentence(*sentences: str) -> bytes:
     return b"".join(nmea(each[:2], each[2:5], each.split(",")[1:]) for each in sentences)
 
 
-GSV = spoken("GPGSV,1,1,00", "GPTXT,01,01,02,hello")
-BARE = spoken("GPGGA,120000.00,5000.0,N,11100.0,W,1,08,0.9,700.0,M,-20.0,M,,").split(b"*")[0] + b"\r\n"
-WRONG = spoken("GPGGA,120000.00,5000.0,N,11100.0,W,1,eight,0.9,700.0,M,-20.0,M,,")
-STILL = spoken("GPGGA,120000.00,5000.0,N,11100.0,W,1,08,0.9,700.0,M,-20.0,M,,")
+GSV = make_sentence("GPGSV,1,1,00", "GPTXT,01,01,02,hello")
+BARE = make_sentence("GPGGA,120000.00,5000.0,N,11100.0,W,1,08,0.9,700.0,M,-20.0,M,,").split(b"*")[0] + b"\r\n"
+WRONG = make_sentence("GPGGA,120000.00,5000.0,N,11100.0,W,1,eight,0.9,700.0,M,-20.0,M,,")
+STOPPED = make_sentence("GPGGA,120000.00,5000.0,N,11100.0,W,1,08,0.9,700.0,M,-20.0,M,,")
 
 
 @pytest.mark.parametrize(
-    ("data", "says"),
+    ("data", "expected"),
     [
-        (GSV, ("heard GPGSV, GPTXT, which are not used since", "switch GGA or RMC on")),
-        (BARE, ("heard GPGGA without checksum since", "switch its checksums on")),
-        (WRONG, ("heard GPGGA with a right checksum and a field that cannot be", "compare its sentences")),
-        (STILL, ("GPGGA come, but their time stands still", "no new fix for 2 s")),
+        (GSV, ("received GPGSV, GPTXT, which are not used since", "switch GGA or RMC on")),
+        (BARE, ("received GPGGA without checksum since", "switch its checksums on")),
+        (WRONG, ("received GPGGA with a right checksum and a field that cannot be", "compare its sentences")),
+        (STOPPED, ("GPGGA arrive, but their time does not advance", "no new fix for 2 s")),
     ],
     ids=["others", "bare", "wrong", "still"],
 )
-def test_given_sentences_that_make_no_fix_when_heard_then_it_is_said_why_and_the_rate_is_kept(
-    data: bytes, says: tuple[str, ...]
+def test_given_sentences_that_make_no_fix_when_received_then_the_reason_is_reported_and_the_rate_stays(
+    data: bytes, expected: tuple[str, ...]
 ):
     one = alone(*[data] * 20, protocol="nmea", bauds=(4800, 9600))
-    silent = [each.text for each in one.told if each.phase is StationPhase.SILENT]
-    assert silent, one.words
-    assert all(each in silent[0] for each in says), silent[0]
+    silent = [each.text for each in one.statuses if each.phase is EndpointPhase.SILENT]
+    assert silent, one.status_text
+    assert all(each in silent[0] for each in expected), silent[0]
     assert "baud" not in silent[0]
-    assert not one.reopened
+    assert not one.reopens
 
 
 def test_given_a_heading_without_a_deviation_when_published_then_there_is_none():
     for sigma, known in ((0.0, False), (-1.0, False), (0.2, True)):
         heading = HeadingLog(0, 50, 2.0, 90.0, 1.0, sigma, 0.2, "AAAA", 10, 9)
         body = Position(0, PositionType.SINGLE, 50.0, -111.0, 700.0, -20.0, 61, 1.0, 2.0, 3.0, "", 0.0, 0.0, 9, 8)
-        sample = novatel_sample(SensorHeader(1, "gps", 0), body, None, heading)
+        sample = sample_from_novatel(SensorHeader(1, "gps", 0), body, None, heading)
         assert sample.baseline_yaw == pytest.approx(0.0)
         assert (sample.baseline_yaw_sigma == sample.baseline_yaw_sigma) is known
 
@@ -432,7 +440,7 @@ def test_given_answers_that_come_late_or_not_when_set_up_then_each_is_its_own_co
     late_s: float, first_is_lost: bool
 ):
     commands = tuple(f"command {n}" for n in range(6))
-    dialogue = SetUp(commands, S, 3)
+    dialogue = SetupDialogue(commands, S, 3)
     coming: list[tuple[int, str]] = []
     answered: list[tuple[str, str]] = []
     now, sent = 0, 0
@@ -444,18 +452,18 @@ def test_given_answers_that_come_late_or_not_when_set_up_then_each_is_its_own_co
                 coming.append((now + round(late_s * S), each))
             sent += bool(each)
 
-    send(dialogue.begin(now))
-    while dialogue.progress is SetupProgress.ASKING:
-        due = dialogue.due()
+    send(dialogue.start(now))
+    while dialogue.progress is SetupProgress.RUNNING:
+        due = dialogue.get_deadline()
         assert due is not None
         if coming and coming[0][0] <= due:
             now, command = coming.pop(0)
-            # every second command is refused, and says which it was
+            # every second command is refused, and expected which it was
             error = command if int(command[-1]) % 2 else ""
-            send(dialogue.answered(Answer(0, error), now))
+            send(dialogue.on_response(CommandResponse(0, error), now))
         else:
             now = due
-            send(dialogue.woken(now))
-    answered = dialogue.refused
+            send(dialogue.on_timer(now))
+    answered = dialogue.rejected
     assert dialogue.progress is SetupProgress.DONE
     assert answered == [(each, each) for each in commands if int(each[-1]) % 2]

@@ -1,4 +1,4 @@
-"""NMEA 0183: what sentences say, how they make epochs, and what is refused."""
+"""NMEA 0183: content of sentences, assembly of epochs, rejection of damaged sentences."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import pytest
 from modelserver.messages import FixType
 from msdrivers.protocol.gps_stream import GpsStream
 from msdrivers.protocol.nmea import NmeaEpoch
-from msdrivers.protocol.nmea.encode import angle, encode, number, time_of_day
-from msdrivers.protocol.nmea.sentences import read
+from msdrivers.protocol.nmea.encode import encode, format_angle, format_number, format_time_of_day
+from msdrivers.protocol.nmea.sentences import parse_sentence
 
 KNOT = 1852.0 / 3600.0
 
 
-def said(*sentences: str) -> bytes:
+def make_sentences(*sentences: str) -> bytes:
     return b"".join(encode(each[:2], each[2:5], each.split(",")[1:]) for each in sentences)
 
 
 def epochs(*sentences: str) -> list[NmeaEpoch]:
     stream = GpsStream()
-    found = [*stream.feed(said(*sentences)), *stream.idle()]
+    found = [*stream.feed(make_sentences(*sentences)), *stream.flush()]
     assert all(isinstance(each, NmeaEpoch) for each in found)
     return found  # type: ignore[return-value]
 
@@ -40,7 +40,7 @@ def utime(*parts: int) -> int:
     return round(datetime(*parts, tzinfo=UTC).timestamp() * 1e6)  # type: ignore[misc]
 
 
-def test_given_all_sentences_of_an_instant_when_read_then_one_epoch_says_it_all():
+def test_given_all_sentences_of_an_instant_when_read_then_one_epoch_contains_all():
     sentences = (gga(), rmc(), "GPVTG,91.0,T,,M,11.0,N,20.4,K,A", "GPGSA,A,3,,,,,,,,,,,,,1.5,0.9,1.2")
     more = ("GPGST,120000.00,,,,,0.3,0.2,0.4", "GPHDT,45.0,T", "GPZDA,120000.00,21,11,2026,00,00")
     (epoch,) = epochs(*sentences, *more)
@@ -96,7 +96,7 @@ def test_given_any_talker_when_it_speaks_then_it_is_read(talker: str):
         (("GPGLL,5000.0,N,11100.0,W,120000.00,V,N",), FixType.NONE),
     ],
 )
-def test_given_what_sentences_say_of_the_fix_when_together_then_the_strictest_counts(
+def test_given_the_fix_data_of_sentences_when_together_then_the_strictest_counts(
     sentences: Sequence[str], fix: FixType
 ):
     (epoch,) = epochs(*sentences)
@@ -105,7 +105,7 @@ def test_given_what_sentences_say_of_the_fix_when_together_then_the_strictest_co
     assert (epoch.latitude, epoch.longitude) == (50.0, -111.0)
 
 
-def test_given_empty_fields_when_read_then_nothing_is_said():
+def test_given_empty_fields_when_read_then_nothing_is_reported():
     (epoch,) = epochs("GPGGA,120000.00,,,,,0,00,,,M,,M,,", "GPVTG,,T,,M,,N,,K,N")
     assert epoch.fix_type is FixType.NONE
     values = (epoch.latitude, epoch.height_msl, epoch.undulation, epoch.hdop, epoch.speed, epoch.track, epoch.heading)
@@ -128,10 +128,10 @@ def test_given_cycles_that_were_alike_for_a_second_when_the_last_sentence_comes_
     stream = GpsStream()
     for n in range(8):
         clock = f"12000{n // 4}.{n % 4 * 25:02d}"
-        got = stream.feed(said(gga(clock), rmc(clock)))
+        got = stream.feed(make_sentences(gga(clock), rmc(clock)))
     # the epoch is complete with its own RMC
     assert [each.time_of_day for each in got if isinstance(each, NmeaEpoch)][-1] == 43_201_750_000
-    assert stream.idle() == []
+    assert stream.flush() == []
 
 
 def test_given_a_sentence_that_comes_once_a_second_when_between_fast_ones_then_it_is_not_lost():
@@ -142,16 +142,16 @@ def test_given_a_sentence_that_comes_once_a_second_when_between_fast_ones_then_i
     assert [each.speed == each.speed for each in epochs(*found)] == [n % 10 == 9 for n in range(40)]
 
 
-def test_given_a_clock_that_stands_still_when_the_same_instant_comes_again_then_it_is_one_epoch():
+def test_given_a_clock_that_does_not_advance_when_the_same_instant_comes_again_then_it_is_one_epoch():
     assert len(epochs(*[gga(), rmc()] * 50)) == 1
     stream = GpsStream()
-    assert len([*stream.feed(said(gga(), rmc())), *stream.idle()]) == 1
-    stream.feed(said(gga(), rmc()))
-    assert stream.idle() == []
+    assert len([*stream.feed(make_sentences(gga(), rmc())), *stream.flush()]) == 1
+    stream.feed(make_sentences(gga(), rmc()))
+    assert stream.flush() == []
     assert stream.counts["rejected.late"] == 2
 
 
-def test_given_midnight_when_only_gga_tells_then_the_day_goes_on():
+def test_given_midnight_with_gga_only_then_the_day_goes_on():
     found = epochs(rmc("235959.50"), gga("000000.00"), gga("000000.50"))
     assert [each.utime for each in found] == [utime(2026, 11, 22) + n * 500_000 for n in (-1, 0, 1)]
 
@@ -161,11 +161,11 @@ def test_given_no_date_when_read_then_there_is_none():
     assert (epoch.utime, epoch.time_of_day) == (0, 43_200_000_000)
 
 
-def test_given_a_leap_second_when_read_then_it_is_flagged_and_all_instants_are_told_apart():
+def test_given_a_leap_second_when_read_then_it_is_flagged_and_all_instants_are_distinguished():
     date = "311216"
     clocks = ("235959.00", "235960.00", "235960.50")
     found = epochs(*(rmc(each, date=date) for each in clocks), rmc("000000.00", date="010117"))
-    assert [each.leap_second for each in found] == [False, True, True, False]
+    assert [each.is_leap_second for each in found] == [False, True, True, False]
     new_year = utime(2017, 1, 1)
     assert [each.utime - new_year for each in found] == [-1_000_000, 0, 500_000, 0]
 
@@ -194,9 +194,9 @@ def test_given_a_leap_second_when_read_then_it_is_flagged_and_all_instants_are_t
         "GPZDA,120000.00,31,02,2026,00,00",
     ],
 )
-def test_given_a_field_that_cannot_be_when_read_then_the_sentence_is_refused(sentence: str):
+def test_given_a_field_that_cannot_be_when_read_then_the_sentence_is_rejected(sentence: str):
     stream = GpsStream()
-    assert [*stream.feed(said(sentence)), *stream.idle()] == []
+    assert [*stream.feed(make_sentences(sentence)), *stream.flush()] == []
     assert stream.counts["rejected.nmea_field"] == 1
 
 
@@ -205,38 +205,40 @@ def test_given_a_field_that_cannot_be_when_read_then_the_sentence_is_refused(sen
     [
         (lambda data: data.replace(b"5000.0", b"5000.1"), "nmea_checksum"),
         (lambda data: data[:-4] + b"+1\r\n", "nmea_checksum"),
-        (lambda data: data[:-5] + b"\r\n", "nmea_unfinished"),
+        (lambda data: data[:-5] + b"\r\n", "nmea_incomplete"),
         (lambda data: data[:7] + b"0" * 200 + data[7:], "nmea_length"),
     ],
 )
-def test_given_a_damaged_sentence_when_read_then_it_is_refused_and_the_next_is_read(damage, reason: str):
+def test_given_a_damaged_sentence_when_read_then_it_is_rejected_and_the_next_is_read(damage, reason: str):
     stream = GpsStream()
-    good = said(rmc())
-    found = [*stream.feed(damage(said(gga())) + good), *stream.idle()]
+    good = make_sentences(rmc())
+    found = [*stream.feed(damage(make_sentences(gga())) + good), *stream.flush()]
     assert [each.kinds for each in found if isinstance(each, NmeaEpoch)] == [("RMC",)]
     assert stream.counts[f"rejected.{reason}"] == 1
 
 
 def test_given_sentences_of_no_use_when_read_then_they_are_counted_and_nothing_else():
     stream = GpsStream()
-    data = b"$PGRME,15.0,M,22.5,M,27.0,M*1A\r\n" + said("GPGSV,1,1,00", "HEROT,0.0,A")
+    data = b"$PGRME,15.0,M,22.5,M,27.0,M*1A\r\n" + make_sentences("GPGSV,1,1,00", "HEROT,0.0,A")
     assert stream.feed(data) == []
-    assert stream.counts == {"nmea.unused": 3, "skipped": 0}
+    assert stream.counts == {"nmea.unsupported": 3, "skipped": 0}
 
 
 def test_given_a_number_of_decimals_when_read_then_none_is_lost():
-    sentence = read(said(gga(clock="120000.289999", place="4404.1306024,N,12118.8446777,W")).decode().strip())
+    sentence = parse_sentence(
+        make_sentences(gga(clock="120000.289999", place="4404.1306024,N,12118.8446777,W")).decode().strip()
+    )
     assert sentence is not None
     assert sentence.time_of_day == 43_200_289_999
     assert sentence.latitude == pytest.approx(44.06884337333, abs=1e-11)
 
 
 def test_given_values_when_written_then_they_read_as_they_should():
-    assert angle(-111.99999999999, "EW", 3) == ("11200.0000000", "W")
-    assert angle(5.5, "NS", 2) == ("0530.0000000", "N")
-    assert angle(math.nan, "NS", 2) == ("", "")
-    assert time_of_day(86_400_500_000) == "235960.500"
-    assert (number(math.nan, 2), number(1.005, 1)) == ("", "1.0")
+    assert format_angle(-111.99999999999, "EW", 3) == ("11200.0000000", "W")
+    assert format_angle(5.5, "NS", 2) == ("0530.0000000", "N")
+    assert format_angle(math.nan, "NS", 2) == ("", "")
+    assert format_time_of_day(86_400_500_000) == "235960.500"
+    assert (format_number(math.nan, 2), format_number(1.005, 1)) == ("", "1.0")
 
 
 @pytest.mark.parametrize(
@@ -258,7 +260,7 @@ def test_given_values_when_written_then_they_read_as_they_should():
         (rmc(status="", mode=""), False),
     ],
 )
-def test_given_motion_that_is_flagged_invalid_when_read_then_it_is_not_said(sentence: str, moves: bool):
+def test_given_motion_that_is_flagged_invalid_when_read_then_it_is_not_reported(sentence: str, moves: bool):
     (epoch,) = epochs(gga(), sentence)
     assert [value == value for value in (epoch.speed, epoch.track)] == [moves, moves]
 
@@ -269,7 +271,7 @@ def test_given_a_gns_without_a_mode_when_read_then_it_is_no_fix_as_a_gga_without
 
 
 def cycles(order: Sequence[str], silent: Sequence[int], number: int = 8) -> list[tuple[int, float, float]]:
-    """Return second, speed and heading of each epoch of a receiver; both tell the second.
+    """Return second, speed and heading of each epoch of a receiver; both encode the second.
 
     silent: the cycles after which the line is silent.
     """
@@ -281,9 +283,9 @@ def cycles(order: Sequence[str], silent: Sequence[int], number: int = 8) -> list
             "HDT": f"GPHDT,{n}.0,T",
             "GSA": "GPGSA,A,3,,,,,,,,,,,,,1.5,0.9,1.2",
         }
-        found += stream.feed(said(*(kinds[each] for each in order)))
+        found += stream.feed(make_sentences(*(kinds[each] for each in order)))
         if n in silent:
-            found += stream.idle()
+            found += stream.flush()
     assert all(isinstance(each, NmeaEpoch) for each in found)
     return [(each.time_of_day // 1_000_000 % 10, each.speed / KNOT, each.heading) for each in found]  # type: ignore[union-attr]
 
@@ -305,16 +307,16 @@ def test_given_sentences_without_a_time_when_they_lead_or_follow_then_no_epoch_h
 ):
     found = cycles(order, silent)
     assert len(found) >= 6
-    for second, *said_of in found:
-        assert all(value != value or value == pytest.approx(second) for value in said_of)
+    for second, *motion in found:
+        assert all(value != value or value == pytest.approx(second) for value in motion)
     if len(silent) == 8:
-        # the first cycle may have begun before the line was opened, and two must have told the order
+        # the first cycle may have begun before the line was opened, and two must have shown the order
         for second, speed, _ in found[3:]:
             assert speed == pytest.approx(second)
 
 
 @pytest.mark.parametrize("order", ORDERS[:2])
-def test_given_the_order_that_silence_told_when_the_line_is_full_then_motion_is_said_still(order: list[str]):
+def test_given_the_order_learned_from_silence_when_the_line_is_full_then_motion_is_published(order: list[str]):
     for second, speed, _ in cycles(order, (0, 1))[2:-1]:
         assert speed == pytest.approx(second)
 
@@ -322,10 +324,10 @@ def test_given_the_order_that_silence_told_when_the_line_is_full_then_motion_is_
 def test_given_a_pause_amid_a_cycle_when_it_contradicts_the_others_then_motion_is_left_out_rather_than_wrong():
     stream, found = GpsStream(), []
     for n in range(8):
-        found += stream.feed(said(gga(f"12000{n}.00")))
+        found += stream.feed(make_sentences(gga(f"12000{n}.00")))
         if n == 3:
-            found += stream.idle()
-        found += stream.feed(said(f"GPVTG,90.0,T,,M,{n}.0,N,,K,A"))
-    found += stream.idle()
+            found += stream.flush()
+        found += stream.feed(make_sentences(f"GPVTG,90.0,T,,M,{n}.0,N,,K,A"))
+    found += stream.flush()
     wrong = [each for each in found if abs(each.speed / KNOT - each.time_of_day // 1_000_000 % 10) > 0.1]  # type: ignore[union-attr,operator]
     assert len(wrong) <= 1

@@ -8,7 +8,7 @@ import pytest
 
 from msdrivers.protocol.gps_stream import GpsStream
 from msdrivers.protocol.novatel import (
-    Answer,
+    CommandResponse,
     HeadingLog,
     LogHeader,
     NovatelLog,
@@ -19,7 +19,7 @@ from msdrivers.protocol.novatel import (
     TimeStatus,
     Velocity,
 )
-from msdrivers.protocol.novatel.crc import crc32
+from msdrivers.protocol.novatel.binary import crc32
 from msdrivers.protocol.novatel.encode import encode
 
 BESTPOSB = bytes.fromhex(
@@ -91,7 +91,7 @@ def test_given_a_heading_when_written_and_read_then_it_is_the_same(name: str, as
 
 
 @pytest.mark.parametrize("at", range(3, len(BESTPOSB)))
-def test_given_one_damaged_byte_when_read_then_the_log_is_refused_and_the_next_is_found(at: int):
+def test_given_one_damaged_byte_when_read_then_the_log_is_rejected_and_the_next_is_found(at: int):
     damaged = bytearray(BESTPOSB)
     damaged[at] ^= 0x10
     stream = GpsStream()
@@ -123,7 +123,7 @@ def test_given_a_short_header_when_read_then_the_log_is_known_by_name_and_time()
     assert one(text("INSPVASA,2288,7.000;1,2,3", "%")).header.milliseconds == 7000
 
 
-def test_given_an_unknown_log_when_read_then_it_is_told_by_number_and_has_no_body():
+def test_given_an_unknown_log_when_read_then_it_is_named_by_number_and_has_no_body():
     log = one(binary(4711, b"anything"))
     assert (log.header.name, log.body) == ("id 4711", None)
 
@@ -144,10 +144,10 @@ def test_given_a_response_in_binary_when_read_then_it_is_no_position():
         (text("BESTPOSA;SOL_COMPUTED"), ""),
         (text("BESTVELA,COM1,0,0,FINE,1,0.0,0,0,0;SOL_COMPUTED,SINGLE,nan,0,0,0,0,0"), "novatel_value"),
         (BESTPOSA.replace(b"*b5", b"*b6"), "novatel_checksum"),
-        (BESTPOSA.replace(b"*", b"\r\n*"), "novatel_unfinished"),
+        (BESTPOSA.replace(b"*", b"\r\n*"), "novatel_incomplete"),
     ],
 )
-def test_given_what_no_receiver_says_when_read_then_it_is_refused_by_reason(frame: bytes, reason: str):
+def test_given_impossible_values_when_read_then_it_is_rejected_by_reason(frame: bytes, reason: str):
     stream = GpsStream()
     assert not any(isinstance(each, NovatelLog) for each in stream.feed(frame))
     rejected = {kind for kind in stream.counts if kind.startswith("rejected.")}
@@ -166,18 +166,18 @@ def test_given_words_that_are_not_in_the_tables_when_read_then_the_log_is_taken_
     assert log.body.station == "a,b"
 
 
-def test_given_answers_and_prompts_when_read_then_they_are_told_apart():
+def test_given_answers_and_prompts_when_read_then_they_are_distinguished():
     stream = GpsStream()
     data = (
         b"\r\n<OK\r\n[COM1]\r\n<ERROR:Invalid Message. Field = 1\r\n[COM1]<OK\n[USB2]<BESTPOS COM1 0 72.0 FINE\r\n[X]"
     )
     messages = stream.feed(data)
     assert [(type(each), getattr(each, "error", getattr(each, "port", ""))) for each in messages] == [
-        (Answer, ""),
+        (CommandResponse, ""),
         (Prompt, "COM1"),
-        (Answer, "Invalid Message. Field = 1"),
+        (CommandResponse, "Invalid Message. Field = 1"),
         (Prompt, "COM1"),
-        (Answer, ""),
+        (CommandResponse, ""),
         (Prompt, "USB2"),
     ]
     assert stream.counts["novatel.abbreviated"] == 1
@@ -197,7 +197,7 @@ def test_given_the_crc_when_compared_with_zlibs_then_it_is_another():
     assert crc32(BESTPOSB[:-4]) == int.from_bytes(BESTPOSB[-4:], "little")
 
 
-def test_given_a_log_without_body_when_written_then_it_is_refused():
+def test_given_a_log_without_body_when_written_then_it_is_rejected():
     with pytest.raises(ValueError, match="VERSION cannot be written"):
         encode(NovatelLog(LogHeader("VERSION", 1, 1, 180, "", 0, 0, True), None))
 
@@ -215,7 +215,7 @@ def test_given_a_log_without_body_when_written_then_it_is_refused():
         "BESTPOSA,COM1,0,80.0,FINESTEERING,1957,0,100000000,7145,6938",
     ],
 )
-def test_given_a_header_that_cannot_be_when_read_then_the_log_is_refused_and_the_next_is_read(header: str):
+def test_given_a_header_that_cannot_be_when_read_then_the_log_is_rejected_and_the_next_is_read(header: str):
     _, body = BESTPOSA.decode("ascii").split("*")[0].split(";")
     stream = GpsStream()
     assert stream.feed(text(f"{header};{body}")) == []
@@ -224,7 +224,7 @@ def test_given_a_header_that_cannot_be_when_read_then_the_log_is_refused_and_the
 
 
 @pytest.mark.parametrize("count", ["256", "2147483648", "-1", "8.5", ""])
-def test_given_a_number_of_satellites_that_cannot_be_when_read_then_the_log_is_refused(count: str):
+def test_given_a_number_of_satellites_that_cannot_be_when_read_then_the_log_is_rejected(count: str):
     content = BESTPOSA.decode("ascii").split("*")[0][1:].replace(",8,8,8,0,0", f",8,{count},8,0,0")
     stream = GpsStream()
     assert stream.feed(text(content)) == []
@@ -233,11 +233,11 @@ def test_given_a_number_of_satellites_that_cannot_be_when_read_then_the_log_is_r
 
 @pytest.mark.parametrize("degrees", [-0.5, 360.5, math.nan, math.inf, 1e30])
 @pytest.mark.parametrize("as_binary", [True, False])
-def test_given_a_heading_that_cannot_be_when_read_then_it_is_refused(degrees: float, as_binary: bool):
-    said = HeadingLog(0, 50, 2.0, degrees, 1.0, 0.1, 0.2, "AAAA", 10, 9)
+def test_given_a_heading_that_cannot_be_when_read_then_it_is_rejected(degrees: float, as_binary: bool):
+    log = HeadingLog(0, 50, 2.0, degrees, 1.0, 0.1, 0.2, "AAAA", 10, 9)
     header = LogHeader("HEADING", 2288, 1000, TimeStatus.FINESTEERING, "32", 0, 0, as_binary)
     stream = GpsStream()
-    assert stream.feed(encode(NovatelLog(header, said))) == []
+    assert stream.feed(encode(NovatelLog(header, log))) == []
     assert stream.counts["rejected.novatel_value"] == 1
 
 

@@ -14,10 +14,10 @@ from msdrivers.protocol.gps_time import (
     ROLLOVER,
     SECOND,
     WEEK,
+    count_leap_seconds,
     gps_of,
-    in_leap_second,
-    leap_seconds,
-    unrolled,
+    is_in_leap_second,
+    resolve_rollover,
     utime_of,
 )
 
@@ -44,7 +44,7 @@ NOW = utc(2026, 11, 21)
     ],
 )
 def test_given_a_date_when_asked_then_gps_is_ahead_by_the_leap_seconds(at: int, ahead: int):
-    assert leap_seconds(at) == ahead
+    assert count_leap_seconds(at) == ahead
 
 
 def test_given_a_real_log_when_converted_then_the_instant_is_that_of_the_sentence_beside_it():
@@ -61,13 +61,13 @@ def test_given_a_week_that_rolled_over_when_the_host_knows_the_year_then_it_is_o
 def test_given_a_host_without_a_date_when_converted_then_nothing_is_moved():
     week, microseconds = gps_of(NOW)
     assert utime_of(week, microseconds, 0) == NOW
-    assert unrolled(NOW, 0) == NOW
+    assert resolve_rollover(NOW, 0) == NOW
 
 
 def test_given_a_time_that_is_ahead_when_unrolled_then_it_stays():
-    assert unrolled(NOW + ROLLOVER, NOW) == NOW + ROLLOVER
-    assert unrolled(NOW - ROLLOVER, NOW) == NOW
-    assert unrolled(NOW - ROLLOVER // 2, NOW) == NOW - ROLLOVER // 2
+    assert resolve_rollover(NOW + ROLLOVER, NOW) == NOW + ROLLOVER
+    assert resolve_rollover(NOW - ROLLOVER, NOW) == NOW
+    assert resolve_rollover(NOW - ROLLOVER // 2, NOW) == NOW - ROLLOVER // 2
 
 
 def test_given_the_leap_second_of_2016_when_converted_then_it_is_known_as_ambiguous():
@@ -76,13 +76,13 @@ def test_given_the_leap_second_of_2016_when_converted_then_it_is_known_as_ambigu
     week, microseconds = gps_of(after)
     assert utime_of(week, microseconds, pivot) == after
     within = microseconds - SECOND // 2
-    assert in_leap_second(week, within, pivot)
+    assert is_in_leap_second(week, within, pivot)
     assert utime_of(week, within, pivot) == after + SECOND // 2
     before = microseconds - SECOND - 1
-    assert not in_leap_second(week, before, pivot)
+    assert not is_in_leap_second(week, before, pivot)
     assert utime_of(week, before, pivot) == after - 1
-    assert not in_leap_second(week, microseconds, pivot)
-    assert not in_leap_second(*gps_of(NOW), NOW)
+    assert not is_in_leap_second(week, microseconds, pivot)
+    assert not is_in_leap_second(*gps_of(NOW), NOW)
 
 
 @given(st.integers(GPS_EPOCH, NOW + 100 * WEEK))

@@ -7,16 +7,17 @@ import math
 import random
 
 import pytest
-from support_gx1 import FIELD_NED, GRAVITY, START_UTIME, Line, angle_between, standing, turning
+from support_gx1 import FIELD_NED, GRAVITY, START_UTIME, Line, angle_between, rotating_samples, stationary_samples
 
 from modelserver.messages import ImuSample, OrientationReference, YawSource
-from modelserver.spatial import so3
+from modelserver.transforms import so3
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings, HeadingSource
-from msdrivers.devices.gx1.tick_rate import TickRate
+from msdrivers.devices.gx1.driver import TickRateCheck
 from msdrivers.emulate.gx1 import Gx1Emulator
-from msdrivers.emulate.gx1_unit import Eeprom, Gx1Unit, UnitFault
-from msdrivers.protocol.gx1 import Address, CommandByte, Gains, requests
-from msdrivers.station import StationPhase
+from msdrivers.emulate.gx1_unit import Eeprom, Gx1Unit
+from msdrivers.endpoint import EndpointPhase
+from msdrivers.fault_injection import InjectedFault
+from msdrivers.protocol.gx1 import CommandByte, EepromAddress, Gains, requests
 
 
 def imu_samples(line: Line) -> list[ImuSample]:
@@ -26,10 +27,12 @@ def imu_samples(line: Line) -> list[ImuSample]:
 
 
 def test_given_a_device_when_opened_then_it_is_identified_set_up_and_streams_at_100_hz():
-    line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(turning()))
+    line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(rotating_samples()))
     line.run(6.0)
-    assert line.texts(StationPhase.CONFIGURING) == ["3DM-GX1 serial 1234, firmware 3.1.00 answers at 38400 baud"]
-    assert line.texts(StationPhase.STREAMING) == ["3DM-GX1 serial 1234, firmware 3.1.00 streams message 49"]
+    assert line.status_texts(EndpointPhase.CONFIGURING) == [
+        "3DM-GX1 serial 1234, firmware 3.1.00 answers at 38400 baud"
+    ]
+    assert line.status_texts(EndpointPhase.STREAMING) == ["3DM-GX1 serial 1234, firmware 3.1.00 streams message 49"]
     headers = [sample.header for sample in imu_samples(line)]
     assert [header.seq for header in headers] == list(range(len(headers)))
     assert {b.device_utime - a.device_utime for a, b in itertools.pairwise(headers)} == {10_000}
@@ -39,7 +42,7 @@ def test_given_a_device_when_opened_then_it_is_identified_set_up_and_streams_at_
 
 def test_given_a_turning_unit_then_samples_are_what_it_did_at_the_instants_of_its_ticks():
     rate = (0.1, -0.2, 0.3)
-    line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(turning(rate)))
+    line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(rotating_samples(rate)))
     line.run(6.0)
     samples = imu_samples(line)
     # by processing and flight the samples come 5 ms after they were measured
@@ -60,29 +63,29 @@ def test_given_a_turning_unit_then_samples_are_what_it_did_at_the_instants_of_it
 
 
 @pytest.mark.parametrize(
-    ("message", "says"),
+    ("message", "content"),
     [
-        (CommandByte.STABILISED_VECTORS, "rate force field"),
+        (CommandByte.STABILIZED_VECTORS, "rate force field"),
         (CommandByte.INSTANTANEOUS_VECTORS, "rate force field"),
         (CommandByte.QUATERNION_VECTORS, "rate force field orientation"),
         (CommandByte.INSTANTANEOUS_EULER, "orientation"),
-        (CommandByte.STABILISED_EULER, "orientation"),
+        (CommandByte.STABILIZED_EULER, "orientation"),
         (CommandByte.EULER_VECTORS, "rate force orientation"),
     ],
 )
-def test_given_each_message_then_a_sample_says_what_it_says_and_no_more(message, says):
+def test_given_each_message_then_a_sample_contains_it_and_no_more(message, content):
     settings = Gx1Settings("imu", message, HeadingSource.MAGNETIC)
-    line = Line(Gx1Driver(settings), Gx1Emulator(turning()))
+    line = Line(Gx1Driver(settings), Gx1Emulator(rotating_samples()))
     line.run(3.0)
     sample = imu_samples(line)[-1]
     t = (sample.header.host_utime - 5000 - START_UTIME) * 1e-6
     truth = so3.exponential((0.0, 0.0, 0.2 * t))
-    assert (sample.angular_velocity is not None) == ("rate" in says)
-    assert (sample.specific_force is not None) == ("force" in says)
-    assert (sample.orientation is not None) == ("orientation" in says)
-    assert (sample.yaw_source is YawSource.MAGNETIC) == ("orientation" in says)
-    assert (sample.orientation_reference is OrientationReference.NED) == ("orientation" in says)
-    assert (sample.magnetic_field is not None) == ("field" in says)
+    assert (sample.angular_velocity is not None) == ("rate" in content)
+    assert (sample.specific_force is not None) == ("force" in content)
+    assert (sample.orientation is not None) == ("orientation" in content)
+    assert (sample.yaw_source is YawSource.MAGNETIC) == ("orientation" in content)
+    assert (sample.orientation_reference is OrientationReference.NED) == ("orientation" in content)
+    assert (sample.magnetic_field is not None) == ("field" in content)
     if sample.magnetic_field is not None:
         field = so3.rotate(so3.conjugate(truth), FIELD_NED)
         assert sample.magnetic_field == pytest.approx(field, abs=1e-8)
@@ -92,7 +95,7 @@ def test_given_each_message_then_a_sample_says_what_it_says_and_no_more(message,
 
 
 def test_given_other_gains_in_the_eeprom_then_samples_are_scaled_by_them():
-    unit = Gx1Emulator(turning((0.0, 0.0, 1.0)), Eeprom.factory(Gains(10_000, 8500, 2500)))
+    unit = Gx1Emulator(rotating_samples((0.0, 0.0, 1.0)), Eeprom.make_factory(Gains(10_000, 8500, 2500)))
     line = Line(Gx1Driver(Gx1Settings("imu")), unit)
     line.run(3.0)
     sample = imu_samples(line)[-1]
@@ -100,17 +103,19 @@ def test_given_other_gains_in_the_eeprom_then_samples_are_scaled_by_them():
     assert sample.specific_force == pytest.approx((0.0, 0.0, -GRAVITY), abs=2e-3)
 
 
-def test_given_polls_then_the_temperature_is_told_once_a_period_and_never_repeated():
-    line = Line(Gx1Driver(Gx1Settings("imu", temperature_period=1.0)), Gx1Emulator(turning(), unit=Gx1Unit(celsius=31)))
+def test_given_polls_then_the_temperature_is_reported_once_a_period_and_never_repeated():
+    line = Line(
+        Gx1Driver(Gx1Settings("imu", temperature_period=1.0)), Gx1Emulator(rotating_samples(), unit=Gx1Unit(celsius=31))
+    )
     line.run(5.9)
-    told = [s.temperature_celsius for s in imu_samples(line) if not math.isnan(s.temperature_celsius)]
-    assert told == pytest.approx([31.0] * 6, abs=0.01)
-    assert line.host.counts["message.temperature"] == len(told)
+    reported = [s.temperature_celsius for s in imu_samples(line) if not math.isnan(s.temperature_celsius)]
+    assert reported == pytest.approx([31.0] * 6, abs=0.01)
+    assert line.host.counts["message.temperature"] == len(reported)
 
 
 def test_given_a_polled_measurement_then_both_are_published_each_with_its_own_tick():
-    settings = Gx1Settings("imu", CommandByte.EULER_VECTORS, polled=CommandByte.STABILISED_VECTORS, poll_period=0.1)
-    line = Line(Gx1Driver(settings), Gx1Emulator(turning()))
+    settings = Gx1Settings("imu", CommandByte.EULER_VECTORS, polled=CommandByte.STABILIZED_VECTORS, poll_period=0.1)
+    line = Line(Gx1Driver(settings), Gx1Emulator(rotating_samples()))
     line.run(3.4)
     samples = imu_samples(line)
     fields = [sample for sample in samples if sample.magnetic_field is not None]
@@ -122,7 +127,9 @@ def test_given_a_polled_measurement_then_both_are_published_each_with_its_own_ti
 
 def test_given_the_default_timer_then_a_tick_is_6553_microseconds_and_a_wrap_goes_unseen():
     unit = Gx1Unit(tick_offset=65_000, cycle_ticks=2)
-    line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(turning(), Eeprom.factory(hundred_hertz=False), unit))
+    line = Line(
+        Gx1Driver(Gx1Settings("imu")), Gx1Emulator(rotating_samples(), Eeprom.make_factory(hundred_hertz=False), unit)
+    )
     line.run(8.0)
     times = [sample.header.device_utime for sample in imu_samples(line)]
     steps = {b - a for a, b in itertools.pairwise(times)}
@@ -135,7 +142,7 @@ def test_given_the_default_timer_then_a_tick_is_6553_microseconds_and_a_wrap_goe
 def test_given_a_drifting_clock_and_bytes_in_pieces_then_no_sample_is_lost():
     line = Line(
         Gx1Driver(Gx1Settings("imu", message=CommandByte.QUATERNION_VECTORS, temperature_period=0.5)),
-        Gx1Emulator(turning(), unit=Gx1Unit(drift=150e-6)),
+        Gx1Emulator(rotating_samples(), unit=Gx1Unit(drift=150e-6)),
         pieces=random.Random(3),
     )
     line.run(20.0)
@@ -146,84 +153,85 @@ def test_given_a_drifting_clock_and_bytes_in_pieces_then_no_sample_is_lost():
 
 def test_given_biases_captured_at_start_then_the_rates_are_free_of_them():
     bias = (0.02, -0.03, 0.01)
-    device = Gx1Emulator(standing(), unit=Gx1Unit(gyro_bias=bias))
+    device = Gx1Emulator(stationary_samples(), unit=Gx1Unit(gyro_bias=bias))
     line = Line(Gx1Driver(Gx1Settings("imu", capture_bias_at_start=True)), device)
     line.run(8.0)
-    assert "capturing the gyro biases: keep the vehicle still" in line.texts(StationPhase.CONFIGURING)
+    assert "capturing the gyro biases: keep the vehicle still" in line.status_texts(EndpointPhase.CONFIGURING)
     assert imu_samples(line)[-1].angular_velocity == pytest.approx((0.0, 0.0, 0.0), abs=2e-4)
-    without = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(standing(), unit=Gx1Unit(gyro_bias=bias)))
+    without = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(stationary_samples(), unit=Gx1Unit(gyro_bias=bias)))
     without.run(4.0)
     assert imu_samples(without)[-1].angular_velocity == pytest.approx(bias, abs=2e-4)
 
 
-def test_given_a_capture_that_does_not_end_then_it_is_said_and_the_device_is_used():
-    device = Gx1Emulator(standing(), unit=Gx1Unit(bias_capture=9.5))
+def test_given_a_capture_that_does_not_end_then_it_is_reported_and_the_device_is_used():
+    device = Gx1Emulator(stationary_samples(), unit=Gx1Unit(bias_capture=9.5))
     line = Line(Gx1Driver(Gx1Settings("imu", capture_bias_at_start=True)), device)
     line.run(20.0)
-    assert any("did not end within 9 s; going on with the biases from before" in text for text in line.texts())
+    assert any("timed out after 9 s; using the previous biases" in text for text in line.status_texts())
     assert len(line.samples) > 200
 
 
 def test_given_a_restart_after_biases_were_captured_then_they_are_not_captured_on_the_move():
-    unit = Gx1Unit(faults=(UnitFault(8.0, "restart"),))
-    line = Line(Gx1Driver(Gx1Settings("imu", capture_bias_at_start=True)), Gx1Emulator(turning(), unit=unit))
+    unit = Gx1Unit(faults=(InjectedFault(8.0, "restart"),))
+    line = Line(Gx1Driver(Gx1Settings("imu", capture_bias_at_start=True)), Gx1Emulator(rotating_samples(), unit=unit))
     line.run(14.0)
-    assert line.sent.count(requests.poll(CommandByte.CAPTURE_BIAS)) == 1
-    assert any("not captured again, since the vehicle may be moving" in text for text in line.texts())
+    assert line.sent.count(requests.make_poll(CommandByte.CAPTURE_BIAS)) == 1
+    assert any("not captured again, since the vehicle may be moving" in text for text in line.status_texts())
 
 
-@pytest.mark.parametrize("found", [0, CommandByte.STABILISED_EULER])
+@pytest.mark.parametrize("found", [0, CommandByte.STABILIZED_EULER])
 def test_given_a_device_that_streamed_or_not_when_left_then_it_is_as_it_was_found(found):
-    device = Gx1Emulator(turning(), unit=Gx1Unit(streams=found))
+    device = Gx1Emulator(rotating_samples(), unit=Gx1Unit(streamed_at_start=found))
     line = Line(Gx1Driver(Gx1Settings("imu")), device)
     line.run(3.0)
     assert device.streamed == CommandByte.EULER_VECTORS
     assert len(line.samples) > 100
-    line.leave()
+    line.close()
     assert device.streamed == found
 
 
 def test_given_leaving_amid_the_set_up_then_what_was_streamed_is_streamed_again():
-    device = Gx1Emulator(turning(), unit=Gx1Unit(streams=CommandByte.STABILISED_EULER))
+    device = Gx1Emulator(rotating_samples(), unit=Gx1Unit(streamed_at_start=CommandByte.STABILIZED_EULER))
     line = Line(Gx1Driver(Gx1Settings("imu")), device)
     line.run(0.8)
     assert device.streamed == 0
-    line.leave()
-    assert device.streamed == CommandByte.STABILISED_EULER
+    line.close()
+    assert device.streamed == CommandByte.STABILIZED_EULER
 
 
-def test_given_a_device_that_gives_the_opposite_of_specific_force_then_it_is_said_which_sign_to_set():
-    line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(standing(), unit=Gx1Unit(force_sign=-1)))
+def test_given_a_device_that_gives_the_opposite_of_specific_force_then_the_sign_to_set_is_reported():
+    line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(stationary_samples(), unit=Gx1Unit(force_sign=-1)))
     line.run(4.0)
-    assert any("set specific_force_sign to -1 (it is 1)" in text for text in line.texts(StationPhase.STREAMING))
-    mended = Line(
-        Gx1Driver(Gx1Settings("imu", specific_force_sign=-1)), Gx1Emulator(standing(), unit=Gx1Unit(force_sign=-1))
+    assert any("set specific_force_sign to -1 (it is 1)" in text for text in line.status_texts(EndpointPhase.STREAMING))
+    corrected = Line(
+        Gx1Driver(Gx1Settings("imu", specific_force_sign=-1)),
+        Gx1Emulator(stationary_samples(), unit=Gx1Unit(force_sign=-1)),
     )
-    mended.run(4.0)
-    assert not any("specific_force_sign" in text for text in mended.texts())
-    assert imu_samples(mended)[-1].specific_force == pytest.approx((0.0, 0.0, -GRAVITY), abs=2e-3)
+    corrected.run(4.0)
+    assert not any("specific_force_sign" in text for text in corrected.status_texts())
+    assert imu_samples(corrected)[-1].specific_force == pytest.approx((0.0, 0.0, -GRAVITY), abs=2e-3)
 
 
 @pytest.mark.parametrize(
-    "message", [CommandByte.STABILISED_VECTORS, CommandByte.STABILISED_EULER, CommandByte.QUATERNION_VECTORS]
+    "message", [CommandByte.STABILIZED_VECTORS, CommandByte.STABILIZED_EULER, CommandByte.QUATERNION_VECTORS]
 )
 def test_given_any_message_then_the_sign_of_gravity_is_checked_and_its_poll_is_not_published(message):
-    line = Line(Gx1Driver(Gx1Settings("imu", message)), Gx1Emulator(standing(), unit=Gx1Unit(force_sign=-1)))
+    line = Line(Gx1Driver(Gx1Settings("imu", message)), Gx1Emulator(stationary_samples(), unit=Gx1Unit(force_sign=-1)))
     line.run(10.0)
-    assert sum("set specific_force_sign" in text for text in line.texts()) == 1
-    sent = line.sent.count(requests.poll(CommandByte.EULER_VECTORS))
+    assert sum("set specific_force_sign" in text for text in line.status_texts()) == 1
+    sent = line.sent.count(requests.make_poll(CommandByte.EULER_VECTORS))
     assert sent == (0 if message == CommandByte.QUATERNION_VECTORS else 5)
     assert len(line.samples) == line.host.counts[f"message.{message.name.lower()}"]
 
 
-def test_given_a_moving_unit_then_nothing_is_said_of_gravity():
-    line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(turning(), unit=Gx1Unit(force_sign=-1)))
+def test_given_a_moving_unit_then_gravity_is_not_reported():
+    line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(rotating_samples(), unit=Gx1Unit(force_sign=-1)))
     line.run(4.0)
-    assert not any("specific_force_sign" in text for text in line.texts())
+    assert not any("specific_force_sign" in text for text in line.status_texts())
 
 
 def test_given_a_rate_beyond_the_range_then_it_is_not_published_and_counted():
-    line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(turning((0.0, 0.0, 30.0))))
+    line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(rotating_samples((0.0, 0.0, 30.0))))
     line.run(3.0)
     sample = imu_samples(line)[-1]
     assert sample.angular_velocity is None
@@ -232,12 +240,12 @@ def test_given_a_rate_beyond_the_range_then_it_is_not_published_and_counted():
 
 
 def test_given_timer_words_that_take_effect_later_then_the_device_time_is_not_used():
-    device = Gx1Emulator(turning(), Eeprom.factory(hundred_hertz=False))
+    device = Gx1Emulator(rotating_samples(), Eeprom.make_factory(hundred_hertz=False))
     line = Line(Gx1Driver(Gx1Settings("imu")), device)
-    line.device.opened(line.now())
-    device.eeprom = device.eeprom.written(dict(zip(Address.TIMER, (4, 10, 250, 10), strict=True)))
+    line.device.on_open(line.now())
+    device.eeprom = device.eeprom.write(dict(zip(EepromAddress.TIMER, (4, 10, 250, 10), strict=True)))
     line.run(20.0)
-    assert any("6.554 ms by the host's clock" in text and "power off and on" in text for text in line.texts())
+    assert any("6.554 ms by the host's clock" in text and "power off and on" in text for text in line.status_texts())
     last = line.samples[-1]
     assert last.sample.header.device_utime == 0
     assert last.delay == pytest.approx(230 / 38400)
@@ -246,29 +254,29 @@ def test_given_timer_words_that_take_effect_later_then_the_device_time_is_not_us
 @pytest.mark.parametrize("off", [0.05, -0.05, 0.01, -0.01])
 def test_given_ticks_of_another_length_when_they_are_compared_then_they_contradict(off: float):
     rng = random.Random(1)
-    rate = TickRate(0.01)
-    changes = [rate.take(n, round((n * (1.0 + off) + rng.uniform(0.0, 2.0)) * 1e7)) for n in range(2500)]
+    rate = TickRateCheck(0.01)
+    changes = [rate.update(n, round((n * (1.0 + off) + rng.uniform(0.0, 2.0)) * 1e7)) for n in range(2500)]
     assert sum(changes) == 1
-    assert not rate.agrees
-    assert f"take {10.0 * (1.0 + off):.2g}" in rate.text()
+    assert not rate.is_consistent
+    assert f"take {10.0 * (1.0 + off):.2g}" in rate.describe()
 
 
 @pytest.mark.parametrize("stall_s", [0.0, 0.3, 4.0])
 def test_given_a_host_that_stalls_and_a_crystal_that_is_off_when_ticks_are_compared_then_they_agree(stall_s: float):
     rng = random.Random(2)
-    rate = TickRate(0.01)
+    rate = TickRateCheck(0.01)
     for n in range(6000):
         at_s = n * 0.01 * 1.0002 + rng.uniform(0.0, 0.02)
         at_s = max(at_s, 7.0 * (at_s // 7.0) + stall_s)
-        assert not rate.take(n, round(at_s * 1e9))
-    assert rate.agrees
+        assert not rate.update(n, round(at_s * 1e9))
+    assert rate.is_consistent
 
 
-def test_given_a_unit_whose_timer_is_not_documented_then_the_tick_is_inferred_and_said():
-    words = dict(zip(Address.TIMER, (8, 10, 250, 10), strict=True))
-    line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(turning(), Eeprom.factory().written(words)))
+def test_given_a_unit_whose_timer_is_not_documented_then_the_tick_is_inferred_and_reported():
+    words = dict(zip(EepromAddress.TIMER, (8, 10, 250, 10), strict=True))
+    line = Line(Gx1Driver(Gx1Settings("imu")), Gx1Emulator(rotating_samples(), Eeprom.make_factory().write(words)))
     line.run(12.0)
-    assert any("a tick of 20 ms is inferred" in text for text in line.texts(StationPhase.CONFIGURING))
+    assert any("a tick of 20 ms is inferred" in text for text in line.status_texts(EndpointPhase.CONFIGURING))
     assert line.samples[-1].sample.header.device_utime > 0
 
 
@@ -284,6 +292,6 @@ def test_given_a_unit_whose_timer_is_not_documented_then_the_tick_is_inferred_an
         ({"tick": math.nan}, "tick: must be at least"),
     ],
 )
-def test_given_settings_that_contradict_then_the_error_says_which_and_why(change, text):
+def test_given_settings_that_contradict_then_the_error_names_it(change, text):
     with pytest.raises(ValueError, match=text.replace("(", r"\(")):
         Gx1Settings("imu", **change)

@@ -5,21 +5,20 @@ from __future__ import annotations
 import math
 
 import pytest
-from support_gx1 import START_UTIME, Line, angle_between, standing, turning
+from support_gx1 import START_UTIME, Line, angle_between, rotating_samples, stationary_samples
 
 from modelserver.earth.geodesy import Geodesy, origin_at
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.simulation import DrivePhase, ImuModel, Trajectory
-from modelserver.simulation.imu import readings
-from modelserver.simulation.magnetometer import MagnetometerModel
-from modelserver.spatial import so3
-from modelserver.spatial.pose import Pose
+from modelserver.simulation.imu import MagnetometerModel, simulate_imu
+from modelserver.transforms import so3
+from modelserver.transforms.pose import Pose
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings, HeadingSource
-from msdrivers.emulate.gx1 import Gx1Emulator
-from msdrivers.emulate.gx1_samples import Samples
-from msdrivers.emulate.gx1_unit import Eeprom, Gx1Unit, UnitFault
-from msdrivers.protocol.gx1 import LAYOUTS, Address, CommandByte, Gx1Parser, Packet, requests
-from msdrivers.station import Now, Send
+from msdrivers.emulate.gx1 import Gx1Emulator, SampleInterpolator
+from msdrivers.emulate.gx1_unit import Eeprom, Gx1Unit
+from msdrivers.endpoint import HostTime, Send
+from msdrivers.fault_injection import InjectedFault
+from msdrivers.protocol.gx1 import LAYOUTS, CommandByte, EepromAddress, Gx1Packet, Gx1Parser, requests
 
 S = 1_000_000_000
 
@@ -30,19 +29,19 @@ class Hand:
     def __init__(self, device: Gx1Emulator):
         self.device, self.ns = device, 5 * S
         self.parser = Gx1Parser()
-        self.parser.stream(*LAYOUTS)
-        device.opened(self.now())
+        self.parser.set_streamed(*LAYOUTS)
+        device.on_open(self.now())
 
-    def now(self) -> Now:
-        return Now(self.ns, START_UTIME + (self.ns - 5 * S) // 1000)
+    def now(self) -> HostTime:
+        return HostTime(self.ns, START_UTIME + (self.ns - 5 * S) // 1000)
 
-    def ask(self, request: bytes = b"", wait: float = 0.005) -> list[Packet]:
+    def ask(self, request: bytes = b"", wait: float = 0.005) -> list[Gx1Packet]:
         """Send a request; return what comes until `wait` seconds later."""
-        raw = b"".join(o.unit for o in self.device.received(request, self.now()) if isinstance(o, Send))
+        raw = b"".join(o.unit for o in self.device.on_receive(request, self.now()) if isinstance(o, Send))
         until = self.ns + round(wait * S)
-        while (due := self.device.due()) is not None and due <= until:
+        while (due := self.device.get_deadline()) is not None and due <= until:
             self.ns = max(due, self.ns)
-            raw += b"".join(o.unit for o in self.device.woken(self.now()) if isinstance(o, Send))
+            raw += b"".join(o.unit for o in self.device.on_timer(self.now()) if isinstance(o, Send))
         self.ns = until
         return self.parser.feed(raw)
 
@@ -56,39 +55,41 @@ def sample(at: float, orientation: so3.Quaternion, reference: OrientationReferen
 def test_given_samples_against_enu_then_the_device_gives_north_east_down():
     # axes forward, left, up, facing north: in north, east, down half a turn about north
     facing_north = so3.from_rpy(0.0, 0.0, math.pi / 2)
-    samples = Samples([sample(0.0, facing_north, OrientationReference.ENU)])
-    felt = samples.at(START_UTIME)
+    samples = SampleInterpolator([sample(0.0, facing_north, OrientationReference.ENU)])
+    felt = samples.sense_at(START_UTIME)
     assert felt is not None
     assert so3.rotate(felt.orientation, (1.0, 0.0, 0.0)) == pytest.approx((1.0, 0.0, 0.0), abs=1e-12)
     assert so3.rotate(felt.orientation, (0.0, 0.0, 1.0)) == pytest.approx((0.0, 0.0, -1.0), abs=1e-12)
 
 
 def test_given_an_instant_between_samples_then_it_is_interpolated_before_the_first_held_and_after_the_last_none():
-    samples = Samples(turning((0.0, 0.0, 1.0), seconds=1.0, hz=10.0))
-    first = samples.at(START_UTIME - 1_000_000)
-    between = samples.at(START_UTIME + 150_000)
-    last = samples.at(START_UTIME + 1_000_000)
+    samples = SampleInterpolator(rotating_samples((0.0, 0.0, 1.0), seconds=1.0, hz=10.0))
+    first = samples.sense_at(START_UTIME - 1_000_000)
+    between = samples.sense_at(START_UTIME + 150_000)
+    last = samples.sense_at(START_UTIME + 1_000_000)
     assert first is not None
     assert between is not None
     assert last is not None
     assert first.orientation == so3.IDENTITY
     assert angle_between(between.orientation, so3.from_rpy(0.0, 0.0, 0.15)) < 1e-9
     assert angle_between(last.orientation, so3.from_rpy(0.0, 0.0, 1.0)) < 1e-9
-    assert samples.at(START_UTIME + 1_000_001) is None
+    assert samples.sense_at(START_UTIME + 1_000_001) is None
 
 
-def test_given_the_end_of_the_samples_then_it_streams_no_more_and_still_tells_its_temperature():
-    hand = Hand(Gx1Emulator(standing(0.5), unit=Gx1Unit(streams=CommandByte.EULER_VECTORS)))
+def test_given_the_end_of_the_samples_then_it_streams_no_more_and_reports_its_temperature():
+    hand = Hand(Gx1Emulator(stationary_samples(0.5), unit=Gx1Unit(streamed_at_start=CommandByte.EULER_VECTORS)))
     assert len(hand.ask(wait=0.6)) == 51
-    assert hand.ask(requests.poll(CommandByte.EULER_VECTORS), 0.1) == []
-    assert [packet.command for packet in hand.ask(requests.poll(CommandByte.TEMPERATURE))] == [CommandByte.TEMPERATURE]
+    assert hand.ask(requests.make_poll(CommandByte.EULER_VECTORS), 0.1) == []
+    assert [packet.command for packet in hand.ask(requests.make_poll(CommandByte.TEMPERATURE))] == [
+        CommandByte.TEMPERATURE
+    ]
 
 
 def test_given_a_stream_and_a_poll_then_replies_come_whole_in_order_with_ticks_that_rise():
-    hand = Hand(Gx1Emulator(standing(), unit=Gx1Unit(tick_offset=65_530)))
-    (started,) = hand.ask(requests.stream(CommandByte.STABILISED_EULER))
-    assert started.field("streamed") == (CommandByte.STABILISED_EULER,)
-    found = hand.ask(wait=0.1) + hand.ask(requests.poll(CommandByte.TEMPERATURE), 0.1)
+    hand = Hand(Gx1Emulator(stationary_samples(), unit=Gx1Unit(tick_offset=65_530)))
+    (started,) = hand.ask(requests.make_stream(CommandByte.STABILIZED_EULER))
+    assert started.field("streamed") == (CommandByte.STABILIZED_EULER,)
+    found = hand.ask(wait=0.1) + hand.ask(requests.make_poll(CommandByte.TEMPERATURE), 0.1)
     assert [packet.command for packet in found].count(CommandByte.TEMPERATURE) == 1
     ticks = [(packet.ticks + 6) % 65_536 for packet in found if packet.ticks is not None]
     assert ticks == sorted(ticks)
@@ -97,37 +98,37 @@ def test_given_a_stream_and_a_poll_then_replies_come_whole_in_order_with_ticks_t
 
 
 def test_given_a_command_that_cannot_be_streamed_then_it_is_not_answered():
-    device = Gx1Emulator(standing())
-    assert Hand(device).ask(requests.stream(CommandByte.TEMPERATURE)) == []
+    device = Gx1Emulator(stationary_samples())
+    assert Hand(device).ask(requests.make_stream(CommandByte.TEMPERATURE)) == []
     assert device.streamed == 0
 
 
 def test_given_words_written_then_they_outlive_a_restart_and_the_timer_follows_only_then():
-    device = Gx1Emulator(standing(), Eeprom.factory(hundred_hertz=False))
+    device = Gx1Emulator(stationary_samples(), Eeprom.make_factory(hundred_hertz=False))
     hand = Hand(device)
-    for address, value in zip(Address.TIMER, (4, 10, 250, 10), strict=True):
-        (written,) = hand.ask(requests.write_eeprom(address, value))
+    for address, value in zip(EepromAddress.TIMER, (4, 10, 250, 10), strict=True):
+        (written,) = hand.ask(requests.make_write_eeprom(address, value))
         assert written.unsigned == value
-    before = hand.ask(requests.poll(CommandByte.TEMPERATURE), 0.65536)[0].ticks
-    assert hand.ask(requests.poll(CommandByte.TEMPERATURE))[0].ticks == before + 100
-    device.strike(UnitFault(0.0, "restart"), hand.now())
-    assert hand.ask(requests.poll(CommandByte.TEMPERATURE), 1.5) == []
-    assert hand.ask(requests.read_eeprom(Address.TIMER[0]))[0].unsigned == 4
-    before = hand.ask(requests.poll(CommandByte.TEMPERATURE), 1.0)[0].ticks
-    assert hand.ask(requests.poll(CommandByte.TEMPERATURE))[0].ticks == before + 100
+    before = hand.ask(requests.make_poll(CommandByte.TEMPERATURE), 0.65536)[0].ticks
+    assert hand.ask(requests.make_poll(CommandByte.TEMPERATURE))[0].ticks == before + 100
+    device.apply_fault(InjectedFault(0.0, "restart"), hand.now())
+    assert hand.ask(requests.make_poll(CommandByte.TEMPERATURE), 1.5) == []
+    assert hand.ask(requests.make_read_eeprom(EepromAddress.TIMER[0]))[0].unsigned == 4
+    before = hand.ask(requests.make_poll(CommandByte.TEMPERATURE), 1.0)[0].ticks
+    assert hand.ask(requests.make_poll(CommandByte.TEMPERATURE))[0].ticks == before + 100
 
 
 def test_given_an_address_without_a_word_then_it_reads_zero():
-    hand = Hand(Gx1Emulator(standing()))
+    hand = Hand(Gx1Emulator(stationary_samples()))
     assert hand.ask(b"\x28\x00\x83")[0].unsigned == 0
     assert hand.ask(b"\x28\x40\x00")[0].unsigned == 0
 
 
 def test_given_a_wake_long_after_then_only_the_last_cycles_are_made_up_for():
-    device = Gx1Emulator(standing(), unit=Gx1Unit(streams=CommandByte.STABILISED_EULER))
+    device = Gx1Emulator(stationary_samples(), unit=Gx1Unit(streamed_at_start=CommandByte.STABILIZED_EULER))
     hand = Hand(device)
     hand.ns += 20 * S
-    outputs = [output for output in device.woken(hand.now()) if isinstance(output, Send)]
+    outputs = [output for output in device.on_timer(hand.now()) if isinstance(output, Send)]
     assert 95 <= len(outputs) <= 101
 
 
@@ -138,7 +139,7 @@ def test_given_a_simulated_drive_then_the_driver_gives_back_what_the_simulated_u
         [DrivePhase(2.0), DrivePhase(4.0, speed=4.0), DrivePhase(6.0, curvature=0.1), DrivePhase(4.0, speed=0.0)]
     )
     model = ImuModel(magnetometer=MagnetometerModel(), yaw_source=YawSource.MAGNETIC)
-    made = readings(model, drive, mount, geodesy, START_UTIME, 1, "imu")
+    made = simulate_imu(model, drive, mount, geodesy, START_UTIME, 1, "imu")
     felt = {each.header.utime: each for each, _ in zip(made, range(1500), strict=False)}
     settings = Gx1Settings("imu", CommandByte.QUATERNION_VECTORS, HeadingSource.MAGNETIC)
     line = Line(Gx1Driver(settings), Gx1Emulator(felt.values()))
@@ -155,4 +156,4 @@ def test_given_a_simulated_drive_then_the_driver_gives_back_what_the_simulated_u
         assert truth.orientation is not None
         assert angle_between(got.orientation, truth.orientation) < 3e-4
         assert got.yaw_source is YawSource.MAGNETIC
-    assert not any("specific_force_sign" in text for text in line.texts())
+    assert not any("specific_force_sign" in text for text in line.status_texts())

@@ -5,57 +5,57 @@ from __future__ import annotations
 import math
 
 import pytest
-from support_gx1 import SHEET
+from support_gx1 import DOCUMENTED_REPLIES
 
-from modelserver.spatial import so3
+from modelserver.transforms import so3
 from msdrivers.protocol.gx1 import (
-    DATA,
     LENGTHS,
+    MEASUREMENTS,
     CommandByte,
+    Gx1Packet,
     Gx1Parser,
-    Packet,
-    Request,
+    Gx1Request,
     RequestParser,
     requests,
     scaling,
 )
-from msdrivers.protocol.gx1.checksum import checksum, sealed
+from msdrivers.protocol.gx1.packets import append_checksum, compute_checksum
 
 
-def only(data: bytes) -> Packet:
+def only(data: bytes) -> Gx1Packet:
     parser = Gx1Parser()
-    parser.stream(data[0])
+    parser.set_streamed(data[0])
     (packet,) = parser.feed(data)
     return packet
 
 
 def test_given_the_worked_euler_vectors_when_decoded_then_every_number_is_the_sheets():
-    packet = only(SHEET[0x31])
+    packet = only(DOCUMENTED_REPLIES[0x31])
     assert packet.field("euler") == (182, -364, 16384)
     roll, pitch, yaw = so3.to_rpy(scaling.orientation_from_euler(packet.field("euler")))
     assert [math.degrees(angle) for angle in (roll, pitch, yaw)] == pytest.approx([0.99976, -1.99951, 90.0], abs=1e-5)
-    force = scaling.vector(packet.field("acceleration"), 7000)
+    force = scaling.vector_from_words(packet.field("acceleration"), 7000)
     assert force == pytest.approx((0.0, 0.0, -0.99997), abs=1e-5)
-    rate = scaling.vector(packet.field("rate"), 8500)
+    rate = scaling.vector_from_words(packet.field("rate"), 8500)
     assert rate == pytest.approx((0.010117, -0.010117, 0.100128), abs=1e-6)
     assert packet.ticks == 1000
 
 
 def test_given_the_worked_temperature_when_decoded_then_it_is_near_23_degrees():
-    packet = only(SHEET[0x07])
+    packet = only(DOCUMENTED_REPLIES[0x07])
     assert packet.ticks == 1000
-    assert scaling.temperature_celsius(packet.unsigned) == pytest.approx(23.0, abs=0.01)
+    assert scaling.temperature_from_word(packet.unsigned) == pytest.approx(23.0, abs=0.01)
 
 
-def test_given_the_worked_stabilised_euler_when_decoded_then_all_are_45_degrees_at_the_last_tick():
-    packet = only(SHEET[0x0E])
+def test_given_the_worked_stabilized_euler_when_decoded_then_all_are_45_degrees_at_the_last_tick():
+    packet = only(DOCUMENTED_REPLIES[0x0E])
     assert packet.words == (8192, 8192, 8192)
     assert packet.ticks == 65535
     angles = so3.to_rpy(scaling.orientation_from_euler(packet.words))
     assert angles == pytest.approx([math.pi / 4] * 3)
 
 
-@pytest.mark.parametrize("raw", SHEET.values(), ids=map(hex, SHEET))
+@pytest.mark.parametrize("raw", DOCUMENTED_REPLIES.values(), ids=map(hex, DOCUMENTED_REPLIES))
 def test_given_a_worked_reply_when_decoded_and_written_then_the_bytes_are_the_same(raw):
     assert only(raw).to_bytes() == raw
 
@@ -67,8 +67,8 @@ def test_given_the_table_of_replies_then_their_lengths_are_the_sheets():
     }  # fmt: skip
 
 
-def test_given_a_quaternion_and_vectors_then_the_fields_stand_where_the_sheet_says():
-    packet = only(Packet(0x0C, tuple(range(1, 14)), 77).to_bytes())
+def test_given_a_quaternion_and_vectors_then_the_fields_stand_where_the_sheet_has_them():
+    packet = only(Gx1Packet(0x0C, tuple(range(1, 14)), 77).to_bytes())
     raw = packet.to_bytes()
     assert packet.field("quaternion") == (1, 2, 3, 4)
     assert int.from_bytes(raw[9:11], "big") == packet.field("field")[0] == 5
@@ -78,48 +78,55 @@ def test_given_a_quaternion_and_vectors_then_the_fields_stand_where_the_sheet_sa
 
 
 def test_given_extremes_then_minimum_stands_before_maximum_and_both_are_signed():
-    packet = only(Packet(0x41, (1, 2, 3, -4, -5, -6, 7, 8, 9), 5).to_bytes())
+    packet = only(Gx1Packet(0x41, (1, 2, 3, -4, -5, -6, 7, 8, 9), 5).to_bytes())
     assert packet.field("minimum") == (-4, -5, -6)
     assert packet.field("maximum") == (7, 8, 9)
 
 
-def test_given_words_of_a_wrong_number_when_written_then_it_is_refused():
+def test_given_words_of_a_wrong_number_when_written_then_it_is_rejected():
     with pytest.raises(ValueError, match="has 9 words"):
-        Packet(0x31, (1, 2), 3).to_bytes()
+        Gx1Packet(0x31, (1, 2), 3).to_bytes()
     with pytest.raises(ValueError, match="ticks: True"):
-        Packet(0x07, (1,)).to_bytes()
+        Gx1Packet(0x07, (1,)).to_bytes()
 
 
 def test_given_a_body_of_half_a_word_then_it_has_no_checksum():
     with pytest.raises(ValueError, match="whole words"):
-        checksum(b"\x31\x00")
-    assert sealed(b"\xff\xff\xff") == b"\xff\xff\xff\x00\xfe"
+        compute_checksum(b"\x31\x00")
+    assert append_checksum(b"\xff\xff\xff") == b"\xff\xff\xff\x00\xfe"
 
 
 def test_given_requests_then_their_bytes_are_the_sheets():
     assert bytes.fromhex("100000") == requests.STOP
-    assert requests.stream(0x31) == bytes.fromhex("100031")
-    assert requests.read_eeprom(130) == bytes.fromhex("280082")
-    assert requests.write_eeprom(172, -2) == bytes.fromhex("297100acfffeaa")
-    assert requests.hard_iron_start() == bytes.fromhex("40713e")
-    assert requests.hard_iron_compute(two_dimensional=True, magnitude_z=259) == bytes.fromhex("42713e010103")
+    assert requests.make_stream(0x31) == bytes.fromhex("100031")
+    assert requests.make_read_eeprom(130) == bytes.fromhex("280082")
+    assert requests.make_write_eeprom(172, -2) == bytes.fromhex("297100acfffeaa")
+    assert requests.make_hard_iron_start() == bytes.fromhex("40713e")
+    assert requests.make_hard_iron_compute(two_dimensional=True, magnitude_z=259) == bytes.fromhex("42713e010103")
 
 
 @pytest.mark.parametrize("address", [-2, 131, 256])
-def test_given_an_address_that_no_word_has_then_it_is_refused(address):
+def test_given_an_address_that_no_word_has_then_it_is_rejected(address):
     with pytest.raises(ValueError, match=r"even and 0\.\.254"):
-        requests.read_eeprom(address)
+        requests.make_read_eeprom(address)
 
 
 def test_given_noise_between_requests_when_the_device_reads_then_it_finds_each():
     parser = RequestParser()
-    data = b"\x55\x10" + requests.STOP + b"\x99" + requests.read_eeprom(230) + b"\x07" + requests.write_eeprom(238, 4)
+    data = (
+        b"\x55\x10"
+        + requests.STOP
+        + b"\x99"
+        + requests.make_read_eeprom(230)
+        + b"\x07"
+        + requests.make_write_eeprom(238, 4)
+    )
     found = [request for k in range(len(data)) for request in parser.feed(data[k : k + 1])]
     assert found == [
-        Request(CommandByte.CONTINUOUS, b"\0"),
-        Request(CommandByte.READ_EEPROM, b"\0\xe6"),
-        Request(CommandByte.TEMPERATURE),
-        Request(CommandByte.WRITE_EEPROM, b"\0\xee\0\4"),
+        Gx1Request(CommandByte.CONTINUOUS, b"\0"),
+        Gx1Request(CommandByte.READ_EEPROM, b"\0\xe6"),
+        Gx1Request(CommandByte.TEMPERATURE),
+        Gx1Request(CommandByte.WRITE_EEPROM, b"\0\xee\0\4"),
     ]
     assert parser.skipped == 3
 
@@ -131,20 +138,20 @@ def test_given_requests_with_wrong_keys_then_the_device_does_nothing():
 
 
 def test_given_both_documented_timers_then_the_tick_is_as_documented():
-    assert scaling.tick_seconds((16, 16, 256, 1)) == pytest.approx(6.5536e-3)
-    assert scaling.tick_seconds((4, 10, 250, 10)) == pytest.approx(10e-3)
+    assert scaling.tick_from_timer_words((16, 16, 256, 1)) == pytest.approx(6.5536e-3)
+    assert scaling.tick_from_timer_words((4, 10, 250, 10)) == pytest.approx(10e-3)
 
 
 def test_given_vectors_beyond_the_range_when_written_then_they_saturate():
-    words = scaling.vector_words((1e6, -1e6, 1.0), 8500)
+    words = scaling.vector_to_words((1e6, -1e6, 1.0), 8500)
     assert words == (32767, -32768, 3855)
     assert scaling.is_saturated(words)
     assert not scaling.is_saturated((32766, 0, -32767))
 
 
 def test_given_a_version_word_then_its_text_is_the_sheets():
-    assert scaling.version_text(3102) == "3.1.02"
+    assert scaling.format_version(3102) == "3.1.02"
 
 
 def test_given_measurements_then_all_have_ticks():
-    assert all(Packet(command, (0,) * ((LENGTHS[command] - 5) // 2), 1).to_bytes() for command in DATA)
+    assert all(Gx1Packet(command, (0,) * ((LENGTHS[command] - 5) // 2), 1).to_bytes() for command in MEASUREMENTS)

@@ -7,20 +7,20 @@ import random
 import tracemalloc
 
 import pytest
-from support_gx1 import SHEET
+from support_gx1 import DOCUMENTED_REPLIES
 
-from msdrivers.protocol.gx1 import DATA, CommandByte, Gx1Parser, Packet
+from msdrivers.protocol.gx1 import MEASUREMENTS, CommandByte, Gx1Packet, Gx1Parser
 
-EULER_VECTORS, TEMPERATURE = SHEET[0x31], SHEET[0x07]
+EULER_VECTORS, TEMPERATURE = DOCUMENTED_REPLIES[0x31], DOCUMENTED_REPLIES[0x07]
 
 
 def stream(count: int, first_tick: int = 0) -> list[bytes]:
-    return [Packet(0x31, (k, 2, 3, 4, 5, 6, 7, 8, 9), first_tick + k).to_bytes() for k in range(count)]
+    return [Gx1Packet(0x31, (k, 2, 3, 4, 5, 6, 7, 8, 9), first_tick + k).to_bytes() for k in range(count)]
 
 
 def test_given_a_reply_that_nobody_asked_for_then_it_does_not_count():
     parser = Gx1Parser()
-    parser.stream(0x31)
+    parser.set_streamed(0x31)
     assert parser.feed(TEMPERATURE) == []
     assert parser.counts["skipped"] == len(TEMPERATURE)
 
@@ -34,7 +34,7 @@ def test_given_one_poll_then_one_reply_counts_and_a_second_does_not():
 
 def test_given_a_poll_between_streamed_replies_then_all_come_in_order():
     parser = Gx1Parser()
-    parser.stream(0x31)
+    parser.set_streamed(0x31)
     parser.expect(0x07)
     found = parser.feed(EULER_VECTORS + TEMPERATURE + EULER_VECTORS)
     assert [packet.command for packet in found] == [0x31, 0x07, 0x31]
@@ -44,13 +44,13 @@ def test_given_a_poll_between_streamed_replies_then_all_come_in_order():
 def test_given_a_poll_given_up_then_its_late_reply_does_not_count():
     parser = Gx1Parser()
     parser.expect(0x07)
-    parser.give_up(0x07)
+    parser.cancel(0x07)
     assert parser.feed(TEMPERATURE) == []
 
 
 def test_given_a_corrupt_reply_then_the_one_behind_it_is_not_lost():
     parser = Gx1Parser()
-    parser.stream(0x31)
+    parser.set_streamed(0x31)
     corrupt = bytearray(EULER_VECTORS)
     corrupt[5] ^= 1
     assert len(parser.feed(bytes(corrupt) + EULER_VECTORS)) == 1
@@ -60,18 +60,18 @@ def test_given_a_corrupt_reply_then_the_one_behind_it_is_not_lost():
 
 def test_given_a_false_first_byte_right_before_a_reply_then_the_reply_is_found():
     parser = Gx1Parser()
-    parser.stream(0x31)
+    parser.set_streamed(0x31)
     assert len(parser.feed(b"\x31" + EULER_VECTORS)) == 1
     assert parser.counts["skipped"] == 1
 
 
-def test_given_a_reply_that_the_judge_refuses_then_one_byte_is_skipped_and_a_reply_inside_it_is_found():
+def test_given_a_reply_that_the_judge_rejects_then_one_byte_is_skipped_and_a_reply_inside_it_is_found():
     inner = TEMPERATURE
-    outer = Packet(0x31, (0, 0x5500, *(0,) * 7), 0).to_bytes()
+    outer = Gx1Packet(0x31, (0, 0x5500, *(0,) * 7), 0).to_bytes()
     body = outer[:3] + inner + outer[10:-2]
     total = body[0] + sum(int.from_bytes(body[k : k + 2], "big") for k in range(1, len(body), 2))
     parser = Gx1Parser(lambda packet: "ticks" if packet.command == 0x31 else "")
-    parser.stream(0x31, 0x07)
+    parser.set_streamed(0x31, 0x07)
     (packet,) = parser.feed(body + (total & 0xFFFF).to_bytes(2, "big"))
     assert packet.command == 0x07
     assert parser.counts["rejected.ticks"] == 1
@@ -81,7 +81,7 @@ def test_given_a_stream_cut_at_every_place_then_what_is_whole_comes():
     raw = b"".join(stream(3))
     for cut in range(len(raw)):
         parser = Gx1Parser()
-        parser.stream(0x31)
+        parser.set_streamed(0x31)
         whole = len(raw[cut:]) // len(EULER_VECTORS)
         assert len(parser.feed(raw[cut:])) == whole
 
@@ -90,7 +90,7 @@ def test_given_bytes_one_by_one_then_the_replies_are_those_of_the_whole():
     raw = b"\x31\x07" + b"".join(stream(20)) + b"\x31\x31\x10" + b"".join(stream(5, 40))
     whole, single = Gx1Parser(), Gx1Parser()
     for parser in (whole, single):
-        parser.stream(0x31, 0x07)
+        parser.set_streamed(0x31, 0x07)
     found = whole.feed(raw)
     assert len(found) == 25
     assert [packet for k in range(len(raw)) for packet in single.feed(raw[k : k + 1])] == found
@@ -101,9 +101,9 @@ def test_given_bytes_one_by_one_then_the_replies_are_those_of_the_whole():
 def test_given_noise_before_a_good_stream_then_it_is_followed_within_three_messages(seed):
     rng = random.Random(seed)
     parser = Gx1Parser()
-    parser.stream(*DATA)
+    parser.set_streamed(*MEASUREMENTS)
     parser.expect(0x07)
-    parser.feed(rng.randbytes(rng.randrange(200)) + bytes(rng.choices(sorted(DATA), k=rng.randrange(1, 40))))
+    parser.feed(rng.randbytes(rng.randrange(200)) + bytes(rng.choices(sorted(MEASUREMENTS), k=rng.randrange(1, 40))))
     found = parser.feed(b"".join(stream(10, 500)))
     ticks = [packet.ticks for packet in found if packet.command == 0x31]
     assert ticks[-8:] == list(range(502, 510))
@@ -112,16 +112,16 @@ def test_given_noise_before_a_good_stream_then_it_is_followed_within_three_messa
 def test_given_three_million_random_bytes_then_no_more_pass_than_the_checksum_lets_through():
     rng = random.Random(7)
     parser = Gx1Parser()
-    parser.stream(*DATA)
+    parser.set_streamed(*MEASUREMENTS)
     found = sum(len(parser.feed(rng.randbytes(50_000))) for _ in range(60))
-    expected = 3e6 * len(DATA) / 256 / 65_536
+    expected = 3e6 * len(MEASUREMENTS) / 256 / 65_536
     assert found <= expected + 4 * math.sqrt(expected) + 1
 
 
 def test_given_random_bytes_for_long_then_memory_stays_flat():
     rng = random.Random(8)
     parser = Gx1Parser()
-    parser.stream(*DATA)
+    parser.set_streamed(*MEASUREMENTS)
     parser.feed(rng.randbytes(20_000))
     tracemalloc.start()
     try:
@@ -144,7 +144,7 @@ def test_given_nothing_that_was_asked_for_then_every_byte_is_skipped():
 
 def test_given_clear_then_bytes_that_waited_are_skipped_and_nothing_is_expected():
     parser = Gx1Parser()
-    parser.stream(0x31)
+    parser.set_streamed(0x31)
     parser.expect(CommandByte.TEMPERATURE)
     parser.feed(EULER_VECTORS[:-1])
     parser.clear()

@@ -1,4 +1,4 @@
-"""Real lines between two ends in one process, and what they say when they cannot be opened."""
+"""Real links between two ends in one process, and their errors when they cannot be opened."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from typing import Any
 import pytest
 import serial
 
-from msdrivers.links import Link, LinkError, ports
+from msdrivers.links import Link, LinkError
 from msdrivers.links import can_bus as can_module
-from msdrivers.links import serial_line as serial_module
+from msdrivers.links import serial_port as ports
+from msdrivers.links import serial_port as serial_module
 from msdrivers.links.can_bus import CanLink
-from msdrivers.links.modbus import ANSWER_S, ModbusLink, ModbusServerLink, modbus_link
+from msdrivers.links.modbus import REPLY_TIMEOUT_S, ModbusLink, ModbusServerLink, make_modbus_link
 from msdrivers.links.pty import PtyLink
-from msdrivers.links.serial_line import SerialLink
+from msdrivers.links.serial_port import SerialLink
 from msdrivers.links.tcp import TcpLink, TcpServerLink
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.modbus.registers import (
@@ -29,18 +30,18 @@ from msdrivers.protocol.modbus.registers import (
     ModbusUnit,
     ReadRegisters,
     Registers,
-    Table,
+    RegistersWritten,
+    RegisterTable,
     WriteRegisters,
-    Written,
 )
 
-PATIENCE_S = 10.0
+TIMEOUT_S = 10.0
 
 
-def heard(link: Link[Any], count: int, other: Link[Any] | None = None) -> list[Any]:
+def receive(link: Link[Any], count: int, other: Link[Any] | None = None) -> list[Any]:
     """Return what comes until there are `count` units, or bytes; `other` is polled meanwhile."""
     found: list[Any] = []
-    end = time.monotonic() + PATIENCE_S
+    end = time.monotonic() + TIMEOUT_S
     while sum(len(unit) if isinstance(unit, bytes) else 1 for unit in found) < count and time.monotonic() < end:
         if other is not None:
             other.poll(0.0)
@@ -48,10 +49,10 @@ def heard(link: Link[Any], count: int, other: Link[Any] | None = None) -> list[A
     return found
 
 
-def lost(link: Link[Any]) -> LinkError:
-    """Return the error with which a line says that it is lost."""
+def wait_for_loss(link: Link[Any]) -> LinkError:
+    """Return the error that a lost link raises."""
     with pytest.raises(LinkError) as caught:
-        heard(link, 1 << 30)
+        receive(link, 1 << 30)
     return caught.value
 
 
@@ -83,9 +84,9 @@ def test_given_a_pty_when_opened_as_a_port_then_bytes_go_both_ways_unchanged(pty
     port.open()
     every = bytes(range(256))
     pty.send(every)
-    assert b"".join(heard(port, 256)) == every
+    assert b"".join(receive(port, 256)) == every
     port.send(every)
-    assert b"".join(heard(pty, 256)) == every
+    assert b"".join(receive(pty, 256)) == every
     port.close()
     port.close()
     # a driver that goes is no loss for the device
@@ -100,7 +101,7 @@ def test_given_a_port_whose_device_goes_then_the_line_is_lost_and_can_be_opened_
     port = SerialLink(str(path), 9600)
     port.open()
     pty.close()
-    assert "unplugged" in str(lost(port))
+    assert "unplugged" in str(wait_for_loss(port))
     port.close()
     assert not path.is_symlink()
     with pytest.raises(LinkError, match="there is no such port"):
@@ -108,7 +109,7 @@ def test_given_a_port_whose_device_goes_then_the_line_is_lost_and_can_be_opened_
     pty.open()
     port.open()
     pty.send(b"back")
-    assert b"".join(heard(port, 4)) == b"back"
+    assert b"".join(receive(port, 4)) == b"back"
     port.close()
     pty.close()
 
@@ -156,7 +157,7 @@ def test_given_a_link_to_a_terminal_then_it_is_a_number_used_again_and_taken_ove
     os.close(ours)
 
 
-def test_given_a_link_in_use_when_another_emulator_wants_it_then_it_is_told_by_whom_and_both_stay_as_they_are(
+def test_given_a_link_in_use_when_another_emulator_wants_it_then_the_user_is_named_and_both_stay_as_they_are(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "gps"
@@ -179,35 +180,35 @@ def test_given_a_link_that_another_has_taken_over_then_it_is_left_to_that_one(tm
     assert str(path.readlink()) == "/dev/null"
 
 
-def test_given_the_wrong_rate_then_garbage_is_heard_and_at_the_right_one_the_device(tmp_path: Path) -> None:
+def test_given_the_wrong_rate_then_garbage_is_received_and_at_the_right_one_the_device(tmp_path: Path) -> None:
     pty = PtyLink(baud=38400)
     pty.open()
     port = SerialLink(pty.description, 9600)
     port.open()
     pty.send(b"hello")
-    assert b"".join(heard(port, 5)) != b"hello"
+    assert b"".join(receive(port, 5)) != b"hello"
     port.close()
     port.open(38400)
     assert port.baud == 38400
     pty.send(b"hello")
-    assert b"".join(heard(port, 5)) == b"hello"
+    assert b"".join(receive(port, 5)) == b"hello"
     port.close()
     pty.close()
 
 
-def test_given_a_port_in_use_then_it_says_by_which_process(pty: PtyLink) -> None:
+def test_given_a_port_in_use_then_the_process_is_named(pty: PtyLink) -> None:
     first, second = SerialLink(pty.description, 9600), SerialLink(pty.description, 9600)
     first.open()
     with pytest.raises(LinkError) as caught:
         second.open()
     assert caught.value.what == f"{pty.description} is in use"
-    assert f"process {os.getpid()}" in caught.value.why
+    assert f"process {os.getpid()}" in caught.value.reason
     first.close()
 
 
 @pytest.mark.parametrize("number", [errno.EACCES, errno.EPERM])
 @pytest.mark.parametrize(
-    ("group", "mode", "said"),
+    ("group", "mode", "expected"),
     [
         (20, 0o660, "it belongs to group dialout: sudo usermod -aG dialout operator, then log in again"),
         (0, 0o660, "no group but root's may use it: write KERNEL=="),
@@ -215,20 +216,20 @@ def test_given_a_port_in_use_then_it_says_by_which_process(pty: PtyLink) -> None
         (20, 0o620, 'GROUP="dialout", MODE="0660" into /etc/udev/rules.d/99-serial.rules, sudo usermod -aG dialout'),
     ],
 )
-def test_given_no_permission_then_it_says_how_to_get_it(
-    number: int, group: int, mode: int, said: str, monkeypatch: pytest.MonkeyPatch
+def test_given_no_permission_then_the_fix_is_reported_how_to_get_it(
+    number: int, group: int, mode: int, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(*_: object, **__: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise serial.SerialException(number, "could not open port")
 
-    monkeypatch.setattr(serial_module.serial, "Serial", refused)
+    monkeypatch.setattr(serial_module.serial, "Serial", fail)
     owned = os.stat_result((mode, 0, 0, 1, 0, group, 0, 0, 0, 0))
-    monkeypatch.setattr(ports, "owner_of", lambda _: (owned, "dialout"))
+    monkeypatch.setattr(ports, "get_owner", lambda _: (owned, "dialout"))
     monkeypatch.setattr(ports.getpass, "getuser", lambda: "operator")
     with pytest.raises(LinkError) as caught:
         SerialLink("/dev/ttyUSB0", 9600).open()
-    assert caught.value.why == "permission denied"
-    assert said in caught.value.fix
+    assert caught.value.reason == "permission denied"
+    assert expected in caught.value.fix
 
 
 @pytest.mark.parametrize(
@@ -240,11 +241,11 @@ def test_given_no_permission_then_it_says_how_to_get_it(
         ("/dev/ttyACM0", ""),
     ],
 )
-def test_given_a_missing_port_then_those_of_its_name_are_told(
+def test_given_a_missing_port_then_those_of_its_name_are_reported(
     wanted: str, near: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = [ports.PortLine("/dev/ttyUSB8", "adapter", ""), ports.PortLine("/dev/ttyS0", "", "")]
-    monkeypatch.setattr(ports, "found_ports", lambda: found)
+    found = [ports.PortInfo("/dev/ttyUSB8", "adapter", ""), ports.PortInfo("/dev/ttyS0", "", "")]
+    monkeypatch.setattr(ports, "find_ports", lambda: found)
     monkeypatch.setattr(ports.glob, "glob", lambda _: [])
     with pytest.raises(LinkError) as caught:
         SerialLink(wanted, 9600).open()
@@ -252,13 +253,13 @@ def test_given_a_missing_port_then_those_of_its_name_are_told(
 
 
 def test_given_adapters_with_an_id_then_a_missing_port_names_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ports, "found_ports", list)
+    monkeypatch.setattr(ports, "find_ports", list)
     monkeypatch.setattr(ports.glob, "glob", lambda _: ["/dev/serial/by-id/usb-FTDI"])
-    assert ports.near_ports("/dev/ttyUSB0") == ("/dev/serial/by-id/usb-FTDI",)
+    assert ports.suggest_ports("/dev/ttyUSB0") == ("/dev/serial/by-id/usb-FTDI",)
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "expected"),
     [
         (("/usr/bin/python3", "/usr/bin/modelserver", "driver", "gps"), "process 7 (modelserver driver gps)"),
         (("/usr/bin/python3", "-c", "main()", "driver", "gps"), "process 7 (python driver gps)"),
@@ -267,32 +268,32 @@ def test_given_adapters_with_an_id_then_a_missing_port_names_them(monkeypatch: p
         (("",), "process 7 (kworker)"),
     ],
 )
-def test_given_a_process_then_it_is_told_by_what_was_typed(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
+def test_given_a_process_then_its_command_line_is_shown(words: tuple[str, ...], expected: str, tmp_path: Path) -> None:
     process = tmp_path / "7"
     process.mkdir()
     (process / "cmdline").write_text("\0".join(words) + "\0")
     (process / "comm").write_text("kworker\n")
-    assert ports._shown(process) == said
+    assert ports._describe_process(process) == expected
 
 
 def test_given_driver_and_emulator_on_one_pty_then_the_driver_alone_holds_it(monkeypatch: pytest.MonkeyPatch) -> None:
     processes = [Path("/proc/7"), Path("/proc/8")]
-    monkeypatch.setattr(ports, "_holders", lambda _: processes)
-    monkeypatch.setattr(ports, "_shown", lambda process: process.name)
-    monkeypatch.setattr(ports, "_has_other_end", lambda process, _: process.name == "7")
-    assert ports.holders("/dev/pts/3") == ["8"]
-    assert ports.other_ends("/dev/pts/3") == ["7"]
+    monkeypatch.setattr(ports, "_find_processes", lambda _: processes)
+    monkeypatch.setattr(ports, "_describe_process", lambda process: process.name)
+    monkeypatch.setattr(ports, "_has_emulator_end", lambda process, _: process.name == "7")
+    assert ports.find_users("/dev/pts/3") == ["8"]
+    assert ports.find_emulators("/dev/pts/3") == ["7"]
 
 
-def test_given_a_port_whose_settings_are_refused_then_it_is_a_link_error(
+def test_given_a_port_whose_settings_are_rejected_then_it_is_a_link_error(
     monkeypatch: pytest.MonkeyPatch, pty: PtyLink
 ) -> None:
-    def refused(*_: object) -> None:
+    def fail(*_: object) -> None:
         # no OSError, and pyserial lets it through
         raise termios.error(errno.EINVAL, "Invalid argument")
 
-    monkeypatch.setattr(termios, "tcsetattr", refused)
-    with pytest.raises(LinkError, match="its settings are refused: Invalid argument; is it a serial port"):
+    monkeypatch.setattr(termios, "tcsetattr", fail)
+    with pytest.raises(LinkError, match="its settings are rejected: Invalid argument; is it a serial port"):
         SerialLink(pty.description, 9600).open()
 
 
@@ -304,7 +305,7 @@ def test_given_a_file_that_is_no_port_then_it_is_a_link_error(tmp_path: Path) ->
 
 
 def test_given_the_ports_of_this_machine_then_each_can_be_shown() -> None:
-    assert all(port.path and port.what for port in ports.found_ports())
+    assert all(port.path and port.description for port in ports.find_ports())
 
 
 # --- TCP ----------------------------------------------------------------------------------------------------
@@ -313,18 +314,18 @@ def test_given_the_ports_of_this_machine_then_each_can_be_shown() -> None:
 def test_given_a_server_when_called_then_bytes_go_both_ways_and_a_later_caller_takes_over(
     server: TcpServerLink,
 ) -> None:
-    server.send(b"nobody hears this")
+    server.send(b"no client is there")
     first, second = TcpLink("127.0.0.1", port_of(server)), TcpLink("127.0.0.1", port_of(server))
     first.open()
     first.send(b"hello")
-    assert b"".join(heard(server, 5)) == b"hello"
+    assert b"".join(receive(server, 5)) == b"hello"
     server.send(b"back")
-    assert b"".join(heard(first, 4)) == b"back"
+    assert b"".join(receive(first, 4)) == b"back"
     second.open()
     second.send(b"me too")
-    assert b"".join(heard(server, 6)) == b"me too"
-    assert "gone" in str(lost(first))
-    assert server.callers == 2
+    assert b"".join(receive(server, 6)) == b"me too"
+    assert "gone" in str(wait_for_loss(first))
+    assert server.clients_accepted == 2
     for link in (first, second):
         link.close()
 
@@ -334,7 +335,7 @@ def test_given_a_caller_who_goes_then_the_server_waits_for_another(server: TcpSe
         link = TcpLink("127.0.0.1", port_of(server))
         link.open()
         link.send(word)
-        assert b"".join(heard(server, 3)) == word
+        assert b"".join(receive(server, 3)) == word
         link.close()
 
 
@@ -348,7 +349,7 @@ def test_given_a_line_that_is_open_when_opened_again_then_it_stays_as_it_is(serv
     driver.close()
 
 
-def test_given_nobody_listens_then_it_says_so_and_a_port_in_use_is_named(server: TcpServerLink) -> None:
+def test_given_nobody_listens_then_it_is_reported_and_a_port_in_use_is_named(server: TcpServerLink) -> None:
     with pytest.raises(LinkError, match=f"port {port_of(server)} is in use"):
         TcpServerLink(port_of(server)).open()
     with socket.create_server(("127.0.0.1", 0)) as free:
@@ -394,7 +395,7 @@ def test_given_a_bus_then_frames_and_error_frames_come_as_they_were_sent(multica
     ]
     for frame in frames:
         one.send(frame)
-    found = heard(two, 4)
+    found = receive(two, 4)
     assert found == frames
     assert found[2].is_bus_off
     one.close()
@@ -402,45 +403,45 @@ def test_given_a_bus_then_frames_and_error_frames_come_as_they_were_sent(multica
 
 
 @pytest.mark.parametrize(
-    ("number", "said"),
+    ("number", "expected"),
     [
         (errno.ENODEV, "there is no such network interface"),
         (errno.ENETDOWN, "sudo ip link set can7 up"),
-        (errno.ENOBUFS, "nobody acknowledges"),
+        (errno.ENOBUFS, "not acknowledged"),
         (errno.EPERM, "permission denied"),
         (errno.EAFNOSUPPORT, "sudo modprobe -a can can_raw"),
         (-2, "python-can's documentation"),
     ],
 )
-def test_given_an_interface_that_cannot_be_used_then_it_says_what_to_do(
-    number: int, said: str, monkeypatch: pytest.MonkeyPatch
+def test_given_an_interface_that_cannot_be_used_then_the_fix_is_reported(
+    number: int, expected: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(**_: object) -> None:
+    def fail(**_: object) -> None:
         raise OSError(number, "name or service not known" if number < 0 else os.strerror(number))
 
-    monkeypatch.setattr(can_module.can, "Bus", refused)
-    with pytest.raises(LinkError, match=said):
+    monkeypatch.setattr(can_module.can, "Bus", fail)
+    with pytest.raises(LinkError, match=expected):
         CanLink("can7").open()
 
 
-def test_given_a_mistyped_interface_then_the_nearest_is_told() -> None:
+def test_given_a_mistyped_interface_then_the_nearest_is_reported() -> None:
     with pytest.raises(LinkError, match="write socketcan"):
         CanLink("can0", "soketcan").open()
 
 
 @pytest.mark.parametrize(
-    ("channel", "interface", "said"),
+    ("channel", "interface", "expected"),
     [
         ("can0", "udp_multicast", "GROUP:PORT"),
         ("239.74.163.9", "socketcan", "modelserver emulate --interface udp_multicast"),
     ],
 )
-def test_given_a_channel_of_another_interface_then_it_says_which(channel: str, interface: str, said: str) -> None:
-    with pytest.raises(LinkError, match=said):
+def test_given_a_channel_of_another_interface_then_it_is_named(channel: str, interface: str, expected: str) -> None:
+    with pytest.raises(LinkError, match=expected):
         CanLink(channel, interface).open()
 
 
-def test_given_a_bus_that_cannot_be_opened_then_python_can_says_nothing_beside(
+def test_given_a_bus_that_cannot_be_opened_then_python_can_logs_nothing(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     for _ in range(3):
@@ -455,7 +456,7 @@ def test_given_a_bus_that_cannot_be_opened_then_python_can_says_nothing_beside(
 @pytest.fixture
 def modbus(server: TcpServerLink) -> Iterator[tuple[ModbusLink, ModbusServerLink]]:
     device = ModbusServerLink(server)
-    driver = modbus_link("127.0.0.1", port_of(server), 7)
+    driver = make_modbus_link("127.0.0.1", port_of(server), 7)
     driver.open()
     yield driver, device
     driver.close()
@@ -464,35 +465,35 @@ def modbus(server: TcpServerLink) -> Iterator[tuple[ModbusLink, ModbusServerLink
 def test_given_requests_then_each_has_its_reply_in_any_order(modbus: tuple[ModbusLink, ModbusServerLink]) -> None:
     driver, device = modbus
     requests: list[ModbusUnit] = [
-        ReadRegisters(5, 3, Table.INPUT, 70_001),
+        ReadRegisters(5, 3, RegisterTable.INPUT, 70_001),
         ReadRegisters(6, 2, transaction=70_002),
         WriteRegisters(9, (1, 2, 65_535), 70_003),
     ]
     for request in requests:
         driver.send(request)
-    came = heard(device, 3)
-    assert came[0] == ReadRegisters(5, 3, Table.INPUT, 70_001 & 0xFFFF)
+    came = receive(device, 3)
+    assert came[0] == ReadRegisters(5, 3, RegisterTable.INPUT, 70_001 & 0xFFFF)
     assert came[2] == WriteRegisters(9, (1, 2, 65_535), 70_003 & 0xFFFF)
     numbers = [unit.transaction for unit in came]
-    device.send(Written(9, 3, numbers[2]))
+    device.send(RegistersWritten(9, 3, numbers[2]))
     device.send(ModbusFailure(FailureKind.EXCEPTION, code=2, transaction=numbers[1]))
     device.send(Registers(5, (7, 8, 9), numbers[0]))
-    written, failure, registers = heard(driver, 3)
-    assert written == Written(9, 3, 70_003)
+    written, failure, registers = receive(driver, 3)
+    assert written == RegistersWritten(9, 3, 70_003)
     assert registers == Registers(5, (7, 8, 9), 70_001)
     assert (failure.kind, failure.code, failure.transaction) == (FailureKind.EXCEPTION, 2, 70_002)
     assert "no such register" in failure.text
 
 
-def test_given_no_reply_then_silence_is_told_once(server: TcpServerLink) -> None:
+def test_given_no_reply_then_silence_is_reported_once(server: TcpServerLink) -> None:
     now = [0]
     driver = ModbusLink(TcpLink("127.0.0.1", port_of(server)), 1, lambda: now[0])
     driver.open()
     driver.send(ReadRegisters(1, 1, transaction=4))
     assert driver.poll(0.0) == []
-    now[0] = round(ANSWER_S * 1e9)
+    now[0] = round(REPLY_TIMEOUT_S * 1e9)
     (failure,) = driver.poll(0.0)
-    assert (failure.kind, failure.transaction) == (FailureKind.SILENCE, 4)
+    assert (failure.kind, failure.transaction) == (FailureKind.TIMEOUT, 4)
     assert driver.poll(0.0) == []
     driver.close()
 
@@ -511,27 +512,29 @@ def test_given_a_request_that_is_not_served_then_an_exception_is_the_answer(
     caller = TcpLink("127.0.0.1", port_of(server))
     caller.open()
     caller.send(request_bytes)
-    reply = b"".join(heard(caller, 9, device))
+    reply = b"".join(receive(caller, 9, device))
     assert reply[:2] == b"\x00\x01"
     assert reply[7] == request_bytes[7] | 0x80
     assert reply[8] == code
     caller.close()
 
 
-def test_given_bytes_that_are_no_modbus_then_the_driver_says_so_and_the_device_hangs_up(server: TcpServerLink) -> None:
-    driver = modbus_link("127.0.0.1", port_of(server), 1)
+def test_given_bytes_that_are_no_modbus_then_the_driver_reports_it_and_the_device_hangs_up(
+    server: TcpServerLink,
+) -> None:
+    driver = make_modbus_link("127.0.0.1", port_of(server), 1)
     driver.open()
     driver.send(ReadRegisters(1, 1, transaction=4))
-    heard(server, 12)
+    receive(server, 12)
     server.send(b"GET / HTTP/1.1\r\n")
-    assert "not Modbus/TCP" in str(lost(driver))
+    assert "not Modbus/TCP" in str(wait_for_loss(driver))
     driver.close()
     caller = TcpLink("127.0.0.1", port_of(server))
     caller.open()
     caller.send(b"GET / HTTP/1.1\r\n")
     device = ModbusServerLink(server)
     with pytest.raises(LinkError):
-        heard(caller, 1, device)
+        receive(caller, 1, device)
     caller.close()
 
 

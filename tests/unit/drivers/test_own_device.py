@@ -1,4 +1,4 @@
-"""The example of a device of one's own: it runs, stays short, and does what docs/own-device.md says."""
+"""The example of a new device: it runs, stays short, and does what docs/own-device.md describes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modelserver.messages import DriverPhase, Sample, SensorHeader, WheelSample, WheelsSample
-from msdrivers.faults import InjectedFault
-from msdrivers.links.fake import FakeLink, FakeTime
-from msdrivers.protocol.framing import Scanner
-from msdrivers.registry import KINDS, Emulation
+from msdrivers.endpoint import HostTime, Send
+from msdrivers.fault_injection import InjectedFault
+from msdrivers.links.fake import FakeLink, FakeTimeSource
+from msdrivers.protocol.framing import FrameScanner
+from msdrivers.registry import KINDS, EmulatorInputs
 from msdrivers.runner import Runner, RunnerSettings
 from msdrivers.settings import read_driver
-from msdrivers.station import Now, Send
 
 ROOT = Path(__file__).resolve().parents[3]
 EXAMPLE = ROOT / "examples" / "python" / "own_device.py"
@@ -40,22 +40,24 @@ def _samples(*speeds: float) -> list[WheelsSample]:
     ]
 
 
-def _said(unit: Any) -> list[tuple[float, bytes]]:
-    """Return what the emulated device says, with the seconds of the monotonic clock."""
+def _run_emulator(unit: Any) -> list[tuple[float, bytes]]:
+    """Return the output of the emulated device, with the seconds of the monotonic clock."""
     monotonic_ns, coming = 1_000_000_000, []
-    unit.opened(Now(monotonic_ns, START_US))
-    while (due := unit.due()) is not None:
-        now = Now(due, START_US + (due - monotonic_ns) // 1000)
-        coming += [(due * 1e-9, each.unit) for each in unit.woken(now) if isinstance(each, Send)]
+    unit.on_open(HostTime(monotonic_ns, START_US))
+    while (due := unit.get_deadline()) is not None:
+        now = HostTime(due, START_US + (due - monotonic_ns) // 1000)
+        coming += [(due * 1e-9, each.unit) for each in unit.on_timer(now) if isinstance(each, Send)]
     return coming
 
 
-def _driven(coming: list[tuple[float, bytes]], seconds: float) -> tuple[Runner[bytes], list[Sample], FakeTime]:
-    time, published = FakeTime(START_US), list[Sample]()
+def _run_driver(
+    coming: list[tuple[float, bytes]], seconds: float
+) -> tuple[Runner[bytes], list[Sample], FakeTimeSource]:
+    time, published = FakeTimeSource(START_US), list[Sample]()
     driver = OWN["SpeedDriver"](OWN["SpeedSettings"]("radar"))
     runner = Runner(driver, FakeLink(time, coming), RunnerSettings("radar", "speed"), time, published.append)
     while time.monotonic_ns < round((1.0 + seconds) * 1e9):
-        runner.turn()
+        runner.run_once()
     return runner, published, time
 
 
@@ -75,32 +77,34 @@ def test_given_the_example_then_it_runs_and_is_short() -> None:
 
 
 def test_given_driver_and_emulator_on_one_line_then_the_speeds_arrive_with_their_instants() -> None:
-    unit = OWN["KIND"].emulate(Emulation(None, ROOT, _samples(1.0, -0.5, 2.25)))
-    _, published, _ = _driven(_said(unit), 0.5)
+    unit = OWN["KIND"].make_emulator(EmulatorInputs(None, ROOT, _samples(1.0, -0.5, 2.25)))
+    _, published, _ = _run_driver(_run_emulator(unit), 0.5)
     assert _speeds(published) == [1.0, -0.5, 2.25]
-    # without a device's time: the reception less the delay of the settings
+    # without a device time: the receive time minus the configured delay
     assert [each.header.utime for each in published] == [START_US + 1000 * ms for ms in (70, 170, 270)]
     assert all(math.isclose(each.header.utime_sigma, 0.01) for each in published)
 
 
 def test_given_a_damaged_line_then_it_is_counted_and_the_next_one_taken() -> None:
-    unit = OWN["KIND"].emulate(Emulation(None, ROOT, _samples(1.0, 2.0, 3.0), (InjectedFault(0.15, "corrupt", 1.0),)))
-    runner, published, time = _driven(_said(unit), 0.5)
+    unit = OWN["KIND"].make_emulator(
+        EmulatorInputs(None, ROOT, _samples(1.0, 2.0, 3.0), (InjectedFault(0.15, "corrupt", 1.0),))
+    )
+    runner, published, time = _run_driver(_run_emulator(unit), 0.5)
     assert _speeds(published) == [1.0, 3.0]
-    counters = dict(runner.health(time.now()).counters)
+    counters = dict(runner.make_health(time.now()).counters)
     assert sum(count for name, count in counters.items() if name.startswith("rejected.")) == 1
 
 
-@pytest.mark.parametrize("said", ["SPD,nan", "SPD,inf", "SPD,1e9", "SPD,1_0", "SPD, 1.00", "1.00", "SPD,", "XYZ,1.00"])
-def test_given_a_line_that_is_right_by_its_checksum_alone_then_it_is_refused(said: str) -> None:
-    body = said.encode()
-    scanner = Scanner[float]([OWN["SpeedFormat"]()])
+@pytest.mark.parametrize("line", ["SPD,nan", "SPD,inf", "SPD,1e9", "SPD,1_0", "SPD, 1.00", "1.00", "SPD,", "XYZ,1.00"])
+def test_given_a_line_that_is_right_by_its_checksum_alone_then_it_is_rejected(line: str) -> None:
+    body = line.encode()
+    scanner = FrameScanner[float]([OWN["SpeedFormat"]()])
     assert scanner.feed(b"$%b*%02X\r\n" % (body, reduce(xor, body))) == []
     assert scanner.counts["rejected.content"] == 1
 
 
 @pytest.mark.slow
-def test_given_the_program_of_the_page_and_a_mistyped_key_then_it_says_so_with_its_line(tmp_path: Path) -> None:
+def test_given_the_program_of_the_page_and_a_mistyped_key_then_it_is_reported_with_its_line(tmp_path: Path) -> None:
     (code,) = re.findall(
         r"```python\n(.*?)```", (ROOT / "docs" / "own-device.md").read_text(encoding="utf-8"), re.DOTALL
     )
@@ -123,30 +127,30 @@ def test_given_the_program_of_the_page_and_a_mistyped_key_then_it_says_so_with_i
     )
 
 
-def test_given_silence_then_it_is_told_and_ends_with_the_next_speed() -> None:
-    unit = OWN["KIND"].emulate(Emulation(None, ROOT, _samples(1.0)))
-    coming = [*_said(unit), (4.0, OWN["line"](2.0))]
-    runner, _, time = _driven(coming, 2.0)
-    report = runner.health(time.now())
+def test_given_silence_then_it_is_reported_and_ends_with_the_next_speed() -> None:
+    unit = OWN["KIND"].make_emulator(EmulatorInputs(None, ROOT, _samples(1.0)))
+    coming = [*_run_emulator(unit), (4.0, OWN["encode_speed"](2.0))]
+    runner, _, time = _run_driver(coming, 2.0)
+    report = runner.make_health(time.now())
     assert report.phase is DriverPhase.SILENT
     assert "no $SPD for 1 s" in report.text
     while time.monotonic_ns < 4_100_000_000:
-        runner.turn()
-    assert runner.health(time.now()).phase is DriverPhase.STREAMING
+        runner.run_once()
+    assert runner.make_health(time.now()).phase is DriverPhase.STREAMING
 
 
 def test_given_a_section_of_the_vehicle_file_then_its_settings_are_read() -> None:
     section = {"device": "speed", "port": "/dev/ttyUSB2", "wheel": "speed", "delay": 0.02}
     settings = read_driver("radar", section, kinds={**KINDS, "speed": OWN["KIND"]})
-    assert settings.station == OWN["SpeedSettings"]("radar", delay=0.02)
+    assert settings.device_settings == OWN["SpeedSettings"]("radar", delay=0.02)
 
 
-@given(st.lists(st.one_of(st.binary(max_size=40), st.just(OWN["line"](1.5))), max_size=8), st.integers(1, 20))
+@given(st.lists(st.one_of(st.binary(max_size=40), st.just(OWN["encode_speed"](1.5))), max_size=8), st.integers(1, 20))
 def test_given_any_bytes_then_pieces_give_the_same_as_the_whole(parts: list[bytes], size: int) -> None:
     data = b"".join(parts)
-    whole, pieces = (Scanner[float]([OWN["SpeedFormat"]()]) for _ in range(2))
+    whole, pieces = (FrameScanner[float]([OWN["SpeedFormat"]()]) for _ in range(2))
     expected = whole.feed(data)
     got = [speed for at in range(0, len(data), size) for speed in pieces.feed(data[at : at + size])]
     assert got == pytest.approx(expected, nan_ok=True)
     assert pieces.counts == whole.counts
-    assert pieces.waiting <= OWN["LONGEST"]
+    assert pieces.pending_bytes <= OWN["MAX_FRAME_LENGTH"]

@@ -11,24 +11,32 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modelserver.errors import RecordingError
-from msdrivers.lines import CanForm, ModbusForm
-from msdrivers.links import LinkError, PlayedOutError
-from msdrivers.links.fake import FakeLink, FakeTime
-from msdrivers.links.recorded import PlayedLink, RecordingLink
+from msdrivers.endpoint import HostTime
+from msdrivers.factory import CanFrameCodec, ModbusCodec
+from msdrivers.links import EndOfRecordingError, LinkError
+from msdrivers.links.fake import FakeLink, FakeTimeSource
 from msdrivers.protocol.can.frame import CanFrame
-from msdrivers.protocol.modbus.registers import FailureKind, ModbusFailure, ReadRegisters, Registers, Table
-from msdrivers.raw_log import BytesForm, RawReader, RawWriter, RecordDirection, open_for_reading, recording
-from msdrivers.station import Now
+from msdrivers.protocol.modbus.registers import FailureKind, ModbusFailure, ReadRegisters, Registers, RegisterTable
+from msdrivers.raw_log import (
+    BytesCodec,
+    RawReader,
+    RawWriter,
+    RecordDirection,
+    RecordingLink,
+    ReplayLink,
+    open_for_reading,
+    open_for_writing,
+)
 
 
-def recorded(limit: int = 1 << 20) -> tuple[str, RawWriter]:
-    time = FakeTime()
+def make_recording(limit: int = 1 << 20) -> tuple[str, RawWriter]:
+    time = FakeTimeSource()
     start = time.monotonic_ns * 1e-9
     stream = io.StringIO()
     writer = RawWriter(stream, limit, "x")
     writer.begin("bytes", "gps", "novatel")
     units = [(start + 0.5, b"one"), (start + 0.75, b"two"), (start + 3.0, b"\x00\xff")]
-    link = RecordingLink(FakeLink(time, units), BytesForm(), writer, time)
+    link = RecordingLink(FakeLink(time, units), BytesCodec(), writer, time)
     link.open(38400)
     link.send(b"log")
     while time.monotonic_ns * 1e-9 < start + 4.0:
@@ -38,40 +46,40 @@ def recorded(limit: int = 1 << 20) -> tuple[str, RawWriter]:
 
 
 def test_given_a_line_when_recorded_then_all_of_it_stands_there_with_times() -> None:
-    text, _ = recorded()
+    text, _ = make_recording()
     reader = RawReader(io.StringIO(text), "x")
     records = list(reader)
     assert (reader.kind, reader.source, reader.device, reader.damaged) == ("bytes", "gps", "novatel", 0)
-    assert [(record.way, record.data) for record in records] == [
-        (RecordDirection.WORD, b"open fake 38400"),
+    assert [(record.direction, record.data) for record in records] == [
+        (RecordDirection.EVENT, b"open fake 38400"),
         (RecordDirection.SENT, b"log"),
         (RecordDirection.RECEIVED, b"one"),
         (RecordDirection.RECEIVED, b"two"),
         (RecordDirection.RECEIVED, b"\x00\xff"),
-        (RecordDirection.WORD, b"close"),
+        (RecordDirection.EVENT, b"close"),
     ]
-    received = [record.now for record in records if record.way is RecordDirection.RECEIVED]
+    received = [record.time for record in records if record.direction is RecordDirection.RECEIVED]
     assert received[1].utime - received[0].utime == 250_000
     assert received[1].monotonic_ns - received[0].monotonic_ns == 250_000_000
 
 
 def test_given_a_recording_when_played_then_units_come_as_long_after_each_other_and_then_it_ends() -> None:
-    text, _ = recorded()
-    time = FakeTime(monotonic_ns=77_000_000_000)
-    link = PlayedLink(RawReader(io.StringIO(text), "x"), BytesForm().unpack, time)
+    text, _ = make_recording()
+    time = FakeTimeSource(monotonic_ns=77_000_000_000)
+    link = ReplayLink(RawReader(io.StringIO(text), "x"), BytesCodec().unpack, time)
     link.open()
-    heard = []
-    while len(heard) < 3:
-        heard += [(time.monotonic_ns, unit) for unit in link.poll(0.2)]
+    received = []
+    while len(received) < 3:
+        received += [(time.monotonic_ns, unit) for unit in link.poll(0.2)]
         link.send(b"goes nowhere")
-    with pytest.raises(PlayedOutError, match=r"the recording has ended$"):
+    with pytest.raises(EndOfRecordingError, match=r"the recording has ended$"):
         link.poll(0.2)
-    assert heard == [(77_000_000_000, b"one"), (77_250_000_000, b"two"), (79_500_000_000, b"\x00\xff")]
+    assert received == [(77_000_000_000, b"one"), (77_250_000_000, b"two"), (79_500_000_000, b"\x00\xff")]
 
 
 @given(st.integers(0, 400))
 def test_given_a_recording_cut_anywhere_then_all_before_is_read(length: int) -> None:
-    text, _ = recorded()
+    text, _ = make_recording()
     cut = text[: min(length, len(text))]
     try:
         records = list(RawReader(io.StringIO(cut), "x"))
@@ -82,7 +90,7 @@ def test_given_a_recording_cut_anywhere_then_all_before_is_read(length: int) -> 
 
 
 def test_given_damaged_lines_then_they_are_counted_and_the_others_read() -> None:
-    text, _ = recorded()
+    text, _ = make_recording()
     lines = text.splitlines(keepends=True)
     lines[3:3] = ["< 1 2 zz\n", "nonsense\n", "? 1 2 00\n", "< x 2 00\n", "\n"]
     reader = RawReader(io.StringIO("".join(lines)), "x")
@@ -91,9 +99,9 @@ def test_given_damaged_lines_then_they_are_counted_and_the_others_read() -> None
 
 
 def test_given_a_limit_then_the_recording_is_no_larger_and_whole() -> None:
-    text, writer = recorded(limit=150)
+    text, writer = make_recording(limit=150)
     assert len(text) <= 150
-    assert writer.full
+    assert writer.is_full
     assert text.endswith("\n")
     assert len(list(RawReader(io.StringIO(text), "x"))) >= 1
 
@@ -101,18 +109,18 @@ def test_given_a_limit_then_the_recording_is_no_larger_and_whole() -> None:
 def played_out(lines: list[str]) -> Exception:
     """Return how the playing of a recording with these lines ends."""
     text = "".join(["# modelserver raw 1 can wheels wheels\n", *lines])
-    link = PlayedLink(RawReader(io.StringIO(text), "w.raw"), CanForm().unpack, FakeTime())
+    link = ReplayLink(RawReader(io.StringIO(text), "w.raw"), CanFrameCodec().unpack, FakeTimeSource())
     try:
         while True:
             link.poll(10.0)
-    except (PlayedOutError, RecordingError) as error:
+    except (EndOfRecordingError, RecordingError) as error:
         return error
 
 
-def test_given_damage_in_a_recording_when_played_then_its_end_says_how_much() -> None:
+def test_given_damage_in_a_recording_when_played_then_its_end_reports_how_much() -> None:
     ended = played_out(["< 1 2 0000010000ff\n", "< 1 3 00\n", "nonsense\n"])
-    assert isinstance(ended, PlayedOutError)
-    assert ended.why == "the recording has ended; 2 damaged lines of it were left out"
+    assert isinstance(ended, EndOfRecordingError)
+    assert ended.reason == "the recording has ended; 2 damaged lines of it were left out"
 
 
 @pytest.mark.parametrize(
@@ -139,36 +147,36 @@ class FullDisk(io.StringIO):
         return super().write(text)
 
 
-def test_given_a_full_disk_then_the_recording_ends_it_is_told_once_and_the_line_goes_on(
+def test_given_a_full_disk_then_the_recording_ends_it_is_reported_once_and_the_line_goes_on(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     writer = RawWriter(FullDisk(2), 1 << 20, "gps.raw")
     writer.begin("bytes", "gps", "novatel")
-    time = FakeTime()
-    link = RecordingLink(FakeLink(time, [(1.5, b"one"), (1.6, b"two")]), BytesForm(), writer, time)
+    time = FakeTimeSource()
+    link = RecordingLink(FakeLink(time, [(1.5, b"one"), (1.6, b"two")]), BytesCodec(), writer, time)
     link.open()
     assert [*link.poll(1.0), *link.poll(1.0)] == [b"one", b"two"]
     link.send(b"log")
     writer.close()
-    assert writer.full
+    assert writer.is_full
     assert [(record.levelname, record.message) for record in caplog.records] == [
-        ("WARNING", "recording gps.raw ended: No space left on device; the driver goes on"),
-        ("WARNING", "recording gps.raw: 3 records came after its end and are not in it"),
+        ("WARNING", "recording gps.raw ended: No space left on device; the driver continues"),
+        ("WARNING", "recording gps.raw: 3 records after its end were dropped"),
     ]
 
 
-def test_given_a_limit_that_is_reached_then_it_is_told(caplog: pytest.LogCaptureFixture) -> None:
-    recorded(limit=150)
+def test_given_a_limit_that_is_reached_then_it_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+    make_recording(limit=150)
     assert [record.message for record in caplog.records][:1] == [
-        "recording x ended: it has its 0.00015 MB, see --record-limit; the driver goes on"
+        "recording x ended: it has its 0.00015 MB, see --record-limit; the driver continues"
     ]
 
 
 def keep(path: Path, *units: bytes) -> None:
-    with recording(path, 1 << 20) as writer:
+    with open_for_writing(path, 1 << 20) as writer:
         writer.begin("bytes", "gps", "novatel")
         for unit in units:
-            writer.record(RecordDirection.RECEIVED, Now(1, 2), unit)
+            writer.record(RecordDirection.RECEIVED, HostTime(1, 2), unit)
 
 
 def test_given_a_recording_of_that_name_then_it_stays_and_the_next_has_a_number(
@@ -207,10 +215,10 @@ def test_given_nothing_to_record_then_no_file_is_left(tmp_path: Path) -> None:
 
 
 def test_given_a_line_that_cannot_be_opened_then_nothing_is_recorded() -> None:
-    stream, time = io.StringIO(), FakeTime()
+    stream, time = io.StringIO(), FakeTimeSource()
     link = FakeLink[bytes](time)
-    link.gone = [(0.0, 1e9)]
-    recorded_link = RecordingLink(link, BytesForm(), RawWriter(stream, 1 << 20), time)
+    link.outages = [(0.0, 1e9)]
+    recorded_link = RecordingLink(link, BytesCodec(), RawWriter(stream, 1 << 20), time)
     for _ in range(3):
         with pytest.raises(LinkError):
             recorded_link.open()
@@ -238,24 +246,24 @@ def test_given_another_file_then_it_is_no_recording(text: str, tmp_path: Path) -
     [CanFrame(0x123, b"\x01\x02"), CanFrame(0x1FFFFFFF, b"", is_extended=True), CanFrame(0x40, is_error=True)],
 )
 def test_given_a_can_frame_then_its_form_keeps_all_of_it(frame: CanFrame) -> None:
-    assert CanForm().unpack(CanForm().pack(frame)) == frame
+    assert CanFrameCodec().unpack(CanFrameCodec().pack(frame)) == frame
 
 
 @pytest.mark.parametrize(
     "unit",
     [
-        ReadRegisters(5, 3, Table.INPUT, 77),
+        ReadRegisters(5, 3, RegisterTable.INPUT, 77),
         Registers(5, (1, 65535), 77),
         ModbusFailure(FailureKind.EXCEPTION, "no such register", 2, 77),
     ],
 )
 def test_given_a_modbus_unit_then_its_form_keeps_all_of_it(unit: ReadRegisters | Registers | ModbusFailure) -> None:
-    assert ModbusForm().unpack(ModbusForm().pack(unit)) == unit
+    assert ModbusCodec().unpack(ModbusCodec().pack(unit)) == unit
 
 
 @given(st.binary(max_size=40))
-def test_given_any_bytes_then_a_form_refuses_or_takes_them(data: bytes) -> None:
-    for form in (CanForm(), ModbusForm()):
+def test_given_any_bytes_then_a_form_rejects_or_takes_them(data: bytes) -> None:
+    for form in (CanFrameCodec(), ModbusCodec()):
         try:
             form.unpack(data)
         except ValueError:

@@ -1,4 +1,4 @@
-"""The runner on lines that go and come, fail in their own way or are quiet, and what it tells of them."""
+"""The runner on links that are lost repeatedly, raise other exceptions or are silent, and its reports."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from modelserver.messages import DriverPhase, VehicleCommand
 from msdrivers.devices.axis import AxisDriver
 from msdrivers.devices.gps import GpsDriver, GpsSettings
 from msdrivers.devices.wheels import WheelsDriver
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, HasMaxSilence, HostTime, Output, Reopen, Send
 from msdrivers.links import LinkError
-from msdrivers.station import Now, Output, Quiet, Reopen, Send, StationPhase, StationStatus
 
 
 @dataclass
 class Rare(Echo):
     """A station of a device that may be quiet for long."""
 
-    quiet: float = math.inf
+    max_silence: float = math.inf
 
 
 @dataclass
@@ -33,12 +33,12 @@ class Broken(Echo):
 
     opened_at: list[float] = field(default_factory=list)
 
-    def opened(self, now: Now) -> Sequence[Output[bytes]]:
+    def on_open(self, now: HostTime) -> Sequence[Output[bytes]]:
         self.opened_at.append(now.monotonic_ns * 1e-9)
-        return [StationStatus(StationPhase.WAITING, "asks"), Send(b"on")]
+        return [EndpointStatus(EndpointPhase.WAITING, "asks"), Send(b"on")]
 
-    def received(self, unit: bytes, now: Now) -> Sequence[Output[bytes]]:
-        return [StationStatus(StationPhase.SILENT, "that is no answer"), Reopen("that is no answer")]
+    def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
+        return [EndpointStatus(EndpointPhase.SILENT, "that is no answer"), Reopen("that is no answer")]
 
 
 def answering(bench: Bench) -> None:
@@ -47,8 +47,8 @@ def answering(bench: Bench) -> None:
 
     def answers(unit: bytes) -> None:
         send(unit)
-        bench.link.coming.clear()
-        bench.link.coming.append((bench.now + 0.001, b"x"))
+        bench.link.incoming.clear()
+        bench.link.incoming.append((bench.now + 0.001, b"x"))
 
     bench.link.send = answers  # type: ignore[method-assign]
 
@@ -57,30 +57,34 @@ def answering(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("quiet", [math.inf, 60.0])
-def test_given_a_device_that_may_be_quiet_then_its_line_stays_open_and_no_silence_is_told(quiet: float) -> None:
-    bench = Bench(0.0, echo=Rare(quiet=quiet)).until(50.0)
-    assert bench.link.opened == [None]
+def test_given_a_device_that_may_be_quiet_then_its_line_stays_open_and_no_silence_is_reported(quiet: float) -> None:
+    bench = Bench(0.0, echo=Rare(max_silence=quiet)).until(50.0)
+    assert bench.link.opened_bauds == [None]
     assert DriverPhase.SILENT not in bench.phases()
 
 
-def test_given_a_device_that_is_quiet_longer_than_it_may_be_then_the_line_is_opened_anew() -> None:
-    bench = Bench(0.0, echo=Rare(quiet=20.0)).until(45.0)
-    assert bench.link.opened == [None, None]
-    assert next(each.text for each in bench.reports if each.phase is DriverPhase.SILENT) == "nothing heard for 20 s"
+def test_given_a_device_that_is_quiet_longer_than_it_may_be_then_the_line_is_reopened() -> None:
+    bench = Bench(0.0, echo=Rare(max_silence=20.0)).until(45.0)
+    assert bench.link.opened_bauds == [None, None]
+    assert next(each.text for each in bench.reports if each.phase is DriverPhase.SILENT) == "nothing received for 20 s"
 
 
-def test_given_the_stations_of_devices_then_those_that_may_be_quiet_say_for_how_long() -> None:
+def test_given_the_stations_of_devices_then_those_that_may_be_quiet_report_for_how_long() -> None:
     rare = GpsDriver(GpsSettings("gps", rate_hz=0.1, silence=20.0))
     axis = AxisDriver(axis_settings(silence=30.0))
     wheels = WheelsDriver(wheels_settings(silence=60.0), raptor_dbc())
-    assert [station.quiet for station in (rare, axis, wheels) if isinstance(station, Quiet)] == [20.0, 30.0, 60.0]
+    assert [station.max_silence for station in (rare, axis, wheels) if isinstance(station, HasMaxSilence)] == [
+        20.0,
+        30.0,
+        60.0,
+    ]
 
 
 # --- errors that are no LinkError --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("what", ["open", "poll", "send"])
-def test_given_a_line_that_fails_in_its_own_way_then_it_is_counted_told_and_tried_again(
+def test_given_a_line_that_fails_in_its_own_way_then_it_is_counted_reported_and_tried_again(
     what: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     bench = Bench(20.0)
@@ -109,7 +113,7 @@ def test_given_a_line_that_cannot_be_closed_then_the_driver_goes_on() -> None:
         raise NameError("of a library")
 
     bench.link.close = raises  # type: ignore[method-assign]
-    bench.link.gone = [(1.0, 1.5)]
+    bench.link.outages = [(1.0, 1.5)]
     bench.runner.run(lambda: bench.runner.stop() if bench.now > 4.0 else None)
     assert bench.runner.counts["errors.link.close"] == 3
     assert bench.reports[-1].text == "ended"
@@ -128,18 +132,18 @@ def test_given_a_line_that_is_unusable_at_each_opening_then_it_is_tried_with_gro
     assert len(bench.reports) < 200
 
 
-def test_given_a_flood_of_words_then_reports_and_log_are_few_and_the_last_is_told(
+def test_given_a_flood_of_words_then_reports_and_log_are_few_and_the_last_is_reported(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     bench = Bench(0.0).until(0.1)
-    bench.link.coming.extend((0.1 + 0.001 * n, b"x") for n in range(3000))
+    bench.link.incoming.extend((0.1 + 0.001 * n, b"x") for n in range(3000))
     words = iter(range(10_000))
-    received = bench.echo.received
+    received = bench.echo.on_receive
 
-    def talks(unit: bytes, now: Now) -> Sequence[Output[bytes]]:
-        return [*received(unit, now), StationStatus(StationPhase.STREAMING, f"word {next(words)}")]
+    def talks(unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
+        return [*received(unit, now), EndpointStatus(EndpointPhase.STREAMING, f"word {next(words)}")]
 
-    bench.echo.received = talks  # type: ignore[method-assign]
+    bench.echo.on_receive = talks  # type: ignore[method-assign]
     with caplog.at_level(logging.INFO):
         bench.until(5.0)
     assert len(bench.reports) < 60
@@ -153,12 +157,12 @@ def flapping(bench: Bench, seconds: float) -> None:
 
     def opens(baud: int | None = None) -> None:
         opened(baud)
-        bench.link.gone = [(bench.now + seconds, bench.now + seconds + 0.01)]
+        bench.link.outages = [(bench.now + seconds, bench.now + seconds + 0.01)]
 
     bench.link.open = opens  # type: ignore[method-assign]
 
 
-def test_given_a_line_that_goes_and_comes_then_that_is_told_and_the_log_is_not_filled(
+def test_given_a_line_that_is_repeatedly_lost_then_that_is_reported_and_the_log_is_not_filled(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     bench = Bench(60.0)
@@ -166,16 +170,16 @@ def test_given_a_line_that_goes_and_comes_then_that_is_told_and_the_log_is_not_f
     with caplog.at_level(logging.INFO):
         bench.until(60.0)
     assert bench.runner.reconnects > 60
-    said = [record.getMessage() for record in caplog.records]
-    assert len(said) < 20
-    (third, tenth_after, *_) = [each for each in said if "does another program use it?" in each]
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) < 20
+    (third, tenth_after, *_) = [each for each in messages if "does another program use it?" in each]
     assert "; opened and closed 3 times in " in third
     assert "; opened and closed 12 times in " in tenth_after
     closed = [each.text for each in bench.reports if each.phase is DriverPhase.CLOSED]
     assert any("opened and closed 50 times" in text for text in closed)
 
 
-def test_given_a_line_that_is_steady_again_then_what_it_tells_is_logged_again(
+def test_given_a_line_that_is_steady_again_then_its_states_are_logged_again(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     bench = Bench(100.0)
@@ -183,60 +187,60 @@ def test_given_a_line_that_is_steady_again_then_what_it_tells_is_logged_again(
     flapping(bench, 0.25)
     bench.until(10.0)
     bench.link.open = opened  # type: ignore[method-assign]
-    assert logged(caplog, lambda: bench.until(20.0)) == [("INFO", "imu: streaming: comes")]
-    bench.link.gone = [(bench.now, bench.now + 0.1)]
-    said = [text for _, text in logged(caplog, lambda: bench.until(30.0))]
-    assert len(said) == 4
-    assert said[0] == "imu: closed: fake: it is away; waiting for its return"
+    assert collect_log(caplog, lambda: bench.until(20.0)) == [("INFO", "imu: streaming: comes")]
+    bench.link.outages = [(bench.now, bench.now + 0.1)]
+    messages = [text for _, text in collect_log(caplog, lambda: bench.until(30.0))]
+    assert len(messages) == 4
+    assert messages[0] == "imu: closed: fake: it is away; waiting for its return"
 
 
-# --- what is trouble ---------------------------------------------------------------------------------------------
+# --- warnings ---------------------------------------------------------------------------------------------
 
 
-def logged(caplog: pytest.LogCaptureFixture, do: Callable[[], object]) -> list[tuple[str, str]]:
+def collect_log(caplog: pytest.LogCaptureFixture, do: Callable[[], object]) -> list[tuple[str, str]]:
     caplog.clear()
     with caplog.at_level(logging.INFO):
         do()
     return [(record.levelname, record.getMessage()) for record in caplog.records]
 
 
-def test_given_a_word_of_trouble_then_it_is_a_warning_and_stands_beside_the_silence_that_follows(
+def test_given_a_warning_then_it_is_a_warning_and_stands_beside_the_silence_that_follows(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     bench = Bench(0.5)
-    bench.echo.extra = [StationStatus(StationPhase.CONFIGURING, "the device refuses 'log'", is_trouble=True)]
+    bench.echo.extra = [EndpointStatus(EndpointPhase.CONFIGURING, "the device refuses 'log'", is_warning=True)]
     bench.echo.fails = lambda unit: bench.echo.seq > 0
-    said = logged(caplog, lambda: bench.until(5.0))
-    assert ("WARNING", "imu: configuring: the device refuses 'log'") in said
-    silent = ("WARNING", "imu: silent: nothing heard for 3 s; before that: the device refuses 'log'")
-    assert said[-1] == silent
+    messages = collect_log(caplog, lambda: bench.until(5.0))
+    assert ("WARNING", "imu: configuring: the device refuses 'log'") in messages
+    silent = ("WARNING", "imu: silent: nothing received for 3 s; before that: the device refuses 'log'")
+    assert messages[-1] == silent
 
 
-def test_given_a_trouble_that_is_over_then_a_later_silence_does_not_name_it(caplog: pytest.LogCaptureFixture) -> None:
+def test_given_a_warning_that_is_over_then_a_later_silence_does_not_name_it(caplog: pytest.LogCaptureFixture) -> None:
     bench = Bench(1.0)
-    bench.echo.extra = [StationStatus(StationPhase.STREAMING, "a speed that cannot be", is_trouble=True)]
-    said = logged(caplog, lambda: bench.until(1.0 + PERIOD_S))
-    assert ("WARNING", "imu: streaming: a speed that cannot be") in said
-    said = logged(caplog, lambda: bench.until(5.0))
-    assert said[-1] == ("WARNING", "imu: silent: nothing heard for 3 s")
+    bench.echo.extra = [EndpointStatus(EndpointPhase.STREAMING, "a speed that cannot be", is_warning=True)]
+    messages = collect_log(caplog, lambda: bench.until(1.0 + PERIOD_S))
+    assert ("WARNING", "imu: streaming: a speed that cannot be") in messages
+    messages = collect_log(caplog, lambda: bench.until(5.0))
+    assert messages[-1] == ("WARNING", "imu: silent: nothing received for 3 s")
 
 
-def test_given_bytes_that_are_no_command_then_the_station_tells_it_as_a_warning(
+def test_given_bytes_that_are_no_command_then_the_endpoint_reports_it_as_a_warning(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     bench = Bench().until(0.5)
-    said = logged(caplog, lambda: bench.runner.refuse("malformed", "a command refused: valid_for -1"))
-    assert said == [("WARNING", "imu: streaming: a command refused: valid_for -1")]
-    bench.link.gone = [(0.6, math.inf)]
+    messages = collect_log(caplog, lambda: bench.runner.reject_command("malformed", "a command refused: valid_for -1"))
+    assert messages == [("WARNING", "imu: streaming: a command refused: valid_for -1")]
+    bench.link.outages = [(0.6, math.inf)]
     bench.until(1.0)
-    bench.runner.refuse("malformed", "a command refused")
-    bench.runner.command(VehicleCommand(1, 0.5, 0, "operator", 1.0, 0.0))
-    assert bench.runner.counts["commands_lost"] == 2
+    bench.runner.reject_command("malformed", "a command refused")
+    bench.runner.send_command(VehicleCommand(1, 0.5, 0, "operator", 1.0, 0.0))
+    assert bench.runner.counts["commands_dropped"] == 2
 
 
 def test_given_a_line_that_is_not_there_then_no_other_program_is_suspected() -> None:
     bench = Bench()
-    bench.link.gone = [(0.0, math.inf)]
+    bench.link.outages = [(0.0, math.inf)]
     bench.until(20.0)
     assert not [each for each in bench.reports if "another program" in each.text]
     with pytest.raises(LinkError):

@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from modelserver.config import config_lines, load_config
+from modelserver.config.vehicle_file import load_config, read_config_lines
 from modelserver.errors import ConfigError, Location, Problem, Severity
 from modelserver.messages import ImuSample
-from msdrivers.faults import InjectedFault, parse_fault
+from msdrivers.factory import choose_first_baud
+from msdrivers.fault_injection import InjectedFault, parse_fault
 from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings, TcpSettings, split_group
-from msdrivers.lines import first_baud
 from msdrivers.registry import CHANNELS, KINDS, DeviceKind, DeviceModules
-from msdrivers.settings import DriverSettings, Place, read_driver, read_drivers
+from msdrivers.settings import DriverSettings, SourceMap, read_driver, read_drivers
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ def test_given_a_section_then_line_and_settings_come_from_their_dataclasses() ->
         }
     )
     assert driver.line == SerialSettings("/dev/ttyUSB0", 38400)
-    assert driver.station == EchoSettings(
+    assert driver.device_settings == EchoSettings(
         "imu", 5.0, "magnetic", (1.0, 2.5), (38400,), {"a": Part(2.0)}, hidden="preset"
     )
     assert (driver.name, driver.kind, driver.channel) == ("imu", ECHO, "IMU2")
@@ -108,7 +108,7 @@ def test_given_a_lines_first_key_then_it_is_that_line(section: dict[str, Any], l
 
 
 @pytest.mark.parametrize(
-    ("section", "key", "said"),
+    ("section", "key", "expected"),
     [
         ({"can": "can0", "interface": "sockcan"}, "interface", "write socketcan"),
         ({"can": "", "interface": "pcan"}, "can", "is the channel as the interface names it, got nothing"),
@@ -124,12 +124,14 @@ def test_given_a_lines_first_key_then_it_is_that_line(section: dict[str, Any], l
         ({"can": "can0", "bitrate": -1}, "bitrate", "bitrate is 0"),
     ],
 )
-def test_given_a_can_line_that_cannot_be_then_the_key_is_named(section: dict[str, Any], key: str, said: str) -> None:
+def test_given_a_can_line_that_cannot_be_then_the_key_is_named(
+    section: dict[str, Any], key: str, expected: str
+) -> None:
     with pytest.raises(ConfigError) as caught:
         read({"device": "canner", **section})
     (problem,) = caught.value.problems
     assert f"drivers.imu.{key}" in str(problem)
-    assert said in str(problem)
+    assert expected in str(problem)
 
 
 @pytest.mark.parametrize(
@@ -142,16 +144,16 @@ def test_given_a_can_line_that_cannot_be_then_the_key_is_named(section: dict[str
         ("[ff15::1]", ("ff15::1", 43113)),
     ],
 )
-def test_given_a_group_of_multicast_then_its_port_is_told_from_it(channel: str, parts: tuple[str, int]) -> None:
+def test_given_a_group_of_multicast_then_its_port_is_parsed(channel: str, parts: tuple[str, int]) -> None:
     assert split_group(channel) == parts
     assert CanSettings(channel, "udp_multicast").can == channel
 
 
 def test_given_rates_to_try_then_the_line_is_opened_at_the_first_else_the_ports_else_the_makers() -> None:
     base = {"device": "echo", "port": "p"}
-    assert first_baud(read({**base, "bauds": [4800, 9600]})) == 4800
-    assert first_baud(read({**base, "baud": 19200})) == 19200
-    assert first_baud(read(base)) == 9600
+    assert choose_first_baud(read({**base, "bauds": [4800, 9600]})) == 4800
+    assert choose_first_baud(read({**base, "baud": 19200})) == 19200
+    assert choose_first_baud(read(base)) == 9600
 
 
 @pytest.mark.parametrize(
@@ -250,7 +252,7 @@ def test_given_rates_to_try_then_the_line_is_opened_at_the_first_else_the_ports_
             "both baud and bauds are given",
             "keep one of baud or bauds",
         ),
-        # told of what stands in the file, and not of what is made of it
+        # located of what stands in the file, and not of what is made of it
         ({"device": "echo", "port": "p", "baud": -9600}, "drivers.imu.baud", "baud is between 50 and", ""),
         ({"device": "echo", "address": "host"}, "drivers.imu.address", "address is HOST:PORT", ""),
         ({"device": "echo", "address": "host:99999"}, "drivers.imu.address", "address is HOST:PORT", ""),
@@ -277,7 +279,7 @@ def test_given_rates_to_try_then_the_line_is_opened_at_the_first_else_the_ports_
         ({"device": "axle", "address": "a:1", "unit_id": 300}, "drivers.imu.unit_id", "unit_id is between 0", ""),
     ],
 )
-def test_given_a_slip_then_it_is_told_with_its_place_and_what_to_do(
+def test_given_a_slip_then_it_is_reported_with_its_place_and_what_to_do(
     section: dict[str, Any], element: str, message: str, fix: str | None
 ) -> None:
     (problem,) = problems(section)
@@ -286,16 +288,16 @@ def test_given_a_slip_then_it_is_told_with_its_place_and_what_to_do(
     assert fix is None or problem.fix == fix
 
 
-def test_given_several_slips_then_all_are_told_at_once() -> None:
-    found = problems({"device": "echo", "port": 3, "rate_hz": "x", "colour": "red"})
+def test_given_several_slips_then_all_are_reported_at_once() -> None:
+    found = problems({"device": "echo", "port": 3, "rate_hz": "x", "color": "red"})
     assert {problem.element for problem in found} == {
         "drivers.imu.port",
         "drivers.imu.rate_hz",
-        "drivers.imu.colour",
+        "drivers.imu.color",
     }
 
 
-def test_given_rules_of_the_section_that_are_broken_then_they_are_told_beside_the_wrong_types() -> None:
+def test_given_rules_of_the_section_that_are_broken_then_they_are_reported_beside_the_wrong_types() -> None:
     section = {
         "device": "novatel",
         "port": "p",
@@ -317,7 +319,7 @@ def test_given_rules_of_the_section_that_are_broken_then_they_are_told_beside_th
     assert len(caught.value.problems) == 5
 
 
-def test_given_a_wrong_part_then_what_misses_it_is_not_told_too() -> None:
+def test_given_a_wrong_part_then_what_misses_it_is_not_reported_too() -> None:
     status = {"forward_speed": {"signal": 5}}
     with pytest.raises(ConfigError) as caught:
         read_driver("car", {"device": "vehicle", "can": "can0", "dbc": "a.dbc", "status": status, "window": -1})
@@ -341,14 +343,14 @@ KEYS = sorted({field for kind in KINDS.values() for field in kind.load().setting
     st.sampled_from(sorted(KINDS)),
     st.dictionaries(st.one_of(st.sampled_from([*KEYS, "port", "can", "address", "baud"]), st.text(max_size=5)), VALUES),
 )
-def test_given_any_section_then_it_is_read_or_refused_with_places(kind: str, section: dict[str, Any]) -> None:
+def test_given_any_section_then_it_is_read_or_rejected_with_places(kind: str, section: dict[str, Any]) -> None:
     try:
         driver = read_driver("any", {**section, "device": kind})
     except ConfigError as error:
-        told = [(problem.element, problem.message) for problem in error.problems]
-        assert told
-        assert len(set(told)) == len(told)
-        assert all(element.startswith("drivers.any") and message for element, message in told)
+        located = [(problem.element, problem.message) for problem in error.problems]
+        assert located
+        assert len(set(located)) == len(located)
+        assert all(element.startswith("drivers.any") and message for element, message in located)
     else:
         assert driver.kind is KINDS[kind]
 
@@ -371,7 +373,7 @@ def test_given_a_vehicle_file_then_problems_of_all_drivers_have_their_lines(tmp_
     path.write_text(VEHICLE)
     config = load_config(path)
     assert list(config.drivers) == ["imu", "gps"]
-    found, wrong = read_drivers(config.drivers, Place(str(path), config_lines(path)))
+    found, wrong = read_drivers(config.drivers, SourceMap(str(path), read_config_lines(path)))
     assert not found
     assert [(problem.file, problem.line, problem.nearest[:1]) for problem in wrong] == [
         (str(path), 8, ("polled",)),
@@ -379,7 +381,7 @@ def test_given_a_vehicle_file_then_problems_of_all_drivers_have_their_lines(tmp_
     ]
 
 
-def test_given_a_name_with_nothing_after_it_then_it_is_told_and_the_others_are_read(tmp_path: Path) -> None:
+def test_given_a_name_with_nothing_after_it_then_it_is_reported_and_the_others_are_read(tmp_path: Path) -> None:
     path = tmp_path / "vehicle.yaml"
     path.write_text(
         VEHICLE.replace("polld", "polled")
@@ -387,7 +389,7 @@ def test_given_a_name_with_nothing_after_it_then_it_is_told_and_the_others_are_r
         .replace("{device: novatell, port: /dev/ttyUSB1}", "# later")
     )
     config = load_config(path)
-    found, (problem,) = read_drivers(config.drivers, Place(str(path), config_lines(path)))
+    found, (problem,) = read_drivers(config.drivers, SourceMap(str(path), read_config_lines(path)))
     assert list(found) == ["imu"]
     assert (problem.line, problem.message) == (9, "drivers.gps is empty: device is missing")
 
@@ -399,8 +401,8 @@ def test_given_problems_of_a_driver_then_they_get_the_lines_of_their_keys(tmp_pa
         for element in ("drivers.w.wheels.front.left.count", "wheels.front.left", "drivers.w.dbc")
     ]
     of_another_file = Problem(Severity.ERROR, "b", Location("x.dbc", 3))
-    told = Place("v.yaml", lines).located("w", [*problems, of_another_file])
-    assert [str(each.source) for each in told] == [
+    located = SourceMap("v.yaml", lines).locate_problems("w", [*problems, of_another_file])
+    assert [str(each.source) for each in located] == [
         "v.yaml:7 (drivers.w.wheels.front.left.count)",
         "v.yaml:7 (drivers.w.wheels.front.left)",
         "v.yaml:5 (drivers.w.dbc)",
@@ -419,10 +421,10 @@ def test_given_a_kind_then_its_settings_take_the_drivers_name_and_its_sample_has
     assert kind.lines
 
 
-def test_given_texts_of_faults_then_they_are_read_or_refused_with_what_is_wrong() -> None:
+def test_given_texts_of_faults_then_they_are_read_or_rejected_with_what_is_wrong() -> None:
     assert parse_fault("stall@10:2") == InjectedFault(10.0, "stall", 2.0)
     assert parse_fault("drop@0.5") == InjectedFault(0.5, "drop", 1.0)
-    for text, said in (
+    for text, expected in (
         ("stal@10", "did you mean stall"),
         ("stall", "KIND@SECONDS"),
         ("stall@x", "SECONDS"),
@@ -431,7 +433,7 @@ def test_given_texts_of_faults_then_they_are_read_or_refused_with_what_is_wrong(
         ("stall@nan", "0 or more"),
         ("zzz@1", "drop: units"),
     ):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=expected):
             parse_fault(text)
 
 
@@ -453,6 +455,6 @@ def test_given_a_line_when_shown_then_a_person_can_read_it():
 @pytest.mark.parametrize("device", ["gx1", "novatel", "nmea"])
 def test_given_a_device_server_then_no_baud_rates_are_tried_that_nobody_could_set(device: str) -> None:
     driver = read_driver("imu", {"device": device, "address": "10.0.0.5:3001"})
-    assert driver.station.bauds == ()
+    assert driver.device_settings.bauds == ()
     driver = read_driver("imu", {"device": device, "port": "/dev/ttyUSB0", "bauds": [9600, 38400]})
-    assert driver.station.bauds == (9600, 38400)
+    assert driver.device_settings.bauds == (9600, 38400)

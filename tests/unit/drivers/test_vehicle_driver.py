@@ -22,25 +22,25 @@ from support_vehicle_bus import (
 from modelserver.errors import ConfigError
 from modelserver.messages import SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
 from msdrivers.devices.vehicle import VehicleDriver
-from msdrivers.devices.vehicle_settings import LimitsMap, VehicleSettings
-from msdrivers.emulate.can_line import CanFault
+from msdrivers.devices.vehicle_settings import CommandLimits, VehicleSettings
 from msdrivers.emulate.vehicle import VehicleEmulator, VehicleUnit
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Send
+from msdrivers.fault_injection import InjectedFault
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.can.mapping import SignalMap, StatusMap
-from msdrivers.station import Measured, Send, StationPhase, StationStatus
 
 DATABASE = raptor_dbc()
 
 
-def wired(
-    *faults: CanFault, settings: VehicleSettings | None = None, unit: VehicleUnit | None = None
+def connect(
+    *faults: InjectedFault, settings: VehicleSettings | None = None, unit: VehicleUnit | None = None
 ) -> tuple[Wire[CanFrame], VehicleDriver, VehicleEmulator]:
     driver = VehicleDriver(settings or vehicle_settings(), DATABASE)
     emulator = VehicleEmulator(DATABASE, RAPTOR_STATUS, RAPTOR_COMMAND, unit, faults=faults)
     return Wire(driver, emulator), driver, emulator
 
 
-def wish(
+def make_command(
     t: float, seq: int, speed: float = 2.0, angle: float = 0.2, valid_for: float = 0.3, source: str = "arbitrator"
 ) -> VehicleCommand:
     return VehicleCommand(START_UTIME + round(t * 1e6), valid_for, seq, source, speed, angle)
@@ -51,13 +51,13 @@ def drive(wire: Wire[CanFrame], driver: VehicleDriver, until: float, speed: floa
     wire.run(wire.t)
     seq = round(wire.t * 1000)
     while wire.t < until - 1e-9:
-        command = wish(wire.t, seq, speed, angle)
-        wire.command(lambda now, command=command: driver.command(command, now))  # type: ignore[misc]
+        command = make_command(wire.t, seq, speed, angle)
+        wire.send_command(lambda now, command=command: driver.on_command(command, now))  # type: ignore[misc]
         seq += 1
         wire.run(min(until, wire.t + 0.1))
 
 
-def said(frame: CanFrame) -> dict[str, float]:
+def decode_frame(frame: CanFrame) -> dict[str, float]:
     return DATABASE.decode(frame)
 
 
@@ -70,8 +70,8 @@ def statuses(wire: Wire[CanFrame], begin: float = 0.0) -> list[VehicleStatusSamp
 # --- status ----------------------------------------------------------------------------------------------------
 
 
-def test_given_a_controller_then_its_status_is_published_as_it_says() -> None:
-    wire, driver, emulator = wired(unit=VehicleUnit(fault_bits=0x8001))
+def test_given_a_controller_then_its_status_is_published_as_sent() -> None:
+    wire, driver, emulator = connect(unit=VehicleUnit(fault_bits=0x8001))
     emulator.speed, emulator.steering = 0.0, 0.1
     wire.run(2.0)
     samples = statuses(wire)
@@ -83,14 +83,14 @@ def test_given_a_controller_then_its_status_is_published_as_it_says() -> None:
     assert last.steering_angle == pytest.approx(0.1, abs=0.006 * DEG)
     assert last.supply_voltage == pytest.approx(13.8)
     assert last.engine_speed == pytest.approx(150.0, abs=0.02)
-    assert (last.fault_bits, last.commands_refused) == (0x8001, 0)
+    assert (last.fault_bits, last.commands_rejected) == (0x8001, 0)
     assert last.header.source == "raptor"
     assert driver.counts["samples"] == 40
 
 
 def test_given_the_message_of_voltages_lost_then_they_are_nan_and_the_rest_is_published() -> None:
-    wire, _, _ = wired()
-    wire.spoil = lambda frame, t: [] if frame.arbitration_id == 0x201 else [frame]
+    wire, _, _ = connect()
+    wire.corrupt = lambda frame, t: [] if frame.arbitration_id == 0x201 else [frame]
     wire.run(1.0)
     assert len(statuses(wire)) == 20
     assert all(math.isnan(each.supply_voltage) and math.isnan(each.engine_speed) for each in statuses(wire))
@@ -98,12 +98,12 @@ def test_given_the_message_of_voltages_lost_then_they_are_nan_and_the_rest_is_pu
 
 
 def test_given_the_message_of_faults_lost_then_nothing_is_published() -> None:
-    wire, driver, _ = wired()
-    wire.spoil = lambda frame, t: [] if frame.arbitration_id == 0x200 else [frame]
+    wire, driver, _ = connect()
+    wire.corrupt = lambda frame, t: [] if frame.arbitration_id == 0x200 else [frame]
     wire.run(1.5)
     assert statuses(wire) == []
     assert driver.counts["rejected.incomplete"] >= 19
-    assert "silent: no usable VehicleStatus (0x200)" in wire.texts()
+    assert "silent: no usable VehicleStatus (0x200)" in wire.status_text()
 
 
 def test_given_a_fault_word_of_32_bits_then_the_highest_is_the_sign() -> None:
@@ -112,22 +112,22 @@ def test_given_a_fault_word_of_32_bits_then_the_highest_is_the_sign() -> None:
 
     settings = vehicle_settings(status=StatusMap("S.M", {"fault": 9}, fault_bits="S.F"), command=None)
     driver = VehicleDriver(settings, parse_dbc(text, "s.dbc"))
-    driver.opened(at(0.0))
-    (_, measured) = driver.received(CanFrame(1, bytes.fromhex("01000080 09 000000")), at(0.1))
-    assert isinstance(measured, Measured)
+    driver.on_open(at(0.0))
+    (_, measured) = driver.on_receive(CanFrame(1, bytes.fromhex("01000080 09 000000")), at(0.1))
+    assert isinstance(measured, MeasuredSample)
     assert isinstance(measured.sample, VehicleStatusSample)
     assert measured.sample.fault_bits == 1 - (1 << 31)
     assert measured.sample.mode is VehicleMode.FAULT
     assert math.isnan(measured.sample.forward_speed)
 
 
-def test_given_a_mode_that_changes_then_it_is_told_with_what_it_means() -> None:
-    wire, _, emulator = wired()
+def test_given_a_mode_that_changes_then_it_is_reported_with_what_it_means() -> None:
+    wire, _, emulator = connect()
     wire.run(1.0)
     emulator.mode = VehicleMode.EMERGENCY_STOP
     wire.run(2.0)
     assert statuses(wire)[-1].mode is VehicleMode.EMERGENCY_STOP
-    assert "emergency stop: commands have no effect until it is released" in wire.texts()
+    assert "emergency stop: commands have no effect until it is released" in wire.status_text()
 
 
 def test_given_a_vehicle_that_is_driven_then_the_status_has_its_speed_and_its_steering_angle() -> None:
@@ -150,8 +150,8 @@ def test_given_a_vehicle_that_is_driven_then_the_status_has_its_speed_and_its_st
 # --- commands --------------------------------------------------------------------------------------------------
 
 
-def test_given_commands_then_the_vehicle_drives_as_it_is_told() -> None:
-    wire, driver, emulator = wired()
+def test_given_commands_then_the_vehicle_drives_as_commanded() -> None:
+    wire, driver, emulator = connect()
     wire.run(0.5)
     assert wire.sent == []
     drive(wire, driver, 4.0)
@@ -160,47 +160,47 @@ def test_given_commands_then_the_vehicle_drives_as_it_is_told() -> None:
     assert statuses(wire)[-1].forward_speed == pytest.approx(2.0)
     periods = [b - a for (a, _), (b, _) in zip(wire.sent, wire.sent[1:], strict=False)]
     assert max(periods) < 0.0501
-    alive = [said(frame)["Alive"] for _, frame in wire.sent]
+    alive = [decode_frame(frame)["Alive"] for _, frame in wire.sent]
     assert alive == [n % 256 for n in range(len(alive))]
 
 
-def test_given_no_more_commands_then_stop_is_said_when_the_last_ends_and_the_vehicle_stops() -> None:
-    wire, driver, emulator = wired()
+def test_given_no_more_commands_then_stop_is_sent_when_the_last_ends_and_the_vehicle_stops() -> None:
+    wire, driver, emulator = connect()
     drive(wire, driver, 3.0)
-    last = max(t for t, frame in wire.sent if said(frame)["Enable"] == 1)
+    last = max(t for t, frame in wire.sent if decode_frame(frame)["Enable"] == 1)
     wire.run(6.0)
-    stops = [(t, said(frame)) for t, frame in wire.sent if said(frame)["Enable"] == 0]
+    stops = [(t, decode_frame(frame)) for t, frame in wire.sent if decode_frame(frame)["Enable"] == 0]
     # the last command was given at 2.9 s and is valid for 0.3 s
     assert stops[0][0] == pytest.approx(3.2, abs=1e-6)
-    assert max(t for t, frame in wire.sent if said(frame)["Enable"] == 1) <= max(last, 3.2)
+    assert max(t for t, frame in wire.sent if decode_frame(frame)["Enable"] == 1) <= max(last, 3.2)
     assert all(frame["ForwardSpeed"] == 0 for _, frame in stops)
     # the wheels stay where they were steered
     assert {frame["SteeringAngle"] for _, frame in stops} == {round(0.2 / DEG * 100)}
     assert emulator.speed == 0.0
     assert driver.counts["dead_man"] == 1
-    assert "no command after number 29 of 'arbitrator': stop" in wire.texts()
+    assert "no command after number 29 of 'arbitrator': stop" in wire.status_text()
 
 
 def test_given_a_command_valid_for_long_then_the_dead_man_ends_it() -> None:
-    wire, driver, _ = wired(settings=vehicle_settings(dead_man=0.5))
+    wire, driver, _ = connect(settings=vehicle_settings(dead_man=0.5))
     wire.run(1.0)
-    wire.command(lambda now: driver.command(wish(1.0, 1, valid_for=60.0), now))
+    wire.send_command(lambda now: driver.on_command(make_command(1.0, 1, valid_for=60.0), now))
     wire.run(3.0)
-    first = next(t for t, frame in wire.sent if said(frame)["Enable"] == 0)
+    first = next(t for t, frame in wire.sent if decode_frame(frame)["Enable"] == 0)
     assert first == pytest.approx(1.5, abs=1e-6)
 
 
 def test_given_stop_frames_that_are_lost_then_the_controllers_own_dead_man_stops_it() -> None:
-    wire, driver, emulator = wired()
+    wire, driver, emulator = connect()
     drive(wire, driver, 3.0)
     wire.to_device.clear()
-    wire.device.received = lambda unit, now: []  # type: ignore[method-assign]
+    wire.device.on_receive = lambda unit, now: []  # type: ignore[method-assign]
     wire.run(6.0)
     assert emulator.speed == 0.0
 
 
 def test_given_a_new_command_after_the_stop_then_it_drives_again() -> None:
-    wire, driver, emulator = wired()
+    wire, driver, emulator = connect()
     drive(wire, driver, 2.0)
     wire.run(4.0)
     drive(wire, driver, 6.0, speed=-0.5)
@@ -208,122 +208,122 @@ def test_given_a_new_command_after_the_stop_then_it_drives_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("speed", "angle", "speed_said", "angle_said"),
+    ("speed", "angle", "speed_sent", "angle_sent"),
     [(9.0, 0.1, 3.0, 0.1), (-9.0, 0.1, -1.0, 0.1), (1.0, 2.0, 1.0, 0.5), (1.0, -2.0, 1.0, -0.5)],
 )
-def test_given_a_wish_beyond_the_limits_then_the_limit_is_commanded_and_told(
-    speed: float, angle: float, speed_said: float, angle_said: float
+def test_given_a_command_beyond_the_limits_then_the_limit_is_commanded_and_reported(
+    speed: float, angle: float, speed_sent: float, angle_sent: float
 ) -> None:
-    wire, driver, _ = wired()
+    wire, driver, _ = connect()
     wire.run(0.5)
     for seq in range(3):
-        wire.command(lambda now, seq=seq: driver.command(wish(wire.t, seq, speed, angle), now))  # type: ignore[misc]
-    frames = [said(frame) for _, frame in wire.sent]
-    assert {frame["ForwardSpeed"] for frame in frames} == {round(speed_said * 1000)}
-    assert {frame["SteeringAngle"] for frame in frames} == {round(angle_said / DEG * 100)}
+        wire.send_command(lambda now, seq=seq: driver.on_command(make_command(wire.t, seq, speed, angle), now))  # type: ignore[misc]
+    frames = [decode_frame(frame) for _, frame in wire.sent]
+    assert {frame["ForwardSpeed"] for frame in frames} == {round(speed_sent * 1000)}
+    assert {frame["SteeringAngle"] for frame in frames} == {round(angle_sent / DEG * 100)}
     assert driver.counts["clamped"] == 3
-    assert wire.texts().count("the limit is commanded") == 1
+    assert wire.status_text().count("the limit is commanded") == 1
 
 
-def test_given_limits_that_refuse_then_nothing_is_commanded() -> None:
-    limits = LimitsMap(3.0, 1.0, 0.5, "refuse")
-    wire, driver, _ = wired(settings=vehicle_settings(limits=limits))
+def test_given_limits_that_reject_then_nothing_is_commanded() -> None:
+    limits = CommandLimits(3.0, 1.0, 0.5, "reject")
+    wire, driver, _ = connect(settings=vehicle_settings(limits=limits))
     wire.run(0.5)
-    wire.command(lambda now: driver.command(wish(0.5, 1, speed=3.5), now))
+    wire.send_command(lambda now: driver.on_command(make_command(0.5, 1, speed=3.5), now))
     assert wire.sent == []
     assert driver.counts["rejected.limit"] == 1
-    assert "forward_speed 3.5 m/s is beyond -1 to 3 m/s" in wire.texts()
+    assert "forward_speed 3.5 m/s is outside -1 to 3 m/s" in wire.status_text()
     wire.run(1.0)
-    assert statuses(wire)[-1].commands_refused == 1
+    assert statuses(wire)[-1].commands_rejected == 1
 
 
 @pytest.mark.parametrize(
     ("command", "reason"),
     [
-        (wish(0.0, 5), "expired"),
-        (wish(3.0, 5), "future"),
-        (wish(1.0, 5, source="someone"), "stranger"),
-        (wish(1.0, 0), "old"),
-        (wish(1.0, 5, speed=math.nan), "malformed"),
-        (wish(1.0, 5, angle=math.inf), "malformed"),
-        (wish(1.0, 5, valid_for=-1.0), "expired"),
+        (make_command(0.0, 5), "expired"),
+        (make_command(3.0, 5), "future"),
+        (make_command(1.0, 5, source="someone"), "source"),
+        (make_command(1.0, 0), "stale"),
+        (make_command(1.0, 5, speed=math.nan), "malformed"),
+        (make_command(1.0, 5, angle=math.inf), "malformed"),
+        (make_command(1.0, 5, valid_for=-1.0), "expired"),
     ],
 )
 def test_given_a_command_that_may_not_count_then_the_one_before_goes_on(command: VehicleCommand, reason: str) -> None:
-    wire, driver, _ = wired()
+    wire, driver, _ = connect()
     wire.run(1.0)
-    wire.command(lambda now: driver.command(wish(1.0, 0, speed=1.0), now))
-    wire.command(lambda now: driver.command(command, now))
+    wire.send_command(lambda now: driver.on_command(make_command(1.0, 0, speed=1.0), now))
+    wire.send_command(lambda now: driver.on_command(command, now))
     wire.run(1.2)
-    assert {said(frame)["ForwardSpeed"] for _, frame in wire.sent} == {1000}
+    assert {decode_frame(frame)["ForwardSpeed"] for _, frame in wire.sent} == {1000}
     assert driver.counts[f"rejected.{reason}"] == 1
-    assert "refused" in wire.texts()
+    assert "rejected" in wire.status_text()
     wire.run(2.0)
     assert driver.counts["dead_man"] == 1
-    assert statuses(wire)[-1].commands_refused == 1
+    assert statuses(wire)[-1].commands_rejected == 1
 
 
-def test_given_a_commander_by_name_then_nobody_else_is_heard() -> None:
-    wire, driver, _ = wired(settings=vehicle_settings(commander="arbitrator"))
+def test_given_a_commander_by_name_then_others_are_rejected() -> None:
+    wire, driver, _ = connect(settings=vehicle_settings(commander="arbitrator"))
     wire.run(1.0)
-    wire.command(lambda now: driver.command(wish(1.0, 0, source="stranger"), now))
+    wire.send_command(lambda now: driver.on_command(make_command(1.0, 0, source="stranger"), now))
     assert wire.sent == []
-    assert "only 'arbitrator' commands" in wire.texts()
+    assert "only 'arbitrator' commands" in wire.status_text()
 
 
 def test_given_a_source_whose_commands_have_ended_then_another_may_command() -> None:
-    wire, driver, _ = wired()
+    wire, driver, _ = connect()
     wire.run(1.0)
-    wire.command(lambda now: driver.command(wish(1.0, 7), now))
+    wire.send_command(lambda now: driver.on_command(make_command(1.0, 7), now))
     wire.run(2.0)
-    wire.command(lambda now: driver.command(wish(2.0, 0, speed=1.0, source="joystick"), now))
-    assert said(wire.sent[-1][1])["ForwardSpeed"] == 1000
+    wire.send_command(lambda now: driver.on_command(make_command(2.0, 0, speed=1.0, source="joystick"), now))
+    assert decode_frame(wire.sent[-1][1])["ForwardSpeed"] == 1000
 
 
-def test_given_an_emergency_stop_then_the_controller_stops_and_refuses_and_that_is_told() -> None:
-    wire, driver, emulator = wired()
+def test_given_an_emergency_stop_then_the_controller_stops_and_rejects_and_that_is_reported() -> None:
+    wire, driver, emulator = connect()
     drive(wire, driver, 3.0)
     emulator.mode = VehicleMode.EMERGENCY_STOP
     drive(wire, driver, 6.0)
     assert emulator.speed == 0.0
-    assert statuses(wire)[-1].commands_refused > 20
+    assert statuses(wire)[-1].commands_rejected > 20
 
 
-def test_given_bus_off_while_driving_then_nothing_is_sent_and_stop_is_said_when_it_is_back() -> None:
-    wire, driver, _ = wired(CanFault(3.0, "bus_off", 1.0))
+def test_given_bus_off_while_driving_then_nothing_is_sent_and_stop_is_sent_when_it_is_back() -> None:
+    wire, driver, _ = connect(InjectedFault(3.0, "bus_off", 1.0))
     wire.reopen_s = 0.5
     drive(wire, driver, 4.5)
     off = [t for t, _ in wire.sent if 3.002 < t < 3.5]
     assert off == []
-    assert driver.counts["rejected.line"] >= 4
-    first = next(said(frame) for t, frame in wire.sent if t > 3.4)
+    assert driver.counts["rejected.bus_off"] >= 4
+    first = next(decode_frame(frame) for t, frame in wire.sent if t > 3.4)
     assert first["Enable"] == 0
-    assert [told.phase for _, told in wire.told if "went bus-off" in told.text] == [StationPhase.SILENT]
+    assert [status.phase for _, status in wire.statuses if "went bus-off" in status.text] == [EndpointPhase.SILENT]
 
 
-def test_given_that_the_driver_leaves_then_it_says_stop() -> None:
-    wire, driver, _ = wired()
+def test_given_that_the_driver_leaves_then_it_sends_stop() -> None:
+    wire, driver, _ = connect()
     wire.run(1.0)
-    assert driver.leaving(at(1.0)) == []
+    assert driver.on_close(at(1.0)) == []
     drive(wire, driver, 2.0)
-    (stop,) = driver.leaving(at(2.0))
+    (stop,) = driver.on_close(at(2.0))
     assert isinstance(stop, Send)
-    assert said(stop.unit)["Enable"] == 0
+    assert decode_frame(stop.unit)["Enable"] == 0
 
 
 def test_given_no_command_mapping_then_commands_go_nowhere() -> None:
     driver = VehicleDriver(vehicle_settings(command=None), DATABASE)
-    driver.opened(at(0.0))
-    assert driver.command(wish(0.0, 0), at(0.0)) == []
+    driver.on_open(at(0.0))
+    assert driver.on_command(make_command(0.0, 0), at(0.0)) == []
     assert driver.counts["rejected.no_command_mapping"] == 1
 
 
-def test_given_a_flood_of_refused_commands_then_little_is_told() -> None:
-    wire, driver, _ = wired()
+def test_given_a_flood_of_rejected_commands_then_little_is_reported() -> None:
+    wire, driver, _ = connect()
     wire.run(1.0)
     for seq in range(1000):
-        wire.command(lambda now, seq=seq: driver.command(wish(0.0, seq, source=f"s{seq}"), now))  # type: ignore[misc]
-    assert len(wire.told) < 5
+        wire.send_command(lambda now, seq=seq: driver.on_command(make_command(0.0, seq, source=f"s{seq}"), now))  # type: ignore[misc]
+    assert len(wire.statuses) < 5
     assert driver.counts["rejected.expired"] == 1000
 
 
@@ -331,7 +331,7 @@ def test_given_a_flood_of_refused_commands_then_little_is_told() -> None:
 def test_given_random_frames_and_commands_then_nothing_is_raised_and_memory_stays_flat() -> None:
     rng = random.Random(3)
     driver = VehicleDriver(vehicle_settings(), DATABASE)
-    driver.opened(at(0.0))
+    driver.on_open(at(0.0))
     wild = (math.nan, math.inf, -1e300, 0.0, 1.0, 5.0)
 
     def flood(begin: int, count: int) -> None:
@@ -339,16 +339,16 @@ def test_given_random_frames_and_commands_then_nothing_is_raised_and_memory_stay
             now = at(0.001 * n)
             identifier = rng.choice((0x200, 0x201, 0x300, rng.randrange(2048)))
             frame = CanFrame(identifier, rng.randbytes(rng.choice((4, 8, 8, rng.randrange(65)))), rng.random() < 0.1)
-            command = wish(
+            command = make_command(
                 0.001 * n + rng.uniform(-0.5, 0.5), n, rng.choice(wild), rng.choice(wild), rng.choice(wild), "a"
             )
-            outputs = driver.received(frame, now) + driver.woken(now) + driver.command(command, now)
+            outputs = driver.on_receive(frame, now) + driver.on_timer(now) + driver.on_command(command, now)
             for output in outputs:
                 if isinstance(output, Send):
-                    assert -1000 <= said(output.unit)["ForwardSpeed"] <= 3000
-                    assert abs(said(output.unit)["SteeringAngle"]) <= 2865
+                    assert -1000 <= decode_frame(output.unit)["ForwardSpeed"] <= 3000
+                    assert abs(decode_frame(output.unit)["SteeringAngle"]) <= 2865
                 else:
-                    assert isinstance(output, Measured | StationStatus)
+                    assert isinstance(output, MeasuredSample | EndpointStatus)
 
     flood(0, 1_000)
     tracemalloc.start()
@@ -365,7 +365,7 @@ def test_given_random_frames_and_commands_then_nothing_is_raised_and_memory_stay
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "expected"),
     [
         ({"status": None, "command": None}, "status or command is needed"),
         ({"dbc": ""}, "dbc is the path"),
@@ -375,43 +375,43 @@ def test_given_random_frames_and_commands_then_nothing_is_raised_and_memory_stay
         ({"silence": math.nan}, "silence is between"),
     ],
 )
-def test_given_settings_that_cannot_be_then_the_key_is_named(changes: dict[str, object], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_given_settings_that_cannot_be_then_the_key_is_named(changes: dict[str, object], expected: str) -> None:
+    with pytest.raises(ValueError, match=expected):
         vehicle_settings(**changes)
 
 
 def test_given_limits_that_cannot_be_then_the_key_is_named() -> None:
     with pytest.raises(ValueError, match="steering_angle is between"):
-        LimitsMap(steering_angle=2.0)
-    with pytest.raises(ValueError, match="beyond is clamp or refuse"):
-        LimitsMap(beyond="perhaps")  # type: ignore[arg-type]
+        CommandLimits(steering_angle=2.0)
+    with pytest.raises(ValueError, match="over_limit is clamp or reject"):
+        CommandLimits(over_limit="perhaps")  # type: ignore[arg-type]
 
 
-def test_given_limits_that_the_frame_cannot_say_then_it_is_told() -> None:
+def test_given_limits_that_the_frame_cannot_represent_then_it_is_reported() -> None:
     with pytest.raises(ConfigError, match=r"ForwardSpeed holds 20 m/s at most, 30 is allowed; fix: lower"):
-        VehicleDriver(vehicle_settings(limits=LimitsMap(forward_speed=30.0)), DATABASE)
+        VehicleDriver(vehicle_settings(limits=CommandLimits(forward_speed=30.0)), DATABASE)
 
 
-def test_given_a_mistyped_status_signal_then_the_nearest_is_told() -> None:
+def test_given_a_mistyped_status_signal_then_the_nearest_is_reported() -> None:
     status = StatusMap(forward_speed=SignalMap("VehicleStatus.ForwardSped"))
     with pytest.raises(ConfigError, match=r"nearest: VehicleStatus\.ForwardSpeed;"):
         VehicleDriver(vehicle_settings(status=status), DATABASE)
 
 
-def test_given_a_line_opened_anew_while_a_command_counts_then_stop_is_said_and_it_counts_no_more() -> None:
+def test_given_a_line_reopened_while_a_command_counts_then_stop_is_sent_and_it_counts_no_more() -> None:
     driver = VehicleDriver(vehicle_settings(), DATABASE)
-    driver.opened(at(0.0))
-    driver.command(wish(0.0, 0), at(0.0))
-    later = [driver.opened(at(0.05)), driver.woken(at(0.1)), driver.woken(at(0.15))]
+    driver.on_open(at(0.0))
+    driver.on_command(make_command(0.0, 0), at(0.0))
+    later = [driver.on_open(at(0.05)), driver.on_timer(at(0.1)), driver.on_timer(at(0.15))]
     frames = [output.unit for outputs in later for output in outputs if isinstance(output, Send)]
-    assert [said(frame)["Enable"] for frame in frames] == [0, 0, 0]
+    assert [decode_frame(frame)["Enable"] for frame in frames] == [0, 0, 0]
 
 
 def test_given_bus_off_while_a_command_counts_then_nothing_is_sent() -> None:
     driver = VehicleDriver(vehicle_settings(), DATABASE)
-    driver.opened(at(0.0))
-    driver.command(wish(0.0, 0), at(0.0))
-    driver.received(CanFrame(0x40, is_error=True), at(0.01))
+    driver.on_open(at(0.0))
+    driver.on_command(make_command(0.0, 0), at(0.0))
+    driver.on_receive(CanFrame(0x40, is_error=True), at(0.01))
     for t in (0.06, 0.3, 1.0):
-        assert not [output for output in driver.woken(at(t)) if isinstance(output, Send)]
-    assert driver.leaving(at(1.1)) == []
+        assert not [output for output in driver.on_timer(at(t)) if isinstance(output, Send)]
+    assert driver.on_close(at(1.1)) == []

@@ -1,4 +1,4 @@
-"""The driver of wheels on a CAN bus against the emulated encoders, and against what no encoder should say."""
+"""The driver of wheels on a CAN bus against the emulated encoders, and against impossible data."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from collections.abc import Callable
 import pytest
 from support_vehicle_bus import (
     DBC,
-    METRES_PER_COUNT,
+    METERS_PER_COUNT,
     START_UTIME,
     Wire,
     at,
     raptor_dbc,
-    rolling,
+    rolling_samples,
     wheel,
     wheels_settings,
 )
@@ -29,31 +29,31 @@ from modelserver.errors import ConfigError
 from modelserver.messages import Direction, WheelsSample
 from modelserver.simulation import Simulation, Timing, Trajectory, WheelsModel, figure_eight
 from msdrivers.devices.wheels import WheelsDriver, WheelsSettings
-from msdrivers.emulate.can_line import CanFault
 from msdrivers.emulate.wheels import WheelsEmulator
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Reopen, Send
+from msdrivers.fault_injection import InjectedFault
 from msdrivers.protocol.can.database import parse_dbc
 from msdrivers.protocol.can.frame import MAX_BASE_ID, CanFrame
 from msdrivers.protocol.can.mapping import CountMap, DirectionMap, SignalMap, SpeedMap, WheelMap
-from msdrivers.station import Measured, Reopen, Send, StationPhase, StationStatus
 
 BOTH = ("front_left", "front_right")
 
 
-def wired(
+def connect(
     seconds: float,
     speed: Callable[[float], float],
-    *faults: CanFault,
+    *faults: InjectedFault,
     settings: WheelsSettings | None = None,
     first_count: int = 0,
     hz: float = 100.0,
 ) -> Wire[CanFrame]:
     database = raptor_dbc()
     settings = settings or wheels_settings()
-    emulator = WheelsEmulator(settings.wheels, database, rolling(seconds, speed, hz, BOTH), faults, first_count)
+    emulator = WheelsEmulator(settings.wheels, database, rolling_samples(seconds, speed, hz, BOTH), faults, first_count)
     return Wire(WheelsDriver(settings, database), emulator)
 
 
-def swing(t: float) -> float:
+def oscillate(t: float) -> float:
     """Forward, to a stop, backward, and so on."""
     return 3.0 * math.cos(t)
 
@@ -65,45 +65,45 @@ def wheels_of(wire: Wire[CanFrame], begin: float = 0.0) -> list[WheelsSample]:
 
 
 def test_given_wheels_at_100_hz_over_wraps_and_reversals_then_travel_and_speed_are_theirs() -> None:
-    wire = wired(20.0, swing, first_count=65_500)
+    wire = connect(20.0, oscillate, first_count=65_500)
     wire.run(21.0)
     samples = wheels_of(wire)
     assert len(samples) == 2001
     assert [sample.header.seq for sample in samples] == list(range(2001))
-    truths = list(rolling(20.0, swing, 100.0, BOTH))
+    truths = list(rolling_samples(20.0, oscillate, 100.0, BOTH))
     for sample, truth in zip(samples, truths, strict=True):
         assert sample.header.host_utime == sample.header.utime == truth.header.utime + 1000
         assert sample.header.device_utime == 0
-        for said, true in zip(sample.wheels, truth.wheels, strict=True):
-            assert said.name == true.name
-            assert said.travel == pytest.approx(true.travel, abs=0.51 * METRES_PER_COUNT)
-            assert said.speed == pytest.approx(true.speed, abs=0.00051)
-            assert said.direction is true.direction
-            assert math.isnan(said.steering)
+        for measured, true in zip(sample.wheels, truth.wheels, strict=True):
+            assert measured.name == true.name
+            assert measured.travel == pytest.approx(true.travel, abs=0.51 * METERS_PER_COUNT)
+            assert measured.speed == pytest.approx(true.speed, abs=0.00051)
+            assert measured.direction is true.direction
+            assert math.isnan(measured.steering)
     assert min(sample.wheels[0].travel for sample in samples) < 0.0 < max(sample.wheels[0].travel for sample in samples)
     assert wire.host.counts["samples"] == 2001
     assert not [key for key, value in wire.host.counts.items() if key.startswith("rejected") and value]
 
 
-def test_given_the_settings_then_the_sigmas_and_the_delay_are_told() -> None:
-    wire = wired(0.1, swing, settings=wheels_settings(delay=0.005, delay_sigma=0.002)).run(0.2)
+def test_given_the_settings_then_the_sigmas_and_the_delay_are_reported() -> None:
+    wire = connect(0.1, oscillate, settings=wheels_settings(delay=0.005, delay_sigma=0.002)).run(0.2)
     measured = wire.samples[5][1]
     assert (measured.delay, measured.delay_sigma) == (0.005, 0.002)
     (left, _) = wheels_of(wire)[5].wheels
-    assert left.travel_sigma == pytest.approx(METRES_PER_COUNT / math.sqrt(12.0))
+    assert left.travel_sigma == pytest.approx(METERS_PER_COUNT / math.sqrt(12.0))
     assert left.speed_sigma == 0.05
 
 
 def test_given_a_counter_that_wraps_several_times_then_the_way_is_whole() -> None:
-    wire = wired(200.0, lambda t: 5.0, hz=20.0, first_count=60_000)
+    wire = connect(200.0, lambda t: 5.0, hz=20.0, first_count=60_000)
     wire.run(201.0)
     assert wheels_of(wire)[-1].wheels[0].travel == pytest.approx(1000.0, abs=0.02)
 
 
-def test_given_lost_frames_then_what_was_not_heard_is_not_told_and_travel_goes_on() -> None:
+def test_given_lost_frames_then_what_was_not_received_is_not_published_and_travel_goes_on() -> None:
     # of the pair of an instant the first, counts and directions, is lost three times
-    drops = [CanFault(2.0 + 0.1 * n, "drop") for n in range(3)]
-    wire = wired(6.0, lambda t: 2.0, *drops).run(6.5)
+    drops = [InjectedFault(2.0 + 0.1 * n, "drop") for n in range(3)]
+    wire = connect(6.0, lambda t: 2.0, *drops).run(6.5)
     samples = wheels_of(wire)
     assert wire.host.counts["incomplete"] == 3
     assert len(samples) == 601 - 3
@@ -112,8 +112,8 @@ def test_given_lost_frames_then_what_was_not_heard_is_not_told_and_travel_goes_o
 
 
 def test_given_only_the_frame_of_counts_then_speed_is_nan_and_not_the_last_one() -> None:
-    wire = wired(2.0, lambda t: 2.0)
-    wire.spoil = lambda frame, t: [] if frame.arbitration_id == 0x101 and 1.0 < t < 1.5 else [frame]
+    wire = connect(2.0, lambda t: 2.0)
+    wire.corrupt = lambda frame, t: [] if frame.arbitration_id == 0x101 and 1.0 < t < 1.5 else [frame]
     wire.run(2.5)
     without = [sample for sample in wheels_of(wire) if math.isnan(sample.wheels[0].speed)]
     assert 49 <= len(without) <= 51
@@ -124,7 +124,7 @@ def test_given_only_the_frame_of_counts_then_speed_is_nan_and_not_the_last_one()
 
 @pytest.mark.parametrize("jump", [40_000.0, -200.0, 3000.0])
 def test_given_counters_that_jump_as_no_wheel_can_then_one_sample_has_no_travel(jump: float) -> None:
-    wire = wired(6.0, lambda t: 1.0, CanFault(3.005, "jump", jump)).run(6.5)
+    wire = connect(6.0, lambda t: 1.0, InjectedFault(3.005, "jump", jump)).run(6.5)
     samples = wheels_of(wire)
     without = [sample for sample in samples if math.isnan(sample.wheels[0].travel)]
     assert [round((each.header.utime - START_UTIME) * 1e-6, 3) for each in without] == [3.011]
@@ -132,73 +132,73 @@ def test_given_counters_that_jump_as_no_wheel_can_then_one_sample_has_no_travel(
     # without the 1 cm that was rolled unseen
     assert samples[-1].wheels[0].travel == pytest.approx(6.0, abs=0.04)
     assert (wire.host.counts["rejected.jump"], wire.host.counts["resumed"]) == (2, 2)
-    assert "no wheel of at most 8 m/s can have come to" in wire.texts()
+    assert "no wheel of at most 8 m/s can have reached" in wire.status_text()
 
 
 def test_given_a_controller_that_restarts_then_travel_goes_on_from_where_it_was() -> None:
-    wire = wired(6.0, lambda t: 1.0, CanFault(3.0, "restart", 0.3), first_count=20_000).run(6.5)
+    wire = connect(6.0, lambda t: 1.0, InjectedFault(3.0, "restart", 0.3), first_count=20_000).run(6.5)
     travels = [sample.wheels[0].travel for sample in wheels_of(wire) if math.isfinite(sample.wheels[0].travel)]
     steps = [after - before for before, after in itertools.pairwise(travels)]
     assert max(map(abs, steps)) < 0.03
     assert travels[-1] == pytest.approx(6.0 - 0.31, abs=0.04)
 
 
-def test_given_bus_off_then_it_is_told_once_and_the_line_is_opened_anew() -> None:
-    wire = wired(4.0, swing, CanFault(2.0, "bus_off", 0.5)).run(4.5)
-    assert [reopen.why for _, reopen in wire.reopened] == ["the CAN interface went bus-off: too many frames failed"]
-    (silent,) = [told for _, told in wire.told if told.phase is StationPhase.SILENT]
+def test_given_bus_off_then_it_is_reported_once_and_the_line_is_reopened() -> None:
+    wire = connect(4.0, oscillate, InjectedFault(2.0, "bus_off", 0.5)).run(4.5)
+    assert [reopen.reason for _, reopen in wire.reopens] == ["the CAN interface went bus-off: too many frames failed"]
+    (silent,) = [status for _, status in wire.statuses if status.phase is EndpointPhase.SILENT]
     assert "terminators" in silent.text
     between = [t for t, _ in wire.samples if 2.01 < t < 2.5]
     assert between == []
     assert wire.samples[-1][0] > 4.0
-    assert wire.told[-1][1].phase is StationPhase.STREAMING
+    assert wire.statuses[-1][1].phase is EndpointPhase.STREAMING
 
 
-def test_given_an_interface_that_says_bus_off_again_and_again_then_the_line_is_opened_once() -> None:
+def test_given_an_interface_that_reports_bus_off_again_and_again_then_the_line_is_opened_once() -> None:
     driver = WheelsDriver(wheels_settings(), raptor_dbc())
-    driver.opened(at(0.0))
-    outputs = [output for n in range(50) for output in driver.received(CanFrame(0x40, is_error=True), at(0.01 * n))]
+    driver.on_open(at(0.0))
+    outputs = [output for n in range(50) for output in driver.on_receive(CanFrame(0x40, is_error=True), at(0.01 * n))]
     assert sum(isinstance(output, Reopen) for output in outputs) == 1
     assert driver.counts["error_frames"] == 50
 
 
-def test_given_silence_then_it_is_told_once_and_nothing_is_published() -> None:
-    wire = wired(9.0, swing, CanFault(2.0, "stall", 4.0)).run(9.5)
-    silent = [(t, told.text) for t, told in wire.told if told.phase is StationPhase.SILENT]
+def test_given_silence_then_it_is_reported_once_and_nothing_is_published() -> None:
+    wire = connect(9.0, oscillate, InjectedFault(2.0, "stall", 4.0)).run(9.5)
+    silent = [(t, status.text) for t, status in wire.statuses if status.phase is EndpointPhase.SILENT]
     assert [round(t) for t, _ in silent] == [3]
     assert "nothing else on the bus: check power, wiring" in silent[0][1]
     assert not [t for t, _ in wire.samples if 2.01 < t < 6.0]
-    assert [told.phase for _, told in wire.told][-1] is StationPhase.STREAMING
+    assert [status.phase for _, status in wire.statuses][-1] is EndpointPhase.STREAMING
 
 
-def test_given_another_bus_then_what_is_on_it_is_told() -> None:
+def test_given_another_bus_then_what_is_on_it_is_reported() -> None:
     driver = WheelsDriver(wheels_settings(), raptor_dbc())
-    driver.opened(at(0.0))
+    driver.on_open(at(0.0))
     for number in range(1000):
-        assert driver.received(CanFrame(0x400 + number % 500, bytes(8)), at(0.0005 * number)) == []
-    (told,) = driver.woken(at(1.0))
-    assert isinstance(told, StationStatus)
-    assert "on the bus are 0x400, 0x401" in told.text
-    assert len(told.text) < 300
+        assert driver.on_receive(CanFrame(0x400 + number % 500, bytes(8)), at(0.0005 * number)) == []
+    (status,) = driver.on_timer(at(1.0))
+    assert isinstance(status, EndpointStatus)
+    assert "on the bus are 0x400, 0x401" in status.text
+    assert len(status.text) < 300
 
 
-def test_given_frames_of_a_wrong_length_then_they_are_told_once_and_counted() -> None:
-    wire = wired(5.0, swing)
-    wire.spoil = lambda frame, t: [dataclasses.replace(frame, data=frame.data + b"\0")] if t > 2.0 else [frame]
+def test_given_frames_of_a_wrong_length_then_they_are_reported_once_and_counted() -> None:
+    wire = connect(5.0, oscillate)
+    wire.corrupt = lambda frame, t: [dataclasses.replace(frame, data=frame.data + b"\0")] if t > 2.0 else [frame]
     wire.run(5.5)
-    assert wire.texts().count("has 9 bytes where raptor.dbc says 8") == 1
+    assert wire.status_text().count("has 9 bytes, raptor.dbc expects 8") == 1
     assert wire.host.counts["rejected.length"] > 500
     assert not [t for t, _ in wire.samples if t > 2.01]
-    assert "frames come, but not as the DBC says" in wire.texts()
+    assert "frames arrive but do not match the DBC" in wire.status_text()
 
 
 def test_given_speeds_that_the_vehicle_cannot_have_then_they_are_not_published() -> None:
-    wire = wired(1.0, lambda t: 12.0, settings=wheels_settings(frame_delay=10.0)).run(1.5)
+    wire = connect(1.0, lambda t: 12.0, settings=wheels_settings(frame_delay=10.0)).run(1.5)
     assert all(math.isnan(sample.wheels[0].speed) for sample in wheels_of(wire))
     assert wire.host.counts["rejected.speed"] == 202
 
 
-def test_given_a_dbc_of_another_vehicle_then_every_missing_signal_is_told() -> None:
+def test_given_a_dbc_of_another_vehicle_then_every_missing_signal_is_reported() -> None:
     other = parse_dbc('BO_ 5 WheelCount: 8 A\n SG_ FrontLeftCounts : 0|16@1+ (1,0) [0|0] "" A\n', "other.dbc")
     with pytest.raises(ConfigError) as caught:
         WheelsDriver(wheels_settings(), other)
@@ -227,75 +227,75 @@ BO_ 2566834688 Axle: 8 A
         )
     }
     settings = wheels_settings(wheels=maps)
-    emulator = WheelsEmulator(maps, database, rolling(10.0, swing), first_count=(1 << 23) - 100)
+    emulator = WheelsEmulator(maps, database, rolling_samples(10.0, oscillate), first_count=(1 << 23) - 100)
     wire = Wire(WheelsDriver(settings, database), emulator).run(11.0)
-    for sample, truth in zip(wheels_of(wire), rolling(10.0, swing), strict=True):
-        (said,), (true,) = sample.wheels, truth.wheels
-        assert said.travel == pytest.approx(true.travel, abs=0.0011)
-        assert said.speed == pytest.approx(true.speed, abs=0.0015)
-        assert said.direction is Direction.UNKNOWN
-        assert said.steering == 0.0
+    for sample, truth in zip(wheels_of(wire), rolling_samples(10.0, oscillate), strict=True):
+        (measured,), (true,) = sample.wheels, truth.wheels
+        assert measured.travel == pytest.approx(true.travel, abs=0.0011)
+        assert measured.speed == pytest.approx(true.speed, abs=0.0015)
+        assert measured.direction is Direction.UNKNOWN
+        assert measured.steering == 0.0
 
 
 def test_given_pulses_without_sign_then_the_direction_gives_it() -> None:
-    count = CountMap("WheelCounts.FrontLeftCount", METRES_PER_COUNT, wrap=1000, up_only=True)
-    settings = wheels_settings(wheels={"front_left": wheel("Left", count=count, steers=False)})
-    wire = wired(20.0, swing, settings=settings).run(21.0)
+    count = CountMap("WheelCounts.FrontLeftCount", METERS_PER_COUNT, wrap=1000, counts_up_only=True)
+    settings = wheels_settings(wheels={"front_left": wheel("Left", count=count, is_steered=False)})
+    wire = connect(20.0, oscillate, settings=settings).run(21.0)
     # at a reversal one pulse may be counted to the side before
     assert wheels_of(wire)[-1].wheels[0].travel == pytest.approx(3.0 * math.sin(20.0), abs=0.15)
     assert wheels_of(wire)[-1].wheels[0].steering == 0.0
 
 
 def test_given_pulses_and_speeds_without_sign_or_direction_then_they_are_published_as_sizes() -> None:
-    count = CountMap("WheelCounts.FrontLeftCount", METRES_PER_COUNT, wrap=1000, up_only=True)
+    count = CountMap("WheelCounts.FrontLeftCount", METERS_PER_COUNT, wrap=1000, counts_up_only=True)
     size = SpeedMap("WheelSpeeds.FrontLeftSpeed", is_magnitude=True)
-    settings = wheels_settings(wheels={"front_left": WheelMap(count, size, steers=True)})
-    wire = wired(20.0, swing, settings=settings).run(21.0)
+    settings = wheels_settings(wheels={"front_left": WheelMap(count, size, is_steered=True)})
+    wire = connect(20.0, oscillate, settings=settings).run(21.0)
     wheels = [each.wheels[0] for each in wheels_of(wire)]
     assert {each.direction for each in wheels} == {Direction.UNSIGNED}
     assert all(b.travel >= a.travel for a, b in itertools.pairwise(wheels))
     assert min(each.speed for each in wheels) >= 0.0
     assert max(each.speed for each in wheels) > 2.5
-    rolled = sum(abs(swing(0.001 * n)) for n in range(20_000)) * 0.001
+    rolled = sum(abs(oscillate(0.001 * n)) for n in range(20_000)) * 0.001
     assert wheels[-1].travel == pytest.approx(rolled, abs=0.5)
 
 
-def test_given_the_line_opened_anew_then_half_an_instant_from_before_is_not_joined() -> None:
+def test_given_the_line_reopened_then_half_an_instant_from_before_is_not_joined() -> None:
     database = raptor_dbc()
     driver = WheelsDriver(wheels_settings(), database)
-    driver.opened(at(0.0))
+    driver.on_open(at(0.0))
     counts = CanFrame(0x100, bytes(8))
     speeds = CanFrame(0x101, bytes(4))
-    assert driver.received(counts, at(0.1)) == []
-    driver.opened(at(0.101))
-    assert driver.received(speeds, at(0.102)) == []
-    (told, measured) = driver.received(counts, at(0.103))
-    assert isinstance(told, StationStatus)
-    assert isinstance(measured, Measured)
+    assert driver.on_receive(counts, at(0.1)) == []
+    driver.on_open(at(0.101))
+    assert driver.on_receive(speeds, at(0.102)) == []
+    (status, measured) = driver.on_receive(counts, at(0.103))
+    assert isinstance(status, EndpointStatus)
+    assert isinstance(measured, MeasuredSample)
     assert measured.sample.header.utime == START_UTIME + 102_000
 
 
 def test_given_a_wheels_driver_then_it_never_sends() -> None:
-    wire = wired(1.0, swing).run(1.5)
+    wire = connect(1.0, oscillate).run(1.5)
     assert wire.sent == []
-    assert wire.host.leaving(at(2.0)) == []
+    assert wire.host.on_close(at(2.0)) == []
 
 
 @pytest.mark.slow
 def test_given_random_frames_then_nothing_is_raised_and_memory_stays_flat() -> None:
     rng = random.Random(7)
     driver = WheelsDriver(wheels_settings(), raptor_dbc())
-    driver.opened(at(0.0))
+    driver.on_open(at(0.0))
 
     def flood(begin: int, frames: int) -> None:
         for n in range(begin, begin + frames):
             identifier = rng.choice((0x100, 0x101, 0x200, rng.randrange(MAX_BASE_ID + 1)))
             length = rng.choice((4, 8, 8, rng.randrange(65)))
             frame = CanFrame(identifier, rng.randbytes(length), rng.random() < 0.1, rng.random() < 0.01)
-            outputs = driver.received(frame, at(0.0003 * n)) + driver.woken(at(0.0003 * n + 0.0001))
+            outputs = driver.on_receive(frame, at(0.0003 * n)) + driver.on_timer(at(0.0003 * n + 0.0001))
             assert not any(isinstance(output, Send) for output in outputs)
             for output in outputs:
-                if isinstance(output, Measured):
+                if isinstance(output, MeasuredSample):
                     assert isinstance(output.sample, WheelsSample)
                     assert all(not abs(each.speed) > 8.0 for each in output.sample.wheels)
 
@@ -315,7 +315,7 @@ def test_given_random_frames_then_nothing_is_raised_and_memory_stays_flat() -> N
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "expected"),
     [
         ({"dbc": ""}, "dbc is the path"),
         ({"wheels": {}}, "wheels has 1 to 64"),
@@ -329,24 +329,24 @@ def test_given_random_frames_then_nothing_is_raised_and_memory_stays_flat() -> N
         ({"delay_sigma": -0.1}, "delay_sigma is between"),
     ],
 )
-def test_given_settings_that_cannot_be_then_the_key_is_named(changes: dict[str, object], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_given_settings_that_cannot_be_then_the_key_is_named(changes: dict[str, object], expected: str) -> None:
+    with pytest.raises(ValueError, match=expected):
         wheels_settings(**changes)
 
 
 def test_given_a_direction_that_the_mapping_does_not_have_then_it_is_unknown() -> None:
     direction = DirectionMap("WheelCounts.FrontLeftDirection", 0, 1, 3)
     settings = wheels_settings(wheels={"front_left": wheel("Left", direction=direction)})
-    wire = wired(0.5, lambda t: -1.0).run(0.1)
+    wire = connect(0.5, lambda t: -1.0).run(0.1)
     driver = WheelsDriver(settings, raptor_dbc())
-    driver.opened(at(0.0))
-    found = [output for _, frame in wire.to_host for output in driver.received(frame, at(0.2))]
+    driver.on_open(at(0.0))
+    found = [output for _, frame in wire.to_host for output in driver.on_receive(frame, at(0.2))]
     found += [
         output
         for frame in (CanFrame(0x100, bytes((1, 0, 0, 0, 2, 0, 0, 0))), CanFrame(0x101, bytes((232, 3, 0, 0))))
-        for output in driver.received(frame, at(0.3))
+        for output in driver.on_receive(frame, at(0.3))
     ]
-    measured = next(output for output in found if isinstance(output, Measured))
+    measured = next(output for output in found if isinstance(output, MeasuredSample))
     assert isinstance(measured.sample, WheelsSample)
     assert measured.sample.wheels[0].direction is Direction.UNKNOWN
     assert math.isnan(measured.sample.wheels[0].speed)
@@ -355,13 +355,13 @@ def test_given_a_direction_that_the_mapping_does_not_have_then_it_is_unknown() -
 @pytest.mark.slow
 def test_given_a_simulated_raptor_that_turns_and_backs_up_then_its_wheels_come_over_the_bus() -> None:
     settings = wheels_settings()
-    drive = Trajectory(figure_eight(speed=3.0, radius=6.0, stand=2.0, stop=1.0, reverse=3.0))
+    drive = Trajectory(figure_eight(speed=3.0, radius=6.0, stationary=2.0, stop=1.0, reverse=3.0))
     run = Simulation(
         load_model(DBC.with_name("geometry.yaml")),
         "Raptor:CG",
         drive,
         origin_at(50.27, -111.18, 700.0),
-        rolling_frame="Raptor:RearAxleCentre",
+        rolling_frame="Raptor:RearAxleCenter",
         wheel_frames={name: f"Raptor:{name.title().replace('_', '')}WheelContact" for name in BOTH},
         wheels_model=WheelsModel.noise_free(Timing(100.0), frozenset(BOTH)),
     )
@@ -372,9 +372,9 @@ def test_given_a_simulated_raptor_that_turns_and_backs_up_then_its_wheels_come_o
     samples = wheels_of(wire)
     assert len(samples) == len(truths)
     for sample, truth in zip(samples, truths, strict=True):
-        for said, true in zip(sample.wheels, truth.wheels, strict=True):
-            assert said.travel == pytest.approx(true.travel, abs=0.51 * METRES_PER_COUNT)
-            assert said.direction is true.direction
+        for measured, true in zip(sample.wheels, truth.wheels, strict=True):
+            assert measured.travel == pytest.approx(true.travel, abs=0.51 * METERS_PER_COUNT)
+            assert measured.direction is true.direction
             # below 2 cm/s the direction is `stopped`, and a speed without sign has none
-            assert said.speed == pytest.approx(true.speed, abs=0.00051) or abs(true.speed) <= 0.02
+            assert measured.speed == pytest.approx(true.speed, abs=0.00051) or abs(true.speed) <= 0.02
     assert min(wheel.speed for sample in samples for wheel in sample.wheels) < -0.5

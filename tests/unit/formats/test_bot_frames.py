@@ -1,4 +1,4 @@
-"""libbot2's coordinate frames: what is read, and what each bad input is told."""
+"""libbot2's coordinate frames: what is read, and the error for each bad input."""
 
 import math
 
@@ -9,7 +9,7 @@ from support_urdf import BOT_FRAMES, pose_at
 
 from modelserver.errors import Severity
 from modelserver.geometry import JointType
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 LASER = 'relative_to = "body";'
 RPY = "rpy = [ 0, 90, 0 ];"
@@ -25,7 +25,7 @@ def test_frames_are_bodies_root_first_and_a_driven_one_floats():
         "body:Origin",
         JointType.FLOATING,
     )
-    assert (laser.from_, laser.to, laser.joint.moves) == ("body:laser", "laser:Origin", False)
+    assert (laser.from_, laser.to, laser.joint.is_movable) == ("body:laser", "laser:Origin", False)
     assert model.problems == ()
 
 
@@ -36,9 +36,9 @@ def test_a_transform_takes_points_of_the_frame_to_those_of_the_other():
     np.testing.assert_allclose(T, [[0, 0, 1, 1.5], [0, 1, 0, 2], [-1, 0, 0, 3.25], [0, 0, 0, 1]], atol=1e-15)
 
 
-def test_a_driven_frame_goes_where_its_message_says():
+def test_a_driven_frame_follows_its_messages():
     model = read(BOT_FRAMES)
-    # quarter turn to the left at (5, 6, 7); the laser is half a metre ahead, a quarter above
+    # quarter turn to the left at (5, 6, 7); the laser is half a meter ahead, a quarter above
     names = ("body.x", "body.y", "body.z", "body.rx", "body.ry", "body.rz")
     values = dict(zip(names, (5, 6, 7, 0, 0, math.pi / 2), strict=True))
     found = pose_at(model, "laser:Origin", "local:Origin", values)
@@ -79,7 +79,7 @@ coordinate_frames {
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said", "fix", "line"),
+    ("old", "new", "message", "fix", "line"),
     [
         (LASER, 'relative_to = "bodi";', "relative_to names frame 'bodi'", "write body", 13),
         (LASER, 'relative_to = "laser";', "laser in laser", "root frame", 13),
@@ -101,18 +101,18 @@ coordinate_frames {
         (RPY, "rpy = [ 0, 1e300, 0 ];", "rpy is out of reach", "exponent", 16),
         (RPY, "quat = [ 2, 0, 0, 0 ];", "length 2, not 1", "w first", 16),
         (RPY, "rpy { x = 1; }", "rpy is a block", "rpy =", 16),
-        ("translation = [ 0.5, 0, 0.25 ];", "", "translation is missing", "metres", 14),
-        ("0.5, 0, 0.25", "0.5, 0, 1e12", "out of reach", "metres", 14),
+        ("translation = [ 0.5, 0, 0.25 ];", "", "translation is missing", "meters", 14),
+        ("0.5, 0, 0.25", "0.5, 0, 1e12", "out of reach", "meters", 14),
         ('root_frame = "local";', "", "root_frame is missing", "add root_frame", 1),
         ('root_frame = "local";', 'root_frame = "body";', "is the root frame", "another root_frame", 3),
         ('root_frame = "local";', 'root_frame = "a b";', "no white space", "rename", 2),
         ("  laser {", "  body {", "frame body is defined twice (first on line 3)", "rename", 12),
-        ("  laser {", "  World {", "the service keeps this name", "rename", 12),
+        ("  laser {", "  World {", "this name is reserved", "rename", 12),
     ],
 )
-def test_a_bad_file_is_told_where_what_and_what_to_do(old, new, said, fix, line):
+def test_a_bad_file_has_an_error_with_place_and_fix(old, new, message, fix, line):
     found = [each for each in problems_of(BOT_FRAMES.replace(old, new, 1)) if each.severity is Severity.ERROR]
-    problem = next(each for each in found if said in each.message)
+    problem = next(each for each in found if message in each.message)
     assert fix in problem.fix
     assert problem.line == line
     assert problem.file == "file"

@@ -1,4 +1,4 @@
-"""The example in docs/geometry-files.md is what it says it is."""
+"""The examples in docs/geometry-files.md do what the page states."""
 
 import math
 from pathlib import Path
@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 from support_formats import read
 
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "geometry-files.md"
 
 
-def test_the_worked_example_is_clean_and_does_what_its_comments_say():
+def test_the_worked_example_is_clean_and_does_what_its_comments_state():
     text = DOCUMENT.read_text(encoding="utf-8")
     model = read(text.split("```yaml\n")[1].split("```")[0])
     assert model.problems == ()
@@ -22,7 +22,7 @@ def test_the_worked_example_is_clean_and_does_what_its_comments_say():
     assert model.get_transformation("FrontCamera:Left", "Cart:Origin").covariance is not None
 
 
-def test_given_the_example_of_joints_then_it_is_clean_and_rests_and_moves_as_the_text_says():
+def test_given_the_example_of_joints_then_it_is_clean_and_rests_and_moves_as_the_page_states():
     model = read(DOCUMENT.read_text(encoding="utf-8").split("```yaml\n")[2].split("```")[0])
     assert model.problems == ()
     assert list(model.joints) == ["Turn", "Lift", "KeepLevel", "Reach", "OnTheFloor"]

@@ -1,4 +1,4 @@
-"""Loading a file: told by content, with limits, and nothing heavy imported."""
+"""Loading a file: its format detected from the content, with limits, and nothing heavy imported."""
 
 import os
 import subprocess
@@ -9,8 +9,8 @@ from support_formats import YAML, miro, miro_body, miro_constraint, miro_frame, 
 from support_urdf import BOT_FRAMES, URDF
 
 from modelserver.errors import GeometryError
-from modelserver.formats import FORMS, check_file, form_of_path, load_model, save_model
-from modelserver.formats.content import MAX_BYTES
+from modelserver.formats import FORMATS, check_file, format_of_path, load_model, save_model
+from modelserver.formats.registry import MAX_BYTES
 
 TREE = tree(tree_frame("Rover"), tree_frame("Mast", "Rover"), tree_frame("Camera", "Mast"))
 
@@ -43,13 +43,13 @@ def only_error(path):
         ("a.cfg", "other { x = 1; }\n" + BOT_FRAMES, "local"),
     ],
 )
-def test_the_form_is_told_by_content_not_by_the_name_of_the_file(tmp_path, name, text, root):
+def test_the_format_is_detected_from_the_content_not_the_file_name(tmp_path, name, text, root):
     path = tmp_path / name
     path.write_bytes(text.encode())
     assert load_model(path).root.name == root
 
 
-def test_a_file_of_50_megabytes_is_refused_unread_and_the_limit_is_named(tmp_path):
+def test_a_file_of_50_megabytes_is_rejected_unread_and_the_limit_is_named(tmp_path):
     path = tmp_path / "huge.xml"
     path.touch()
     os.truncate(path, 50 * 1024**2)
@@ -87,16 +87,21 @@ def test_a_symbolic_link_is_followed_and_a_cycle_of_them_is_an_oserror(tmp_path)
 
 
 def test_the_form_to_write_follows_from_the_ending():
-    assert [form_of_path(name) for name in ("a.yaml", "a.YML", "b/a.xml", "a.urdf")] == ["yaml", "yaml", "miro", "urdf"]
+    assert [format_of_path(name) for name in ("a.yaml", "a.YML", "b/a.xml", "a.urdf")] == [
+        "yaml",
+        "yaml",
+        "miro",
+        "urdf",
+    ]
     for name in ("a.json", "a"):
         with pytest.raises(ValueError, match=r"\.yaml"):
-            form_of_path(name)
+            format_of_path(name)
 
 
-def test_an_unknown_form_is_refused_with_those_known(tmp_path):
+def test_an_unknown_form_is_rejected_with_those_known(tmp_path):
     path = tmp_path / "a.yaml"
     path.write_text(YAML)
-    with pytest.raises(ValueError, match=", ".join(FORMS)):
+    with pytest.raises(ValueError, match=", ".join(FORMATS)):
         save_model(load_model(path), "sdf")
 
 

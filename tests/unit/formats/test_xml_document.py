@@ -22,7 +22,7 @@ BOMB = (
         "<!DOCTYPE config\n[]>",
     ],
 )
-def test_a_doctype_with_a_dtd_or_entities_is_refused_at_its_line(doctype):
+def test_a_doctype_with_a_dtd_or_entities_is_rejected_at_its_line(doctype):
     problem = only_problem(PROLOG + doctype + "\n" + miro())
     assert problem.line == 4
     assert "DOCTYPE" in problem.message
@@ -33,11 +33,11 @@ def test_a_bare_doctype_is_let_through():
     assert read(PROLOG + "<!DOCTYPE MiroConfigDocument>\n" + miro())
 
 
-def test_an_entity_bomb_is_refused():
+def test_an_entity_bomb_is_rejected():
     assert "entities" in only_problem(BOMB).message
 
 
-def test_a_doctype_hidden_by_an_encoding_is_refused():
+def test_a_doctype_hidden_by_an_encoding_is_rejected():
     for encoding in ("utf-16", "utf-32"):
         assert only_problem(BOMB.encode(encoding)).severity == "error"
     hidden = BOMB.replace("<!", "+ADwAIQ-").encode()
@@ -68,12 +68,12 @@ def test_broken_xml_is_a_problem_not_a_traceback(content):
 def test_a_file_named_xml_is_read_as_xml_whatever_it_begins_with():
     from modelserver.formats import registry
 
-    (problem,) = registry.read(b"bodies:\n", "cart.xml").problems
+    (problem,) = registry.parse_content(b"bodies:\n", "cart.xml").problems
     assert "not well-formed" in problem.message
 
 
 @pytest.mark.parametrize(
-    ("root", "said"),
+    ("root", "message"),
     [
         ("<html><body/></html>", "the outermost element is html, not config"),
         ('<robot name="x"/>', "there is no link"),
@@ -82,9 +82,9 @@ def test_a_file_named_xml_is_read_as_xml_whatever_it_begins_with():
         ("<config><config_group name='test'/></config>", "compile-time"),
     ],
 )
-def test_xml_that_is_no_geometry_says_what_it_is(root, said):
+def test_xml_that_is_no_geometry_is_recognized(root, message):
     problem = next(each for each in problems_of(root) if each.severity == "error")
-    assert said in problem.message
+    assert message in problem.message
     assert problem.line == 1
     assert problem.fix
 

@@ -1,4 +1,4 @@
-"""Visuals and collisions in the YAML form."""
+"""Visuals and collisions in the YAML format."""
 
 import pytest
 from support_formats import YAML, problems_of, read
@@ -6,7 +6,7 @@ from support_formats import YAML, problems_of, read
 from modelserver.errors import Severity
 from modelserver.formats import save_model
 from modelserver.geometry import Material, ModelBuilder, Shape, ShapeKind
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 VISUALS = """\
   Camera:
@@ -18,7 +18,7 @@ VISUALS = """\
       - cylinder: {radius: 0.05, length: 0.2}
       - mesh: "meshes/lens cap.stl"
         scale: [0.001, 0.001, 0.001]
-        material: {name: "on", colour: [1, 0, 0, 0.5], texture: a.png}
+        material: {name: "on", color: [1, 0, 0, 0.5], texture: a.png}
     collisions:
       - sphere: {radius: 0.3}
 """
@@ -55,12 +55,12 @@ def test_a_body_takes_its_templates_shapes_unless_it_has_its_own():
 def test_a_body_added_again_keeps_its_shapes():
     camera = read(TEXT).body("Camera")
     builder = ModelBuilder()
-    builder.add(camera.renamed("Rear"))
+    builder.copy_body(camera.with_name("Rear"))
     assert builder.build().root.visuals == camera.visuals
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("box: [0.1, 0.2, 0.3]", "box: [0.1, 0.2]", "box has 2 numbers, not 3"),
         ("box: [0.1, 0.2, 0.3]", "box: [0.1, -0.2, 0.3]", "the y of a box is finite and not negative"),
@@ -69,14 +69,14 @@ def test_a_body_added_again_keeps_its_shapes():
         ("box: [0.1, 0.2, 0.3]", "box: [1, 1, 1]\n        scale: [1, 1, 1]", "a box has no scale"),
         (", length: 0.2", "", "length is missing"),
         ('mesh: "meshes/lens cap.stl"', 'mesh: ""', "a mesh's file is missing"),
-        ("colour: [1, 0", "colour: [2, 0", "each from 0 to 1"),
+        ("color: [1, 0", "color: [2, 0", "each from 0 to 1"),
         ('name: "on", ', "", "a material's name is missing"),
         ("- sphere: {radius: 0.3}", "sphere", "expected a list of shapes"),
     ],
 )
-def test_a_bad_shape_is_an_error_with_its_place(old, new, said):
+def test_a_bad_shape_is_an_error_with_its_place(old, new, message):
     errors = [each for each in problems_of(TEXT.replace(old, new)) if each.severity is Severity.ERROR]
-    problem = next(each for each in errors if said in each.message)
+    problem = next(each for each in errors if message in each.message)
     assert problem.fix
     assert problem.line > 5
     assert problem.element.startswith("body Camera, ")

@@ -18,7 +18,7 @@ from modelserver.errors import (
 )
 from modelserver.formats import load_model
 from modelserver.geometry import BodyFrame, Joint, JointType, Mimic, Model, ModelBuilder
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 RAPTOR = Path(__file__).resolve().parents[3] / "config" / "raptor"
 QUARTER = Pose.from_rpy((1.0, 2.0, 3.0), 0.0, 0.0, np.pi / 2)
@@ -27,13 +27,13 @@ QUARTER = Pose.from_rpy((1.0, 2.0, 3.0), 0.0, 0.0, np.pi / 2)
 def cart(strict: bool = False) -> Model:
     """Return a cart with a rail that carries two cameras at one frame, and a lamp on the first."""
     builder = ModelBuilder("cart", strict=strict)
-    builder.body("Cart").frame("Origin").frame("Rail", Pose((0.2, 0.0, 1.0)))
-    camera = builder.body("Left").frame("Mount").frame("Lens", Pose((0.1, 0.0, 0.0)))
-    builder.body("Right").frame("Mount")
-    builder.body("Lamp").frame("Foot")
-    builder.constraint("LeftFixed", "Cart:Rail", "Left:Mount", QUARTER)
-    builder.constraint("RightFixed", "Right:Mount", "Cart:Rail", QUARTER)
-    builder.constraint("LampFixed", "Left:Lens", "Lamp:Foot")
+    builder.add_body("Cart").add_frame("Origin").add_frame("Rail", Pose((0.2, 0.0, 1.0)))
+    camera = builder.add_body("Left").add_frame("Mount").add_frame("Lens", Pose((0.1, 0.0, 0.0)))
+    builder.add_body("Right").add_frame("Mount")
+    builder.add_body("Lamp").add_frame("Foot")
+    builder.add_constraint("LeftFixed", "Cart:Rail", "Left:Mount", QUARTER)
+    builder.add_constraint("RightFixed", "Right:Mount", "Cart:Rail", QUARTER)
+    builder.add_constraint("LampFixed", "Left:Lens", "Lamp:Foot")
     assert camera.name == "Left"
     return builder.build()
 
@@ -53,7 +53,7 @@ def test_given_a_file_then_every_frame_knows_its_body_and_full_name(file: str) -
 
 def test_given_a_copied_body_then_its_frames_are_equal_and_know_the_copy() -> None:
     left = cart().body("Left")
-    copy = left.renamed("Spare")
+    copy = left.with_name("Spare")
     assert [frame.full_name for frame in copy] == ["Spare:Mount", "Spare:Lens"]
     assert copy.frames == left.frames
     assert not left.has_frame(copy.frame("Lens"))
@@ -101,7 +101,7 @@ def test_given_no_constraint_then_nothing_is_next() -> None:
             model.next("Cart:Origin", constraint)
 
 
-def test_given_what_is_no_frame_of_the_model_then_an_error_says_so() -> None:
+def test_given_what_is_no_frame_of_the_model_then_an_error_is_raised() -> None:
     model = cart()
     for query in (model.neighbors, model.constraints_of, model.next, model.verify):
         with pytest.raises(UnknownFrameError, match="no frame 'Rial'"):
@@ -115,8 +115,8 @@ def test_given_what_is_no_frame_of_the_model_then_an_error_says_so() -> None:
 def test_given_equation_13_when_constraints_are_crossed_one_by_one_then_the_product_is_the_answer() -> None:
     """The report's chain from the Raptor's origin to the Digiclops's image plane, frame by frame (4.6.3)."""
     model = load_model(RAPTOR / "geometry.xml")
-    X = model.frame("Raptor:CabFrontRailCentre").pose
-    sick = model.next("Raptor:CabFrontRailCentre")
+    X = model.frame("Raptor:CabFrontRailCenter").pose
+    sick = model.next("Raptor:CabFrontRailCenter")
     X = X @ sick.pose @ sick.frame.pose.inverse() @ model.frame("FrontNoddingSICK:BottomPlateCorner").pose
     camera = model.next("FrontNoddingSICK:BottomPlateCorner")
     X = X @ camera.pose @ camera.frame.pose.inverse() @ model.frame("Digiclops:ImagePlane").pose
@@ -131,7 +131,7 @@ def test_given_a_sound_frame_then_nothing_is_wrong_with_it() -> None:
     assert all(model.verify(frame) == () for body in model.bodies for frame in body)
 
 
-def test_given_a_frame_with_two_constraints_then_a_note_says_that_strict_models_allow_one() -> None:
+def test_given_a_frame_with_two_constraints_then_a_note_reports_that_strict_models_allow_one() -> None:
     (problem,) = cart().verify("Cart:Rail")
     assert problem.severity is Severity.NOTE
     assert "2 constraints, LeftFixed, RightFixed" in problem.message
@@ -141,7 +141,7 @@ def test_given_a_frame_with_two_constraints_then_a_note_says_that_strict_models_
 
 def test_given_a_frame_of_an_orphan_or_of_another_model_then_that_is_what_is_wrong() -> None:
     builder = ModelBuilder.from_model(cart())
-    builder.body("Loose").frame("Origin")
+    builder.add_body("Loose").add_frame("Origin")
     model = builder.build()
     (problem,) = model.verify("Loose:Origin")
     assert problem.severity is Severity.WARNING
@@ -165,7 +165,7 @@ def test_given_a_model_when_it_goes_through_a_builder_then_it_is_the_same() -> N
 def test_given_an_unconstrained_frame_then_what_hung_on_it_is_an_orphan_that_answers_inside_itself() -> None:
     model = cart()
     builder = ModelBuilder.from_model(model)
-    assert builder.unconstrain(model.frame("Left:Mount")) == ("LeftFixed",)
+    assert builder.remove_constraints(model.frame("Left:Mount")) == ("LeftFixed",)
     left = builder.build()
     assert [str(each.severity) for each in left.problems] == ["warning", "warning"]
     assert [each.message.split(":")[0] for each in left.problems] == [
@@ -187,29 +187,29 @@ def test_given_an_unconstrained_frame_then_what_hung_on_it_is_an_orphan_that_ans
 def test_given_several_constraints_then_one_is_removed_by_name_or_all_are() -> None:
     builder = ModelBuilder.from_model(cart())
     with pytest.raises(NotConnectedError, match="has no constraint 'RigthFixed'"):
-        builder.unconstrain("Cart:Rail", "RigthFixed")
-    assert builder.unconstrain("Cart:Rail", "RightFixed") == ("RightFixed",)
+        builder.remove_constraints("Cart:Rail", "RigthFixed")
+    assert builder.remove_constraints("Cart:Rail", "RightFixed") == ("RightFixed",)
     assert [each.name for each in builder.build().constraints] == ["LeftFixed", "LampFixed"]
     builder = ModelBuilder.from_model(cart())
-    assert builder.unconstrain("Cart:Rail") == ("LeftFixed", "RightFixed")
+    assert builder.remove_constraints("Cart:Rail") == ("LeftFixed", "RightFixed")
     with pytest.raises(NotConnectedError, match="Cart:Rail has no constraint"):
-        builder.unconstrain("Cart:Rail")
+        builder.remove_constraints("Cart:Rail")
 
 
-def test_given_a_joint_that_others_follow_when_it_is_removed_then_the_build_says_who_follows() -> None:
+def test_given_a_joint_that_others_follow_when_it_is_removed_then_the_build_names_the_followers() -> None:
     builder = ModelBuilder("lift")
-    builder.body("Base").frame("Origin").frame("Other")
-    builder.body("Arm").frame("Origin")
-    builder.body("Shade").frame("Origin")
-    builder.constraint("Lift", "Base:Origin", "Arm:Origin", joint=Joint(JointType.REVOLUTE))
+    builder.add_body("Base").add_frame("Origin").add_frame("Other")
+    builder.add_body("Arm").add_frame("Origin")
+    builder.add_body("Shade").add_frame("Origin")
+    builder.add_constraint("Lift", "Base:Origin", "Arm:Origin", joint=Joint(JointType.REVOLUTE))
     follows = Joint(JointType.REVOLUTE, mimic=Mimic("Lift"))
-    builder.constraint("Shades", "Base:Other", "Shade:Origin", joint=follows)
+    builder.add_constraint("Shades", "Base:Other", "Shade:Origin", joint=follows)
     model = builder.build()
     assert not model.is_static("Arm:Origin", "Base:Origin")
     assert model.is_static("Base:Other", "Base:Origin")
     assert [each.is_static for each in model.constraints] == [False, False]
     changed = ModelBuilder.from_model(model)
-    changed.unconstrain("Arm:Origin")
+    changed.remove_constraints("Arm:Origin")
     with pytest.raises(GeometryError, match="Shades"):
         changed.build()
 

@@ -1,4 +1,4 @@
-"""What changes from one model to another, told line by line."""
+"""Changes from one model to another, a line each."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from modelserver.geometry import Joint, JointType, ModelBuilder, Sigma
-from modelserver.geometry.difference import changes
+from modelserver.geometry.difference import describe_changes
 from modelserver.geometry.model import Model
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 NOD = Joint(JointType.REVOLUTE, (0.0, 1.0, 0.0))
 
@@ -27,18 +27,18 @@ def cart(
     description: str = "",
 ) -> Model:
     builder = ModelBuilder("cart")
-    body = builder.body("Cart", description=description)
-    body.frame("Base").frame("Mast", mast, sigma=sigma)
-    builder.body(camera).frame("Origin").frame(lens)
+    body = builder.add_body("Cart", description=description)
+    body.add_frame("Base").add_frame("Mast", mast, sigma=sigma)
+    builder.add_body(camera).add_frame("Origin").add_frame(lens)
     if more:
-        builder.body(more).frame("Origin")
+        builder.add_body(more).add_frame("Origin")
     extra = {} if joint is None else {"joint": joint}
-    builder.constraint("Mounted", "Cart:Mast", f"{camera}:Origin", mounted, sigma=sigma, **extra)
+    builder.add_constraint("Mounted", "Cart:Mast", f"{camera}:Origin", mounted, sigma=sigma, **extra)
     return builder.build()
 
 
 @pytest.mark.parametrize(
-    ("new", "told"),
+    ("new", "expected"),
     [
         (cart(), ()),
         (cart(mast=Pose((0.5 + 1e-13, 0.0, 1.0))), ("descriptions or the order of what is listed",)),
@@ -51,11 +51,11 @@ def cart(
             ("frame Cart:Mast states another sigma", "constraint Mounted states another sigma"),
         ),
         (cart(joint=NOD), ("the joint of constraint Mounted is revolute, it was fixed",)),
-        (cart(lens="Glass"), ("frame Camera:Lens is gone", "frame Camera:Glass is new")),
+        (cart(lens="Glass"), ("frame Camera:Lens is removed", "frame Camera:Glass is new")),
         (
             cart(camera="Eye"),
             (
-                "body Camera is gone",
+                "body Camera is removed",
                 "body Eye is new",
                 "constraint Mounted joins Cart:Mast and Eye:Origin, it joined Cart:Mast and Camera:Origin",
             ),
@@ -63,12 +63,12 @@ def cart(
         (cart(more="Lamp"), ("body Lamp is new",)),
     ],
 )
-def test_given_another_model_then_each_change_is_told_in_its_line(new: Model, told: tuple[str, ...]) -> None:
-    assert changes(cart(), new) == told
+def test_given_another_model_then_each_change_has_its_line(new: Model, expected: tuple[str, ...]) -> None:
+    assert describe_changes(cart(), new) == expected
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "expected"),
     [
         ({"axis": (0.0, 0.0, 1.0)}, "the axis 0 0 1, it was 0 1 0"),
         ({"lower": (math.radians(-30.0),)}, "the lower limit -30 deg, it was none"),
@@ -81,33 +81,35 @@ def test_given_another_model_then_each_change_is_told_in_its_line(new: Model, to
         ),
     ],
 )
-def test_given_a_joint_that_states_otherwise_then_each_number_is_told(change: dict[str, Any], told: str) -> None:
-    found = changes(cart(joint=NOD), cart(joint=replace(NOD, **change)))
-    assert found == (f"the joint of constraint Mounted has {told}",)
+def test_given_a_joint_that_states_otherwise_then_each_number_is_reported(
+    change: dict[str, Any], expected: str
+) -> None:
+    found = describe_changes(cart(joint=NOD), cart(joint=replace(NOD, **change)))
+    assert found == (f"the joint of constraint Mounted has {expected}",)
 
 
-def test_given_constraints_that_come_and_go_and_another_root_then_it_is_told() -> None:
+def test_given_constraints_that_come_and_go_and_another_root_then_it_is_reported() -> None:
     def pair(first: str, second: str, constraint: str) -> Model:
         builder = ModelBuilder("pair")
-        builder.body(first).frame("Origin")
-        builder.body(second).frame("Origin")
-        builder.constraint(constraint, "A:Origin", "B:Origin")
+        builder.add_body(first).add_frame("Origin")
+        builder.add_body(second).add_frame("Origin")
+        builder.add_constraint(constraint, "A:Origin", "B:Origin")
         return builder.build()
 
-    assert changes(pair("A", "B", "Weld"), pair("B", "A", "Bolt")) == (
-        "constraint Weld is gone",
+    assert describe_changes(pair("A", "B", "Weld"), pair("B", "A", "Bolt")) == (
+        "constraint Weld is removed",
         "constraint Bolt is new",
         "the root body is B, it was A",
     )
 
 
-def test_given_mass_that_changes_then_it_is_told() -> None:
-    def weighed(mass: float) -> Model:
+def test_given_mass_that_changes_then_it_is_reported() -> None:
+    def build_with_mass(mass: float) -> Model:
         builder = ModelBuilder("weight")
         inertia = [[0.0] * 6 for _ in range(6)]
         for n in range(3):
             inertia[n][n], inertia[n + 3][n + 3] = mass, 1.0
-        builder.body("Cart", inertia=inertia).frame("Base")
+        builder.add_body("Cart", inertia=inertia).add_frame("Base")
         return builder.build()
 
-    assert changes(weighed(1.0), weighed(2.0)) == ("body Cart has another inertia",)
+    assert describe_changes(build_with_mass(1.0), build_with_mass(2.0)) == ("body Cart has another inertia",)

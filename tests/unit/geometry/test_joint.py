@@ -15,21 +15,26 @@ from support_spatial import axes
 
 from modelserver.geometry import Joint, JointType, Mimic
 from modelserver.geometry.joint import FIXED, coordinate_names
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 MOVED = joints(types=MOVING)
 UP, LEFT = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
 
 
-def turned(joint, *position):
-    return joint.motion(position).rotation
+def rotation_of(joint, *position):
+    return joint.compute_pose(position).rotation
 
 
 # what it does
 
 
 def test_given_a_fixed_joint_then_it_has_no_coordinates_and_does_not_move():
-    assert (FIXED.count, FIXED.moves, FIXED.rest, FIXED.motion(())) == (0, False, (), Pose.identity())
+    assert (FIXED.count, FIXED.is_movable, FIXED.default_position, FIXED.compute_pose(())) == (
+        0,
+        False,
+        (),
+        Pose.identity(),
+    )
     assert FIXED.jacobian(()).shape == (6, 0)
     assert coordinate_names("A", FIXED) == ()
 
@@ -37,31 +42,31 @@ def test_given_a_fixed_joint_then_it_has_no_coordinates_and_does_not_move():
 def test_given_a_revolute_joint_then_it_turns_about_its_axis_by_the_right_hand():
     joint = Joint(JointType.REVOLUTE, LEFT)
     # about y, which points left, x goes down
-    np.testing.assert_allclose(turned(joint, math.pi / 2) @ (1, 0, 0), (0, 0, -1), atol=1e-15)
-    assert joint.motion((7 * math.tau + 0.5,)).is_close(joint.motion((0.5,)), 0, 1e-14)
+    np.testing.assert_allclose(rotation_of(joint, math.pi / 2) @ (1, 0, 0), (0, 0, -1), atol=1e-15)
+    assert joint.compute_pose((7 * math.tau + 0.5,)).is_close(joint.compute_pose((0.5,)), 0, 1e-14)
 
 
 def test_given_a_prismatic_joint_then_it_slides_along_its_axis():
-    assert Joint(JointType.PRISMATIC, (0, 0, 5)).motion((0.4,)) == Pose((0, 0, 0.4))
+    assert Joint(JointType.PRISMATIC, (0, 0, 5)).compute_pose((0.4,)) == Pose((0, 0, 0.4))
 
 
 def test_given_a_spherical_joint_then_its_coordinates_are_a_rotation_vector():
     joint = Joint(JointType.SPHERICAL)
     np.testing.assert_allclose(
-        turned(joint, 0.3, -0.2, 0.9), Rotation.from_rotvec((0.3, -0.2, 0.9)).as_matrix(), atol=1e-14
+        rotation_of(joint, 0.3, -0.2, 0.9), Rotation.from_rotvec((0.3, -0.2, 0.9)).as_matrix(), atol=1e-14
     )
 
 
 def test_given_a_planar_joint_then_it_slides_in_its_plane_and_turns_about_the_normal():
-    moved = Joint(JointType.PLANAR).motion((0.3, -0.4, math.pi / 2))
+    moved = Joint(JointType.PLANAR).compute_pose((0.3, -0.4, math.pi / 2))
     assert moved.is_close(Pose.from_rpy((0.3, -0.4, 0), yaw=math.pi / 2), 1e-15, 1e-15)
     # the normal turned to x: the shortest way takes z to x, and x to -z
-    moved = Joint(JointType.PLANAR, (1, 0, 0)).motion((0.3, -0.4, 0.0))
+    moved = Joint(JointType.PLANAR, (1, 0, 0)).compute_pose((0.3, -0.4, 0.0))
     assert moved.is_close(Pose((0, -0.4, -0.3)), 1e-15, 1e-15)
 
 
 def test_given_a_floating_joint_then_it_has_a_position_and_a_rotation_vector():
-    moved = Joint(JointType.FLOATING).motion((1, 2, 3, 0, 0, 0.5))
+    moved = Joint(JointType.FLOATING).compute_pose((1, 2, 3, 0, 0, 0.5))
     assert moved.is_close(Pose.from_rpy((1, 2, 3), yaw=0.5), 1e-15, 1e-15)
 
 
@@ -77,11 +82,11 @@ def test_given_a_floating_joint_then_it_has_a_position_and_a_rotation_vector():
 )
 def test_given_a_type_then_each_coordinate_has_a_name_and_a_unit(kind, names, angles):
     assert coordinate_names("A", Joint(kind)) == names
-    assert Joint(kind).is_angle == angles
+    assert Joint(kind).angle_flags == angles
 
 
 @given(MOVED, st.data())
-def test_given_any_joint_when_its_coordinates_change_then_the_jacobian_says_how_it_moves(joint, data):
+def test_given_any_joint_when_its_coordinates_change_then_the_jacobian_is_its_derivative(joint, data):
     position = data.draw(positions_of(joint))
     found = joint.jacobian(position)
     step = 1e-5
@@ -89,7 +94,7 @@ def test_given_any_joint_when_its_coordinates_change_then_the_jacobian_says_how_
         ahead, behind = list(position), list(position)
         ahead[number] += step
         behind[number] -= step
-        X, Y = joint.motion(ahead), joint.motion(behind)
+        X, Y = joint.compute_pose(ahead), joint.compute_pose(behind)
         turn = Rotation.from_matrix(X.rotation) * Rotation.from_matrix(Y.rotation).inv()
         numerical = np.concatenate(((X.position - Y.position), turn.as_rotvec())) / (2 * step)
         np.testing.assert_allclose(found[:, number], numerical, atol=1e-6)
@@ -98,7 +103,7 @@ def test_given_any_joint_when_its_coordinates_change_then_the_jacobian_says_how_
 @given(axes)
 def test_given_any_normal_then_a_planes_axes_are_square_to_it_and_right_handed(normal):
     joint = Joint(JointType.PLANAR, normal)
-    x, y = joint.motion((1, 0, 0)).position, joint.motion((0, 1, 0)).position
+    x, y = joint.compute_pose((1, 0, 0)).position, joint.compute_pose((0, 1, 0)).position
     np.testing.assert_allclose(
         np.column_stack((x, y, joint.axis)).T @ np.column_stack((x, y, joint.axis)), np.eye(3), atol=1e-12
     )
@@ -106,9 +111,9 @@ def test_given_any_normal_then_a_planes_axes_are_square_to_it_and_right_handed(n
 
 
 @pytest.mark.parametrize("tilt", [0.0, 1e-200, 1e-9, 1e-7, 1e-6, 3e-6, 1e-3])
-def test_given_a_normal_near_straight_down_then_a_planes_axes_are_still_square_to_it(tilt):
+def test_given_a_normal_near_straight_down_then_a_planes_axes_are_square_to_it(tilt):
     joint = Joint(JointType.PLANAR, (tilt, tilt / 2, -1.0))
-    frame = np.column_stack((*(joint.motion(at).position for at in ((1, 0, 0), (0, 1, 0))), joint.axis))
+    frame = np.column_stack((*(joint.compute_pose(at).position for at in ((1, 0, 0), (0, 1, 0))), joint.axis))
     np.testing.assert_allclose(frame.T @ frame, np.eye(3), atol=1e-14)
 
 
@@ -117,21 +122,21 @@ def test_given_a_normal_near_straight_down_then_a_planes_axes_are_still_square_t
 
 @given(MOVED)
 def test_given_any_joint_then_it_rests_within_its_limits_at_its_default_if_it_has_one(joint):
-    assert not joint.out_of_limits(joint.rest)
-    assert joint.rest == (joint.default or (0.0,) * joint.count)
+    assert not joint.is_out_of_limits(joint.default_position)
+    assert joint.default_position == (joint.default or (0.0,) * joint.count)
 
 
 def test_given_limits_that_exclude_0_then_it_rests_at_the_nearer_one():
-    assert Joint(JointType.PRISMATIC, UP, (0.2,), (0.5,)).rest == (0.2,)
-    assert Joint(JointType.PRISMATIC, UP, (-0.5,), (-0.2,)).rest == (-0.2,)
-    assert Joint(JointType.PLANAR, UP, (0.1, -1, -1), (1, 1, -0.5)).rest == (0.1, 0.0, -0.5)
+    assert Joint(JointType.PRISMATIC, UP, (0.2,), (0.5,)).default_position == (0.2,)
+    assert Joint(JointType.PRISMATIC, UP, (-0.5,), (-0.2,)).default_position == (-0.2,)
+    assert Joint(JointType.PLANAR, UP, (0.1, -1, -1), (1, 1, -0.5)).default_position == (0.1, 0.0, -0.5)
 
 
 def test_given_a_position_beyond_a_limit_by_rounding_alone_then_it_is_within():
     joint = Joint(JointType.REVOLUTE, UP, (-0.5,), (0.5,))
-    assert not joint.out_of_limits((0.5 + 1e-12,))
-    assert joint.out_of_limits((0.5 + 1e-6,))
-    assert joint.out_of_limits((-0.6,))
+    assert not joint.is_out_of_limits((0.5 + 1e-12,))
+    assert joint.is_out_of_limits((0.5 + 1e-6,))
+    assert joint.is_out_of_limits((-0.6,))
 
 
 def test_given_no_limits_written_in_several_ways_then_the_joints_are_equal():
@@ -141,7 +146,7 @@ def test_given_no_limits_written_in_several_ways_then_the_joints_are_equal():
 
 
 @pytest.mark.parametrize(
-    ("given_", "said"),
+    ("given_", "message"),
     [
         ({"type": "hinge"}, "hinge"),
         ({"axis": (0, 0, 0)}, "not all 0"),
@@ -161,13 +166,13 @@ def test_given_no_limits_written_in_several_ways_then_the_joints_are_equal():
         ({"type": JointType.FIXED, "default": (0.0,)}, "a fixed joint has 0 coordinates"),
     ],
 )
-def test_given_what_no_joint_can_state_then_it_is_refused(given_, said):
-    with pytest.raises(ValueError, match=re.escape(said)):
+def test_given_what_no_joint_can_state_then_it_is_rejected(given_, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
         Joint(**({"type": JointType.REVOLUTE} | given_))
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf])
-def test_given_a_mimic_that_is_no_number_then_it_is_refused(number):
+def test_given_a_mimic_that_is_no_number_then_it_is_rejected(number):
     with pytest.raises(ValueError, match="finite"):
         Mimic("A", number)
     with pytest.raises(ValueError, match="finite"):

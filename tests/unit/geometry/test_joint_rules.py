@@ -1,4 +1,4 @@
-"""Joints among each other: names of coordinates, who follows whom, and where they rest."""
+"""Rules between joints: coordinate names, mimic chains, and default positions."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 
 from modelserver.errors import GeometryError, Location, Severity
 from modelserver.geometry import Joint, JointType, Mimic, ModelBuilder
-from modelserver.geometry.drives import JointDrive
-from modelserver.spatial import Pose
+from modelserver.geometry.mimic import JointDrive
+from modelserver.transforms import Pose
 
 X = (1.0, 0.0, 0.0)
 
@@ -22,12 +22,12 @@ def slide(mimic=None, **stated):
 def comb(**joints):
     """Return a builder of a body for each joint, named as it is in small, all on the first body."""
     builder = ModelBuilder("comb")
-    builder.body("Base").frame("O")
+    builder.add_body("Base").add_frame("O")
     for number, (name, joint) in enumerate(joints.items(), 10):
         name = name.replace("__", ".")
         body = name.lower().replace(".", "_")
-        builder.body(body, source=Location("comb", number)).frame("o")
-        builder.constraint(name, "Base:O", f"{body}:o", joint=joint, source=Location("comb", number))
+        builder.add_body(body, source=Location("comb", number)).add_frame("o")
+        builder.add_constraint(name, "Base:O", f"{body}:o", joint=joint, source=Location("comb", number))
     return builder
 
 
@@ -63,9 +63,9 @@ def test_given_a_joint_that_follows_then_it_rests_where_its_leaders_rest_takes_i
     # and building again of what was built changes nothing
     again = ModelBuilder("comb")
     for body in model.bodies:
-        again.add(body)
+        again.copy_body(body)
     for each in model.constraints:
-        again.constraint(each.name, each.from_, each.to, each.pose, each.description, each.sigma, each.joint)
+        again.add_constraint(each.name, each.from_, each.to, each.pose, each.description, each.sigma, each.joint)
     assert again.build().problems == ()
     assert again.build().revision == model.revision
 
@@ -84,7 +84,7 @@ def test_given_a_planar_joint_then_no_other_may_be_called_as_one_of_its_coordina
 
 
 @pytest.mark.parametrize(
-    ("joints", "said", "fix"),
+    ("joints", "message", "fix"),
     [
         ({"A": slide(Mimic("A"))}, "constraint 'A': its joint follows itself", "remove mimic"),
         (
@@ -101,26 +101,26 @@ def test_given_a_planar_joint_then_no_other_may_be_called_as_one_of_its_coordina
         ),
         (
             {"A": slide(Mimic("B")), "B": slide(Mimic("C")), "C": slide(Mimic("A"))},
-            "joints follow each other in a circle: A follows B follows C follows A",
+            "joints follow each other in a cycle: A follows B follows C follows A",
             "remove the mimic of one",
         ),
-        # one that follows into the circle is not at fault
+        # a follower of a joint of the cycle is not reported
         (
             {"T": slide(Mimic("A")), "A": slide(Mimic("B")), "B": slide(Mimic("A"))},
-            "in a circle: A follows B follows A",
+            "in a cycle: A follows B follows A",
             "remove",
         ),
-        ({"A": slide(default=(3.0,)), "B": slide(Mimic("A", 1e9))}, "out of all reach", "multipliers"),
+        ({"A": slide(default=(3.0,)), "B": slide(Mimic("A", 1e9))}, "beyond 1e+09", "multipliers"),
         (
             {"A": slide(default=(3.0,)), "B": slide(Mimic("A", 1e200)), "C": slide(Mimic("B", 1e200))},
-            "constraint 'B': following A takes its joint out of all reach",
+            "constraint 'B': following A puts its joint beyond 1e+09",
             "multipliers",
         ),
     ],
 )
-def test_given_a_joint_that_cannot_follow_then_it_is_named_with_the_remedy_and_repair_drops_it(joints, said, fix):
+def test_given_a_joint_that_cannot_follow_then_it_is_named_with_the_remedy_and_repair_drops_it(joints, message, fix):
     problem = errors(comb(**joints))[0]
-    assert said in problem.message
+    assert message in problem.message
     assert fix in problem.fix
     assert problem.line >= 10
     model = comb(**joints).build(repair=True)
@@ -135,7 +135,7 @@ def test_given_several_faults_then_each_is_reported_once():
 
 def test_given_a_leader_that_is_broken_itself_then_its_followers_are_no_second_fault():
     builder = comb(B=slide(Mimic("A")), C=slide(Mimic("B")))
-    builder.constraint("A", "Base:Nope", "b:o", joint=slide(), source=Location("comb", 9))
+    builder.add_constraint("A", "Base:Nope", "b:o", joint=slide(), source=Location("comb", 9))
     assert "Nope" in only(builder).message
     model = builder.build(repair=True)
     assert model.get_body_list() == ["Base"]
@@ -181,21 +181,21 @@ def test_given_a_leaders_rest_out_of_a_followers_limits_then_that_is_a_warning()
     model = comb(A=slide(default=(0.5,)), B=Joint(JointType.REVOLUTE, X, upper=(0.2,), mimic=Mimic("A", 2.0))).build()
     (problem,) = model.problems
     assert problem.severity is Severity.WARNING
-    assert problem.message == "constraint 'B': where A rests, its joint is at 57.3 deg, out of its limits"
+    assert problem.message == "constraint 'B': at the default of A, its joint is at 57.3 deg, out of its limits"
     assert problem.line == 11
 
 
 def test_given_a_default_of_a_joint_that_follows_then_that_is_a_warning_and_it_counts_for_nothing():
     model = comb(A=slide(default=(0.5,)), B=slide(Mimic("A"), default=(0.1,))).build()
     (problem,) = model.problems
-    assert "the default of its joint counts for nothing, for it follows A" in problem.message
+    assert "the default of its joint is not used, because it follows A" in problem.message
     assert place(model, "b") == 0.5
 
 
 def test_given_a_sigma_of_a_joint_that_follows_then_that_is_a_warning():
     model = comb(A=slide(sigma=(0.001,)), B=slide(Mimic("A"), sigma=(0.002,))).build()
     (problem,) = model.problems
-    assert "the sigma of its joint counts for nothing, for it follows A" in problem.message
+    assert "the sigma of its joint is not used, because it follows A" in problem.message
 
 
 @pytest.mark.parametrize("stated", [{"lower": (-30.0,)}, {"upper": (45.0,)}, {"default": (20.0,)}])
@@ -207,7 +207,7 @@ def test_given_an_angle_beyond_two_turns_then_degrees_are_suspected(stated):
 
 
 @pytest.mark.parametrize("stated", [{"lower": (-6.3,), "upper": (6.3,)}, {"rate_limit": (30.0,)}])
-def test_given_angles_up_to_two_turns_then_nobody_is_warned(stated):
+def test_given_angles_up_to_two_turns_then_there_is_no_warning(stated):
     assert not comb(A=Joint(JointType.REVOLUTE, X, **stated)).build().problems
     assert not comb(A=slide(lower=(-30.0,), upper=(30.0,))).build().problems
 

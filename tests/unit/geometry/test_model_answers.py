@@ -1,4 +1,4 @@
-"""What a model answers, keeps and refuses."""
+"""What a model answers, caches and rejects."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from support_geometry import all_frames, chain, random_builder, star
 from modelserver.errors import LimitError, NotConnectedError, UnknownBodyError, UnknownFrameError
 from modelserver.geometry import Body, BodyFrame, Constraint, Model, ModelBuilder, Search, Sigma, topology
 from modelserver.geometry import model as model_module
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 
 
 def pair(**changes):
@@ -31,10 +31,10 @@ def pair(**changes):
         "body_pose": None,
     } | changes
     builder = ModelBuilder()
-    first = builder.body(content["first"], content["body_description"], content["body_pose"], content["inertia"])
-    first.frame(content["frame"], content["pose"], content["frame_description"], content["sigma"])
-    builder.body("B").frame("b")
-    builder.constraint(
+    first = builder.add_body(content["first"], content["body_description"], content["body_pose"], content["inertia"])
+    first.add_frame(content["frame"], content["pose"], content["frame_description"], content["sigma"])
+    builder.add_body("B").add_frame("b")
+    builder.add_constraint(
         content["constraint"],
         f"{content['first']}:{content['frame']}",
         "B:b",
@@ -92,13 +92,13 @@ def test_a_duplicated_body_stands_where_it_is_mounted_not_where_the_first_is():
     camera = Body("Left", (BodyFrame("Mount"), BodyFrame("Lens", Pose((0.1, 0, 0)))))
     rail = Body("Rail", (BodyFrame("L", Pose((0, 1, 0))), BodyFrame("R", Pose((0, -1, 0)))))
     model = Model(
-        (rail, camera, camera.renamed("Right")),
+        (rail, camera, camera.with_name("Right")),
         (Constraint("l", "Rail:L", "Left:Mount"), Constraint("r", "Rail:R", "Right:Mount")),
     )
     assert model.get_transformation("Left:Lens", "Right:Lens").pose == Pose((0, 2, 0))
 
 
-def test_unknown_names_are_told_apart_with_the_nearest():
+def test_unknown_names_are_distinguished_with_the_nearest():
     model = pair()
     with pytest.raises(UnknownBodyError, match="no body 'C'"):
         model.get_transformation("C:a", "A:a")
@@ -120,18 +120,18 @@ def test_unknown_names_are_told_apart_with_the_nearest():
     assert caught.value.nearest[0] == "Hub:Mount00003"
 
 
-def test_a_failed_question_is_not_kept():
+def test_a_failed_query_is_not_cached():
     model = pair()
     for name in ("C:a", "A:b", "A", "", ":", "x" * 60_000):
         with pytest.raises((UnknownBodyError, UnknownFrameError)):
             model.get_transformation(name, "A:a")
-    assert len(model._answers) == 0
+    assert len(model._transformations) == 0
     assert set(model._tree.nodes) == set(all_frames(model))
 
 
 def test_not_connected_names_both_assemblies_shortly():
     builder = chain(40)
-    builder.body("Alone").frame("x")
+    builder.add_body("Alone").add_frame("x")
     with pytest.raises(NotConnectedError) as caught:
         builder.build().get_transformation("Alone:x", "B3:In")
     assert "from B3 to Alone" in str(caught.value)
@@ -146,14 +146,14 @@ def test_cache_is_bounded_and_answers_do_not_change_when_the_oldest_go(monkeypat
     model = random_builder(random.Random(4), 6, sigmas=True).build()
     frames = all_frames(model)
     first = {(a, b): model.get_transformation(a, b) for a in frames for b in frames}
-    assert len(model._answers) == 10
+    assert len(model._transformations) == 10
     for (a, b), answer in first.items():
         again = model.get_transformation(a, b)
         assert again == answer
-    assert len(model._answers) == 10
+    assert len(model._transformations) == 10
     assert len(model._tree.nodes) == len(frames)
     # the newest are those that stay
-    assert list(model._answers) == list(first)[-10:]
+    assert list(model._transformations) == list(first)[-10:]
     a, b = frames[0], frames[1]
     assert model.get_transformation(a, b) is model.get_transformation(a, b)
 
@@ -177,7 +177,7 @@ def test_nothing_can_be_set_on_a_model_or_its_parts():
         model.extra = 1
 
 
-def test_pickles_and_copies_answer_alike_even_after_questions():
+def test_pickles_and_copies_answer_alike_even_after_queries():
     model = pair(joint_sigma=Sigma())
     answer = model.get_transformation("B:b", "A:a")
     for back in (pickle.loads(pickle.dumps(model)), copy.deepcopy(model)):
@@ -191,10 +191,10 @@ def test_parts_compare_and_hash_by_value():
     frame = BodyFrame("a", Pose((1, 2, 3)), "text", Sigma((1, 2, 3)))
     assert frame == BodyFrame("a", Pose((1, 2, 3)), "text", Sigma([1, 2, 3]))
     body = Body("A", (frame,))
-    assert len({body, Body("A", (frame,)), body.renamed("B")}) == 2
+    assert len({body, Body("A", (frame,)), body.with_name("B")}) == 2
     assert pickle.loads(pickle.dumps(body)) == body
     assert pickle.loads(pickle.dumps(body)).frame("a") == frame
-    assert body.renamed("B").frames == body.frames
+    assert body.with_name("B").frames == body.frames
     assert list(body.with_frame(BodyFrame("b")).without_frame("a")) == [BodyFrame("b")]
     with pytest.raises(ValueError, match="two frames named a"):
         body.with_frame(BodyFrame("a"))
@@ -255,7 +255,7 @@ def test_a_chain_of_two_thousand_bodies():
 @pytest.mark.slow
 def test_a_ring_of_two_thousand_bodies_is_one_loop_and_the_message_stays_short():
     builder = chain(2000)
-    builder.constraint("Last", "B1999:Out", "B0:In")
+    builder.add_constraint("Last", "B1999:Out", "B0:In")
     model = builder.build()
     (problem,) = model.problems
     assert "(2000 in all)" in problem.message
@@ -268,15 +268,15 @@ def test_the_depth_first_search_gives_up_on_dense_loops(monkeypatch):
     builder = ModelBuilder()
     count = 9
     for i in range(count):
-        body = builder.body(f"B{i}")
+        body = builder.add_body(f"B{i}")
         for j in range(count):
             if i != j:
-                body.frame(f"to{j}")
-        body.frame("free")
-    builder.body("Alone").frame("x")
+                body.add_frame(f"to{j}")
+        body.add_frame("free")
+    builder.add_body("Alone").add_frame("x")
     for i in range(count):
         for j in range(i):
-            builder.constraint(f"C{i}_{j}", f"B{i}:to{j}", f"B{j}:to{i}")
+            builder.add_constraint(f"C{i}_{j}", f"B{i}:to{j}", f"B{j}:to{i}")
     model = builder.build()
     with pytest.raises(LimitError, match="use the breadth-first search"):
         model.find_path("Alone:x", "B0:free", Search.DEPTH_FIRST)

@@ -1,4 +1,4 @@
-"""A vehicle with its sensors askew and far from its base frame, for the tests of what a simulation can do more."""
+"""A vehicle with tilted sensors far from its base frame, for the tests of simulation options."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from modelserver.simulation import (
     WheelsModel,
     figure_eight,
 )
-from modelserver.spatial.pose import Pose
+from modelserver.transforms.pose import Pose
 
 WHEELS = {"front_left": "Car:FL", "front_right": "Car:FR", "rear_left": "Car:RL", "rear_right": "Car:RR"}
 
@@ -31,20 +31,20 @@ def origin():
 @pytest.fixture(scope="session")
 def car() -> Model:
     builder = ModelBuilder("car")
-    body = builder.body("Car")
-    body.frame("CG", Pose((0.9, 0.0, 0.6))).frame("RearAxle")
+    body = builder.add_body("Car")
+    body.add_frame("CG", Pose((0.9, 0.0, 0.6))).add_frame("RearAxle")
     for name, x, y in (("FL", 1.6, 0.6), ("FR", 1.6, -0.6), ("RL", 0.0, 0.6), ("RR", 0.0, -0.6)):
-        body.frame(name, Pose((x, y, -0.1)))
-    body.frame("Antenna", Pose((0.3, -0.4, 1.8))).frame("Second", Pose((0.2, 0.6, 1.7)))
-    body.frame("Imu", Pose.from_rpy((1.1, 0.3, 1.2), math.pi, 0.1, 0.7))
-    body.frame("Camera", Pose.from_rpy((1.5, 0.1, 0.9), -0.2, 0.1, 0.05))
+        body.add_frame(name, Pose((x, y, -0.1)))
+    body.add_frame("Antenna", Pose((0.3, -0.4, 1.8))).add_frame("Second", Pose((0.2, 0.6, 1.7)))
+    body.add_frame("Imu", Pose.from_rpy((1.1, 0.3, 1.2), math.pi, 0.1, 0.7))
+    body.add_frame("Camera", Pose.from_rpy((1.5, 0.1, 0.9), -0.2, 0.1, 0.05))
     return builder.build()
 
 
 @pytest.fixture(scope="session")
 def eight() -> Trajectory:
     return Trajectory(
-        figure_eight(speed=3.0, radius=6.0, stand=2.0, stop=1.0, reverse=3.0), start=(20.0, -10.0), yaw=0.4
+        figure_eight(speed=3.0, radius=6.0, stationary=2.0, stop=1.0, reverse=3.0), start=(20.0, -10.0), yaw=0.4
     )
 
 

@@ -1,4 +1,4 @@
-"""Poses from elsewhere, visual odometry and ranges: true but for the noise that they state."""
+"""Absolute poses, visual odometry and ranges: true up to the noise that they state."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from modelserver.simulation import (
     Trajectory,
     WheelsModel,
 )
-from modelserver.spatial import so3
+from modelserver.transforms import so3
 
 BEACONS = {"mast": (30.0, 10.0, 8.0), "gate": (-20.0, -40.0, 3.0), "far": (900.0, 0.0, 0.0)}
 
@@ -61,21 +61,21 @@ def test_the_noise_of_poses_is_along_the_world_and_as_stated(simulate, camera):
     )
 
 
-def test_a_source_of_poses_may_tell_half_and_fail_for_a_while(simulate):
-    model = AbsolutePoseModel(tells_orientation=False, outages=((1.0, 2.0),))
+def test_a_source_of_poses_may_report_half_and_fail_for_a_while(simulate):
+    model = AbsolutePoseModel(has_orientation=False, outages=((1.0, 2.0),))
     samples = list(simulate(pose_frame="Car:Camera", pose_model=model).events(4.0))
     assert [sample.header.seq for sample in samples] == [*range(5), *range(10, 20)]
     assert all(sample.orientation is None and sample.position is not None for sample in samples)
-    only = next(simulate(pose_frame="Car:CG", pose_model=AbsolutePoseModel(tells_position=False)).events(1.0))
+    only = next(simulate(pose_frame="Car:CG", pose_model=AbsolutePoseModel(has_position=False)).events(1.0))
     assert only.position is None
     with pytest.raises(ValueError, match="World"):
         AbsolutePoseModel(frame_of_reference="Odom:Origin")
 
 
-def test_odometry_chained_gives_the_way(simulate, hills, camera):
+def test_odometry_chained_gives_the_path(simulate, hills, camera):
     model = RelativePoseModel(position_sigma=0.0, orientation_sigma=0.0)
     run = simulate(
-        terrain=hills, side_slip=SideSlip(wander_sigma=0.1), odometry_frame="Car:Camera", odometry_model=model
+        terrain=hills, side_slip=SideSlip(random_sigma=0.1), odometry_frame="Car:Camera", odometry_model=model
     )
     here = run.truth(run.start_utime).enu @ camera
     reached = run.start_utime
@@ -99,14 +99,14 @@ def test_odometry_errs_as_stated_and_in_its_scale(simulate):
     one = list(simulate(odometry_frame="Car:CG", odometry_model=exact).events(20.0))
     other = list(simulate(odometry_frame="Car:CG", odometry_model=replace(exact, scale_sigma=0.1)).events(20.0))
     ways = [(math.hypot(*a.position), math.hypot(*b.position)) for a, b in zip(one, other, strict=True)]
-    ratios = [said / true for true, said in ways if true > 0.01]
+    ratios = [measured / true for true, measured in ways if true > 0.01]
     assert len(ratios) > 50
     assert max(ratios) - min(ratios) < 1e-9
     assert abs(ratios[0] - 1.0) > 0.01
 
 
-def test_ranges_are_distances_within_reach(simulate, hills, camera):
-    model = RangeModel(sigma=0.0, reach=100.0)
+def test_ranges_are_distances_within_max_range(simulate, hills, camera):
+    model = RangeModel(sigma=0.0, max_range=100.0)
     run = simulate(terrain=hills, range_frame="Car:Camera", beacons=BEACONS, range_model=model)
     samples = list(run.events(20.0))
     assert [sample.header.seq for sample in samples] == list(range(200))
@@ -137,7 +137,7 @@ def test_ranges_err_as_stated(simulate):
     assert len({round(each, 6) for each in off}) == 3
 
 
-def test_more_sources_disturb_no_other_and_come_in_order(simulate, hills):
+def test_further_sources_do_not_change_the_others_and_come_in_order(simulate, hills):
     base = {"terrain": hills, "gps_model": GpsModel(), "imu_model": ImuModel(), "wheels_model": WheelsModel()}
     more = {
         "pose_frame": "Car:Camera",

@@ -1,4 +1,4 @@
-"""On hills and sliding, without noise, the sensors say the truth: each against the truth's positions."""
+"""On hills and with side slip, samples without noise equal the truth, compared with its positions."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import pytest
 from modelserver.earth import gravity as earth
 from modelserver.earth.geodesy import Geodesy
 from modelserver.simulation import GpsModel, ImuModel, SideSlip, Timing, WheelsModel
-from modelserver.spatial import so3
+from modelserver.transforms import so3
 
-SLIDING = SideSlip(cornering=0.02, wander_sigma=0.1)
+SLIDING = SideSlip(cornering=0.02, random_sigma=0.1)
 
 
 @pytest.mark.slow
@@ -22,7 +22,7 @@ def test_integrating_the_inertial_unit_gives_the_drive_back(simulate, hills, car
     run = simulate(terrain=hills, side_slip=SLIDING, imu_model=ImuModel.noise_free(Timing(rate)), seed=3)
     samples = list(run.events(run.trajectory.duration))
     latitude, _, height = Geodesy(origin).geodetic_from_enu((0.0, 0.0, 0.0))
-    turning = so3.skew(earth.rotation(latitude))
+    turning = so3.skew(earth.earth_rate(latitude))
     g = np.array((0.0, 0.0, earth.gravity(latitude, height)))
     X_BS = car.get_transformation("Car:Imu", "Car:CG").pose
 

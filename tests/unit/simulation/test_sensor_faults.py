@@ -1,4 +1,4 @@
-"""What receivers, inertial units and wheels do wrong on request, and that it is off unless asked for."""
+"""Faults of receivers, IMUs and wheels on request; off by default."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from modelserver.simulation import (
     WheelsModel,
     straight,
 )
-from modelserver.spatial import so3
+from modelserver.transforms import so3
 
 STANDING = Trajectory([DrivePhase(1.0)])
-RUN = Trajectory(straight(speed=3.0, length=60.0, stand=2.0))
+RUN = Trajectory(straight(speed=3.0, length=60.0, stationary=2.0))
 
 
 def enu(fix, origin):
@@ -69,25 +69,25 @@ def test_what_is_stated_can_be_wrong_or_missing(simulate):
     def first(**more):
         return next(simulate(gps_model=GpsModel(**more), second_gps_frame="Car:Second").events(1.0))
 
-    sound, proud = first(), first(stated_factor=0.5)
+    sound, proud = first(), first(sigma_factor=0.5)
     np.testing.assert_allclose(proud.position_covariance, np.array(sound.position_covariance) / 4.0)
     np.testing.assert_allclose(proud.velocity_covariance, np.array(sound.velocity_covariance) / 4.0)
     assert proud.speed_sigma == sound.speed_sigma / 2.0
     assert proud.baseline_yaw_sigma == sound.baseline_yaw_sigma / 2.0
     assert proud.latitude_deg == sound.latitude_deg
-    mute = first(tells_velocity=False)
+    mute = first(has_velocity=False)
     assert mute.velocity is None
     assert mute.velocity_covariance is None
     assert all(map(math.isnan, (mute.speed, mute.course, mute.speed_sigma, mute.course_sigma, mute.velocity_latency)))
     assert mute.position_covariance == sound.position_covariance
-    vague = first(tells_covariance=False)
+    vague = first(has_covariance=False)
     assert vague.position_covariance is None
     assert vague.velocity_covariance is None
     assert all(map(math.isnan, (vague.speed_sigma, vague.course_sigma, vague.baseline_yaw_sigma)))
     assert vague.velocity == sound.velocity
 
 
-def test_the_baseline_is_as_good_as_said_and_only_there_with_two_antennas(simulate):
+def test_the_baseline_is_as_good_as_stated_and_only_there_with_two_antennas(simulate):
     model = GpsModel(baseline_sigma=0.01)
     assert math.isnan(next(simulate(gps_model=model).events(1.0)).baseline_yaw)
     fixes = list(simulate(STANDING, gps_model=model, second_gps_frame="Car:Second").events(300.0))
@@ -107,7 +107,7 @@ def vectors(run, seconds, name):
 
 
 @pytest.mark.slow
-def test_scale_and_misalignment_are_one_matrix_of_the_size_said(simulate):
+def test_scale_and_misalignment_are_one_matrix_of_the_stated_size(simulate):
     model = replace(QUIET, accelerometer=TriadModel(scale_sigma=0.01, misalignment_sigma=0.003))
     true = vectors(simulate(imu_model=QUIET), 20.0, "specific_force")
     seen = vectors(simulate(imu_model=model), 20.0, "specific_force")
@@ -139,7 +139,7 @@ def test_a_bias_that_is_unstable_stays_within_its_size_and_one_that_walks_does_n
     assert np.std(ends) == pytest.approx(1e-3 * math.sqrt(100.0), rel=0.2)
 
 
-def test_it_shakes_while_it_moves(simulate):
+def test_it_vibrates_while_it_moves(simulate):
     model = replace(QUIET, gyro=TriadModel(vibration=0.02), accelerometer=TriadModel(vibration=0.5))
     for name, sigma in (("angular_velocity", 0.02), ("specific_force", 0.5)):
         shake = vectors(simulate(RUN, imu_model=model), 26.0, name) - vectors(
@@ -167,7 +167,7 @@ def test_an_outage_leaves_the_other_samples_as_they_were(simulate):
 
 
 @pytest.mark.slow
-def test_the_magnetometer_feels_the_earth_the_vehicle_and_the_roadside(simulate, car):
+def test_the_magnetometer_measures_the_earth_the_vehicle_and_disturbances(simulate, car):
     field, pull = (3e-6, 17e-6, -51e-6), (5e-6, -2e-6, 1e-6)
     soft = ((1.1, 0.02, 0.0), (0.01, 0.9, 0.03), (0.0, -0.02, 1.05))
     sound = replace(QUIET, magnetometer=MagnetometerModel(field))
@@ -286,18 +286,18 @@ def test_a_stuck_encoder_and_one_that_counts_backward(simulate):
             assert each["rear_left"].direction is Direction.STOPPED
 
 
-def test_encoders_may_tell_only_travel_or_only_speed(simulate):
-    for each in wheel(simulate(wheels_model=with_faults(tells_travel=False)), "rear_left", 5.0):
+def test_encoders_may_report_only_travel_or_only_speed(simulate):
+    for each in wheel(simulate(wheels_model=with_faults(has_travel=False)), "rear_left", 5.0):
         assert math.isnan(each.travel)
         assert math.isnan(each.travel_sigma)
         assert math.isfinite(each.speed)
-    for each in wheel(simulate(wheels_model=with_faults(tells_speed=False)), "rear_left", 5.0):
+    for each in wheel(simulate(wheels_model=with_faults(has_speed=False)), "rear_left", 5.0):
         assert math.isnan(each.speed)
         assert math.isnan(each.speed_sigma)
         assert math.isfinite(each.travel)
 
 
-def test_wheels_can_be_later_than_they_say(simulate):
+def test_wheels_can_have_unstated_latency(simulate):
     prompt = wheel(simulate(wheels_model=WheelsModel.noise_free()), "rear_left", 20.0)
     late = wheel(simulate(wheels_model=replace(WheelsModel.noise_free(), unstated_latency=0.2)), "rear_left", 20.0)
     for old, new in zip(late[4:], prompt[:-4], strict=True):

@@ -1,4 +1,4 @@
-"""What the sensors say without noise is the truth, and with noise what their models promise."""
+"""Samples without noise equal the truth, and with noise have the errors of their models."""
 
 from __future__ import annotations
 
@@ -32,12 +32,14 @@ from modelserver.simulation import (
     figure_eight,
     straight,
 )
-from modelserver.simulation.stamps import Timing
-from modelserver.spatial import so3
-from modelserver.spatial.pose import Pose
+from modelserver.simulation.timing import Timing
+from modelserver.transforms import so3
+from modelserver.transforms.pose import Pose
 
 ORIGIN = origin_at(50.27, -111.18, 700.0)
-DRIVE = Trajectory(figure_eight(speed=3.0, radius=6.0, stand=2.0, stop=1.0, reverse=3.0), start=(20.0, -10.0), yaw=0.4)
+DRIVE = Trajectory(
+    figure_eight(speed=3.0, radius=6.0, stationary=2.0, stop=1.0, reverse=3.0), start=(20.0, -10.0), yaw=0.4
+)
 WHEELS = {"front_left": "Car:FL", "front_right": "Car:FR", "rear_left": "Car:RL", "rear_right": "Car:RR"}
 TRACK, BASE = 1.2, 1.6
 
@@ -45,17 +47,17 @@ TRACK, BASE = 1.2, 1.6
 def car() -> Model:
     """A vehicle with its sensors askew and far from its base frame."""
     builder = ModelBuilder("car")
-    body = builder.body("Car")
-    body.frame("CG", Pose((0.9, 0.0, 0.6)))
-    body.frame("RearAxle")
+    body = builder.add_body("Car")
+    body.add_frame("CG", Pose((0.9, 0.0, 0.6)))
+    body.add_frame("RearAxle")
     for name, x, y in (("FL", BASE, 1), ("FR", BASE, -1), ("RL", 0.0, 1), ("RR", 0.0, -1)):
-        body.frame(name, Pose((x, y * TRACK / 2, 0.0)))
-    body.frame("Mast", Pose((0.3, -0.4, 1.8)))
-    body.frame("Shelf", Pose((1.1, 0.3, 1.2)))
-    builder.body("Antenna").frame("Foot").frame("Phase", Pose((0.0, 0.0, 0.1)))
-    builder.body("Imu").frame("Foot").frame("Sensor", Pose.from_rpy((0.01, 0.02, 0.03), math.pi, 0.1, 0.7))
-    builder.constraint("AntennaFixed", "Car:Mast", "Antenna:Foot")
-    builder.constraint("ImuFixed", "Car:Shelf", "Imu:Foot")
+        body.add_frame(name, Pose((x, y * TRACK / 2, 0.0)))
+    body.add_frame("Mast", Pose((0.3, -0.4, 1.8)))
+    body.add_frame("Shelf", Pose((1.1, 0.3, 1.2)))
+    builder.add_body("Antenna").add_frame("Foot").add_frame("Phase", Pose((0.0, 0.0, 0.1)))
+    builder.add_body("Imu").add_frame("Foot").add_frame("Sensor", Pose.from_rpy((0.01, 0.02, 0.03), math.pi, 0.1, 0.7))
+    builder.add_constraint("AntennaFixed", "Car:Mast", "Antenna:Foot")
+    builder.add_constraint("ImuFixed", "Car:Shelf", "Imu:Foot")
     return builder.build()
 
 
@@ -93,7 +95,7 @@ def test_integrating_the_inertial_unit_gives_the_drive_back():
     run = simulation(imu_model=ImuModel.noise_free(Timing(rate)), gps_frame=None, wheel_frames=None)
     samples = list(run.events(DRIVE.duration))
     latitude, _, height = Geodesy(ORIGIN).geodetic_from_enu((0.0, 0.0, 0.0))
-    turning = so3.skew(earth.rotation(latitude))
+    turning = so3.skew(earth.earth_rate(latitude))
     g = np.array((0.0, 0.0, earth.gravity(latitude, height)))
     X_BS = CAR.get_transformation("Imu:Sensor", "Car:CG").pose
 
@@ -119,16 +121,16 @@ def test_integrating_the_inertial_unit_gives_the_drive_back():
         np.testing.assert_allclose(state[0:9].reshape(3, 3), truth.rotation, atol=1e-8)
 
 
-def test_at_rest_it_feels_gravity_and_the_earth_turning():
+def test_a_stationary_imu_measures_gravity_and_earth_rotation():
     run = simulation(Trajectory([DrivePhase(10.0)]), gps_frame=None, wheel_frames=None)
     sample = next(run.events(1.0))
     X_ES = run.truth(sample.header.utime).enu @ CAR.get_transformation("Imu:Sensor", "Car:CG").pose
     np.testing.assert_allclose(X_ES.rotation @ sample.specific_force, (0.0, 0.0, 9.8085), atol=1e-3)
-    np.testing.assert_allclose(X_ES.rotation @ sample.angular_velocity, earth.rotation(50.27), atol=1e-15)
+    np.testing.assert_allclose(X_ES.rotation @ sample.angular_velocity, earth.earth_rate(50.27), atol=1e-15)
 
 
 def test_gravity_is_that_of_the_ellipsoid():
-    """WGS 84's own values at the equator, at 45 degrees and at the pole; free air falls by 0.3086 mGal a metre."""
+    """WGS 84's own values at the equator, at 45 degrees and at the pole; free air falls by 0.3086 mGal a meter."""
     assert earth.gravity(0.0, 0.0) == pytest.approx(9.7803253359, abs=1e-10)
     assert earth.gravity(45.0, 0.0) == pytest.approx(9.8061977694, abs=1e-9)
     assert earth.gravity(90.0, 0.0) == pytest.approx(9.8321849379, abs=1e-9)
@@ -142,7 +144,7 @@ def test_gravity_is_that_of_the_ellipsoid():
         (OrientationReference.NED, np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])),
     ],
 )
-def test_its_own_orientation_is_the_truth_turned_by_where_its_yaw_began(reference, axes):
+def test_its_own_orientation_is_the_truth_rotated_by_its_initial_yaw(reference, axes):
     offset = 2.0
     imu = replace(ImuModel.noise_free(yaw_offset=offset, earth_rotation=False), reference=reference)
     run = simulation(imu_model=imu, gps_frame=None, wheel_frames=None)
@@ -153,7 +155,7 @@ def test_its_own_orientation_is_the_truth_turned_by_where_its_yaw_began(referenc
         np.testing.assert_allclose(stated, axes @ turned @ X_ES.rotation, atol=1e-9)
 
 
-def test_its_yaw_drifts_by_what_its_gyros_say_too_much():
+def test_its_yaw_drifts_by_the_gyro_error():
     """A vertical gyro: its yaw is the integral of its rates, bias and earth's rotation included."""
     run = simulation(
         Trajectory([DrivePhase(60.0)]), imu_model=ImuModel(gyro_walk=0.0), gps_frame=None, wheel_frames=None
@@ -165,15 +167,15 @@ def test_its_yaw_drifts_by_what_its_gyros_say_too_much():
         x, y, z = (0.0, math.sqrt(0.5), math.sqrt(0.5))
         q_EN = (x, y, z, 0.0)
         q = so3.multiply(so3.multiply(so3.conjugate(q_EN), sample.orientation), so3.conjugate(X_ES.wxyz))
-        return so3.to_rpy(so3.normalized(q))[2]
+        return so3.to_rpy(so3.normalize(q))[2]
 
     rates = np.array([X_ES.rotation @ sample.angular_velocity for sample in samples])
-    said = rates[:-1, 2].sum() / 100.0
-    assert math.remainder(yaw(samples[-1]) - yaw(samples[0]) - said, math.tau) == pytest.approx(0.0, abs=0.01)
-    assert abs(said) > 0.02
+    measured = rates[:-1, 2].sum() / 100.0
+    assert math.remainder(yaw(samples[-1]) - yaw(samples[0]) - measured, math.tau) == pytest.approx(0.0, abs=0.01)
+    assert abs(measured) > 0.02
 
 
-def test_its_noise_is_what_the_model_says():
+def test_its_noise_is_that_of_the_model():
     imu = ImuModel(gyro_bias_sigma=0.0, gyro_walk=0.0, accelerometer_bias_sigma=0.0)
     run = simulation(Trajectory([DrivePhase(100.0)]), imu_model=imu, gps_frame=None, wheel_frames=None)
     samples = list(run.events(100.0))
@@ -183,7 +185,7 @@ def test_its_noise_is_what_the_model_says():
     np.testing.assert_allclose(force.std(axis=0), imu.accelerometer_noise * 10.0, rtol=0.05)
 
 
-def test_quantised_samples_are_multiples_of_the_step():
+def test_quantized_samples_are_multiples_of_the_step():
     imu = replace(ImuModel(), gyro_step=0.01, accelerometer_step=0.05)
     run = simulation(imu_model=imu, gps_frame=None, wheel_frames=None)
     for sample in run.events(5.0):
@@ -216,7 +218,7 @@ def test_fixes_without_noise_are_the_antenna_itself():
 
 
 @pytest.mark.slow
-def test_the_error_of_fixes_lingers_and_is_as_large_as_stated():
+def test_the_error_of_fixes_is_time_correlated_and_as_large_as_stated():
     run = simulation(
         Trajectory([DrivePhase(1.0)]), imu_frame=None, wheel_frames=None, gps_model=GpsModel(time_constant=5.0)
     )
@@ -240,7 +242,7 @@ def test_the_error_of_fixes_lingers_and_is_as_large_as_stated():
     np.testing.assert_allclose(velocity.std(axis=0), (0.03, 0.03, 0.045), rtol=0.05)
 
 
-def test_an_old_velocity_is_that_of_the_instant_it_tells():
+def test_a_delayed_velocity_is_that_of_its_instant():
     late = simulation(
         imu_frame=None, wheel_frames=None, gps_model=replace(GpsModel.noise_free(), velocity_latency=0.25)
     )
@@ -257,7 +259,7 @@ def test_an_outage_has_no_fix_and_leaves_the_others_as_they_were():
     lost = [fix for fix in holed if fix.fix_type is FixType.NONE]
     assert [fix.header.seq for fix in lost] == list(range(20, 32))
     assert all(math.isnan(fix.latitude_deg) for fix in lost)
-    # compared by their text: what a fix does not say is nan, which equals nothing
+    # compared by their text: missing values are nan, which equals nothing
     assert [repr(fix) for fix in holed if fix not in lost] == [
         repr(fix) for fix in whole if fix.header.seq not in range(20, 32)
     ]
@@ -304,7 +306,7 @@ def test_the_vehicle_controller_measures_the_speed_and_the_angle_of_the_equivale
     assert max(abs(each.steering_angle) for each in statuses) > 0.2
 
 
-def test_unsteered_and_steered_wheels_follow_the_way_of_their_contact_points():
+def test_unsteered_and_steered_wheels_follow_the_path_of_their_contact_points():
     """Against positions: a steered wheel rolls the length of its contact point's way."""
     steered = frozenset(("front_left", "front_right"))
     run = simulation(gps_frame=None, imu_frame=None, wheels_model=WheelsModel.noise_free(steered=steered))
@@ -383,7 +385,7 @@ def test_the_same_seed_gives_the_same_samples_and_another_seed_others():
 
 
 @pytest.mark.parametrize("chunk", [0.003, 0.25, 3.7])
-def test_how_samples_are_asked_for_changes_nothing(chunk):
+def test_samples_do_not_depend_on_the_chunks_requested(chunk):
     whole = noisy()
     run = noisy()
     samples = []
@@ -394,7 +396,7 @@ def test_how_samples_are_asked_for_changes_nothing(chunk):
     assert list(map(repr, samples)) == list(map(repr, expected))
 
 
-def test_what_is_left_unread_comes_with_the_next_call():
+def test_unread_samples_come_with_the_next_call():
     run = noisy()
     first = [next(run.events(1.0)) for _ in range(3)]
     rest = list(run.events(1.0))
@@ -416,13 +418,13 @@ def test_samples_come_in_order_of_arrival_and_none_is_lost():
         assert all(sample.header.host_utime >= sample.header.utime for sample in mine)
 
 
-def test_a_sensor_that_is_not_there_disturbs_no_other():
+def test_an_absent_sensor_does_not_change_the_others():
     whole = of(ImuSample, noisy().events(5.0))
     alone = simulation(seed=7, imu_model=ImuModel(), gps_frame=None, wheel_frames=None).events(5.0)
     assert list(map(repr, whole)) == list(map(repr, alone))
 
 
-def test_truth_in_the_grid_is_truth_in_the_plane_seen_by_geodesy():
+def test_truth_in_the_grid_is_truth_in_the_plane_by_geodesy():
     run = simulation()
     for t in (0.0, 10.0, 20.0):
         truth = run.truth(run.start_utime + round(t * 1e6))
@@ -430,9 +432,9 @@ def test_truth_in_the_grid_is_truth_in_the_plane_seen_by_geodesy():
         geodesy = Geodesy(ORIGIN)
         np.testing.assert_allclose(geodesy.enu_from_geodetic(lat, lon, height), truth.enu.position, atol=1e-7)
         np.testing.assert_allclose(
-            geodesy.relative(geodesy.utm_from_geodetic(lat, lon, height)), truth.utm.position, atol=1e-7
+            geodesy.to_relative_utm(geodesy.utm_from_geodetic(lat, lon, height)), truth.utm.position, atol=1e-7
         )
-        # true north turns by 4 microradians in twenty metres of east
+        # true north turns by 4 microradians in twenty meters of east
         assert truth.utm.rpy[2] == pytest.approx(truth.enu.rpy[2] + geodesy.convergence(lat, lon), abs=2e-5)
         linear, angular = truth.twist
         np.testing.assert_allclose(truth.enu.rotation @ linear, truth.velocity, atol=1e-12)
@@ -440,6 +442,6 @@ def test_truth_in_the_grid_is_truth_in_the_plane_seen_by_geodesy():
 
 
 @pytest.mark.parametrize("timing", [(0.0, 0.0, 0.0), (10.0, -1.0, 0.0), (math.nan, 0.0, 0.0)])
-def test_a_timing_that_makes_no_sense_is_refused(timing):
-    with pytest.raises(ValueError, match="Hz"):
+def test_an_invalid_timing_is_rejected(timing):
+    with pytest.raises(ValueError, match="rate_hz"):
         Timing(*timing)

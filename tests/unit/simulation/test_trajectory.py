@@ -37,7 +37,7 @@ def test_each_quantity_is_the_derivative_of_the_one_before(drive):
         np.testing.assert_allclose(slope("velocity"), here.acceleration, atol=1e-6)
         assert slope("yaw") == pytest.approx(here.yaw_rate, abs=1e-6)
         assert slope("yaw_rate") == pytest.approx(here.yaw_acceleration, abs=1e-6)
-        assert slope("way") == pytest.approx(here.speed, abs=1e-6)
+        assert slope("distance") == pytest.approx(here.speed, abs=1e-6)
         assert slope("speed") == pytest.approx(here.forward_acceleration, abs=1e-6)
 
 
@@ -46,12 +46,12 @@ def test_position_is_continuous_and_exact_across_knots_and_phases(drive):
     n = 10_000
     dt = drive.duration / (2 * n)
     v = np.array([drive.at(k * dt).velocity for k in range(2 * n + 1)])
-    way = (v[:-2:2] + 4 * v[1:-1:2] + v[2::2]) * dt / 3
-    end = np.array(drive.at(0.0).position) + way.sum(axis=0)
+    steps = (v[:-2:2] + 4 * v[1:-1:2] + v[2::2]) * dt / 3
+    end = np.array(drive.at(0.0).position) + steps.sum(axis=0)
     np.testing.assert_allclose(drive.at(drive.duration).position, end, atol=1e-9)
 
 
-def test_the_vehicle_points_along_its_way_and_never_slides(drive):
+def test_the_vehicle_points_along_its_path_and_never_slides(drive):
     for t in times(drive):
         motion = drive.at(t)
         across = -motion.velocity[0] * math.sin(motion.yaw) + motion.velocity[1] * math.cos(motion.yaw)
@@ -59,7 +59,7 @@ def test_the_vehicle_points_along_its_way_and_never_slides(drive):
         assert motion.yaw_rate == pytest.approx(motion.curvature * motion.speed, abs=1e-12)
 
 
-def test_it_stands_before_and_after(drive):
+def test_it_is_stationary_before_and_after(drive):
     for t in (-10.0, 0.0, drive.duration, drive.duration + 10.0):
         motion = drive.at(t)
         assert motion.velocity == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
@@ -68,7 +68,7 @@ def test_it_stands_before_and_after(drive):
 
 
 def test_an_eight_closes_and_turns_both_ways():
-    drive = Trajectory(figure_eight(speed=2.0, radius=6.0, stand=4.0, ramp=3.0, laps=2))
+    drive = Trajectory(figure_eight(speed=2.0, radius=6.0, stationary=4.0, ramp=3.0, laps=2))
     # the crossing is where the run-up of 3 s at 1 m/s on average ends
     crossing, end = drive.at(7.0), drive.at(drive.duration - 7.0)
     np.testing.assert_allclose(end.position, crossing.position, atol=1e-9)
@@ -92,16 +92,16 @@ def test_an_eight_with_reverse_backs_up():
 
 
 @pytest.mark.parametrize(
-    ("phases", "said"),
+    ("phases", "message"),
     [
-        ([], "needs a phase"),
-        ([DrivePhase(0.0, 1.0)], "takes time"),
+        ([], "at least one phase"),
+        ([DrivePhase(0.0, 1.0)], "positive duration"),
         ([DrivePhase(1.0, math.nan)], "finite"),
-        ([DrivePhase(1.0, 1.0)], "ends at rest"),
+        ([DrivePhase(1.0, 1.0)], "must end stationary"),
     ],
 )
-def test_a_drive_that_makes_no_sense_is_refused(phases, said):
-    with pytest.raises(ValueError, match=said):
+def test_an_invalid_drive_is_rejected(phases, message):
+    with pytest.raises(ValueError, match=message):
         Trajectory(phases)
 
 
@@ -114,6 +114,6 @@ def test_a_drive_that_makes_no_sense_is_refused(phases, said):
         lambda: figure_eight(speed=5.0, radius=2.0),
     ],
 )
-def test_a_figure_that_cannot_be_driven_is_refused(figure):
+def test_an_impossible_maneuver_is_rejected(figure):
     with pytest.raises(ValueError, match=r"m|lap"):
         figure()

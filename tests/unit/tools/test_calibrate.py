@@ -54,7 +54,7 @@ def event(sample: ImuSample | GpsSample, channel: str) -> Event:
     return (sample.header.utime + LATENCY, channel, encode(sample))
 
 
-def stood(seconds: float, begin: float = 0.0, moving: bool = False) -> Iterator[ImuSample]:
+def stationary_samples(seconds: float, begin: float = 0.0, moving: bool = False) -> Iterator[ImuSample]:
     """Yield the samples of a unit mounted as the Husky's: y up."""
     chance = np.random.default_rng(round(begin) + 1)
     count = round(seconds * RATE)
@@ -64,7 +64,7 @@ def stood(seconds: float, begin: float = 0.0, moving: bool = False) -> Iterator[
         yield ImuSample(at(begin + n / RATE), angular_velocity=tuple(rate), specific_force=tuple(force))
 
 
-def turned(turns: float = 2.0, seconds: float = 40.0) -> Iterator[ImuSample]:
+def rotated_samples(turns: float = 2.0, seconds: float = 40.0) -> Iterator[ImuSample]:
     """Yield the samples of a unit on a vehicle that turns on the level, in Boston's field of that day."""
     chance = np.random.default_rng(4)
     for n, yaw in enumerate(np.linspace(0.0, 2.0 * np.pi * turns, round(seconds * RATE)).tolist()):
@@ -83,15 +83,15 @@ def log_of(path: Path, samples: Iterator[ImuSample] | list[ImuSample], channel: 
 
 
 @pytest.fixture(scope="session")
-def standing_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def stationary_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Twenty seconds of moving, then 100 of standing."""
-    samples = [*stood(20.0, moving=True), *stood(100.0, begin=20.0)]
-    return log_of(tmp_path_factory.mktemp("calibrate") / "stood.lcm", samples)
+    samples = [*stationary_samples(20.0, moving=True), *stationary_samples(100.0, begin=20.0)]
+    return log_of(tmp_path_factory.mktemp("calibrate") / "stationary.lcm", samples)
 
 
 @pytest.fixture(scope="session")
 def turning_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return log_of(tmp_path_factory.mktemp("calibrate") / "turned.lcm", turned())
+    return log_of(tmp_path_factory.mktemp("calibrate") / "turned.lcm", rotated_samples())
 
 
 def drawings(page: Path) -> list[ElementTree.Element]:
@@ -106,8 +106,10 @@ def drawings(page: Path) -> list[ElementTree.Element]:
 # --- the unit's noise ---------------------------------------------------------------------------------------
 
 
-def test_given_a_stand_after_a_drive_when_calibrated_then_the_noise_of_the_stand(standing_log: Path, run: Run) -> None:
-    code, out, err = run("imu", standing_log, "--json")
+def test_given_a_stationary_unit_after_a_drive_when_calibrated_then_its_noise_while_stationary(
+    stationary_log: Path, run: Run
+) -> None:
+    code, out, err = run("imu", stationary_log, "--json")
     report = json.loads(out)
     assert (code, err) == (0, "")
     assert report["proposal"]["gyro_noise"] == pytest.approx(GYRO_NOISE, rel=0.1)
@@ -121,36 +123,36 @@ def test_given_a_stand_after_a_drive_when_calibrated_then_the_noise_of_the_stand
     assert report["mount"] is None
 
 
-def test_given_a_stand_when_calibrated_then_words_say_what_was_used_and_what_is_open(
-    standing_log: Path, run: Run
+def test_given_a_stationary_unit_when_calibrated_then_the_text_reports_what_was_used_and_what_is_open(
+    stationary_log: Path, run: Run
 ) -> None:
-    code, out, err = run("imu", standing_log)
+    code, out, err = run("imu", stationary_log)
     assert (code, err) == (0, "")
-    assert "2400 samples, 20.0 Hz; stood and used: 2" in out
+    assert "2400 samples, 20.0 Hz; stationary, used: 2" in out
     assert "angle random walk: 0.00" in out
     assert "gyro bias random walk: not determined; at most" in out
-    assert "stand for 10 minutes or more" in out
+    assert "record 10 minutes or more while stationary" in out
 
 
 def test_given_the_huskys_file_when_calibrated_then_its_mount_agrees_and_an_upright_one_does_not(
-    standing_log: Path, tmp_path: Path, run: Run
+    stationary_log: Path, tmp_path: Path, run: Run
 ) -> None:
-    code, out, _ = run("imu", standing_log, "-c", HUSKY)
+    code, out, _ = run("imu", stationary_log, "-c", HUSKY)
     assert code == 0
-    assert "mount: gravity is felt along the sensor's +y axis, 0." in out
+    assert "mount: gravity is measured along the sensor's +y axis, 0." in out
     for name in ("vehicle.yaml", "geometry.yaml"):
         text = HUSKY.with_name(name).read_text()
         (tmp_path / name).write_text(text.replace("rpy_deg: [90, 0, -90]", "rpy_deg: [0, 0, 0]"))
-    code, out, _ = run("imu", standing_log, "-c", tmp_path / "vehicle.yaml")
+    code, out, _ = run("imu", stationary_log, "-c", tmp_path / "vehicle.yaml")
     assert code == 0
-    assert "but the geometry says +z points up (90 deg apart); mounts that fit: rpy_deg [90, 0, 0]" in out
+    assert "but up in the geometry is +z: 90 deg apart; mounts that fit: rpy_deg [90, 0, 0]" in out
 
 
 def test_given_a_plot_and_a_proposal_when_calibrated_then_both_files_are_whole(
-    standing_log: Path, tmp_path: Path, run: Run
+    stationary_log: Path, tmp_path: Path, run: Run
 ) -> None:
     page, proposal = tmp_path / "allan.html", tmp_path / "imu.yaml"
-    assert run("imu", standing_log, "--plot", page, "-o", proposal)[0] == 0
+    assert run("imu", stationary_log, "--plot", page, "-o", proposal)[0] == 0
     settings = yaml.safe_load(proposal.read_text())
     assert settings["localization"]["filter"]["gyro_noise"] == pytest.approx(GYRO_NOISE, rel=0.1)
     assert set(settings["localization"]["filter"]) == {"gyro_noise", "accelerometer_noise"}
@@ -162,62 +164,62 @@ def test_given_a_plot_and_a_proposal_when_calibrated_then_both_files_are_whole(
         assert len(list(drawing.iter("{http://www.w3.org/2000/svg}polyline"))) >= 4
 
 
-def test_given_a_file_that_exists_when_calibrated_then_it_is_kept_unless_forced(
-    standing_log: Path, tmp_path: Path, run: Run
+def test_given_a_file_that_exists_when_calibrated_then_it_is_not_overwritten_unless_forced(
+    stationary_log: Path, tmp_path: Path, run: Run
 ) -> None:
     out = tmp_path / "imu.yaml"
     out.write_text("precious")
     for option in ("-o", "--plot"):
-        code, _, err = run("imu", standing_log, option, out)
+        code, _, err = run("imu", stationary_log, option, out)
         assert (code, err.count("\n")) == (1, 1)
         assert "--force" in err
         assert out.read_text() == "precious"
-    assert run("imu", standing_log, "-o", out, "--force")[0] == 0
+    assert run("imu", stationary_log, "-o", out, "--force")[0] == 0
     assert "gyro_noise" in out.read_text()
 
 
-def test_given_standard_output_for_the_proposal_then_only_it_goes_there(standing_log: Path, run: Run) -> None:
-    code, out, err = run("imu", standing_log, "-o", "-")
+def test_given_standard_output_for_the_proposal_then_only_it_goes_there(stationary_log: Path, run: Run) -> None:
+    code, out, err = run("imu", stationary_log, "-o", "-")
     assert code == 0
     assert "localization" in yaml.safe_load(out)
     assert "angle random walk" in err
 
 
-def test_given_half_a_minute_when_calibrated_then_it_tells_what_it_can_and_proposes_nothing(
-    standing_log: Path, tmp_path: Path, run: Run
+def test_given_half_a_minute_when_calibrated_then_it_reports_what_it_can_and_proposes_nothing(
+    stationary_log: Path, tmp_path: Path, run: Run
 ) -> None:
     proposal = tmp_path / "imu.yaml"
-    code, out, err = run("imu", standing_log, "--from", 40, "--to", 70, "-o", proposal)
+    code, out, err = run("imu", stationary_log, "--from", 40, "--to", 70, "-o", proposal)
     assert (code, err.count("\n")) == (1, 1)
-    assert "longest standing stretch is 29.9 s, 60 s are needed" in err
+    assert "longest stationary range is 29.9 s; 60 s are needed" in err
     assert "angle random walk: 0.00" in out
     assert not proposal.exists()
 
 
-def test_given_a_moving_vehicle_when_calibrated_then_it_says_so(tmp_path: Path, run: Run) -> None:
-    log = log_of(tmp_path / "moving.lcm", stood(70.0, moving=True))
+def test_given_a_moving_vehicle_when_calibrated_then_that_is_reported(tmp_path: Path, run: Run) -> None:
+    log = log_of(tmp_path / "moving.lcm", stationary_samples(70.0, moving=True))
     code, _, err = run("imu", log)
     assert (code, err.count("\n")) == (1, 1)
-    assert "never stands still in 69.9 s" in err or "never stands still in 70.0 s" in err
+    assert "never stationary in 69.9 s" in err or "never stationary in 70.0 s" in err
     assert "10 minutes" in err
 
 
-def test_given_a_moving_vehicle_when_calibrated_then_its_axis_of_up_is_told_with_what_the_file_says(
+def test_given_a_moving_vehicle_when_calibrated_then_its_axis_of_up_is_reported_with_what_the_file_reports(
     tmp_path: Path, run: Run
 ) -> None:
-    log = log_of(tmp_path / "moving.lcm", stood(70.0, moving=True))
+    log = log_of(tmp_path / "moving.lcm", stationary_samples(70.0, moving=True))
     code, out, _ = run("imu", log, "-c", HUSKY)
     assert code == 1
-    assert "from the unit's +y axis, which points up" in out
-    assert "mount: gravity is felt along the sensor's +y axis" in out
-    assert "the mount agrees" in out
+    assert "from the IMU's +y axis, which points up" in out
+    assert "mount: gravity is measured along the sensor's +y axis" in out
+    assert "the mount is consistent" in out
     code, out, _ = run("imu", log, "--json")
     assert json.loads(out) == {"up": "+y", "mount": None}
 
 
-def test_given_a_few_seconds_of_standing_then_no_bias_figure_is_made_of_chance(standing_log: Path, run: Run) -> None:
+def test_given_a_few_stationary_seconds_then_no_bias_figure_is_proposed(stationary_log: Path, run: Run) -> None:
     for end in (23, 26, 30, 50):
-        out = run("imu", standing_log, "--from", 20, "--to", end)[1]
+        out = run("imu", stationary_log, "--from", 20, "--to", end)[1]
         assert "gyro bias instability: not determined" in out
         assert "accelerometer bias instability: not determined" in out
 
@@ -225,7 +227,7 @@ def test_given_a_few_seconds_of_standing_then_no_bias_figure_is_made_of_chance(s
 def test_given_samples_that_are_not_numbers_when_calibrated_then_they_are_left_out_and_counted(
     tmp_path: Path, run: Run
 ) -> None:
-    samples = list(stood(90.0))
+    samples = list(stationary_samples(90.0))
     for n in range(0, len(samples), 50):
         samples[n] = replace(samples[n], angular_velocity=NAN)
     samples[5] = replace(samples[5], specific_force=None)
@@ -235,21 +237,21 @@ def test_given_samples_that_are_not_numbers_when_calibrated_then_they_are_left_o
     assert report["proposal"]["gyro_noise"] == pytest.approx(GYRO_NOISE, rel=0.1)
 
 
-def test_given_a_unit_that_says_no_rates_when_calibrated_then_it_says_so(tmp_path: Path, run: Run) -> None:
+def test_given_a_unit_that_reports_no_rates_when_calibrated_then_that_is_reported(tmp_path: Path, run: Run) -> None:
     log = log_of(tmp_path / "a.lcm", [ImuSample(at(n * 0.1), specific_force=(0.0, 0.0, 9.8)) for n in range(100)])
     code, _, err = run("imu", log)
     assert (code, err.count("\n")) == (1, 1)
-    assert "100 samples on IMU, none with all of angular velocity and specific force" in err
+    assert "100 samples on IMU, none with angular velocity and specific force" in err
 
 
 def test_given_a_frozen_unit_when_calibrated_then_nothing_is_proposed(tmp_path: Path, run: Run) -> None:
-    sample = next(iter(stood(1.0)))
+    sample = next(iter(stationary_samples(1.0)))
     log = log_of(tmp_path / "a.lcm", [replace(sample, header=at(n * 0.1)) for n in range(700)])
     out, page = tmp_path / "imu.yaml", tmp_path / "allan.html"
     code, words, err = run("imu", log, "-o", out, "--plot", page)
     assert (code, err.count("\n")) == (1, 1)
     assert "frozen" in err
-    assert "the values repeat themselves exactly" in words
+    assert "all values are equal" in words
     assert not out.exists()
     assert len(drawings(page)) == 2
 
@@ -257,7 +259,7 @@ def test_given_a_frozen_unit_when_calibrated_then_nothing_is_proposed(tmp_path: 
 # --- the magnetometer ---------------------------------------------------------------------------------------
 
 
-def test_given_two_circles_when_calibrated_then_the_iron_is_found(turning_log: Path, run: Run) -> None:
+def test_given_two_turns_when_calibrated_then_the_iron_is_found(turning_log: Path, run: Run) -> None:
     code, out, err = run("magnetometer", turning_log, "--place", PLACE, "--json")
     report = json.loads(out)
     assert (code, err) == (0, "")
@@ -266,14 +268,14 @@ def test_given_two_circles_when_calibrated_then_the_iron_is_found(turning_log: P
     assert soft == pytest.approx(np.eye(3), abs=0.02)
     assert report["sectors"] == [True] * 12
     assert report["strength_known"] is True
-    # what the published model says of Boston, end of 2023: 20.5 microtesla level, 51.6 in all
+    # World Magnetic Model for Boston, end of 2023: 20.5 microtesla horizontal, 51.6 in total
     assert math.hypot(*report["field"]) == pytest.approx(51.6e-6, rel=0.01)
 
 
-def test_given_fixes_in_the_log_when_calibrated_then_they_tell_the_place(tmp_path: Path, run: Run) -> None:
+def test_given_fixes_in_the_log_when_calibrated_then_they_give_the_position(tmp_path: Path, run: Run) -> None:
     fix = GpsSample(at(3.0, "gps"), FixType.FIX_3D, 42.36, -71.06, height_ellipsoidal=10.0)
     none = replace(fix, fix_type=FixType.NONE, latitude_deg=0.0)
-    events = [*(event(each, "IMU") for each in turned()), event(fix, "GPS"), event(none, "GPS")]
+    events = [*(event(each, "IMU") for each in rotated_samples()), event(fix, "GPS"), event(none, "GPS")]
     code, out, _ = run("magnetometer", write_log(tmp_path / "a.lcm", events))
     assert code == 0
     assert "field at 42.3600, -71.0600: 51." in out
@@ -283,8 +285,8 @@ def test_given_fixes_in_the_log_when_calibrated_then_they_tell_the_place(tmp_pat
 def test_given_no_place_when_calibrated_then_the_strength_is_left_open(turning_log: Path, run: Run) -> None:
     code, out, _ = run("magnetometer", turning_log)
     assert code == 0
-    assert "place unknown: the horizontal field is taken to be the mean felt, 20.5" in out
-    assert "Hard iron along the vertical is not determined" in out
+    assert "position unknown: the horizontal field is set to the measured mean, 20.5" in out
+    assert "Vertical hard iron is not determined" in out
 
 
 def test_given_a_plot_and_a_proposal_when_calibrated_then_before_and_after(
@@ -297,38 +299,42 @@ def test_given_a_plot_and_a_proposal_when_calibrated_then_before_and_after(
     assert len(settings["soft_iron"]) == 9
     (drawing,) = drawings(page)
     words = {each.text for each in drawing.iter("{http://www.w3.org/2000/svg}text")}
-    assert {"as felt", "calibrated", "mean radius"} <= words
+    assert {"measured", "calibrated", "mean radius"} <= words
 
 
-def test_given_a_quarter_turn_when_calibrated_then_it_says_what_was_seen(tmp_path: Path, run: Run) -> None:
-    log = log_of(tmp_path / "quarter.lcm", turned(turns=0.3))
+def test_given_a_quarter_turn_when_calibrated_then_it_reports_what_was_seen(tmp_path: Path, run: Run) -> None:
+    log = log_of(tmp_path / "quarter.lcm", rotated_samples(turns=0.3))
     code, out, err = run("magnetometer", log)
     assert (code, out, err.count("\n")) == (1, "", 1)
     assert "of 12 sectors of 30 degrees" in err
     assert "full circle" in err
 
 
-def test_given_a_level_turn_when_all_axes_are_claimed_then_refused(turning_log: Path, run: Run) -> None:
+def test_given_a_level_turn_when_all_axes_are_claimed_then_rejected(turning_log: Path, run: Run) -> None:
     code, _, err = run("magnetometer", turning_log, "--all-axes")
     assert code == 1
     assert "level" in err
 
 
-def test_given_a_unit_without_a_magnetometer_when_calibrated_then_it_says_so(standing_log: Path, run: Run) -> None:
-    code, out, err = run("magnetometer", standing_log)
+def test_given_a_unit_without_a_magnetometer_when_calibrated_then_that_is_reported(
+    stationary_log: Path, run: Run
+) -> None:
+    code, out, err = run("magnetometer", stationary_log)
     assert (code, out, err.count("\n")) == (1, "", 1)
-    assert "2400 samples on IMU, none with a magnetic field: this unit has no magnetometer" in err
+    assert "2400 samples on IMU, none with a magnetic field: it has no magnetometer" in err
 
 
-def test_given_stamps_of_no_model_when_calibrated_then_it_is_told_and_the_strength_left_open(
+def test_given_stamps_of_no_model_when_calibrated_then_it_is_reported_and_the_strength_left_open(
     tmp_path: Path, run: Run
 ) -> None:
-    samples = [replace(each, header=replace(each.header, utime=each.header.utime - START + 1)) for each in turned()]
+    samples = [
+        replace(each, header=replace(each.header, utime=each.header.utime - START + 1)) for each in rotated_samples()
+    ]
     code, out, err = run("magnetometer", log_of(tmp_path / "a.lcm", samples), "--place", PLACE)
     assert code == 0
-    assert "outside the years of the World Magnetic Model" in err
-    assert "place unknown" not in out
-    assert "is taken to be the mean felt" in out
+    assert "outside the World Magnetic Model's years" in err
+    assert "position unknown" not in out
+    assert "is set to the measured mean" in out
 
 
 # --- bad input ----------------------------------------------------------------------------------------------
@@ -349,38 +355,38 @@ def test_given_no_log_then_one_clear_error(tmp_path: Path, run: Run, subcommand:
 
 
 @BOTH
-def test_given_another_channel_then_the_nearest_is_offered(standing_log: Path, run: Run, subcommand: str) -> None:
-    code, _, err = run(subcommand, standing_log, "--channel", "IMUU")
+def test_given_another_channel_then_the_nearest_is_offered(stationary_log: Path, run: Run, subcommand: str) -> None:
+    code, _, err = run(subcommand, stationary_log, "--channel", "IMUU")
     assert (code, err.count("\n")) == (1, 1)
-    assert "nothing on channel IMUU; nearest: IMU" in err
+    assert "no messages on channel IMUU; nearest: IMU" in err
 
 
 @BOTH
-def test_given_a_channel_of_another_type_then_it_says_so(tmp_path: Path, run: Run, subcommand: str) -> None:
+def test_given_a_channel_of_another_type_then_that_is_reported(tmp_path: Path, run: Run, subcommand: str) -> None:
     fix = GpsSample(at(1.0, "gps"), FixType.FIX_3D, 42.0, -71.0)
     log = write_log(tmp_path / "gps.lcm", [event(fix, "GPS")])
     code, _, err = run(subcommand, log, "--channel", "GPS", *(("--gps-channel", "X") if subcommand != "imu" else ()))
     assert (code, err.count("\n")) == (1, 1)
-    assert "carries no imu_t" in err
+    assert "has no imu_t" in err
 
 
 @BOTH
-def test_given_times_past_the_end_then_it_says_so(standing_log: Path, run: Run, subcommand: str) -> None:
-    code, _, err = run(subcommand, standing_log, "--from", 1000)
+def test_given_times_past_the_end_then_that_is_reported(stationary_log: Path, run: Run, subcommand: str) -> None:
+    code, _, err = run(subcommand, stationary_log, "--from", 1000)
     assert code == 1
     assert "none of 2400 messages on IMU lies between" in err
 
 
-def test_given_junk_on_the_channel_and_a_torn_end_then_both_are_told(
-    standing_log: Path, tmp_path: Path, run: Run
+def test_given_junk_on_the_channel_and_a_torn_end_then_both_are_reported(
+    stationary_log: Path, tmp_path: Path, run: Run
 ) -> None:
     log = tmp_path / "torn.lcm"
     junk = write_log(tmp_path / "junk.lcm", [(START, "IMU", b"junk")])
-    log.write_bytes(junk.read_bytes() + standing_log.read_bytes()[:-5])
+    log.write_bytes(junk.read_bytes() + stationary_log.read_bytes()[:-5])
     code, _, err = run("imu", log)
     assert code == 0
     assert "1 message of the channel left out" in err
-    assert "breaks off" in err
+    assert "is truncated" in err
 
 
 @pytest.mark.parametrize(
@@ -396,11 +402,11 @@ def test_given_junk_on_the_channel_and_a_torn_end_then_both_are_told(
     ],
 )
 def test_given_wrong_options_then_usage(
-    standing_log: Path, run: Run, options: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stationary_log: Path, run: Run, options: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run("imu", standing_log, *options)[0] == 2
-    assert run("magnetometer", standing_log, *options)[0] == 2
+    assert run("imu", stationary_log, *options)[0] == 2
+    assert run("magnetometer", stationary_log, *options)[0] == 2
 
 
 @pytest.mark.parametrize("place", ["42", "north,west", "91,0", "nan,0", "1,2,3"])
@@ -410,10 +416,10 @@ def test_given_no_place_then_usage(turning_log: Path, run: Run, place: str) -> N
     assert "latitude,longitude" in err
 
 
-def test_given_the_log_as_output_then_it_is_not_touched(standing_log: Path, run: Run) -> None:
-    before = standing_log.read_bytes()
-    assert run("imu", standing_log, "-o", standing_log, "--force")[0] == 2
-    assert standing_log.read_bytes() == before
+def test_given_the_log_as_output_then_it_is_not_touched(stationary_log: Path, run: Run) -> None:
+    before = stationary_log.read_bytes()
+    assert run("imu", stationary_log, "-o", stationary_log, "--force")[0] == 2
+    assert stationary_log.read_bytes() == before
 
 
 @pytest.mark.parametrize("subcommand", ["", "imu", "magnetometer"])
@@ -437,14 +443,16 @@ def test_given_another_command_then_nothing_of_this_is_imported() -> None:
 
 
 def test_given_axes_then_ticks_at_even_places() -> None:
-    assert svg.decades("t", [0.03, 5.0]).ticks() == pytest.approx([0.01, 0.1, 1.0, 10.0])
-    assert svg.decades("t", [1.0]).ticks() == pytest.approx([1.0, 10.0])
+    assert svg.decade_axis("t", [0.03, 5.0]).ticks() == pytest.approx([0.01, 0.1, 1.0, 10.0])
+    assert svg.decade_axis("t", [1.0]).ticks() == pytest.approx([1.0, 10.0])
     assert svg.Axis("x", -30.0, 30.0).ticks() == pytest.approx([-30, -20, -10, 0, 10, 20, 30])
-    assert svg.Axis("x", -30.0, 30.0).share(0.0) == 0.5
+    assert svg.Axis("x", -30.0, 30.0).fraction(0.0) == 0.5
 
 
 def test_given_names_with_markup_then_they_stay_words() -> None:
     axis = svg.Axis("<x>", 0.0, 1.0)
-    drawing = svg.chart("a & b", axis, axis, [svg.PlotLine("<script>", [0.0], [1.0], svg.COLOURS[0], dots=True)])
+    drawing = svg.render_chart(
+        "a & b", axis, axis, [svg.PlotLine("<script>", [0.0], [1.0], svg.COLORS[0], is_dotted=True)]
+    )
     assert ElementTree.fromstring(drawing).get("aria-label") == "a & b"
-    assert "<script>" not in svg.page("<script>", ["<script>"], [drawing])
+    assert "<script>" not in svg.render_page("<script>", ["<script>"], [drawing])

@@ -42,13 +42,13 @@ def test_every_problem_is_printed_with_place_fix_and_nearest_and_exit_1(check):
     lines = out.splitlines()
     assert lines[0] == "cart:6: error: xyz has 2 numbers, not 3"
     assert lines[1] == "    in:      body Cart, frame Mast"
-    assert lines[2] == "    fix:     write xyz: [number, number, number], in metres"
+    assert lines[2] == "    fix:     write xyz: [number, number, number], in meters"
     assert lines[3].startswith("cart:11: error: ")
     assert any(line.startswith("    nearest: Camera:Origin") for line in lines)
     assert lines[-1] == "cart: 2 errors"
 
 
-def test_a_warning_exits_1_and_the_size_is_told(check):
+def test_a_warning_exits_1_and_the_size_is_reported(check):
     code, out, _ = check(cart=YAML.replace("constraints:", "  Lamp: {frames: {Origin: }}\nconstraints:"))
     assert code == 1
     assert out.splitlines()[-1] == "cart: 3 bodies, 4 frames, 1 constraint; 1 warning"
@@ -78,7 +78,7 @@ def test_notes_are_counted_printed_when_asked_for_and_change_no_exit_code(check)
     assert check(cart=NOTED) == (0, "cart: 2 bodies, 3 frames, 1 constraint; clean; 1 note (--notes shows them)\n", "")
     code, out, _ = check("--notes", cart=NOTED)
     assert code == 0
-    assert "note: the file does not say which form it is in" in out
+    assert "note: the file does not state its format" in out
 
 
 def test_several_files_are_checked_though_one_is_missing(check):
@@ -119,7 +119,7 @@ def test_json_holds_all_for_scripts(check):
         "line": 6,
         "element": "body Cart, frame Mast",
         "message": "xyz has 2 numbers, not 3",
-        "fix": "write xyz: [number, number, number], in metres",
+        "fix": "write xyz: [number, number, number], in meters",
         "nearest": [],
         "edit": None,
     }
@@ -187,7 +187,7 @@ def test_an_empty_file_leads_to_both_pages(check):
     assert "docs/vehicle-file.md" in out
 
 
-def test_what_is_wrong_with_values_and_with_frames_is_told_at_once_with_lines(check, tmp_path):
+def test_what_is_wrong_with_values_and_with_frames_is_reported_at_once_with_lines(check, tmp_path):
     (tmp_path / "geometry.yaml").write_text(YAML)
     text = (
         VEHICLE
@@ -200,24 +200,24 @@ localization:
   filter:
     horizon: -1
     heading_limit: 30
-    gps_wander_time: soon
+    gps_correlation_time: soon
 """
     )
     code, out, _ = check(**{"vehicle.yaml": text})
     assert code == 1
     lines = [line for line in out.splitlines() if line.startswith("vehicle.yaml:") and "error: " in line]
-    told = {int(line.split(":")[1]): line for line in lines}
+    reported = {int(line.split(":")[1]): line for line in lines}
     # latency and frame are on one line, but nothing hides anything
     assert [int(line.split(":")[1]) for line in lines] == [5, 5, 6, 8, 10, 11, 12]
     assert "80 ms is 0.08" in out
     assert "body Cart has no frame 'Mst'" in out
-    assert "horizon must be finite and above 0" in told[10]
-    assert "30 degrees are 0.524" in told[11]
+    assert "horizon must be finite and above 0" in reported[10]
+    assert "30 degrees are 0.524" in reported[11]
     assert "write skid_steer" in out
     assert "write no_gps" in out
 
 
-def test_a_frame_that_is_not_there_is_told_with_its_line(check, tmp_path):
+def test_a_frame_that_is_not_there_is_reported_with_its_line(check, tmp_path):
     (tmp_path / "geometry.yaml").write_text(YAML)
     out = check(**{"vehicle.yaml": VEHICLE.replace("Mast", "Mst")})[1]
     assert out.startswith("vehicle.yaml:3: error: body Cart has no frame 'Mst'")
@@ -227,7 +227,7 @@ def test_a_vehicle_without_sensors_is_noted(check, tmp_path):
     (tmp_path / "geometry.yaml").write_text(YAML)
     code, out, _ = check("--notes", **{"vehicle.yaml": VEHICLE})
     assert code == 0
-    assert "note: no sensors: there will never be a pose" in out
+    assert "note: no localization sensor is configured, so there is no pose" in out
 
 
 def test_one_wheel_of_a_steered_vehicle_and_wheels_without_names_are_warned_of(check, tmp_path):
@@ -246,7 +246,7 @@ def test_one_wheel_of_a_steered_vehicle_and_wheels_without_names_are_warned_of(c
         assert words in out
 
 
-def test_everything_wrong_with_drivers_is_told_at_once_with_lines(check, tmp_path):
+def test_everything_wrong_with_drivers_is_reported_at_once_with_lines(check, tmp_path):
     (tmp_path / "geometry.yaml").write_text(YAML)
     (tmp_path / "cart.dbc").write_text('BO_ 5 Wheels: 8 A\n SG_ Left : 0|16@1+ (1,0) [0|0] "" A\n')
     text = (

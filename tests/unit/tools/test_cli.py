@@ -1,10 +1,10 @@
-"""The command line itself: slips are told with what was probably meant."""
+"""The command line itself: errors name the nearest known word."""
 
 from __future__ import annotations
 
 import pytest
 
-from mstools.cli import COMMANDS, OTHER_WORDS, main
+from mstools.cli import COMMAND_ALIASES, COMMANDS, main
 
 
 @pytest.mark.parametrize(
@@ -12,7 +12,7 @@ from mstools.cli import COMMANDS, OTHER_WORDS, main
     [
         ("serve", "did you mean run? Run the service"),
         ("replya", "did you mean replay?"),
-        ("xyzzy", "there are: demo, run, check"),
+        ("xyzzy", "commands: demo, run, check"),
     ],
 )
 def test_given_an_unknown_command_then_the_nearest_is_offered(
@@ -22,13 +22,13 @@ def test_given_an_unknown_command_then_the_nearest_is_offered(
         main([word, "-c", "vehicle.yaml"])
     assert ended.value.code == 2
     err = capsys.readouterr().err
-    assert f"there is no command {word!r}" in err
+    assert f"unknown command {word!r}" in err
     assert words in err
 
 
 @pytest.mark.parametrize("command", [("run",), ("driver", "gps")])
 @pytest.mark.parametrize("option", ["--log-level", "--log-format"])
-def test_given_a_log_that_there_is_not_then_those_there_are_are_told(
+def test_given_a_log_that_there_is_not_then_those_there_are_are_reported(
     capsys: pytest.CaptureFixture[str], command: tuple[str, ...], option: str
 ) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -38,5 +38,5 @@ def test_given_a_log_that_there_is_not_then_those_there_are_are_told(
 
 
 def test_given_the_words_of_others_then_they_lead_to_commands_that_there_are() -> None:
-    assert set(OTHER_WORDS.values()) <= COMMANDS.keys()
-    assert not OTHER_WORDS.keys() & COMMANDS.keys()
+    assert set(COMMAND_ALIASES.values()) <= COMMANDS.keys()
+    assert not COMMAND_ALIASES.keys() & COMMANDS.keys()

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from modelserver.config import load_config
-from modelserver.file_kinds import FileKind, file_kind
+from modelserver.config.vehicle_file import load_config
+from modelserver.files.kinds import FileKind, detect_file_kind
 from mstools.cli import main
 
 RAPTOR = Path(__file__).resolve().parents[3] / "config" / "raptor"
@@ -34,10 +34,10 @@ PROCESS = """\
       </parameter>
       <parameter name="UtmZone" value="12"/>
       <parameter name="UtmHemisphere" value="North"/>
-      <parameter name="RollingFrame" value="Raptor:RearAxleCentre"/>
+      <parameter name="RollingFrame" value="Raptor:RearAxleCenter"/>
       <parameter name="Gps">
         <parameter name="Channel" value="GPS"/>
-        <parameter name="Frame" value="GPSAntenna:PhaseCentre"/>
+        <parameter name="Frame" value="GPSAntenna:PhaseCenter"/>
       </parameter>
       <parameter name="ImuChannel" value="IMU"/>
       <parameter name="ImuFrame" value="Microstrain:Sensor"/>
@@ -113,13 +113,13 @@ def test_given_a_process_configuration_then_it_is_refused_with_a_command_whose_r
     assert run("check", "process.yaml") == (0, summary, "")
     config = load_config(folder / "process.yaml")
     assert (config.vehicle, config.geometry) == ("raptor", str(folder / "geometry.xml"))
-    assert (config.base_frame, config.rolling_frame) == ("Raptor:CG", "Raptor:RearAxleCentre")
+    assert (config.base_frame, config.rolling_frame) == ("Raptor:CG", "Raptor:RearAxleCenter")
     assert (config.publish.mode, config.publish.rate_hz) == ("timer", 10.0)
     assert (config.localization.mode, config.localization.filter.recapture_time) == ("raw", 5.0)
     assert config.origin.initial_utm == (350000.0, 5570000.0, 700.0)
     assert (config.origin.zone, config.origin.hemisphere) == (12, "north")
     assert config.sensors.gps is not None
-    assert (config.sensors.gps.channel, config.sensors.gps.frame) == ("GPS", "GPSAntenna:PhaseCentre")
+    assert (config.sensors.gps.channel, config.sensors.gps.frame) == ("GPS", "GPSAntenna:PhaseCenter")
     assert config.sensors.imu is not None
     assert (config.sensors.imu.channel, config.sensors.imu.frame) == ("IMU", "Microstrain:Sensor")
     assert config.sensors.wheels is not None
@@ -147,14 +147,16 @@ def test_given_a_path_with_a_space_then_the_command_is_quoted(folder: Path, run:
     ],
 )
 def test_a_process_configuration_is_known_by_what_stands_in_it(content: str, kind: FileKind) -> None:
-    assert file_kind(content.encode()) is kind
-    assert file_kind((RAPTOR / "geometry.xml").read_bytes()) is FileKind.XML
+    assert detect_file_kind(content.encode()) is kind
+    assert detect_file_kind((RAPTOR / "geometry.xml").read_bytes()) is FileKind.XML
 
 
 # --- the result ----------------------------------------------------------------------------------------------------
 
 
-def test_each_line_says_where_it_comes_from_and_what_is_left_is_listed_with_a_warning(folder: Path, run: Run) -> None:
+def test_each_line_reports_where_it_comes_from_and_what_is_left_is_listed_with_a_warning(
+    folder: Path, run: Run
+) -> None:
     write(
         folder,
         GEOMETRY,
@@ -202,7 +204,7 @@ def test_given_sections_of_other_processes_then_their_parameters_are_not_taken_f
   <section name="Common"><parameter name="GeometryFile" value="geometry.xml"/></section>
   <section name="ModelServer"><parameter name="RateHz" value="10"/></section>
   <section name="Gps">
-    <parameter name="Channel" value="GPS"/><parameter name="Frame" value="GPSAntenna:PhaseCentre"/>
+    <parameter name="Channel" value="GPS"/><parameter name="Frame" value="GPSAntenna:PhaseCenter"/>
   </section>
 </config>
 """
@@ -248,13 +250,13 @@ def test_given_no_known_name_then_the_one_parameter_that_names_a_file_is_the_geo
         ),
         (
             ['<parameter name="GeometryFile" value="geometri.xml"/>'],
-            ["process.xml:2: error: the geometry file 'geometri.xml' is not there", "did you mean geometry.xml?"],
+            ["process.xml:2: error: the geometry file 'geometri.xml' is missing", "did you mean geometry.xml?"],
         ),
         (['<parameter name="GeometryFile" value="wrong.xml"/>'], ["wrong.xml", "no geometry in this file"]),
         (["<parameter"], ["not well-formed"]),
     ],
 )
-def test_given_no_geometry_to_name_then_nothing_is_written_and_the_error_says_what_to_do(
+def test_given_no_geometry_to_name_then_nothing_is_written_and_the_error_reports_what_to_do(
     folder: Path, run: Run, parameters: list[str], words: list[str]
 ) -> None:
     (folder / "wrong.xml").write_text("<config/>")
@@ -268,11 +270,11 @@ def test_given_no_geometry_to_name_then_nothing_is_written_and_the_error_says_wh
 def test_given_a_target_that_is_no_yaml_or_exists_then_nothing_is_written(folder: Path, run: Run) -> None:
     code, _, err = run("convert", "process.xml", "vehicle.urdf")
     assert code == 2
-    assert "it becomes a vehicle file, which is YAML" in " ".join(err.split())
+    assert "which becomes a vehicle file in YAML" in " ".join(err.split())
     (folder / "vehicle.yaml").write_text("mine")
     code, _, err = run("convert", "process.xml", "vehicle.yaml")
     assert code == 1
-    assert "exists already" in err
+    assert "already exists" in err
     assert (folder / "vehicle.yaml").read_text() == "mine"
 
 

@@ -1,4 +1,4 @@
-"""Emulated devices that are given one start are on one drive: what each says comes at its stamp."""
+"""Emulated devices with one start time are on one drive: each sample comes at its stamp."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from itertools import islice
 
 import pytest
 
-from modelserver.config import load_config
+from modelserver.config.vehicle_file import load_config
 from modelserver.messages import GpsSample, WheelsSample
 from msdrivers.emulate.wheels import WheelsEmulator
+from msdrivers.endpoint import HostTime
 from msdrivers.protocol.can.database import parse_dbc
-from msdrivers.station import Now
-from mstools.commands.demo import vehicle_file
+from mstools.commands.demo import find_vehicle_file
 from mstools.commands.driver import load_driver
-from mstools.demo.drive import simulation
+from mstools.demo.drive import make_simulation
 
 START = 1_750_000_000_000_000
 
 
 def test_given_one_start_then_the_truth_does_not_depend_on_sensor_length_or_seed() -> None:
-    vehicle = load_config(vehicle_file())
-    one = simulation(vehicle, START, 10.0, sensors=(GpsSample,), seed=3)
-    other = simulation(vehicle, START, 80.0, sensors=(WheelsSample,), seed=4)
+    vehicle = load_config(find_vehicle_file())
+    one = make_simulation(vehicle, START, 10.0, sensors=(GpsSample,), seed=3)
+    other = make_simulation(vehicle, START, 80.0, sensors=(WheelsSample,), seed=4)
     for seconds in (0.0, 4.0, 9.5):
         utime = START + round(seconds * 1e6)
         assert one.truth(utime).enu.is_close(other.truth(utime).enu)
@@ -30,15 +30,17 @@ def test_given_one_start_then_the_truth_does_not_depend_on_sensor_length_or_seed
 
 @pytest.mark.parametrize("ahead_us", [2_000_000, 0, -500_000])
 def test_given_a_drive_that_begins_later_then_the_wheels_wait_for_it_and_else_begin_at_once(ahead_us: int) -> None:
-    _, settings = load_driver("wheels", vehicle_file())
-    vehicle = load_config(vehicle_file())
-    dbc = vehicle_file().parent / settings.station.dbc
-    samples = simulation(vehicle, START, 10.0, sensors=(WheelsSample,)).events(10.0)
+    _, settings = load_driver("wheels", find_vehicle_file())
+    vehicle = load_config(find_vehicle_file())
+    dbc = find_vehicle_file().parent / settings.device_settings.dbc
+    samples = make_simulation(vehicle, START, 10.0, sensors=(WheelsSample,)).events(10.0)
     first, second, *_ = wheels = [sample for sample in islice(samples, 5) if isinstance(sample, WheelsSample)]
-    emulator = WheelsEmulator(settings.station.wheels, parse_dbc(dbc.read_text(encoding="utf-8"), str(dbc)), wheels)
-    now = Now(7_000_000_000, first.header.utime - ahead_us)
-    emulator.opened(now)
-    due = emulator.due()
+    emulator = WheelsEmulator(
+        settings.device_settings.wheels, parse_dbc(dbc.read_text(encoding="utf-8"), str(dbc)), wheels
+    )
+    now = HostTime(7_000_000_000, first.header.utime - ahead_us)
+    emulator.on_open(now)
+    due = emulator.get_deadline()
     following = first if ahead_us > 0 else second
     wait_us = following.header.utime - first.header.utime + max(ahead_us, 0)
     assert due == now.monotonic_ns + wait_us * 1000

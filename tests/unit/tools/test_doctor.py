@@ -1,4 +1,4 @@
-"""`modelserver doctor`: findings for people and scripts, exit codes, and what a vehicle file needs of the machine."""
+"""`modelserver doctor`: findings as text and JSON, exit codes, and checks of a vehicle file on the machine."""
 
 from __future__ import annotations
 
@@ -12,29 +12,36 @@ from typing import Any
 import pytest
 from support_samples import GEOMETRY, VEHICLE, write_vehicle
 
-from modelserver.config import load_config
+from modelserver.config.vehicle_file import load_config
 from modelserver.errors import Problem, Severity
-from modelserver.service.probing import listening, machine
-from modelserver.service.probing.clock import ClockFacts
-from modelserver.service.probing.findings import Diagnosis, DiagnosisLevel, worst
-from modelserver.service.probing.probe import BusFacts, Interface, UdpAddress
-from modelserver.service.probing.servers import DiscoveredServers, Server
+from modelserver.server.diagnostics import bus_probe, machine
+from modelserver.server.diagnostics.checks import (
+    BusFacts,
+    ClockFacts,
+    Diagnosis,
+    DiagnosisLevel,
+    DiscoveredServers,
+    NetworkInterface,
+    Server,
+    UdpAddress,
+    get_worst_level,
+)
 from modelserver.wire.channels import DEFAULT_URL
 from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
 from msdrivers.settings import read_drivers
 from mstools.cli import main
 from mstools.commands import doctor
-from mstools.deployment import doctor_vehicle
-from mstools.deployment.doctor_vehicle import file_finding, line_findings, vehicle_findings
+from mstools.deployment import diagnosis
+from mstools.deployment.diagnosis import diagnose_connections, diagnose_vehicle, diagnose_vehicle_file
 
-LO = Interface("lo", loopback=True)
+LO = NetworkInterface("lo", loopback=True)
 WELL = BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), True, True, RECEIVE_BUFFER_BYTES, RECEIVE_BUFFER_BYTES, 0)
 Run = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """The command on a machine that is well, but for what `facts` and `answers` say."""
+    """Return the command, on a machine without problems except those in `facts` and `answers`."""
 
     def command(
         *arguments: object, facts: BusFacts = WELL, answers: DiscoveredServers | None = None
@@ -42,21 +49,23 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
         from modelserver.version import __version__
 
         answers = answers or DiscoveredServers((Server("pc", 1, "cart", __version__),), 1)
-        monkeypatch.setattr(machine, "bus_facts", lambda url, delivery=None: facts)
-        monkeypatch.setattr(listening, "who_answers", lambda *_: answers)
-        monkeypatch.setattr(machine.ClockWatch, "facts", lambda self: ClockFacts(1_800_000_000_000_000, True, 0.01))
+        monkeypatch.setattr(machine, "read_bus_facts", lambda url, delivery=None: facts)
+        monkeypatch.setattr(bus_probe, "discover_servers", lambda *_: answers)
+        monkeypatch.setattr(
+            machine.HostClockMonitor, "read_facts", lambda self: ClockFacts(1_800_000_000_000_000, True, 0.01)
+        )
         with pytest.raises(SystemExit) as ended:
             main(["doctor", *map(str, arguments)])
-        said = capsys.readouterr()
-        return int(ended.value.code or 0), said.out, said.err
+        output = capsys.readouterr()
+        return int(ended.value.code or 0), output.out, output.err
 
     return command
 
 
-def test_given_a_machine_that_is_well_then_it_says_so_and_exits_0(run: Run) -> None:
+def test_given_a_machine_that_is_well_then_that_is_reported_and_exits_0(run: Run) -> None:
     code, out, _ = run()
     assert code == 0
-    assert out.splitlines()[-1] == "all is well"
+    assert out.splitlines()[-1] == "no problem found"
     assert "modelserver" in out.splitlines()[0]
 
 
@@ -68,7 +77,7 @@ def test_given_a_machine_that_is_well_then_it_says_so_and_exits_0(run: Run) -> N
         (BusFacts(DEFAULT_URL, UdpAddress(), LO, (LO,), False), 3, "1 error"),
     ],
 )
-def test_given_something_to_mend_then_command_and_exit_code_tell(
+def test_given_something_to_fix_then_command_and_exit_code_report(
     run: Run, facts: BusFacts, code: int, words: str
 ) -> None:
     found, out, _ = run(facts=facts)
@@ -84,7 +93,7 @@ def test_given_two_daemons_then_it_is_an_error(run: Run) -> None:
 
 
 @pytest.mark.parametrize("url", ["udpm://nonsense", "udpm://10.0.0.1:7667", "udpm://239.255.76.67", "x://"])
-def test_given_a_wrong_url_then_that_is_the_error_and_nothing_is_said_of_routes(run: Run, url: str) -> None:
+def test_given_a_wrong_url_then_that_is_the_error_and_nothing_is_reported_of_routes(run: Run, url: str) -> None:
     code, out, _ = run("--url", url)
     assert code == 3
     assert f"error    bus       {url}" in out
@@ -97,7 +106,7 @@ def test_given_json_then_scripts_get_every_finding(run: Run) -> None:
     data = json.loads(out)
     assert (code, data["exit_code"]) == (3, 3)
     found = next(each for each in data["findings"] if each["subject"] == "own message")
-    assert found["grade"] == "error"
+    assert found["level"] == "error"
     assert "iptables" in found["command"]
 
 
@@ -119,7 +128,7 @@ def test_given_a_vehicle_file_that_is_wrong_then_it_is_an_error_that_check_expla
     assert "own message" in out
 
 
-def test_given_a_geometry_for_the_vehicle_file_then_it_says_so_and_does_not_send_to_check(
+def test_given_a_geometry_for_the_vehicle_file_then_that_is_reported_and_does_not_send_to_check(
     run: Run, tmp_path: Path
 ) -> None:
     path = write_vehicle(tmp_path).parent / "geometry.yaml"
@@ -130,7 +139,7 @@ def test_given_a_geometry_for_the_vehicle_file_then_it_says_so_and_does_not_send
     assert "modelserver check" not in out
 
 
-def test_given_no_such_vehicle_file_then_it_says_so(run: Run, tmp_path: Path) -> None:
+def test_given_no_such_vehicle_file_then_that_is_reported(run: Run, tmp_path: Path) -> None:
     code, out, err = run("-c", tmp_path / "vehicel.yaml")
     assert (code, out) == (2, "")
     assert "there is no vehicle file" in err
@@ -147,10 +156,10 @@ def test_given_a_vehicle_file_that_may_not_be_read_then_it_is_a_finding(
 ) -> None:
     path = write_vehicle(tmp_path, VEHICLE)
 
-    def closed(file: Path) -> None:
+    def raise_permission_error(file: Path) -> None:
         raise PermissionError(13, "Permission denied", str(file))
 
-    monkeypatch.setattr(doctor_vehicle, "load_config", closed)
+    monkeypatch.setattr(diagnosis, "load_config", raise_permission_error)
     code, out, _ = run("-c", path)
     assert code == 3
     assert f"{path} cannot be read: Permission denied" in out
@@ -169,11 +178,11 @@ def test_given_a_geometry_that_is_missing_then_the_vehicle_file_is_an_error(tmp_
     path = write_vehicle(tmp_path, VEHICLE, GEOMETRY)
     config = load_config(path)
     Path(config.geometry).unlink()
-    assert worst(vehicle_findings(config, path)) is DiagnosisLevel.ERROR
+    assert get_worst_level(diagnose_vehicle(config, path)) is DiagnosisLevel.ERROR
 
 
 @pytest.mark.parametrize(
-    ("severities", "grade"),
+    ("severities", "level"),
     [
         ([], DiagnosisLevel.OK),
         ([Severity.NOTE], DiagnosisLevel.OK),
@@ -181,48 +190,48 @@ def test_given_a_geometry_that_is_missing_then_the_vehicle_file_is_an_error(tmp_
         ([Severity.WARNING, Severity.ERROR, Severity.ERROR], DiagnosisLevel.ERROR),
     ],
 )
-def test_given_problems_of_a_file_then_the_gravest_counts(severities: list[Severity], grade: DiagnosisLevel) -> None:
-    found = file_finding([Problem(each, f"it is {each}") for each in severities], Path("v.yaml"))
-    assert found.grade is grade
-    assert bool(found.command) == (grade is not DiagnosisLevel.OK)
+def test_given_problems_of_a_file_then_the_gravest_counts(severities: list[Severity], level: DiagnosisLevel) -> None:
+    found = diagnose_vehicle_file([Problem(each, f"it is {each}") for each in severities], Path("v.yaml"))
+    assert found.level is level
+    assert bool(found.command) == (level is not DiagnosisLevel.OK)
 
 
-def lines(sections: dict[str, dict[str, Any]], networks: Sequence[Interface] = ()) -> list[Diagnosis]:
+def lines(sections: dict[str, dict[str, Any]], networks: Sequence[NetworkInterface] = ()) -> list[Diagnosis]:
     drivers, problems = read_drivers(sections)
     assert not problems
-    return list(line_findings(drivers.values(), networks))
+    return list(diagnose_connections(drivers.values(), networks))
 
 
-def test_given_a_serial_port_then_who_may_use_it_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from msdrivers.links import ports
+def test_given_a_serial_port_then_who_may_use_it_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from msdrivers.links import serial_port
 
     port = tmp_path / "ttyX"
     sections = {"gps": {"device": "nmea", "port": str(port)}}
     (found,) = lines(sections)
-    assert (found.grade, found.subject, found.command) == (
+    assert (found.level, found.subject, found.command) == (
         DiagnosisLevel.WARNING,
         "driver gps",
         "modelserver driver --list",
     )
     port.write_text("")
-    assert lines(sections)[0].grade is DiagnosisLevel.OK
+    assert lines(sections)[0].level is DiagnosisLevel.OK
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     hint = "it belongs to group dialout: sudo usermod -aG dialout ann, then log in again"
-    monkeypatch.setattr(ports, "permission_fix", lambda path: hint)
+    monkeypatch.setattr(serial_port, "explain_permission", lambda path: hint)
     (found,) = lines(sections)
-    assert (found.grade, found.command) == (DiagnosisLevel.ERROR, "sudo usermod -aG dialout ann")
-    monkeypatch.setattr(ports, "permission_fix", lambda path: "give this user access")
+    assert (found.level, found.command) == (DiagnosisLevel.ERROR, "sudo usermod -aG dialout ann")
+    monkeypatch.setattr(serial_port, "explain_permission", lambda path: "give this user access")
     assert lines(sections)[0].command == f"ls -l {port}"
 
 
 def test_given_a_port_in_use_then_it_is_worth_knowing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from msdrivers.links import ports
+    from msdrivers.links import serial_port
 
     port = tmp_path / "ttyX"
     port.write_text("")
-    monkeypatch.setattr(ports, "hint_for", lambda path: "in use by process 3 (minicom)")
+    monkeypatch.setattr(serial_port, "find_access_problem", lambda path: "in use by process 3 (minicom)")
     (found,) = lines({"gps": {"device": "nmea", "port": str(port)}})
-    assert (found.grade, "minicom" in found.seen) == (DiagnosisLevel.NOTE, True)
+    assert (found.level, "minicom" in found.observed) == (DiagnosisLevel.NOTE, True)
 
 
 def test_given_a_can_network_then_it_must_be_there_and_up() -> None:
@@ -230,9 +239,12 @@ def test_given_a_can_network_then_it_must_be_there_and_up() -> None:
     config = load_config(raptor)
     section = {"wheels": config.drivers["wheels"]}
     grades = [
-        lines(section, networks)[0].grade for networks in ((), (Interface("can0", up=False),), (Interface("can0"), LO))
+        lines(section, networks)[0].level
+        for networks in ((), (NetworkInterface("can0", up=False),), (NetworkInterface("can0"), LO))
     ]
     assert grades == [DiagnosisLevel.WARNING, DiagnosisLevel.ERROR, DiagnosisLevel.OK]
-    assert lines(section, (Interface("can0", up=False),))[0].command.startswith("sudo ip link set can0 up type can")
+    assert lines(section, (NetworkInterface("can0", up=False),))[0].command.startswith(
+        "sudo ip link set can0 up type can"
+    )
     trying = {"wheels": {**config.drivers["wheels"], "can": "239.74.163.2:4000", "interface": "udp_multicast"}}
-    assert lines(trying)[0].grade is DiagnosisLevel.OK
+    assert lines(trying)[0].level is DiagnosisLevel.OK

@@ -1,4 +1,4 @@
-"""`modelserver query --explain` and `--motion`: what people and scripts are told beyond the pose."""
+"""`modelserver query --explain` and `--motion`: text and JSON beyond the pose."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from support_moving import BASE, DEEP, SCAN, T0, UTM, S, view
 
-from modelserver.joints.joints import Joints
+from modelserver.joints.history import JointHistory
 from modelserver.messages import (
     EdgeReport,
     Explanation,
@@ -22,12 +22,18 @@ from modelserver.messages import (
     PoseAnswer,
     TimeQuery,
 )
-from modelserver.platform.explained import explained
-from modelserver.platform.moving import motion
-from modelserver.spatial import Pose, Transformation, so3
+from modelserver.query.explanation import explain
+from modelserver.query.motion import compute_motion
+from modelserver.transforms import Pose, Transformation, so3
 from mstools.cli import main
-from mstools.commands.explain import coordinates, describe_edges, describe_motion, edges_as_data, motion_as_data
-from mstools.commands.query import describe
+from mstools.commands.query import (
+    describe,
+    describe_edges,
+    describe_motion,
+    edges_as_data,
+    format_coordinates,
+    motion_as_data,
+)
 
 Run = Callable[..., tuple[int, str, str]]
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "moving-geometry.md"
@@ -63,7 +69,7 @@ def run(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
     return query
 
 
-# --- what an answer rests on ----------------------------------------------------------------------------------------
+# --- explanation
 
 
 def test_given_a_file_then_each_edge_has_its_row_and_shares_come_to_100_percent(run: Run) -> None:
@@ -73,11 +79,13 @@ def test_given_a_file_then_each_edge_has_its_row_and_shares_come_to_100_percent(
     rows = [line.split() for line in table.splitlines()]
     assert rows[0] == ["Laser:Scan", "in", "Cart:Base", "rests", "on"]
     assert [row[0] for row in rows[2:6]] == ["frame", "constraint", "joint", "frame"]
-    assert rows[4][:6] == ["joint", "Nod", "Cart:Mast", "→", "Laser:Axle", "at"]
+    assert rows[4][:6] == ["joint", "Nod", "Cart:Mast", "→", "Laser:Axle", "default"]
     assert rows[4][-6:-4] == ["10.000", "deg"]
     assert rows[6] == ["sum", "100.0", "%", "100.0", "%"]
     assert answer.rstrip() == run("Laser:Scan", "Cart:Base")[1].rstrip()
-    assert answer.rstrip().endswith("AT_REST: a joint on the way was never heard; it is taken to stand at its default")
+    assert answer.rstrip().endswith(
+        "JOINT_DEFAULT: no sample of a joint on the path was received; its default is assumed"
+    )
 
 
 def test_the_table_in_the_documentation_is_what_its_command_prints(
@@ -92,7 +100,7 @@ def test_the_table_in_the_documentation_is_what_its_command_prints(
     assert capsys.readouterr().out.partition("\n\n")[0] == table.rstrip()
 
 
-def test_given_the_way_back_then_edges_are_passed_the_other_way_and_say_so(run: Run) -> None:
+def test_given_the_way_back_then_edges_are_passed_the_other_way_and_report_it(run: Run) -> None:
     _, out, _ = run("Cart:Base", "Laser:Scan", "--explain")
     assert "Laser:Axle → Cart:Mast, inverse" in out
     assert out.index("Laser:Scan → Laser, inverse") < out.index("Laser:Axle → Cart:Mast, inverse")
@@ -105,10 +113,10 @@ def test_given_json_then_it_holds_the_answer_and_the_same_edges(run: Run) -> Non
     assert code == 0
     edges = found.pop("edges")
     assert found == plain
-    assert plain["flags"] == ["AT_REST"]
+    assert plain["flags"] == ["JOINT_DEFAULT"]
     joint = edges[2]
     assert (joint["kind"], joint["name"], joint["from"], joint["to"]) == ("joint", "Nod", "Cart:Mast", "Laser:Axle")
-    assert (joint["forward"], joint["how"], joint["age"], joint["source"]) == (True, "at_rest", None, None)
+    assert (joint["forward"], joint["provenance"], joint["age"], joint["source"]) == (True, "default", None, None)
     assert joint["coordinates"] == [pytest.approx(math.radians(10))]
     assert sum(edge["position_share"] for edge in edges) == pytest.approx(1.0)
     assert sum(edge["rotation_share"] for edge in edges) == pytest.approx(1.0)
@@ -121,25 +129,25 @@ def test_given_one_frame_twice_then_the_answer_rests_on_nothing(run: Run) -> Non
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "output"),
     [
-        (("Laser:Scan", "Cart:Base", "--motion"), 1, "ask the daemon"),
-        (("Laser:Scan", "World:UTM", "--explain"), 1, "ask the daemon"),
+        (("Laser:Scan", "Cart:Base", "--motion"), 1, "query the daemon"),
+        (("Laser:Scan", "World:UTM", "--explain"), 1, "query the daemon"),
         (("Laser:Scna", "Cart:Base", "--explain"), 1, "Laser:Scan"),
         (("Laser:Scan", "Cart:Base", "--expressed-in", "Cart:Mast"), 2, "--motion"),
-        (("Laser:Scan", "Cart:Base", "--explain", "--motion"), 2, "two questions"),
+        (("Laser:Scan", "Cart:Base", "--explain", "--motion"), 2, "exclude each other"),
     ],
 )
-def test_given_what_cannot_be_told_then_it_says_what_to_do(
-    run: Run, arguments: tuple[str, ...], code: int, said: str
+def test_given_what_cannot_be_reported_then_it_reports_what_to_do(
+    run: Run, arguments: tuple[str, ...], code: int, output: str
 ) -> None:
     found, out, err = run(*arguments)
     assert (found, out) == (code, "")
-    assert said in err
+    assert output in err
 
 
-def test_given_a_vehicle_and_joints_that_were_heard_then_how_age_and_source_are_told() -> None:
-    text = describe_edges(explained(view(), SCAN, UTM, AT, NOW))
+def test_given_a_vehicle_and_joints_that_were_received_then_how_age_and_source_are_reported() -> None:
+    text = describe_edges(explain(view(), SCAN, UTM, AT, NOW))
     rows = {line.split()[0]: line for line in text.splitlines() if not line.startswith("  no")}
     assert "World:UTM → Rover:Base" in rows["vehicle"]
     assert "localization" in rows["vehicle"]
@@ -147,11 +155,11 @@ def test_given_a_vehicle_and_joints_that_were_heard_then_how_age_and_source_are_
         assert part in rows["joint"]
 
 
-def test_given_edges_without_sigmas_then_they_have_no_share_and_the_foot_says_why() -> None:
-    text = describe_edges(explained(view(sigma=None), SCAN, BASE, AT, NOW))
-    assert "nobody states a sigma" in text
+def test_given_edges_without_sigmas_then_they_have_no_share_and_the_foot_reports_why() -> None:
+    text = describe_edges(explain(view(sigma=None), SCAN, BASE, AT, NOW))
+    assert "no sigma is known" in text
     assert "100.0 %" in next(line for line in text.splitlines() if line.lstrip().startswith("joint"))
-    data = json.loads(json.dumps(edges_as_data(explained(view(sigma=None), SCAN, BASE, AT, NOW)), allow_nan=False))
+    data = json.loads(json.dumps(edges_as_data(explain(view(sigma=None), SCAN, BASE, AT, NOW)), allow_nan=False))
     assert None in {edge["position_share"] for edge in data}
 
 
@@ -161,9 +169,13 @@ def test_given_nothing_that_states_a_sigma_then_there_is_no_sum_either() -> None
     assert "%" not in text
 
 
-def test_given_joints_of_every_type_then_lengths_are_metres_and_angles_degrees() -> None:
-    found = explained(view(), DEEP, BASE, AT, NOW)
-    units = {edge.name: [text.split()[1] for text in coordinates(edge)] for edge in found.edges if edge.kind == "joint"}
+def test_given_joints_of_every_type_then_lengths_are_meters_and_angles_degrees() -> None:
+    found = explain(view(), DEEP, BASE, AT, NOW)
+    units = {
+        edge.name: [text.split()[1] for text in format_coordinates(edge)]
+        for edge in found.edges
+        if edge.kind == "joint"
+    }
     assert units == {"Slide": ["m"], "Ball": ["deg"] * 3, "Table": ["m", "m", "deg"]}
 
 
@@ -181,49 +193,52 @@ def test_given_joints_of_every_type_then_lengths_are_metres_and_angles_degrees()
         ),
     ],
 )
-def test_given_a_joints_motion_then_it_tells_the_units_of_its_coordinates(
+def test_given_a_joints_motion_then_it_reports_the_units_of_its_coordinates(
     X: Pose, position: tuple[float, ...], shown: list[str], forward: bool
 ) -> None:
     pose = X if forward else X.inverse()
     edge = EdgeReport("joint", "J", forward, ("A:A", "B:B"), pose, "measured", coordinates=position)
-    assert coordinates(edge) == shown
+    assert format_coordinates(edge) == shown
 
 
-# --- how a frame moves ----------------------------------------------------------------------------------------------
+# --- motion
 
 
 def test_given_a_motion_then_people_see_units_sigmas_and_axes() -> None:
-    lines = describe_motion(motion(view(), SCAN, UTM, "", AT)).splitlines()
+    lines = describe_motion(compute_motion(view(), SCAN, UTM, "", AT)).splitlines()
     assert lines[0] == f"{SCAN} moves in {UTM}, along the axes of {UTM}"
-    assert [line[:20].strip() for line in lines[1:]] == ["velocity", "turn rate", "acceleration", "turn acceleration"]
+    names = ["velocity", "turn rate", "acceleration", "angular acceleration"]
+    assert [line[:22].strip() for line in lines[1:]] == names
     assert "m/s,  sigma" in lines[1]
     assert "deg/s,  sigma" in lines[2]
     assert lines[3].endswith("m/s2")
 
 
 def test_given_a_motion_then_scripts_see_si_units_and_the_covariance() -> None:
-    found = motion(view(), SCAN, BASE, "Rover:Mast", AT)
+    found = compute_motion(view(), SCAN, BASE, "Rover:Mast", AT)
     data = json.loads(json.dumps(motion_as_data(found), allow_nan=False))
     assert data["expressed_in"] == "Rover:Mast"
-    assert data["rate"] == pytest.approx(list(found.rate))
+    assert data["angular_velocity"] == pytest.approx(list(found.angular_velocity))
     assert len(data["motion_covariance"]) == len(data["motion_covariance"][0]) == 6
 
 
-def test_given_what_nobody_knows_then_it_says_so_and_is_null() -> None:
+def test_given_what_nobody_knows_then_it_reports_it_and_is_null() -> None:
     none = (math.nan,) * 3
     pose = PoseAnswer(Transformation("A:A", "B:B", Pose(), invalid_reasons=int(Invalid.STALE_JOINT)))
     found = MotionAnswer(pose, "B:B", (1.0, 0.0, -2.0), none, none, none)
     text = describe_motion(found)
     assert "1.0000  0.0000  -2.0000  m/s" in text
-    assert text.count("not known") == 4
-    assert motion_as_data(found)["rate"] == [None] * 3
+    assert text.count("unknown") == 4
+    assert motion_as_data(found)["angular_velocity"] == [None] * 3
     assert motion_as_data(found)["motion_covariance"] is None
-    assert "NOT VALID       a joint on the way was silent" in describe(pose)
+    assert "NOT VALID       a joint on the path was silent" in describe(pose)
 
 
-def test_given_joints_never_heard_then_the_flags_are_told_in_words() -> None:
+def test_given_joints_never_received_then_the_flags_are_reported_in_words() -> None:
     known = view()
-    silent = replace(known, joints=Joints(known.model.joints.values(), 60.0))
+    silent = replace(known, joints=JointHistory(known.model.joints.values(), 60.0))
     text = describe(silent.transformation(SCAN, BASE, TimeQuery(), NOW))
-    assert "flags           AT_REST: a joint on the way was never heard" in text
-    assert "NOT VALID       a joint on the way was never heard, and the geometry states no default" in text
+    assert "flags           JOINT_DEFAULT: no sample of a joint on the path was received" in text
+    assert (
+        "NOT VALID       no sample of a joint on the path was received, and the geometry has no default for it" in text
+    )

@@ -1,4 +1,4 @@
-"""What strangers say to the commands: a false daemon's names and texts never steer the terminal."""
+"""Hostile replies to the commands: names and texts of a false daemon never control the terminal."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from modelserver.messages import (
     ReplyHeader,
     TransformReply,
 )
-from modelserver.spatial import Pose, Transformation
+from modelserver.transforms import Pose, Transformation
 from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode, encode
 from mstools.cli import main
@@ -60,8 +60,8 @@ def false_daemon(status: Status) -> Iterator[str]:
         def answering(kind: type) -> Any:
             def answer(_: str, data: bytes) -> None:
                 header = decode(BY_NAME[CHANNEL_OF[kind]].type_name, data).header
-                told = ReplyHeader(header.request_id, 1, status, "" if status is Status.OK else EVIL, (EVIL,), EVIL)
-                bus.publish(header.reply_channel, encode(GOOD[kind](told)))
+                reported = ReplyHeader(header.request_id, 1, status, "" if status is Status.OK else EVIL, (EVIL,), EVIL)
+                bus.publish(header.reply_channel, encode(GOOD[kind](reported)))
 
             return answer
 
@@ -95,7 +95,7 @@ def test_given_hostile_replies_then_every_line_on_the_terminal_is_plain(
         main([*arguments, "--url", url, "--timeout", "1" if arguments[0] != "tree" else "0.2"])
     out, err = capsys.readouterr()
     assert out + err
-    # only line breaks of our own: nothing that a stranger said begins a line
+    # only line breaks of our own: no text of the false daemon starts a line
     for line in (out + err).splitlines():
         assert line.isprintable(), line
         assert not line.startswith("FORGED")

@@ -12,43 +12,43 @@ from pathlib import Path
 import pytest
 
 from modelserver.errors import ConfigError, ModelServerError
-from modelserver.keys import new_key, write_key
+from modelserver.signing.key_files import generate_key, write_key
 from mstools.cli import main
 from mstools.commands import install
-from mstools.deployment import place as install_place
+from mstools.deployment import installation
 from mstools.deployment import steps as install_steps
 from mstools.deployment.files import (
     SerialDriver,
     check_drivers,
-    check_seen,
-    credential,
-    hidden_by,
-    limits,
+    check_visible,
+    find_hiding_setting,
     loopback_group,
-    realtime,
-    rules,
-    units,
+    render_credential_drop_in,
+    render_realtime_drop_in,
+    render_sysctl,
+    render_udev_rules,
+    render_units,
 )
-from mstools.deployment.plan import SYSCTL, Facts
+from mstools.deployment.plan import SYSCTL, SystemFacts
 
 RAPTOR = Path(__file__).parents[3] / "config" / "raptor"
 OWN_KEY = "commands.key"
-TEMPLATES = install.templates()
+TEMPLATES = install.read_templates()
 
-Said = tuple[int, str, str]
+Output = tuple[int, str, str]
 
 
 @pytest.fixture
-def run(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Said]:
-    """A function that runs a command on a system below a folder, with an installation that the units can see."""
+def run(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Output]:
+    """Return a function that runs a command on a system below a folder, with a valid installation."""
     monkeypatch.setattr(install, "check_installation", lambda: None)
-    monkeypatch.setattr(install, "program", lambda: "/opt/modelserver/bin/modelserver")
-    # there may be no systemd here, and what it is told is looked at elsewhere
+    monkeypatch.setattr(install, "get_command_path", lambda: "/opt/modelserver/bin/modelserver")
+    # there may be no systemd here; other tests check its commands
     monkeypatch.setattr(install_steps.shutil, "which", lambda name, path: "/bin/true")
     root = tmp_path / "root"
     (root / "etc").mkdir(parents=True)
 
-    def command(*words: str) -> Said:
+    def command(*words: str) -> Output:
         try:
             main([*words, "--root", str(root)])
         except SystemExit as ended:
@@ -72,8 +72,8 @@ def tree(root: Path) -> dict[str, bytes | None]:
     return {str(path.relative_to(root)): path.read_bytes() if path.is_file() else None for path in root.rglob("*")}
 
 
-def test_given_a_dry_run_then_all_is_told_and_nothing_done(
-    run: Callable[..., Said], vehicle: Path, tmp_path: Path
+def test_given_a_dry_run_then_all_is_reported_and_nothing_done(
+    run: Callable[..., Output], vehicle: Path, tmp_path: Path
 ) -> None:
     code, out, _ = run("install", "--vehicle", str(vehicle), "--dry-run", "--serial", "gps=usb-X_1-if00")
     assert code == 0
@@ -89,7 +89,7 @@ def test_given_a_dry_run_then_all_is_told_and_nothing_done(
 
 
 def test_given_an_installation_then_a_removal_leaves_nothing_of_it(
-    run: Callable[..., Said], vehicle: Path, tmp_path: Path
+    run: Callable[..., Output], vehicle: Path, tmp_path: Path
 ) -> None:
     assert run("install", "--vehicle", str(vehicle), "--drivers", "gps,wheels")[0] == 0
     there = tree(tmp_path / "root")
@@ -108,7 +108,7 @@ def test_given_an_installation_then_a_removal_leaves_nothing_of_it(
     ids=["beside it", "elsewhere"],
 )
 def test_given_a_key_then_systemd_hands_it_over_and_nobody_else_may_read_it(
-    run: Callable[..., Said], vehicle: Path, tmp_path: Path, named: str, where: str
+    run: Callable[..., Output], vehicle: Path, tmp_path: Path, named: str, where: str
 ) -> None:
     named = named or str(tmp_path / "rover.key")
     where = where or named
@@ -131,19 +131,19 @@ def test_given_a_key_then_systemd_hands_it_over_and_nobody_else_may_read_it(
 
 
 def write_key_file(path: Path) -> str:
-    key = new_key()
+    key = generate_key()
     write_key(path, key)
     return key.secret.hex()
 
 
-def test_given_a_key_file_whose_name_a_unit_would_take_for_something_else_then_it_is_refused() -> None:
-    with pytest.raises(ModelServerError, match="cannot stand in a unit"):
-        credential("/etc/my keys/%n")
+def test_given_a_key_file_whose_name_a_unit_would_take_for_something_else_then_it_is_rejected() -> None:
+    with pytest.raises(ModelServerError, match="cannot be written in a unit"):
+        render_credential_drop_in("/etc/my keys/%n")
 
 
 @pytest.mark.slow
 def test_given_an_edited_vehicle_file_then_it_stays_and_counts(
-    run: Callable[..., Said], vehicle: Path, tmp_path: Path
+    run: Callable[..., Output], vehicle: Path, tmp_path: Path
 ) -> None:
     run("install", "--vehicle", str(vehicle))
     installed = tmp_path / "root" / "etc" / "modelserver" / "vehicle.yaml"
@@ -151,14 +151,14 @@ def test_given_an_edited_vehicle_file_then_it_stays_and_counts(
     installed.write_text(edited)
     code, out, err = run("install", "--vehicle", str(vehicle))
     assert code == 0, err
-    assert f"leave   {installed}: it was edited" in out
+    assert f"leave   {installed}: edited" in out
     assert "modelserver-driver@receiver.service" in out
     assert installed.read_text() == edited
     # without a file the one that is installed counts
     assert "modelserver-driver@receiver.service" in run("install", "--dry-run")[1]
 
 
-def test_given_no_vehicle_file_then_it_is_said_where_examples_are(run: Callable[..., Said]) -> None:
+def test_given_no_vehicle_file_then_it_is_reported_where_examples_are(run: Callable[..., Output]) -> None:
     code, _, err = run("install")
     assert code == 1
     assert "no vehicle file in" in err
@@ -166,7 +166,7 @@ def test_given_no_vehicle_file_then_it_is_said_where_examples_are(run: Callable[
 
 
 def test_given_a_wrong_vehicle_file_then_nothing_is_installed(
-    run: Callable[..., Said], vehicle: Path, tmp_path: Path
+    run: Callable[..., Output], vehicle: Path, tmp_path: Path
 ) -> None:
     vehicle.write_text(vehicle.read_text().replace("Raptor:CG", "Raptor:GC"))
     code, _, err = run("install", "--vehicle", str(vehicle))
@@ -175,7 +175,7 @@ def test_given_a_wrong_vehicle_file_then_nothing_is_installed(
     assert tree(tmp_path / "root") == {"etc": None}
 
 
-def test_given_a_geometry_outside_the_folder_then_it_is_refused(run: Callable[..., Said], vehicle: Path) -> None:
+def test_given_a_geometry_outside_the_folder_then_it_is_rejected(run: Callable[..., Output], vehicle: Path) -> None:
     (vehicle.parent / "geometry.yaml").rename(vehicle.parent.parent / "other.yaml")
     vehicle.write_text(vehicle.read_text().replace("geometry: geometry.yaml", "geometry: ../other.yaml"))
     code, _, err = run("install", "--vehicle", str(vehicle))
@@ -183,18 +183,18 @@ def test_given_a_geometry_outside_the_folder_then_it_is_refused(run: Callable[..
     assert "outside its folder\n    fix:     put it beside the vehicle file" in err
 
 
-def test_given_a_user_without_rights_then_the_command_with_sudo_is_said(
+def test_given_a_user_without_rights_then_the_command_with_sudo_is_reported(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
     for command in ("install", "uninstall"):
         with pytest.raises(SystemExit):
             main([command])
-        assert f"needs root: sudo {install_place.program()} {command}" in capsys.readouterr().err
+        assert f"needs root: sudo {installation.get_command_path()} {command}" in capsys.readouterr().err
 
 
-def test_given_a_command_that_fails_then_it_is_said_which_and_what_it_said(
-    run: Callable[..., Said], vehicle: Path, monkeypatch: pytest.MonkeyPatch
+def test_given_a_command_that_fails_then_it_is_reported_which_and_what_it_reported(
+    run: Callable[..., Output], vehicle: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(install_steps.shutil, "which", lambda name, path: "/bin/false")
     code, _, err = run("install", "--vehicle", str(vehicle))
@@ -215,23 +215,23 @@ def test_given_a_command_that_fails_then_it_is_said_which_and_what_it_said(
     ],
 )
 def test_given_a_path_then_it_is_known_what_hides_it(path: str, why: str) -> None:
-    assert hidden_by(path) == why
+    assert find_hiding_setting(path) == why
 
 
-def test_given_an_installation_that_the_units_do_not_see_then_it_is_refused_with_the_way_out() -> None:
+def test_given_an_installation_that_the_units_do_not_see_then_it_is_rejected_with_the_way_out() -> None:
     with pytest.raises(ModelServerError, match=r"its Python is /root/x, which .*ProtectHome=yes.*/opt/modelserver"):
-        check_seen([("/usr/bin/x", "a"), ("/root/x", "its Python")], install_place.ELSEWHERE)
+        check_visible([("/usr/bin/x", "a"), ("/root/x", "its Python")], installation.INSTALL_HINT)
 
 
 def test_given_several_paths_that_the_units_do_not_see_then_one_error_names_all_and_what_works() -> None:
     with pytest.raises(ConfigError) as caught:
-        check_seen([("/root/x", "its Python"), ("/tmp/y", "its package")], install_place.ELSEWHERE)
+        check_visible([("/root/x", "its Python"), ("/tmp/y", "its package")], installation.INSTALL_HINT)
     (problem,) = caught.value.problems
     assert problem.message == (
-        "its Python is /root/x, its package is /tmp/y, which the hardened units do not see "
+        "its Python is /root/x, its package is /tmp/y, which the hardened units cannot access "
         "(ProtectHome=yes and PrivateTmp=yes)"
     )
-    # with whichever python3 comes first it may be the same again
+    # the first python3 in the PATH may be the same again
     assert "sudo /usr/bin/python3 -m venv --clear /opt/modelserver" in problem.fix
 
 
@@ -239,67 +239,67 @@ def test_given_several_paths_that_the_units_do_not_see_then_one_error_names_all_
 def test_given_the_documentation_then_it_names_the_same_way_as_the_advice(page: str) -> None:
     text = (Path(__file__).parents[3] / page).read_text(encoding="utf-8")
     way = "sudo /usr/bin/python3 -m venv --clear /opt/modelserver"
-    assert way in install_place.ELSEWHERE
+    assert way in installation.INSTALL_HINT
     assert way in text
     assert "-m venv" not in text.replace(way, "").replace("python3 -m venv .venv", "")
 
 
-def test_given_an_installation_then_everything_that_is_wrong_with_it_is_told(
+def test_given_an_installation_then_everything_that_is_wrong_with_it_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     python = tmp_path / "bin" / "python"
     python.parent.mkdir()
     python.write_text("")
     python.parent.chmod(0o700)
-    monkeypatch.setattr(install_place.sys, "executable", str(python))
-    monkeypatch.setattr(install_place.sys, "base_prefix", "/home/me/python")
-    monkeypatch.setattr(install_place.install_files, "HIDDEN", {"/home": "ProtectHome"})
-    monkeypatch.setattr(install_place, "files", lambda name: tmp_path)
+    monkeypatch.setattr(installation.sys, "executable", str(python))
+    monkeypatch.setattr(installation.sys, "base_prefix", "/home/me/python")
+    monkeypatch.setattr(installation.install_files, "HIDDEN_FOLDERS", {"/home": "ProtectHome"})
+    monkeypatch.setattr(installation, "files", lambda name: tmp_path)
     with pytest.raises(ConfigError) as caught:
-        install_place.check_installation()
-    said = "\n".join(problem.message for problem in caught.value.problems)
-    assert "its Python's library is /home/me/python, which the hardened units do not see" in said
-    assert f"there is no {tmp_path}/bin/modelserver" in said
-    assert f"its Python is {python}, and the service's user may not read " in said
+        installation.check_installation()
+    output = "\n".join(problem.message for problem in caught.value.problems)
+    assert "its Python's library is /home/me/python, which the hardened units cannot access" in output
+    assert f"there is no {tmp_path}/bin/modelserver" in output
+    assert f"its Python is {python}, and the service's user may not read " in output
     assert {problem.file for problem in caught.value.problems} == {"this installation"}
 
 
-def test_given_several_problems_then_all_are_told_and_nothing_is_done(
-    run: Callable[..., Said], vehicle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_given_several_problems_then_all_are_reported_and_nothing_is_done(
+    run: Callable[..., Output], vehicle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(install, "check_installation", lambda: check_seen([("/root/x", "its Python")], "go"))
+    monkeypatch.setattr(install, "check_installation", lambda: check_visible([("/root/x", "its Python")], "go"))
     good = vehicle.read_text()
     vehicle.write_text(good.replace("Raptor:CG", "Raptor:GC"))
     words = ("install", "--vehicle", str(vehicle), "--dry-run", "--drivers", "none,gsp,imu")
     code, out, err = run(*words)
     assert (code, out) == (1, "")
-    for said in (
+    for output in (
         "this installation: error: its Python is /root/x",
         "body Raptor has no frame 'GC'",
-        "--drivers: error: none stands beside other names in 'none,gsp,imu', and means no driver at all",
+        "--drivers: error: none is combined with other names in 'none,gsp,imu', and means no driver at all",
         "fix:     --drivers none, or only the names: --drivers gsp,imu",
         "the vehicle file has no driver 'gsp'; did you mean gps?",
     ):
-        assert said in err
+        assert output in err
     # what needs a vehicle file that is well: further ones
     vehicle.write_text(good.replace("geometry: geometry.yaml", "geometry: ../other.yaml"))
     (vehicle.parent / "geometry.yaml").rename(vehicle.parent.parent / "other.yaml")
     code, _, err = run(*words, "--serial", "gsp=x", "--serial", "imu=a b")
     assert code == 1
-    for said in (
+    for output in (
         "names '../other.yaml', outside its folder",
-        "--serial: error: it names 'gsp', which is no driver on a serial port here; did you mean gps?",
-        "--serial: error: 'a b' is no name below /dev/serial/by-id/",
+        "--serial: error: 'gsp' is not a driver on a serial port; did you mean gps?",
+        "--serial: error: 'a b' is not a name below /dev/serial/by-id/",
         "its Python is /root/x",
     ):
-        assert said in err
+        assert output in err
     assert tree(tmp_path / "root") == {"etc": None}
 
 
-def test_given_a_vehicle_file_that_is_not_there_or_no_yaml_then_the_other_problems_are_told_too(
-    run: Callable[..., Said], vehicle: Path, monkeypatch: pytest.MonkeyPatch
+def test_given_a_vehicle_file_that_is_not_there_or_no_yaml_then_the_other_problems_are_reported_too(
+    run: Callable[..., Output], vehicle: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(install, "check_installation", lambda: check_seen([("/root/x", "its Python")], "go"))
+    monkeypatch.setattr(install, "check_installation", lambda: check_visible([("/root/x", "its Python")], "go"))
     vehicle.write_text("[")
     for file in (vehicle, vehicle.parent / "none.yaml"):
         code, _, err = run("install", "--vehicle", str(file), "--dry-run")
@@ -308,21 +308,21 @@ def test_given_a_vehicle_file_that_is_not_there_or_no_yaml_then_the_other_proble
         assert "its Python is /root/x" in err
 
 
-def test_given_another_root_then_paths_are_told_within_it(
-    run: Callable[..., Said], vehicle: Path, tmp_path: Path
+def test_given_another_root_then_paths_are_reported_within_it(
+    run: Callable[..., Output], vehicle: Path, tmp_path: Path
 ) -> None:
     root = tmp_path / "root"
     code, _, err = run("uninstall")
-    assert f"nothing to take back: {root}/etc/modelserver/installed.json" in err
+    assert f"nothing to uninstall: {root}/etc/modelserver/installed.json" in err
     run("install", "--vehicle", str(vehicle))
     code, out, _ = run("uninstall", "--dry-run")
     assert code == 0
-    assert f"what the service kept is still in {root}/var/lib/modelserver" in out
-    told = [line.split()[1].rstrip(":") for line in out.splitlines() if line.startswith(("remove", "leave"))]
-    assert told
-    assert all(path.startswith(f"{root}/etc") for path in told)
+    assert f"the service's state is still in {root}/var/lib/modelserver" in out
+    reported = [line.split()[1].rstrip(":") for line in out.splitlines() if line.startswith(("remove", "leave"))]
+    assert reported
+    assert all(path.startswith(f"{root}/etc") for path in reported)
     (root / "etc/modelserver/installed.json").write_text("{")
-    assert f"{root}/etc/modelserver/installed.json, which holds" in run("uninstall")[2]
+    assert f"{root}/etc/modelserver/installed.json: the record of the installation is damaged" in run("uninstall")[2]
 
 
 def test_given_an_installation_that_others_may_not_read_then_it_is_known_what_is_closed(tmp_path: Path) -> None:
@@ -331,9 +331,9 @@ def test_given_an_installation_that_others_may_not_read_then_it_is_known_what_is
     for part in (tmp_path, *tmp_path.parents):
         if "/pytest-of-" in str(part):  # the tests' own
             part.chmod(0o755)
-    assert install_place.closed_to_others(str(folder / "bin")) == ""
+    assert installation.find_unreadable_part(str(folder / "bin")) == ""
     folder.chmod(0o700)
-    assert install_place.closed_to_others(str(folder / "bin")) == str(folder)
+    assert installation.find_unreadable_part(str(folder / "bin")) == str(folder)
 
 
 @pytest.mark.parametrize(
@@ -363,29 +363,29 @@ def test_given_names_of_drivers_then_they_are_taken(wanted: str, expected: tuple
 
 
 @pytest.mark.parametrize(
-    ("wanted", "known", "said"),
+    ("wanted", "known", "output"),
     [
         ("gsp", ["gps", "imu"], "did you mean gps?"),
         ("x", [], "it has: none"),
-        ("all", ["gps/1"], "cannot be the name of a unit"),
-        ("all", ["-gps"], "cannot be the name of a unit"),
-        ("all", ["gps%n"], "cannot be the name of a unit"),
-        ("none,gps", ["gps", "imu"], "none stands beside other names in 'none,gps', and means no driver at all"),
-        ("imu,all", ["gps", "imu"], "all stands beside other names in 'imu,all', and means every driver"),
+        ("all", ["gps/1"], "cannot be a unit name"),
+        ("all", ["-gps"], "cannot be a unit name"),
+        ("all", ["gps%n"], "cannot be a unit name"),
+        ("none,gps", ["gps", "imu"], "none is combined with other names in 'none,gps', and means no driver at all"),
+        ("imu,all", ["gps", "imu"], "all is combined with other names in 'imu,all', and means every driver"),
         ("none,all", ["gps"], "fix: --drivers none, or only the names"),
     ],
 )
-def test_given_a_driver_that_cannot_be_then_it_is_said_why(wanted: str, known: list[str], said: str) -> None:
-    with pytest.raises(ModelServerError, match=said.replace("?", r"\?")):
+def test_given_a_driver_that_cannot_be_then_it_is_reported_why(wanted: str, known: list[str], output: str) -> None:
+    with pytest.raises(ModelServerError, match=output.replace("?", r"\?")):
         check_drivers(wanted, known)
 
 
 @pytest.mark.parametrize(
     "program", ["bin/modelserver", "/opt/my programs/modelserver", "/opt/%h/modelserver", "/a\n/b"]
 )
-def test_given_a_path_that_a_unit_would_take_for_something_else_then_it_is_refused(program: str) -> None:
-    with pytest.raises(ModelServerError, match="cannot stand in a unit"):
-        units(TEMPLATES, program, "", "/sbin/ip", drivers=False)
+def test_given_a_path_that_a_unit_would_take_for_something_else_then_it_is_rejected(program: str) -> None:
+    with pytest.raises(ModelServerError, match="cannot be written in a unit"):
+        render_units(TEMPLATES, program, "", "/sbin/ip", drivers=False)
 
 
 @pytest.mark.parametrize(
@@ -406,7 +406,7 @@ def test_given_a_path_that_a_unit_would_take_for_something_else_then_it_is_refus
 def test_given_a_bus_and_devices_then_the_units_speak_with_those_alone(
     url: str, hosts: tuple[str, ...], service: str, driver: str
 ) -> None:
-    texts = {each.path: each.content.decode() for each in units(TEMPLATES, "/x", url, "/sbin/ip", True, hosts)}
+    texts = {each.path: each.content.decode() for each in render_units(TEMPLATES, "/x", url, "/sbin/ip", True, hosts)}
     for name, addresses in (("modelserver.service", service), ("modelserver-driver@.service", driver)):
         text = texts[f"/etc/systemd/system/{name}"]
         assert f"\nIPAddressDeny=any\nIPAddressAllow={addresses}\n" in text
@@ -427,7 +427,9 @@ def test_given_a_unit_then_it_is_bounded_and_hardened_as_the_others(name: str) -
 def test_given_a_bus_that_leaves_the_machine_and_no_drivers_then_there_is_the_service_alone() -> None:
     assert [
         each.path
-        for each in units(TEMPLATES, "/opt/x/modelserver", "udpm://239.1.2.3:7667?ttl=1", "/sbin/ip", drivers=False)
+        for each in render_units(
+            TEMPLATES, "/opt/x/modelserver", "udpm://239.1.2.3:7667?ttl=1", "/sbin/ip", drivers=False
+        )
     ] == ["/etc/systemd/system/modelserver.service"]
 
 
@@ -437,16 +439,16 @@ BY_ID = {"usb-FTDI_A1-if00-port0": "/dev/ttyUSB0"}
 @pytest.mark.parametrize(
     ("port", "given", "facts", "device"),
     [
-        ("/dev/serial/by-id/usb-X_1-if00", {}, Facts(), "usb-X_1-if00"),
-        ("/dev/ttyUSB0", {}, Facts(by_id=BY_ID), "usb-FTDI_A1-if00-port0"),
-        ("/dev/ttyUSB0", {"gps": "/dev/serial/by-id/usb-Y"}, Facts(by_id=BY_ID), "usb-Y"),
-        ("/dev/modelserver/gps", {"gps": "usb-Y"}, Facts(), "usb-Y"),
+        ("/dev/serial/by-id/usb-X_1-if00", {}, SystemFacts(), "usb-X_1-if00"),
+        ("/dev/ttyUSB0", {}, SystemFacts(by_id=BY_ID), "usb-FTDI_A1-if00-port0"),
+        ("/dev/ttyUSB0", {"gps": "/dev/serial/by-id/usb-Y"}, SystemFacts(by_id=BY_ID), "usb-Y"),
+        ("/dev/modelserver/gps", {"gps": "usb-Y"}, SystemFacts(), "usb-Y"),
     ],
 )
 def test_given_a_serial_driver_then_its_device_gets_a_name_by_its_id(
-    port: str, given: dict[str, str], facts: Facts, device: str
+    port: str, given: dict[str, str], facts: SystemFacts, device: str
 ) -> None:
-    (write,), notes = rules([SerialDriver("gps", port)], given, facts)
+    (write,), notes = render_udev_rules([SerialDriver("gps", port)], given, facts)
     line = write.content.decode().splitlines()[1]
     assert line == (
         f'SUBSYSTEM=="tty", SYMLINK=="serial/by-id/{device}", ENV{{ID_MM_DEVICE_IGNORE}}="1", '
@@ -454,42 +456,42 @@ def test_given_a_serial_driver_then_its_device_gets_a_name_by_its_id(
     )
     assert bool(notes) == (port == "/dev/ttyUSB0")
     # unplugged at the next installation it keeps its name
-    again, _ = rules([SerialDriver("gps", "/dev/ttyUSB0")], {}, Facts(rules=write.content.decode()))
+    again, _ = render_udev_rules([SerialDriver("gps", "/dev/ttyUSB0")], {}, SystemFacts(rules=write.content.decode()))
     assert again == [write]
 
 
-def test_given_a_device_that_nobody_knows_then_a_note_says_what_to_do() -> None:
-    writes, (note,) = rules([SerialDriver("gps", "/dev/ttyUSB0")], {}, Facts())
+def test_given_a_device_that_nobody_knows_then_a_note_reports_what_to_do() -> None:
+    writes, (note,) = render_udev_rules([SerialDriver("gps", "/dev/ttyUSB0")], {}, SystemFacts())
     assert writes == []
     assert "--serial gps=/dev/serial/by-id/..." in note
 
 
 @pytest.mark.parametrize("device", ['x", RUN+="/bin/sh', "a b", "a*", "../x"])
-def test_given_a_device_name_that_would_be_more_than_a_name_then_it_is_refused(device: str) -> None:
-    with pytest.raises(ModelServerError, match="is no name below"):
-        rules([SerialDriver("gps", f"/dev/serial/by-id/{device}")], {"gps": device}, Facts())
+def test_given_a_device_name_that_would_be_more_than_a_name_then_it_is_rejected(device: str) -> None:
+    with pytest.raises(ModelServerError, match="is not a name below"):
+        render_udev_rules([SerialDriver("gps", f"/dev/serial/by-id/{device}")], {"gps": device}, SystemFacts())
 
 
-def test_given_an_id_for_a_driver_that_there_is_not_then_it_is_refused() -> None:
-    with pytest.raises(ModelServerError, match="which is no driver on a serial port"):
-        rules([SerialDriver("gps", "/dev/ttyUSB0")], {"imu": "usb-Y"}, Facts())
+def test_given_an_id_for_a_driver_that_there_is_not_then_it_is_rejected() -> None:
+    with pytest.raises(ModelServerError, match="is not a driver on a serial port"):
+        render_udev_rules([SerialDriver("gps", "/dev/ttyUSB0")], {"imu": "usb-Y"}, SystemFacts())
 
 
 def test_given_a_machine_that_can_then_the_loop_goes_before_other_programs() -> None:
-    assert realtime(Facts()) == []
-    (write,) = realtime(Facts(realtime=True))
+    assert render_realtime_drop_in(SystemFacts()) == []
+    (write,) = render_realtime_drop_in(SystemFacts(realtime=True))
     assert write.content.decode().splitlines()[1:] == ["[Service]", "CPUSchedulingPolicy=rr", "CPUSchedulingPriority=1"]
 
 
 @pytest.mark.parametrize(
     ("facts", "count"),
     [
-        (Facts(rmem_max=212_992), 1),
-        (Facts(), 1),
-        (Facts(rmem_max=8_000_000), 0),
+        (SystemFacts(rmem_max=212_992), 1),
+        (SystemFacts(), 1),
+        (SystemFacts(rmem_max=8_000_000), 0),
         # raised by an earlier installation: it stays ours
-        (Facts(rmem_max=4_194_304, files={SYSCTL: "x"}), 1),
+        (SystemFacts(rmem_max=4_194_304, files={SYSCTL: "x"}), 1),
     ],
 )
-def test_given_a_limit_then_it_is_raised_where_it_is_too_low(facts: Facts, count: int) -> None:
-    assert len(limits(4_194_304, facts)) == count
+def test_given_a_limit_then_it_is_raised_where_it_is_too_low(facts: SystemFacts, count: int) -> None:
+    assert len(render_sysctl(4_194_304, facts)) == count

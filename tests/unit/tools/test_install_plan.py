@@ -1,4 +1,4 @@
-"""The plan of an installation: nothing that is another's is touched, and what is ours goes again."""
+"""The plan of an installation: files of others are not touched, and own files are removed again."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from mstools.deployment.plan import (
     SYSCTL,
     UNITS,
     VEHICLE,
-    Facts,
-    Keep,
+    KeepFile,
     Manifest,
     Plan,
-    Remove,
+    RemovePath,
     RunProgram,
-    Write,
+    SystemFacts,
+    WriteFile,
     digest,
-    folders_around,
+    parent_folders,
     plan_install,
     plan_uninstall,
 )
@@ -38,55 +38,55 @@ PROGRAMS = {name: f"/usr/bin/{name}" for name in ("systemctl", "udevadm", "sysct
 
 
 class Disk:
-    """Files by path, on which plans are carried out; folders are those around files, and what plans leave behind."""
+    """A simulated disk to execute plans on: files by path, and their folders."""
 
     def __init__(self, files: Mapping[str, bytes] | None = None):
         self.files = dict(files or {})
-        self.folders = {folder for path in self.files for folder in folders_around(path)} | {"/etc"}
+        self.folders = {folder for path in self.files for folder in parent_folders(path)} | {"/etc"}
         self.ran: list[str] = []
 
-    def facts(self) -> Facts:
+    def facts(self) -> SystemFacts:
         raw = self.files.get(MANIFEST)
-        around = {folder for path in (*PATHS, MANIFEST) for folder in folders_around(path)}
-        return Facts(
+        around = {folder for path in (*PATHS, MANIFEST) for folder in parent_folders(path)}
+        return SystemFacts(
             files={path: digest(content) for path, content in self.files.items()},
             absent=frozenset(around - self.folders),
-            manifest=Manifest() if raw is None else Manifest.decoded(raw),
+            manifest=Manifest() if raw is None else Manifest.decode(raw),
             programs=PROGRAMS,
         )
 
-    def does(self, plan: Plan) -> None:
+    def execute(self, plan: Plan) -> None:
         for step in plan.steps:
-            if isinstance(step, Write):
+            if isinstance(step, WriteFile):
                 self.files[step.path] = step.content
-                self.folders.update(folders_around(step.path))
-            elif isinstance(step, Remove):
+                self.folders.update(parent_folders(step.path))
+            elif isinstance(step, RemovePath):
                 held = [path for path in (*self.files, *self.folders) if path.startswith(f"{step.path}/")]
-                if step.whole or not held:
+                if step.is_recursive or not held:
                     self.files.pop(step.path, None)
                     self.folders.discard(step.path)
             elif isinstance(step, RunProgram):
                 self.ran.append(" ".join(step.arguments))
 
-    def installs(self, contents: Mapping[str, bytes], units: tuple[str, ...] = ("modelserver.service",)) -> Plan:
-        writes = [Write(path, content, "a file") for path, content in contents.items()]
+    def install(self, contents: Mapping[str, bytes], units: tuple[str, ...] = ("modelserver.service",)) -> Plan:
+        writes = [WriteFile(path, content, "a file") for path, content in contents.items()]
         plan = plan_install(writes, units, self.facts(), start=True, notes=())
-        self.does(plan)
+        self.execute(plan)
         return plan
 
-    def uninstalls(self, purge: bool = False) -> Plan:
+    def uninstall(self, purge: bool = False) -> Plan:
         plan = plan_uninstall(self.facts(), purge=purge)
-        self.does(plan)
+        self.execute(plan)
         return plan
 
 
-def kept(plan: Plan) -> list[str]:
-    return [step.path for step in plan.steps if isinstance(step, Keep)]
+def list_unchanged(plan: Plan) -> list[str]:
+    return [step.path for step in plan.steps if isinstance(step, KeepFile)]
 
 
 def test_given_an_empty_system_then_all_is_written_and_started_in_order() -> None:
     disk = Disk()
-    disk.installs(dict.fromkeys(PATHS, b"x"))
+    disk.install(dict.fromkeys(PATHS, b"x"))
     assert set(disk.files) == {*PATHS, MANIFEST}
     assert disk.ran == [
         "/usr/bin/udevadm control --reload",
@@ -98,12 +98,12 @@ def test_given_an_empty_system_then_all_is_written_and_started_in_order() -> Non
     ]
 
 
-def test_given_the_same_again_then_nothing_is_written_and_it_is_started_anew() -> None:
+def test_given_the_same_again_then_nothing_is_written_and_it_is_started_again() -> None:
     disk = Disk()
-    disk.installs(dict.fromkeys(PATHS, b"x"))
+    disk.install(dict.fromkeys(PATHS, b"x"))
     before = dict(disk.files)
     disk.ran.clear()
-    assert set(kept(disk.installs(dict.fromkeys(PATHS, b"x")))) == set(PATHS)
+    assert set(list_unchanged(disk.install(dict.fromkeys(PATHS, b"x")))) == set(PATHS)
     assert disk.files == before
     assert disk.ran == [
         "/usr/bin/systemctl enable modelserver.service",
@@ -113,61 +113,61 @@ def test_given_the_same_again_then_nothing_is_written_and_it_is_started_anew() -
 
 def test_given_an_upgrade_then_what_was_not_edited_is_replaced() -> None:
     disk = Disk()
-    disk.installs({VEHICLE: b"old", SERVICE: b"old"})
+    disk.install({VEHICLE: b"old", SERVICE: b"old"})
     disk.files[VEHICLE] = b"edited"
-    plan = disk.installs({VEHICLE: b"new", SERVICE: b"new"})
-    assert (disk.files[VEHICLE], disk.files[SERVICE], kept(plan)) == (b"edited", b"new", [VEHICLE])
-    assert kept(disk.uninstalls()) == [VEHICLE]
+    plan = disk.install({VEHICLE: b"new", SERVICE: b"new"})
+    assert (disk.files[VEHICLE], disk.files[SERVICE], list_unchanged(plan)) == (b"edited", b"new", [VEHICLE])
+    assert list_unchanged(disk.uninstall()) == [VEHICLE]
     assert disk.files == {VEHICLE: b"edited"}
 
 
 def test_given_a_driver_that_is_not_wanted_any_more_then_its_unit_ends() -> None:
     disk = Disk()
-    disk.installs({SERVICE: b"x"}, ("modelserver.service", "modelserver-driver@gps.service"))
+    disk.install({SERVICE: b"x"}, ("modelserver.service", "modelserver-driver@gps.service"))
     disk.ran.clear()
-    disk.installs({SERVICE: b"x"}, ("modelserver.service",))
+    disk.install({SERVICE: b"x"}, ("modelserver.service",))
     assert "/usr/bin/systemctl disable --now modelserver-driver@gps.service" in disk.ran
 
 
 def test_given_a_file_that_is_not_wanted_any_more_then_it_goes_unless_it_was_edited() -> None:
     disk = Disk()
-    disk.installs(dict.fromkeys(PATHS, b"x"))
+    disk.install(dict.fromkeys(PATHS, b"x"))
     disk.files[RULES] = b"edited"
-    disk.installs({SERVICE: b"x"})
+    disk.install({SERVICE: b"x"})
     assert set(disk.files) == {SERVICE, RULES, MANIFEST, *(path for path in PATHS if path.startswith(CONFIGURATION))}
-    disk.uninstalls()
+    disk.uninstall()
     assert disk.files == {RULES: b"edited"}
 
 
-def test_given_an_interrupted_installation_then_it_can_be_taken_back() -> None:
+def test_given_an_interrupted_installation_then_it_can_be_undone() -> None:
     disk = Disk()
-    writes = [Write(path, b"x", "a file") for path in PATHS]
+    writes = [WriteFile(path, b"x", "a file") for path in PATHS]
     plan = plan_install(writes, ("modelserver.service",), disk.facts(), start=True, notes=())
-    disk.does(replace(plan, steps=plan.steps[:3]))
+    disk.execute(replace(plan, steps=plan.steps[:3]))
     assert len(disk.files) == 3
-    disk.uninstalls()
+    disk.uninstall()
     assert (disk.files, disk.folders) == ({}, {"/etc"})
 
 
 def test_given_a_purge_then_what_was_edited_and_the_state_go_too() -> None:
     disk = Disk()
-    disk.installs({VEHICLE: b"x"})
+    disk.install({VEHICLE: b"x"})
     disk.files |= {VEHICLE: b"edited", f"{STATE[1]}/origin.json": b"{}"}
-    plan = disk.uninstalls(purge=True)
+    plan = disk.uninstall(purge=True)
     assert VEHICLE not in disk.files
-    assert [step.path for step in plan.steps if isinstance(step, Remove) and step.whole] == list(STATE)
+    assert [step.path for step in plan.steps if isinstance(step, RemovePath) and step.is_recursive] == list(STATE)
 
 
 def test_given_another_system_then_nothing_is_started_and_systemctl_works_on_it() -> None:
-    facts = Facts(programs=PROGRAMS, is_live=False, root="/mnt/image")
-    plan = plan_install([Write(RULES, b"x", "rules")], ("modelserver.service",), facts, start=True, notes=())
+    facts = SystemFacts(programs=PROGRAMS, is_live=False, root="/mnt/image")
+    plan = plan_install([WriteFile(RULES, b"x", "rules")], ("modelserver.service",), facts, start=True, notes=())
     commands = [" ".join(step.arguments) for step in plan.steps if isinstance(step, RunProgram)]
     assert commands == ["/usr/bin/systemctl --root=/mnt/image enable modelserver.service"]
 
 
-def test_given_nothing_installed_then_there_is_nothing_to_take_back() -> None:
-    with pytest.raises(ModelServerError, match="nothing to take back"):
-        plan_uninstall(Facts(), purge=True)
+def test_given_nothing_installed_then_there_is_nothing_to_uninstall() -> None:
+    with pytest.raises(ModelServerError, match="nothing to uninstall"):
+        plan_uninstall(SystemFacts(), purge=True)
 
 
 @pytest.mark.parametrize(
@@ -186,9 +186,9 @@ def test_given_nothing_installed_then_there_is_nothing_to_take_back() -> None:
         b"[" * 100_000,
     ],
 )
-def test_given_a_damaged_or_forged_record_then_it_is_refused(content: bytes) -> None:
+def test_given_a_damaged_or_forged_record_then_it_is_rejected(content: bytes) -> None:
     with pytest.raises(ModelServerError, match="is damaged"):
-        Manifest.decoded(content)
+        Manifest.decode(content)
 
 
 CONTENTS = st.dictionaries(st.sampled_from(PATHS), st.sampled_from([b"1", b"2", b"3"]))
@@ -201,7 +201,7 @@ def test_given_any_course_then_what_is_not_ours_is_as_it_was_and_what_is_ours_is
     disk = Disk(before)
     folders = set(disk.folders)
     for contents in installed:
-        disk.installs(contents)
+        disk.install(contents)
         # what was there is never written over
         assert all(disk.files[path] == content for path, content in before.items())
     wanted = {path for contents in installed for path in contents if path.startswith(CONFIGURATION)} | set(
@@ -213,7 +213,7 @@ def test_given_any_course_then_what_is_not_ours_is_as_it_was_and_what_is_ours_is
     disk.files |= dict.fromkeys(edited, b"edited")
     if not ours:
         return
-    disk.uninstalls(purge)
+    disk.uninstall(purge)
     expected = before | dict.fromkeys(edited, b"edited")
     if purge:
         expected = {path: content for path, content in expected.items() if path not in ours}

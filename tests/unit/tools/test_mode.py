@@ -1,4 +1,4 @@
-"""`modelserver mode`: the wish reaches the channel that the vehicle file names, and slips are told with what to do."""
+"""`modelserver mode`: the command arrives on the channel of the vehicle file; errors name the fix."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from modelserver.messages import (
     SwitchMode,
     Verdict,
 )
-from modelserver.signing import is_genuine
-from modelserver.spatial import Pose
+from modelserver.signing.signatures import has_valid_signature
+from modelserver.transforms import Pose
 from modelserver.wire.codec import decode, encode
 from mstools.cli import main
 from mstools.commands.mode import MODES, parse_mode
@@ -56,13 +56,13 @@ def write_vehicle(folder: Path, vehicle: str = VEHICLE) -> Path:
 
 
 class Answering:
-    """A daemon that hears wishes and tells its state, as far as a test wants it to."""
+    """A daemon that receives mode commands and publishes its state, as far as a test wants."""
 
-    def __init__(self, url: str, prefix: str = "", mode: Mode = Mode.FULL, obeys: bool = True, decides: bool = False):
-        self.mode, self.obeys, self.decides, self.prefix = mode, obeys, decides, prefix
-        self.wishes: list[SwitchMode] = []
+    def __init__(self, url: str, prefix: str = "", mode: Mode = Mode.FULL, applies: bool = True, decides: bool = False):
+        self.mode, self.applies, self.decides, self.prefix = mode, applies, decides, prefix
+        self.commands: list[SwitchMode] = []
         self.bus = lcm.LCM(url)
-        self.bus.subscribe(f"{prefix}MODELSERVER_SIGNED", self.heard)
+        self.bus.subscribe(f"{prefix}MODELSERVER_SIGNED", self.on_command)
         self.ended = threading.Event()
         self.thread = threading.Thread(target=self.run)
 
@@ -81,18 +81,18 @@ class Answering:
                 self.bus.publish(f"{self.prefix}LOCALIZATION_STATE", encode(state(self.mode)))
             self.bus.publish(f"{self.prefix}POSE", b"")
 
-    def heard(self, _: str, data: bytes) -> None:
+    def on_command(self, _: str, data: bytes) -> None:
         envelope: Envelope = decode("signed_t", data)
         assert envelope.channel == "console/mode"
-        assert is_genuine(KEY, self.prefix, envelope)
-        wish: SwitchMode = decode("localization_mode_t", envelope.payload)
-        self.wishes.append(wish)
-        if self.obeys:
-            self.mode = wish.mode
+        assert has_valid_signature(KEY, self.prefix, envelope)
+        command: SwitchMode = decode("localization_mode_t", envelope.payload)
+        self.commands.append(command)
+        if self.applies:
+            self.mode = command.mode
         if self.decides:
-            header = wish.header
-            word = f"mode {wish.mode.name.lower()}"
-            made = Decision(header.utime, header.source, header.seq, "mode", Verdict.TOOK_UP, word)
+            header = command.header
+            word = f"mode {command.mode.name.lower()}"
+            made = Decision(header.utime, header.source, header.seq, "mode", Verdict.RESET, word)
             self.bus.publish(f"{self.prefix}LOCALIZATION_DECISIONS", encode(PublishDecisions(header.utime, (made,))))
 
 
@@ -100,81 +100,83 @@ def state(mode: Mode) -> NavigationState:
     nan = math.nan
     nothing = (0.0, 0.0, 0.0)
     return NavigationState(
-        START, mode, Phase.LEVELLING, False, VALID, 0, nan, nan, nan, Pose(), nothing, nothing, (0.0,) * 36, (), (), ()
+        START, mode, Phase.LEVELING, False, VALID, 0, nan, nan, nan, Pose(), nothing, nothing, (0.0,) * 36, (), (), ()
     )
 
 
 @pytest.mark.parametrize("prefix", ["", "V1_"])
-def test_given_a_daemon_that_obeys_then_the_mode_before_and_now_are_told(tmp_path: Path, run: Run, prefix: str) -> None:
+def test_given_a_daemon_that_applies_then_the_mode_before_and_now_are_reported(
+    tmp_path: Path, run: Run, prefix: str
+) -> None:
     config = write_vehicle(tmp_path, f"{LISTENS}lcm: {{channel_prefix: '{prefix}'}}\n")
     with reserved_url() as url, Answering(url, prefix) as daemon:
         assert run("no_wheels", "-c", config, "--url", url) == (0, "now no_wheels (was full)\n", "")
-    (wish,) = daemon.wishes
-    assert wish.mode is Mode.NO_WHEELS
-    assert wish.header.source == "operator"
-    assert wish.header.utime == wish.header.host_utime > 1_700_000_000_000_000
+    (command,) = daemon.commands
+    assert command.mode is Mode.NO_WHEELS
+    assert command.header.source == "operator"
+    assert command.header.utime == command.header.host_utime > 1_700_000_000_000_000
 
 
-def test_given_a_daemon_that_goes_to_raw_mode_then_its_silence_or_its_decision_tells(
+def test_given_a_daemon_that_goes_to_raw_mode_then_its_silence_or_its_decision_reports(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = write_vehicle(tmp_path, LISTENS)
     with reserved_url() as url:
         with Answering(url, decides=True):
             assert run("raw", "-c", config, "--url", url)[:2] == (0, "now raw (was full)\n")
-        monkeypatch.setattr("mstools.commands.mode.PATIENCE_S", 1.0)
+        monkeypatch.setattr("mstools.commands.mode.TIMEOUT_S", 1.0)
         with Answering(url):
             assert run("raw", "-c", config, "--url", url)[:2] == (0, "now raw (was full)\n")
         with Answering(url, mode=Mode.RAW):
             assert "not confirmed: LOCALIZATION_STATE is silent" in run("raw", "-c", config, "--url", url)[1]
 
 
-def test_given_a_daemon_that_stays_in_its_mode_then_that_is_told(
+def test_given_a_daemon_that_stays_in_its_mode_then_that_is_reported(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mstools.commands.mode.PATIENCE_S", 0.5)
-    with reserved_url() as url, Answering(url, obeys=False):
+    monkeypatch.setattr("mstools.commands.mode.TIMEOUT_S", 0.5)
+    with reserved_url() as url, Answering(url, applies=False):
         code, out, err = run("no_gps", "-c", write_vehicle(tmp_path, LISTENS), "--url", url)
     assert (code, out) == (1, "")
     assert "but the daemon stays in mode full" in err
 
 
-def test_given_nobody_then_it_is_told_what_was_sent_and_that_nobody_answers(
+def test_given_nobody_then_it_is_reported_what_was_sent_and_that_nobody_answers(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mstools.commands.mode.PATIENCE_S", 0.1)
+    monkeypatch.setattr("mstools.commands.mode.TIMEOUT_S", 0.1)
     with reserved_url() as url:
         config = write_vehicle(tmp_path, f"{LISTENS}lcm: {{url: '{url}'}}\n")
         listener = Listener(url, "MODELSERVER_SIGNED")
         code, out, err = run("full", "--config", config)
         assert (code, out) == (1, "")
-        assert "told console/mode: full, but nobody answers" in err
+        assert "sent console/mode: full, but no message was received" in err
         assert listener.wait()
 
 
-def test_given_a_state_that_is_never_published_then_it_says_that_nothing_confirms(
+def test_given_a_state_that_is_never_published_then_it_reports_that_nothing_confirms(
     tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mstools.commands.mode.PATIENCE_S", 0.5)
+    monkeypatch.setattr("mstools.commands.mode.TIMEOUT_S", 0.5)
     config = write_vehicle(tmp_path, f"{LISTENS}publish: {{state_hz: 0}}\n")
-    with reserved_url() as url, Answering(url, mode=Mode.RAW, obeys=False):
+    with reserved_url() as url, Answering(url, mode=Mode.RAW, applies=False):
         code, out, _ = run("no_gps", "-c", config, "--url", url)
     assert code == 0
     assert "cannot be confirmed" in out
     assert "publish.state_hz: 0" in out
 
 
-def test_given_a_vehicle_file_without_a_channel_then_it_says_what_to_write(tmp_path: Path, run: Run) -> None:
+def test_given_a_vehicle_file_without_a_channel_then_it_reports_what_to_write(tmp_path: Path, run: Run) -> None:
     code, out, err = run("raw", "-c", write_vehicle(tmp_path), "--url", "memq://")
     assert (code, out) == (1, "")
-    assert "names no channel for wishes about the mode" in err
+    assert "no channel for mode commands is configured" in err
     assert "localization.mode_channel" in err
     assert "write mode_channel: LOCALIZATION_MODE under localization" in err
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("no_gsp", "did you mean no_gps?"), ("FUL", "did you mean full?"), ("xyzzy", "there are: full, raw, no_imu")],
+    [("no_gsp", "did you mean no_gps?"), ("FUL", "did you mean full?"), ("xyzzy", "modes: full, raw, no_imu")],
 )
 def test_given_a_mistyped_mode_then_the_nearest_is_offered(tmp_path: Path, run: Run, text: str, words: str) -> None:
     code, _, err = run(text, "-c", write_vehicle(tmp_path, LISTENS))
@@ -182,7 +184,7 @@ def test_given_a_mistyped_mode_then_the_nearest_is_offered(tmp_path: Path, run: 
     assert words in " ".join(err.split())
 
 
-def test_given_a_vehicle_file_that_is_wrong_or_missing_then_it_is_told(tmp_path: Path, run: Run) -> None:
+def test_given_a_vehicle_file_that_is_wrong_or_missing_then_it_is_reported(tmp_path: Path, run: Run) -> None:
     code, _, err = run("raw", "-c", write_vehicle(tmp_path, f"{VEHICLE}localization: {{mode_chanel: M}}\n"))
     assert code == 1
     assert "write mode_channel" in err
@@ -190,7 +192,7 @@ def test_given_a_vehicle_file_that_is_wrong_or_missing_then_it_is_told(tmp_path:
 
 
 @pytest.mark.parametrize("mode", Mode)
-def test_given_the_name_of_a_mode_in_any_spelling_then_it_is_understood(mode: Mode) -> None:
+def test_given_the_name_of_a_mode_in_any_suggestion_then_it_is_understood(mode: Mode) -> None:
     name = mode.name.lower()
     assert name in MODES
     assert {parse_mode(text) for text in (name, mode.name, name.replace("_", "-"), f" {name} ")} == {mode}

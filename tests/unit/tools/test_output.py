@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from modelserver.errors import ModelServerError
-from mstools.terminal.output import check_target, write_file, written_whole
+from mstools.terminal.output import check_writable, open_atomic, write_file
 
 
 def test_given_an_error_half_way_then_the_file_is_as_it_was(tmp_path: Path) -> None:
     target = tmp_path / "poses.csv"
     target.write_text("old")
-    with pytest.raises(ZeroDivisionError), written_whole(str(target), replace=True) as stream:
+    with pytest.raises(ZeroDivisionError), open_atomic(str(target), replace=True) as stream:
         stream.write(f"half{1 / 0}")
     assert target.read_text() == "old"
     assert os.listdir(tmp_path) == ["poses.csv"]
@@ -23,15 +23,15 @@ def test_given_an_error_half_way_then_the_file_is_as_it_was(tmp_path: Path) -> N
 
 def test_given_a_good_end_then_the_file_is_there_whole(tmp_path: Path) -> None:
     target = tmp_path / "poses.csv"
-    with written_whole(str(target), replace=True) as stream:
+    with open_atomic(str(target), replace=True) as stream:
         stream.write("new\n")
     assert target.read_bytes() == b"new\n"
 
 
-def test_given_a_file_that_exists_then_it_is_replaced_only_when_told(tmp_path: Path) -> None:
+def test_given_a_file_that_exists_then_it_is_replaced_only_with_force(tmp_path: Path) -> None:
     target = tmp_path / "a.yaml"
     write_file(str(target), "one", replace=False)
-    with pytest.raises(ModelServerError, match="exists already"):
+    with pytest.raises(ModelServerError, match="already exists"):
         write_file(str(target), "two", replace=False)
     assert target.read_text() == "one"
     write_file(str(target), "two", replace=True)
@@ -52,8 +52,8 @@ def test_given_a_pipe_then_it_is_written_to_and_stays_a_pipe(tmp_path: Path) -> 
 
 def test_given_a_folder_that_is_not_there_then_the_target_is_named_and_not_a_draft(tmp_path: Path) -> None:
     target = tmp_path / "none" / "a.txt"
-    with pytest.raises(ModelServerError, match=f"{target} cannot be written: there is no folder {target.parent}"):
-        check_target(str(target))
+    with pytest.raises(ModelServerError, match=f"{target} cannot be written: folder {target.parent}"):
+        check_writable(str(target))
     with pytest.raises(OSError, match="No such file") as caught:
         write_file(str(target), "text", replace=True)
     assert caught.value.filename == str(target)
@@ -62,6 +62,6 @@ def test_given_a_folder_that_is_not_there_then_the_target_is_named_and_not_a_dra
 def test_given_targets_that_can_be_written_then_there_is_no_objection(tmp_path: Path) -> None:
     (tmp_path / "there.txt").write_text("old")
     for target in ("", "-", tmp_path / "new.txt", tmp_path / "there.txt", os.devnull):
-        check_target(str(target))
+        check_writable(str(target))
     with pytest.raises(ModelServerError, match="is a directory"):
-        check_target(str(tmp_path))
+        check_writable(str(tmp_path))

@@ -14,7 +14,7 @@ import pytest
 
 from modelserver import __version__
 from modelserver.messages import Invalid, Origin, PoseAnswer, Quality
-from modelserver.spatial import Pose, Transformation
+from modelserver.transforms import Pose, Transformation
 from mstools.cli import COMMANDS, main
 from mstools.commands.query import as_dict, describe
 
@@ -98,7 +98,7 @@ def annex(tmp_path: Path) -> Path:
 # --- query --------------------------------------------------------------------------------------------------
 
 
-def test_given_annex_c_then_the_camera_stands_where_the_report_says(run: Command, annex: Path) -> None:
+def test_given_annex_c_then_the_camera_stands_where_the_report_reports(run: Command, annex: Path) -> None:
     code, out, err = run("query", *PAIR, "--model", annex)
     assert (code, err) == (0, "")
     lines = [line.split() for line in out.splitlines()]
@@ -131,10 +131,10 @@ def test_given_json_then_every_field_is_there_and_what_is_not_known_is_null(run:
     assert (code, err) == (0, "")
     assert set(found) == {
         "frame_of_interest", "frame_of_reference", "utime", "position", "quaternion", "rpy", "matrix", "covariance",
-        "valid", "invalid_reasons", "flags", "initial_utm", "utm_zone", "origin_id", "pose_epoch", "horizontal_bound",
-        "heading_bound", "model_revision",
+        "valid", "invalid_reasons", "flags", "initial_utm", "utm_zone", "origin_id", "pose_epoch",
+        "horizontal_protection_level", "heading_protection_level", "model_revision",
     }  # fmt: skip
-    assert found["covariance"] is found["initial_utm"] is found["horizontal_bound"] is None
+    assert found["covariance"] is found["initial_utm"] is found["horizontal_protection_level"] is None
     assert (found["valid"], found["invalid_reasons"], found["flags"], found["utime"]) == (True, [], [], 0)
     assert np.array(found["matrix"]).shape == (4, 4)
     assert len(found["model_revision"]) == 16
@@ -171,10 +171,10 @@ def test_given_a_mistyped_name_then_one_line_offers_the_nearest_and_exit_is_1(
     assert near in err
 
 
-def test_given_a_world_frame_and_a_file_then_it_says_to_ask_the_daemon(run: Command, annex: Path) -> None:
+def test_given_a_world_frame_and_a_file_then_it_reports_to_ask_the_daemon(run: Command, annex: Path) -> None:
     code, out, err = run("query", PAIR[0], "World:UTM", "--model", annex)
     assert (code, out) == (1, "")
-    assert "ask the daemon" in err
+    assert "query the daemon" in err
 
 
 @pytest.mark.parametrize("name", ["nowhere.xml", "."])
@@ -184,7 +184,7 @@ def test_given_a_file_that_cannot_be_read_then_the_error_names_it(run: Command, 
     assert str(tmp_path / name) in err.splitlines()[0]
 
 
-def test_given_a_file_that_is_wrong_then_its_problems_are_told(run: Command, tmp_path: Path) -> None:
+def test_given_a_file_that_is_wrong_then_its_problems_are_reported(run: Command, tmp_path: Path) -> None:
     path = tmp_path / "bad.xml"
     path.write_text(ANNEX_C.replace('"Digiclops:ImagePlane"', '"Digiclops:ImagePlan"'))
     code, out, err = run("query", *PAIR, "--model", path)
@@ -193,10 +193,12 @@ def test_given_a_file_that_is_wrong_then_its_problems_are_told(run: Command, tmp
     assert "Digiclops:ImagePlane" in err
 
 
-def test_given_a_world_frame_that_there_is_not_then_those_that_there_are_are_told(run: Command, annex: Path) -> None:
+def test_given_a_world_frame_that_there_is_not_then_those_that_there_are_are_reported(
+    run: Command, annex: Path
+) -> None:
     code, _, err = run("query", "World:UTN", "Digiclops:ImagePlane", "--model", annex)
     assert code == 1
-    assert "'World:UTN' is no frame; there are World:UTM, World:ENU, Odom:Origin. Nearest: World:UTM" in err
+    assert "'World:UTN' is an unknown frame; known: World:UTM, World:ENU, Odom:Origin. Nearest: World:UTM" in err
 
 
 @pytest.mark.parametrize(
@@ -207,7 +209,7 @@ def test_given_a_world_frame_that_there_is_not_then_those_that_there_are_are_tol
         (b"# bodies:\n", "there is nothing in the file but comments"),
     ],
 )
-def test_given_a_file_of_another_kind_for_a_model_then_one_error_says_what_it_is(
+def test_given_a_file_of_another_kind_for_a_model_then_one_error_reports_what_it_is(
     run: Command, tmp_path: Path, content: bytes, words: str
 ) -> None:
     path = tmp_path / "file.yaml"
@@ -219,7 +221,7 @@ def test_given_a_file_of_another_kind_for_a_model_then_one_error_says_what_it_is
     assert ("give the geometry file that it names, 'cart.xml'" in err) == (b"cart.xml" in content)
 
 
-def test_given_no_daemon_then_one_line_says_so_and_exit_is_1(run: Command, lcm_url: str) -> None:
+def test_given_no_daemon_then_one_line_reports_it_and_exit_is_1(run: Command, lcm_url: str) -> None:
     for command in (("query", *PAIR), ("bodies",), ("frames", "Digiclops")):
         code, out, err = run(*command, "--url", lcm_url, "--timeout", "0.02")
         assert (code, out) == (1, "")
@@ -265,7 +267,7 @@ def test_given_a_file_then_bodies_and_frames_list_it(run: Command, annex: Path) 
         ["check"],
     ],
 )
-def test_given_wrong_usage_then_exit_is_2_and_the_way_to_help_is_told(run: Command, arguments: list[str]) -> None:
+def test_given_wrong_usage_then_exit_is_2_and_the_way_to_help_is_reported(run: Command, arguments: list[str]) -> None:
     code, out, err = run(*arguments)
     assert (code, out) == (2, "")
     assert "--help" in err or "Error" in err
@@ -303,18 +305,20 @@ def world_answer(**more: Any) -> PoseAnswer:
 
 
 def test_given_a_world_pose_then_people_see_time_grid_bounds_and_what_speaks_against_it() -> None:
-    text = describe(world_answer(quality=Quality.PREDICTED, horizontal_bound=1.5, heading_bound=0.1))
+    text = describe(
+        world_answer(quality=Quality.PREDICTED, horizontal_protection_level=1.5, heading_protection_level=0.1)
+    )
     assert "2023-11-14T22:13:20.500000+00:00  (1700000000500000)" in text
     assert "445002.000 E  5029998.000 N  71.250 up  zone 18S" in text
     assert "sigma           0.2000  0.2000  0.2000  m,  11.459  11.459  11.459  deg" in text
-    assert "bounds          1.50 m, heading 5.73 deg" in text
+    assert "protection      1.50 m, heading 5.73 deg" in text
     assert "flags           PREDICTED" in text
     assert "epoch           3, origin 0000000000000abc" in text
     assert text.splitlines()[-1].startswith("  NOT VALID       the last usable GPS fix is too old; the last inertial")
 
 
 def test_given_a_world_pose_then_scripts_see_the_same() -> None:
-    found = json.loads(json.dumps(as_dict(world_answer(horizontal_bound=math.nan)), allow_nan=False))
+    found = json.loads(json.dumps(as_dict(world_answer(horizontal_protection_level=math.nan)), allow_nan=False))
     assert found["initial_utm"] == [445_000.5, 5_030_000.0, 71.0]
-    assert (found["utm_zone"], found["valid"], found["horizontal_bound"]) == ("18S", False, None)
+    assert (found["utm_zone"], found["valid"], found["horizontal_protection_level"]) == ("18S", False, None)
     assert found["invalid_reasons"] == ["STALE_GPS", "STALE_IMU"]

@@ -15,8 +15,8 @@ from support_moving import BASE, ODOM, SCAN, T0, UTM, S, estimate, joints_at, ro
 from support_recordings import write_log
 
 from modelserver.formats import save_model
-from modelserver.joints.joints import Joints
-from modelserver.spatial import Pose
+from modelserver.joints.history import JointHistory
+from modelserver.transforms import Pose
 from modelserver.wire.codec import encode
 from mstools.cli import main
 
@@ -45,7 +45,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_log(tmp_path_factory.mktemp("log") / "drive.lcm", sorted(events))
 
 
-def said(out: str) -> Pose:
+def output(out: str) -> Pose:
     answer = json.loads(out)
     return Pose(answer["position"], answer["quaternion"])
 
@@ -63,12 +63,12 @@ def test_given_a_time_in_the_log_then_the_answer_is_the_truth_of_then(
         code, out, err = run("query", *pair, "--log", log, "--at", T0 + round(at * S), "--json")
     assert (code, err) == (0, "")
     expected = truth(*pair, at) if ODOM not in pair else estimate(at).odom
-    assert said(out).is_close(expected, 1e-3, 1e-3)
+    assert output(out).is_close(expected, 1e-3, 1e-3)
     assert json.loads(out)["utime"] == T0 + round(at * S)
     assert json.loads(out)["covariance"] is not None
 
 
-def test_given_a_log_then_it_is_told_as_the_daemon_would_tell_it(run: Command, log: Path) -> None:
+def test_given_a_log_then_it_is_reported_as_the_daemon_would_report_it(run: Command, log: Path) -> None:
     code, out, _ = run("query", SCAN, UTM, "--log", log, "--at", "+1.0")
     lines = out.splitlines()
     assert code == 0
@@ -86,19 +86,19 @@ def test_given_policies_then_each_is_as_of_then(run: Command, log: Path) -> None
         assert json.loads(out)["utime"] == T0 + expected
     code, _, err = run("query", BASE, UTM, "--log", log, "--at", T0 + 4_500_000)
     assert code == 1
-    assert "0.500 s after what is held" in err
+    assert "0.500 s after the time covered" in err
 
 
 def test_given_a_correction_after_the_time_then_it_counts(run: Command, tmp_path: Path) -> None:
     events = list(drive(4.0))
     for channel, data in pose(estimate(2.0)):
-        # said again, as when a sample came late: everything from there on is told anew
+        # published again, as after a delayed sample: everything from there on is republished
         events.append((T0 + 2_505_000, channel, data))
     later = [event for event in events if not (event[1].startswith("POSE") and T0 + 2 * S < event[0] < T0 + 2_500_000)]
     path = write_log(tmp_path / "late.lcm", sorted(later))
     code, out, _ = run("query", BASE, UTM, "--log", path, "--at", T0 + 2 * S, "--json")
     assert code == 0
-    assert said(out).is_close(vehicle(2.0), 1e-9, 1e-9)
+    assert output(out).is_close(vehicle(2.0), 1e-9, 1e-9)
 
 
 @pytest.mark.parametrize(
@@ -111,11 +111,11 @@ def test_given_a_correction_after_the_time_then_it_counts(run: Command, tmp_path
         ("+90", "after the log"),
     ],
 )
-def test_given_a_time_outside_the_log_then_its_span_is_said(run: Command, log: Path, at: object, why: str) -> None:
+def test_given_a_time_outside_the_log_then_its_span_is_reported(run: Command, log: Path, at: object, why: str) -> None:
     code, out, err = run("query", BASE, UTM, "--log", log, "--at", at)
     assert (code, out) == (1, "")
     assert why in err
-    assert f"lasts from {T0}" in err
+    assert f"extends from {T0}" in err
 
 
 @pytest.mark.parametrize("text", ["+", "+x", "+nan", "+inf", "yesterday"])
@@ -125,25 +125,25 @@ def test_given_no_time_at_all_then_it_is_wrong_usage(run: Command, log: Path, te
     assert "+12.5" in err
 
 
-def test_given_a_log_without_a_snapshot_then_it_says_how_to_get_one_and_takes_a_file(
+def test_given_a_log_without_a_snapshot_then_it_reports_how_to_get_one_and_takes_a_file(
     run: Command, tmp_path: Path
 ) -> None:
     events = [event for event in drive(2.0) if event[1] != "MODEL_SNAPSHOT"]
     path = write_log(tmp_path / "old.lcm", events)
     code, _, err = run("query", SCAN, UTM, "--log", path)
     assert code == 1
-    assert "no whole geometry on MODEL_SNAPSHOT (none)" in err
+    assert "no complete geometry on MODEL_SNAPSHOT (none)" in err
     assert "--model FILE" in err
     geometry = tmp_path / "rover.yaml"
     geometry.write_text(save_model(rover(), "yaml").text)
     code, out, err = run("query", SCAN, UTM, "--log", path, "--model", geometry, "--json")
     assert code == 0
-    # degrees in the file are rounded, so it is another revision: that is said, and it is used
+    # degrees in the file are rounded, so it is another revision: it is used, with a note
     assert "the poses in" in err
-    assert said(out).is_close(truth(SCAN, UTM, 2.0), 1e-9, 1e-9)
+    assert output(out).is_close(truth(SCAN, UTM, 2.0), 1e-9, 1e-9)
 
 
-def test_given_a_snapshot_that_is_not_whole_then_it_says_how_much_there_is(run: Command, tmp_path: Path) -> None:
+def test_given_a_snapshot_that_is_not_whole_then_it_reports_how_much_there_is(run: Command, tmp_path: Path) -> None:
     pieces = parts(snapshot(), size=200)[:-1]
     events = [(T0 + number, *message) for number, message in enumerate(pieces)]
     path = write_log(tmp_path / "part.lcm", [*events, (T0 + 100, *joints(0.0))])
@@ -152,7 +152,7 @@ def test_given_a_snapshot_that_is_not_whole_then_it_says_how_much_there_is(run: 
     assert f"only {len(pieces)} of {len(pieces) + 1} parts" in err
 
 
-def test_given_a_log_with_a_prefix_then_it_has_to_be_said(run: Command, tmp_path: Path) -> None:
+def test_given_a_log_with_a_prefix_then_it_has_to_be_reported(run: Command, tmp_path: Path) -> None:
     geometry = snapshot(channel="V1_JOINTS")
     events = [(T0 + n, f"V1_{channel}", data) for n, (channel, data) in enumerate(parts(geometry))]
     for n in range(20):
@@ -164,14 +164,14 @@ def test_given_a_log_with_a_prefix_then_it_has_to_be_said(run: Command, tmp_path
     assert run("query", SCAN, UTM, "--log", path)[0] == 1
     code, out, _ = run("query", SCAN, UTM, "--log", path, "--prefix", "V1_", "--at", T0 + S, "--json")
     assert code == 0
-    assert said(out).is_close(truth(SCAN, UTM, 1.0), 1e-9, 1e-9)
+    assert output(out).is_close(truth(SCAN, UTM, 1.0), 1e-9, 1e-9)
 
 
-def test_given_a_log_that_begins_after_a_joint_was_told_then_it_has_where_it_was_held(
+def test_given_a_log_that_begins_after_a_joint_was_reported_then_it_has_where_it_was_held(
     run: Command, tmp_path: Path
 ) -> None:
     now = T0 + 3600 * S
-    held = Joints(rover().joints.values(), 60.0).taken(joints_at(0.0), T0)[0].newest(now)
+    held = JointHistory(rover().joints.values(), 60.0).update(joints_at(0.0), T0)[0].get_newest_samples(now)
     events = [(now + n, *message) for n, message in enumerate(parts(snapshot(), now))]
     events += [(now + 50 + n, "JOINTS_HELD", encode(each)) for n, each in enumerate(held)]
     events += [
@@ -182,16 +182,16 @@ def test_given_a_log_that_begins_after_a_joint_was_told_then_it_has_where_it_was
     path = write_log(tmp_path / "late.lcm", events)
     code, out, _ = run("query", SCAN, BASE, "--log", path, "--at", now + S // 10, "--policy", "held", "--json")
     assert code == 0
-    assert said(out).is_close(truth(SCAN, BASE, 0.0), 1e-9, 1e-9)
+    assert output(out).is_close(truth(SCAN, BASE, 0.0), 1e-9, 1e-9)
 
 
-def test_given_a_mistyped_frame_then_the_nearest_is_said(run: Command, log: Path) -> None:
+def test_given_a_mistyped_frame_then_the_nearest_is_reported(run: Command, log: Path) -> None:
     code, _, err = run("query", "Laser:Scna", UTM, "--log", log)
     assert code == 1
     assert "Laser:Scan" in err
 
 
-def test_given_no_log_then_it_says_so(run: Command, tmp_path: Path) -> None:
+def test_given_no_log_then_that_is_reported(run: Command, tmp_path: Path) -> None:
     (tmp_path / "empty.lcm").touch()
     for name in ("empty.lcm", "missing.lcm"):
         code, _, err = run("query", SCAN, UTM, "--log", tmp_path / name)

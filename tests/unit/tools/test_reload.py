@@ -10,7 +10,7 @@ from support_lcm import reserved_url
 from modelserver.client.remote import Platform
 from modelserver.errors import NoServerError
 from modelserver.messages import ReloadReply, ReplyHeader
-from modelserver.spatial import Pose, Transformation
+from modelserver.transforms import Pose, Transformation
 from mstools.cli import main
 from mstools.commands.reload import as_data, describe
 
@@ -23,8 +23,8 @@ OTHER = ReloadReply(ReplyHeader(1, 2, model_revision="aaaa"), "bbbb", ("body Lam
     [
         (SAME, False, ["nothing changed: revision aaaa"]),
         (SAME, True, ["nothing would change: revision aaaa"]),
-        (OTHER, True, ["the geometry in force would be revision bbbb; what changes:", "  body Lamp is gone"]),
-        (OTHER, False, ["the geometry in force is now revision bbbb; what changes:", "  body Lamp is gone"]),
+        (OTHER, True, ["the geometry in force would be revision bbbb; changes:", "  body Lamp is gone"]),
+        (OTHER, False, ["the geometry in force is now revision bbbb; changes:", "  body Lamp is gone"]),
     ],
 )
 def test_given_a_reply_then_people_see_what_changes(reply: ReloadReply, dry_run: bool, words: list[str]) -> None:
@@ -42,7 +42,9 @@ def test_given_a_reply_then_scripts_see_both_revisions() -> None:
     }
 
 
-def test_given_nobody_then_the_wish_goes_out_once_and_one_line_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_given_nobody_then_the_request_goes_out_once_and_one_line_reports_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with reserved_url() as url:
         with pytest.raises(SystemExit) as ended:
             main(["reload", "--url", url, "--timeout", "0.05"])

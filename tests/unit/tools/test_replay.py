@@ -16,19 +16,19 @@ import lcm
 import pytest
 from support_lcm import reserved_url
 from support_recordings import EASTING, HEIGHT, HUSKY, LATENCY, NORTHING, SPEED, START, drive, write_log
-from support_samples import Scripted
-from support_tuning import in_raw_mode
+from support_samples import ScriptedLocalizer
+from support_tuning import write_raw_mode_vehicle
 
 from modelserver import core
 from modelserver.core import CoreSettings, CoreState, Instant
 from modelserver.messages import Decision, GetBodyList, GpsSample, Invalid, PoseAnswer, RequestHeader, Verdict
-from modelserver.service import playback
-from modelserver.service.daemon import Vehicle
-from modelserver.spatial import Pose, Transformation
+from modelserver.server import playback
+from modelserver.server.vehicle import Vehicle
+from modelserver.transforms import Pose, Transformation
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools import cli
-from mstools.commands.replay import _inputs, read_times
+from mstools.commands.replay import _exclude_service_messages, read_times
 
 pytestmark = pytest.mark.slow
 
@@ -51,13 +51,13 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 
 
 @pytest.fixture(scope="session")
-def driven(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_log(tmp_path_factory.mktemp("recordings") / "drive.lcm", drive(40.0))
 
 
 @pytest.fixture(scope="session")
 def forward(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The Husky's vehicle file for `drive`, which starts at speed without wheels: it says that this is forward."""
+    """The Husky's vehicle file for `drive`, which starts at speed without wheels, with the direction in a setting."""
     folder = tmp_path_factory.mktemp("husky")
     (folder / "geometry.yaml").write_bytes(HUSKY.with_name("geometry.yaml").read_bytes())
     path = folder / "vehicle.yaml"
@@ -75,10 +75,10 @@ def rows(path: Path) -> list[list[float]]:
 
 
 def test_given_a_drive_when_replayed_then_the_antenna_is_where_it_was(
-    driven: Path, forward: Path, tmp_path: Path, run: Run
+    recorded_log: Path, forward: Path, tmp_path: Path, run: Run
 ) -> None:
     out = tmp_path / "poses.csv"
-    code, words, err = run(driven, "-c", forward, "--poses", out, "--frame", "Antenna:PhaseCentre", "--rate", 10)
+    code, words, err = run(recorded_log, "-c", forward, "--poses", out, "--frame", "Antenna:PhaseCenter", "--rate", 10)
     assert (code, err) == (0, "")
     assert "times real time" in words
     found = rows(out)
@@ -96,29 +96,31 @@ def test_given_a_drive_when_replayed_then_the_antenna_is_where_it_was(
 
 
 def test_given_no_frame_when_replayed_then_it_is_the_base_frame(
-    driven: Path, forward: Path, tmp_path: Path, run: Run
+    recorded_log: Path, forward: Path, tmp_path: Path, run: Run
 ) -> None:
-    for name, options in (("base.csv", ()), ("antenna.csv", ("--frame", "Antenna:PhaseCentre"))):
-        assert run(driven, "-c", forward, "--poses", tmp_path / name, *options)[0] == 0
+    for name, options in (("base.csv", ()), ("antenna.csv", ("--frame", "Antenna:PhaseCenter"))):
+        assert run(recorded_log, "-c", forward, "--poses", tmp_path / name, *options)[0] == 0
     base, antenna = rows(tmp_path / "base.csv")[-1], rows(tmp_path / "antenna.csv")[-1]
     assert antenna[1] - base[1] == pytest.approx(0.2475, abs=0.01)
     assert antenna[3] - base[3] == pytest.approx(0.2231, abs=0.01)
 
 
-def test_given_the_same_log_when_replayed_twice_then_the_same_bytes(driven: Path, tmp_path: Path, run: Run) -> None:
+def test_given_the_same_log_when_replayed_twice_then_the_same_bytes(
+    recorded_log: Path, tmp_path: Path, run: Run
+) -> None:
     for name in ("one.csv", "two.csv"):
-        assert run(driven, "-c", HUSKY, "--poses", tmp_path / name)[0] == 0
+        assert run(recorded_log, "-c", HUSKY, "--poses", tmp_path / name)[0] == 0
     assert (tmp_path / "one.csv").read_bytes() == (tmp_path / "two.csv").read_bytes()
 
 
 def test_given_times_when_replayed_then_a_row_for_each_whatever_comes_after(
-    driven: Path, tmp_path: Path, run: Run
+    recorded_log: Path, tmp_path: Path, run: Run
 ) -> None:
     at = START + 30_000_000
     times = tmp_path / "times.txt"
     times.write_text(f"# two of them\n\n{at}\n{at + 12_345}  # not on a sample\n")
     shorter = write_log(tmp_path / "short.lcm", [each for each in drive(40.0) if each[0] < at + 12_345])
-    for log, name in ((driven, "whole.csv"), (shorter, "short.csv")):
+    for log, name in ((recorded_log, "whole.csv"), (shorter, "short.csv")):
         assert run(log, "-c", HUSKY, "--poses", tmp_path / name, "--at-times", times)[0] == 0
     assert [row[0] for row in rows(tmp_path / "whole.csv")] == [at, at + 12_345]
     # what arrived later cannot have been used: without it the answer is the same to the bit
@@ -129,57 +131,57 @@ def test_given_times_when_replayed_then_a_row_for_each_whatever_comes_after(
     ("factor", "words"),
     [(1e-6, "these look like seconds"), (1e3, "these look like nanoseconds"), (2.0, "the log lasts")],
 )
-def test_given_times_that_lie_outside_the_log_then_that_is_told(
-    driven: Path, tmp_path: Path, run: Run, factor: float, words: str
+def test_given_times_that_lie_outside_the_log_then_that_is_reported(
+    recorded_log: Path, tmp_path: Path, run: Run, factor: float, words: str
 ) -> None:
     times = tmp_path / "times.txt"
     times.write_text(f"{round((START + 30_000_000) * factor)}\n")
-    code, _, err = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--at-times", times)
+    code, _, err = run(recorded_log, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--at-times", times)
     assert code == 0
     assert "none of 1 time lies within the log" in err
     assert words in err
 
 
-def test_given_poses_that_are_not_valid_then_the_summary_says_how_many_and_why(
-    driven: Path, tmp_path: Path, run: Run
+def test_given_poses_that_are_not_valid_then_the_summary_reports_how_many_and_why(
+    recorded_log: Path, tmp_path: Path, run: Run
 ) -> None:
-    code, out, _ = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--rate", 10)
+    code, out, _ = run(recorded_log, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--rate", 10)
     assert code == 0
     bad = sum(row[8] == 0 for row in rows(tmp_path / "p.csv"))
     assert f"(not valid: {bad}, mostly NO" in out
-    code, out, _ = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--rate", 10, "--json")
+    code, out, _ = run(recorded_log, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--rate", 10, "--json")
     assert json.loads(out)["invalid_reasons"]["NOT_MOVED_YET"] <= bad
 
 
 def test_given_fixes_that_are_refused_then_the_kinds_of_measurement_are_named(tmp_path: Path, run: Run) -> None:
-    def spoiled(event: tuple[int, str, bytes]) -> tuple[int, str, bytes]:
+    def spoil(event: tuple[int, str, bytes]) -> tuple[int, str, bytes]:
         if event[1] != "GPS" or event[0] < START + 20_000_000:
             return event
         fix: GpsSample = decode("gps_t", event[2])
         return (*event[:2], encode(replace(fix, latitude_deg=math.nan)))
 
-    log = write_log(tmp_path / "a.lcm", map(spoiled, drive(25.0)))
+    log = write_log(tmp_path / "a.lcm", map(spoil, drive(25.0)))
     code, out, _ = run(log, "-c", HUSKY, "--poses", tmp_path / "p.csv")
     assert code == 0
     assert re.search(r"not used: \d+ of sensor:gps, nan \(.*gps_position.*\)", out)
 
 
-def test_given_a_folder_that_is_not_there_then_it_is_told_before_the_run(
-    driven: Path, tmp_path: Path, run: Run
+def test_given_a_folder_that_is_not_there_then_it_is_reported_before_the_run(
+    recorded_log: Path, tmp_path: Path, run: Run
 ) -> None:
     target = tmp_path / "none" / "report.html"
-    code, out, err = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--report", target)
+    code, out, err = run(recorded_log, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--report", target)
     assert (code, out) == (1, "")
-    assert f"{target} cannot be written: there is no folder" in err
+    assert f"{target} cannot be written: folder" in err
     assert not (tmp_path / "p.csv").exists()
 
 
-def test_given_help_then_it_says_that_files_are_replaced(run: Run) -> None:
-    assert "are replaced, without --force" in " ".join(run("--help")[1].split())
+def test_given_help_then_it_reports_that_files_are_replaced(run: Run) -> None:
+    assert "Existing files of --poses, --decisions and --report are replaced" in " ".join(run("--help")[1].split())
 
 
-def test_given_standard_output_when_replayed_then_only_the_poses_go_there(driven: Path, run: Run) -> None:
-    code, out, err = run(driven, "-c", HUSKY, "--poses", "-", "--rate", 1)
+def test_given_standard_output_when_replayed_then_only_the_poses_go_there(recorded_log: Path, run: Run) -> None:
+    code, out, err = run(recorded_log, "-c", HUSKY, "--poses", "-", "--rate", 1)
     assert code == 0
     assert out.splitlines()[0] == HEADER
     assert len(out.splitlines()) == 41
@@ -198,21 +200,21 @@ def test_given_json_when_replayed_then_the_counts_are_for_scripts(tmp_path: Path
 
 
 def test_given_a_channel_when_replayed_offline_then_the_others_are_left_out(
-    driven: Path, tmp_path: Path, run: Run
+    recorded_log: Path, tmp_path: Path, run: Run
 ) -> None:
     out = tmp_path / "p.csv"
-    assert run(driven, "-c", HUSKY, "--poses", out, "--channel", "IMU", "--rate", 1)[0] == 0
+    assert run(recorded_log, "-c", HUSKY, "--poses", out, "--channel", "IMU", "--rate", 1)[0] == 0
     assert all(not row[8] for row in rows(out))
 
 
 # --- what became of measurements ----------------------------------------------------------------------------
 
 
-class Deciding(Scripted):
-    """A localizer that says of each fix what became of it."""
+class Deciding(ScriptedLocalizer):
+    """A localizer that decides on each fix."""
 
-    def take(self, sample: Any) -> Any:
-        taken, notes = super().take(sample)
+    def process(self, sample: Any) -> Any:
+        taken, notes = super().process(sample)
         if not isinstance(sample, GpsSample):
             return taken, notes
         utime, seq = sample.header.utime, sample.header.seq
@@ -231,15 +233,15 @@ def deciding(monkeypatch: pytest.MonkeyPatch) -> None:
         settings = CoreSettings(vehicle.config.base_frame, publish_decisions=False)
         return core.start(settings, vehicle.model, Deciding(), now)
 
-    monkeypatch.setattr(Vehicle, "core", start)
+    monkeypatch.setattr(Vehicle, "start_core", start)
 
 
 @pytest.mark.usefixtures("deciding")
 def test_given_a_ledger_when_replayed_then_each_decision_is_a_line_of_json(
-    driven: Path, tmp_path: Path, run: Run
+    recorded_log: Path, tmp_path: Path, run: Run
 ) -> None:
     ledger = tmp_path / "ledger.jsonl"
-    code, _, err = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--decisions", ledger, "--rate", 1)
+    code, _, err = run(recorded_log, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--decisions", ledger, "--rate", 1)
     assert (code, err) == (0, "")
     text = ledger.read_text()
     assert "NaN" not in text
@@ -257,52 +259,56 @@ def test_given_a_ledger_when_replayed_then_each_decision_is_a_line_of_json(
 
 
 @pytest.mark.usefixtures("deciding")
-def test_given_a_ledger_on_standard_output_then_only_that_goes_there(driven: Path, tmp_path: Path, run: Run) -> None:
-    code, out, err = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--decisions", "-", "--rate", 1)
+def test_given_a_ledger_on_standard_output_then_only_that_goes_there(
+    recorded_log: Path, tmp_path: Path, run: Run
+) -> None:
+    code, out, err = run(recorded_log, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--decisions", "-", "--rate", 1)
     assert code == 0
     assert len([json.loads(line) for line in out.splitlines()]) == 200
     assert "times real time" in err
 
 
 def test_given_raw_mode_then_the_ledger_is_empty_and_the_poses_are_the_same(
-    driven: Path, tmp_path: Path, run: Run
+    recorded_log: Path, tmp_path: Path, run: Run
 ) -> None:
-    config = in_raw_mode(HUSKY, tmp_path)
+    config = write_raw_mode_vehicle(HUSKY, tmp_path)
     for name, options in (("one.csv", ("--decisions", tmp_path / "ledger.jsonl")), ("two.csv", ())):
-        assert run(driven, "-c", config, "--poses", tmp_path / name, *options)[0] == 0
+        assert run(recorded_log, "-c", config, "--poses", tmp_path / name, *options)[0] == 0
     assert (tmp_path / "ledger.jsonl").read_text() == ""
     assert (tmp_path / "one.csv").read_bytes() == (tmp_path / "two.csv").read_bytes()
 
 
-def test_given_a_ledger_over_a_file_that_is_needed_then_it_is_refused(driven: Path, tmp_path: Path, run: Run) -> None:
+def test_given_a_ledger_over_a_file_that_is_needed_then_it_is_refused(
+    recorded_log: Path, tmp_path: Path, run: Run
+) -> None:
     log, poses = tmp_path / "drive.lcm", tmp_path / "p.csv"
-    log.write_bytes(driven.read_bytes())
-    for target, words in ((log, "is read by this command"), (poses, "the poses go there")):
+    log.write_bytes(recorded_log.read_bytes())
+    for target, words in ((log, "is an input of this command"), (poses, "already the file of the poses")):
         code, _, err = run(log, "-c", HUSKY, "--poses", poses, "--decisions", target)
         assert code == 1
         assert words in err
-    assert log.read_bytes() == driven.read_bytes()
+    assert log.read_bytes() == recorded_log.read_bytes()
     assert not poses.exists()
 
 
 # --- bad input ----------------------------------------------------------------------------------------------
 
 
-def test_given_a_log_that_breaks_off_when_replayed_then_the_rest_counts_and_it_is_told(
-    driven: Path, tmp_path: Path, run: Run
+def test_given_a_log_that_breaks_off_when_replayed_then_the_rest_counts_and_it_is_reported(
+    recorded_log: Path, tmp_path: Path, run: Run
 ) -> None:
     log = tmp_path / "cut.lcm"
-    log.write_bytes(driven.read_bytes()[:-5])
+    log.write_bytes(recorded_log.read_bytes()[:-5])
     code, _, err = run(log, "-c", HUSKY, "--poses", tmp_path / "p.csv")
     assert code == 0
-    assert "breaks off after event 2199" in err
+    assert "truncated after event 2199" in err
     assert len(rows(tmp_path / "p.csv")) > 1900
 
 
-def test_given_damage_within_when_replayed_then_what_is_good_is_used_and_the_exit_code_tells(
-    driven: Path, forward: Path, tmp_path: Path, run: Run
+def test_given_damage_within_when_replayed_then_what_is_good_is_used_and_the_exit_code_reports(
+    recorded_log: Path, forward: Path, tmp_path: Path, run: Run
 ) -> None:
-    whole = driven.read_bytes()
+    whole = recorded_log.read_bytes()
     broken = bytearray(whole)
     broken[24:28] = struct.pack(">i", 0x7FFFFFFF)  # the first event's length: lcm's own reader dies of it
     log = tmp_path / "broken.lcm"
@@ -314,23 +320,23 @@ def test_given_damage_within_when_replayed_then_what_is_good_is_used_and_the_exi
     assert rows(tmp_path / "p.csv")[-1][8] == 1
 
 
-def test_given_a_log_of_another_vehicle_when_replayed_then_both_sides_channels_are_told(
+def test_given_a_log_of_another_vehicle_when_replayed_then_both_sides_channels_are_reported(
     tmp_path: Path, run: Run
 ) -> None:
     log = write_log(tmp_path / "a.lcm", drive(1.0, prefix="NORTH_"))
     code, _, err = run(log, "-c", HUSKY, "--poses", tmp_path / "p.csv")
     assert code == 1
-    assert "nothing on the vehicle's channels (GPS, IMU, WHEELS); it has: NORTH_GPS, NORTH_IMU" in err
+    assert "no message on the vehicle's channels (GPS, IMU, WHEELS); the log has: NORTH_GPS, NORTH_IMU" in err
 
 
-def test_given_a_vehicle_without_sensors_when_replayed_then_it_says_what_is_missing(
-    driven: Path, tmp_path: Path, run: Run
+def test_given_a_vehicle_without_sensors_when_replayed_then_it_reports_what_is_missing(
+    recorded_log: Path, tmp_path: Path, run: Run
 ) -> None:
     config = tmp_path / "v.yaml"
     config.write_text(f"vehicle: V\ngeometry: {HUSKY.with_name('geometry.yaml')}\nbase_frame: Husky:Base\n")
-    code, _, err = run(driven, "-c", config, "--poses", tmp_path / "p.csv")
+    code, _, err = run(recorded_log, "-c", config, "--poses", tmp_path / "p.csv")
     assert code == 1
-    assert "names nothing under sensors to localize by" in err
+    assert "no localization sensor is configured" in err
 
 
 @pytest.mark.parametrize("content", [b"", os.urandom(100_000), b"<Model/>"])
@@ -344,20 +350,20 @@ def test_given_no_log_when_replayed_then_one_clear_error_and_no_poses(tmp_path: 
 
 
 def test_given_an_unknown_frame_when_replayed_then_the_nearest_is_offered_and_no_file_is_touched(
-    driven: Path, tmp_path: Path, run: Run
+    recorded_log: Path, tmp_path: Path, run: Run
 ) -> None:
     out = tmp_path / "p.csv"
     out.write_text("precious")
-    code, _, err = run(driven, "-c", HUSKY, "--poses", out, "--frame", "Antenna:PhaseCenter")
+    code, _, err = run(recorded_log, "-c", HUSKY, "--poses", out, "--frame", "Antenna:PhaseCentar")
     assert code == 1
-    assert "Antenna:PhaseCentre" in err
+    assert "Antenna:PhaseCenter" in err
     assert out.read_text() == "precious"
 
 
 def test_given_an_unknown_channel_when_replayed_then_the_nearest_is_offered(
-    driven: Path, tmp_path: Path, run: Run
+    recorded_log: Path, tmp_path: Path, run: Run
 ) -> None:
-    code, _, err = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--channel", "IMUU")
+    code, _, err = run(recorded_log, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--channel", "IMUU")
     assert code == 1
     assert "Nearest: IMU" in err
 
@@ -365,22 +371,22 @@ def test_given_an_unknown_channel_when_replayed_then_the_nearest_is_offered(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("1\n2\nthree\n", ":3: 'three' is no time"),
+        ("1\n2\nthree\n", ":3: 'three' is not a time"),
         ("5\n4\n", ":2: 4 is before 5"),
-        ("-1\n", ":1: '-1' is no time"),
-        ("0\n", ":1: '0' is no time"),
-        ("1.5\n", ":1: '1.5' is no time"),
+        ("-1\n", ":1: '-1' is not a time"),
+        ("0\n", ":1: '0' is not a time"),
+        ("1.5\n", ":1: '1.5' is not a time"),
         ("9" * 30 + "\n", ":1: "),
-        ("\n# nothing\n", "lists no times"),
+        ("\n# nothing\n", "has no times"),
         ("\x00\xff", ":1: "),
     ],
 )
-def test_given_a_wrong_file_of_times_when_replayed_then_the_line_is_told(
-    driven: Path, tmp_path: Path, run: Run, text: str, words: str
+def test_given_a_wrong_file_of_times_when_replayed_then_the_line_is_reported(
+    recorded_log: Path, tmp_path: Path, run: Run, text: str, words: str
 ) -> None:
     times = tmp_path / "times.txt"
     times.write_text(text, encoding="latin-1")
-    code, _, err = run(driven, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--at-times", times)
+    code, _, err = run(recorded_log, "-c", HUSKY, "--poses", tmp_path / "p.csv", "--at-times", times)
     assert code == 1
     assert words in err
 
@@ -408,8 +414,8 @@ def test_given_times_with_comments_when_read_then_they_are_numbers(tmp_path: Pat
         ["-c", "v.yaml", "--poses", "p.csv", "--rate", "10", "--at-times", "t"],
     ],
 )
-def test_given_wrong_options_when_replayed_then_usage(driven: Path, run: Run, options: list[str]) -> None:
-    assert run(driven, *options)[0] == 2
+def test_given_wrong_options_when_replayed_then_usage(recorded_log: Path, run: Run, options: list[str]) -> None:
+    assert run(recorded_log, *options)[0] == 2
 
 
 def test_given_the_page_on_recordings_then_it_gives_the_value_of_each_reason() -> None:
@@ -440,34 +446,34 @@ def test_given_a_log_when_played_on_a_bus_then_the_same_bytes_arrive(
 
 
 def test_given_an_interrupt_when_played_then_it_ends_with_the_count(
-    driven: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+    recorded_log: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupted(player: playback.Player, *arguments: object) -> None:
+    def interrupt(player: playback.Player, *arguments: object) -> None:
         player.sent = 3
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(playback.Player, "play", interrupted)
+    monkeypatch.setattr(playback.Player, "play", interrupt)
     with reserved_url() as url:
-        code, words, _ = run(driven, "--url", url)
+        code, words, _ = run(recorded_log, "--url", url)
     assert code == 130
     assert "3 messages sent" in words
 
 
 def test_given_an_input_as_output_when_replayed_then_it_is_refused_and_not_touched(
-    driven: Path, tmp_path: Path, run: Run
+    recorded_log: Path, tmp_path: Path, run: Run
 ) -> None:
     log = tmp_path / "drive.lcm"
-    log.write_bytes(driven.read_bytes())
+    log.write_bytes(recorded_log.read_bytes())
     link = tmp_path / "poses.csv"
     link.symlink_to(log)
     for target in (log, link):
         code, _, err = run(log, "-c", HUSKY, "--poses", target)
         assert code == 1
-        assert "is read by this command" in err
-        assert log.read_bytes() == driven.read_bytes()
+        assert "is an input of this command" in err
+        assert log.read_bytes() == recorded_log.read_bytes()
 
 
-def test_given_a_log_of_a_running_daemon_then_what_it_said_is_not_sent_again(driven: Path) -> None:
+def test_given_a_log_of_a_running_daemon_then_what_it_reported_is_not_sent_again(recorded_log: Path) -> None:
     pose = encode(PoseAnswer(Transformation("Cart:Base", "World:UTM", Pose.identity(), None, 5)))
     request = encode(GetBodyList(RequestHeader(1, "REPLY_X")))
     events = [
@@ -475,6 +481,6 @@ def test_given_a_log_of_a_running_daemon_then_what_it_said_is_not_sent_again(dri
         LogEvent(1, 2, "PLATFORM_GET_BODY_LIST", request, 0),
         LogEvent(2, 3, "CAMERA", b"of another program", 0),
     ]
-    with LogFile(driven) as recording:
+    with LogFile(recorded_log) as recording:
         sensors = list(itertools.islice(recording, 3))
-    assert list(_inputs([*events, *sensors])) == [events[2], *sensors]
+    assert list(_exclude_service_messages([*events, *sensors])) == [events[2], *sensors]

@@ -1,4 +1,4 @@
-"""The page: whole, by itself, small, and with what a simulated drive shows."""
+"""The report's page: valid, self-contained, small, and with the findings of a simulated drive."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from support_recordings import HUSKY, drive, write_log
-from support_tuning import in_raw_mode, simulated
+from support_tuning import write_raw_mode_vehicle, write_simulated_log
 
 from modelserver.simulation import EncoderModel, WheelsModel
 from mstools import cli
@@ -30,7 +30,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 
 
 class Balanced(HTMLParser):
-    """Counts what is opened and not closed."""
+    """Checks that every tag is closed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -45,22 +45,22 @@ class Balanced(HTMLParser):
 
 
 def whole(page: str) -> str:
-    """Check that a page is HTML that loads nothing, and return it."""
+    """Check that a page is self-contained HTML, and return it."""
     parser = Balanced()
     parser.feed(page)
     parser.close()
     assert parser.open == []
     assert not re.search(r"(src|href)=(?!\"#)|url\(|@import|<script|<link", page)
-    assert not re.search(r'[ ",](nan|inf)', page)
+    assert not re.search(r'[ ",](nan|inf)\b', page)
     return page
 
 
 @pytest.fixture(scope="module")
 def eight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A drive round an eight with one wheel that counts backward: its log and vehicle file."""
+    """Return log and vehicle file of a figure-eight drive with one wheel that counts backward."""
     folder = tmp_path_factory.mktemp("eight")
     wheels = WheelsModel(encoder=EncoderModel(swapped=frozenset({"front_left"})))
-    return simulated(folder, seconds=25.0, wheels_model=wheels)
+    return write_simulated_log(folder, seconds=25.0, wheels_model=wheels)
 
 
 @pytest.mark.slow
@@ -94,18 +94,18 @@ def test_given_a_report_beside_poses_and_decisions_then_these_are_as_without_it(
 
 
 def test_given_raw_mode_then_there_is_a_page_without_innovations(tmp_path: Path, run: Run) -> None:
-    config = in_raw_mode(HUSKY, tmp_path)
+    config = write_raw_mode_vehicle(HUSKY, tmp_path)
     log = write_log(tmp_path / "drive.lcm", drive(20.0))
     assert run(log, "-c", config, "--report", tmp_path / "r.html")[0] == 0
-    assert "Nothing was compared" in whole((tmp_path / "r.html").read_text())
+    assert "No innovations" in whole((tmp_path / "r.html").read_text())
 
 
-def test_given_a_log_without_fixes_then_the_page_says_that_there_was_no_pose(tmp_path: Path, run: Run) -> None:
+def test_given_a_log_without_fixes_then_the_page_has_no_pose(tmp_path: Path, run: Run) -> None:
     log = write_log(tmp_path / "drive.lcm", [each for each in drive(10.0) if each[1] == "IMU"])
     code, words, _ = run(log, "-c", HUSKY, "--report", tmp_path / "r.html")
     assert code == 0
     assert "The pose was never valid" in words
-    assert "There was never a pose in the world" in whole((tmp_path / "r.html").read_text())
+    assert "No pose in the world" in whole((tmp_path / "r.html").read_text())
 
 
 def test_given_standard_output_then_only_the_page_goes_there(tmp_path: Path, run: Run) -> None:
@@ -120,8 +120,8 @@ def test_given_standard_output_then_only_the_page_goes_there(tmp_path: Path, run
     ("options", "words"),
     [
         (["--report", "r.html"], "--report needs the vehicle"),
-        (["-c", str(HUSKY), "--report", "r.html", "--at-times", "t"], "--at-times go with --poses"),
-        (["-c", str(HUSKY), "--report", "r.html", "--speed", "2"], "work offline"),
+        (["-c", str(HUSKY), "--report", "r.html", "--at-times", "t"], "--at-times need --poses"),
+        (["-c", str(HUSKY), "--report", "r.html", "--speed", "2"], "are offline"),
         (["-c", str(HUSKY), "--report", "-", "--poses", "-"], "only one of"),
     ],
 )
@@ -134,13 +134,13 @@ def test_given_options_that_do_not_go_together_then_usage(
     assert words in " ".join(re.sub(r"[│╭╮╰╯─]", " ", err).split())
 
 
-def test_given_a_report_over_what_is_read_or_written_then_it_is_refused(tmp_path: Path, run: Run) -> None:
+def test_given_a_report_over_what_is_read_or_written_then_it_is_rejected(tmp_path: Path, run: Run) -> None:
     log = write_log(tmp_path / "drive.lcm", drive(1.0))
     before = log.read_bytes()
-    assert "is read by this command" in run(log, "-c", HUSKY, "--report", log)[2]
+    assert "is an input of this command" in run(log, "-c", HUSKY, "--report", log)[2]
     assert log.read_bytes() == before
     one = tmp_path / "one"
-    assert "the poses go there" in run(log, "-c", HUSKY, "--poses", one, "--report", one)[2]
+    assert "already the file of the poses" in run(log, "-c", HUSKY, "--poses", one, "--report", one)[2]
     assert not one.exists()
 
 
@@ -149,19 +149,19 @@ def test_given_a_report_over_what_is_read_or_written_then_it_is_refused(tmp_path
 
 def test_given_many_points_then_a_curve_keeps_its_peaks_and_little_else() -> None:
     points = [(n / 100.0, 5.0 if n == 3333 else 0.0) for n in range(10_000)]
-    kept = panels.thinned(points)
-    assert len(kept) <= 4 * 101
-    assert (33.33, 5.0) in kept
+    drawn = panels.decimate(points)
+    assert len(drawn) <= 4 * 101
+    assert (33.33, 5.0) in drawn
 
 
 def test_given_many_dots_then_a_pixel_has_one() -> None:
     axis = panels.Axis("m", -1.0, 1.0)
     many = panels.Dots("dots", [n / 1000.0 for n in range(100_000)], [0.5] * 100_000)
-    drawn = panels.stack("a", 0.0, 100.0, [panels.Panel("p", axis, [many])])
+    drawn = panels.render_panels("a", 0.0, 100.0, [panels.Panel("p", axis, [many])])
     assert len(drawn) < 30_000
 
 
 def test_given_a_name_with_marks_of_html_then_it_is_written_as_text() -> None:
-    drawn = panels.strip("<b>", 0.0, 1.0, [panels.StripRow("<i>", [(0.0, 1.0, '"&<')], panels.RED)])
+    drawn = panels.render_strip("<b>", 0.0, 1.0, [panels.StripRow("<i>", [(0.0, 1.0, '"&<')], panels.RED)])
     assert "<b>" not in drawn
     assert "<i>" not in drawn

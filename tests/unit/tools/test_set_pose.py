@@ -14,10 +14,18 @@ from support_samples import GEODESY, ORIGIN
 
 from modelserver.errors import ModelServerError
 from modelserver.messages import Decision, PoseAnswer, PublishDecisions, Verdict
-from modelserver.spatial import Pose, Transformation
+from modelserver.transforms import Pose, Transformation
 from modelserver.wire.codec import encode
 from mstools.cli import main
-from mstools.commands.set_pose import Listener, SetPoseResult, Target, as_data, describe, to_covariance, to_pose
+from mstools.commands.set_pose import (
+    PoseTarget,
+    SetPoseListener,
+    SetPoseResult,
+    as_data,
+    describe,
+    to_covariance,
+    to_pose,
+)
 
 CURRENT = Pose.from_rpy((100.0, 50.0, 5.0), 0.1, -0.2, 1.0)
 UTM = (ORIGIN.easting + 30.0, ORIGIN.northing + 40.0, ORIGIN.height + 2.0)
@@ -26,19 +34,19 @@ UTM = (ORIGIN.easting + 30.0, ORIGIN.northing + 40.0, ORIGIN.height + 2.0)
 # --- the pose ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("target", [Target(utm=UTM, yaw=0.5), Target(xyz=(30.0, 40.0, 2.0), yaw=0.5)])
-def test_given_grid_coordinates_and_yaw_then_roll_and_pitch_stay(target: Target) -> None:
+@pytest.mark.parametrize("target", [PoseTarget(utm=UTM, yaw=0.5), PoseTarget(xyz=(30.0, 40.0, 2.0), yaw=0.5)])
+def test_given_grid_coordinates_and_yaw_then_roll_and_pitch_stay(target: PoseTarget) -> None:
     pose = to_pose(target, GEODESY, CURRENT)
     np.testing.assert_allclose(pose.position, (30.0, 40.0, 2.0), atol=1e-6)
     np.testing.assert_allclose(pose.rpy, (0.1, -0.2, 0.5), atol=1e-12)
 
 
 def test_given_an_orientation_in_full_then_it_is_taken_as_it_is() -> None:
-    assert to_pose(Target(xyz=(1.0, 2.0, 3.0), rpy=(0.3, 0.2, -2.0)), GEODESY, CURRENT) == Pose.from_rpy(
+    assert to_pose(PoseTarget(xyz=(1.0, 2.0, 3.0), rpy=(0.3, 0.2, -2.0)), GEODESY, CURRENT) == Pose.from_rpy(
         (1.0, 2.0, 3.0), 0.3, 0.2, -2.0
     )
     quaternion = (0.5, 0.5, -0.5, 0.5)
-    assert to_pose(Target(xyz=(1.0, 2.0, 3.0), quaternion=quaternion), GEODESY, CURRENT).wxyz == quaternion
+    assert to_pose(PoseTarget(xyz=(1.0, 2.0, 3.0), quaternion=quaternion), GEODESY, CURRENT).wxyz == quaternion
 
 
 @pytest.mark.parametrize("heading_deg", [0.0, 90.0, 200.0, 359.0])
@@ -46,7 +54,7 @@ def test_given_latitude_longitude_and_heading_then_the_pose_is_that_of_the_tange
     """Against the service's own conversion of a pose in World:ENU, at the origin, where both have the same vertical."""
     latitude, longitude, height = GEODESY.geodetic_from_enu((0.0, 0.0, 1.0))
     heading = math.radians(heading_deg)
-    found = to_pose(Target(geodetic=(latitude, longitude, height), heading=heading), GEODESY, Pose())
+    found = to_pose(PoseTarget(geodetic=(latitude, longitude, height), heading=heading), GEODESY, Pose())
     wanted = GEODESY.pose_in_utm(Pose.from_rpy((0.0, 0.0, 1.0), yaw=math.pi / 2 - heading))
     assert found.is_close(wanted, 1e-4, 1e-8)
     # the convergence is more than nothing: a heading is no yaw
@@ -55,17 +63,17 @@ def test_given_latitude_longitude_and_heading_then_the_pose_is_that_of_the_tange
 
 def test_given_no_height_then_the_height_of_the_pose_in_force_stays() -> None:
     latitude, longitude, _ = GEODESY.geodetic_from_enu((10.0, 20.0, 0.0))
-    pose = to_pose(Target(geodetic=(latitude, longitude, None), yaw=0.0), GEODESY, CURRENT)
+    pose = to_pose(PoseTarget(geodetic=(latitude, longitude, None), yaw=0.0), GEODESY, CURRENT)
     assert pose.position[2] == pytest.approx(5.0)
 
 
 def test_given_a_position_beyond_reach_then_the_origin_and_the_two_forms_are_named() -> None:
     with pytest.raises(ModelServerError, match=r"km from the origin .*zone 12 north.*--xyz meters from the origin"):
-        to_pose(Target(xyz=UTM, yaw=0.0), GEODESY, CURRENT)
+        to_pose(PoseTarget(xyz=UTM, yaw=0.0), GEODESY, CURRENT)
     with pytest.raises(ModelServerError, match="--utm takes absolute coordinates"):
-        to_pose(Target(utm=(30.0, 40.0, 2.0), yaw=0.0), GEODESY, CURRENT)
+        to_pose(PoseTarget(utm=(30.0, 40.0, 2.0), yaw=0.0), GEODESY, CURRENT)
     with pytest.raises(ModelServerError, match="pinned UTM zone"):
-        to_pose(Target(geodetic=(50.0, 9.0, 0.0), yaw=0.0), GEODESY, CURRENT)
+        to_pose(PoseTarget(geodetic=(50.0, 9.0, 0.0), yaw=0.0), GEODESY, CURRENT)
 
 
 def test_given_sigmas_then_the_covariance_has_their_squares_in_meters_and_radians() -> None:
@@ -100,7 +108,7 @@ def test_given_a_slip_of_usage_then_it_is_named_before_the_bus_is_joined(
     assert words in " ".join(capsys.readouterr().err.split())
 
 
-def test_given_nobody_then_one_line_says_what_to_look_at(capsys: pytest.CaptureFixture[str]) -> None:
+def test_given_nobody_then_one_line_reports_what_to_look_at(capsys: pytest.CaptureFixture[str]) -> None:
     with reserved_url() as url:
         with pytest.raises(SystemExit) as ended:
             main(
@@ -116,7 +124,7 @@ def test_given_nobody_then_one_line_says_what_to_look_at(capsys: pytest.CaptureF
 def test_given_messages_of_another_type_then_they_are_passed_over() -> None:
     decisions = encode(PublishDecisions(9, (USED, USED._replace(utime=6, source="vo"))))
     with reserved_url() as url:
-        bus, listener = lcm.LCM(url), Listener(lcm.LCM(url), "V1_")
+        bus, listener = lcm.LCM(url), SetPoseListener(lcm.LCM(url), "V1_")
         for channel, data in (
             ("V1_POSE", b"none"),
             ("V1_POSE", decisions),
@@ -126,8 +134,8 @@ def test_given_messages_of_another_type_then_they_are_passed_over() -> None:
         ):
             bus.publish(channel, data)
         assert listener.wait(30.0, lambda: listener.pose is not None)
-    assert listener.decision(5) == USED
-    assert listener.decision(6) is None
+    assert listener.get_decision(5) == USED
+    assert listener.get_decision(6) is None
 
 
 # --- the report ----------------------------------------------------------------------------------------------------
@@ -146,7 +154,7 @@ def result(decision: Decision | None, has_decisions: bool = True, reasons: int =
     [
         (result(USED), "decision: used (chi-square 3.2 of 22.5 allowed, 6 numbers)"),
         (
-            result(Decision(5, "operator", 1, "absolute_pose", Verdict.TOOK_UP, "position and heading were set")),
+            result(Decision(5, "operator", 1, "absolute_pose", Verdict.RESET, "position and heading were set")),
             "decision: set: position and heading were set",
         ),
         (

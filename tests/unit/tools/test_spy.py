@@ -17,7 +17,7 @@ from modelserver.wire.channels import DEFAULT_URL
 from mstools.cli import main
 from mstools.commands import spy
 from mstools.spy import terminal as spy_terminal
-from mstools.spy.lcm_wheel import MissingToolError, type_files
+from mstools.spy.lcm_wheel import MissingToolError, find_type_files
 
 needs_javac = pytest.mark.skipif(shutil.which("javac") is None, reason="no Java compiler (default-jdk-headless)")
 
@@ -52,15 +52,15 @@ def _failure(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 @pytest.mark.slow
 @needs_javac
-def test_given_an_empty_cache_when_built_then_the_jar_holds_every_type_and_is_kept(cache: Path) -> None:
-    jar = spy.types_jar()
+def test_given_an_empty_cache_when_built_then_the_jar_holds_every_type_and_is_retained(cache: Path) -> None:
+    jar = spy.get_types_jar()
     assert jar.is_relative_to(cache)
     with zipfile.ZipFile(jar) as archive:
         classes = {name for name in archive.namelist() if "$" not in name}
-    assert classes == {f"mslcm/{path.stem}.class" for path in type_files()}
+    assert classes == {f"mslcm/{path.stem}.class" for path in find_type_files()}
     assert [path.name for path in jar.parent.iterdir()] == ["mslcm.jar"]
     built = jar.stat().st_mtime_ns
-    assert spy.types_jar() == jar
+    assert spy.get_types_jar() == jar
     assert jar.stat().st_mtime_ns == built
 
 
@@ -74,33 +74,33 @@ def test_given_build_only_when_run_as_a_command_then_the_path_alone_is_printed(c
     assert Path(line).is_relative_to(cache)
 
 
-def test_given_a_kept_jar_when_there_is_no_compiler_then_it_is_used(cache: Path, only: Path) -> None:
-    jar = cache / spy.contract_hash(type_files()) / "mslcm.jar"
+def test_given_a_retained_jar_when_there_is_no_compiler_then_it_is_used(cache: Path, only: Path) -> None:
+    jar = cache / spy.hash_contract(find_type_files()) / "mslcm.jar"
     jar.parent.mkdir(parents=True)
     jar.write_bytes(b"")
-    assert spy.types_jar() == jar
+    assert spy.get_types_jar() == jar
 
 
-def test_given_no_compiler_when_built_then_it_says_what_to_install(
+def test_given_no_compiler_when_built_then_it_reports_what_to_install(
     cache: Path, only: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert "sudo apt install default-jdk-headless" in _failure(capsys, "--build-only")
 
 
-def test_given_a_compiler_that_fails_when_built_then_it_says_so_and_leaves_nothing(cache: Path, only: Path) -> None:
+def test_given_a_compiler_that_fails_when_built_then_it_reports_it_and_leaves_nothing(cache: Path, only: Path) -> None:
     _program(only / "javac", "echo 'error: out of luck' >&2; exit 1")
     with pytest.raises(MissingToolError, match="javac failed: error: out of luck"):
-        spy.types_jar()
+        spy.get_types_jar()
     assert [path for path in cache.rglob("*") if path.is_file()] == []
 
 
-def test_given_no_java_when_a_window_is_wanted_then_it_says_what_to_install(
+def test_given_no_java_when_a_window_is_wanted_then_it_reports_what_to_install(
     cache: Path, only: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert "sudo apt install default-jre default-jdk-headless" in _failure(capsys, "--window")
 
 
-def test_given_a_java_without_windows_when_one_is_wanted_then_it_says_what_to_install(
+def test_given_a_java_without_windows_when_one_is_wanted_then_it_reports_what_to_install(
     only: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":1")
@@ -108,10 +108,10 @@ def test_given_a_java_without_windows_when_one_is_wanted_then_it_says_what_to_in
     (tmp_path / "jvm" / "lib").mkdir()
     (tmp_path / "jvm" / "lib" / "libjava.so").touch()
     (only / "java").symlink_to(tmp_path / "jvm" / "bin" / "java")
-    assert "this Java has no windows: sudo apt install default-jre" in _failure(capsys, "--window")
+    assert "this Java is headless: sudo apt install default-jre" in _failure(capsys, "--window")
 
 
-def test_given_no_display_when_a_window_is_wanted_then_it_says_so(
+def test_given_no_display_when_a_window_is_wanted_then_it_reports_it(
     only: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
@@ -120,7 +120,7 @@ def test_given_no_display_when_a_window_is_wanted_then_it_says_so(
 
 
 @pytest.fixture
-def shown(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float]]:
+def shown_calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, float]]:
     """What the table in the terminal was asked for: the channel, and for how many seconds."""
     asked: list[tuple[str, float]] = []
     monkeypatch.setattr(provider, "open_lcm", lambda url: None)
@@ -136,25 +136,25 @@ def _run(*arguments: str) -> int:
 
 def test_given_no_display_when_run_then_it_is_the_terminal_and_nothing_is_missed(
     only: Path,
-    shown: list[tuple[str, float]],
+    shown_calls: list[tuple[str, float]],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     assert _run() == 0
-    assert shown == [("", 0.0)]
+    assert shown_calls == [("", 0.0)]
     assert capsys.readouterr().err == ""
 
 
-def test_given_a_display_and_no_java_when_run_then_it_says_what_to_install_and_is_the_terminal(
+def test_given_a_display_and_no_java_when_run_then_it_reports_what_to_install_and_is_the_terminal(
     only: Path,
-    shown: list[tuple[str, float]],
+    shown_calls: list[tuple[str, float]],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":1")
     assert _run() == 0
-    assert shown == [("", 0.0)]
+    assert shown_calls == [("", 0.0)]
     assert "sudo apt install default-jre" in capsys.readouterr().err
 
 
@@ -169,14 +169,14 @@ def test_given_a_display_and_no_java_when_run_then_it_says_what_to_install_and_i
     ],
 )
 def test_given_options_of_the_terminal_when_run_then_there_is_no_window_even_with_a_display(
-    shown: list[tuple[str, float]],
+    shown_calls: list[tuple[str, float]],
     monkeypatch: pytest.MonkeyPatch,
     arguments: tuple[str, ...],
     asked: tuple[str, float],
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":1")
     assert _run(*arguments) == 0
-    assert shown == [asked]
+    assert shown_calls == [asked]
 
 
 def test_given_a_window_and_options_of_the_terminal_then_it_is_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
@@ -200,7 +200,7 @@ def test_given_all_it_needs_when_run_then_lcm_spy_takes_its_place_with_jar_and_u
     default: str,
     expected: str,
 ) -> None:
-    jar = cache / spy.contract_hash(type_files()) / "mslcm.jar"
+    jar = cache / spy.hash_contract(find_type_files()) / "mslcm.jar"
     jar.parent.mkdir(parents=True)
     jar.write_bytes(b"")
     # stands for java: what lcm-spy, which is a shell script, starts in the end

@@ -1,4 +1,4 @@
-"""`modelserver status`: the report in words, and what is said where none comes."""
+"""`modelserver status`: the report as text, and the message where there is none."""
 
 from __future__ import annotations
 
@@ -28,7 +28,15 @@ from modelserver.messages import (
 )
 from modelserver.wire.codec import encode
 from mstools.commands import status
-from mstools.terminal.status_text import MAX_ROWS, as_data, clock, duration, is_well, line, report
+from mstools.terminal.health_text import (
+    MAX_ROWS,
+    as_data,
+    format_clock,
+    format_duration,
+    format_line,
+    format_report,
+    is_healthy,
+)
 
 BARE, FULL = EXAMPLES["health_t"]
 WELL: Health = replace(FULL, state=RUNNING)
@@ -38,129 +46,128 @@ DRIVERS: tuple[DriverHealth, ...] = EXAMPLES["driver_health_t"]
 # --- in words -----------------------------------------------------------------------------------------------
 
 
-def test_given_a_report_then_all_of_it_is_told() -> None:
-    text = report(WELL, DRIVERS[1:], ("gps", "imu"))
+def test_given_a_report_then_all_of_it_is_reported() -> None:
+    text = format_report(WELL, DRIVERS[1:], ("gps", "imu"))
     for words in (
         "raptor: RUNNING, up 1 min 39 s; modelserver 0.1.0, process 4711 on raptor-pc",
         "valid",
-        "within 1.50 m, heading 2.9 deg; 12.0 s to a limit",
-        "mode no_gps, aligned, standing; last fix used 300 ms ago",
+        "protection level 1.50 m, heading 2.9 deg; 12.0 s to the limit",
+        "mode no_gps, aligned, stationary; last fix used 300 ms ago",
         "epoch 2, origin ffffffffffffffb3, 4950 poses published",
         "revision ab12",
-        "late by 0.10 / 0.50 / 1.00 / 2.00 ms",
-        "12% of a processor, 150 MB",
-        "12 answered, 1 waits for data, 3 in the queue",
+        "tick latency 0.10 / 0.50 / 1.00 / 2.00 ms",
+        "12% of a CPU, 150 MB",
+        "12 answered, 1 waiting for data, 3 queued",
         "journal: the disk is full",
-        "never heard",
+        "never received",
         "streaming",
-        "NOT HEARD",
+        "NO REPORT",
         "truncated",
     ):
         assert words in text, words
 
 
-def test_given_a_pose_that_may_not_be_used_then_every_reason_is_told_in_words() -> None:
+def test_given_a_pose_that_may_not_be_used_then_every_reason_is_reported_in_words() -> None:
     health = replace(WELL, state=DEGRADED, invalid_reasons=Invalid.STALE_GPS | Invalid.TILTED)
-    text = report(health)
+    text = format_report(health)
     assert "raptor: DEGRADED" in text
-    assert "NOT VALID: the last usable GPS fix is too old; gravity says" in text
+    assert "NOT VALID: the last usable GPS fix is too old; " in text
 
 
 def test_given_a_report_in_which_little_is_known_then_no_number_is_made_up() -> None:
-    text = report(BARE)
-    assert "the vehicle file names no sensor to localize by" in text
+    text = format_report(BARE)
+    assert "no localization sensor is configured" in text
     assert "nan" not in text
-    assert "processor time not known yet, memory not known" in text
+    assert "CPU load unknown, memory unknown" in text
 
 
 IMU = ChannelHealth("sensor:imu", 500, 50.0, 0.01)
 GPS = ChannelHealth("sensor:gps", 100, 10.0, 0.05)
-UNHEARD = (
+NEVER_RECEIVED = (
     ChannelHealth("GPS", 0, 0.0, math.nan, math.nan, True),
     ChannelHealth("IMU", 0, 0.0, math.nan, math.nan, True),
 )
 QUIET = tuple(replace(each, rate_hz=0.0, age=9.0, silent=True) for each in (GPS, IMU))
-LEVELLING = LocalizationHealth(Mode.FULL, Phase.LEVELLING)
+LEVELING = LocalizationHealth(Mode.FULL, Phase.LEVELING)
 DRIVING = LocalizationHealth(Mode.FULL, Phase.ALIGNED, False, 1.5, 0.05, 12.0, 0.3)
-STALE = Invalid.STALE_IMU | Invalid.BOUND_EXCEEDED
+STALE = Invalid.STALE_IMU | Invalid.PROTECTION_LEVEL_EXCEEDED
 
 
 @pytest.mark.parametrize(
-    ("said", "channels", "reasons", "filter_line", "bounds"),
+    ("output", "channels", "reasons", "filter_line", "bounds"),
     [
-        (LEVELLING, UNHEARD, Invalid.NO_IMU,
-         "mode full, levelling: no sensor was heard yet; no fix used yet", "no bound is known"),
-        (LEVELLING, (UNHEARD[0], IMU), Invalid.NO_FIX,
-         "mode full, levelling; no fix used yet", "no bound is known"),
-        (replace(LEVELLING, standing=True), (GPS, IMU), Invalid.NO_FIX,
-         "mode full, levelling, standing; no fix used yet", "no bound is known"),
-        (replace(LEVELLING, phase=Phase.UNALIGNED), (GPS, IMU), Invalid.NOT_MOVED_YET,
-         "mode full, unaligned, moving; no fix used yet", "no bound is known"),
+        (LEVELING, NEVER_RECEIVED, Invalid.NO_IMU,
+         "mode full, leveling: no sensor sample received yet; no fix used yet", "protection levels unknown"),
+        (LEVELING, (NEVER_RECEIVED[0], IMU), Invalid.NO_FIX,
+         "mode full, leveling; no fix used yet", "protection levels unknown"),
+        (replace(LEVELING, stationary=True), (GPS, IMU), Invalid.NO_FIX,
+         "mode full, leveling, stationary; no fix used yet", "protection levels unknown"),
+        (replace(LEVELING, phase=Phase.UNALIGNED), (GPS, IMU), Invalid.NOT_MOVED_YET,
+         "mode full, unaligned, moving; no fix used yet", "protection levels unknown"),
         (DRIVING, (GPS, IMU), Invalid(0),
-         "mode full, aligned, moving; last fix used 300 ms ago", "within 1.50 m, heading 2.9 deg; 12.0 s to a limit"),
+         "mode full, aligned, moving; last fix used 300 ms ago",
+         "protection level 1.50 m, heading 2.9 deg; 12.0 s to the limit"),
         (DRIVING, (GPS, QUIET[1]), STALE,
-         "mode full; aligned and moving at the last inertial sample; last fix used 300 ms ago", "within 1.50 m"),
+         "mode full; aligned and moving at the last IMU sample; last fix used 300 ms ago", "protection level 1.50 m"),
         (replace(DRIVING, mode=Mode.NO_IMU), QUIET, Invalid.STALE_GPS,
-         "mode no_imu; aligned and moving when the sensors fell silent; last fix", "within"),
+         "mode no_imu; aligned and moving at the last sensor sample; last fix", "protection level"),
         (replace(DRIVING, mode=Mode.RAW, phase=None), (GPS, IMU), Invalid(0),
-         "mode raw, no filter, moving; last fix", "within"),
+         "mode raw, no filter, moving; last fix", "protection level"),
         (replace(DRIVING, mode=Mode.RAW, phase=None), QUIET, STALE,
-         "mode raw, no filter; moving at the last inertial sample; last fix", "within"),
-        (replace(LEVELLING, mode=Mode.RAW, phase=None), UNHEARD, Invalid.NO_IMU,
-         "mode raw, no filter: no sensor was heard yet; no fix", "no bound"),
-        (DRIVING, UNHEARD, Invalid.NO_IMU,
-         "mode full, aligned: no sensor was heard yet; last fix used 300 ms ago", "within"),
-        (replace(DRIVING, heading_bound=math.nan), (GPS, IMU), Invalid(0),
-         "mode full", "within 1.50 m, heading without a bound"),
-        (replace(DRIVING, horizontal_bound=math.inf), (GPS, IMU), Invalid(0),
-         "mode full", "position without a bound, heading 2.9 deg"),
+         "mode raw, no filter; moving at the last IMU sample; last fix", "protection level"),
+        (replace(LEVELING, mode=Mode.RAW, phase=None), NEVER_RECEIVED, Invalid.NO_IMU,
+         "mode raw, no filter: no sensor sample received yet; no fix", "protection levels unknown"),
+        (DRIVING, NEVER_RECEIVED, Invalid.NO_IMU,
+         "mode full, aligned: no sensor sample received yet; last fix used 300 ms ago", "protection level"),
+        (replace(DRIVING, heading_protection_level=math.nan), (GPS, IMU), Invalid(0),
+         "mode full", "protection level 1.50 m, heading unknown"),
+        (replace(DRIVING, horizontal_protection_level=math.inf), (GPS, IMU), Invalid(0),
+         "mode full", "protection level of position unknown, heading 2.9 deg"),
         (replace(DRIVING, fix_age=-3600.0), (GPS, IMU), Invalid(0),
-         "last fix used has a stamp 1 h 00 min ahead of the clock", "within"),
+         "last fix used has a stamp 1 h 00 min ahead of the clock", "protection level"),
     ],
 )  # fmt: skip
-def test_given_a_state_then_what_was_known_is_not_told_as_if_it_were_so_now(
-    said: LocalizationHealth,
+def test_given_a_state_then_what_was_known_is_not_reported_as_if_it_were_so_now(
+    output: LocalizationHealth,
     channels: tuple[ChannelHealth, ...],
     reasons: Invalid,
     filter_line: str,
     bounds: str,
 ) -> None:
-    health = replace(WELL, localization=said, channels=channels, invalid_reasons=reasons)
-    text = report(health)
+    health = replace(WELL, localization=output, channels=channels, invalid_reasons=reasons)
+    text = format_report(health)
     assert filter_line in text
     assert f"\n          {bounds}" in text
-    assert not re.search(r"\b(within|heading) -", text + line(health))
-    moving = "moving;" in filter_line or "standing;" in filter_line
+    assert not re.search(r"\b(level|heading) -", text + format_line(health))
+    moving = "moving;" in filter_line or "stationary;" in filter_line
     current = as_data(health)["localization"]["current"]
-    assert current == (
-        "heard yet" not in filter_line and "silent" not in filter_line and "last inert" not in filter_line
-    )
+    assert current == ("received yet" not in filter_line and "at the last" not in filter_line)
     assert current or not moving
 
 
 def test_given_one_of_a_thing_then_the_words_are_of_one() -> None:
-    one = replace(WELL, ticks_missed=1, handler_errors=1, poses_published=1, requests_parked=1)
-    for words in ("1 tick missed, 1 error of its own", "1 pose published", "1 waits for data"):
-        assert words in report(one)
-    several = replace(WELL, ticks_missed=3, handler_errors=0, poses_published=2, requests_parked=2)
-    for words in ("3 ticks missed, 0 errors of its own", "2 poses published", "2 wait for data"):
-        assert words in report(several)
+    one = replace(WELL, ticks_missed=1, handler_errors=1, poses_published=1, requests_waiting=1)
+    for words in ("1 tick missed, 1 internal error", "1 pose published", "1 waiting for data"):
+        assert words in format_report(one)
+    several = replace(WELL, ticks_missed=3, handler_errors=0, poses_published=2, requests_waiting=2)
+    for words in ("3 ticks missed, 0 internal errors", "2 poses published", "2 waiting for data"):
+        assert words in format_report(several)
 
 
-def test_given_a_source_that_was_just_heard_then_its_rate_is_not_0() -> None:
+def test_given_a_source_that_was_just_received_then_its_rate_is_not_0() -> None:
     fresh = replace(WELL, channels=(ChannelHealth("sensor:imu", 3, 0.0, 0.02),))
-    assert "sensor:imu heard" in line(fresh)
-    assert "0.0" not in next(each for each in report(fresh).splitlines() if "sensor:imu" in each)
+    assert "sensor:imu received" in format_line(fresh)
+    assert "0.0" not in next(each for each in format_report(fresh).splitlines() if "sensor:imu" in each)
 
 
 def test_given_a_silent_sensor_then_it_stands_out() -> None:
     silent = ChannelHealth("sensor:imu", 5, 0.0, 7.5, math.nan, True)
-    assert "SILENT" in report(replace(WELL, channels=(silent,)))
-    assert "sensor:imu SILENT" in line(replace(WELL, channels=(silent,)))
+    assert "SILENT" in format_report(replace(WELL, channels=(silent,)))
+    assert "sensor:imu SILENT" in format_line(replace(WELL, channels=(silent,)))
 
 
 def test_given_a_driver_that_is_not_well_then_its_phase_stands_out() -> None:
-    assert "CLOSED" in report(WELL, DRIVERS[:1])
+    assert "CLOSED" in format_report(WELL, DRIVERS[:1])
     assert DRIVERS[0].phase is DriverPhase.CLOSED
 
 
@@ -173,17 +180,17 @@ def test_given_words_of_a_stranger_then_they_are_escaped_and_endless_tables_are_
         version=evil,
         channels=tuple(ChannelHealth(f"{evil}{n}", 1, 1.0, 1.0) for n in range(500)),
         rejected=tuple((evil, f"{evil}{n}", 1) for n in range(500)),
-        notices=((evil, evil),),
+        warnings=((evil, evil),),
     )
-    text = report(health, [replace(DRIVERS[1], source=evil, text=evil, link=evil)], [evil])
+    text = format_report(health, [replace(DRIVERS[1], source=evil, text=evil, link=evil)], [evil])
     assert all(each.isprintable() for each in text.split("\n"))
     assert f"and {500 - MAX_ROWS} more" in text
     assert "\nEVIL" not in text
-    assert line(health).isprintable()
+    assert format_line(health).isprintable()
 
 
 @pytest.mark.parametrize(
-    ("health", "well"),
+    ("health", "is_well"),
     [
         (WELL, True),
         (replace(WELL, state=STARTING), False),
@@ -192,16 +199,16 @@ def test_given_words_of_a_stranger_then_they_are_escaped_and_endless_tables_are_
         (replace(BARE, localization=LocalizationHealth()), True),
     ],
 )
-def test_given_a_report_then_it_is_well_or_not(health: Health, well: bool) -> None:
-    assert is_well(health) is well
+def test_given_a_report_then_it_is_well_or_not(health: Health, is_well: bool) -> None:
+    assert is_healthy(health) is is_well
 
 
 def test_given_a_report_for_scripts_then_it_is_json_with_names_and_nulls() -> None:
     data = json.loads(json.dumps(as_data(WELL, DRIVERS), allow_nan=False))
-    assert (data["state"], data["well"], data["invalid_reasons"]) == ("RUNNING", True, 0)
+    assert (data["state"], data["healthy"], data["invalid_reasons"]) == ("RUNNING", True, 0)
     assert data["localization"]["mode"] == "NO_GPS"
     assert data["channels"][1]["age"] is None
-    assert data["notices"] == {"journal": "the disk is full"}
+    assert data["warnings"] == {"journal": "the disk is full"}
     assert [each["phase"] for each in data["drivers"]] == ["CLOSED", "STREAMING"]
     assert data["drivers"][1]["counters"]["bestpos"] == 450
     assert json.dumps(as_data(BARE), allow_nan=False)
@@ -221,14 +228,14 @@ def test_given_a_report_for_scripts_then_it_is_json_with_names_and_nulls() -> No
         (math.inf, "-"),
     ],
 )
-def test_given_a_time_then_it_is_told_in_the_units_that_people_use(seconds: float, text: str) -> None:
-    assert duration(seconds) == text
+def test_given_a_time_then_it_is_reported_in_the_units_that_people_use(seconds: float, text: str) -> None:
+    assert format_duration(seconds) == text
 
 
 @given(st.floats(), st.integers(-(1 << 63), (1 << 63) - 1))
-def test_given_any_numbers_then_they_are_told(seconds: float, utime: int) -> None:
-    assert duration(seconds)
-    assert clock(utime)
+def test_given_any_numbers_then_they_are_reported(seconds: float, utime: int) -> None:
+    assert format_duration(seconds)
+    assert format_clock(utime)
 
 
 # --- nobody there -------------------------------------------------------------------------------------------
@@ -237,9 +244,9 @@ def test_given_any_numbers_then_they_are_told(seconds: float, utime: int) -> Non
 @pytest.mark.parametrize(
     ("instead", "words"),
     [
-        ({}, "Nobody speaks there at all: is the daemon running (modelserver run -c FILE"),
-        ({"GPS": False, "IMU": False}, "Others speak there ('GPS', 'IMU'), the daemon does not"),
-        ({"A_MODELSERVER_HEALTH": True}, "Heard instead: 'A_MODELSERVER_HEALTH'. Did you mean --prefix 'A_'?"),
+        ({}, "The bus has no messages at all: is the daemon running (modelserver run -c FILE"),
+        ({"GPS": False, "IMU": False}, "The bus has other channels ('GPS', 'IMU'): is the daemon running"),
+        ({"A_MODELSERVER_HEALTH": True}, "Other reports: 'A_MODELSERVER_HEALTH'. Did you mean --prefix 'A_'?"),
         (
             {"RAPTOR_MODELSERVER_HEALTH": True, "HUSKY_MODELSERVER_HEALTH": True},
             "Did you mean --prefix 'HUSKY_'?",
@@ -248,26 +255,26 @@ def test_given_any_numbers_then_they_are_told(seconds: float, utime: int) -> Non
         ({"HUSKI_MODELSERVER_HEALTH": False}, "another version"),
     ],
 )
-def test_given_no_report_then_it_says_what_was_there_instead_and_what_to_do(
+def test_given_no_report_then_it_reports_what_was_there_instead_and_what_to_do(
     instead: dict[str, bool], words: str
 ) -> None:
-    text = status.nobody("udpm://x", "HUSKI_", 2.5, instead)
-    assert text.startswith("nothing was heard on HUSKI_MODELSERVER_HEALTH for 2.5 s, on udpm://x. ")
+    text = status.format_no_report("udpm://x", "HUSKI_", 2.5, instead)
+    assert text.startswith("no health report on HUSKI_MODELSERVER_HEALTH within 2.5 s, on udpm://x. ")
     assert words in text
 
 
 def test_given_endless_channels_of_strangers_then_few_are_named_and_escaped() -> None:
-    text = status.nobody("udpm://x", "", 2.5, {f"\x1b[2J{n:03}": False for n in range(500)})
+    text = status.format_no_report("udpm://x", "", 2.5, {f"\x1b[2J{n:03}": False for n in range(500)})
     assert "and 494 more" in text
     assert text.isprintable()
 
 
 ALWAYS_READY = os.open(os.devnull, os.O_RDONLY)
-"""A file that `select` finds to be readable at any time."""
+"""`modelserver status`: the report as text, and the message where there is none."""
 
 
 class FakeLcm:
-    """Hands over what is queued to whoever listens to its channel."""
+    """Pass queued messages to the subscribers of their channels."""
 
     def __init__(self, *messages: tuple[str, bytes]):
         self.queue = list(messages)
@@ -290,7 +297,7 @@ class FakeLcm:
         return 1
 
 
-def test_given_reports_then_the_ear_knows_the_last_ones_and_passes_over_what_is_none() -> None:
+def test_given_reports_then_the_listener_knows_the_last_ones_and_passes_over_what_is_none() -> None:
     driver: Any = DRIVERS[1]
     bus = FakeLcm(
         ("A_MODELSERVER_HEALTH", b"rubbish"),
@@ -299,23 +306,23 @@ def test_given_reports_then_the_ear_knows_the_last_ones_and_passes_over_what_is_
         ("A_DRIVER_HEALTH", encode(driver)),
         ("MODELSERVER_HEALTH", encode(BARE)),
     )
-    ear = status.HealthListener(bus, "A_")  # type: ignore[arg-type]
-    assert ear.listen(10.0, lambda: ear.knows(("gps",)))
-    assert ear.health is not None
-    assert (ear.health.state, ear.reports) == (RUNNING, 1)
-    assert not ear.knows(())
-    assert not ear.knows(("gps", "imu"))
+    listener = status.HealthListener(bus, "A_")  # type: ignore[arg-type]
+    assert listener.listen(10.0, lambda: listener.has_drivers(("gps",)))
+    assert listener.health is not None
+    assert (listener.health.state, listener.reports) == (RUNNING, 1)
+    assert not listener.has_drivers(())
+    assert not listener.has_drivers(("gps", "imu"))
 
 
-def test_given_endless_drivers_of_a_stranger_then_so_many_are_kept() -> None:
+def test_given_endless_drivers_of_a_stranger_then_so_many_are_retained() -> None:
     driver: Any = DRIVERS[1]
     reports = [("DRIVER_HEALTH", encode(replace(driver, source=f"d{n}"))) for n in range(status.MAX_NAMES + 9)]
     bus = FakeLcm(*reports)
-    ear = status.HealthListener(bus, "")  # type: ignore[arg-type]
-    assert ear.listen(60.0, lambda: not bus.queue)
-    assert len(ear.drivers) == status.MAX_NAMES
+    listener = status.HealthListener(bus, "")  # type: ignore[arg-type]
+    assert listener.listen(60.0, lambda: not bus.queue)
+    assert len(listener.drivers) == status.MAX_NAMES
 
 
-def test_given_a_bus_then_what_is_there_instead_is_told_with_whether_it_is_a_report() -> None:
+def test_given_a_bus_then_what_is_there_instead_is_reported_with_whether_it_is_a_report() -> None:
     bus = FakeLcm(("B_MODELSERVER_HEALTH", encode(BARE)), ("X", b"12345678"))
-    assert status.heard_instead(bus, 0.05) == {"B_MODELSERVER_HEALTH": True, "X": False}  # type: ignore[arg-type]
+    assert status.probe_channels(bus, 0.05) == {"B_MODELSERVER_HEALTH": True, "X": False}  # type: ignore[arg-type]

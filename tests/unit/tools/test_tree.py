@@ -13,17 +13,16 @@ from support_lcm import reserved_url
 from support_samples import START, VEHICLE, write_vehicle
 
 from modelserver.formats import load_model
-from modelserver.formats.snapshot import ModelSnapshot, written
+from modelserver.formats.snapshot import ModelSnapshot, encode_snapshot
 from modelserver.geometry import ModelBuilder
 from modelserver.geometry.model import Model
-from modelserver.spatial import Pose
+from modelserver.transforms import Pose
 from modelserver.wire.codec import encode
-from modelserver.wire.snapshot import in_parts
+from modelserver.wire.snapshot import split_snapshot
 from mstools.cli import main
-from mstools.commands.tree import lines
-from mstools.terminal.graph import nodes
-from mstools.terminal.table import drawable
-from mstools.terminal.tree_svg import drawing
+from mstools.commands.tree import draw_lines
+from mstools.terminal.model_tree import build_nodes, draw_svg
+from mstools.terminal.output import replace_unencodable
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -50,12 +49,12 @@ constraints:
 TREE = """\
 Base
 ├─ Turret  (Turn: revolute, -170 to 90 deg, 60 deg/s at most)
-│  │  ⟲ loop: Head (fixed) to Strut:High, misses by 3 mm and 0 deg with joints at rest
+│  │  ⟲ loop: Head (fixed) to Strut:High, misses by 3 mm and 0 deg with joints at their defaults
 │  └─ Lift  (Rise: prismatic, 0 to 0.5 m)
 │     └─ Grip  (Close: revolute, follows Turn times -1 +5 deg)
 └─ Strut  (Foot: fixed, from here)
 
-1 orphan, which no constraint joins to the root:
+1 orphan, not connected to the root:
 Lamp
 """
 
@@ -127,7 +126,7 @@ def test_given_neither_or_both_sources_then_it_is_wrong_usage(run: Run, argument
     assert "--live" in err
 
 
-def test_given_a_file_that_is_wrong_then_its_problems_are_told(run: Run, tmp_path: Path) -> None:
+def test_given_a_file_that_is_wrong_then_its_problems_are_reported(run: Run, tmp_path: Path) -> None:
     path = tmp_path / "bad.yaml"
     path.write_text(ARM.replace("to: Lift:Foot", "to: Lfit:Foot"))
     code, out, err = run(path)
@@ -141,37 +140,37 @@ def test_given_a_file_that_is_wrong_then_its_problems_are_told(run: Run, tmp_pat
 def chain(count: int, deep: bool) -> Model:
     builder = ModelBuilder("chain")
     for n in range(count):
-        builder.body(f"Body{n}").frame("Near").frame("Far", Pose((0.1, 0.0, 0.0)))
+        builder.add_body(f"Body{n}").add_frame("Near").add_frame("Far", Pose((0.1, 0.0, 0.0)))
         if n:
-            builder.constraint(f"Joint{n}", f"Body{n - 1 if deep else 0}:Far", f"Body{n}:Near")
+            builder.add_constraint(f"Joint{n}", f"Body{n - 1 if deep else 0}:Far", f"Body{n}:Near")
     return builder.build()
 
 
 @pytest.mark.parametrize(("count", "deep"), [(200, False), (200, True), (1500, True)])
 def test_given_many_bodies_in_breadth_or_depth_then_each_has_one_line(count: int, deep: bool) -> None:
-    drawn = nodes(chain(count, deep))
-    text = list(lines(drawn))
+    drawn = build_nodes(chain(count, deep))
+    text = list(draw_lines(drawn))
     assert len(text) == count
     assert sum("(Joint" in line for line in text) == count - 1
-    image = ElementTree.fromstring(drawing("chain", drawn))
+    image = ElementTree.fromstring(draw_svg("chain", drawn))
     assert len(list(image.iter("{http://www.w3.org/2000/svg}circle"))) == count
 
 
 def test_given_a_terminal_without_such_letters_then_lines_are_ascii() -> None:
-    assert drawable("├─ a → b\n│  └─ ⟲ é", "ascii") == "|- a > b\n|  `- @ ?"
-    assert drawable("├─ a", "utf-8") == "├─ a"
-    assert drawable("└─ a", "no such encoding") == "`- a"
+    assert replace_unencodable("├─ a → b\n│  └─ ⟲ é", "ascii") == "|- a > b\n|  `- @ ?"
+    assert replace_unencodable("├─ a", "utf-8") == "├─ a"
+    assert replace_unencodable("└─ a", "no such encoding") == "`- a"
 
 
 # --- the running daemon ---------------------------------------------------------------------------------------------
 
 
-class Telling:
+class PublishingDaemon:
     """A daemon that broadcasts a geometry in parts, every 20 ms, until it is left."""
 
     def __init__(self, url: str, model: Model):
-        content = written(ModelSnapshot("arm", model, "Base:Mount", "Base:Mount", 60.0, "JOINTS"))
-        self.parts = [encode(part) for part in reversed(in_parts(content, model.revision, START))]
+        content = encode_snapshot(ModelSnapshot("arm", model, "Base:Mount", "Base:Mount", 60.0, "JOINTS"))
+        self.parts = [encode(part) for part in reversed(split_snapshot(content, model.revision, START))]
         self.bus = lcm.LCM(url)
         self.ended = threading.Event()
         self.thread = threading.Thread(target=self.run)
@@ -182,7 +181,7 @@ class Telling:
             for part in self.parts:
                 self.bus.publish("V1_MODEL_SNAPSHOT", part)
 
-    def __enter__(self) -> Telling:
+    def __enter__(self) -> PublishingDaemon:
         self.thread.start()
         return self
 
@@ -192,13 +191,13 @@ class Telling:
 
 
 def test_given_a_daemon_then_the_geometry_that_it_broadcasts_is_drawn(run: Run, arm: Path) -> None:
-    with reserved_url() as url, Telling(url, load_model(arm)):
+    with reserved_url() as url, PublishingDaemon(url, load_model(arm)):
         code, out, _ = run("--live", "--url", url, "--prefix", "V1_")
     assert code == 0
     assert out.partition("\n")[2] == TREE
 
 
-def test_given_nobody_then_it_says_where_it_listened_and_what_to_do(run: Run) -> None:
+def test_given_nobody_then_it_reports_where_it_listened_and_what_to_do(run: Run) -> None:
     with reserved_url() as url:
         code, out, err = run("--live", "--url", url, "--wait", "0.05")
     assert (code, out) == (1, "")

@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from support_lcm import PATIENCE_S
+from support_lcm import TIMEOUT_S
 from support_recordings import HUSKY, drive, write_log
-from support_tuning import RAPTOR, simulated
+from support_tuning import RAPTOR, write_simulated_log
 
-from modelserver.config import load_config
+from modelserver.config.vehicle_file import load_config
 from modelserver.simulation import GpsModel, Timing
 from mstools import cli
 from mstools.commands.tune import TUNABLES
-from mstools.tuning.runs import mixed
+from mstools.tuning.evaluation import mixture_log_density
 from mstools.tuning.search import Parameter, Score, search
 
 Run = Callable[..., tuple[int, str, str]]
@@ -45,7 +45,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 
 
 class Hill:
-    """A likelihood that is highest at `top`, and is looked up as often as `asked` says."""
+    """A likelihood that is highest at `top`; `asked` counts its evaluations."""
 
     def __init__(self, begin: Mapping[str, float], top: Mapping[str, float], rmse: Mapping[str, float] | None = None):
         self.begin, self.top, self.rmse = begin, top, rmse or {}
@@ -65,7 +65,7 @@ def test_given_a_hill_when_searched_then_each_setting_goes_to_its_top() -> None:
     hill = Hill(begin, {"a": 4.0, "b": 0.5})
     found = search(begin, hill.score(begin), [Parameter(name) for name in begin], hill)
     assert found.settings == {"a": 4.0, "b": 0.5}
-    assert found.unseen == ("c",)
+    assert found.insensitive == ("c",)
     assert found.score.likelihood == 0.0
     assert [(each.name, each.after) for each in found.steps] == [("a", 2.0), ("a", 4.0), ("b", 0.5)]
     assert hill.asked < 20
@@ -99,7 +99,7 @@ def test_given_residuals_then_the_true_covariance_is_the_most_likely() -> None:
     draws[::100] += 30.0
 
     def likelihood(sigma: float) -> float:
-        return sum(mixed(each, np.eye(2) * sigma**2) for each in draws)
+        return sum(mixture_log_density(each, np.eye(2) * sigma**2) for each in draws)
 
     assert max((0.125, 0.25, 0.5, 1.0, 2.0), key=likelihood) == 0.5
 
@@ -115,9 +115,9 @@ def test_given_the_settings_that_are_tuned_then_all_are_the_filters_and_within_b
 
 @pytest.fixture(scope="module")
 def noisy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A drive whose fixes scatter by 0.6 m, as they say; but all of it is new with each fix."""
-    receiver = GpsModel(Timing(3.0), lingering_sigma=0.0, white_sigma=0.6, tells_velocity=False)
-    return simulated(tmp_path_factory.mktemp("noisy"), seconds=30.0, gps_model=receiver)
+    """A drive whose fixes have white errors of 0.6 m, as they state."""
+    receiver = GpsModel(Timing(3.0), correlated_sigma=0.0, white_sigma=0.6, has_velocity=False)
+    return write_simulated_log(tmp_path_factory.mktemp("noisy"), seconds=30.0, gps_model=receiver)
 
 
 @pytest.mark.slow
@@ -138,7 +138,7 @@ def test_given_fixes_that_scatter_more_than_is_set_when_tuned_then_more_is_taken
 
 
 @pytest.mark.slow
-def test_given_the_same_drive_when_tuned_twice_then_the_same_is_told(
+def test_given_the_same_drive_when_tuned_twice_then_the_same_is_reported(
     noisy: tuple[Path, Path], run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mstools.commands.tune.TUNABLES", TUNABLES[:0])
@@ -158,19 +158,19 @@ def test_given_no_vehicle_then_usage(tmp_path: Path, run: Run) -> None:
     assert "tune needs the vehicle" in err
 
 
-def test_given_a_log_without_fixes_then_it_says_so(tmp_path: Path, run: Run) -> None:
+def test_given_a_log_without_fixes_then_that_is_reported(tmp_path: Path, run: Run) -> None:
     log = write_log(tmp_path / "drive.lcm", [each for each in drive(5.0) if each[1] == "IMU"])
     code, out, err = run(log, "-c", HUSKY)
     assert (code, out) == (1, "")
     assert "0 of 0 messages on GPS are good fixes" in err
 
 
-def test_given_a_vehicle_without_gps_then_it_says_so(tmp_path: Path, run: Run) -> None:
+def test_given_a_vehicle_without_gps_then_that_is_reported(tmp_path: Path, run: Run) -> None:
     config = tmp_path / "vehicle.yaml"
     config.write_text(f"vehicle: V\ngeometry: {HUSKY.with_name('geometry.yaml')}\nbase_frame: Husky:Base\n")
     code, _, err = run(write_log(tmp_path / "drive.lcm", drive(1.0)), "-c", config)
     assert code == 1
-    assert "names no GPS under sensors" in err
+    assert "no GPS is configured (sensors.gps)" in err
 
 
 def test_given_a_log_that_is_not_there_then_one_line(tmp_path: Path, run: Run) -> None:
@@ -179,11 +179,11 @@ def test_given_a_log_that_is_not_there_then_one_line(tmp_path: Path, run: Run) -
     assert "no.lcm" in err
 
 
-def test_given_a_standing_vehicle_then_it_says_that_nothing_can_be_scored(tmp_path: Path, run: Run) -> None:
+def test_given_a_stationary_vehicle_then_it_reports_that_nothing_can_be_scored(tmp_path: Path, run: Run) -> None:
     log = write_log(tmp_path / "drive.lcm", [each for each in drive(8.0) if each[1] == "GPS"])
     code, _, err = run(log, "-c", HUSKY, "--quick", "--processes", 1)
     assert code == 1
-    assert "there was no pose at any of the withheld fixes" in err
+    assert "no pose at any withheld fix" in err
     assert "--report" in err
 
 
@@ -205,27 +205,27 @@ import time
 from pathlib import Path
 from mstools import cli
 from mstools.commands import tune
-from mstools.tuning import runs as tune_runs
-from mstools.tuning.runs import Job
+from mstools.tuning import evaluation
+from mstools.tuning.evaluation import EvaluationJob
 
-def read_pipe(job: Job) -> None:
+def read_pipe(job: EvaluationJob) -> None:
     job.config.read_bytes()
 
 def command(log: Path, config: Path) -> None:
-    with tune._pool(2, 1) as runs:
-        runs([Job(log, config, "half", ())] * 2)
+    with tune._open_pool(2, 1) as runs:
+        runs([EvaluationJob(log, config, "half", ())] * 2)
 
 # in the workers too: each imports this file
-tune_runs.run = read_pipe
+evaluation.evaluate = read_pipe
 tune.command = command
 if __name__ == "__main__":
     cli.main(["tune", *sys.argv[1:]])
 """
 
 
-def opened_for_writing(pipe: Path, process: subprocess.Popen[str]) -> int:
+def open_for_writing(pipe: Path, process: subprocess.Popen[str]) -> int:
     """Open a pipe once a process reads it, and fail where that ends before."""
-    end = time.monotonic() + PATIENCE_S
+    end = time.monotonic() + TIMEOUT_S
     while True:
         with suppress(OSError):  # nobody reads yet
             return os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
@@ -247,11 +247,11 @@ def test_given_ctrl_c_while_workers_run_then_all_end_at_once_with_130(tmp_path: 
             stderr=subprocess.PIPE,
             text=True,
         ) as process,
-        os.fdopen(opened_for_writing(config, process), "wb", buffering=0) as pipe,
+        os.fdopen(open_for_writing(config, process), "wb", buffering=0) as pipe,
     ):
         os.killpg(process.pid, signal.SIGINT)
         try:
-            _, err = process.communicate(timeout=PATIENCE_S)
+            _, err = process.communicate(timeout=TIMEOUT_S)
         finally:
             process.kill()
         with pytest.raises(BrokenPipeError):

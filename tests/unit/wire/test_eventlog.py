@@ -8,12 +8,12 @@ import lcm
 import pytest
 
 from modelserver.errors import RecordingError
-from modelserver.wire.eventlog import Damage, LogEvent, LogFile, scan
+from modelserver.wire.eventlog import LogDamage, LogEvent, LogFile, scan
 
 SIZE = 28 + 2 + 20
 
 
-def written(path: Path, count: int = 5) -> bytes:
+def write_log(path: Path, count: int = 5) -> bytes:
     log = lcm.EventLog(str(path), "w", overwrite=True)
     for number in range(count):
         log.write_event(1000 + number, "CH", bytes([number]) * 20)
@@ -21,20 +21,20 @@ def written(path: Path, count: int = 5) -> bytes:
     return path.read_bytes()
 
 
-def split(data: bytes) -> tuple[list[int], list[Damage]]:
+def split(data: bytes) -> tuple[list[int], list[LogDamage]]:
     found = list(scan(data))
     return (
         [each.utime - 1000 for each in found if isinstance(each, LogEvent)],
-        [each for each in found if isinstance(each, Damage)],
+        [each for each in found if isinstance(each, LogDamage)],
     )
 
 
 @pytest.fixture
 def good(tmp_path: Path) -> bytes:
-    return written(tmp_path / "good.lcm")
+    return write_log(tmp_path / "good.lcm")
 
 
-def test_given_a_log_of_lcm_when_read_then_every_event_comes_back(tmp_path: Path, good: bytes) -> None:
+def test_given_a_log_of_lcm_when_read_then_every_event_is_returned(tmp_path: Path, good: bytes) -> None:
     theirs = [(e.eventnum, e.timestamp, e.channel, e.data) for e in lcm.EventLog(str(tmp_path / "good.lcm"))]
     with LogFile(tmp_path / "good.lcm") as log:
         ours = [(e.number, e.utime, e.channel, e.data) for e in log]
@@ -47,14 +47,14 @@ def test_given_a_log_of_lcm_when_read_then_every_event_comes_back(tmp_path: Path
 def test_given_a_log_cut_short_when_read_then_the_whole_events_and_a_tail(good: bytes, cut: int) -> None:
     events, damage = split(good[:-cut])
     assert events == [0, 1, 2, 3]
-    assert damage == [Damage(4 * SIZE, SIZE - cut, 4, tail=True)]
+    assert damage == [LogDamage(4 * SIZE, SIZE - cut, 4, tail=True)]
     assert "after event 4" in str(damage[0])
 
 
-def test_given_junk_between_events_when_read_then_it_is_skipped_and_told(good: bytes) -> None:
+def test_given_junk_between_events_when_read_then_it_is_skipped_and_reported(good: bytes) -> None:
     events, damage = split(good[: 2 * SIZE] + b"junk" * 9 + good[2 * SIZE :])
     assert events == [0, 1, 2, 3, 4]
-    assert damage == [Damage(2 * SIZE, 36, 2, tail=False)]
+    assert damage == [LogDamage(2 * SIZE, 36, 2, tail=False)]
     assert "36 bytes after event 2" in str(damage[0])
 
 
@@ -66,17 +66,17 @@ def test_given_overwritten_lengths_when_read_then_only_that_event_is_lost(
 ) -> None:
     head = struct.pack(">Iqqii", 0xEDA1DA01, 2, 1002, *lengths)
     events, damage = split(good[: 2 * SIZE] + head + good[2 * SIZE + 28 :])
-    if lengths == (2, 19):  # a byte too few: the event is taken, the byte left over is told
+    if lengths == (2, 19):  # a byte too few: the event is accepted, the excess byte reported
         assert events == [0, 1, 2, 3, 4]
-        assert damage == [Damage(3 * SIZE - 1, 1, 3, tail=False)]
+        assert damage == [LogDamage(3 * SIZE - 1, 1, 3, tail=False)]
     else:
         assert events == [0, 1, 3, 4]
-        assert damage == [Damage(2 * SIZE, SIZE, 2, tail=False)]
+        assert damage == [LogDamage(2 * SIZE, SIZE, 2, tail=False)]
 
 
 def test_given_a_message_that_holds_the_sync_word_when_read_then_it_is_whole(tmp_path: Path) -> None:
     log = lcm.EventLog(str(tmp_path / "a.lcm"), "w")
-    inner = written(tmp_path / "b.lcm", 2)
+    inner = write_log(tmp_path / "b.lcm", 2)
     for number in range(3):
         log.write_event(1000 + number, "LOGS", inner)
     log.close()
@@ -87,7 +87,7 @@ def test_given_a_message_that_holds_the_sync_word_when_read_then_it_is_whole(tmp
 
 def test_given_a_channel_name_that_is_no_text_when_read_then_it_is_damage() -> None:
     head = struct.pack(">Iqqii", 0xEDA1DA01, 0, 1, 2, 1)
-    assert list(scan(head + b"\xff\xfeA")) == [Damage(0, 31, 0, tail=True)]
+    assert list(scan(head + b"\xff\xfeA")) == [LogDamage(0, 31, 0, tail=True)]
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_given_a_file_that_is_no_log_when_opened_then_a_clear_error(tmp_path: Pa
         pass
 
 
-def test_given_an_empty_file_when_opened_then_it_says_so(tmp_path: Path) -> None:
+def test_given_an_empty_file_when_opened_then_the_error_names_it(tmp_path: Path) -> None:
     path = tmp_path / "empty.lcm"
     path.touch()
     with pytest.raises(RecordingError, match="is empty"), LogFile(path):
@@ -113,4 +113,4 @@ def test_given_a_torn_log_when_read_then_only_a_tail_is_not_torn(tmp_path: Path,
         path.write_bytes(data)
         with LogFile(path) as log:
             list(log)
-        assert log.torn is torn
+        assert log.is_corrupt is torn

@@ -1,4 +1,4 @@
-"""The multicast group of a bus, out of whatever stands in its URL; it goes into commands that root runs."""
+"""The multicast group of any URL; it becomes part of commands that root runs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modelserver.wire.channels import DEFAULT_URL
-from modelserver.wire.multicast import GROUP, group_of, route
+from modelserver.wire.urls import GROUP, group_of, make_route_command
 
 
 @pytest.mark.parametrize(
@@ -30,5 +30,5 @@ def test_given_a_bus_then_its_group_is_known(url: str, group: str) -> None:
 
 @given(st.text() | st.text().map("udpm://{}:7667".format))
 def test_given_any_text_then_the_route_is_of_a_multicast_group(url: str) -> None:
-    command = route(group_of(url), "lo")
+    command = make_route_command(group_of(url), "lo")
     assert re.fullmatch(r"ip route replace 2[23][0-9](\.[0-9]{1,3}){3}/32 dev lo", command, re.ASCII)

@@ -1,4 +1,4 @@
-"""What a client reads of the reply to its own question, beside the whole reply read by the codec."""
+"""The fast path of a client for replies, compared with the codec."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from modelserver.errors import Status, WireError
 from modelserver.messages import Invalid, Origin, PoseAnswer, Quality, ReplyHeader, TransformReply
-from modelserver.spatial import Pose, Transformation
+from modelserver.transforms import Pose, Transformation
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.queries import read_answer
 
@@ -54,13 +54,13 @@ def test_given_one_that_holds_for_good_then_it_is_read_once_whatever_its_id_and_
     assert read_answer(other, INTEREST, REFERENCE) is not read_answer(other, INTEREST, REFERENCE)
 
 
-def test_given_more_than_are_kept_then_the_oldest_goes_and_is_read_again(monkeypatch):
-    monkeypatch.setattr("modelserver.wire.queries._MOST_KNOWN", 2)
-    monkeypatch.setattr("modelserver.wire.queries._KNOWN", OrderedDict())
-    kept = [reply(answers()[0], f"bounded {number}") for number in range(3)]
-    first, second, _ = (read_answer(data, INTEREST, REFERENCE) for data in kept)
-    assert read_answer(kept[1], INTEREST, REFERENCE) is second
-    again = read_answer(kept[0], INTEREST, REFERENCE)
+def test_given_a_full_cache_then_the_oldest_answer_is_evicted_and_read_again(monkeypatch):
+    monkeypatch.setattr("modelserver.wire.queries._MAX_CACHED_ANSWERS", 2)
+    monkeypatch.setattr("modelserver.wire.queries._ANSWER_CACHE", OrderedDict())
+    cached = [reply(answers()[0], f"bounded {number}") for number in range(3)]
+    first, second, _ = (read_answer(data, INTEREST, REFERENCE) for data in cached)
+    assert read_answer(cached[1], INTEREST, REFERENCE) is second
+    again = read_answer(cached[0], INTEREST, REFERENCE)
     assert again is not first
     assert again.transformation == first.transformation
 
@@ -78,7 +78,7 @@ def test_given_other_frames_or_an_error_then_the_whole_reply_is_to_be_read():
 def test_given_bytes_that_are_cut_or_damaged_then_no_answer_comes_of_them():
     data = reply(answers()[0], "damaged")
     for end in range(len(data)):
-        # what the client takes for a reason to read the whole reply, which says what is wrong with it
+        # the client then reads the whole reply, which reports what is wrong
         with contextlib.suppress(struct.error, WireError):
             assert read_answer(data[:end], INTEREST, REFERENCE) is None
         with pytest.raises(WireError):

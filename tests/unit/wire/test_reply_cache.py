@@ -1,4 +1,4 @@
-"""Cached replies are the very bytes that the core would have sent."""
+"""Cached replies are bit for bit those of the core."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from modelserver.core import CoreSettings, Instant
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
 from modelserver.messages import GetTransformation, Policy, RequestHeader, SendReply, TimeQuery
-from modelserver.spatial.pose import Pose
+from modelserver.transforms.pose import Pose
 from modelserver.wire import reply_cache
 from modelserver.wire.codec import encode
 from modelserver.wire.reply_cache import StaticReplyCache
@@ -19,15 +19,15 @@ LATER = Instant(10, 20_000_000)
 
 def cart(height: float = 1.0) -> Model:
     builder = ModelBuilder("cart")
-    builder.body("Cart").frame("Origin").frame("Mast", Pose((0.2, 0.0, height)))
-    builder.body("Camera").frame("Origin").frame("Lens", Pose.from_rpy((0.1, 0.0, 0.0), 0.0, 0.3, 0.0))
-    return builder.constraint("CameraFixed", "Cart:Mast", "Camera:Origin").build()
+    builder.add_body("Cart").add_frame("Origin").add_frame("Mast", Pose((0.2, 0.0, height)))
+    builder.add_body("Camera").add_frame("Origin").add_frame("Lens", Pose.from_rpy((0.1, 0.0, 0.0), 0.0, 0.3, 0.0))
+    return builder.add_constraint("CameraFixed", "Cart:Mast", "Camera:Origin").build()
 
 
 NOW = TimeQuery()
 
 
-def asked(request_id: int = 7, interest: str = "Camera:Lens", time: TimeQuery = NOW) -> GetTransformation:
+def make_request(request_id: int = 7, interest: str = "Camera:Lens", time: TimeQuery = NOW) -> GetTransformation:
     return GetTransformation(RequestHeader(request_id, "REPLY_TEST"), interest, "Cart:Origin", time)
 
 
@@ -47,60 +47,66 @@ def cache_of(model: Model, frames: int = 10) -> StaticReplyCache:
     return cache
 
 
-def filled(model: Model) -> StaticReplyCache:
+def make_cache(model: Model) -> StaticReplyCache:
     cache = cache_of(model)
-    reply = reply_of(model, asked(1), Instant(1, 2))
-    cache.add(encode(asked(1)), CLIENT, reply.reply, encode(reply.reply))
+    reply = reply_of(model, make_request(1), Instant(1, 2))
+    cache.add(encode(make_request(1)), CLIENT, reply.reply, encode(reply.reply))
     return cache
 
 
 @pytest.mark.parametrize(
-    "request_", [asked(7), asked(-8), asked(9, time=TimeQuery(123, Policy.PREDICTED, 50)), asked(10, time=TimeQuery(5))]
+    "request_",
+    [
+        make_request(7),
+        make_request(-8),
+        make_request(9, time=TimeQuery(123, Policy.PREDICTED, 50)),
+        make_request(10, time=TimeQuery(5)),
+    ],
 )
 def test_given_a_cached_pair_then_the_reply_is_the_one_the_core_gives(request_: GetTransformation) -> None:
     model = cart()
     reply = reply_of(model, request_)
-    assert filled(model).find(encode(request_), CLIENT, LATER.utime) == encode(reply.reply)
+    assert make_cache(model).find(encode(request_), CLIENT, LATER.utime) == encode(reply.reply)
 
 
 def test_given_another_client_then_it_gets_the_same_reply_from_the_cache() -> None:
     model = cart()
     other = GetTransformation(RequestHeader(12, "REPLY_OTHER_ONE"), "Camera:Lens", "Cart:Origin")
-    found = filled(model).find(encode(other), b"REPLY_OTHER_ONE", LATER.utime)
+    found = make_cache(model).find(encode(other), b"REPLY_OTHER_ONE", LATER.utime)
     assert found == encode(reply_of(model, other).reply)
 
 
 def test_given_another_model_then_the_cache_is_empty() -> None:
     old, new = cart(1.0), cart(2.0)
-    cache = filled(old)
+    cache = make_cache(old)
     assert cache.is_of(old)
     assert not cache.is_of(new)
     cache.reset(new, 10)
-    assert cache.find(encode(asked()), CLIENT, 5) is None
+    assert cache.find(encode(make_request()), CLIENT, 5) is None
     assert len(cache) == 0
 
 
 @pytest.mark.parametrize("time", [TimeQuery(-1), TimeQuery(1 << 62), TimeQuery(0, Policy.HELD, -5)])
 def test_given_a_time_that_cannot_be_then_it_goes_to_the_core(time: TimeQuery) -> None:
-    assert filled(cart()).find(encode(asked(time=time)), CLIENT, 5) is None
+    assert make_cache(cart()).find(encode(make_request(time=time)), CLIENT, 5) is None
 
 
 def test_given_a_policy_that_is_none_then_it_goes_to_the_core() -> None:
-    data = bytearray(encode(asked()))
+    data = bytearray(encode(make_request()))
     data[-5] = 9
-    assert filled(cart()).find(bytes(data), CLIENT, 5) is None
+    assert make_cache(cart()).find(bytes(data), CLIENT, 5) is None
 
 
 def test_given_other_bytes_then_they_go_to_the_core() -> None:
-    good = encode(asked())
-    cache = filled(cart())
+    good = encode(make_request())
+    cache = make_cache(cart())
     for data in (b"", b"x", good[:8], good[:-1], good + b"\0", b"\0" * 8 + good[8:], good[:34] + b"?" + good[35:]):
         assert cache.find(data, CLIENT, 5) is None
 
 
 def test_given_a_question_that_fails_then_it_is_not_cached() -> None:
     model = cart()
-    wrong = asked(interest="Camera:Lans")
+    wrong = make_request(interest="Camera:Lans")
     reply = reply_of(model, wrong)
     cache = cache_of(model)
     cache.add(encode(wrong), CLIENT, reply.reply, encode(reply.reply))
@@ -110,18 +116,18 @@ def test_given_a_question_that_fails_then_it_is_not_cached() -> None:
 def test_given_all_pairs_of_a_model_then_they_fit() -> None:
     model = cart()
     cache = cache_of(model, frames=57)
-    reply = reply_of(model, asked())
+    reply = reply_of(model, make_request())
     requests = [encode(GetTransformation(RequestHeader(1, "REPLY_TEST"), f"A:{n}", "B:C")) for n in range(57 * 57)]
     for request in requests:
         cache.add(request, CLIENT, reply.reply, encode(reply.reply))
     assert all(cache.find(request, CLIENT, 5) is not None for request in requests)
 
 
-def test_given_more_pairs_than_fit_then_the_one_not_used_for_longest_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reply_cache, "LARGEST_CACHE", 3)
+def test_given_more_pairs_than_fit_then_the_least_recently_used_is_evicted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reply_cache, "MAX_ENTRIES", 3)
     model = cart()
     cache = cache_of(model)
-    reply = reply_of(model, asked())
+    reply = reply_of(model, make_request())
     requests = [encode(GetTransformation(RequestHeader(1, "REPLY_TEST"), f"A:{n}", "B:C")) for n in range(20)]
     for request in requests[:3]:
         cache.add(request, CLIENT, reply.reply, encode(reply.reply))
@@ -136,7 +142,7 @@ def test_given_more_pairs_than_fit_then_the_one_not_used_for_longest_goes(monkey
 def test_given_a_pair_of_long_names_then_it_is_not_cached() -> None:
     model = cart()
     cache = cache_of(model)
-    reply = reply_of(model, asked())
+    reply = reply_of(model, make_request())
     long = GetTransformation(RequestHeader(1, "REPLY_TEST"), "x" * 600, "y")
     cache.add(encode(long), CLIENT, reply.reply, encode(reply.reply))
     assert len(cache) == 0

@@ -1,4 +1,4 @@
-"""LCM URLs that lead nowhere: told apart, each with what to write."""
+"""Invalid LCM URLs, each with a hint."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from modelserver.wire.channels import DEFAULT_URL
 from modelserver.wire.provider import resolve_url
-from modelserver.wire.urls import EXAMPLE, url_problem
+from modelserver.wire.urls import EXAMPLE, find_url_problem
 
 
 @pytest.mark.parametrize(
@@ -19,7 +19,7 @@ from modelserver.wire.urls import EXAMPLE, url_problem
         ("nonsense://", "'nonsense' is no scheme of LCM's; there are udpm://, mpudpm://, tcpq://, file://"),
         ("udp://239.255.76.67:7667", "did you mean udpm://?"),
         ("UDPM://239.255.76.67:7667", "did you mean udpm://?"),
-        ("memq://", "memq:// reaches nobody"),
+        ("memq://", "memq:// does not leave the process"),
         ("file://", "it names no log"),
         ("udpm://nonsense", "'nonsense' is no IPv4 address; write one between 224.0.0.0 and 239.255.255.255"),
         ("udpm://localhost:7667", "'localhost' is no IPv4 address"),
@@ -44,10 +44,10 @@ from modelserver.wire.urls import EXAMPLE, url_problem
         ("udpm://?ttl=1.5", "got '1.5'"),
     ],
 )
-def test_given_a_url_that_leads_nowhere_then_it_is_told_what_is_wrong_and_what_to_write(url: str, words: str) -> None:
-    assert words in url_problem(url)
-    # as it is when a buffer was added to it, too
-    assert words in url_problem(resolve_url(url))
+def test_given_an_invalid_url_then_the_problem_names_what_to_write(url: str, words: str) -> None:
+    assert words in find_url_problem(url)
+    # also with the buffer option
+    assert words in find_url_problem(resolve_url(url))
 
 
 @pytest.mark.parametrize(
@@ -71,10 +71,10 @@ def test_given_a_url_that_leads_nowhere_then_it_is_told_what_is_wrong_and_what_t
     ],
 )
 def test_given_a_url_that_liblcm_takes_then_nothing_is_wrong_with_it(url: str) -> None:
-    assert url_problem(url) == ""
+    assert find_url_problem(url) == ""
 
 
 @given(st.one_of(st.text(), st.text().map("udpm://{}".format), st.text().map("udpm://239.255.76.67:{}".format)))
 def test_given_any_text_then_an_answer_is_one_line(url: str) -> None:
-    text = url_problem(url)
+    text = find_url_problem(url)
     assert text.isprintable() or not text

@@ -1,1 +1,1 @@
-"""The subcommands of `modelserver`, one module each, and what only they use."""
+"""The subcommands of `modelserver`."""

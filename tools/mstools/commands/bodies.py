@@ -1,4 +1,4 @@
-"""`modelserver bodies`: which bodies are there?"""
+"""`modelserver bodies`: the bodies of a model."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import json
 
 import typer
 
-from mstools.commands.asking import JsonOption, ModelOption, PrefixOption, TimeoutOption, UrlOption, answers
-from mstools.terminal.options import Variables
-from mstools.terminal.output import safe
+from mstools.commands.pose_source import open_answer_source
+from mstools.terminal.options import JsonOption, ModelOption, PrefixOption, TimeoutOption, UrlOption, Variables
+from mstools.terminal.output import escape
 
 
 def command(
@@ -21,9 +21,9 @@ def command(
 ) -> None:
     """List the bodies, root first.
 
-    Asks the running daemon, or with --model a geometry file.
+    Queries the running daemon, or with --model a geometry file.
 
     Example: modelserver bodies --model config/raptor/geometry.yaml
     """
-    bodies = answers(model, settings, url, prefix, timeout).get_body_list()
-    typer.echo(json.dumps(bodies) if as_json else "\n".join(map(safe, bodies)))
+    bodies = open_answer_source(model, settings, url, prefix, timeout).get_body_list()
+    typer.echo(json.dumps(bodies) if as_json else "\n".join(map(escape, bodies)))

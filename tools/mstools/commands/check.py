@@ -1,4 +1,4 @@
-"""`modelserver check`: everything that is wrong with a geometry file or a vehicle file, at once."""
+"""`modelserver check`: all problems of a geometry file or a vehicle file in one run."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from modelserver.errors import ConfigError, Location, Problem, Severity
-from modelserver.file_kinds import LOOKED_AT, FileKind, file_kind
+from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
+from modelserver.files.regular import NotRegularFileError, read_start
 from modelserver.formats import check_file
 from modelserver.geometry.model import Model
-from modelserver.regular_files import NotRegularFileError, read_start
-from mstools.commands.check_drivers import drivers_problems
-from mstools.terminal.missing import nearest_path
-from mstools.terminal.options import Variables, parse_variables
-from mstools.terminal.output import counted, print_problem, safe, size_of
+from mstools.commands.driver import find_driver_problems
+from mstools.terminal.options import JsonOption, Variables, parse_variables
+from mstools.terminal.output import describe_size, escape, format_count, print_problem
+from mstools.terminal.problems import find_nearest_path
 
 if TYPE_CHECKING:
-    from modelserver.config import VehicleConfig
-    from modelserver.service.daemon import Vehicle
+    from modelserver.config.vehicle_file import VehicleConfig
+    from modelserver.server.vehicle import Vehicle
 
 
 def command(
@@ -32,58 +32,58 @@ def command(
         typer.Argument(metavar="FILE", help="Geometry files (YAML, Miro XML, URDF, libbot2 frames), or vehicle files."),
     ],
     variables: Variables = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")] = False,
-    notes: Annotated[bool, typer.Option("--notes", help="Print notes as well; they change no exit code.")] = False,
+    as_json: JsonOption = False,
+    notes: Annotated[bool, typer.Option("--notes", help="Print notes too; they do not change the exit code.")] = False,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Refuse a second constraint at a frame, as the server of 2005 did.")
+        bool, typer.Option("--strict", help="Reject a second constraint at a frame, as the server of 2005 did.")
     ] = False,
 ) -> None:
-    """Say everything that is wrong with a geometry file: severity, place, what, and what to do.
+    """Report every problem of a geometry or vehicle file: severity, location, problem, and fix.
 
-    A vehicle file is checked together with the geometry it names. Exits 0 when every file has neither error nor
-    warning, else 1.
+    A vehicle file is checked together with its geometry file. Exit code: 0 if no file has an error or a warning, else
+    1.
 
     Example: modelserver check config/raptor/geometry.xml
     """
     values = parse_variables(variables)
-    results = [(file, *_checked(file, values, strict)) for file in files]
+    results = [(file, *_check(file, values, strict)) for file in files]
     if as_json:
         typer.echo(json.dumps({"files": [_as_data(*result) for result in results]}, indent=2))
     else:
         for file, model, problems in results:
             _print(file, model, problems, notes)
-    if any(_is_unclean(problems) for _, _, problems in results):
+    if any(_has_findings(problems) for _, _, problems in results):
         raise typer.Exit(1)
 
 
-def _checked(file: str, variables: dict[str, str], strict: bool) -> tuple[Model | None, tuple[Problem, ...]]:
+def _check(file: str, variables: dict[str, str], strict: bool) -> tuple[Model | None, tuple[Problem, ...]]:
     try:
         if is_vehicle_file(file):
-            return checked_vehicle(file, strict)
+            return check_vehicle(file, strict)
         if os.path.isfile(file) and not read_start(file, 1):
-            fix = "see docs/geometry-files.md, or docs/vehicle-file.md for a vehicle file, for an example to begin with"
+            fix = "start with an example in docs/geometry-files.md, or docs/vehicle-file.md for a vehicle file"
             return None, (Problem(Severity.ERROR, "the file is empty", Location(file), fix),)
         return check_file(file, variables, strict=strict)
     except OSError as error:
         message = f"the file cannot be read: {error.strerror or error}"
-        near = nearest_path(file) if isinstance(error, FileNotFoundError) else ""
-        fix = f"did you mean {near}?" if near else "look at the path and its permissions"
+        near = find_nearest_path(file) if isinstance(error, FileNotFoundError) else ""
+        fix = f"did you mean {near}?" if near else "check the path and its permissions"
         return None, (Problem(Severity.ERROR, message, Location(file), fix),)
 
 
 def is_vehicle_file(file: str) -> bool:
-    """Return whether a file is a vehicle file, by what stands in it. Raises OSError where it cannot be read."""
+    """Return whether a file has the content of a vehicle file. Raises OSError."""
     try:
-        return file_kind(read_start(file, LOOKED_AT)) is FileKind.VEHICLE
+        return detect_file_kind(read_start(file, EXAMINED_BYTES)) is FileKind.VEHICLE
     except NotRegularFileError:
         return False
 
 
-def checked_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tuple[Problem, ...]]:
-    """Return the model of a vehicle file, None where anything is wrong, and every problem. Raises OSError."""
-    # imported here: a geometry file needs neither the configuration's libraries nor geodesy
-    from modelserver.config import load_partly, with_lines
-    from modelserver.service.daemon import examine_vehicle, load_vehicle
+def check_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tuple[Problem, ...]]:
+    """Return the model of a vehicle file, None if it has an error, and all problems. Raises OSError."""
+    # imported here: a geometry file needs no configuration libraries and no geodesy
+    from modelserver.config.vehicle_file import add_lines, load_partly
+    from modelserver.server.vehicle import examine_vehicle, load_vehicle
 
     try:
         config, problems = load_partly(file, blank=True)
@@ -91,50 +91,50 @@ def checked_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tupl
         return None, error.problems
     if config is None:
         return None, problems
-    # each stage examines what it can, whatever another has found: all faults are reported in one run
+    # each stage checks what it can, whatever another has found: one run reports all problems
     geometry, of_vehicle = examine_vehicle(config, file, strict)
-    more = [*of_vehicle, *drivers_problems(config, file, geometry.constraints), *_worth_knowing(config, file)]
+    more = [*of_vehicle, *find_driver_problems(config, file, geometry.constraints), *_find_notes(config, file)]
     if geometry.model is not None and config.base_frame and not of_vehicle:
         try:
             vehicle = load_vehicle(config, file, strict)
             if not any(each.element.partition(".")[0] == "sensors" for each in problems):
-                more += _unusable(vehicle, file)
-            vehicle.gate(0, file)
+                more += _find_unusable_sensors(vehicle, file)
+            vehicle.make_command_verifier(0, file)
         except ConfigError as error:
             more += error.problems
-    # what a wrong value was left out of is not missing, and what was left out says nothing of itself
+    # a wrong value was dropped: it is not missing, and has no further problems
     wrong = {each.element for each in problems}
-    more = [each for each in with_lines(more, file) if not _is_within(each.element, wrong)]
+    more = [each for each in add_lines(more, file) if not _is_within(each.element, wrong)]
     found = (*problems, *more, *geometry.problems)
-    # a model beside a wrong vehicle file would look as if all were well
+    # a model beside a wrong vehicle file would look like success
     clean = not any(each.severity is Severity.ERROR for each in found)
     return geometry.model if clean else None, (*sorted(found, key=lambda each: (each.file != file, each.line)),)
 
 
 def _is_within(element: str, wrong: set[str]) -> bool:
-    """Return whether a finding rests on what was left out of a vehicle file as wrong: its own key, or the sensors."""
+    """Return whether a finding follows from a wrong value that was dropped: its own key, or the sensors."""
     if element == "localization.mode" or element == "sensors":
         return any(each.partition(".")[0] == "sensors" for each in wrong)
     return any(f"{element}.".startswith(f"{each}.") or f"{each}.".startswith(f"{element}.") for each in wrong if each)
 
 
-def _worth_knowing(config: VehicleConfig, file: str) -> Iterator[Problem]:
-    """Yield what is allowed in a vehicle file and hardly meant."""
+def _find_notes(config: VehicleConfig, file: str) -> Iterator[Problem]:
+    """Yield notes on what a vehicle file may have but rarely intends."""
     sensors = config.sensors
     if sensors.gps is None and sensors.imu is None and sensors.wheels is None:
-        words = "no sensors: there will never be a pose"
+        words = "no localization sensor is configured, so there is no pose"
         yield Problem(Severity.NOTE, words, Location(file, element="sensors"), "see docs/vehicle-file.md")
 
 
-def _unusable(vehicle: Vehicle, file: str) -> Iterator[Problem]:
-    """Yield the sensors that localization cannot use; those that the vehicle file leaves out on purpose as notes."""
-    for found in vehicle.unusable():
+def _find_unusable_sensors(vehicle: Vehicle, file: str) -> Iterator[Problem]:
+    """Yield the sensors that localization cannot use; those that the vehicle file excludes as notes."""
+    for found in vehicle.find_unusable_sensors():
         severity = Severity.NOTE if found.is_choice else Severity.WARNING
         text = f"sensors.{found.sensor}: {found.text}" if found.is_choice else found.text
         yield Problem(severity, text, Location(file, element=found.element), found.fix)
 
 
-def _is_unclean(problems: tuple[Problem, ...]) -> bool:
+def _has_findings(problems: tuple[Problem, ...]) -> bool:
     return any(problem.severity is not Severity.NOTE for problem in problems)
 
 
@@ -143,19 +143,19 @@ def _print(file: str, model: Model | None, problems: tuple[Problem, ...], notes:
     for problem in problems:
         if notes or problem.severity is not Severity.NOTE:
             print_problem(problem)
-    parts = [size_of(model)] if model is not None else []
-    found = [counted(count[each], str(each)) for each in (Severity.ERROR, Severity.WARNING) if count[each]]
+    parts = [describe_size(model)] if model is not None else []
+    found = [format_count(count[each], str(each)) for each in (Severity.ERROR, Severity.WARNING) if count[each]]
     parts.append(", ".join(found) or "clean")
     if count[Severity.NOTE] and not notes:
-        parts.append(f"{counted(count[Severity.NOTE], 'note')} (--notes shows them)")
-    typer.echo(f"{safe(file)}: {'; '.join(parts)}")
+        parts.append(f"{format_count(count[Severity.NOTE], 'note')} (--notes shows them)")
+    typer.echo(f"{escape(file)}: {'; '.join(parts)}")
 
 
 def _as_data(file: str, model: Model | None, problems: tuple[Problem, ...]) -> dict[str, Any]:
     count = Counter(problem.severity for problem in problems)
     return {
         "file": file,
-        "clean": not _is_unclean(problems),
+        "clean": not _has_findings(problems),
         "errors": count[Severity.ERROR],
         "warnings": count[Severity.WARNING],
         "notes": count[Severity.NOTE],

@@ -1,4 +1,4 @@
-"""`modelserver convert`: a geometry file in another form."""
+"""`modelserver convert`: a geometry file in another format."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
-from modelserver.errors import ModelServerError, Severity, nearest_names, shown
-from modelserver.file_kinds import LOOKED_AT, FileKind, file_kind
-from modelserver.formats import FORMS, check_file, form_of_path, save_model
+from modelserver.errors import ModelServerError, Severity, find_nearest_names, quote
+from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
+from modelserver.formats import FORMATS, check_file, format_of_path, save_model
 from mstools.terminal.options import Variables, parse_variables
-from mstools.terminal.output import counted, print_problem, safe, size_of, write_file
+from mstools.terminal.output import describe_size, escape, format_count, print_problem, write_file
 
 
 def command(
@@ -22,25 +22,27 @@ def command(
         ),
     ],
     target: Annotated[str, typer.Argument(metavar="OUT", help="File to write, or - for standard output.")],
-    form: Annotated[
+    output_format: Annotated[
         str,
         typer.Option(
             "--to",
-            metavar="FORM",
-            help=f"Form to write: {', '.join(FORMS)}. Without it the ending of OUT decides: "
+            metavar="FORMAT",
+            help=f"Format to write: {', '.join(FORMATS)}. Default: by the extension of OUT, "
             ".yaml, .yml, .urdf; .xml is miro.",
         ),
     ] = "",
     variables: Variables = None,
     repair: Annotated[
         bool,
-        typer.Option("--repair", help="Drop what is badly formed, and what no constraint joins to the first body."),
+        typer.Option(
+            "--repair", help="Drop malformed elements, and bodies that no constraint connects to the first one."
+        ),
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace OUT where it exists.")] = False,
 ) -> None:
-    """Write a geometry file in another form; what that form cannot hold is said on standard error.
+    """Convert a geometry file to another format; unsupported features are listed on standard error.
 
-    A Miro process configuration becomes a vehicle file: the geometry file that it names and the tunables that have a
+    A Miro process configuration becomes a vehicle file with its geometry file and the parameters that have a
     counterpart; the others are listed in it and on standard error.
 
     \b
@@ -49,17 +51,17 @@ def command(
       modelserver convert process.xml vehicle.yaml
       modelserver convert husky.urdf husky.yaml
     """
-    form = _form(form, target)
+    output_format = _choose_format(output_format, target)
     values = parse_variables(variables)
     is_process = is_process_file(source)
-    if is_process and form != "yaml":
+    if is_process and output_format != "yaml":
         raise typer.BadParameter(
-            f"{source} is a Miro process configuration: it becomes a vehicle file, which is YAML; name it FILE.yaml",
+            f"{source} is a Miro process configuration, which becomes a vehicle file in YAML; name it FILE.yaml",
             param_hint="OUT",
         )
     if target != "-" and not force and os.path.lexists(target):
-        # said before the reading, for that may take a while; the writing looks again
-        raise ModelServerError(f"{safe(target)} exists already; give --force to replace it, or another name")
+        # before reading, which may take long; writing checks it again
+        raise ModelServerError(f"{escape(target)} already exists; give --force to replace it, or another name")
     if is_process:
         _convert_process(source, target, values, force)
         return
@@ -69,28 +71,28 @@ def command(
             print_problem(problem, err=True)
     if model is None:
         errors = sum(problem.severity is Severity.ERROR for problem in problems)
-        raise ModelServerError(f"{safe(source)} has {counted(errors, 'error')}; nothing was written")
-    saved = save_model(model, form)
-    for loss in saved.losses:
-        typer.echo(f"modelserver: this form cannot hold {safe(loss)}", err=True)
+        raise ModelServerError(f"{escape(source)} has {format_count(errors, 'error')}; nothing was written")
+    saved = save_model(model, output_format)
+    for loss in saved.unsupported:
+        typer.echo(f"modelserver: the format does not support {escape(loss)}", err=True)
     if target == "-":
         typer.echo(saved.text, nl=False)
     else:
         write_file(target, saved.text, replace=force)
-        typer.echo(f"{safe(target)}: {size_of(model)}", err=True)
+        typer.echo(f"{escape(target)}: {describe_size(model)}", err=True)
 
 
 def is_process_file(file: str) -> bool:
-    """Return whether a file is a Miro process configuration, by what stands in it. Raises OSError."""
+    """Return whether a file has the content of a Miro process configuration. Raises OSError."""
     if not os.path.isfile(file):
         return False
     with open(file, "rb") as stream:
-        return file_kind(stream.read(LOOKED_AT)) is FileKind.MIRO_PROCESS
+        return detect_file_kind(stream.read(EXAMINED_BYTES)) is FileKind.MIRO_PROCESS
 
 
 def _convert_process(source: str, target: str, values: dict[str, str], force: bool) -> None:
     """Write the vehicle file of a Miro process configuration."""
-    # the schema of the vehicle file needs libraries that a geometry file does not
+    # imported here: a geometry file needs no configuration libraries
     from mstools.commands.convert_process import convert_process
 
     text, problems = convert_process(source, target, values)
@@ -100,23 +102,26 @@ def _convert_process(source: str, target: str, values: dict[str, str], force: bo
         typer.echo(text, nl=False)
     else:
         write_file(target, text, replace=force)
-        typer.echo(f"{safe(target)}: {counted(len(problems), 'warning')}; modelserver check {safe(target)}", err=True)
+        typer.echo(
+            f"{escape(target)}: {format_count(len(problems), 'warning')}; modelserver check {escape(target)}", err=True
+        )
 
 
-def _form(form: str, target: str) -> str:
-    if form in FORMS:
+def _choose_format(form: str, target: str) -> str:
+    if form in FORMATS:
         return form
     if form:
-        near = nearest_names(form, FORMS)
+        near = find_nearest_names(form, FORMATS)
         raise typer.BadParameter(
-            f"{shown(form)} is no form; " + (f"write {near[0]}" if near else f"forms are {', '.join(FORMS)}"),
+            f"{quote(form)} is an unknown format; "
+            + (f"did you mean {near[0]}?" if near else f"formats: {', '.join(FORMATS)}"),
             param_hint="--to",
         )
     if target == "-":
         raise typer.BadParameter(
-            f"standard output has no ending; say which form: {', '.join(FORMS)}", param_hint="--to"
+            f"standard output has no extension; give the format: {', '.join(FORMATS)}", param_hint="--to"
         )
     try:
-        return form_of_path(target)
+        return format_of_path(target)
     except ValueError as error:
         raise typer.BadParameter(f"{error}; or give --to", param_hint="OUT") from None

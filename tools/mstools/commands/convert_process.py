@@ -1,11 +1,11 @@
 """Conversion of Miro's process configuration (report, Annex B.3) to a vehicle file.
 
 The server of 2005 read a process configuration in XML that named the geometry file and held its tunables. The report
-prints the form of such files and none of ModelServer's own parameters, so a parameter is matched by its name: the keys
+has the format of such files and none of ModelServer's own parameters, so a parameter is matched by its name: the keys
 of the vehicle file without punctuation and case (`Publish`/`RateHz`, `PublishRateHz` and `RateHz` are publish.rate_hz),
-and the names in `SYNONYMS` for what the report speaks of. A name that fits several keys fits none. Each line of the
-result says which parameter it comes from; what has no counterpart, or a value that the key does not take, is listed in
-a comment at the end and reported as a warning.
+and the names in `SYNONYMS` for those of the report. A name that fits several keys fits none. Each line of the
+result names the parameter that it comes from; what has no counterpart, or a value that the key rejects, is listed in a
+comment at the end and reported as a warning.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Union, get_ar
 
 import yaml
 
-from modelserver.config import VehicleConfig, parse_partly
-from modelserver.errors import ConfigError, GeometryError, Location, Problem, QueryError, Severity, shown
-from modelserver.file_kinds import LOOKED_AT
+from modelserver.config.vehicle_file import VehicleConfig, parse_partly
+from modelserver.errors import ConfigError, GeometryError, Location, Problem, QueryError, Severity, quote
+from modelserver.files.kinds import EXAMINED_BYTES
 from modelserver.formats import check_file, xml_document
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
-from mstools.terminal.missing import nearest_path
-from mstools.terminal.output import safe
+from mstools.terminal.output import escape
+from mstools.terminal.problems import find_nearest_path
 
 if TYPE_CHECKING:
     from lxml.etree import _Element as Element
@@ -56,26 +56,26 @@ SYNONYMS: Final[Mapping[str, Key]] = {
     "utmzone": ("origin", "zone"),
     "utmhemisphere": ("origin", "hemisphere"),
 }
-"""Names, without punctuation and case, for what the report speaks of and the vehicle file calls otherwise."""
+"""Names in the report, without punctuation and case, with the key of the vehicle file."""
 
 SWITCHES: Final[Mapping[str, tuple[str, str]]] = {
     "eventdriven": ("event", "timer"),
     "timerdriven": ("timer", "event"),
     "rawmode": ("raw", "full"),
 }
-"""Names whose value is true or false, and the vehicle file's values for these."""
+"""Names with a Boolean value, and the vehicle file's values for true and false."""
 
 OWN_SECTION: Final = "modelserver"
-"""Sections whose name holds this are ModelServer's own; where there is one, others count by section and name only."""
+"""Sections with this in their name are ModelServer's; if there is one, parameters of others need section and name."""
 
-SHORTEST_NAME: Final = 6
-"""Letters that a name needs to be matched without its section: `Type` or `Mode` alone may be anybody's."""
+MIN_NAME_LENGTH: Final = 6
+"""Letters of a name that is matched without its section: `Type` or `Mode` alone are ambiguous."""
 
 MAX_SETTINGS: Final = 10_000
-"""Parameters that are read at most."""
+"""Largest number of parameters."""
 
 _MAPPINGS: Final = frozenset({("variables",), ("sensors", "wheels", "frames")})
-"""Keys of the vehicle file whose entries the user names."""
+"""Keys of the vehicle file with entries named by the user."""
 
 _TRUE, _FALSE = ("true", "1", "yes", "on"), ("false", "0", "no", "off")
 
@@ -89,44 +89,46 @@ class Setting(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The path as it is shown."""
+        """The path for messages."""
         return "/".join(self.path)
 
 
 class Conversion(NamedTuple):
-    """The text of the vehicle file, and a warning for each parameter that is not in it."""
+    """The text of the vehicle file, and a warning for each unconverted parameter."""
 
     text: str
     problems: tuple[Problem, ...]
 
 
 def convert_process(file: str, target: str, variables: Mapping[str, str] | None = None) -> Conversion:
-    """Convert a process configuration to the text of a vehicle file that is to stand at `target`.
+    """Convert a process configuration to the text of a vehicle file at `target`.
 
     `target` is a path, or - for standard output; the geometry file is named relative to it. `variables` fill `$NAME` in
-    a frame-tree geometry. Raises ConfigError where the file names no geometry file, GeometryError where one of the two
-    is wrong, OSError where one cannot be read.
+    a frame-tree geometry. Raises ConfigError if the file names no geometry file, GeometryError if one of the two
+    is wrong, OSError if one cannot be read.
     """
     with open(file, "rb") as stream:
-        content = stream.read(LOOKED_AT + 1)
-    if len(content) > LOOKED_AT:
-        problem = f"the file is larger than {LOOKED_AT >> 20} MiB", "is this the process configuration?"
+        content = stream.read(EXAMINED_BYTES + 1)
+    if len(content) > EXAMINED_BYTES:
+        problem = f"the file is larger than {EXAMINED_BYTES >> 20} MiB", "is this the process configuration?"
         raise ConfigError([Problem(Severity.ERROR, problem[0], Location(file), problem[1])])
     builder = ModelBuilder()
     root = xml_document.parse(content, builder, file)
     if root is None:
         raise GeometryError(builder.problems)
     settings = list(read_settings(root, file))
-    matching = _Matching(file, settings)
+    matching = _KeyMatcher(file, settings)
     for setting in settings:
         matching.add(setting)
     geometry = _find_geometry(matching, file)
     model, problems = check_file(geometry, variables)
     if model is None:
         raise GeometryError(problems)
-    matching.put(("geometry",), _relative(geometry, target))
+    matching.put(("geometry",), _get_relative_path(geometry, target))
     matching.complete(model)
-    return Conversion(_text(matching, file), tuple(sorted(matching.problems, key=lambda each: each.line)))
+    return Conversion(
+        _format_vehicle_file(matching, file), tuple(sorted(matching.problems, key=lambda each: each.line))
+    )
 
 
 def read_settings(root: Element, file: str) -> Iterator[Setting]:
@@ -134,7 +136,7 @@ def read_settings(root: Element, file: str) -> Iterator[Setting]:
 
     Raises ConfigError for more than `MAX_SETTINGS`.
     """
-    for count, setting in enumerate(_settings(root, ()), 1):
+    for count, setting in enumerate(_iter_settings(root, ()), 1):
         if count > MAX_SETTINGS:
             why = f"the file has more than {MAX_SETTINGS} parameters"
             fix = "remove the sections of other processes"
@@ -142,76 +144,76 @@ def read_settings(root: Element, file: str) -> Iterator[Setting]:
         yield setting
 
 
-def _settings(element: Element, path: tuple[str, ...]) -> Iterator[Setting]:
-    for number, child in enumerate(xml_document.children(element)):
+def _iter_settings(element: Element, path: tuple[str, ...]) -> Iterator[Setting]:
+    for number, child in enumerate(xml_document.iterate_children(element)):
         below = (*path, (child.get("name") or "").strip() or f"[{number}]")
-        value, inside = child.get("value"), list(xml_document.children(child))
+        value, inside = child.get("value"), list(xml_document.iterate_children(child))
         if value is not None:
-            yield Setting(below, value.strip(), xml_document.line(child))
+            yield Setting(below, value.strip(), xml_document.get_line(child))
         elif inside and all(each.get("name") is None and each.get("value") is not None for each in inside):
             yield Setting(
-                below, tuple([(each.get("value") or "").strip() for each in inside]), xml_document.line(child)
+                below, tuple([(each.get("value") or "").strip() for each in inside]), xml_document.get_line(child)
             )
             continue
-        # libxml2 bounds the depth, and so this recursion
-        yield from _settings(child, below)
+        # libxml2 limits the depth of this recursion
+        yield from _iter_settings(child, below)
 
 
-class _Matching:
-    """The keys of the vehicle file that were found so far: value and origin of each, and what found no place."""
+class _KeyMatcher:
+    """Match parameters with keys of the vehicle file: value and source of each key, and the skipped parameters."""
 
     def __init__(self, file: str, settings: Iterable[Setting]):
         self.file = file
-        self.own = {each.path[0] for each in settings if OWN_SECTION in _plain(each.path[0])}
+        self.own = {each.path[0] for each in settings if OWN_SECTION in _normalize(each.path[0])}
         self.values: dict[Key, Any] = {}
         self.sources: dict[Key, Setting] = {}
         self.notes: dict[Key, str] = {}
-        self.left: list[tuple[Setting, str]] = []
+        self.skipped: list[tuple[Setting, str]] = []
         self.problems: list[Problem] = []
-        self._types = dict(_leaves(VehicleConfig, ()))
+        self._types = dict(_iter_keys(VehicleConfig, ()))
 
     def add(self, setting: Setting) -> None:
-        """Match a parameter with a key, or list it as left."""
+        """Match a parameter with a key, or skip it."""
         found = self._keys_of(setting)
         if len(found) != 1:
             near = tuple(".".join(key) for key in found)
-            self.leave(setting, "its name fits several keys" if found else "no counterpart", near)
+            self.skip(setting, "its name fits several keys" if found else "no counterpart", near)
             return
         (key,) = found
         if key in self.values:
-            self.leave(setting, f"{'.'.join(key)} is given already (line {self.sources[key].line})")
+            self.skip(setting, f"{'.'.join(key)} is given already (line {self.sources[key].line})")
             return
         try:
-            value = _value(setting, self._types.get(key, str))
+            value = _parse_value(setting, self._types.get(key, str))
         except ValueError as error:
-            self.leave(setting, f"{'.'.join(key)} {error}")
+            self.skip(setting, f"{'.'.join(key)} {error}")
             return
         self.values[key], self.sources[key] = value, setting
 
-    def leave(self, setting: Setting, why: str, nearest: tuple[str, ...] = ()) -> None:
+    def skip(self, setting: Setting, why: str, nearest: tuple[str, ...] = ()) -> None:
         """List a parameter as not converted, with a warning."""
-        self.left.append((setting, why))
+        self.skipped.append((setting, why))
         fix = (
             f"write it under {' or '.join(nearest)} if that is what it means" if nearest else "see docs/vehicle-file.md"
         )
-        message = f"{shown(setting.label, 80)} is not converted: {why}"
+        message = f"{quote(setting.label, 80)} is not converted: {why}"
         self.problems.append(
             Problem(Severity.WARNING, message, Location(self.file, setting.line, setting.label), fix, nearest)
         )
 
     def put(self, key: Key, value: Any, note: str = "") -> None:
-        """Set a key whatever the file has; `note` says why where no parameter stands for it."""
+        """Set a key; `note` is the reason if it does not come from a parameter."""
         self.values[key] = value
         if note:
             self.notes[key] = note
 
     def drop(self, key: Key, why: str) -> None:
-        """Take back a key that a parameter gave; the parameter is left."""
+        """Remove the key of a parameter, which is skipped."""
         del self.values[key]
-        self.leave(self.sources.pop(key), why)
+        self.skip(self.sources.pop(key), why)
 
     def complete(self, model: Model) -> None:
-        """Take back what the geometry or the vehicle file does not take, and add what it needs."""
+        """Remove what the geometry or the vehicle file rejects, and add required keys."""
         for key in [
             key for key in self.values if key[-1].endswith("frame") or key[:-1] == ("sensors", "wheels", "frames")
         ]:
@@ -227,8 +229,8 @@ class _Matching:
         if ("vehicle",) not in self.values:
             self.put(("vehicle",), model.name or model.root.name, "no parameter names it; taken from the geometry")
         while True:
-            _, problems = parse_partly(_text(self, "").encode(), self.file)
-            # what is wrong goes, and the rest is looked at again: a section's own rules come last
+            _, problems = parse_partly(_format_vehicle_file(self, "").encode(), self.file)
+            # remove wrong keys and check the rest again: a section's own rules are checked last
             if not sum(self._drop_wrong(problem) for problem in problems):
                 break
         if not any(key[0] == "sensors" for key in self.values):
@@ -237,7 +239,7 @@ class _Matching:
             self.problems.append(Problem(Severity.WARNING, why, Location(self.file), fix))
 
     def _drop_wrong(self, problem: Problem) -> bool:
-        """Take back the keys that a problem of the vehicle file is about; return whether there was any."""
+        """Remove the keys of a problem of the vehicle file; return whether there was one."""
         at = tuple(problem.element.split("."))
         while at:
             below = [key for key in self.sources if key[: len(at)] == at]
@@ -249,54 +251,56 @@ class _Matching:
         return False
 
     def _keys_of(self, setting: Setting) -> list[Key]:
-        """Return the keys that a parameter's name fits, by as much of its path as fits."""
-        words = [_plain(each) for each in setting.path]
-        # the file is common to all processes: a rate in another one's section is that one's
+        """Return the keys that match the longest part of a parameter's path."""
+        words = [_normalize(each) for each in setting.path]
+        # the file is common to all processes: a rate in the section of another one is not ours
         is_own = not self.own or setting.path[0] in self.own
         synonym = SYNONYMS.get(words[-1])
         if synonym is not None and (is_own or len(synonym) == 1):
             return [synonym]
         for count in range(len(words), 0 if is_own else 1, -1):
             name = "".join(words[-count:])
-            found = [key for key in self._types if any(name == "".join(map(_plain, key[n:])) for n in range(len(key)))]
-            whole = [key for key in found if name == "".join(map(_plain, key))]
-            if found and (count > 1 or len(name) >= SHORTEST_NAME or whole or len(found) > 1):
+            found = [
+                key for key in self._types if any(name == "".join(map(_normalize, key[n:])) for n in range(len(key)))
+            ]
+            whole = [key for key in found if name == "".join(map(_normalize, key))]
+            if found and (count > 1 or len(name) >= MIN_NAME_LENGTH or whole or len(found) > 1):
                 return whole or found
         section = "".join(words[:-1])
-        return [(*key, setting.path[-1]) for key in _MAPPINGS if section.endswith("".join(map(_plain, key[-2:])))]
+        return [(*key, setting.path[-1]) for key in _MAPPINGS if section.endswith("".join(map(_normalize, key[-2:])))]
 
 
-def _plain(name: str) -> str:
+def _normalize(name: str) -> str:
     return re.sub(r"[\W_]", "", name).lower()
 
 
-def _leaves(schema: type, at: Key) -> Iterator[tuple[Key, Any]]:
+def _iter_keys(schema: type, at: Key) -> Iterator[tuple[Key, Any]]:
     """Yield the keys of the vehicle file that have a value, and its type."""
     hints = get_type_hints(schema)
     for each in dataclasses.fields(schema):
         kind = hints[each.name]
-        choices = [one for one in (kind, *_choices(kind)) if dataclasses.is_dataclass(one)]
+        choices = [one for one in (kind, *_get_choices(kind)) if dataclasses.is_dataclass(one)]
         if choices:
             assert isinstance(choices[0], type)
-            yield from _leaves(choices[0], (*at, each.name))
+            yield from _iter_keys(choices[0], (*at, each.name))
         elif get_origin(kind) is not dict:
             yield (*at, each.name), kind
 
 
-def _choices(kind: Any) -> tuple[Any, ...]:
+def _get_choices(kind: Any) -> tuple[Any, ...]:
     """Return the types of a union without None, one type alone as it is."""
     if get_origin(kind) in (Union, UnionType):
         return tuple(each for each in get_args(kind) if each is not NoneType)
     return (kind,)
 
 
-def _value(setting: Setting, kind: Any) -> Any:
-    """Return the value of a parameter as the type of its key. Raises ValueError, saying what is expected."""
-    switch = SWITCHES.get(_plain(setting.path[-1]))
+def _parse_value(setting: Setting, kind: Any) -> Any:
+    """Return the value of a parameter as the type of its key. Raises ValueError with what is expected."""
+    switch = SWITCHES.get(_normalize(setting.path[-1]))
     text = setting.value
     if switch is not None:
         return switch[0] if _parse_bool(text) else switch[1]
-    (kind, *_) = _choices(kind)
+    (kind, *_) = _get_choices(kind)
     if get_origin(kind) is tuple:
         words = text.split() if isinstance(text, str) else text
         return [float(_parse_number(word, float)) for word in words]
@@ -313,7 +317,7 @@ def _value(setting: Setting, kind: Any) -> Any:
 
 def _parse_bool(text: str | tuple[str, ...]) -> bool:
     if not isinstance(text, str) or text.lower() not in _TRUE + _FALSE:
-        raise ValueError(f"takes true or false, got {shown(str(text), 40)}")
+        raise ValueError(f"takes true or false, got {quote(str(text), 40)}")
     return text.lower() in _TRUE
 
 
@@ -321,18 +325,18 @@ def _parse_number(text: str, kind: type) -> Any:
     try:
         return kind(text)
     except ValueError:
-        raise ValueError(f"takes {'a whole number' if kind is int else 'a number'}, got {shown(text, 40)}") from None
+        raise ValueError(f"takes {'a whole number' if kind is int else 'a number'}, got {quote(text, 40)}") from None
 
 
-def _find_geometry(matching: _Matching, file: str) -> str:
+def _find_geometry(matching: _KeyMatcher, file: str) -> str:
     """Return the path of the geometry file that the process configuration names. Raises ConfigError."""
     named = matching.values.get(("geometry",))
     if named is None:
-        # any name will do where the value is a file that is there; one alone, for with two nobody knows
+        # accept any name whose value is an existing file, if there is only one
         folder = Path(file).parent
         files = [
             setting
-            for setting, _ in matching.left
+            for setting, _ in matching.skipped
             if isinstance(setting.value, str)
             and setting.value.lower().endswith((".xml", ".yaml", ".yml", ".urdf"))
             and (folder / setting.value).is_file()
@@ -343,54 +347,54 @@ def _find_geometry(matching: _Matching, file: str) -> str:
             fix = 'add <parameter name="GeometryFile" value="geometry.xml"/> to its section'
             raise ConfigError([Problem(Severity.ERROR, why, Location(file), fix)])
         (found,) = files
-        matching.left = [each for each in matching.left if each[0] is not found]
+        matching.skipped = [each for each in matching.skipped if each[0] is not found]
         matching.problems = [each for each in matching.problems if each.element != found.label]
         named = str(found.value)
         matching.sources[("geometry",)] = found
     path = Path(file).parent / os.path.expanduser(named)
     if not path.exists():
         setting = matching.sources[("geometry",)]
-        near = nearest_path(path)
+        near = find_nearest_path(path)
         fix = f"did you mean {near}?" if near else "paths are taken relative to the process configuration; correct it"
-        why = f"the geometry file {shown(named, 100)} is not there"
+        why = f"the geometry file {quote(named, 100)} is missing"
         raise ConfigError([Problem(Severity.ERROR, why, Location(file, setting.line, setting.label), fix)])
     return str(path)
 
 
-def _relative(geometry: str, target: str) -> str:
+def _get_relative_path(geometry: str, target: str) -> str:
     """Return the path of the geometry file as a vehicle file at `target` names it."""
     return os.path.relpath(geometry, os.path.dirname(target) if target != "-" else None)
 
 
-def _text(matching: _Matching, file: str) -> str:
-    """Return the vehicle file: required keys first, sections in the order of the schema, each line with its origin."""
+def _format_vehicle_file(matching: _KeyMatcher, file: str) -> str:
+    """Format the vehicle file: required keys first, sections in schema order, each line with its source."""
     order = {each.name: number for number, each in enumerate(dataclasses.fields(VehicleConfig))}
     keys = sorted(matching.values, key=lambda key: (order[key[0]], len(key) > 1, key))
     lines = []
     if file:
-        name = safe(os.path.basename(file))
+        name = escape(os.path.basename(file))
         lines.append(f"# Converted from {name} by modelserver convert. Keys that are not here have their defaults; see")
         lines.append("# docs/vehicle-file.md. The comments name the lines of that file.")
-    opened: Key = ()
+    open_section: Key = ()
     for key in keys:
         shared = 0
-        while shared < min(len(opened), len(key) - 1) and opened[shared] == key[shared]:
+        while shared < min(len(open_section), len(key) - 1) and open_section[shared] == key[shared]:
             shared += 1
-        lines += [f"{'  ' * depth}{_scalar(key[depth])}:" for depth in range(shared, len(key) - 1)]
-        opened = key[:-1]
+        lines += [f"{'  ' * depth}{_format_scalar(key[depth])}:" for depth in range(shared, len(key) - 1)]
+        open_section = key[:-1]
         source = matching.sources.get(key)
-        origin = f"line {source.line}: {safe(source.label)}" if source is not None else matching.notes.get(key, "")
-        line = f"{'  ' * (len(key) - 1)}{_scalar(key[-1])}: {_scalar(matching.values[key])}"
+        origin = f"line {source.line}: {escape(source.label)}" if source is not None else matching.notes.get(key, "")
+        line = f"{'  ' * (len(key) - 1)}{_format_scalar(key[-1])}: {_format_scalar(matching.values[key])}"
         lines.append(f"{line} # {origin}" if origin else line)
-    if matching.left and file:
+    if matching.skipped and file:
         lines += ["", "# Not converted:"]
-        for setting, why in sorted(matching.left, key=lambda each: each[0].line):
+        for setting, why in sorted(matching.skipped, key=lambda each: each[0].line):
             value = setting.value if isinstance(setting.value, str) else " ".join(setting.value)
-            lines.append(f"#   line {setting.line}: {safe(setting.label)} = {shown(value, 80)}: {safe(why)}")
+            lines.append(f"#   line {setting.line}: {escape(setting.label)} = {quote(value, 80)}: {escape(why)}")
     return "\n".join(lines) + "\n"
 
 
-def _scalar(value: Any) -> str:
-    """Return a value, or a key, as YAML writes it on one line."""
+def _format_scalar(value: Any) -> str:
+    """Format a value or a key as YAML on one line."""
     text: str = yaml.safe_dump(value, default_flow_style=True, width=1e9, allow_unicode=True)
     return text.removesuffix("\n").removesuffix("...").rstrip()

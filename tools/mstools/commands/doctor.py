@@ -1,4 +1,4 @@
-"""`modelserver doctor`: is this machine fit for the service, and if not, the commands that mend it."""
+"""`modelserver doctor`: diagnose bus, clock, machine and vehicle file, and print the commands that fix problems."""
 
 from __future__ import annotations
 
@@ -12,158 +12,158 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from modelserver.errors import BusError, ConfigError
-from mstools.commands.asking import JsonOption, PrefixOption, UrlOption
-from mstools.terminal.missing import nearest_path
-from mstools.terminal.output import counted, safe
+from mstools.terminal.options import JsonOption, PrefixOption, UrlOption
+from mstools.terminal.output import escape, format_count
+from mstools.terminal.problems import find_nearest_path
 
 if TYPE_CHECKING:
-    from modelserver.config import VehicleConfig
-    from modelserver.service.probing.findings import Diagnosis
+    from modelserver.config.vehicle_file import VehicleConfig
+    from modelserver.server.diagnostics.checks import Diagnosis
 
 EXIT_WARNINGS = 1
 EXIT_ERRORS = 3
-"""2 is wrong usage, as for every command; and a vehicle file that is not there, with which nothing is looked at."""
+"""2 is wrong usage, as for every command, and a missing vehicle file, with which nothing is checked."""
 
-WORDS = ("ok", "note", "warning", "error")
-"""What the grades of findings are called, by their number."""
+LEVEL_NAMES = ("ok", "note", "warning", "error")
+"""Names of the levels of findings, by number."""
 
 
 def command(
     config: Annotated[
-        Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file; it is looked at too.")
+        Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file; it is checked too.")
     ] = None,
     url: UrlOption = "",
     prefix: PrefixOption = "",
     as_json: JsonOption = False,
 ) -> None:
-    """Look at the bus, the clock, and what a vehicle file needs of this machine; print the commands that mend it.
+    """Diagnose the bus, the clock, and what a vehicle file needs of this machine; print the commands that fix it.
 
-    It sends a message to itself, and asks who answers: two daemons on one bus are found. Nothing is changed. With
-    a vehicle file also: does it load, may state and journal be kept, is the key file well, are the drivers' lines
-    there and may they be used. Run it as the user that the service runs as; for the unit's own, as root.
+    Sends a message to itself, and a request to all daemons: two on one bus are found. Nothing is changed. With a
+    vehicle file also: whether it loads, state and journal can be written, the key file is valid, and the drivers'
+    ports exist and are accessible. Run it as the user of the service; for the systemd unit, as root.
 
-    Exit code: 0 nothing to mend, 1 warnings, 3 errors. 2 is wrong usage, also a vehicle file that is not there: then
-    nothing was looked at. (Other commands have 1 for wrong input, which here would look like a warning.)
+    Exit code: 0 no problem, 1 warnings, 3 errors, 2 wrong usage, also a missing vehicle file: then nothing was checked.
+    (Other commands have 1 for wrong input, which would look like a warning here.)
 
     Example: modelserver doctor -c config/raptor/vehicle.yaml
     """
     if config is not None:
-        check_there(config)
-    findings = examine(config, url, prefix)
+        check_exists(config)
+    findings = diagnose(config, url, prefix)
     typer.echo(json.dumps(as_data(findings), indent=2) if as_json else describe(findings))
-    code = exit_code(findings)
+    code = get_exit_code(findings)
     if code:
         raise typer.Exit(code)
 
 
-def check_there(config: Path) -> None:
-    """Raise typer.BadParameter, a usage error, where there is no such vehicle file.
-
-    One that is there and may not be read is a finding.
-    """
+def check_exists(config: Path) -> None:
+    """Raise typer.BadParameter, a usage error, for a missing vehicle file. An unreadable one is a finding."""
     try:
-        wrong = f"{config} is a folder; name the vehicle file in it" if os.path.isdir(config) else ""
+        wrong = f"{config} is a folder; give the vehicle file in it" if os.path.isdir(config) else ""
         os.stat(config)
     except (FileNotFoundError, NotADirectoryError):
-        near = nearest_path(config)
+        near = find_nearest_path(config)
         offer = f"; did you mean {near}?" if near else ""
         wrong = f"there is no vehicle file {config}{offer}"
     except OSError:
         return
     if wrong:
-        raise typer.BadParameter(safe(wrong), param_hint="--config")
+        raise typer.BadParameter(escape(wrong), param_hint="--config")
 
 
-def examine(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...]:
-    """Return all that is found. Takes two seconds, most of it waiting for who answers."""
-    from modelserver.config import NOT_ONE
-    from modelserver.service.probing.clock import clock_findings
-    from modelserver.service.probing.findings import Diagnosis, DiagnosisLevel
-    from modelserver.service.probing.listening import hears_itself, who_answers
-    from modelserver.service.probing.machine import ClockWatch, bus_facts
-    from modelserver.service.probing.probe import bus_findings
-    from modelserver.service.probing.servers import server_findings
+def diagnose(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...]:
+    """Return all findings. Takes two seconds, most of it waiting for replies."""
+    from modelserver.config.vehicle_file import NOT_A_VEHICLE_FILE
+    from modelserver.server.diagnostics.bus_probe import discover_servers, probe_delivery
+    from modelserver.server.diagnostics.checks import (
+        Diagnosis,
+        DiagnosisLevel,
+        evaluate_bus,
+        evaluate_clock,
+        evaluate_servers,
+    )
+    from modelserver.server.diagnostics.machine import HostClockMonitor, read_bus_facts
     from modelserver.version import __version__
     from modelserver.wire.channels import REPLY_PREFIX
     from modelserver.wire.provider import resolve_url
-    from modelserver.wire.urls import url_problem
-    from mstools.deployment.doctor_vehicle import read_vehicle, vehicle_findings, versions
+    from modelserver.wire.urls import find_url_problem
+    from mstools.deployment.diagnosis import diagnose_vehicle, diagnose_versions, read_vehicle
 
     vehicle: VehicleConfig | None = None
-    found: list[Diagnosis] = [versions()]
+    found: list[Diagnosis] = [diagnose_versions()]
     reply_prefix = REPLY_PREFIX
     if config is not None:
         try:
             vehicle = read_vehicle(config)
         except OSError as error:
-            seen = f"{safe(str(config))} cannot be read: {error.strerror}"
-            # which of the folders around it is closed, if it is not the file
+            seen = f"{escape(str(config))} cannot be read: {error.strerror}"
+            # namei shows which folder has no permission, if it is not the file
             command = f"{'sudo chmod a+r' if os.path.exists(config) else 'sudo namei -l'} {shlex.quote(str(config))}"
             found.append(
                 Diagnosis(DiagnosisLevel.ERROR, "vehicle file", seen, "the service does not start without it", command)
             )
         except ConfigError as error:
             first = error.problems[0]
-            seen, why = f"{safe(str(config))} is wrong: {safe(first.message)}", "the service does not start with it"
+            seen, why = f"{escape(str(config))} is wrong: {escape(first.message)}", "the service does not start with it"
             command = f"modelserver check {shlex.quote(str(config))}"
-            if first.message.endswith(NOT_ONE):
-                why, command = safe(f"{why}; {first.fix}"), ""  # check might find it to be a good geometry
+            if first.message.endswith(NOT_A_VEHICLE_FILE):
+                why, command = escape(f"{why}; {first.fix}"), ""  # check may find it to be a valid geometry file
             found.append(Diagnosis(DiagnosisLevel.ERROR, "vehicle file", seen, why, command))
     if vehicle is not None:
         url, prefix = url or vehicle.lcm.url, prefix or vehicle.lcm.channel_prefix
         reply_prefix = vehicle.lcm.reply_prefix
     provider = resolve_url(url)
-    watch = ClockWatch()
-    wrong, leaves = url_problem(provider), False
+    watch = HostClockMonitor()
+    wrong, leaves = find_url_problem(provider), False
     if wrong:
         found.append(Diagnosis(DiagnosisLevel.ERROR, "bus", f"{provider}: {wrong}", "LCM cannot be joined there"))
     else:
-        facts = bus_facts(provider, hears_itself)
-        found.append(Diagnosis(DiagnosisLevel.OK, "bus", safe(provider)))
-        found += bus_findings(facts)
-        if facts.address is None or facts.heard:
+        facts = read_bus_facts(provider, probe_delivery)
+        found.append(Diagnosis(DiagnosisLevel.OK, "bus", escape(provider)))
+        found += evaluate_bus(facts)
+        if facts.address is None or facts.delivered:
             try:
-                found += server_findings(who_answers(provider, prefix, reply_prefix), prefix, __version__)
+                found += evaluate_servers(discover_servers(provider, prefix, reply_prefix), prefix, __version__)
             except BusError as error:
-                found.append(Diagnosis(DiagnosisLevel.ERROR, "bus", str(error), "nothing is heard or said"))
+                found.append(Diagnosis(DiagnosisLevel.ERROR, "bus", str(error), "no message can be received or sent"))
         leaves = facts.address is not None and facts.address.ttl > 0
-    found += clock_findings(watch.facts(), leaves)
+    found += evaluate_clock(watch.read_facts(), leaves)
     if config is not None and vehicle is not None:
-        found += vehicle_findings(vehicle, config)
+        found += diagnose_vehicle(vehicle, config)
     return tuple(found)
 
 
-def exit_code(findings: Sequence[Diagnosis]) -> int:
-    """Return the exit code that findings make."""
-    from modelserver.service.probing.findings import DiagnosisLevel, worst
+def get_exit_code(findings: Sequence[Diagnosis]) -> int:
+    """Return the exit code of findings."""
+    from modelserver.server.diagnostics.checks import DiagnosisLevel, get_worst_level
 
-    return {DiagnosisLevel.WARNING: EXIT_WARNINGS, DiagnosisLevel.ERROR: EXIT_ERRORS}.get(worst(findings), 0)
+    return {DiagnosisLevel.WARNING: EXIT_WARNINGS, DiagnosisLevel.ERROR: EXIT_ERRORS}.get(get_worst_level(findings), 0)
 
 
 def describe(findings: Sequence[Diagnosis]) -> str:
-    """Return findings for people to read: the grade, what was seen, and below it why it matters and what mends it."""
+    """Format findings: level and observation, below them the reason and the command that fixes it."""
     width = max(len(each.subject) for each in findings)
     lines = []
     for each in findings:
-        lines.append(f"{WORDS[each.grade]:<8} {safe(each.subject):<{width}}  {safe(each.seen)}")
+        lines.append(f"{LEVEL_NAMES[each.level]:<8} {escape(each.subject):<{width}}  {escape(each.observed)}")
         if each.why:
-            lines.append(f"{'':<8} {'':<{width}}  {safe(each.why)}")
+            lines.append(f"{'':<8} {'':<{width}}  {escape(each.why)}")
         if each.command:
-            lines.append(f"{'':<8} {'':<{width}}  $ {safe(each.command)}")
-    number = [sum(each.grade == grade for each in findings) for grade in range(len(WORDS))]
-    said = [counted(number[grade], WORDS[grade]) for grade in (3, 2, 1) if number[grade]]
-    return "\n".join([*lines, ", ".join(said) or "all is well"])
+            lines.append(f"{'':<8} {'':<{width}}  $ {escape(each.command)}")
+    number = [sum(each.level == level for each in findings) for level in range(len(LEVEL_NAMES))]
+    totals = [format_count(number[level], LEVEL_NAMES[level]) for level in (3, 2, 1) if number[level]]
+    return "\n".join([*lines, ", ".join(totals) or "no problem found"])
 
 
 def as_data(findings: Sequence[Diagnosis]) -> dict[str, object]:
-    """Return findings for scripts."""
+    """Return findings as JSON data."""
     return {
-        "exit_code": exit_code(findings),
+        "exit_code": get_exit_code(findings),
         "findings": [
             {
-                "grade": WORDS[each.grade],
+                "level": LEVEL_NAMES[each.level],
                 "subject": each.subject,
-                "seen": each.seen,
+                "observed": each.observed,
                 "why": each.why,
                 "command": each.command,
             }

@@ -1,67 +1,124 @@
-"""`modelserver driver`: a device onto the bus."""
+"""`modelserver driver`: publish the samples of a device; and the checks of a vehicle file's drivers."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from modelserver.errors import ConfigError, ModelServerError, RecordingError, Severity, nearest_names, shown
-from modelserver.service.log_format import set_up
-from mstools.commands.asking import UrlOption
-from mstools.commands.run import LEVELS, FormatOption, check_log
-from mstools.terminal.output import print_problem, safe
+from modelserver.errors import (
+    ConfigError,
+    ModelServerError,
+    Problem,
+    RecordingError,
+    Severity,
+    find_nearest_names,
+    quote,
+)
+from modelserver.server.log import set_up_logging
+from mstools.commands.run import LEVELS, FormatOption, check_log_options
+from mstools.terminal.options import UrlOption
+from mstools.terminal.output import escape, print_problem
 
 if TYPE_CHECKING:
-    from modelserver.config import VehicleConfig
+    from modelserver.config.vehicle_file import VehicleConfig
     from msdrivers.links import Link
     from msdrivers.registry import DeviceKind
     from msdrivers.settings import DriverSettings
-    from mstools.deployment.refusal import Start
+    from mstools.deployment.service_start import ServiceStart
 
-COMMANDS_LOOK_S = 0.02
-"""How often a driver that takes commands looks for them."""
+
+def find_driver_problems(vehicle: VehicleConfig, file: str, constraints: Collection[str] | None) -> tuple[Problem, ...]:
+    """Return every problem of the drivers of a vehicle file that is visible without their devices.
+
+    `constraints` are those of its geometry; None if unknown.
+    """
+    from modelserver.config.vehicle_file import read_config_lines
+
+    lines = read_config_lines(file)
+    if not any(path[:1] == ("drivers",) for path in lines):
+        return ()
+    from msdrivers.settings import SourceMap, read_drivers
+    from msdrivers.validation import find_shared_lines, find_unbuildable_drivers
+
+    found, problems = read_drivers(vehicle.drivers, SourceMap(file, lines))
+    drivers = found.values()
+    return (
+        *problems,
+        *find_unbuildable_drivers(drivers, Path(file).parent),
+        *find_shared_lines(drivers),
+        *find_misnamed(vehicle, drivers, constraints),
+    )
+
+
+def find_misnamed(
+    vehicle: VehicleConfig, drivers: Iterable[DriverSettings], constraints: Collection[str] | None
+) -> Iterator[Problem]:
+    """Yield the wheels and joints of drivers that the vehicle file or the geometry does not have."""
+    from msdrivers.validation import find_unknown_joint, find_unknown_wheels
+
+    wheels = vehicle.sensors.wheels
+    for driver in drivers:
+        # the server does not receive a driver on another channel
+        if wheels is not None and driver.channel in ("", wheels.channel):
+            yield from find_unknown_wheels(driver, wheels.frames)
+        if constraints is not None:
+            yield from find_unknown_joint(driver, constraints)
+
+
+def constraints_of(vehicle: VehicleConfig) -> tuple[str, ...] | None:
+    """Return the constraints of a vehicle file's geometry; None if it cannot be read."""
+    from modelserver.formats import examine_file
+
+    try:
+        return examine_file(vehicle.geometry, vehicle.variables).constraints
+    except OSError:
+        return None
+
+
+COMMAND_POLL_S = 0.02
+"""Poll period of a driver with commands, seconds."""
 
 
 def command(
     name: Annotated[str, typer.Argument(metavar="[NAME]", help="Name of the driver in the vehicle file.")] = "",
     config: Annotated[Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file.")] = None,
     list_ports: Annotated[
-        bool, typer.Option("--list", help="List the ports found, and the drivers of the vehicle file; then end.")
+        bool, typer.Option("--list", help="List the ports and the drivers of the vehicle file, then exit.")
     ] = False,
     record_raw: Annotated[
-        Path | None, typer.Option("--record-raw", metavar="FILE", help="Keep what comes and goes on the line.")
+        Path | None, typer.Option("--record-raw", metavar="FILE", help="Record the bytes of the connection.")
     ] = None,
     record_limit: Annotated[
-        float, typer.Option("--record-limit", metavar="MB", min=0.001, help="Largest recording; then it ends.")
+        float, typer.Option("--record-limit", metavar="MB", min=0.001, help="Largest size of the recording.")
     ] = 1000.0,
     play_raw: Annotated[
-        Path | None, typer.Option("--play-raw", metavar="FILE", help="Take a recording in place of the device.")
+        Path | None, typer.Option("--play-raw", metavar="FILE", help="Read a recording instead of the device.")
     ] = None,
     hard_iron: Annotated[
-        bool, typer.Option("--hard-iron", help="Turn the vehicle: find its own magnetic field, store it, then end.")
+        bool, typer.Option("--hard-iron", help="Turn the vehicle: calibrate hard iron, store it in the device, exit.")
     ] = False,
     seconds: Annotated[
-        float, typer.Option("--seconds", metavar="N", min=1.0, help="With --hard-iron: how long to turn it.")
+        float, typer.Option("--seconds", metavar="N", min=1.0, help="With --hard-iron: duration of turning.")
     ] = 60.0,
     all_axes: Annotated[
-        bool, typer.Option("--all-axes", help="With --hard-iron: it is turned about all axes, not on level ground.")
+        bool, typer.Option("--all-axes", help="With --hard-iron: turned about all axes, not on level ground.")
     ] = False,
     url: UrlOption = "",
     log_level: Annotated[str, typer.Option("--log-level", help=f"One of {', '.join(LEVELS)}.")] = "info",
     log_format: FormatOption = "auto",
 ) -> None:
-    """Read a device and publish what it measures, until SIGTERM or Ctrl-C.
+    """Run the driver of a device: publish its samples until SIGTERM or Ctrl-C.
 
-    Connects, sets the device up, stamps each sample with the instant of its measurement, and connects again when the
-    device has been away. How it goes is on DRIVER_HEALTH once a second, and on stderr when it changes. What drivers
-    there are stands in the vehicle file, under `drivers`.
+    Connects, configures the device, stamps each sample with the time of its measurement, and reconnects when the
+    device was away. Its status is on DRIVER_HEALTH once a second, and on stderr when it changes. Drivers are configured
+    in the vehicle file, under `drivers`.
 
     \b
     Examples:
@@ -70,10 +127,10 @@ def command(
       modelserver driver imu -c vehicle.yaml --record-raw imu.raw
       modelserver driver imu -c vehicle.yaml --hard-iron --seconds 90
     """
-    from modelserver.service.supervision.notify import Notifier
-    from mstools.deployment.refusal import Start
+    from modelserver.server.supervision.systemd import Notifier
+    from mstools.deployment.service_start import ServiceStart
 
-    check_log(log_level, log_format)
+    check_log_options(log_level, log_format)
     if list_ports:
         show_ports()
         if config is not None:
@@ -82,18 +139,18 @@ def command(
     if config is None:
         raise typer.BadParameter("give the vehicle file: -c vehicle.yaml", param_hint="--config")
     if record_raw is not None and play_raw is not None:
-        raise typer.BadParameter("a recording that is played is not recorded again", param_hint="--record-raw")
+        raise typer.BadParameter("a replayed recording is not recorded again", param_hint="--record-raw")
     if all_axes and not hard_iron:
-        raise typer.BadParameter("belongs to --hard-iron, which is not given", param_hint="--all-axes")
-    start = Start(config, Notifier.of_environment())
-    with start.patient():
+        raise typer.BadParameter("needs --hard-iron", param_hint="--all-axes")
+    start = ServiceStart(config, Notifier.from_environment())
+    with start.wait_on_error():
         vehicle, settings = load_driver(name, config)
-    if hard_iron and not settings.kind.hard_iron:
-        raise typer.BadParameter(f"a {settings.kind.name} has no such procedure", param_hint="--hard-iron")
-    set_up(log_level, log_format, f"modelserver-driver-{settings.name}")
+    if hard_iron and not settings.kind.has_hard_iron:
+        raise typer.BadParameter(f"a {settings.kind.name} has no hard-iron calibration", param_hint="--hard-iron")
+    set_up_logging(log_level, log_format, f"modelserver-driver-{settings.name}")
     warn_of_names(vehicle, settings)
     with contextlib.ExitStack() as stack:
-        link = _line(stack, settings, record_raw, round(record_limit * 1e6), play_raw)
+        link = _make_link(stack, settings, record_raw, round(record_limit * 1e6), play_raw)
         if hard_iron:
             from mstools.calibration.hard_iron import run_hard_iron
 
@@ -104,26 +161,26 @@ def command(
 
 def show_ports() -> None:
     """Print the ports of this machine."""
-    from msdrivers.links.can_bus import can_networks
-    from msdrivers.links.ports import found_ports
+    from msdrivers.links.can_bus import list_can_interfaces
+    from msdrivers.links.serial_port import find_ports
 
-    ports = found_ports()
+    ports = find_ports()
     for port in ports:
-        typer.echo(safe(f"{port.path:<16} {port.what}") + (f"\n    {safe(port.hint)}" if port.hint else ""))
-    for network in can_networks():
-        typer.echo(safe(f"{network:<16} CAN network interface"))
+        typer.echo(escape(f"{port.path:<16} {port.description}") + (f"\n    {escape(port.hint)}" if port.hint else ""))
+    for network in list_can_interfaces():
+        typer.echo(escape(f"{network:<16} CAN network interface"))
     if not ports:
-        typer.echo("no serial port found: is the adapter plugged in? dmesg says what the kernel made of it")
+        typer.echo("no serial port found: is the adapter plugged in? see dmesg for the kernel's messages")
 
 
 def show_drivers(config: Path) -> None:
-    """Print the drivers of a vehicle file, and what is wrong with them, as `modelserver check` does."""
-    from mstools.commands.check_drivers import constraints_of, drivers_problems
+    """Print the drivers of a vehicle file, and their problems as `modelserver check` does."""
+    from mstools.commands.driver import constraints_of, find_driver_problems
 
     vehicle, drivers = load_drivers(config)
     for name, driver in drivers.items():
-        typer.echo(safe(f"{name:<16} {driver.kind.name}: {driver.kind.about}; {driver.line}"))
-    problems = drivers_problems(vehicle, str(config), constraints_of(vehicle))
+        typer.echo(escape(f"{name:<16} {driver.kind.name}: {driver.kind.description}; {driver.line}"))
+    problems = find_driver_problems(vehicle, str(config), constraints_of(vehicle))
     for problem in problems:
         print_problem(problem, err=True)
     if any(problem.severity is Severity.ERROR for problem in problems):
@@ -131,53 +188,53 @@ def show_drivers(config: Path) -> None:
 
 
 def load_drivers(config: Path) -> tuple[VehicleConfig, dict[str, DriverSettings]]:
-    """Return a vehicle file and its drivers, without those of which something is wrong. Raises ConfigError, OSError."""
-    from modelserver.config import config_lines, load_config
-    from msdrivers.settings import Place, read_drivers
+    """Return a vehicle file and its valid drivers. Raises ConfigError, OSError."""
+    from modelserver.config.vehicle_file import load_config, read_config_lines
+    from msdrivers.settings import SourceMap, read_drivers
 
     vehicle = load_config(config)
-    drivers, _ = read_drivers(vehicle.drivers, Place(str(config), config_lines(config)))
+    drivers, _ = read_drivers(vehicle.drivers, SourceMap(str(config), read_config_lines(config)))
     return vehicle, drivers
 
 
 def load_driver(
     name: str, config: Path, kinds: Mapping[str, DeviceKind] | None = None
 ) -> tuple[VehicleConfig, DriverSettings]:
-    """Return a vehicle file and the settings of one of its drivers, of these kinds, else of all that are known here.
+    """Return a vehicle file and the settings of one of its drivers; `kinds` default to all device kinds.
 
     Raises ConfigError, OSError, ModelServerError.
     """
-    from modelserver.config import config_lines, load_config
+    from modelserver.config.vehicle_file import load_config, read_config_lines
     from msdrivers.registry import KINDS
-    from msdrivers.settings import Place, empty_section, empty_sections, read_driver
+    from msdrivers.settings import SourceMap, find_empty_sections, make_empty_section_problem, read_driver
 
     vehicle = load_config(config)
-    place = Place(str(config), config_lines(config))
+    place = SourceMap(str(config), read_config_lines(config))
     if name in vehicle.drivers:
         return vehicle, read_driver(name, vehicle.drivers[name], place, kinds or KINDS)
-    if name in empty_sections(vehicle.drivers, place):
-        raise ConfigError([empty_section(name, place)])
+    if name in find_empty_sections(vehicle.drivers, place):
+        raise ConfigError([make_empty_section_problem(name, place)])
     if not vehicle.drivers:
-        raise ModelServerError(f"{config} names no drivers; write a section drivers: see docs/vehicle-file.md")
+        raise ModelServerError(f"{config} has no section drivers; see docs/vehicle-file.md")
     known = f"{config} has: {', '.join(vehicle.drivers)}"
     if not name:
-        raise typer.BadParameter(f"name the driver; {known}", param_hint="NAME")
-    near = nearest_names(name, vehicle.drivers)
+        raise typer.BadParameter(f"the driver's name is missing; {known}", param_hint="NAME")
+    near = find_nearest_names(name, vehicle.drivers)
     hint = f"did you mean {near[0]}? " if near else ""
-    raise typer.BadParameter(f"{shown(name, 40)} is no driver; {hint}{known}", param_hint="NAME")
+    raise typer.BadParameter(f"{quote(name, 40)} is an unknown driver; {hint}{known}", param_hint="NAME")
 
 
 def warn_of_names(vehicle: VehicleConfig, settings: DriverSettings) -> None:
-    """Log the names of a driver's wheels and joints that the vehicle does not have: what has them is lost."""
-    from mstools.commands.check_drivers import constraints_of, misnamed
+    """Log the wheels and joints of a driver that the vehicle does not have: their samples are not used."""
+    from mstools.commands.driver import constraints_of, find_misnamed
 
-    constraints = constraints_of(vehicle) if hasattr(settings.station, "joint") else None
-    for problem in misnamed(vehicle, [settings], constraints):
+    constraints = constraints_of(vehicle) if hasattr(settings.device_settings, "joint") else None
+    for problem in find_misnamed(vehicle, [settings], constraints):
         logging.getLogger(__name__).warning("%s: %s; %s", problem.source, problem.message, problem.fix)
 
 
 def channels_of(vehicle: VehicleConfig, settings: DriverSettings) -> dict[type, str]:
-    """Return on which channels a driver's samples go out: the driver's own, else those that the service hears."""
+    """Return the channels of a driver's samples by type: the driver's own, else those of the vehicle's sensors."""
     from modelserver.messages import GpsSample, ImuSample, VehicleStatusSample, WheelsSample
 
     sensors = vehicle.sensors
@@ -193,82 +250,81 @@ def channels_of(vehicle: VehicleConfig, settings: DriverSettings) -> dict[type, 
     return channels
 
 
-def _line(
+def _make_link(
     stack: contextlib.ExitStack, settings: DriverSettings, record: Path | None, limit: int, play: Path | None
 ) -> Link[Any]:
-    """Return the driver's line, recorded, or a recording in its place."""
-    from msdrivers.lines import form_of, link_of
-    from msdrivers.links.recorded import PlayedLink, RecordingLink
-    from msdrivers.raw_log import open_for_reading, recording
-    from msdrivers.runner import SystemTime
+    """Return the driver's connection, with a recorder, or a recording in its place."""
+    from msdrivers.factory import make_codec, make_link
+    from msdrivers.raw_log import RecordingLink, ReplayLink, open_for_reading, open_for_writing
+    from msdrivers.runner import SystemTimeSource
 
-    form = form_of(settings)
+    codec = make_codec(settings)
     if play is not None:
         reader = open_for_reading(play)
         stack.callback(reader.stream.close)
-        if (reader.kind, reader.device) != (form.name, settings.kind.name):
-            said = f"{reader.kind} of a {reader.device} (driver {reader.source})"
-            raise RecordingError(f"{play} holds {said}, and driver {settings.name} reads a {settings.kind.name}")
-        return PlayedLink(reader, form.unpack, SystemTime())
-    link = link_of(settings)
+        if (reader.kind, reader.device) != (codec.name, settings.kind.name):
+            found = f"{reader.kind} of a {reader.device} (driver {reader.source})"
+            raise RecordingError(f"{play}: recording of {found}, but driver {settings.name} is a {settings.kind.name}")
+        return ReplayLink(reader, codec.unpack, SystemTimeSource())
+    link = make_link(settings)
     if record is None:
         return link
-    writer = stack.enter_context(recording(record, limit))
-    writer.begin(form.name, settings.name, settings.kind.name)
-    return RecordingLink(link, form, writer, SystemTime())
+    writer = stack.enter_context(open_for_writing(record, limit))
+    writer.begin(codec.name, settings.name, settings.kind.name)
+    return RecordingLink(link, codec, writer, SystemTimeSource())
 
 
 def run(
-    vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], folder: Path, url: str, start: Start
+    vehicle: VehicleConfig, settings: DriverSettings, link: Link[Any], folder: Path, url: str, start: ServiceStart
 ) -> None:
-    """Run a driver on a line until it is told to end. Raises ConfigError, OSError, BusError."""
-    from modelserver.service.supervision.notify import Notifier
+    """Run a driver on a connection until SIGTERM or Ctrl-C. Raises ConfigError, OSError, BusError."""
+    from modelserver.server.supervision.systemd import Notifier
     from modelserver.wire.provider import open_lcm, resolve_url
-    from msdrivers.making import station_of
-    from msdrivers.publishing import Publisher
-    from msdrivers.runner import Runner, RunnerSettings, SystemTime
-    from mstools.commands.driver_supervised import DriverSupervision
+    from msdrivers.factory import make_driver
+    from msdrivers.health import DriverPublisher
+    from msdrivers.runner import Runner, RunnerSettings, SystemTimeSource
+    from mstools.commands.driver_supervision import DriverSupervision
 
     kind = settings.kind
-    with start.patient():
-        if database := getattr(settings.station, "dbc", ""):
-            start.needs(folder / Path(database).expanduser())
-        station = station_of(settings, folder)
+    with start.wait_on_error():
+        if database := getattr(settings.device_settings, "dbc", ""):
+            start.add_files(folder / Path(database).expanduser())
+        station = make_driver(settings, folder)
     bus = open_lcm(resolve_url(url or vehicle.lcm.url))
-    publisher = Publisher(bus.publish, channels_of(vehicle, settings), vehicle.lcm.channel_prefix)
-    how = RunnerSettings(settings.name, kind.name)
-    if kind.commands:
-        how = replace(how, look=COMMANDS_LOOK_S)
-    runner = Runner(station, link, how, SystemTime(), publisher.sample, publisher.health)
+    publisher = DriverPublisher(bus.publish, channels_of(vehicle, settings), vehicle.lcm.channel_prefix)
+    options = RunnerSettings(settings.name, kind.name)
+    if kind.command_channel:
+        options = replace(options, poll_timeout=COMMAND_POLL_S)
+    runner = Runner(station, link, options, SystemTimeSource(), publisher.publish_sample, publisher.publish_health)
     attend: Callable[[], object] = lambda: None  # noqa: E731
-    if kind.commands:
-        attend = _hear_commands(bus, f"{vehicle.lcm.channel_prefix}{kind.commands}", runner)
+    if kind.command_channel:
+        attend = _subscribe_commands(bus, f"{vehicle.lcm.channel_prefix}{kind.command_channel}", runner)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: runner.stop())
-    supervision = DriverSupervision(runner, Notifier.of_environment())
-    with supervision.ending():
-        runner.run(supervision.attending(attend))
+    supervision = DriverSupervision(runner, Notifier.from_environment())
+    with supervision.notify_stopping():
+        runner.run(supervision.wrap_callback(attend))
 
 
-def _hear_commands(bus: Any, channel: str, runner: Any) -> Callable[[], object]:
-    """Return what takes the commands that have come on a channel."""
+def _subscribe_commands(bus: Any, channel: str, runner: Any) -> Callable[[], object]:
+    """Subscribe to a command channel; return the function that processes the received commands."""
     from modelserver.errors import WireError
-    from modelserver.wire.channels import literal
+    from modelserver.wire.channels import to_subscription_pattern
     from modelserver.wire.codec import decode
-    from modelserver.wire.provider import take_message
+    from modelserver.wire.provider import handle_message
 
     def handle(_: str, data: bytes) -> None:
         try:
-            wish = decode("vehicle_command_t", data)
+            command = decode("vehicle_command_t", data)
         except WireError as error:
-            runner.refuse(error.reason, f"a command on {channel} refused: {error}")
+            runner.reject_command(error.reason, f"a command on {channel} rejected: {error}")
             return
-        runner.command(wish)
+        runner.send_command(command)
 
-    bus.subscribe(literal(channel), handle)
+    bus.subscribe(to_subscription_pattern(channel), handle)
 
     def attend() -> None:
-        while take_message(bus):
+        while handle_message(bus):
             pass
 
     return attend

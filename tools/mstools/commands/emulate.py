@@ -1,4 +1,4 @@
-"""`modelserver emulate`: a device in software, on a line that its driver opens as if it were the device."""
+"""`modelserver emulate`: an emulated device for its driver. It measures a simulated drive, or replays a log."""
 
 from __future__ import annotations
 
@@ -6,19 +6,166 @@ import logging
 import math
 import signal
 import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import chain, dropwhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from modelserver.errors import nearest_names, shown
-from mstools.commands.driver import load_driver
-from mstools.commands.emulate_samples import LONGEST_S, Wanted, samples_of
+from modelserver.errors import ModelServerError, find_nearest_names, quote
+from mstools.commands.driver import channels_of, load_driver
 
 if TYPE_CHECKING:
-    from modelserver.spatial.so3 import Vector3
+    from modelserver.config.vehicle_file import VehicleConfig
+    from modelserver.messages import Sample
+    from modelserver.transforms.so3 import Vector3
     from msdrivers.links import Link
     from msdrivers.settings import DriverSettings
+
+
+log = logging.getLogger(__name__)
+
+MAX_DRIVE_S = 3600.0
+"""Default duration of a simulated drive, seconds."""
+
+START_DELAY_US = 200_000
+"""Time from now to the first sample, in which the driver connects."""
+
+GPS_HZ = 4.0
+"""Default rate of a receiver."""
+
+
+@dataclass(frozen=True, slots=True)
+class DriveOptions:
+    """What to measure: an LCM log, or without one a simulated drive of `seconds`.
+
+    start: its start, microseconds of UTC; None: now. own_field: see `simulate`.
+    """
+
+    log: Path | None
+    start: int | None
+    seconds: float
+    scenario: str
+    seed: int
+    own_field: Vector3
+
+
+def samples_of(vehicle: VehicleConfig, settings: DriverSettings, wanted: DriveOptions) -> Iterator[Sample]:
+    """Return the samples that the emulator of a driver's device measures; their end is logged.
+
+    Raises ModelServerError if there are none: a log without the channel, a drive that is already over.
+    """
+    kind, now = settings.kind, time.time_ns() // 1000
+    start = now + START_DELAY_US if wanted.start is None else wanted.start
+    if wanted.log is not None:
+        samples, what = read_logged(wanted.log, vehicle, settings, start), str(wanted.log)
+    elif not kind.follows_samples or (wanted.start is None and kind.command_channel):
+        # without a drive it follows its commands
+        return iter(())
+    else:
+        if start + round(wanted.seconds * 1e6) < now:
+            ago = f"{(now - start) * 1e-6:.0f} s ago, and the drive lasts {wanted.seconds:g} s"
+            raise ModelServerError(f"--start {wanted.start} is {ago}: it is over, so there are no samples")
+        samples, what = (
+            simulate(vehicle, settings, start, wanted.seconds, wanted.scenario, wanted.seed, wanted.own_field),
+            "the simulated drive",
+        )
+    if wanted.start is not None or wanted.log is None:
+        # samples before now are skipped, also those of the time that making the drive took
+        now = time.time_ns() // 1000
+        samples = dropwhile(lambda sample: sample.header.utime < now, samples)
+    if wanted.log is not None:
+        # an error now, not after the driver has connected
+        first = next(samples, None)
+        if first is None:
+            raise ModelServerError(f"--start {wanted.start} is so long ago that {what} is over: no samples are left")
+        samples = chain((first,), samples)
+    return log_end(samples, settings.name, what)
+
+
+def log_end(samples: Iterator[Sample], name: str, what: str) -> Iterator[Sample]:
+    """Yield samples, and log a warning at their end: the emulator continues without measurements."""
+    yield from samples
+    log.warning("%s: %s is over, there are no more measurements", name, what)
+
+
+def read_logged(file: Path, vehicle: VehicleConfig, settings: DriverSettings, start_utime: int) -> Iterator[Sample]:
+    """Yield the samples of a driver's channel in a log, with stamps shifted so that the first is at `start_utime`.
+
+    Raises ModelServerError if there are none.
+    """
+    from modelserver.wire.channels import BY_NAME
+    from modelserver.wire.codec import decode
+    from modelserver.wire.eventlog import LogFile
+    from msdrivers.registry import CHANNELS
+
+    kind = settings.kind.sample
+    channel = f"{vehicle.lcm.channel_prefix}{channels_of(vehicle, settings).get(kind) or CHANNELS[kind]}"
+    type_name = BY_NAME[CHANNELS[kind]].type_name
+    shift = None
+    with LogFile(file) as events:
+        for event in events:
+            if event.channel != channel:
+                continue
+            sample: Sample = decode(type_name, event.data)
+            header = sample.header
+            shift = start_utime - header.utime if shift is None else shift
+            host = header.host_utime + shift if header.host_utime else 0
+            yield replace(sample, header=replace(header, utime=header.utime + shift, host_utime=host))
+    if shift is None:
+        raise ModelServerError(f"{file} has no messages on {channel}; expected the driver's channel")
+
+
+def simulate(
+    vehicle: VehicleConfig,
+    settings: DriverSettings,
+    start_utime: int,
+    seconds: float,
+    scenario: str,
+    seed: int,
+    own_field: Vector3 = (0.0, 0.0, 0.0),
+) -> Iterator[Sample]:
+    """Return the samples of a driver's sensor on a simulated drive from `start_utime` on.
+
+    `own_field`: hard iron, tesla along the sensor's axes. A receiver measures at the rate of its driver's settings,
+    wheels and the vehicle controller at 100 Hz. Steered wheels are those of the vehicle file and the driver's settings.
+    Raises ModelServerError for a sensor without a section in the vehicle file.
+    """
+    from modelserver.messages import GpsSample, ImuSample, VehicleStatusSample, WheelsSample
+    from modelserver.simulation import GpsModel, ImuModel, MagnetometerModel, Timing, WheelsModel
+    from mstools.demo.drive import WHEELS_HZ, make_simulation
+
+    sensors = vehicle.sensors
+    needed = {
+        GpsSample: (GpsSample, "gps", sensors.gps),
+        ImuSample: (ImuSample, "imu", sensors.imu),
+        WheelsSample: (WheelsSample, "wheels", sensors.wheels),
+        VehicleStatusSample: (VehicleStatusSample, "wheels", sensors.wheels),
+    }
+    if settings.kind.sample not in needed:
+        # it follows its commands
+        return iter(())
+    kind, name, sensor = needed[settings.kind.sample]
+    if sensor is None:
+        raise ModelServerError(f"the vehicle file has no section sensors.{name}, which has the sensor's frame")
+    steered = sensors.steering.wheels if sensors.steering is not None else ()
+    mapped = getattr(settings.device_settings, "wheels", {})
+    wheels = [name for name, wheel in mapped.items() if wheel.is_steered or wheel.steering is not None]
+    run = make_simulation(
+        vehicle,
+        start_utime,
+        seconds,
+        scenario,
+        seed,
+        (kind,),
+        gps_model=GpsModel(Timing(getattr(settings.device_settings, "rate_hz", GPS_HZ))),
+        imu_model=ImuModel(magnetometer=MagnetometerModel(hard_iron=own_field)),
+        wheels_model=WheelsModel(Timing(WHEELS_HZ), steered=frozenset((*steered, *wheels))),
+    )
+    return (sample for sample in run.events(seconds) if isinstance(sample, kind))
+
 
 SCENARIOS = ("eight", "circle", "stand", "straight", "city")
 
@@ -26,20 +173,18 @@ SCENARIOS = ("eight", "circle", "stand", "straight", "city")
 def command(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the driver in the vehicle file.")],
     config: Annotated[Path, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file.")],
-    pty: Annotated[bool, typer.Option("--pty", help="Make a pseudo-terminal and print its path.")] = False,
+    pty: Annotated[bool, typer.Option("--pty", help="Create a pseudo-terminal and print its path.")] = False,
     link: Annotated[
-        Path | None, typer.Option("--link", metavar="PATH", help="With --pty: a symbolic link to it, made here.")
+        Path | None, typer.Option("--link", metavar="PATH", help="With --pty: create a symbolic link to it here.")
     ] = None,
     tcp: Annotated[
-        int | None, typer.Option("--tcp", metavar="PORT", min=0, max=65535, help="Listen on loopback; 0: any free one.")
+        int | None, typer.Option("--tcp", metavar="PORT", min=0, max=65535, help="Listen on loopback; 0: any port.")
     ] = None,
-    can: Annotated[str, typer.Option("--can", metavar="CHANNEL", help="Speak on a CAN bus.")] = "",
+    can: Annotated[str, typer.Option("--can", metavar="CHANNEL", help="Connect to a CAN bus.")] = "",
     interface: Annotated[
         str, typer.Option("--interface", metavar="NAME", help="With --can: python-can's name. Default: the driver's.")
     ] = "",
-    log: Annotated[
-        Path | None, typer.Option("--from", metavar="LOG", help="Measure what an LCM log says was measured.")
-    ] = None,
+    log: Annotated[Path | None, typer.Option("--from", metavar="LOG", help="Replay the samples of an LCM log.")] = None,
     scenario: Annotated[
         str, typer.Option(metavar="NAME", help=f"The simulated drive: {', '.join(SCENARIOS)}.")
     ] = SCENARIOS[0],
@@ -50,15 +195,13 @@ def command(
         ),
     ] = None,
     state: Annotated[
-        Path | None, typer.Option("--state", metavar="FILE", help="Keep here what the device keeps without power.")
+        Path | None, typer.Option("--state", metavar="FILE", help="Store the device's non-volatile memory here.")
     ] = None,
-    iron: Annotated[
-        str, typer.Option("--iron", metavar="X,Y,Z", help="Magnetic field of the vehicle's own at an imu, microtesla.")
-    ] = "0,0,0",
+    iron: Annotated[str, typer.Option("--iron", metavar="X,Y,Z", help="Hard iron at an IMU, microtesla.")] = "0,0,0",
     seconds: Annotated[
-        float | None, typer.Option("--seconds", metavar="N", min=0.1, help="End after so long. Default: never.")
+        float | None, typer.Option("--seconds", metavar="N", min=0.1, help="Exit after this time. Default: never.")
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", metavar="N", help="Of the simulation's noise.")] = 1,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", help="Seed of the simulation's noise.")] = 1,
     start: Annotated[
         int | None,
         typer.Option(
@@ -70,7 +213,7 @@ def command(
         ),
     ] = None,
 ) -> None:
-    """Be a device: answer its driver, and measure a simulated drive or what a log says.
+    """Emulate a device: answer its driver, and measure a simulated drive or replay a log.
 
     Prints the line to put into the vehicle file, and speaks until SIGTERM, Ctrl-C or --seconds.
 
@@ -80,12 +223,12 @@ def command(
       modelserver emulate imu -c vehicle.yaml --tcp 4001 --fault stall@10:2 --fault corrupt@15:3
       modelserver emulate wheels -c vehicle.yaml --can vcan0 --from drive.lcm
     """
-    from msdrivers.faults import parse_fault
+    from msdrivers.fault_injection import parse_fault
 
     if scenario not in SCENARIOS:
-        near = nearest_names(scenario, SCENARIOS)
+        near = find_nearest_names(scenario, SCENARIOS)
         hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(SCENARIOS)}"
-        raise typer.BadParameter(f"{shown(scenario, 40)} is no scenario; {hint}", param_hint="--scenario")
+        raise typer.BadParameter(f"{quote(scenario, 40)} is no scenario; {hint}", param_hint="--scenario")
     if (pty, tcp is not None, bool(can)).count(True) != 1:
         raise typer.BadParameter("give one of --pty, --tcp PORT and --can CHANNEL", param_hint="--pty")
     if link is not None and not pty:
@@ -95,25 +238,25 @@ def command(
         wanted = tuple(parse_fault(text, settings.kind.faults) for text in faults or ())
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--fault") from None
-    if state is not None and not settings.kind.remembers:
+    if state is not None and not settings.kind.has_memory:
         raise typer.BadParameter(f"a {settings.kind.name} keeps nothing without power", param_hint="--state")
-    if log is not None and not settings.kind.follows:
+    if log is not None and not settings.kind.follows_samples:
         raise typer.BadParameter(
-            f"device {settings.kind.name} goes where it is told to, not by a log", param_hint="--from"
+            f"device {settings.kind.name} follows its commands and cannot replay a log", param_hint="--from"
         )
-    own_field = _field(iron)
-    line = _line(settings, link, tcp, can, interface)
+    own_field = _parse_field(iron)
+    line = _make_link(settings, link, tcp, can, interface)
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    samples = samples_of(vehicle, settings, Wanted(log, start, seconds or LONGEST_S, scenario, seed, own_field))
+    samples = samples_of(vehicle, settings, DriveOptions(log, start, seconds or MAX_DRIVE_S, scenario, seed, own_field))
 
-    from msdrivers.making import emulator_of
-    from msdrivers.runner import Runner, RunnerSettings, SystemTime
+    from msdrivers.factory import make_emulator
+    from msdrivers.runner import Runner, RunnerSettings, SystemTimeSource
 
-    station = emulator_of(settings, config.parent, samples, wanted, state)
-    how = RunnerSettings(name, f"emulated {settings.kind.name}", silence=math.inf, reopen=math.inf)
+    station = make_emulator(settings, config.parent, samples, wanted, state)
+    options = RunnerSettings(name, f"emulated {settings.kind.name}", silence=math.inf, reopen_timeout=math.inf)
     line.open()
-    typer.echo(f"{name} ({settings.kind.name}) speaks on {line.description}")
-    runner = Runner(station, line, how, SystemTime())
+    typer.echo(f"{name} ({settings.kind.name}) is on {line.description}")
+    runner = Runner(station, line, options, SystemTimeSource())
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: runner.stop())
     end = math.inf if seconds is None else time.monotonic() + seconds
@@ -125,8 +268,8 @@ def command(
     runner.run(attend)
 
 
-def _line(settings: DriverSettings, link: Path | None, tcp: int | None, can: str, interface: str) -> Link[Any]:
-    """Return the device's end of the line. Raises typer.BadParameter for one that its driver cannot open."""
+def _make_link(settings: DriverSettings, link: Path | None, tcp: int | None, can: str, interface: str) -> Link[Any]:
+    """Return the device's end of the connection. Raises typer.BadParameter if its driver cannot open that."""
     from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings
     from msdrivers.links.pty import PtyLink
     from msdrivers.links.tcp import TcpServerLink
@@ -153,12 +296,12 @@ def _line(settings: DriverSettings, link: Path | None, tcp: int | None, can: str
     return PtyLink(link=link)
 
 
-def _field(text: str) -> Vector3:
-    """Return the tesla of `X,Y,Z` in microtesla."""
+def _parse_field(text: str) -> Vector3:
+    """Parse `X,Y,Z` in microtesla; return tesla."""
     try:
         x, y, z = (float(part) * 1e-6 for part in text.split(","))
     except ValueError:
-        raise typer.BadParameter(f"{shown(text, 40)} is not of the form X,Y,Z", param_hint="--iron") from None
+        raise typer.BadParameter(f"{quote(text, 40)} is not X,Y,Z", param_hint="--iron") from None
     if not math.hypot(x, y, z) < 1e-3:
-        raise typer.BadParameter("no unit works in a field above 1000 microtesla", param_hint="--iron")
+        raise typer.BadParameter("expected a field below 1000 microtesla", param_hint="--iron")
     return (x, y, z)

@@ -1,4 +1,4 @@
-"""`modelserver frames`: which frames has a body?"""
+"""`modelserver frames`: the frames of a body."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from modelserver.geometry import names
-from mstools.commands.asking import JsonOption, ModelOption, PrefixOption, TimeoutOption, UrlOption, answers
-from mstools.terminal.options import Variables
-from mstools.terminal.output import safe
+from mstools.commands.pose_source import open_answer_source
+from mstools.terminal.options import JsonOption, ModelOption, PrefixOption, TimeoutOption, UrlOption, Variables
+from mstools.terminal.output import escape
 
 
 def command(
@@ -24,10 +24,10 @@ def command(
 ) -> None:
     """List the frames of a body, as Body:Frame.
 
-    Asks the running daemon, or with --model a geometry file.
+    Queries the running daemon, or with --model a geometry file.
 
     Example: modelserver frames Digiclops --model config/raptor/geometry.yaml
     """
-    found = answers(model, settings, url, prefix, timeout).get_body_frame_list(body)
-    frames = [names.joined(body, frame) for frame in found]
-    typer.echo(json.dumps(frames) if as_json else "\n".join(map(safe, frames)))
+    found = open_answer_source(model, settings, url, prefix, timeout).get_body_frame_list(body)
+    frames = [names.join(body, frame) for frame in found]
+    typer.echo(json.dumps(frames) if as_json else "\n".join(map(escape, frames)))

@@ -1,4 +1,4 @@
-"""`modelserver install`: the service and its drivers under systemd, as an administrator would do it by hand."""
+"""`modelserver install`: install the service and its drivers under systemd."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from modelserver.errors import ConfigError, Severity, shown
-from modelserver.formats.content import MAX_BYTES as LARGEST_FILE
-from modelserver.regular_files import read_regular
+from modelserver.errors import ConfigError, Severity, quote
+from modelserver.files.regular import read_regular
+from modelserver.formats.registry import MAX_BYTES as LARGEST_FILE
 from mstools.deployment import files as install_files
-from mstools.deployment.place import check_installation, examples, program
+from mstools.deployment.installation import check_installation, get_command_path, get_examples_folder
 from mstools.deployment.plan import (
     CONFIGURATION,
     LOOPBACK,
@@ -25,32 +25,39 @@ from mstools.deployment.plan import (
     SYSCTL,
     UNITS,
     VEHICLE,
-    Facts,
     Plan,
-    Write,
+    SystemFacts,
+    WriteFile,
     digest,
-    in_root,
+    path_in_root,
     plan_install,
 )
-from mstools.deployment.steps import carry_out, check_may, configuration_there, read_facts, read_manifest, show
-from mstools.terminal.gathered import Gathered
+from mstools.deployment.steps import (
+    check_root_user,
+    execute_plan,
+    find_installed_vehicle,
+    print_plan,
+    read_facts,
+    read_manifest,
+)
+from mstools.terminal.problems import ProblemCollector
 
 if TYPE_CHECKING:
-    from modelserver.config import VehicleConfig
+    from modelserver.config.vehicle_file import VehicleConfig
     from msdrivers.settings import DriverSettings
 
 DROP_INS = (install_files.REALTIME, install_files.CREDENTIAL)
 
 RootOption = Annotated[
-    Path, typer.Option("--root", metavar="DIR", help="Another system's root, e.g. of an image; nothing is started.")
+    Path, typer.Option("--root", metavar="DIR", help="Root of another system, e.g. an image; nothing is started.")
 ]
-DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Say what would be done, and do nothing.")]
+DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Only print what would be done.")]
 
 
 def command(
     vehicle: Annotated[
         Path | None,
-        typer.Option("--vehicle", "-c", metavar="FILE", help="The vehicle file; without, the one that is installed."),
+        typer.Option("--vehicle", "-c", metavar="FILE", help="The vehicle file. Default: the installed one."),
     ] = None,
     drivers: Annotated[
         str, typer.Option("--drivers", metavar="NAMES", help="Drivers to start: all, none, or names with commas.")
@@ -59,15 +66,15 @@ def command(
         list[str] | None,
         typer.Option("--serial", metavar="NAME=ID", help="A driver's device below /dev/serial/by-id. May be repeated."),
     ] = None,
-    start: Annotated[bool, typer.Option("--start/--no-start", help="Start what was installed.")] = True,
+    start: Annotated[bool, typer.Option("--start/--no-start", help="Start the installed units.")] = True,
     dry_run: DryRunOption = False,
     root: RootOption = Path("/"),
 ) -> None:
     """Install the service and its drivers under systemd, and start them.
 
-    Copies the vehicle file and what it names to /etc/modelserver, writes units, udev rules for serial devices by their
-    ids and the kernel's limit for receive buffers, and has all of it start with the machine. A file that was edited
-    stays as it is, and is told. Do it again after an upgrade. `modelserver uninstall` takes it back.
+    Copies the vehicle file and the files it names to /etc/modelserver, writes units, udev rules for serial devices by
+    their ids and the kernel's limit for receive buffers, and enables the units at boot. An edited file is not replaced,
+    and is listed. Repeat it after an upgrade. `modelserver uninstall` removes it.
 
     \b
     Examples:
@@ -76,69 +83,69 @@ def command(
     """
     root = root.resolve()
     if not dry_run:
-        check_may(root, f"{program()} install ...")
-    show_or_do(planned(vehicle, drivers, serial_of(serial), start, root), root, dry_run)
+        check_root_user(root, f"{get_command_path()} install ...")
+    show_or_apply(make_plan(vehicle, drivers, parse_serial(serial), start, root), root, dry_run)
 
 
-def show_or_do(plan: Plan, root: Path, dry_run: bool) -> None:
-    """Print a plan, or carry it out."""
+def show_or_apply(plan: Plan, root: Path, dry_run: bool) -> None:
+    """Print a plan, or execute it."""
     if dry_run:
-        show(plan, root)
+        print_plan(plan, root)
         typer.echo("nothing was done")
     else:
-        carry_out(plan, root)
+        execute_plan(plan, root)
 
 
-def planned(vehicle: Path | None, drivers: str, serial: Mapping[str, str], start: bool, root: Path) -> Plan:
-    """Return what there is to do.
+def make_plan(vehicle: Path | None, drivers: str, serial: Mapping[str, str], start: bool, root: Path) -> Plan:
+    """Return the plan of an installation.
 
-    Raises ConfigError with everything that stands in the way; ModelServerError, OSError.
+    Raises ConfigError with all problems; ModelServerError, OSError.
     """
-    gathered = Gathered()
-    with gathered.of("this installation"):
+    gathered = ProblemCollector()
+    with gathered.collect("this installation"):
         check_installation()
-    found = configuration_there(root)
+    found = find_installed_vehicle(root)
     if vehicle is None and found is None:
-        there = in_root(str(root), CONFIGURATION)
+        there = path_in_root(str(root), CONFIGURATION)
         why = f"there is no vehicle file in {there} yet, and none is given"
-        gathered.add("--vehicle", why, f"--vehicle FILE; examples are in {examples()}")
-    given = None if vehicle is None else _made(vehicle, gathered)
-    copied: list[Write] = []
+        gathered.add("--vehicle", why, f"--vehicle FILE; examples are in {get_examples_folder()}")
+    given = None if vehicle is None else _load_vehicle(vehicle, gathered)
+    copied: list[WriteFile] = []
     if given is not None:
-        with gathered.of(str(vehicle)):
-            copied = install_files.configuration(sources_of(given), {key_of(given)})
+        with gathered.collect(str(vehicle)):
+            copied = install_files.list_configuration(sources_of(given), {key_of(given)})
     made = given
-    # the one that will be in force: one that was edited stays
-    if found is not None and (vehicle is None or (given is not None and not _is_ours(found, vehicle, root))):
-        made = _made(found, gathered)
-        with gathered.of(str(found)):
+    # the vehicle file in force: an edited one is not replaced
+    if found is not None and (vehicle is None or (given is not None and not _is_unmodified(found, vehicle, root))):
+        made = _load_vehicle(found, gathered)
+        with gathered.collect(str(found)):
             _check_geometry(made, root)
-    known = made.config.drivers if made is not None else _names_in(vehicle or found)
+    known = made.config.drivers if made is not None else _read_driver_names(vehicle or found)
     names = tuple(known or ())
     if known is not None:
-        with gathered.of("--drivers"):
+        with gathered.collect("--drivers"):
             names = install_files.check_drivers(drivers, known)
     if made is not None:
-        with gathered.of("commands.key_file"):
-            install_files.credential(installed_key(made))
-        with gathered.of("--serial"):
+        with gathered.collect("commands.key_file"):
+            install_files.render_credential_drop_in(get_installed_key(made))
+        with gathered.collect("--serial"):
             install_files.check_serial(serial, made.serial_of(names))
-    gathered.check()
+    gathered.raise_any()
     assert made is not None
-    facts = read_facts([*(each.path for each in copied), RULES, SYSCTL, *_units(), *DROP_INS], root)
-    return _plan(copied, made, names, serial, start, facts)
+    facts = read_facts([*(each.path for each in copied), RULES, SYSCTL, *_list_unit_paths(), *DROP_INS], root)
+    return _build_plan(copied, made, names, serial, start, facts)
 
 
-def _made(vehicle: Path, gathered: Gathered) -> CheckedVehicle | None:
+def _load_vehicle(vehicle: Path, gathered: ProblemCollector) -> CheckedVehicle | None:
     made: list[CheckedVehicle] = []
-    with gathered.of(str(vehicle)):
-        made.append(CheckedVehicle.of(vehicle))
+    with gathered.collect(str(vehicle)):
+        made.append(CheckedVehicle.load(vehicle))
     return made[0] if made else None
 
 
-def _names_in(vehicle: Path | None) -> Iterable[str] | None:
-    """Return the drivers in a vehicle file of which something is wrong; None where they cannot be made out."""
-    from modelserver.config import load_partly
+def _read_driver_names(vehicle: Path | None) -> Iterable[str] | None:
+    """Return the drivers of a wrong vehicle file; None if they cannot be read."""
+    from modelserver.config.vehicle_file import load_partly
 
     with contextlib.suppress(ConfigError, OSError):
         config = None if vehicle is None else load_partly(vehicle)[0]
@@ -150,16 +157,16 @@ def _check_geometry(made: CheckedVehicle | None, root: Path) -> None:
     if made is not None:
         geometry = Path(made.config.geometry).resolve()
         inside = Path("/") / geometry.relative_to(root) if geometry.is_relative_to(root) else geometry
-        install_files.check_seen([(str(inside), "the geometry")], f"copy it to {CONFIGURATION}", str(made.path))
+        install_files.check_visible([(str(inside), "the geometry")], f"copy it to {CONFIGURATION}", str(made.path))
 
 
-def _plan(
-    copied: Iterable[Write],
+def _build_plan(
+    copied: Iterable[WriteFile],
     made: CheckedVehicle,
     names: tuple[str, ...],
     serial: Mapping[str, str],
     start: bool,
-    facts: Facts,
+    facts: SystemFacts,
 ) -> Plan:
     from modelserver.wire.channels import DEFAULT_URL
     from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
@@ -167,30 +174,30 @@ def _plan(
     url = made.config.lcm.url or DEFAULT_URL
     group = install_files.loopback_group(url)
     ip = facts.programs.get("ip", "/usr/sbin/ip")
-    rules, notes = install_files.rules(made.serial_of(names), serial, facts)
+    rules, notes = install_files.render_udev_rules(made.serial_of(names), serial, facts)
     writes = [
         *copied,
-        *install_files.units(templates(), program(), url, ip, bool(names), made.hosts_of(names)),
-        *install_files.realtime(facts),
-        *install_files.credential(installed_key(made)),
+        *install_files.render_units(read_templates(), get_command_path(), url, ip, bool(names), made.hosts_of(names)),
+        *install_files.render_realtime_drop_in(facts),
+        *install_files.render_credential_drop_in(get_installed_key(made)),
         *rules,
-        *install_files.limits(RECEIVE_BUFFER_BYTES, facts),
+        *install_files.render_sysctl(RECEIVE_BUFFER_BYTES, facts),
     ]
     units = (*((LOOPBACK,) if group else ()), SERVICE, *(f"modelserver-driver@{name}.service" for name in names))
     if set(install_files.NETWORK) & set(install_files.bus_addresses(url)):
         notes.append(
-            "the units speak with this machine and with private networks alone (IPAddressAllow); where the vehicle's "
-            "own is another: sudo systemctl edit modelserver, and there [Service] IPAddressAllow=NETWORK"
+            "the units may use this machine's and private addresses only (IPAddressAllow); if the vehicle's network "
+            "is another one: sudo systemctl edit modelserver, and there [Service] IPAddressAllow=NETWORK"
         )
     if made.config.state_directory:
-        notes.append("the vehicle file sets state_directory; without it the state goes where the unit may write")
+        notes.append("the vehicle file sets state_directory; without it the state is in the unit's directory")
     if made.config.journal.directory:
         notes.append(
-            "the vehicle file sets journal.directory, where the unit may not write unless it lies in "
-            f"{STATE[0]}; without it (megabytes alone) the journal is kept there"
+            "the vehicle file sets journal.directory, which the unit can write only inside "
+            f"{STATE[0]}; without it (megabytes only) the journal is written there"
         )
     if facts.is_live and os.geteuid() != 0:
-        notes.append("root is also told whether the service can be scheduled in real time, and the drop-in for that")
+        notes.append("run as root, this also checks for real-time scheduling and adds the drop-in for it")
     if not facts.is_live and facts.root == "/":
         notes.append("systemd does not run this system: the units are enabled, and nothing is started")
     return plan_install(writes, units, facts, start=start, notes=notes)
@@ -198,28 +205,28 @@ def _plan(
 
 @dataclass(frozen=True, slots=True)
 class CheckedVehicle:
-    """A vehicle file that was found well, and those of its drivers that are."""
+    """A vehicle file without errors, and its valid drivers."""
 
     path: Path
     config: VehicleConfig
     drivers: Mapping[str, DriverSettings]
 
     @classmethod
-    def of(cls, vehicle: Path) -> CheckedVehicle:
-        """Return a vehicle file with everything in it checked. Raises ConfigError, GeometryError, OSError."""
-        from modelserver.config import load_config
-        from msdrivers.settings import Place, read_drivers
-        from mstools.commands.check import checked_vehicle
+    def load(cls, vehicle: Path) -> CheckedVehicle:
+        """Load and check a vehicle file. Raises ConfigError, GeometryError, OSError."""
+        from modelserver.config.vehicle_file import load_config
+        from msdrivers.settings import SourceMap, read_drivers
+        from mstools.commands.check import check_vehicle
 
-        _, problems = checked_vehicle(str(vehicle))
+        _, problems = check_vehicle(str(vehicle))
         errors = [problem for problem in problems if problem.severity is Severity.ERROR]
         if errors:
             raise ConfigError(errors)
         config = load_config(vehicle)
-        return cls(vehicle, config, read_drivers(config.drivers, Place(str(vehicle)))[0])
+        return cls(vehicle, config, read_drivers(config.drivers, SourceMap(str(vehicle)))[0])
 
     def hosts_of(self, names: Iterable[str]) -> list[str]:
-        """Return the hosts of those of the named drivers whose devices are on the network."""
+        """Return the hosts of the named drivers' network devices."""
         from msdrivers.line_settings import MULTICAST, split_address, split_group
 
         found = []
@@ -232,16 +239,15 @@ class CheckedVehicle:
         return found
 
     def serial_of(self, names: Iterable[str]) -> list[install_files.SerialDriver]:
-        """Return those of the named drivers that are on serial ports."""
+        """Return the named drivers with serial ports."""
         ports = ((name, getattr(self.drivers[name].line, "port", "")) for name in names)
         return [install_files.SerialDriver(name, port) for name, port in ports if port]
 
 
 def sources_of(made: CheckedVehicle) -> dict[str, bytes]:
-    """Return a vehicle's files by their paths relative to the vehicle file, which itself is vehicle.yaml.
+    """Return a vehicle's files by path relative to the vehicle file, which itself is vehicle.yaml.
 
-    Raises ConfigError for those outside the folder of the vehicle file, which would not be found again, and those that
-    cannot be read; OSError.
+    Raises ConfigError for files outside the folder of the vehicle file and for unreadable ones; OSError.
     """
     import yaml
 
@@ -249,68 +255,68 @@ def sources_of(made: CheckedVehicle) -> dict[str, bytes]:
     text = vehicle.read_bytes()
     raw = yaml.safe_load(text)
     named = [str(raw["geometry"])]
-    named += [dbc for each in made.drivers.values() if (dbc := getattr(each.station, "dbc", ""))]
-    # systemd reads one that lies elsewhere, and hands it over
+    named += [dbc for each in made.drivers.values() if (dbc := getattr(each.device_settings, "dbc", ""))]
+    # systemd passes a key file outside the folder as a credential
     named += [key] if (key := key_of(made)) and not Path(key).is_absolute() else []
     found = {"vehicle.yaml": text}
     folder = vehicle.resolve().parent
-    gathered = Gathered()
+    gathered = ProblemCollector()
     for name in dict.fromkeys(named):
         path = Path(name)
         if path.is_absolute():
-            with gathered.of(str(vehicle)):
+            with gathered.collect(str(vehicle)):
                 seen = [(str(path), "a file that it names")]
-                install_files.check_seen(seen, "put it beside the vehicle file", str(vehicle))
+                install_files.check_visible(seen, "put it beside the vehicle file", str(vehicle))
             continue
         whole = os.path.normpath(folder / path)
         relative = os.path.relpath(whole, folder)
         if Path(whole).parent != folder and folder not in Path(whole).parents:
-            gathered.add(str(vehicle), f"it names {shown(name)}, outside its folder", "put it beside the vehicle file")
+            gathered.add(str(vehicle), f"it names {quote(name)}, outside its folder", "put it beside the vehicle file")
         elif relative in found or relative == "installed.json":
-            gathered.add(str(vehicle), f"it names {shown(name)}, a name that is taken", "give the file another one")
+            gathered.add(str(vehicle), f"it names {quote(name)}, a reserved name", "rename the file")
         else:
-            with gathered.of(whole):
+            with gathered.collect(whole):
                 found[relative] = read_regular(whole, LARGEST_FILE)
-    gathered.check()
+    gathered.raise_any()
     return found
 
 
 def key_of(made: CheckedVehicle) -> str:
-    """Return the key file that a vehicle file names, as it stands there; empty for none."""
+    """Return the key file as written in the vehicle file; empty for none."""
     import yaml
 
     commands = yaml.safe_load(made.path.read_bytes()).get("commands") or {}
     return str(commands.get("key_file") or "")
 
 
-def installed_key(made: CheckedVehicle) -> str:
-    """Return where the key file is once it is installed; empty for none."""
+def get_installed_key(made: CheckedVehicle) -> str:
+    """Return the path of the installed key file; empty for none."""
     key = key_of(made)
     return os.path.normpath(os.path.join(CONFIGURATION, key)) if key else ""
 
 
-def serial_of(given: Iterable[str] | None) -> dict[str, str]:
-    """Return the devices that --serial gave by driver. Raises typer.BadParameter, a usage error."""
+def parse_serial(given: Iterable[str] | None) -> dict[str, str]:
+    """Return the devices of --serial by driver. Raises typer.BadParameter, a usage error."""
     found = {}
     for each in given or ():
         name, sign, device = each.partition("=")
         if not (name and sign and device):
-            raise typer.BadParameter(f"{shown(each)} is not of the form NAME=ID", param_hint="--serial")
+            raise typer.BadParameter(f"{quote(each)} is not NAME=ID", param_hint="--serial")
         found[name] = device
     return found
 
 
-def templates() -> dict[str, str]:
-    """Return the units as they are in the package, or beside it in a source tree."""
-    folder = examples() / "systemd"
+def read_templates() -> dict[str, str]:
+    """Return the unit templates of the package or the source tree."""
+    folder = get_examples_folder() / "systemd"
     return {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.service"))}
 
 
-def _is_ours(found: Path, vehicle: Path, root: Path) -> bool:
-    """Return whether the vehicle file that is installed is as an earlier installation wrote it, or as the one given."""
+def _is_unmodified(found: Path, vehicle: Path, root: Path) -> bool:
+    """Return whether the installed vehicle file equals an earlier installation's, or the given one."""
     there = digest(found.read_bytes())
     return there in read_manifest(root).files.get(VEHICLE, ()) or there == digest(vehicle.read_bytes())
 
 
-def _units() -> list[str]:
-    return [f"{UNITS}/{name}" for name in templates()]
+def _list_unit_paths() -> list[str]:
+    return [f"{UNITS}/{name}" for name in read_templates()]

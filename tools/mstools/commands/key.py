@@ -1,4 +1,4 @@
-"""`modelserver key`: the secrets that commands are signed with."""
+"""`modelserver key`: the secret keys that sign commands."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
-from mstools.terminal.output import safe
+from mstools.terminal.output import escape
 
 command = typer.Typer(
-    help="""Make the key that commands to a vehicle are signed with.
+    help="""Create the key to sign commands to a vehicle with.
 
-    The vehicle file names its file (commands: {key_file: ...}), and so does who commands: --key FILE, or
-    $MODELSERVER_KEY_FILE. docs/network.md says how keys are handed out and changed.
+    The vehicle file names the key file (commands: {key_file: ...}); the commanding program gets it by --key FILE or
+    $MODELSERVER_KEY_FILE. docs/network.md explains how to distribute and change keys.
 
     Example: modelserver key new /etc/modelserver/commands.key
     """,
@@ -24,17 +24,17 @@ command = typer.Typer(
 
 @command.callback()
 def _group() -> None:
-    """Keep `new` a subcommand: another may come."""
+    """Keep `new` a subcommand."""
 
 
 @command.command("new")
-def new(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to make; none may be there.")],
-    name: Annotated[str, typer.Option("--name", metavar="TEXT", help="What to call the key.")] = "",
+def create(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to create; it must not exist.")],
+    name: Annotated[str, typer.Option("--name", metavar="TEXT", help="Name of the key.")] = "",
 ) -> None:
-    """Write a new key into a file that only its owner may read."""
-    from modelserver.keys import new_key, write_key
+    """Write a new key to a file that only its owner can read."""
+    from modelserver.signing.key_files import generate_key, write_key
 
-    key = new_key(name)
+    key = generate_key(name)
     write_key(file, key)
-    typer.echo(f"{safe(str(file))}: key {key.name}, for its owner's eyes alone")
+    typer.echo(f"{escape(str(file))}: key {key.name}, readable by its owner only")

@@ -1,4 +1,4 @@
-"""`modelserver mode`: which sources localization uses, told to the running daemon."""
+"""`modelserver mode`: switch the localization mode of the running daemon."""
 
 from __future__ import annotations
 
@@ -17,25 +17,26 @@ from modelserver.errors import (
     NoServerError,
     Problem,
     Severity,
-    nearest_names,
-    shown,
+    find_nearest_names,
+    quote,
 )
-from modelserver.keys import ENVIRONMENT
 from modelserver.messages import Health, Mode, NavigationState, PublishDecisions, SensorHeader, SwitchMode
+from modelserver.signing.key_files import KEY_FILE_VARIABLE
+from modelserver.wire.channels import SIGNED
 from modelserver.wire.provider import open_lcm, resolve_url
-from modelserver.wire.signed import SIGNED
-from mstools.commands.asking import KeyOption, UrlOption, handle_until
+from mstools.commands.pose_source import handle_until
+from mstools.terminal.options import KeyOption, UrlOption
 
 if TYPE_CHECKING:
     import lcm
 
 MODES = tuple(mode.name.lower() for mode in Mode)
 
-PATIENCE_S = 2.0
-"""How long the daemon is waited for, seconds."""
+TIMEOUT_S = 2.0
+"""Timeout for the daemon, seconds."""
 
 OPERATOR = "operator"
-"""The name under which wishes go out."""
+"""Source of the mode command."""
 
 
 def command(
@@ -44,81 +45,81 @@ def command(
     url: UrlOption = "",
     key: KeyOption = None,
 ) -> None:
-    """Tell the running daemon which sources its localization is to use from now on, and say what it does.
+    """Switch which sources the localization of the running daemon uses, and report the mode in force.
 
-    The wish goes out once, signed, for the channel that the vehicle file names (localization.mode_channel); the daemon
-    must have been started with the same. It is signed with the key of --key, else of $MODELSERVER_KEY_FILE, else of the
-    vehicle file (commands.key_file). Then LOCALIZATION_STATE and LOCALIZATION_DECISIONS are listened to for up to two
-    seconds: they tell which mode is in force. Exits 1 where nobody answers, or the mode stays another.
+    The command is sent once, signed, for the channel in the vehicle file (localization.mode_channel), with which the
+    daemon must have been started. The key is that of --key, else of $MODELSERVER_KEY_FILE, else of the vehicle file
+    (commands.key_file). LOCALIZATION_STATE and LOCALIZATION_DECISIONS confirm the mode within two seconds. Exit code 1
+    if no daemon answers, or the mode does not change.
 
     Example: modelserver mode no_gps -c config/husky/vehicle.yaml
     """
     wanted = parse_mode(mode)
-    from modelserver.client.signing import signer
-    from modelserver.config import load_config
+    from modelserver.client.commands import load_signer
+    from modelserver.config.vehicle_file import load_config
     from modelserver.wire.codec import encode
 
     vehicle = load_config(config)
     if not vehicle.localization.mode_channel:
-        why = "the vehicle file names no channel for wishes about the mode, so the daemon hears none"
-        fix = "write mode_channel: LOCALIZATION_MODE under localization, and start the daemon anew"
+        why = "no channel for mode commands is configured, so the daemon receives none"
+        fix = "write mode_channel: LOCALIZATION_MODE under localization, and restart the daemon"
         source = Location(str(config), element="localization.mode_channel")
         raise ConfigError([Problem(Severity.ERROR, why, source, fix)])
     prefix, state_hz = vehicle.lcm.channel_prefix, vehicle.publish.state_hz
     channel = f"{prefix}{vehicle.localization.mode_channel}"
-    given = str(key or "") or os.environ.get(ENVIRONMENT, "") or vehicle.commands.key_file
-    signing = signer(given, prefix, "modelserver")
+    given = str(key or "") or os.environ.get(KEY_FILE_VARIABLE, "") or vehicle.commands.key_file
+    signing = load_signer(given, prefix, "modelserver")
     if signing is None:
-        raise ModelServerError(f"the wish must be signed: name the daemon's key with --key or ${ENVIRONMENT}")
+        raise ModelServerError(f"the command must be signed; give the daemon's key with --key or ${KEY_FILE_VARIABLE}")
     provider = resolve_url(url or vehicle.lcm.url)
     bus = open_lcm(provider)
-    ear = ModeListener(bus, prefix, vehicle.localization.mode_channel)
+    listener = ModeListener(bus, prefix, vehicle.localization.mode_channel)
     if state_hz:
-        ear.listen(min(PATIENCE_S, 2.5 / state_hz), lambda: ear.mode is not None)
-    was = ear.mode
+        listener.listen(min(TIMEOUT_S, 2.5 / state_hz), lambda: listener.mode is not None)
+    was = listener.mode
     utime = time.time_ns() // 1000
-    ear.forget(utime)
-    wish = encode(SwitchMode(SensorHeader(utime, OPERATOR, host_utime=utime), wanted))
-    bus.publish(signing.channel, signing.sealed(vehicle.localization.mode_channel, wish))
-    told = f"told {channel}: {wanted.name.lower()}"
-    confirmed = ear.listen(PATIENCE_S, lambda: wanted in (ear.mode, ear.decided))
-    if not ear.heard:
+    listener.reset(utime)
+    command = encode(SwitchMode(SensorHeader(utime, OPERATOR, host_utime=utime), wanted))
+    bus.publish(signing.channel, signing.seal(vehicle.localization.mode_channel, command))
+    sent = f"sent {channel}: {wanted.name.lower()}"
+    confirmed = listener.listen(TIMEOUT_S, lambda: wanted in (listener.mode, listener.decided_mode))
+    if not listener.has_received:
         raise NoServerError(
-            f"{told}, but nobody answers on {provider}: is the daemon running, on this bus and with this "
+            f"{sent}, but no message was received on {provider}: is the daemon running, on this bus and with this "
             "vehicle file? (modelserver run -c FILE, --url)"
         )
-    now = ear.mode
-    if not confirmed and now is not None and not (wanted is Mode.RAW and ear.is_silent(state_hz)):
-        why = f" ({ear.refusal})" if ear.refusal else "; was it started with this vehicle file?"
-        raise ModelServerError(f"{told}, but the daemon stays in mode {now.name.lower()}{why}")
+    now = listener.mode
+    if not confirmed and now is not None and not (wanted is Mode.RAW and listener.is_silent(state_hz)):
+        why = f" ({listener.rejection})" if listener.rejection else "; was it started with this vehicle file?"
+        raise ModelServerError(f"{sent}, but the daemon stays in mode {now.name.lower()}{why}")
     if confirmed or (wanted is Mode.RAW and was is not None):
         before = f" (was {was.name.lower()})" if was is not None else ""
         typer.echo(f"now {wanted.name.lower()}{before}")
     elif not state_hz:
-        typer.echo(f"{told}; it cannot be confirmed: the vehicle file has publish.state_hz: 0")
+        typer.echo(f"{sent}; it cannot be confirmed: the vehicle file has publish.state_hz: 0")
     else:
-        typer.echo(f"{told}; not confirmed: LOCALIZATION_STATE is silent, as in raw mode and before the first samples")
+        typer.echo(f"{sent}; not confirmed: LOCALIZATION_STATE is silent, as in raw mode and before the first samples")
 
 
 class ModeListener:
-    """Hears what a daemon says of its mode: `mode` by its state, `decided` by its decisions, `heard` anything at all.
+    """Receive the mode of a daemon: `mode` from its state, `decided_mode` from its decisions since `since`.
 
-    `since`: wishes of before count for nothing. `refusal`: why a wish was refused, by the health report.
+    `has_received`: any message. `rejection`: why a command was rejected, from the health report.
     """
 
     def __init__(self, bus: lcm.LCM, prefix: str, mode_channel: str):
-        from modelserver.wire.channels import literal
+        from modelserver.wire.channels import to_subscription_pattern
 
-        self.heard = False
+        self.has_received = False
         self.mode: Mode | None = None
-        self.decided: Mode | None = None
-        self.refusal = ""
+        self.decided_mode: Mode | None = None
+        self.rejection = ""
         self.since = 0
-        # what the daemon counted of signed wishes that it did not obey; before this one, for later it is compared
+        # rejected commands that the daemon had counted before
         self._sources = (f"{prefix}{mode_channel}", f"{prefix}{SIGNED}")
         self._counts: dict[tuple[str, str], int] = {}
         self._bus = bus
-        self._state_at = 0.0
+        self._state_time = 0.0
         handlers = {
             "LOCALIZATION_STATE": self._on_state,
             "LOCALIZATION_DECISIONS": self._on_decisions,
@@ -126,75 +127,75 @@ class ModeListener:
             "POSE": self._on_pose,
         }
         for name, handler in handlers.items():
-            bus.subscribe(literal(f"{prefix}{name}"), handler)
+            bus.subscribe(to_subscription_pattern(f"{prefix}{name}"), handler)
 
-    def forget(self, since: int) -> None:
-        """Forget what was heard of the mode; from an instant on it counts."""
-        self.mode = self.decided = None
-        self.heard, self.since = False, since
+    def reset(self, since: int) -> None:
+        """Drop what was received; decisions count from `since` on."""
+        self.mode = self.decided_mode = None
+        self.has_received, self.since = False, since
 
     def listen(self, seconds: float, until: Callable[[], bool]) -> bool:
-        """Listen until something is so, for so long at most; return whether it is."""
+        """Listen for up to `seconds` until a condition holds; return whether it does."""
         return handle_until(self._bus, seconds, until)
 
     def is_silent(self, state_hz: float) -> bool:
-        """Return whether the last three reports of the state are missing: raw mode has none."""
-        return time.monotonic() - self._state_at > min(3.0 / state_hz, 0.5 * PATIENCE_S)
+        """Return whether the last three states are missing: raw mode publishes none."""
+        return time.monotonic() - self._state_time > min(3.0 / state_hz, 0.5 * TIMEOUT_S)
 
     def _on_state(self, _: str, data: bytes) -> None:
         from modelserver.wire.codec import decode
 
         state: NavigationState = decode("navigation_state_t", data)
-        self.heard, self.mode, self._state_at = True, state.mode, time.monotonic()
+        self.has_received, self.mode, self._state_time = True, state.mode, time.monotonic()
 
     def _on_decisions(self, _: str, data: bytes) -> None:
         from modelserver.wire.codec import decode
 
-        told: PublishDecisions = decode("decisions_t", data)
-        self.heard = True
-        for each in told.decisions:
+        published: PublishDecisions = decode("decisions_t", data)
+        self.has_received = True
+        for each in published.decisions:
             name = each.reason.removeprefix("mode ").upper()
-            if each.kind == "mode" and told.utime >= self.since > 0 and name in Mode.__members__:
-                self.decided = Mode[name]
+            if each.kind == "mode" and published.utime >= self.since > 0 and name in Mode.__members__:
+                self.decided_mode = Mode[name]
 
     def _on_health(self, _: str, data: bytes) -> None:
         from modelserver.wire.codec import decode
 
         health: Health = decode("health_t", data)
-        self.heard = True
-        self.refusal = next(
-            (why for source, why, _ in health.rejected if source == f"command:{OPERATOR}"), self.refusal
+        self.has_received = True
+        self.rejection = next(
+            (why for source, why, _ in health.rejected if source == f"command:{OPERATOR}"), self.rejection
         )
         counts = {(name, why): count for name, why, count in health.rejected if name in self._sources}
-        # where nothing was heard before the wish, what was refused earlier counts too: it is the likeliest cause
+        # without an earlier report, earlier rejections count too: they are the likeliest cause
         before, self._counts = self._counts, counts
         if self.since:
             for (name, why), count in counts.items():
                 if count > before.get((name, why), 0):
-                    self.refusal = f"{why}: {_WHY.get(why, 'see its log')}"
+                    self.rejection = f"{why}: {_REASONS.get(why, 'see its log')}"
             ahead = (health.utime - time.time_ns() // 1000) * 1e-6
-            if self.refusal.startswith("stale") and abs(ahead) > 1.0:
+            if self.rejection.startswith("stale") and abs(ahead) > 1.0:
                 side = "ahead of" if ahead > 0 else "behind"
-                self.refusal += f"; the daemon's clock is {abs(ahead):.1f} s {side} this one"
+                self.rejection += f"; the daemon's clock is {abs(ahead):.1f} s {side} this one"
 
     def _on_pose(self, _: str, data: bytes) -> None:
-        self.heard = True
+        self.has_received = True
 
 
-_WHY = {
-    "unknown_key": "the daemon has no key of that name; it was started with another key file",
-    "bad_signature": "the daemon's key of that name is another one, or its channel prefix",
-    "stale": "it is too old or of the future by the daemon's clock, or the daemon has just started",
-    "replayed": "the daemon took a newer one of this sender; was a clock set back?",
+_REASONS = {
+    "unknown_key": "the daemon has no key of that name: it was started with another key file",
+    "bad_signature": "the daemon has another key of that name, or another channel prefix",
+    "stale": "too old or in the future by the daemon's clock, or the daemon has just started",
+    "replayed": "the daemon has accepted a newer one of this sender; was a clock set back?",
 }
-"""Reasons that the daemon counts for signed messages, in words."""
+"""Descriptions of the daemon's reasons to reject a signed message."""
 
 
 def parse_mode(text: str) -> Mode:
-    """Return the mode of that name. Raises typer.BadParameter, a usage error, with the nearest for another name."""
+    """Return the mode of that name. Raises typer.BadParameter, a usage error, with the nearest name."""
     name = text.strip().replace("-", "_").upper()
     if name in Mode.__members__:
         return Mode[name]
-    near = nearest_names(name, MODES)
-    hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(MODES)}"
-    raise typer.BadParameter(f"{shown(text, 40)} is no mode; {hint}", param_hint="MODE")
+    near = find_nearest_names(name, MODES)
+    hint = f"did you mean {near[0]}?" if near else f"modes: {', '.join(MODES)}"
+    raise typer.BadParameter(f"{quote(text, 40)} is an unknown mode; {hint}", param_hint="MODE")

@@ -1,41 +1,221 @@
-"""`modelserver query`: where is one frame in another?"""
+"""`modelserver query`: the pose of one frame in another, with --explain its edges, with --motion its velocity."""
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
 
+import numpy as np
 import typer
 
-from modelserver.messages import Invalid, Policy, PoseAnswer, Quality, TimeQuery
-from mstools.commands.asking import (
-    AnswerSource,
-    JsonOption,
-    ModelOption,
-    PrefixOption,
-    TimeoutOption,
-    UrlOption,
-    answers,
-    log_answers,
-)
-from mstools.commands.explain import describe_edges, describe_motion, edges_as_data, explaining, motion_as_data
-from mstools.terminal.options import Variables
-from mstools.terminal.output import safe
+from modelserver.errors import ModelServerError
+from modelserver.messages import EdgeReport, Explanation, Invalid, MotionAnswer, Policy, PoseAnswer, Quality, TimeQuery
+from modelserver.transforms import so3
+from modelserver.transforms.pose import Pose
+from mstools.commands.pose_source import AnswerSource, open_answer_source, open_log_answers
+from mstools.terminal.options import JsonOption, ModelOption, PrefixOption, TimeoutOption, UrlOption, Variables
+from mstools.terminal.output import escape, format_table, replace_unencodable
+
+_EDGE_HEADER = ("kind", "name", "passed", "provenance", "age", "source", "coordinates", "position", "rotation")
+
+
+@runtime_checkable
+class ExplanationSource(Protocol):
+    """A source of explanations and motions."""
+
+    def explain(
+        self,
+        frame_of_interest: str,
+        frame_of_reference: str,
+        *,
+        at: int = 0,
+        policy: Policy = Policy.INTERPOLATED,
+        wait_ms: int = 0,
+    ) -> Explanation:
+        """Return the pose with the edges on its path."""
+        ...
+
+    def get_motion(
+        self,
+        frame_of_interest: str,
+        frame_of_reference: str,
+        *,
+        expressed_in: str = "",
+        at: int = 0,
+        policy: Policy = Policy.INTERPOLATED,
+        wait_ms: int = 0,
+    ) -> MotionAnswer:
+        """Return velocity and acceleration of one frame in another."""
+        ...
+
+
+def require_explanations(source: object) -> ExplanationSource:
+    """Return the source. Raises ModelServerError if it has poses only."""
+    if not isinstance(source, ExplanationSource):
+        raise ModelServerError("this source has poses only; query the daemon for --explain and --motion")
+    return source
+
+
+# --- explanation
+
+
+def describe_edges(explanation: Explanation) -> str:
+    """Format the edges of an explanation as a table, from the frame of reference on."""
+    transformation = explanation.answer.transformation
+    heading = escape(f"{transformation.frame_of_interest} in {transformation.frame_of_reference} rests on")
+    if not explanation.edges:
+        return f"{heading} nothing: both are the same frame"
+    rows = [
+        (
+            edge.kind,
+            edge.name,
+            _format_edge(edge),
+            edge.provenance.replace("_", " "),
+            "-" if math.isnan(edge.age) else f"{edge.age:.3f} s",
+            edge.source or "-",
+            ", ".join(format_coordinates(edge)) or "-",
+            _format_percent(edge.position_share),
+            _format_percent(edge.rotation_share),
+        )
+        for edge in explanation.edges
+    ]
+    total = ("sum", *[""] * 6, _format_sum(each.position_share for each in explanation.edges),
+             _format_sum(each.rotation_share for each in explanation.edges))  # fmt: skip
+    lines = [heading, format_table(_EDGE_HEADER, [*rows, total], numbers=(4, 7, 8))]
+    lines.append("  position and rotation: shares of the sum of the variances")
+    lines += [f"  {edge.name}: {edge.warning}" for edge in explanation.edges if edge.warning]
+    if any(math.isnan(edge.position_share) for edge in explanation.edges):
+        lines.append("  no share: no sigma is known; the shares of the others count it as exact")
+    return replace_unencodable("\n".join(lines))
+
+
+def _format_edge(edge: EdgeReport) -> str:
+    near, far = edge.ends if edge.forward else reversed(edge.ends)
+    return f"{near} → {far}{'' if edge.forward else ', inverse'}"
+
+
+def _format_percent(share: float) -> str:
+    return "-" if math.isnan(share) else f"{100.0 * share:.1f} %"
+
+
+def _format_sum(shares: Iterable[float]) -> str:
+    known = [share for share in shares if not math.isnan(share)]
+    return _format_percent(sum(known)) if known else "-"
+
+
+def format_coordinates(edge: EdgeReport) -> list[str]:
+    """Format a joint's coordinates in degrees and meters; its transform shows which of them are angles."""
+    values = edge.coordinates
+    if values == (0.0,):
+        return ["0"]
+    X = edge.pose if edge.forward else edge.pose.inverse()
+    match len(values):
+        case 1:
+            angles: tuple[bool, ...] = (X.xyz == (0.0, 0.0, 0.0),)
+        case 3:
+            x, y, z = values
+            angles = (
+                (True,) * 3
+                if X.is_close(Pose((0.0, 0.0, 0.0), so3.exponential((x, y, z))), 1e-9, 1e-9)
+                else (False, False, True)
+            )
+        case _:
+            angles = (False,) * 3 + (True,) * 3
+    return [
+        f"{math.degrees(value) + 0.0:.3f} deg" if angle else f"{value + 0.0:.4f} m"
+        for value, angle in zip(values, angles, strict=False)
+    ]
+
+
+def edges_as_data(explanation: Explanation) -> list[dict[str, Any]]:
+    """Return the edges as JSON data, in radians; unknown values are null."""
+    return [
+        {
+            "kind": edge.kind,
+            "name": edge.name,
+            "from": edge.ends[0],
+            "to": edge.ends[1],
+            "forward": edge.forward,
+            "position": list(edge.pose.xyz),
+            "quaternion": list(edge.pose.wxyz),
+            "provenance": edge.provenance,
+            "stamp": edge.stamp or None,
+            "age": _finite_or_none(edge.age),
+            "source": edge.source or None,
+            "coordinates": list(edge.coordinates),
+            "position_share": _finite_or_none(edge.position_share),
+            "rotation_share": _finite_or_none(edge.rotation_share),
+            "warning": edge.warning or None,
+        }
+        for edge in explanation.edges
+    ]
+
+
+# --- motion
+
+
+def describe_motion(motion: MotionAnswer) -> str:
+    """Format a motion in meters, degrees and seconds, along the axes of `expressed_in`."""
+    transformation = motion.pose.transformation
+    sigmas = _get_sigmas(motion)
+    rows = [
+        ("velocity", motion.velocity, 1.0, "m/s", sigmas[:3]),
+        ("turn rate", motion.angular_velocity, math.degrees(1.0), "deg/s", sigmas[3:]),
+        ("acceleration", motion.acceleration, 1.0, "m/s2", ()),
+        ("angular acceleration", motion.angular_acceleration, math.degrees(1.0), "deg/s2", ()),
+    ]
+    lines = [
+        escape(f"{transformation.frame_of_interest} moves in {transformation.frame_of_reference}, ")
+        + escape(f"along the axes of {motion.expressed_in}")
+    ]
+    for name, values, scale, unit, sigma in rows:
+        text = f"  {name:<21}{_format_vector(values, scale, unit)}"
+        lines.append(f"{text},  sigma {_format_vector(sigma, scale, '')}".rstrip() if sigma else text)
+    if not sigmas:
+        lines.append("  sigma                unknown")
+    return "\n".join(lines)
+
+
+def motion_as_data(motion: MotionAnswer) -> dict[str, Any]:
+    """Return a motion as JSON data in SI units; unknown values are null."""
+    return {
+        "expressed_in": motion.expressed_in,
+        "velocity": [_finite_or_none(value) for value in motion.velocity],
+        "angular_velocity": [_finite_or_none(value) for value in motion.angular_velocity],
+        "acceleration": [_finite_or_none(value) for value in motion.acceleration],
+        "angular_acceleration": [_finite_or_none(value) for value in motion.angular_acceleration],
+        "motion_covariance": None if motion.covariance is None else np.array(motion.covariance).reshape(6, 6).tolist(),
+    }
+
+
+def _get_sigmas(motion: MotionAnswer) -> tuple[float, ...]:
+    if motion.covariance is None:
+        return ()
+    return tuple(math.sqrt(max(motion.covariance[7 * n], 0.0)) for n in range(6))
+
+
+def _format_vector(values: Iterable[float], scale: float, unit: str) -> str:
+    known = list(values)
+    if any(map(math.isnan, known)):
+        return "unknown"
+    return "  ".join(f"{scale * value + 0.0:.4f}" for value in known) + f"  {unit}".rstrip()
+
 
 POLICIES = {policy.name.lower(): policy for policy in Policy}
 
 
 def command(
-    frame_of_interest: Annotated[str, typer.Argument(metavar="INTEREST", help="The frame that is looked for.")],
-    frame_of_reference: Annotated[str, typer.Argument(metavar="REFERENCE", help="The frame that it is told in.")],
+    frame_of_interest: Annotated[str, typer.Argument(metavar="INTEREST", help="Frame of interest.")],
+    frame_of_reference: Annotated[str, typer.Argument(metavar="REFERENCE", help="Frame of reference.")],
     model: ModelOption = None,
     settings: Variables = None,
     log: Annotated[
         Path | None,
-        typer.Option("--log", metavar="FILE", help="Ask this LCM log of the service instead of the daemon."),
+        typer.Option("--log", metavar="FILE", help="Query this LCM log of the service instead of the daemon."),
     ] = None,
     at: Annotated[
         str,
@@ -47,47 +227,40 @@ def command(
         ),
     ] = "",
     policy: Annotated[
-        str, typer.Option("--policy", help=f"What is accepted for an answer at a time: {', '.join(POLICIES)}.")
+        str, typer.Option("--policy", help=f"What is accepted at that time: {', '.join(POLICIES)}.")
     ] = "interpolated",
     wait_ms: Annotated[
         int, typer.Option("--wait-ms", min=0, max=60_000, help="Let the daemon wait for data that cover it.")
     ] = 0,
-    inverse: Annotated[bool, typer.Option("--inverse", help="Print the reverse relation.")] = False,
+    inverse: Annotated[bool, typer.Option("--inverse", help="Exchange the two frames.")] = False,
     matrix: Annotated[bool, typer.Option("--matrix", help="Print the 4x4 transform too.")] = False,
-    explain: Annotated[
-        bool, typer.Option("--explain", help="Print each edge that the answer rests on, then the answer.")
-    ] = False,
-    motion: Annotated[
-        bool, typer.Option("--motion", help="Print velocity, turn rate and how they change, then the pose.")
-    ] = False,
+    explain: Annotated[bool, typer.Option("--explain", help="Print each edge on the path, then the pose.")] = False,
+    motion: Annotated[bool, typer.Option("--motion", help="Print velocity and acceleration, then the pose.")] = False,
     expressed_in: Annotated[
-        str, typer.Option("--expressed-in", metavar="FRAME", help="Along whose axes --motion is told.")
+        str, typer.Option("--expressed-in", metavar="FRAME", help="Axes of the vectors of --motion.")
     ] = "",
     as_json: JsonOption = False,
     url: UrlOption = "",
     prefix: PrefixOption = "",
     timeout: TimeoutOption = 1.0,
 ) -> None:
-    """Where is one frame in another? Frames are named Body:Frame.
+    """Print the pose of one frame in another. Frames are named Body:Frame.
 
-    Asks the running daemon, with --model a geometry file, or with --log what a log tells: the geometry that the service
-    broadcast, its poses and the joints. World:UTM, World:ENU and Odom:Origin are known beside
-    the file's frames. Exit code 1 where there is no answer; a pose that is not valid is printed, says why, and
-    exits 0.
+    Queries the running daemon, with --model a geometry file, or with --log the geometry, poses and joints of a log.
+    World:UTM, World:ENU and Odom:Origin exist beside the frames of the geometry. Exit code 1 if there is no answer; a
+    pose that is not valid is printed with the reason, and exits 0.
 
-    --explain tells what the answer rests on: each frame, constraint and joint on the way, how it was come by, how old
-    it is, who told it, and its share of what is unsure. --motion tells how the one frame moves in the other.
+    --explain prints each frame, constraint and joint on the path with its provenance, age, source, and share of the
+    variance. --motion prints velocity and acceleration, linear and angular.
 
     \b
     Example:
       modelserver query Digiclops:ImagePlane FrontNoddingSICK:Origin --model config/raptor/geometry.xml
     """
     if expressed_in and not motion:
-        raise typer.BadParameter(
-            "it says along whose axes --motion is told; give that too", param_hint="--expressed-in"
-        )
+        raise typer.BadParameter("needs --motion, whose axes it sets", param_hint="--expressed-in")
     if explain and motion:
-        raise typer.BadParameter("--explain and --motion are two questions; ask one after the other")
+        raise typer.BadParameter("--explain and --motion exclude each other; run one after the other")
     if policy not in POLICIES:
         raise typer.BadParameter(f"{policy!r} is not one of {', '.join(POLICIES)}", param_hint="--policy")
     if inverse:
@@ -95,18 +268,18 @@ def command(
     source: AnswerSource
     utime = None
     if log is not None:
-        recorded = source = log_answers(log, model, settings, prefix)
-        utime = recorded.time(at)
+        recorded = source = open_log_answers(log, model, settings, prefix)
+        utime = recorded.parse_time(at)
     else:
-        source = answers(model, settings, url, prefix, timeout)
-    utime = _utime(at) if utime is None else utime
+        source = open_answer_source(model, settings, url, prefix, timeout)
+    utime = _parse_time(at) if utime is None else utime
     if log is None:
         _check_unit(utime)
     if explain or motion:
         when = TimeQuery(utime, POLICIES[policy], wait_ms)
         ends = (frame_of_interest, frame_of_reference)
-        told = _explained(source, *ends, when) if explain else _moved(source, *ends, expressed_in, when)
-        typer.echo(json.dumps(told.data, indent=2) if as_json else f"{told.words}\n\n{describe(told.answer, matrix)}")
+        found = _query_explanation(source, *ends, when) if explain else _query_motion(source, *ends, expressed_in, when)
+        typer.echo(json.dumps(found.data, indent=2) if as_json else f"{found.text}\n\n{describe(found.answer, matrix)}")
         return
     answer = source.get_pose(
         frame_of_interest,
@@ -118,39 +291,41 @@ def command(
     typer.echo(json.dumps(as_dict(answer), indent=2) if as_json else describe(answer, matrix))
 
 
-class _Told(NamedTuple):
-    """An answer with what was asked beyond it, in words and for scripts."""
+class _DetailedAnswer(NamedTuple):
+    """An answer with its explanation or motion, as text and as JSON data."""
 
     answer: PoseAnswer
-    words: str
+    text: str
     data: dict[str, Any]
 
 
-def _explained(source: object, interest: str, reference: str, time: TimeQuery) -> _Told:
-    found = explaining(source).explain(interest, reference, at=time.at, policy=time.policy, wait_ms=time.wait_ms)
+def _query_explanation(source: object, interest: str, reference: str, time: TimeQuery) -> _DetailedAnswer:
+    found = require_explanations(source).explain(
+        interest, reference, at=time.at, policy=time.policy, wait_ms=time.wait_ms
+    )
     data = as_dict(found.answer) | {"edges": edges_as_data(found)}
-    return _Told(found.answer, describe_edges(found), data)
+    return _DetailedAnswer(found.answer, describe_edges(found), data)
 
 
-def _moved(source: object, interest: str, reference: str, axes: str, time: TimeQuery) -> _Told:
-    found = explaining(source).get_motion(
+def _query_motion(source: object, interest: str, reference: str, axes: str, time: TimeQuery) -> _DetailedAnswer:
+    found = require_explanations(source).get_motion(
         interest, reference, expressed_in=axes, at=time.at, policy=time.policy, wait_ms=time.wait_ms
     )
-    return _Told(found.pose, describe_motion(found), as_dict(found.pose) | motion_as_data(found))
+    return _DetailedAnswer(found.pose, describe_motion(found), as_dict(found.pose) | motion_as_data(found))
 
 
-_SECONDS = (1_000_000_000, 10_000_000_000)
-"""What seconds since 1970 are in this age; as microseconds that is the first three hours of 1970."""
+_SECONDS_RANGE = (1_000_000_000, 10_000_000_000)
+"""Seconds since 1970 of our time; as microseconds they are the first three hours of 1970."""
 
 
 def _check_unit(utime: int) -> None:
-    if _SECONDS[0] < utime < _SECONDS[1]:
+    if _SECONDS_RANGE[0] < utime < _SECONDS_RANGE[1]:
         raise typer.BadParameter(
             f"{utime} looks like seconds since 1970; times are microseconds: {utime}000000", param_hint="--at"
         )
 
 
-def _utime(text: str) -> int:
+def _parse_time(text: str) -> int:
     if not text:
         return 0
     if text.isascii() and text.isdigit():
@@ -167,22 +342,22 @@ def _utime(text: str) -> int:
 
 
 def describe(answer: PoseAnswer, matrix: bool = False) -> str:
-    """Return an answer for people to read."""
+    """Format an answer."""
     transformation = answer.transformation
     x, y, z = transformation.pose.xyz
     roll, pitch, yaw = (math.degrees(angle) + 0.0 for angle in transformation.rpy)
     quaternion = " ".join(f"{value:.6f}" for value in transformation.pose.wxyz)
     lines = [
-        safe(f"{transformation.frame_of_interest} in {transformation.frame_of_reference}"),
+        escape(f"{transformation.frame_of_interest} in {transformation.frame_of_reference}"),
         f"  position        {x + 0.0:.4f}  {y + 0.0:.4f}  {z + 0.0:.4f}  m",
         f"  roll pitch yaw  {roll:.3f}  {pitch:.3f}  {yaw:.3f}  deg",
         f"  quaternion      {quaternion}  (w x y z)",
     ]
     if transformation.covariance is not None:
         variances = [transformation.covariance[n, n] for n in range(6)]
-        metres = "  ".join(f"{math.sqrt(value):.4f}" for value in variances[:3])
+        meters = "  ".join(f"{math.sqrt(value):.4f}" for value in variances[:3])
         degrees = "  ".join(f"{math.degrees(math.sqrt(value)):.3f}" for value in variances[3:])
-        lines.append(f"  sigma           {metres}  m,  {degrees}  deg")
+        lines.append(f"  sigma           {meters}  m,  {degrees}  deg")
     if matrix:
         lines += ["  transform", *("    " + "  ".join(f"{v: .6f}" for v in row) for row in transformation.matrix)]
     if transformation.utime:
@@ -197,19 +372,19 @@ def describe(answer: PoseAnswer, matrix: bool = False) -> str:
                 f"  UTM             {easting:.3f} E  {northing:.3f} N  {height:.3f} up  zone {origin.zone}{half}"
             )
         lines.append(f"  epoch           {transformation.pose_epoch}, origin {origin.origin_id:016x}")
-    if not math.isnan(answer.horizontal_bound):
-        bound = f"{answer.horizontal_bound:.2f} m, heading {math.degrees(answer.heading_bound):.2f} deg"
-        lines.append(f"  bounds          {bound}")
+    if not math.isnan(answer.horizontal_protection_level):
+        heading = math.degrees(answer.heading_protection_level)
+        lines.append(f"  protection      {answer.horizontal_protection_level:.2f} m, heading {heading:.2f} deg")
     if answer.quality:
         flags = ", ".join(flag.name or "" for flag in Quality if flag in answer.quality)
         lines.append(f"  flags           {flags}: {answer.quality.explain()}")
-    if not transformation.valid:
+    if not transformation.is_valid:
         lines.append(f"  NOT VALID       {Invalid(transformation.invalid_reasons).explain()}")
     return "\n".join(lines)
 
 
 def as_dict(answer: PoseAnswer) -> dict[str, Any]:
-    """Return an answer for scripts to read; what is not known is null."""
+    """Return an answer as JSON data; unknown values are null."""
     transformation = answer.transformation
     covariance = transformation.covariance
     origin = answer.origin
@@ -222,18 +397,18 @@ def as_dict(answer: PoseAnswer) -> dict[str, Any]:
         "rpy": transformation.rpy.tolist(),
         "matrix": [list(row) for row in transformation.pose.matrix_rows()],
         "covariance": None if covariance is None else covariance.tolist(),
-        "valid": transformation.valid,
+        "valid": transformation.is_valid,
         "invalid_reasons": [flag.name for flag in Invalid if flag & transformation.invalid_reasons],
         "flags": [flag.name for flag in Quality if flag in answer.quality],
         "initial_utm": None if origin is None else list(origin.initial_utm),
         "utm_zone": None if origin is None else f"{origin.zone}{'N' if origin.north else 'S'}",
         "origin_id": f"{transformation.origin_id:016x}" if transformation.origin_id else None,
         "pose_epoch": transformation.pose_epoch,
-        "horizontal_bound": _number(answer.horizontal_bound),
-        "heading_bound": _number(answer.heading_bound),
+        "horizontal_protection_level": _finite_or_none(answer.horizontal_protection_level),
+        "heading_protection_level": _finite_or_none(answer.heading_protection_level),
         "model_revision": transformation.model_revision,
     }
 
 
-def _number(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""`modelserver replay --verify`: a journal is run again, and all that was said is compared."""
+"""`modelserver replay --verify`: replay a journal, and compare all published messages bit for bit."""
 
 from __future__ import annotations
 
@@ -10,46 +10,46 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from mstools.terminal.output import counted, safe
-from mstools.terminal.progress import progress
+from mstools.terminal.output import escape, format_count
+from mstools.terminal.progress import show_progress
 
 if TYPE_CHECKING:
-    from modelserver.service.journal.verify import Difference, Verified
+    from modelserver.server.journal.verify import Difference, VerificationReport
 
-MOST_FIELDS = 12
-"""Fields of a message that are printed where they differ."""
+MAX_FIELDS = 12
+"""Printed differing fields of a message."""
 
-MOST_REMARKS = 20
+MAX_FINDINGS = 20
 
 
-def verified(journal: Path, as_json: bool, key: Path | None = None) -> None:
-    """Verify a journal and print what was found; the exit code is the `VerificationResult`.
+def run_verification(journal: Path, as_json: bool, key: Path | None = None) -> None:
+    """Verify a journal and print the result; the exit code is the `VerificationResult`.
 
-    `key`: the vehicle's key file. Without one nobody asks for proof that the journal is authentic, and what is
-    reproduced bit for bit ends with 0.
+    `key`: the vehicle's key file. Without one authenticity is not verified, and a journal that is reproduced bit for
+    bit exits with 0.
     """
-    # as the daemon does: the sums of the linear algebra come in another order with more threads
+    # as in the daemon: with more threads BLAS sums in another order
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from modelserver.keys import read_keys
-    from modelserver.service.journal.files import files_of
-    from modelserver.service.journal.verify import VerificationResult, verify
+    from modelserver.server.journal.segments import files_of
+    from modelserver.server.journal.verify import VerificationResult, verify
+    from modelserver.signing.key_files import read_keys
 
     keys = () if key is None else read_keys(key)
     files = files_of(journal)
-    with progress(f"verifying {journal.name}", sum(path.stat().st_size for path in files)) as show:
+    with show_progress(f"verifying {journal.name}", sum(path.stat().st_size for path in files)) as show:
         found = verify(files, show, keys, journal if journal.is_dir() else None)
     if as_json:
         typer.echo(json.dumps(_as_json(found)))
     else:
-        for line in lines(found, bool(keys)):
-            typer.echo(safe(line))
-        for remark in found.remarks[:MOST_REMARKS]:
-            typer.echo(safe(f"modelserver: {remark}"), err=True)
-        if len(found.remarks) > MOST_REMARKS:
-            typer.echo(f"modelserver: {len(found.remarks) - MOST_REMARKS} remarks more (--json has all)", err=True)
-        if found.other:
-            typer.echo(safe(f"modelserver: bits may differ: {'; '.join(found.other)}"), err=True)
+        for line in format_result(found, bool(keys)):
+            typer.echo(escape(line))
+        for finding in found.findings[:MAX_FINDINGS]:
+            typer.echo(escape(f"modelserver: {finding}"), err=True)
+        if len(found.findings) > MAX_FINDINGS:
+            typer.echo(f"modelserver: {len(found.findings) - MAX_FINDINGS} more findings (--json has all)", err=True)
+        if found.environment_differences:
+            typer.echo(escape(f"modelserver: bits may differ: {'; '.join(found.environment_differences)}"), err=True)
     is_done = found.result is VerificationResult.AUTHENTIC or (
         found.result is VerificationResult.REPRODUCED and not keys
     )
@@ -57,117 +57,124 @@ def verified(journal: Path, as_json: bool, key: Path | None = None) -> None:
         raise typer.Exit(found.result)
 
 
-def lines(found: Verified, keyed: bool = False) -> list[str]:
-    """Return what was found, in words; `keyed`: whether it was verified with a key."""
-    from modelserver.service.journal.comparison import TOLERANCE
+def format_result(found: VerificationReport, keyed: bool = False) -> list[str]:
+    """Format the result; `keyed`: whether it was verified with a key."""
+    from modelserver.server.journal.comparison import TOLERANCE
 
     span = (found.last_utime - found.first_utime) * 1e-6
-    where = f"{counted(found.segments, 'segment')} of {counted(found.runs, 'run')}, {found.seconds:.1f} of {span:.1f} s"
-    text = [f"{where} ({_when(found.first_utime)} to {_when(found.last_utime)}), {found.handled} records run again"]
-    exact, close = sum(found.said.values()), sum(found.close.values())
+    text = [
+        f"{format_count(found.segments, 'segment')} of {format_count(found.runs, 'run')}, {found.seconds:.1f} of "
+        f"{span:.1f} s ({_format_time(found.first_utime)} to {_format_time(found.last_utime)}), {found.handled} "
+        "records replayed"
+    ]
+    exact, close = sum(found.reproduced.values()), sum(found.within_tolerance.values())
     if exact:
-        text.append(f"{found.poses} poses and {exact - found.poses} other messages are reproduced bit for bit:")
-        text += [f"  {name:24} {count:9}" for name, count in sorted(found.said.items())]
+        text.append(
+            f"{found.reproduced_poses} poses and {exact - found.reproduced_poses} other messages are reproduced bit "
+            "for bit:"
+        )
+        text += [f"  {name:24} {count:9}" for name, count in sorted(found.reproduced.items())]
     if close:
-        text.append(f"{counted(close, 'message')} are the same to within {TOLERANCE:g} m and rad: {_largest(found)}:")
-        text += [f"  {name:24} {count:9}" for name, count in sorted(found.close.items())]
+        text.append(
+            f"{format_count(close, 'message')} are the same within {TOLERANCE:g} m and rad: {_format_largest(found)}:"
+        )
+        text += [f"  {name:24} {count:9}" for name, count in sorted(found.within_tolerance.items())]
     if not exact and not close:
-        text.append("nothing is reproduced: nothing in it was sent, or it is not known what to begin from")
+        text.append("nothing is reproduced: it has no sent messages, or no state to start from")
     if found.skipped:
         text.append(
-            f"not verified: {counted(sum(found.skipped.values()), 'message')}, for what the service knew then is not "
-            "in the journal"
+            f"not verified: {format_count(sum(found.skipped.values()), 'message')}, which depend on a state before the "
+            "journal"
         )
-    if found.old:
-        text.append(
-            f"not verified: {found.old} replies about the past, from before the first segment that is still held"
-        )
+    if found.unverifiable:
+        text.append(f"not verified: {found.unverifiable} replies about times before the first remaining segment")
     if found.difference is not None:
-        text += _difference(found.difference)
-    text.append(_verdict(found, keyed))
+        text += _format_difference(found.difference)
+    text.append(_format_verdict(found, keyed))
     return text
 
 
-def _largest(found: Verified) -> str:
-    off, (meters, radians) = found.largest, found.largest_at
+def _format_largest(found: VerificationReport) -> str:
+    off, (meters, radians) = found.max_deviation, found.max_deviation_channels
     return (
         f"largest difference {off.meters:.2g} m{f' in {meters}' if meters else ''}, "
         f"{off.radians:.2g} rad{f' in {radians}' if radians else ''}, {off.share:.2g} of any other number"
     )
 
 
-def _verdict(found: Verified, keyed: bool) -> str:
-    if not found.proved:
-        return "NOT PROVED: what is wrong is named here"
-    words = "reproduced, but not all of it bit for bit" if found.close else "reproduced bit for bit"
-    if found.authentic:
+def _format_verdict(found: VerificationReport, keyed: bool) -> str:
+    if not found.is_reproduced:
+        return "NOT PROVED: see the problems above"
+    words = "reproduced, but not all of it bit for bit" if found.within_tolerance else "reproduced bit for bit"
+    if found.is_authentic:
         return f"authentic: {words}, sealed with the vehicle's key"
     if not keyed:
         return f"{words}; not proved authentic (--key FILE checks the seals, where the vehicle has a key file)"
     why = "segments may be missing at the end"
     if found.unsealed:
-        why = f"{counted(found.unsealed, 'segment')} of {found.segments} not closed, or not sealed with a key"
+        why = f"{format_count(found.unsealed, 'segment')} of {found.segments} not closed, or not sealed with a key"
     return f"{words}; not proved authentic: {why}"
 
 
-def _when(utime: int) -> str:
+def _format_time(utime: int) -> str:
     return datetime.fromtimestamp(utime * 1e-6, UTC).strftime("%Y-%m-%d %H:%M:%S") if utime else "-"
 
 
-def _difference(first: Difference) -> list[str]:
-    place = f"{first.segment} at byte {first.at}, utime {first.utime} ({_when(first.utime)})"
-    if first.now is None:
-        return [f"NOT REPRODUCED: a message on {first.channel} was said, and is not said now: {place}"]
-    if first.was is None:
-        return [f"NOT REPRODUCED: a message on {first.channel} is said now, and was not then: {place}"]
-    told = [f"NOT REPRODUCED: {first.channel} differs: {place}"]
-    fields = differing(first.was, first.now)
-    told += [f"  {name}: was {was}, is {now}" for name, was, now in fields[:MOST_FIELDS]]
-    if len(fields) > MOST_FIELDS:
-        told.append(f"  and {len(fields) - MOST_FIELDS} fields more")
-    return told
+def _format_difference(first: Difference) -> list[str]:
+    place = f"{first.segment} at byte {first.at}, utime {first.utime} ({_format_time(first.utime)})"
+    if first.replayed is None:
+        return [f"NOT REPRODUCED: a message on {first.channel} was published, and is not published now: {place}"]
+    if first.recorded is None:
+        return [f"NOT REPRODUCED: a message on {first.channel} is published now, and was not published then: {place}"]
+    text = [f"NOT REPRODUCED: {first.channel} differs: {place}"]
+    fields = find_differences(first.recorded, first.replayed)
+    text += [f"  {name}: was {was}, is {now}" for name, was, now in fields[:MAX_FIELDS]]
+    if len(fields) > MAX_FIELDS:
+        text.append(f"  and {len(fields) - MAX_FIELDS} more fields")
+    return text
 
 
-def differing(was: bytes, now: bytes) -> list[tuple[str, str, str]]:
-    """Return the fields of two messages that differ: name, and both values. Where one cannot be read, its length.
+def find_differences(was: bytes, now: bytes) -> list[tuple[str, str, str]]:
+    """Return name and both values of the fields that differ; for a message that cannot be decoded its length."""
+    from modelserver.server.journal.comparison import diff_messages
 
-    Numbers are shown with all digits that tell them apart.
-    """
-    from modelserver.service.journal.comparison import changes
-
-    found = changes(was, now)
+    found = diff_messages(was, now)
     if found is None:
         return [("type or content", f"{len(was)} bytes {was[:12].hex()}", f"{len(now)} bytes {now[:12].hex()}")]
-    return [(each.name, _shown(each.was), _shown(each.now)) for each in found] or [
+    return [(each.name, _format_value(each.recorded), _format_value(each.replayed)) for each in found] or [
         ("bits", "nan or zero", "another nan or zero")
     ]
 
 
-def _shown(value: Any) -> str:
-    return f"{len(value)} of them" if isinstance(value, (list, tuple)) else repr(value)
+def _format_value(value: Any) -> str:
+    return f"{len(value)} items" if isinstance(value, (list, tuple)) else repr(value)
 
 
-def _as_json(found: Verified) -> dict[str, Any]:
+def _as_json(found: VerificationReport) -> dict[str, Any]:
     first = found.difference
     return {
         "result": found.result.name.lower(),
-        "proved": found.proved,
-        "authentic": found.authentic,
+        "proved": found.is_reproduced,
+        "authentic": found.is_authentic,
         "genuine_segments": found.genuine,
         "segments": found.segments,
         "runs": found.runs,
         "seconds": found.seconds,
         "span": (found.last_utime - found.first_utime) * 1e-6,
         "records": found.handled,
-        "poses": found.poses,
-        "said": dict(sorted(found.said.items())),
-        "close": dict(sorted(found.close.items())),
-        "largest": {"meters": found.largest.meters, "radians": found.largest.radians, "share": found.largest.share},
+        "poses": found.reproduced_poses,
+        "exact": dict(sorted(found.reproduced.items())),
+        "close": dict(sorted(found.within_tolerance.items())),
+        "largest": {
+            "meters": found.max_deviation.meters,
+            "radians": found.max_deviation.radians,
+            "share": found.max_deviation.share,
+        },
         "skipped": sum(found.skipped.values()),
-        "old_replies": found.old,
+        "old_replies": found.unverifiable,
         "lost": found.lost,
-        "remarks": [{"segment": str(e.segment), "text": e.text, "damage": e.damage} for e in found.remarks],
-        "other": found.other,
+        "findings": [{"segment": str(e.segment), "text": e.text, "damage": e.is_damage} for e in found.findings],
+        "other": found.environment_differences,
         "difference": None
         if first is None
         else {
@@ -176,7 +183,10 @@ def _as_json(found: Verified) -> dict[str, Any]:
             "utime": first.utime,
             "channel": first.channel,
             "fields": []
-            if first.was is None or first.now is None
-            else [{"field": name, "was": was, "is": now} for name, was, now in differing(first.was, first.now)],
+            if first.recorded is None or first.replayed is None
+            else [
+                {"field": name, "was": was, "is": now}
+                for name, was, now in find_differences(first.recorded, first.replayed)
+            ],
         },
     }

@@ -1,4 +1,4 @@
-"""`modelserver run`: the daemon."""
+"""`modelserver run`: the daemon of the service."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Annotated, TypeAlias
 
 import typer
 
-from modelserver.service.log_format import FORMATS, set_up
-from mstools.commands.asking import UrlOption
+from modelserver.server.log import FORMATS, set_up_logging
+from mstools.terminal.options import UrlOption
 
 LEVELS = ("debug", "info", "warning", "error")
 
@@ -27,38 +27,39 @@ def command(
 ) -> None:
     """Run the service for a vehicle file, until SIGTERM or Ctrl-C.
 
-    Loads the geometry, listens to the sensors, broadcasts POSE and answers requests. Refuses to start where the
-    vehicle file or the geometry is wrong, and says everything that is; under a service manager, which would start it
-    anew at once, it ends only when one of the files has changed, or after 30 s. Logs go to stderr. SIGHUP has it read
-    the geometry file anew: all of it is used, or, where it is wrong, nothing changes and the log says why.
+    Loads the geometry, subscribes to the sensors, publishes POSE and answers requests. Does not start with a wrong
+    vehicle file or geometry, and reports all problems; under a service manager, which would restart it at once, it then
+    exits only when one of the files has changed, or after 30 s. Logs go to stderr. SIGHUP reloads the geometry file:
+    the whole file is used, or, if it is wrong, nothing changes and the log has the reason.
 
     Example: modelserver run -c config/raptor/vehicle.yaml
     """
-    check_log(log_level, log_format)
-    # one thread serves; idle BLAS threads would only disturb its timing
+    check_log_options(log_level, log_format)
+    # the service has one thread; idle BLAS threads would disturb its timing
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from modelserver.config import load_config
-    from modelserver.service import daemon
-    from modelserver.service.supervision.notify import Notifier
-    from mstools.deployment.refusal import Start
+    from modelserver.config.vehicle_file import load_config
+    from modelserver.server import daemon
+    from modelserver.server.supervision.systemd import Notifier
+    from modelserver.server.vehicle import load_vehicle
+    from mstools.deployment.service_start import ServiceStart
 
-    set_up(log_level, log_format)
-    notifier = Notifier.of_environment()
-    notifier.starting(f"reading {config}")
-    start = Start(config, notifier)
-    with start.patient():
+    set_up_logging(log_level, log_format)
+    notifier = Notifier.from_environment()
+    notifier.notify_starting(f"reading {config}")
+    start = ServiceStart(config, notifier)
+    with start.wait_on_error():
         settings = load_config(config)
-        start.needs(settings.geometry, settings.commands.key_file)
-        vehicle = daemon.load_vehicle(settings, str(config))
-        vehicle.gate(0, str(config))
+        start.add_files(settings.geometry, settings.commands.key_file)
+        vehicle = load_vehicle(settings, str(config))
+        vehicle.make_command_verifier(0, str(config))
     for problem in vehicle.model.problems:
         logging.getLogger("modelserver").warning("%s", problem)
     daemon.run(vehicle, url, str(config), notifier)
 
 
-def check_log(level: str, form: str) -> None:
-    """Raise typer.BadParameter, a usage error, for a level or a form of log that there is not."""
-    for option, given, known in (("--log-level", level, LEVELS), ("--log-format", form, FORMATS)):
+def check_log_options(level: str, log_format: str) -> None:
+    """Raise typer.BadParameter, a usage error, for an unknown level or format of the log."""
+    for option, given, known in (("--log-level", level, LEVELS), ("--log-format", log_format, FORMATS)):
         if given not in known:
             raise typer.BadParameter(f"{given!r} is not one of {', '.join(known)}", param_hint=option)

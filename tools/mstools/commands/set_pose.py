@@ -14,13 +14,14 @@ import typer
 from modelserver.errors import ForbiddenError, ModelServerError, NoServerError, RejectedError, WireError
 from modelserver.geometry import names
 from modelserver.messages import Decision, Invalid, PoseAnswer, PublishDecisions, Verdict
-from modelserver.spatial import so3
-from modelserver.spatial.pose import Pose
-from modelserver.spatial.so3 import Quaternion, Vector3
-from modelserver.spatial.transformation import Transformation
+from modelserver.transforms import so3
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Quaternion, Vector3
+from modelserver.transforms.transformation import Transformation
 from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.commands.asking import JsonOption, KeyOption, PrefixOption, TimeoutOption, UrlOption, handle_until
-from mstools.terminal.output import safe
+from mstools.commands.pose_source import handle_until
+from mstools.terminal.options import JsonOption, KeyOption, PrefixOption, TimeoutOption, UrlOption
+from mstools.terminal.output import escape
 
 if TYPE_CHECKING:
     import lcm
@@ -30,8 +31,8 @@ if TYPE_CHECKING:
 CONFIRM_S = 4.0
 """How long to wait for the decision, seconds: it is final one filter horizon, about a second, after the request."""
 
-FARTHEST_M = 200_000.0
-"""A position farther from the origin than this, meters, is a slip: another UTM zone, or two numbers exchanged."""
+MAX_DISTANCE_M = 200_000.0
+"""A position farther from the origin than this, meters, is an input error: another UTM zone, or exchanged numbers."""
 
 OPERATOR = "operator"
 """The source under which the ledger lists a pose that was set."""
@@ -41,7 +42,7 @@ PROGRAM = "modelserver"
 Triple = tuple[float, float, float]
 
 
-class Target(NamedTuple):
+class PoseTarget(NamedTuple):
     """The pose to set, as the command line states it; exactly one position and one orientation is not None.
 
     `utm`: grid easting, grid northing, ellipsoidal height, m, absolute. `xyz`: m from the origin. `geodetic`: latitude
@@ -122,7 +123,7 @@ def command(
     from modelserver.earth.geodesy import Geodesy
 
     bus = open_lcm(resolve_url(url))
-    listener = Listener(bus, prefix)
+    listener = SetPoseListener(bus, prefix)
     if not listener.wait(timeout, lambda: listener.pose is not None):
         raise NoServerError(
             f"no {prefix}POSE within {timeout:g} s on {resolve_url(url)}, so the base frame and the origin are not "
@@ -144,16 +145,16 @@ def command(
             accepted = platform.set_state_vector(request)
         except (ForbiddenError, RejectedError) as error:
             raise ModelServerError(f"the pose was not set: {error}") from None
-    listener.wait(CONFIRM_S, lambda: listener.decision(accepted.header.utime) is not None)
-    decision = listener.decision(accepted.header.utime)
+    listener.wait(CONFIRM_S, lambda: listener.get_decision(accepted.header.utime) is not None)
+    decision = listener.get_decision(accepted.header.utime)
     listener.pose = None
     listener.wait(timeout, lambda: listener.pose is not None)
     result = SetPoseResult(request, geodesy, (sigma, sigma_deg), decision, listener.has_decisions, listener.pose)
     typer.echo(json.dumps(as_data(result), indent=2) if as_json else describe(result))
     if decision is not None and decision.verdict is Verdict.REJECTED:
         raise ModelServerError(
-            f"localization rejected the pose: {safe(decision.reason or 'it contradicts what is known')}; if you are "
-            "sure of it, give the sigmas that it deserves (--sigma, --sigma-deg) and check the axes and units"
+            f"localization rejected the pose: {escape(decision.reason or 'it contradicts the estimate')}; if the "
+            "pose is right, check axes and units, and give larger sigmas (--sigma, --sigma-deg)"
         )
 
 
@@ -177,7 +178,7 @@ def parse_target(
     heading: float | None,
     rpy: Triple | None,
     quaternion: Quaternion | None,
-) -> Target:
+) -> PoseTarget:
     """Return the pose that the options state. Raises typer.BadParameter where they state none, two or no numbers."""
     positions = {"--utm": utm, "--xyz": xyz, "--latlon": latlon}
     orientations = {"--yaw": yaw, "--heading": heading, "--rpy": rpy, "--quaternion": quaternion}
@@ -194,7 +195,7 @@ def parse_target(
             raise typer.BadParameter("expected finite numbers", param_hint=name)
     if quaternion is not None and not any(quaternion):
         raise typer.BadParameter("a quaternion of zeros has no direction", param_hint="--quaternion")
-    return Target(
+    return PoseTarget(
         utm,
         xyz,
         None if latlon is None else (*latlon, height),
@@ -216,7 +217,7 @@ def to_covariance(sigma: float, sigma_deg: float) -> np.ndarray[Any, np.dtype[np
     return np.diag([sigma**2] * 3 + [math.radians(sigma_deg) ** 2] * 3)
 
 
-def to_pose(target: Target, geodesy: Geodesy, current: Pose) -> Pose:
+def to_pose(target: PoseTarget, geodesy: Geodesy, current: Pose) -> Pose:
     """Return the pose in World:UTM, in meters from the origin, that a target states.
 
     `current` is the pose in force: its height, roll and pitch stay where the target has none. Raises GeodesyError for a
@@ -227,20 +228,20 @@ def to_pose(target: Target, geodesy: Geodesy, current: Pose) -> Pose:
     if target.geodetic is not None:
         latitude, longitude, height = target.geodetic
         here = up + current.xyz[2] if height is None else height
-        position = geodesy.relative(geodesy.utm_from_geodetic(latitude, longitude, here))
+        position = geodesy.to_relative_utm(geodesy.utm_from_geodetic(latitude, longitude, here))
     else:
-        position = target.xyz if target.xyz is not None else geodesy.relative(target.utm or (0.0, 0.0, 0.0))
+        position = target.xyz if target.xyz is not None else geodesy.to_relative_utm(target.utm or (0.0, 0.0, 0.0))
     away = math.hypot(*position)
-    if away > FARTHEST_M:
+    if away > MAX_DISTANCE_M:
         side = "north" if origin.north else "south"
         raise ModelServerError(
             f"the position is {away / 1e3:.0f} km from the origin (easting {east:.1f}, northing {north:.1f}, zone "
             f"{origin.zone} {side}); --utm takes absolute coordinates of that zone, --xyz meters from the origin"
         )
-    return Pose(position, _orientation(target, geodesy, position, current))
+    return Pose(position, _resolve_orientation(target, geodesy, position, current))
 
 
-def _orientation(target: Target, geodesy: Geodesy, position: Vector3, current: Pose) -> Quaternion:
+def _resolve_orientation(target: PoseTarget, geodesy: Geodesy, position: Vector3, current: Pose) -> Quaternion:
     if target.quaternion is not None:
         return target.quaternion
     if target.rpy is not None:
@@ -255,31 +256,31 @@ def _orientation(target: Target, geodesy: Geodesy, position: Vector3, current: P
     return so3.from_rpy(roll, pitch, yaw)
 
 
-class Listener:
-    """Receives what the daemon publishes: `pose`, the latest pose, and the decisions on poses that were set."""
+class SetPoseListener:
+    """Receive the daemon's latest `pose`, and its decisions on poses that were set."""
 
     def __init__(self, bus: lcm.LCM, prefix: str):
-        from modelserver.wire.channels import literal
+        from modelserver.wire.channels import to_subscription_pattern
 
         self.pose: PoseAnswer | None = None
         self.has_decisions = False
         self._decisions: dict[int, Decision] = {}
         self._bus = bus
-        bus.subscribe(literal(f"{prefix}POSE"), self._on_pose)
-        bus.subscribe(literal(f"{prefix}LOCALIZATION_DECISIONS"), self._on_decisions)
+        bus.subscribe(to_subscription_pattern(f"{prefix}POSE"), self._on_pose)
+        bus.subscribe(to_subscription_pattern(f"{prefix}LOCALIZATION_DECISIONS"), self._on_decisions)
 
-    def decision(self, utime: int) -> Decision | None:
-        """Return the decision on the pose that was set at an instant, None while there is none."""
+    def get_decision(self, utime: int) -> Decision | None:
+        """Return the decision on the pose that was set at a time, None if there is none yet."""
         return self._decisions.get(utime)
 
     def wait(self, seconds: float, until: Callable[[], bool]) -> bool:
-        """Handle messages until `until`, for so many seconds at most; return whether it came to that."""
+        """Handle messages for up to `seconds` until a condition holds; return whether it does."""
         return handle_until(self._bus, seconds, until)
 
     def _on_pose(self, _: str, data: bytes) -> None:
         from modelserver.wire.codec import decode
 
-        # a message of another type is a stranger's, or another version's: the next one may be good
+        # a message of another type is from another program or version: the next one may be valid
         with suppress(WireError):
             self.pose = decode("pose_transform_t", data)
 
@@ -300,26 +301,26 @@ _VERDICTS = {
     Verdict.USED: "used",
     Verdict.REJECTED: "rejected",
     Verdict.MONITORED: "monitored",
-    Verdict.TOOK_UP: "set",
+    Verdict.RESET: "set",
 }
 
 
 def describe(result: SetPoseResult) -> str:
-    """Return the result for people to read."""
+    """Format the result."""
     pose = result.request.pose
     origin = result.geodesy.origin
     east, north, height = (a + b for a, b in zip(origin.initial_utm, pose.xyz, strict=True))
     latitude, longitude, _ = result.geodesy.geodetic_from_utm(east, north, height)
     sigma, sigma_deg = result.sigmas
     lines = [
-        f"{safe(result.request.frame_of_interest)} in World:UTM: {pose}",
+        f"{escape(result.request.frame_of_interest)} in World:UTM: {pose}",
         f"  easting {east:.3f} m, northing {north:.3f} m, height {height:.3f} m, zone {origin.zone} "
         f"{'north' if origin.north else 'south'}; latitude {latitude:.7f}, longitude {longitude:.7f} deg",
         f"  sigma {sigma:g} m, {sigma_deg:g} deg",
     ]
     decision = result.decision
     if decision is not None:
-        reason = f": {safe(decision.reason)}" if decision.reason else ""
+        reason = f": {escape(decision.reason)}" if decision.reason else ""
         tested = ""
         if math.isfinite(decision.statistic) and math.isfinite(decision.limit):
             tested = f" (chi-square {decision.statistic:.1f} of {decision.limit:.1f} allowed, {decision.dof} numbers)"
@@ -332,13 +333,13 @@ def describe(result: SetPoseResult) -> str:
         )
     if result.after is not None:
         now = result.after.transformation
-        state = "valid" if now.valid else f"not valid: {Invalid(now.invalid_reasons).explain()}"
+        state = "valid" if now.is_valid else f"not valid: {Invalid(now.invalid_reasons).explain()}"
         lines.append(f"now: {now.pose}; {state}")
     return "\n".join(lines)
 
 
 def as_data(result: SetPoseResult) -> dict[str, Any]:
-    """Return the result for scripts to read; angles in radians, a pose as its 7-vector."""
+    """Return the result as JSON data; angles in radians, a pose as its 7-vector."""
     origin, decision, after = result.geodesy.origin, result.decision, result.after
     sigma, sigma_deg = result.sigmas
     return {
@@ -363,6 +364,6 @@ def as_data(result: SetPoseResult) -> dict[str, Any]:
         else {
             "utime": after.transformation.utime,
             "state_vector": after.transformation.state_vector.tolist(),
-            "valid": after.transformation.valid,
+            "valid": after.transformation.is_valid,
         },
     }

@@ -1,4 +1,4 @@
-"""`modelserver status`: how the running daemon is."""
+"""`modelserver status`: the health of the running daemon."""
 
 from __future__ import annotations
 
@@ -12,96 +12,97 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from modelserver.errors import NoServerError, WireError, nearest_names, shown
+from modelserver.errors import NoServerError, WireError, find_nearest_names, quote
 from modelserver.messages import DriverHealth, Health
-from modelserver.wire.provider import open_lcm, resolve_url, take_message
-from mstools.commands.asking import JsonOption, PrefixOption, UrlOption
+from modelserver.wire.provider import handle_message, open_lcm, resolve_url
+from mstools.terminal.health_text import as_data, format_line, format_report, is_healthy
 from mstools.terminal.interrupts import Interrupts
-from mstools.terminal.status_text import as_data, is_well, line, report
-from mstools.terminal.table import drawable
+from mstools.terminal.options import JsonOption, PrefixOption, UrlOption
+from mstools.terminal.output import replace_unencodable
 
 if TYPE_CHECKING:
     import lcm
 
-EXIT_NOT_WELL = 3
-"""The daemon was heard and has no valid pose; 1 is that it was not heard, 2 wrong usage, as for every command."""
+EXIT_UNHEALTHY = 3
+"""The daemon runs without a valid pose; 1 is no report, 2 wrong usage, as for every command."""
 
-DRIVERS_S = 1.2
-"""How long drivers are listened to, seconds: each speaks once a second."""
+DRIVER_WAIT_S = 1.2
+"""Wait for the reports of drivers, seconds: each publishes one per second."""
 
-INSTEAD_S = 1.0
-"""For how long what is there instead of the daemon is listened to, seconds."""
+PROBE_S = 1.0
+"""Duration of listening for other channels when no report was received, seconds."""
 
 MAX_NAMES = 1000
-"""Names of channels that are told apart meanwhile, and of drivers."""
+"""Largest number of channels and of drivers."""
 
-SHOWN_NAMES = 6
-"""Names that are told."""
+MAX_SHOWN_NAMES = 6
+"""Names in a message."""
 
 SILENT_S = 5.0
-"""Without a report for so long it is said that nothing is heard: they may be seldom."""
+"""Time without a report until a warning, seconds."""
 
-LOOK_S = 0.2
-"""How often it is looked whether to end, seconds."""
+POLL_S = 0.2
+"""Period of checks for a signal, seconds."""
 
 HEALTH = "MODELSERVER_HEALTH"
 
 
 def command(
     config: Annotated[
-        Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file: its bus and its prefix.")
+        Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file, for its bus and prefix.")
     ] = None,
-    watch: Annotated[bool, typer.Option("--watch", "-w", help="Go on showing it, until Ctrl-C.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", "-w", help="Show each report, until Ctrl-C.")] = False,
     as_json: JsonOption = False,
     url: UrlOption = "",
     prefix: PrefixOption = "",
     timeout: Annotated[
         float,
-        typer.Option("--timeout", metavar="SECONDS", min=0.1, max=3600.0, help="How long the daemon is waited for."),
+        typer.Option("--timeout", metavar="SECONDS", min=0.1, max=3600.0, help="Timeout for the daemon's report."),
     ] = 2.5,
 ) -> None:
-    """Tell how the running daemon is: pose, filter, loop, sensors, drivers, what was refused, and notices.
+    """Show the health of the running daemon: pose, filter, loop, sensors, drivers, rejected messages, and warnings.
 
-    Waits for its next health report, which comes once a second. With --watch it goes on, each report in place of the
-    last one; where the output is no terminal, a line for each.
+    Waits for its next health report, which is published once a second. With --watch each report replaces the last one;
+    if the output is no terminal, each is one line.
 
-    Exit code: 0 the daemon runs and its pose may be used, 3 it runs and has none that may be used, 1 it was not heard
-    (2 is wrong usage).
+    Exit code: 0 the daemon runs with a valid pose, 3 it runs without one, 1 no report was received, 2 wrong usage.
 
     Example: modelserver status --watch
     """
 
     drivers: tuple[str, ...] = ()
     if config is not None:
-        from modelserver.config import load_config
+        from modelserver.config.vehicle_file import load_config
 
         vehicle = load_config(config)
         url, prefix = url or vehicle.lcm.url, prefix or vehicle.lcm.channel_prefix
         drivers = tuple(vehicle.drivers)
     provider = resolve_url(url)
-    ear = HealthListener(open_lcm(provider), prefix)
+    listener = HealthListener(open_lcm(provider), prefix)
     began = time.monotonic()
-    if not ear.listen(timeout, lambda: ear.health is not None):
-        raise NoServerError(nobody(provider, prefix, timeout, heard_instead(open_lcm(provider))))
+    if not listener.listen(timeout, lambda: listener.health is not None):
+        raise NoServerError(format_no_report(provider, prefix, timeout, probe_channels(open_lcm(provider))))
     if watch:
-        go_on(ear, drivers, as_json)
+        watch_reports(listener, drivers, as_json)
         return
-    # all drivers have spoken by then
-    ear.listen(max(0.0, min(DRIVERS_S, timeout) - (time.monotonic() - began)), lambda: ear.knows(drivers))
-    assert ear.health is not None
+    # all drivers have published by then
+    listener.listen(
+        max(0.0, min(DRIVER_WAIT_S, timeout) - (time.monotonic() - began)), lambda: listener.has_drivers(drivers)
+    )
+    assert listener.health is not None
     if as_json:
-        typer.echo(json.dumps(as_data(ear.health, ear.drivers.values()), indent=2))
+        typer.echo(json.dumps(as_data(listener.health, listener.drivers.values()), indent=2))
     else:
-        typer.echo(drawable(report(ear.health, ear.drivers.values(), drivers)))
-    if not is_well(ear.health):
-        raise typer.Exit(EXIT_NOT_WELL)
+        typer.echo(replace_unencodable(format_report(listener.health, listener.drivers.values(), drivers)))
+    if not is_healthy(listener.health):
+        raise typer.Exit(EXIT_UNHEALTHY)
 
 
 class HealthListener:
-    """Hears the reports of one daemon and of the drivers beside it; `reports` counts the daemon's."""
+    """Receive the health reports of one daemon and its drivers; `reports` counts the daemon's."""
 
     def __init__(self, bus: lcm.LCM, prefix: str):
-        from modelserver.wire.channels import literal
+        from modelserver.wire.channels import to_subscription_pattern
         from modelserver.wire.codec import decode
 
         self.health: Health | None = None
@@ -113,7 +114,7 @@ class HealthListener:
             try:
                 self.health = decode("health_t", data)
             except WireError:
-                return  # a stranger's, or of another version; `nobody` tells of it
+                return  # unknown, or of another version: see `format_no_report`
             self.reports += 1
 
         def driver(_: str, data: bytes) -> None:
@@ -124,71 +125,71 @@ class HealthListener:
             if found.source in self.drivers or len(self.drivers) < MAX_NAMES:
                 self.drivers[found.source] = found
 
-        bus.subscribe(literal(f"{prefix}{HEALTH}"), health)
-        bus.subscribe(literal(f"{prefix}DRIVER_HEALTH"), driver)
+        bus.subscribe(to_subscription_pattern(f"{prefix}{HEALTH}"), health)
+        bus.subscribe(to_subscription_pattern(f"{prefix}DRIVER_HEALTH"), driver)
 
-    def knows(self, drivers: tuple[str, ...]) -> bool:
-        """Return whether all these drivers were heard; false of none, for there may be others."""
+    def has_drivers(self, drivers: tuple[str, ...]) -> bool:
+        """Return whether all these drivers have reported; False for none, as others may exist."""
         return bool(drivers) and all(name in self.drivers for name in drivers)
 
     def listen(self, seconds: float, until: Callable[[], bool]) -> bool:
-        """Listen until something is so, for so long at most; return whether it is."""
+        """Listen for up to `seconds` until a condition holds; return whether it does."""
         deadline = time.monotonic() + seconds
         while not until():
             left = deadline - time.monotonic()
             if left <= 0.0:
                 return False
-            if select.select((self._bus.fileno(),), (), (), min(left, LOOK_S))[0]:
-                take_message(self._bus)
+            if select.select((self._bus.fileno(),), (), (), min(left, POLL_S))[0]:
+                handle_message(self._bus)
         return True
 
 
-def heard_instead(bus: lcm.LCM, seconds: float = INSTEAD_S) -> dict[str, bool]:
-    """Return the channels that are heard, and whether a health report came on each."""
-    from modelserver.wire.kinds import type_name_of
+def probe_channels(bus: lcm.LCM, seconds: float = PROBE_S) -> dict[str, bool]:
+    """Return the channels with messages, and whether each had a health report."""
+    from modelserver.wire.encoded import type_name_of
 
     found: dict[str, bool] = {}
 
-    def hear(channel: str, data: bytes) -> None:
+    def handle(channel: str, data: bytes) -> None:
         if channel in found or len(found) < MAX_NAMES:
             found[channel] = type_name_of(data) == "health_t"
 
-    bus.subscribe(".*", hear)
+    bus.subscribe(".*", handle)
     deadline = time.monotonic() + seconds
     while (left := deadline - time.monotonic()) > 0.0:
-        take_message(bus, int(left * 1e3) + 1)
+        handle_message(bus, int(left * 1e3) + 1)
     return found
 
 
-def nobody(provider: str, prefix: str, timeout: float, instead: dict[str, bool]) -> str:
-    """Return what to say where no report came: where was listened, what was there instead, and what to do."""
+def format_no_report(provider: str, prefix: str, timeout: float, channels: dict[str, bool]) -> str:
+    """Format the error for a missing report: where, which channels exist instead, and what to do."""
     channel = f"{prefix}{HEALTH}"
-    text = f"nothing was heard on {channel} for {timeout:g} s, on {provider}. "
-    if channel in instead:
-        return text + "Only messages of another version of the service come there: install the same on both sides"
-    others = [name.removesuffix(HEALTH) for name, is_health in instead.items() if is_health and name.endswith(HEALTH)]
+    text = f"no health report on {channel} within {timeout:g} s, on {provider}. "
+    if channel in channels:
+        return text + "Its messages are of another version of the service: install the same version on both sides"
+    others = [name.removesuffix(HEALTH) for name, is_health in channels.items() if is_health and name.endswith(HEALTH)]
     if others:
-        near = (*nearest_names(prefix, [each for each in others if each]), *others)[0]
-        there = ", ".join(shown(f"{each}{HEALTH}", 80) for each in others[:SHOWN_NAMES])
-        do = f"--prefix {shown(near, 40)}" if near else "no --prefix"
-        return f"{text}Heard instead: {there}. Did you mean {do}?"
-    if instead:
-        names = ", ".join(shown(each, 64) for each in sorted(instead)[:SHOWN_NAMES])
-        more = f" and {len(instead) - SHOWN_NAMES} more" if len(instead) > SHOWN_NAMES else ""
+        near = (*find_nearest_names(prefix, [each for each in others if each]), *others)[0]
+        there = ", ".join(quote(f"{each}{HEALTH}", 80) for each in others[:MAX_SHOWN_NAMES])
+        do = f"--prefix {quote(near, 40)}" if near else "no --prefix"
+        return f"{text}Other reports: {there}. Did you mean {do}?"
+    if channels:
+        names = ", ".join(quote(each, 64) for each in sorted(channels)[:MAX_SHOWN_NAMES])
+        more = f" and {len(channels) - MAX_SHOWN_NAMES} more" if len(channels) > MAX_SHOWN_NAMES else ""
         return (
-            f"{text}Others speak there ({names}{more}), the daemon does not: is it running? modelserver run -c FILE, "
+            f"{text}The bus has other channels ({names}{more}): is the daemon running? modelserver run -c FILE, "
             "or systemctl status modelserver"
         )
     return (
-        f"{text}Nobody speaks there at all: is the daemon running (modelserver run -c FILE, or systemctl status "
-        "modelserver), and on this bus (--url, or -c with its vehicle file)? modelserver doctor looks at the bus"
+        f"{text}The bus has no messages at all: is the daemon running (modelserver run -c FILE, or systemctl status "
+        "modelserver), and on this bus (--url, or -c with its vehicle file)? modelserver doctor checks the bus"
     )
 
 
-def go_on(ear: HealthListener, drivers: tuple[str, ...], as_json: bool) -> None:
-    """Show each report until Ctrl-C; what stays out is told too."""
+def watch_reports(listener: HealthListener, drivers: tuple[str, ...], as_json: bool) -> None:
+    """Show each report until Ctrl-C, and warn when there is none."""
     if as_json or not sys.stdout.isatty():
-        _lines(ear, as_json)
+        _print_lines(listener, as_json)
         return
     from rich.console import Console
     from rich.live import Live
@@ -196,31 +197,35 @@ def go_on(ear: HealthListener, drivers: tuple[str, ...], as_json: bool) -> None:
 
     last = time.monotonic()
     with Interrupts() as stop, Live(console=Console(highlight=False), screen=True, auto_refresh=False) as live:
-        while not stop.came:
-            assert ear.health is not None
+        while not stop.is_set:
+            assert listener.health is not None
             silent = time.monotonic() - last
-            text = report(ear.health, ear.drivers.values(), drivers)
+            text = format_report(listener.health, listener.drivers.values(), drivers)
             if silent > SILENT_S:
-                text = f"NOTHING HEARD for {silent:.0f} s; the last that was:\n\n{text}"
-            live.update(Text(drawable(text), overflow="crop", no_wrap=True), refresh=True)
-            if _next(ear, 1.0, stop):
+                text = f"NO REPORT for {silent:.0f} s; the last one:\n\n{text}"
+            live.update(Text(replace_unencodable(text), overflow="crop", no_wrap=True), refresh=True)
+            if _wait_for_report(listener, 1.0, stop):
                 last = time.monotonic()
 
 
-def _lines(ear: HealthListener, as_json: bool) -> None:
+def _print_lines(listener: HealthListener, as_json: bool) -> None:
     with Interrupts() as stop:
-        while not stop.came:
-            assert ear.health is not None
-            data = json.dumps(as_data(ear.health, ear.drivers.values())) if as_json else drawable(line(ear.health))
+        while not stop.is_set:
+            assert listener.health is not None
+            data = (
+                json.dumps(as_data(listener.health, listener.drivers.values()))
+                if as_json
+                else replace_unencodable(format_line(listener.health))
+            )
             typer.echo(data)
             sys.stdout.flush()
             began = time.monotonic()
-            while not _next(ear, SILENT_S, stop) and not stop.came:
-                typer.echo(f"nothing heard for {time.monotonic() - began:.0f} s", err=True)
+            while not _wait_for_report(listener, SILENT_S, stop) and not stop.is_set:
+                typer.echo(f"no report for {time.monotonic() - began:.0f} s", err=True)
 
 
-def _next(ear: HealthListener, seconds: float, stop: Interrupts) -> bool:
-    """Return whether another report came, in so many seconds at most."""
-    before = ear.reports
-    ear.listen(seconds, lambda: stop.came or ear.reports > before)
-    return ear.reports > before
+def _wait_for_report(listener: HealthListener, seconds: float, stop: Interrupts) -> bool:
+    """Wait up to `seconds` for another report; return whether there was one."""
+    before = listener.reports
+    listener.listen(seconds, lambda: stop.is_set or listener.reports > before)
+    return listener.reports > before

@@ -1,4 +1,4 @@
-"""`modelserver tree`: how bodies hang together, drawn in the terminal or as an image."""
+"""`modelserver tree`: the kinematic tree, drawn in the terminal or as an image."""
 
 from __future__ import annotations
 
@@ -10,18 +10,24 @@ import typer
 
 from modelserver.errors import NoServerError
 from modelserver.geometry.model import Model
-from modelserver.wire.provider import open_lcm, resolve_url, take_message
-from mstools.commands.asking import PrefixOption, UrlOption
-from mstools.terminal.graph import BodyNode, crossing_words, nodes
-from mstools.terminal.options import Variables, parse_variables
-from mstools.terminal.output import check_target, counted, print_problem, safe, size_of, write_file
-from mstools.terminal.table import drawable
+from modelserver.wire.provider import handle_message, open_lcm, resolve_url
+from mstools.terminal.model_tree import BodyNode, build_nodes, describe_crossing
+from mstools.terminal.options import PrefixOption, UrlOption, Variables, parse_variables
+from mstools.terminal.output import (
+    check_writable,
+    describe_size,
+    escape,
+    format_count,
+    print_problem,
+    replace_unencodable,
+    write_file,
+)
 
 if TYPE_CHECKING:
     from modelserver.formats.snapshot import ModelSnapshot
 
-PATIENCE_S = 11.0
-"""How long MODEL_SNAPSHOT is waited for, seconds: it comes every 5 s unless the vehicle file says otherwise."""
+TIMEOUT_S = 11.0
+"""Timeout for MODEL_SNAPSHOT, seconds; it is published every 5 s by default."""
 
 
 def command(
@@ -37,36 +43,36 @@ def command(
     prefix: PrefixOption = "",
     wait: Annotated[
         float,
-        typer.Option("--wait", metavar="SECONDS", min=0.01, max=7200.0, help="How long to wait for the daemon."),
-    ] = PATIENCE_S,
+        typer.Option("--wait", metavar="SECONDS", min=0.01, max=7200.0, help="Timeout for the daemon."),
+    ] = TIMEOUT_S,
 ) -> None:
-    """Draw how bodies hang together: constraints with their joints and limits, what closes loops, orphans.
+    """Draw the kinematic tree: constraints with their joints and limits, loop closures, orphans.
 
-    Each body hangs on the one by which the shortest way from the root comes to it; `from here` marks a constraint that
-    leads up. With --live the daemon's own geometry is drawn, which it broadcasts every few seconds.
+    The parent of each body is on its shortest path from the root; `from here` marks a constraint that points to the
+    parent. --live draws the geometry of the daemon, which publishes it every few seconds.
 
     Example: modelserver tree config/raptor/geometry.yaml
     """
     if live == bool(file):
         raise typer.BadParameter("give a FILE, or --live for the running daemon", param_hint="FILE")
-    check_target(svg)
-    model = heard(url, prefix, wait).model if live else read(file, parse_variables(variables))
-    title = f"{model.name or 'unnamed'}: {size_of(model)}, revision {model.revision}"
-    assemblies = nodes(model)
+    check_writable(svg)
+    model = receive_geometry(url, prefix, wait).model if live else load_geometry(file, parse_variables(variables))
+    title = f"{model.name or 'unnamed'}: {describe_size(model)}, revision {model.revision}"
+    assemblies = build_nodes(model)
     if not svg:
-        typer.echo(drawable("\n".join((safe(title), *lines(assemblies, frames)))))
+        typer.echo(replace_unencodable("\n".join((escape(title), *draw_lines(assemblies, frames)))))
         return
-    from mstools.terminal.tree_svg import drawing
+    from mstools.terminal.model_tree import draw_svg
 
-    image = drawing(title, assemblies, frames)
+    image = draw_svg(title, assemblies, frames)
     if svg == "-":
         typer.echo(image, nl=False)
     else:
         write_file(svg, image, force)
 
 
-def read(file: str, variables: dict[str, str]) -> Model:
-    """Return the model of a geometry file, or of that which a vehicle file names; problems are printed.
+def load_geometry(file: str, variables: dict[str, str]) -> Model:
+    """Load a geometry file, or that of a vehicle file, and print its problems.
 
     Raises GeometryError, ConfigError, OSError.
     """
@@ -74,7 +80,7 @@ def read(file: str, variables: dict[str, str]) -> Model:
     from mstools.commands.check import is_vehicle_file
 
     if is_vehicle_file(file):
-        from modelserver.config import load_config
+        from modelserver.config.vehicle_file import load_config
 
         config = load_config(file)
         model = load_model(config.geometry, variables={**config.variables, **variables})
@@ -85,11 +91,11 @@ def read(file: str, variables: dict[str, str]) -> Model:
     return model
 
 
-def heard(url: str, prefix: str, seconds: float) -> ModelSnapshot:
-    """Return the geometry that a daemon broadcasts. Raises NoServerError where none comes in time."""
+def receive_geometry(url: str, prefix: str, seconds: float) -> ModelSnapshot:
+    """Return the geometry that a daemon publishes. Raises NoServerError after a timeout."""
     from modelserver.errors import WireError
-    from modelserver.formats.snapshot import read as read_snapshot
-    from modelserver.wire.channels import literal
+    from modelserver.formats.snapshot import decode_snapshot
+    from modelserver.wire.channels import to_subscription_pattern
     from modelserver.wire.codec import decode
     from modelserver.wire.snapshot import SnapshotAssembler
 
@@ -100,45 +106,45 @@ def heard(url: str, prefix: str, seconds: float) -> ModelSnapshot:
         try:
             content = assembler.add(decode("model_snapshot_t", data))
             if content is not None:
-                whole.append(read_snapshot(content))
+                whole.append(decode_snapshot(content))
         except WireError:
-            # of a stranger, or of another version: the next may be good
+            # unknown, or of another version: the next may be valid
             pass
 
     channel = f"{prefix}MODEL_SNAPSHOT"
-    bus.subscribe(literal(channel), take).set_queue_capacity(0)
+    bus.subscribe(to_subscription_pattern(channel), take).set_queue_capacity(0)
     deadline = time.monotonic() + seconds
     while not whole:
         left = deadline - time.monotonic()
         if left <= 0.0:
             raise NoServerError(
-                f"no geometry came on {channel} at {provider} within {seconds:g} s. Is the daemon running "
-                "(modelserver run -c vehicle.yaml), on this bus ($LCM_DEFAULT_URL) and with this --prefix? Its vehicle "
-                "file says how often it tells (publish.snapshot_s): --wait longer than that"
+                f"no geometry received on {channel} at {provider} within {seconds:g} s. Is the daemon running "
+                "(modelserver run -c vehicle.yaml), on this bus ($LCM_DEFAULT_URL) and with this --prefix? Its period "
+                "is publish.snapshot_s in the vehicle file: use a longer --wait"
             )
-        take_message(bus, int(left * 1e3) + 1)
+        handle_message(bus, int(left * 1e3) + 1)
     return whole[0]
 
 
-def lines(assemblies: Sequence[Sequence[BodyNode]], with_frames: bool = False) -> Iterator[str]:
-    """Yield the drawing line by line; assemblies that nothing joins to the root's come below it."""
+def draw_lines(assemblies: Sequence[Sequence[BodyNode]], with_frames: bool = False) -> Iterator[str]:
+    """Yield the lines of the drawing; unconnected assemblies come last."""
     for number, assembly in enumerate(assemblies):
         if number == 1:
             yield ""
-            yield f"{counted(len(assemblies) - 1, 'orphan')}, which no constraint joins to the root:"
+            yield f"{format_count(len(assemblies) - 1, 'orphan')}, not connected to the root:"
         for node in assembly:
-            yield from _node(node, with_frames)
+            yield from _draw_node(node, with_frames)
 
 
-def _node(node: BodyNode, with_frames: bool) -> Iterator[str]:
-    trunk = "".join("   " if last else "│  " for last in node.last[:-1])
-    elbow = ("└─ " if node.last[-1] else "├─ ") if node.last else ""
-    told = f"  ({crossing_words(node.crossing)})" if node.crossing is not None else ""
-    yield f"{trunk}{elbow}{safe(node.body)}{safe(told)}"
-    inside = trunk + (("   " if node.last[-1] else "│  ") if node.last else "")
-    inside += "│  " if node.branches else "   "
+def _draw_node(node: BodyNode, with_frames: bool) -> Iterator[str]:
+    trunk = "".join("   " if last else "│  " for last in node.is_last[:-1])
+    elbow = ("└─ " if node.is_last[-1] else "├─ ") if node.is_last else ""
+    label = f"  ({describe_crossing(node.crossing)})" if node.crossing is not None else ""
+    yield f"{trunk}{elbow}{escape(node.body)}{escape(label)}"
+    inside = trunk + (("   " if node.is_last[-1] else "│  ") if node.is_last else "")
+    inside += "│  " if node.has_children else "   "
     for each in node.loops:
-        yield f"{inside}⟲ {safe(each)}"
+        yield f"{inside}⟲ {escape(each)}"
     if with_frames:
         for frame in node.frames:
-            yield f"{inside}· {safe(frame)}"
+            yield f"{inside}· {escape(frame)}"

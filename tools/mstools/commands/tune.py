@@ -17,19 +17,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from modelserver.errors import ModelServerError, RecordingError
-from mstools.terminal.output import check_target, counted, safe, write_file
-from mstools.terminal.progress import progress
+from mstools.terminal.output import check_writable, escape, format_count, write_file
+from mstools.terminal.progress import show_progress
 from mstools.tuning.search import Parameter, Score, SearchResult, SearchStep, Settings, search
 
 if TYPE_CHECKING:
-    from modelserver.service.daemon import Vehicle
+    from modelserver.server.vehicle import Vehicle
     from mstools.report.consistency import Consistency
-    from mstools.tuning.runs import Job, Outcome, Part
+    from mstools.tuning.evaluation import EvaluationJob, EvaluationResult, Part
 
 
 @dataclass(frozen=True, slots=True)
 class Tunable:
-    """A setting that fixes can tell something of: what it takes, and whether --quick looks at it."""
+    """A setting that withheld fixes can tune: the sensor it needs, and whether --quick includes it."""
 
     parameter: Parameter
     needs: str = "gps"
@@ -39,16 +39,16 @@ class Tunable:
 TUNABLES = (
     Tunable(Parameter("gps_white_share", 0.01, 1.0), quick=True),
     Tunable(Parameter("gps_sigma_floor", 0.005, 10.0), quick=True),
-    Tunable(Parameter("gps_wander_time", 5.0, 600.0), quick=True),
+    Tunable(Parameter("gps_correlation_time", 5.0, 600.0), quick=True),
     Tunable(Parameter("accelerometer_noise", 1e-3, 1.0), "imu", quick=True),
     Tunable(Parameter("gyro_noise", 1e-5, 0.05), "imu"),
     Tunable(Parameter("wheel_sigma", 1e-3, 0.5), "wheels", quick=True),
-    Tunable(Parameter("slip_share", 1e-3, 0.2), "wheels", quick=True),
+    Tunable(Parameter("slip_ratio", 1e-3, 0.2), "wheels", quick=True),
     Tunable(Parameter("slip_turn", 0.01, 1.0), "skid_steer"),
     Tunable(Parameter("roll_point_sigma", 5e-3, 1.0), "rolling"),
     Tunable(Parameter("side_sigma", 2e-3, 0.5), "rolling"),
 )
-"""In the order in which they are searched."""
+"""In search order."""
 
 
 def command(
@@ -58,20 +58,20 @@ def command(
         str, typer.Option("-o", "--output", metavar="YAML", help="Write the proposal here, - for standard output.")
     ] = "",
     quick: Annotated[
-        bool, typer.Option("--quick", help="One round over the fewest settings, without gaps: a first look.")
+        bool, typer.Option("--quick", help="One round over few settings, without GNSS gaps: a first look.")
     ] = False,
     rounds: Annotated[int, typer.Option(min=1, max=5, metavar="N", help="Rounds over all settings, at most.")] = 2,
     processes: Annotated[
-        int, typer.Option(min=0, max=64, metavar="N", help="Runs at once. 0: as many as there are processors.")
+        int, typer.Option(min=0, max=64, metavar="N", help="Parallel runs. 0: one per processor.")
     ] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace a proposal that exists.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
-    """Propose noise settings of the filter from a recording; docs/tuning.md says how to tune.
+    """Tune the filter's noise settings on a recording; docs/tuning.md explains how.
 
-    Every second fix is withheld, and all fixes in four gaps; settings are stepped by factors of two while the filter
-    holds the withheld fixes more probable and is no less accurate. The same log, vehicle file and version propose the
-    same. Nothing is changed: the proposal is a part of a vehicle file, to be looked at and merged.
+    Every second fix is withheld, and all fixes in four gaps. A search changes each setting by factors of two while the
+    likelihood of the withheld fixes increases and the accuracy does not decrease. It is deterministic for a log, a
+    vehicle file and a version. Nothing is changed: the proposal is part of a vehicle file, to be reviewed and merged.
 
     \b
     Examples:
@@ -79,23 +79,23 @@ def command(
       modelserver tune drive.lcm -c config/husky/vehicle.yaml -o proposal.yaml
     """
     if config is None:
-        raise typer.BadParameter("tune needs the vehicle: -c FILE")
+        raise typer.BadParameter("tune needs the vehicle file: -c FILE")
     if as_json and output == "-":
-        raise typer.BadParameter("--json and -o - both write to standard output; name a file for the proposal")
+        raise typer.BadParameter("--json and -o - both write to standard output; give a file for the proposal")
     _check_output(output, (log, config), force)
-    # one thread works in each process: those of the linear algebra would only cost time
+    # one thread works in each process; BLAS threads would only cost time
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    from mstools.tuning import runs as tune_runs
+    from mstools.tuning import evaluation as tune_runs
 
     vehicle = tune_runs.load(config)
     tune_runs.gps_channel(vehicle)
     fixes = tune_runs.read_fixes(log, config)
     if vehicle.config.localization.mode == "raw":
-        raise RecordingError(f"{safe(str(config))}: localization.mode is raw, which has no filter to tune")
-    chosen = [each.parameter for each in TUNABLES if _has(vehicle, each.needs) and (each.quick or not quick)]
+        raise RecordingError(f"{escape(str(config))}: localization.mode is raw, without a filter to tune")
+    chosen = [each.parameter for each in TUNABLES if _has_sensor(vehicle, each.needs) and (each.quick or not quick)]
     sigmas = sorted(tune_runs.stated_sigma(each, vehicle) for each in fixes.samples)
-    # below what the receiver states a floor does nothing: steps upward begin there
+    # a floor below the receiver's sigma has no effect: steps upward start there
     chosen = [
         Parameter(p.name, p.low, p.high, sigmas[len(sigmas) // 2]) if p.name == "gps_sigma_floor" else p for p in chosen
     ]
@@ -104,23 +104,23 @@ def command(
     begin = {each.name: float(getattr(settings, each.name)) for each in chosen}
     rounds = 1 if quick else rounds
     bound = len(parts) * (1 + rounds * len(chosen) * 2)
-    with progress(f"tuning on {log.name}", bound) as show, _pool(processes, len(parts)) as runs:
+    with show_progress(f"tuning on {log.name}", bound) as show, _open_pool(processes, len(parts)) as runs:
         trials = Trials(runs, log, config, parts, show)
         first = trials([{}])[0]
         before = trials.outcomes({})
         if first is None or not before[0].scored or before[0].missing == before[0].scored:
             raise RecordingError(
-                f"{safe(str(log))}: there was no pose at any of the withheld fixes, so nothing can be scored: see "
-                f"modelserver replay {safe(str(log))} -c {safe(str(config))} --report report.html"
+                f"{escape(str(log))}: no pose at any withheld fix, so there is no score: see "
+                f"modelserver replay {escape(str(log))} -c {escape(str(config))} --report report.html"
             )
-        found = search(begin, first, chosen, trials, rounds, _told)
+        found = search(begin, first, chosen, trials, rounds, _print_step)
         after = trials.outcomes(found.settings)
     result = TuningResult(begin, first, before, found, after, trials.count)
     if as_json:
-        typer.echo(json.dumps(data(result), indent=2, allow_nan=False))
+        typer.echo(json.dumps(as_data(result), indent=2, allow_nan=False))
     else:
-        typer.echo("\n".join(lines(safe(str(log)), result)), err=output == "-")
-    text = proposal(str(log), result)
+        typer.echo("\n".join(format_result(escape(str(log)), result)), err=output == "-")
+    text = format_proposal(str(log), result)
     if output == "-":
         typer.echo(text, nl=False)
     elif output:
@@ -129,34 +129,34 @@ def command(
 
 @dataclass
 class Trials:
-    """Scores settings by runs of all parts, each once: `evaluate` of the search."""
+    """The search's evaluation: score settings by runs of all parts, with a cache."""
 
-    runs: Callable[[Sequence[Job]], list[Outcome | None]]
+    runs: Callable[[Sequence[EvaluationJob]], list[EvaluationResult | None]]
     log: Path
     config: Path
     parts: tuple[Part, ...]
     show: Callable[[float], None]
     count: int = 0
-    known: dict[tuple[tuple[str, float], ...], list[Outcome | None]] = field(default_factory=dict)
+    results: dict[tuple[tuple[str, float], ...], list[EvaluationResult | None]] = field(default_factory=dict)
 
     def __call__(self, trials: Sequence[Settings]) -> list[Score | None]:
-        """Return the scores of settings; None where they are out of range."""
-        from mstools.tuning.runs import Job
+        """Return the scores of settings; None for those out of range."""
+        from mstools.tuning.evaluation import EvaluationJob
 
         keys = [tuple(sorted(each.items())) for each in trials]
-        new = [key for key in dict.fromkeys(keys) if key not in self.known]
-        outcomes = self.runs([Job(self.log, self.config, part, key) for key in new for part in self.parts])
+        new = [key for key in dict.fromkeys(keys) if key not in self.results]
+        outcomes = self.runs([EvaluationJob(self.log, self.config, part, key) for key in new for part in self.parts])
         self.count += len(outcomes)
         self.show(self.count)
         for n, key in enumerate(new):
-            self.known[key] = outcomes[n * len(self.parts) : (n + 1) * len(self.parts)]
-        return [self._score(self.known[key]) for key in keys]
+            self.results[key] = outcomes[n * len(self.parts) : (n + 1) * len(self.parts)]
+        return [self._score(self.results[key]) for key in keys]
 
-    def outcomes(self, settings: Settings) -> list[Outcome]:
-        """Return what the runs of settings that have been scored came to, one for each part."""
-        return [each for each in self.known[tuple(sorted(settings.items()))] if each is not None]
+    def outcomes(self, settings: Settings) -> list[EvaluationResult]:
+        """Return the results of evaluated settings, one for each part."""
+        return [each for each in self.results[tuple(sorted(settings.items()))] if each is not None]
 
-    def _score(self, outcomes: Sequence[Outcome | None]) -> Score | None:
+    def _score(self, outcomes: Sequence[EvaluationResult | None]) -> Score | None:
         good = [each for each in outcomes if each is not None]
         if len(good) < len(self.parts):
             return None
@@ -165,22 +165,22 @@ class Trials:
 
 @dataclass(frozen=True)
 class TuningResult:
-    """What was found: the values begun with, and scores and runs before and after."""
+    """Initial settings, scores and results before and after."""
 
     begin: Settings
     first: Score
-    before: Sequence[Outcome]
+    before: Sequence[EvaluationResult]
     found: SearchResult
-    after: Sequence[Outcome]
+    after: Sequence[EvaluationResult]
     runs: int
 
 
-def lines(log: str, result: TuningResult) -> list[str]:
-    """Return the report, one line each."""
+def format_result(log: str, result: TuningResult) -> list[str]:
+    """Format the report as lines."""
     found = result.found
-    told = [
-        f"{log}: {counted(result.before[0].scored, 'fix', 'fixes')} withheld in turn, "
-        f"{counted(len(result.before[-1].gaps), 'gap')}; {counted(result.runs, 'run')}",
+    text = [
+        f"{log}: {format_count(result.before[0].scored, 'fix', 'fixes')} withheld in turn, "
+        f"{format_count(len(result.before[-1].gaps), 'gap')}; {format_count(result.runs, 'run')}",
         f"{'':34}{'before':>10}{'after':>10}",
     ]
     rows = [
@@ -188,29 +188,29 @@ def lines(log: str, result: TuningResult) -> list[str]:
         ("mean error at gap ends, m", result.first.gaps, found.score.gaps),
         ("log-likelihood of a withheld fix", result.first.likelihood, found.score.likelihood),
     ]
-    told += [f"{name:34}{a:10.3f}{b:10.3f}" for name, a, b in rows if math.isfinite(a)]
+    text += [f"{name:34}{a:10.3f}{b:10.3f}" for name, a, b in rows if math.isfinite(a)]
     later = {each.kind: each for each in result.after[0].consistency}
     for each in result.before[0].consistency:
-        told.append(_nis(each, later.get(each.kind)))
+        text.append(_format_nis(each, later.get(each.kind)))
     for name, value in found.settings.items():
-        told.append(f"{name}: {result.begin[name]:g} -> {value:g}")
+        text.append(f"{name}: {result.begin[name]:g} -> {value:g}")
     if not found.settings:
-        told.append("No step helps enough: the settings fit this recording.")
-    if found.unseen:
-        told.append(f"Without effect on this recording: {', '.join(found.unseen)}.")
-    return told
+        text.append("No step helps enough: the settings fit this recording.")
+    if found.insensitive:
+        text.append(f"Without effect on this recording: {', '.join(found.insensitive)}.")
+    return text
 
 
-def _nis(before: Consistency, after: Consistency | None) -> str:
+def _format_nis(before: Consistency, after: Consistency | None) -> str:
     later = f"{after.mean:10.2f}" if after is not None else f"{'':10}"
     beyond = f"   beyond 95 %: {before.beyond:.1%}" + (f" -> {after.beyond:.1%}" if after is not None else "")
     return f"{'NIS, ' + before.kind:34}{before.mean:10.2f}{later}{beyond}"
 
 
-def data(result: TuningResult) -> dict[str, object]:
-    """Return the report for scripts; what is not known is null."""
+def as_data(result: TuningResult) -> dict[str, object]:
+    """Return the report as JSON data; unknown values are null."""
 
-    def side(score: Score, outcomes: Sequence[Outcome]) -> dict[str, object]:
+    def format_side(score: Score, outcomes: Sequence[EvaluationResult]) -> dict[str, object]:
         return {
             "likelihood": _or_none(score.likelihood),
             "rmse": _or_none(score.rmse),
@@ -221,18 +221,18 @@ def data(result: TuningResult) -> dict[str, object]:
     return {
         "runs": result.runs,
         "withheld": result.before[0].scored,
-        "before": side(result.first, result.before),
-        "after": side(result.found.score, result.after),
+        "before": format_side(result.first, result.before),
+        "after": format_side(result.found.score, result.after),
         "proposal": dict(result.found.settings),
-        "unseen": list(result.found.unseen),
+        "unseen": list(result.found.insensitive),
     }
 
 
-def proposal(log: str, result: TuningResult) -> str:
-    """Return the settings that are proposed, as part of a vehicle file."""
+def format_proposal(log: str, result: TuningResult) -> str:
+    """Format the proposed settings as part of a vehicle file."""
     found = result.found
     head = [
-        f"# Proposed by modelserver tune from {safe(log)}: log-likelihood of a withheld fix "
+        f"# Proposed by modelserver tune from {escape(log)}: log-likelihood of a withheld fix "
         f"{result.first.likelihood:.3f} -> {found.score.likelihood:.3f},",
         f"# RMSE {result.first.rmse:.3f} -> {found.score.rmse:.3f} m."
         " Try it on another recording before you merge it; nothing was changed.",
@@ -247,18 +247,20 @@ def proposal(log: str, result: TuningResult) -> str:
 
 
 @contextmanager
-def _pool(processes: int, parts: int) -> Iterator[Callable[[Sequence[Job]], list[Outcome | None]]]:
-    """Give what runs jobs, in so many processes at once, and returns what they came to in their order."""
-    # more than both steps of a setting never wait at once
+def _open_pool(
+    processes: int, parts: int
+) -> Iterator[Callable[[Sequence[EvaluationJob]], list[EvaluationResult | None]]]:
+    """Yield a function that runs jobs in parallel processes, and returns their results in order."""
+    # at most both steps of a setting run at once
     count = min(processes or os.cpu_count() or 1, 2 * parts)
     if count == 1:
         yield lambda jobs: [_run(job) for job in jobs]
         return
     pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"))
     try:
-        yield lambda jobs: [future.result() for future in _submitted(pool, jobs)]
+        yield lambda jobs: [future.result() for future in _submit(pool, jobs)]
     except BaseException:
-        # what runs takes seconds and is of no use any more; the pool forgets its workers when it shuts down
+        # running jobs take seconds and are useless now; the pool forgets its workers at shutdown
         workers = list((getattr(pool, "_processes", None) or {}).values())
         pool.shutdown(wait=False, cancel_futures=True)
         for each in workers:
@@ -269,7 +271,7 @@ def _pool(processes: int, parts: int) -> Iterator[Callable[[Sequence[Job]], list
     pool.shutdown()
 
 
-def _submitted(pool: ProcessPoolExecutor, jobs: Sequence[Job]) -> list[Future[Outcome | None]]:
+def _submit(pool: ProcessPoolExecutor, jobs: Sequence[EvaluationJob]) -> list[Future[EvaluationResult | None]]:
     """Submit jobs and return their futures. SIGINT is blocked meanwhile, and delivered afterwards.
 
     Submitting starts workers. One whose start is interrupted would run unknown to the pool, and one that is still
@@ -283,19 +285,19 @@ def _submitted(pool: ProcessPoolExecutor, jobs: Sequence[Job]) -> list[Future[Ou
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _run(job: Job) -> Outcome | None:
-    """Return what a job came to; None for settings that the filter does not take."""
-    from mstools.tuning import runs as tune_runs
+def _run(job: EvaluationJob) -> EvaluationResult | None:
+    """Return the result of a job; None for settings that the filter rejects."""
+    from mstools.tuning import evaluation as tune_runs
 
     try:
-        return tune_runs.run(job)
+        return tune_runs.evaluate(job)
     except ModelServerError:
         raise
     except ValueError:
         return None
 
 
-def _has(vehicle: Vehicle, needs: str) -> bool:
+def _has_sensor(vehicle: Vehicle, needs: str) -> bool:
     sensors = vehicle.config.sensors
     wheels = sensors.wheels
     if needs == "rolling":
@@ -305,7 +307,7 @@ def _has(vehicle: Vehicle, needs: str) -> bool:
     return getattr(sensors, needs) is not None
 
 
-def _told(step: SearchStep) -> None:
+def _print_step(step: SearchStep) -> None:
     typer.echo(
         f"  {step.name}: {step.before:g} -> {step.after:g}, log-likelihood {step.score.likelihood:.3f}, "
         f"RMSE {step.score.rmse:.3f} m",
@@ -319,9 +321,9 @@ def _check_output(output: str, inputs: Sequence[Path], force: bool) -> None:
     if os.path.realpath(output) in {os.path.realpath(each) for each in inputs}:
         raise typer.BadParameter("LOG, --config and --output must be different files")
     if not force and os.path.isfile(output):
-        # said before the work, for that takes a while; the writing looks again
-        raise ModelServerError(f"{safe(output)} exists already; give --force to replace it, or another name")
-    check_target(output)
+        # before the work, which takes long; writing checks it again
+        raise ModelServerError(f"{escape(output)} already exists; give --force to replace it, or another name")
+    check_writable(output)
 
 
 def _mean(values: Sequence[float]) -> float:

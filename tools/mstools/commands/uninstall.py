@@ -1,4 +1,4 @@
-"""`modelserver uninstall`: what `install` did, taken back."""
+"""`modelserver uninstall`: remove what `modelserver install` wrote."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from typing import Annotated
 
 import typer
 
-from mstools.commands.install import DryRunOption, RootOption, show_or_do
-from mstools.deployment.place import program
+from mstools.commands.install import DryRunOption, RootOption, show_or_apply
+from mstools.deployment.installation import get_command_path
 from mstools.deployment.plan import plan_uninstall
-from mstools.deployment.steps import check_may, read_facts
+from mstools.deployment.steps import check_root_user, read_facts
 
 
 def command(
     purge: Annotated[
-        bool, typer.Option("--purge", help="Remove also what was edited since, and what the service has kept.")
+        bool, typer.Option("--purge", help="Also remove edited files and the state of the service.")
     ] = False,
     dry_run: DryRunOption = False,
     root: RootOption = Path("/"),
 ) -> None:
     """Stop the service and its drivers, and remove what `modelserver install` wrote.
 
-    A file that was edited since stays and is told; so does what the service has kept in /var/lib/modelserver.
+    A file that was edited since stays and is listed; so does the state of the service in /var/lib/modelserver.
 
     Example: modelserver uninstall --dry-run
     """
     root = root.resolve()
     if not dry_run:
-        check_may(root, f"{program()} uninstall{' --purge' if purge else ''}")
-    show_or_do(plan_uninstall(read_facts((), root), purge=purge), root, dry_run)
+        check_root_user(root, f"{get_command_path()} uninstall{' --purge' if purge else ''}")
+    show_or_apply(plan_uninstall(read_facts((), root), purge=purge), root, dry_run)

@@ -1,1 +1,1 @@
-"""The demo: its processes, its drive, its lines on the screen."""
+"""Parts of `modelserver demo`: processes, simulated drive, and local connections of the drivers."""

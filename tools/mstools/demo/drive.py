@@ -1,35 +1,36 @@
-"""The simulated drive of `modelserver demo` and of emulated devices: whoever begins it at one instant has one truth."""
+"""The simulated drive of `modelserver demo` and of emulated devices: the same start time gives the same truth."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
-from modelserver.config import VehicleConfig
+from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.earth.geodesy import origin_at
 from modelserver.formats import load_model
 from modelserver.geometry import Model
 from modelserver.messages import GpsSample, ImuSample, Sample, VehicleStatusSample, WheelsSample
-from modelserver.simulation import GpsModel, ImuModel, Simulation, StatusModel, Timing, Trajectory, WheelsModel, figures
+from modelserver.simulation import GpsModel, ImuModel, Simulation, StatusModel, Timing, Trajectory, WheelsModel
+from modelserver.simulation import maneuvers as figures
 from modelserver.simulation.trajectory import DrivePhase
 
 SUFFIELD = (50.27, -111.18, 700.0)
-"""Where the report's vehicle was tried, roughly: latitude and longitude in degrees, height in metres."""
+"""Test site of the report's vehicle, roughly: latitude and longitude in degrees, height in meters."""
 
-STAND_SECONDS = 3.0
-"""Levelling takes two seconds at rest, and a moment until rest is seen."""
+STATIONARY_SECONDS = 3.0
+"""Leveling takes two seconds without motion, after the detection of the stationary vehicle."""
 
 WHEELS_HZ = 100.0
-"""How often wheels and the vehicle controller measure."""
+"""Rate of wheels and vehicle controller."""
 
 TYPICAL_WHEELBASE = 1.5
-"""Meters; for a vehicle whose file does not name the wheels that steer."""
+"""Meters; for a vehicle file without steered wheels."""
 
 LAP_SECONDS = 25.0
-"""An eight takes a little longer."""
+"""A figure of eight takes a little longer."""
 
 
-def simulation(
+def make_simulation(
     config: VehicleConfig,
     start_utime: int,
     seconds: float,
@@ -40,16 +41,16 @@ def simulation(
     imu_model: ImuModel | None = None,
     wheels_model: WheelsModel | None = None,
 ) -> Simulation:
-    """Return a drive of the vehicle for `seconds` or more, and what those of its sensors in `sensors` measure."""
+    """Return a drive of at least `seconds` with the measurements of the sample types in `sensors`."""
     gps, imu, wheels = config.sensors.gps, config.sensors.imu, config.sensors.wheels
     model = load_model(config.geometry, variables=config.variables)
     status = None
     if VehicleStatusSample in sensors:
-        status = StatusModel(_wheelbase(config, model), wheels_model.timing if wheels_model else Timing(WHEELS_HZ))
+        status = StatusModel(_get_wheelbase(config, model), wheels_model.timing if wheels_model else Timing(WHEELS_HZ))
     return Simulation(
         model,
         config.base_frame,
-        Trajectory(_phases(scenario, seconds, seed), yaw=0.5),
+        Trajectory(_make_phases(scenario, seconds, seed), yaw=0.5),
         origin_at(*SUFFIELD),
         gps_frame=gps.frame if gps and GpsSample in sensors else None,
         imu_frame=imu.frame if imu and ImuSample in sensors else None,
@@ -64,8 +65,8 @@ def simulation(
     )
 
 
-def _wheelbase(config: VehicleConfig, model: Model) -> float:
-    """Return how far ahead of the rolling frame the steered axle is, m; `TYPICAL_WHEELBASE` where none is named."""
+def _get_wheelbase(config: VehicleConfig, model: Model) -> float:
+    """Return the distance of the steered axle from the rolling frame, m; `TYPICAL_WHEELBASE` if none is steered."""
     wheels = config.sensors.wheels
     if wheels is None or wheels.steering is None:
         return TYPICAL_WHEELBASE
@@ -75,15 +76,15 @@ def _wheelbase(config: VehicleConfig, model: Model) -> float:
     return sum(ahead) / len(ahead) if ahead else TYPICAL_WHEELBASE
 
 
-def _phases(scenario: str, seconds: float, seed: int) -> tuple[DrivePhase, ...]:
+def _make_phases(scenario: str, seconds: float, seed: int) -> tuple[DrivePhase, ...]:
     if scenario == "stand":
-        return figures.stand(seconds)
+        return figures.stationary(seconds)
     if scenario == "circle":
-        # as for finding the offsets of a magnetometer
+        # full circles, as for a magnetometer calibration
         return (DrivePhase(3.0, 4.0, 0.25), DrivePhase(seconds), DrivePhase(3.0, 0.0))
     if scenario == "straight":
         return figures.straight()
     if scenario == "city":
         return figures.city(seed, seconds)
     laps = max(1, math.ceil(seconds / LAP_SECONDS))
-    return figures.figure_eight(speed=3.0, radius=6.0, stand=STAND_SECONDS, ramp=2.0, laps=laps)
+    return figures.figure_eight(speed=3.0, radius=6.0, stationary=STATIONARY_SECONDS, ramp=2.0, laps=laps)

@@ -1,7 +1,8 @@
-"""What `install` and `uninstall` do, as a list of steps that nothing has carried out yet.
+"""Plan of `install` and `uninstall`: a list of steps, before anything is executed. Pure.
 
-No file is touched here: what there is comes in as `Facts`, what is to be done goes out as a `Plan`, and
-`install_steps` carries it out.
+The state of the system comes in as `SystemFacts`, the steps go out as a `Plan`, and steps.py executes it. A file is
+replaced or removed only if its hash is one that `install` wrote (manifest); edited files are kept. The manifest is
+written first, so that an interrupted installation can be undone.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ UNITS: Final = "/etc/systemd/system"
 RULES: Final = "/etc/udev/rules.d/90-modelserver.rules"
 SYSCTL: Final = "/etc/sysctl.d/60-modelserver.conf"
 STATE: Final = ("/var/lib/modelserver", "/var/lib/private/modelserver")
-"""What a service with a dynamic user has for its state: a link, and the folder that it leads to."""
+"""State directory of a service with a dynamic user: a link, and the folder that it leads to."""
 
 SERVICE: Final = "modelserver.service"
 LOOPBACK: Final = "modelserver-loopback.service"
@@ -31,61 +32,61 @@ MANIFEST_VERSION: Final = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Write:
-    """Write a file whole. `what` it is and `summary` of its content are for people."""
+class WriteFile:
+    """Write a file atomically; `description` and `summary` of its content are for the user."""
 
     path: str
     content: bytes
-    what: str
+    description: str
     summary: str = ""
     mode: int = 0o644
 
     def __str__(self) -> str:
-        said = f"write   {self.path}  ({len(self.content)} bytes, {self.mode:04o}): {self.what}"
-        return said + "".join(f"\n            {line}" for line in self.summary.splitlines())
+        text = f"write   {self.path}  ({len(self.content)} bytes, {self.mode:04o}): {self.description}"
+        return text + "".join(f"\n            {line}" for line in self.summary.splitlines())
 
 
 @dataclass(frozen=True, slots=True)
-class Keep:
-    """Leave a file as it is, and say why."""
+class KeepFile:
+    """Leave a file as it is, for a reason."""
 
     path: str
-    why: str
+    reason: str
 
     def __str__(self) -> str:
-        return f"leave   {self.path}: {self.why}"
+        return f"leave   {self.path}: {self.reason}"
 
 
 @dataclass(frozen=True, slots=True)
-class Remove:
-    """Remove a file, or a folder with what it holds where `whole`, or else an empty one."""
+class RemovePath:
+    """Remove a file, or a folder: recursively where `is_recursive`, else only an empty one."""
 
     path: str
-    what: str
-    whole: bool = False
+    description: str
+    is_recursive: bool = False
 
     def __str__(self) -> str:
-        return f"remove  {self.path}: {self.what}"
+        return f"remove  {self.path}: {self.description}"
 
 
 @dataclass(frozen=True, slots=True)
 class RunProgram:
-    """Run a program. Where it `may_fail`, the rest is done all the same."""
+    """Run a program. Where it `may_fail`, the following steps are executed all the same."""
 
     arguments: tuple[str, ...]
-    what: str
+    description: str
     may_fail: bool = False
 
     def __str__(self) -> str:
-        return f"run     {' '.join(self.arguments)}: {self.what}"
+        return f"run     {' '.join(self.arguments)}: {self.description}"
 
 
-Step: TypeAlias = Write | Keep | Remove | RunProgram
+Step: TypeAlias = WriteFile | KeepFile | RemovePath | RunProgram
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Steps in their order, and what to tell beside them."""
+    """Steps in their order, with notes for the user."""
 
     steps: tuple[Step, ...]
     notes: tuple[str, ...] = ()
@@ -93,14 +94,14 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """What an earlier `install` did: for each file the hashes that are its own, units it enabled, folders it made."""
+    """Record of an earlier `install`: for each file the hashes that it wrote, units it enabled, folders it made."""
 
     files: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     units: tuple[str, ...] = ()
     folders: tuple[str, ...] = ()
 
-    def encoded(self) -> bytes:
-        """Return it as a file's content."""
+    def encode(self) -> bytes:
+        """Return the content of the manifest file."""
         content = {
             "version": MANIFEST_VERSION,
             "files": dict(sorted(self.files.items())),
@@ -110,32 +111,36 @@ class Manifest:
         return (json.dumps(content, indent=1) + "\n").encode()
 
     @classmethod
-    def decoded(cls, raw: bytes, file: str = MANIFEST) -> Manifest:
-        """Return the one that a `file` holds. Raises ModelServerError for a damaged one."""
+    def decode(cls, raw: bytes, file: str = MANIFEST) -> Manifest:
+        """Return the manifest in a `file`. Raises ModelServerError for a damaged one."""
         try:
             content = json.loads(raw)
             if content["version"] != MANIFEST_VERSION:
                 raise ValueError(f"its version is {content['version']!r}, not {MANIFEST_VERSION}")
-            files = {_path(path): tuple(map(_text, hashes)) for path, hashes in content["files"].items()}
-            return cls(files, tuple(map(_unit, content["units"])), tuple(map(_folder, content["folders"])))
+            files = {_parse_path(path): tuple(map(_parse_hash, hashes)) for path, hashes in content["files"].items()}
+            return cls(files, tuple(map(_parse_unit, content["units"])), tuple(map(_parse_folder, content["folders"])))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ModelServerError(
-                f"{file}, which holds what was installed, is damaged ({error}); remove it, and what was written "
-                "counts as your own"
+                f"{file}: the record of the installation is damaged ({error}); remove it: the installed files then "
+                "count as edited"
             ) from None
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
-    """How the system is that is to be installed to.
+class SystemFacts:
+    """State of the system to install to.
 
-    files: hash of every file that is there of those that may be written. absent: folders around them that are not
-        there.
-    by_id: for each name below /dev/serial/by-id the device it leads to. rules: text of the udev rules there are.
-    rmem_max: the kernel's limit of receive buffers, bytes, 0 where it is not known.
-    programs: those that can be run, with their paths.
-    realtime: whether the service may be scheduled before others without taking the machine along.
-    is_live: whether it is the system that runs here, and systemd runs it. root: its root for systemctl, if another.
+    Attributes
+    ----------
+    files : hash of each existing file of those that may be written
+    absent : missing folders around them
+    by_id : device of each name below /dev/serial/by-id
+    rules : content of the installed udev rules
+    rmem_max : the kernel's limit of receive buffers, bytes, 0 if unknown
+    programs : paths of the available programs
+    realtime : whether the service may be scheduled in real time
+    is_live : whether it is the running system, with systemd
+    root : root folder for systemctl
     """
 
     files: Mapping[str, str] = field(default_factory=dict)
@@ -150,8 +155,8 @@ class Facts:
     root: str = "/"
 
 
-def in_root(root: str, path: str) -> str:
-    """Return where an absolute path of a system is, whose root is another folder perhaps."""
+def path_in_root(root: str, path: str) -> str:
+    """Return the location of an absolute path of a system with the given root."""
     return path if root == "/" else f"{root.rstrip('/')}{path}"
 
 
@@ -161,12 +166,12 @@ def digest(content: bytes) -> str:
 
 
 def plan_install(
-    writes: Iterable[Write], units: Iterable[str], facts: Facts, *, start: bool, notes: Iterable[str]
+    writes: Iterable[WriteFile], units: Iterable[str], facts: SystemFacts, *, start: bool, notes: Iterable[str]
 ) -> Plan:
-    """Return the steps that bring `writes` to a system and have its `units` started. What was edited stays.
+    """Return the steps that write `writes` and start `units`. Edited files are kept.
 
-    A file is written where there is none, or where the one there is what an earlier `install` wrote. What an earlier
-    one wrote and this one does not is removed, but for the configuration, which is not always given anew.
+    A file is written where there is none, or where the existing one is what an earlier `install` wrote. What an earlier
+    one wrote and this one does not is removed, except for the configuration, which is not always given again.
     """
     writes = tuple(writes)
     steps: list[Step] = []
@@ -175,16 +180,18 @@ def plan_install(
     for write in writes:
         there, new = facts.files.get(write.path), digest(write.content)
         if there == new:
-            # not taken over where it was there before: uninstall is to leave it
+            # a file that was there before is not owned: uninstall leaves it
             if write.path in owned:
                 owned[write.path] = (new,)
-            steps.append(Keep(write.path, f"it is so already ({write.what})"))
+            steps.append(KeepFile(write.path, f"unchanged ({write.description})"))
         elif there is None or there in owned.get(write.path, ()):
             owned[write.path] = (new,) if there is None else (new, there)
             changed.add(write.path)
             steps.append(write)
         else:
-            steps.append(Keep(write.path, f"it was edited, or is not from here; what was to be written: {write.what}"))
+            steps.append(
+                KeepFile(write.path, f"edited, or not installed by modelserver; not written: {write.description}")
+            )
     for path in sorted(set(owned) - {write.path for write in writes}):
         there = facts.files.get(path)
         if path.startswith(f"{CONFIGURATION}/") or (there is not None and there not in owned[path]):
@@ -192,36 +199,34 @@ def plan_install(
         del owned[path]
         if there is not None:
             changed.add(path)
-            steps.append(Remove(path, "it was installed, and is not wanted any more"))
+            steps.append(RemovePath(path, "installed earlier, no longer needed"))
     units = tuple(units)
-    gone = [unit for unit in facts.manifest.units if unit not in units]
-    made = {folder for path in (*changed, MANIFEST) for folder in folders_around(path)} & facts.absent
+    obsolete = [unit for unit in facts.manifest.units if unit not in units]
+    made = {folder for path in (*changed, MANIFEST) for folder in parent_folders(path)} & facts.absent
     manifest = Manifest(owned, units, tuple(sorted({*facts.manifest.folders, *made})))
-    # before anything it tells of: what an interrupted installation has written can be taken back
-    steps.insert(0, Write(MANIFEST, manifest.encoded(), "what `modelserver uninstall` takes back"))
-    steps += _after_files(facts, changed)
-    if gone:
-        steps.append(_systemctl(facts, "units that are not wanted any more", "disable", *_now(facts), *gone))
-    steps.append(_systemctl(facts, "they start with the machine", "enable", *units))
+    # first, so that an interrupted installation can be undone
+    steps.insert(0, WriteFile(MANIFEST, manifest.encode(), "the record for `modelserver uninstall`"))
+    steps += _plan_reloads(facts, changed)
+    if obsolete:
+        steps.append(_systemctl(facts, "units that are no longer needed", "disable", *_now(facts), *obsolete))
+    steps.append(_systemctl(facts, "start at boot", "enable", *units))
     if start and facts.is_live:
-        steps.append(_systemctl(facts, "they start now, with what was written", "restart", *units))
+        steps.append(_systemctl(facts, "start now, with the new files", "restart", *units))
     return Plan(tuple(steps), tuple(notes))
 
 
-def plan_uninstall(facts: Facts, *, purge: bool) -> Plan:
-    """Return the steps that take an installation back; with `purge` also what was edited, and the state.
+def plan_uninstall(facts: SystemFacts, *, purge: bool) -> Plan:
+    """Return the steps that undo an installation; with `purge` also edited files and the state.
 
     Raises ModelServerError where nothing was installed.
     """
     manifest = facts.manifest
     if not manifest.files:
-        raise ModelServerError(
-            f"there is nothing to take back: {in_root(facts.root, MANIFEST)} tells of no installation"
-        )
+        raise ModelServerError(f"nothing to uninstall: {path_in_root(facts.root, MANIFEST)} has no installation")
     steps: list[Step] = []
     if manifest.units:
-        ended = _systemctl(facts, "they end, and start no more", "disable", *_now(facts), *manifest.units)
-        steps.append(RunProgram(ended.arguments, ended.what, may_fail=True))
+        stop = _systemctl(facts, "stop, and do not start again", "disable", *_now(facts), *manifest.units)
+        steps.append(RunProgram(stop.arguments, stop.description, may_fail=True))
     removed = set()
     for path, hashes in sorted(manifest.files.items()):
         there = facts.files.get(path)
@@ -229,60 +234,60 @@ def plan_uninstall(facts: Facts, *, purge: bool) -> Plan:
             continue
         if there in hashes or purge:
             removed.add(path)
-            steps.append(Remove(path, "as it was installed" if there in hashes else "installed, and edited since"))
+            steps.append(RemovePath(path, "as installed" if there in hashes else "installed, edited since"))
         else:
-            steps.append(Keep(path, "it was edited since; remove it yourself, or with --purge"))
-    steps.append(Remove(MANIFEST, "what was installed"))
+            steps.append(KeepFile(path, "edited since; remove it yourself, or with --purge"))
+    steps.append(RemovePath(MANIFEST, "the record of the installation"))
     if purge:
-        steps += [Remove(path, "what the service kept", whole=True) for path in STATE]
-    # those within others first
+        steps += [RemovePath(path, "the service's state", is_recursive=True) for path in STATE]
+    # nested folders first
     for folder in sorted(manifest.folders, reverse=True):
-        steps.append(Remove(folder, "the folder, where nothing is left in it"))
-    steps += _after_files(facts, removed)
+        steps.append(RemovePath(folder, "the folder, if it is empty"))
+    steps += _plan_reloads(facts, removed)
     notes = []
     if SYSCTL in removed:
-        notes.append("the kernel's limit of receive buffers is as it was set until the machine starts anew")
+        notes.append("the kernel's limit of receive buffers stays until the next boot")
     if not purge:
-        notes.append(f"what the service kept is still in {in_root(facts.root, STATE[0])}; --purge removes it too")
+        notes.append(f"the service's state is still in {path_in_root(facts.root, STATE[0])}; --purge removes it too")
     return Plan(tuple(steps), tuple(notes))
 
 
-def _after_files(facts: Facts, changed: Iterable[str]) -> list[Step]:
-    """Return the commands by which a system that runs takes note of files that have changed."""
+def _plan_reloads(facts: SystemFacts, changed: Iterable[str]) -> list[Step]:
+    """Return the commands that make a running system reload changed files."""
     if not facts.is_live:
         return []
     changed = set(changed)
     steps: list[Step] = []
     if RULES in changed and "udevadm" in facts.programs:
         udevadm = facts.programs["udevadm"]
-        steps.append(RunProgram((udevadm, "control", "--reload"), "the rules for serial ports count", may_fail=True))
+        steps.append(RunProgram((udevadm, "control", "--reload"), "apply the rules for serial ports", may_fail=True))
         trigger = (udevadm, "trigger", "--subsystem-match=tty", "--action=change")
-        steps.append(RunProgram(trigger, "also for what is plugged in", may_fail=True))
+        steps.append(RunProgram(trigger, "apply them to connected devices", may_fail=True))
     if SYSCTL in changed and "sysctl" in facts.programs and SYSCTL not in facts.files:
         load = (facts.programs["sysctl"], "--quiet", "--load", SYSCTL)
-        steps.append(RunProgram(load, "the limit counts from now on", may_fail=True))
+        steps.append(RunProgram(load, "apply the limit", may_fail=True))
     if any(path.startswith(f"{UNITS}/") for path in changed):
-        steps.append(_systemctl(facts, "systemd reads the units", "daemon-reload"))
+        steps.append(_systemctl(facts, "systemd reloads the units", "daemon-reload"))
     return steps
 
 
-def folders_around(path: str) -> list[str]:
+def parent_folders(path: str) -> list[str]:
     """Return the folders around a file, the outermost first."""
     parts = path.split("/")[:-1]
     return ["/".join(parts[:n]) for n in range(2, len(parts) + 1)]
 
 
-def _systemctl(facts: Facts, what: str, *arguments: str) -> RunProgram:
+def _systemctl(facts: SystemFacts, what: str, *arguments: str) -> RunProgram:
     program = facts.programs.get("systemctl", "systemctl")
     return RunProgram((program, *(() if facts.root == "/" else (f"--root={facts.root}",)), *arguments), what)
 
 
-def _now(facts: Facts) -> tuple[str, ...]:
+def _now(facts: SystemFacts) -> tuple[str, ...]:
     return ("--now",) if facts.is_live else ()
 
 
-def _path(path: Any) -> str:
-    """Return a path of the manifest, which decides what is removed: one below a folder that is installed to."""
+def _parse_path(path: Any) -> str:
+    """Return a path of the manifest, which decides what is removed: one below a folder of the installation."""
     below = (f"{CONFIGURATION}/", f"{UNITS}/modelserver")
     is_own = isinstance(path, str) and (path in (RULES, SYSCTL) or path.startswith(below))
     if not is_own or not {"..", "."}.isdisjoint(path.split("/")):
@@ -290,20 +295,20 @@ def _path(path: Any) -> str:
     return str(path)
 
 
-def _unit(name: Any) -> str:
+def _parse_unit(name: Any) -> str:
     if not isinstance(name, str) or not name.startswith("modelserver") or "/" in name:
         raise ValueError(f"{name!r} is no unit of this installation")
     return name
 
 
-def _folder(path: Any) -> str:
-    # only ever removed where it is empty
+def _parse_folder(path: Any) -> str:
+    # removed only where it is empty
     if not isinstance(path, str) or not (path == "/etc" or path.startswith("/etc/")) or ".." in path.split("/"):
         raise ValueError(f"{path!r} is no folder of this installation")
     return path
 
 
-def _text(value: Any) -> str:
+def _parse_hash(value: Any) -> str:
     if not isinstance(value, str):
         raise TypeError(f"{value!r} is no hash")
     return value

@@ -1,4 +1,4 @@
-"""The edge of `install` and `uninstall`: how the system is, and carrying out a plan on it."""
+"""I/O of `install` and `uninstall`: the state of the system, and the execution of a plan."""
 
 from __future__ import annotations
 
@@ -20,41 +20,41 @@ from mstools.deployment.plan import (
     MANIFEST,
     RULES,
     VEHICLE,
-    Facts,
-    Keep,
+    KeepFile,
     Manifest,
     Plan,
-    Remove,
+    RemovePath,
     RunProgram,
     Step,
-    Write,
+    SystemFacts,
+    WriteFile,
     digest,
-    folders_around,
-    in_root,
+    parent_folders,
+    path_in_root,
 )
-from mstools.terminal.output import safe
+from mstools.terminal.output import escape
 
 PROGRAMS: Final = ("systemctl", "systemd-run", "udevadm", "sysctl", "ip")
-SEARCHED: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
-COMMAND_S: Final = 120.0
-"""How long one command may take: a start waits until the service is ready."""
+SEARCH_PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
+COMMAND_TIMEOUT_S: Final = 120.0
+"""Time limit of a command: a start waits until the service is ready."""
 
 
-def read_facts(paths: Iterable[str], root: Path) -> Facts:
-    """Return how the system below `root` is, `paths` being the files that may be written. Raises ModelServerError."""
+def read_facts(paths: Iterable[str], root: Path) -> SystemFacts:
+    """Return the system's state below `root`; `paths` are the files that may be written. Raises ModelServerError."""
     paths = tuple(paths)
     manifest = read_manifest(root)
     files = {}
     for path in {*paths, *manifest.files}:
-        content = _content(below(root, path))
+        content = _read_file(path_below(root, path))
         if content is not None:
             files[path] = digest(content)
-    around = {folder for path in (*paths, MANIFEST) for folder in folders_around(path)}
-    absent = frozenset(folder for folder in around if not below(root, folder).is_dir())
-    programs = {name: found for name in PROGRAMS if (found := shutil.which(name, path=SEARCHED))}
+    around = {folder for path in (*paths, MANIFEST) for folder in parent_folders(path)}
+    absent = frozenset(folder for folder in around if not path_below(root, folder).is_dir())
+    programs = {name: found for name in PROGRAMS if (found := shutil.which(name, path=SEARCH_PATH))}
     is_live = root == Path("/") and os.path.isdir("/run/systemd/system")
-    rules = (_content(below(root, RULES)) or b"").decode("utf-8", "replace")
-    return Facts(
+    rules = (_read_file(path_below(root, RULES)) or b"").decode("utf-8", "replace")
+    return SystemFacts(
         files=files,
         absent=absent,
         manifest=manifest,
@@ -62,66 +62,66 @@ def read_facts(paths: Iterable[str], root: Path) -> Facts:
         rules=rules,
         rmem_max=_rmem_max() if root == Path("/") else 0,
         programs=programs,
-        realtime=is_live and may_be_realtime(programs.get("systemd-run", "")),
+        realtime=is_live and can_be_realtime(programs.get("systemd-run", "")),
         is_live=is_live,
         root=str(root),
     )
 
 
 def read_manifest(root: Path) -> Manifest:
-    """Return what was installed below `root`; an empty one where nothing was. Raises ModelServerError."""
-    raw = _content(below(root, MANIFEST))
-    return Manifest() if raw is None else Manifest.decoded(raw, str(below(root, MANIFEST)))
+    """Return what was installed below `root`; an empty manifest where nothing was. Raises ModelServerError."""
+    raw = _read_file(path_below(root, MANIFEST))
+    return Manifest() if raw is None else Manifest.decode(raw, str(path_below(root, MANIFEST)))
 
 
-def below(root: Path, path: str) -> Path:
-    """Return where an absolute path of the system is below its root."""
-    return Path(in_root(str(root), path))
+def path_below(root: Path, path: str) -> Path:
+    """Return the location of an absolute path of the system below its root."""
+    return Path(path_in_root(str(root), path))
 
 
-def check_may(root: Path, command: str) -> None:
+def check_root_user(root: Path, command: str) -> None:
     """Raise ModelServerError where this user cannot change the system."""
     if os.geteuid() != 0 and root == Path("/"):
         raise ModelServerError(f"this changes /etc and needs root: sudo {command} (to see what it would do: --dry-run)")
 
 
-def show(plan: Plan, root: Path) -> None:
+def print_plan(plan: Plan, root: Path) -> None:
     """Print a plan for the system below `root`."""
     for step in plan.steps:
-        _say(_words(step, root))
+        _print(_format_step(step, root))
     for note in plan.notes:
-        _say(f"note    {note}")
+        _print(f"note    {note}")
 
 
-def carry_out(plan: Plan, root: Path) -> None:
-    """Do what a plan says, telling each step. Raises ModelServerError, OSError at the first that fails."""
+def execute_plan(plan: Plan, root: Path) -> None:
+    """Execute a plan and print each step. Raises ModelServerError, OSError at the first that fails."""
     for step in plan.steps:
-        _say(_words(step, root))
-        _carry_out(step, root)
+        _print(_format_step(step, root))
+        _execute_step(step, root)
     for note in plan.notes:
-        _say(f"note    {note}")
+        _print(f"note    {note}")
 
 
-def _words(step: Step, root: Path) -> str:
-    """Return a step for people, with the path that is touched."""
-    return str(step if isinstance(step, RunProgram) else replace(step, path=str(below(root, step.path))))
+def _format_step(step: Step, root: Path) -> str:
+    """Return a step with the path that is touched."""
+    return str(step if isinstance(step, RunProgram) else replace(step, path=str(path_below(root, step.path))))
 
 
-def _carry_out(step: Step, root: Path) -> None:
-    if isinstance(step, Write):
+def _execute_step(step: Step, root: Path) -> None:
+    if isinstance(step, WriteFile):
         _write(step, root)
-    elif isinstance(step, Remove):
+    elif isinstance(step, RemovePath):
         _remove(step, root)
     elif isinstance(step, RunProgram):
         _run(step)
     else:
-        assert isinstance(step, Keep)
+        assert isinstance(step, KeepFile)
 
 
-def _write(step: Write, root: Path) -> None:
-    path = below(root, step.path)
+def _write(step: WriteFile, root: Path) -> None:
+    path = path_below(root, step.path)
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o755)
-    # whole or not at all: a power cut leaves the old file or the new one
+    # atomic: a power failure leaves the old file or the new one
     handle, draft = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
         with open(handle, "wb") as file:
@@ -135,63 +135,70 @@ def _write(step: Write, root: Path) -> None:
             os.unlink(draft)
 
 
-def _remove(step: Remove, root: Path) -> None:
-    path = below(root, step.path)
+def _remove(step: RemovePath, root: Path) -> None:
+    path = path_below(root, step.path)
     try:
         mode = path.lstat().st_mode
     except FileNotFoundError:
         return
     if not stat.S_ISDIR(mode):
         path.unlink()
-    elif step.whole:
+    elif step.is_recursive:
         shutil.rmtree(path)
     else:
-        # one that still holds something is somebody's
+        # a folder with other files is left
         with suppress(OSError):
             path.rmdir()
 
 
 def _run(step: RunProgram) -> None:
-    said = ""
+    output = ""
     try:
-        done = subprocess.run(step.arguments, capture_output=True, text=True, timeout=COMMAND_S, check=False)
-        failed, said = done.returncode != 0, (done.stderr or done.stdout).strip()
+        done = subprocess.run(step.arguments, capture_output=True, text=True, timeout=COMMAND_TIMEOUT_S, check=False)
+        failed, output = done.returncode != 0, (done.stderr or done.stdout).strip()
     except (OSError, subprocess.TimeoutExpired) as error:
-        failed, said = True, str(error)
+        failed, output = True, str(error)
     if not failed:
         return
     command = " ".join(step.arguments)
     if not step.may_fail:
-        hint = (
-            "journalctl -e -u 'modelserver*' says why" if "restart" in step.arguments else "mend that, then do it again"
-        )
-        raise ModelServerError(f"{command} failed: {said or 'it says nothing'}; {hint}")
-    _say(f"        that failed, and the rest goes on: {said or 'it says nothing'}")
+        hint = "see journalctl -e -u 'modelserver*'" if "restart" in step.arguments else "fix that, then try again"
+        raise ModelServerError(f"{command} failed: {output or 'without a message'}; {hint}")
+    _print(f"        failed, continuing: {output or 'without a message'}")
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     for line in text.splitlines():
-        typer.echo(safe(line))
+        typer.echo(escape(line))
 
 
-def _content(path: Path) -> bytes | None:
-    """Return what a file holds, None where there is none. Raises OSError."""
+def _read_file(path: Path) -> bytes | None:
+    """Return the content of a file, None where there is none. Raises OSError."""
     try:
         return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
         return None
 
 
-def may_be_realtime(systemd_run: str) -> bool:
-    """Return whether systemd can have a unit scheduled in real time, and there is a core left for the others.
+def can_be_realtime(systemd_run: str) -> bool:
+    """Return whether systemd can schedule a unit in real time, and another core is left.
 
-    Some kernels (CONFIG_RT_GROUP_SCHED) refuse it to units, and a unit that asks for it does not start there.
+    Some kernels (CONFIG_RT_GROUP_SCHED) deny it to units, and a unit that requests it does not start there.
     """
     if os.geteuid() != 0 or not systemd_run or (os.cpu_count() or 1) < 2:
         return False
-    asked = ("--quiet", "--wait", "--collect", "-p", "CPUSchedulingPolicy=rr", "-p", "CPUSchedulingPriority=1", "true")
+    arguments = (
+        "--quiet",
+        "--wait",
+        "--collect",
+        "-p",
+        "CPUSchedulingPolicy=rr",
+        "-p",
+        "CPUSchedulingPriority=1",
+        "true",
+    )
     try:
-        done = subprocess.run((systemd_run, *asked), capture_output=True, timeout=20.0, check=False)
+        done = subprocess.run((systemd_run, *arguments), capture_output=True, timeout=20.0, check=False)
     except (OSError, subprocess.TimeoutExpired):
         return False
     return done.returncode == 0
@@ -212,7 +219,7 @@ def _rmem_max() -> int:
         return 0
 
 
-def configuration_there(root: Path) -> Path | None:
-    """Return the vehicle file that is installed already, None where there is none."""
-    path = below(root, VEHICLE)
+def find_installed_vehicle(root: Path) -> Path | None:
+    """Return the installed vehicle file, None where there is none."""
+    path = path_below(root, VEHICLE)
     return path if path.is_file() else None

@@ -1,6 +1,7 @@
-"""ROS messages as samples of this project: what each says, and what it leaves open. No bag is read here.
+"""Conversion of ROS messages to samples of this project, independent of bags. Pure.
 
-Messages are taken by their fields, as any ROS library presents them; ROS 1 and 2 are alike in all that is used.
+Messages are read by their fields, as any ROS library presents them; ROS 1 and 2 are alike in all fields used. What a
+message leaves open (height reference, orientation reference, track width) is a `BagOptions`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from modelserver.messages import (
     ImuSample,
     JointSample,
     JointsSample,
-    Matrix3,
     OrientationReference,
     Sample,
     SensorHeader,
@@ -29,15 +29,15 @@ from modelserver.messages import (
     WheelsSample,
     YawSource,
 )
-from modelserver.spatial import so3
-from modelserver.spatial.so3 import Array
+from modelserver.transforms import so3
+from modelserver.transforms.so3 import Array, Matrix3
 
-STANDSTILL = 1e-3
-"""Speeds below, m/s, count as standing: controllers average, and leave dust of 1e-15."""
+STATIONARY_SPEED = 1e-3
+"""Speed in m/s below which a wheel is stationary: averaging controllers leave residues of 1e-15."""
 
 
 class TopicKind(StrEnum):
-    """What a topic becomes: also the source's name, and in capitals the channel's."""
+    """Kind of samples of a topic: also the source's name, and in capitals the channel's."""
 
     GPS = "gps"
     IMU = "imu"
@@ -69,8 +69,8 @@ class ImuOrientation(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
-    """What a bag does not say about itself."""
+class BagOptions:
+    """What a bag leaves open."""
 
     altitude: Altitude = Altitude.ELLIPSOIDAL
     undulation: float = NAN
@@ -78,22 +78,22 @@ class Options:
     track_width: float = 0.555
 
 
-DEFAULTS = Options()
+DEFAULT_OPTIONS = BagOptions()
 
 
 class Converter(Protocol):
-    """Turns the messages of one topic into samples, in their order. `notes` is what to tell the user at the end."""
+    """Converts the messages of one topic to samples, in their order."""
 
     def convert(self, header: SensorHeader, message: Any) -> Sample:
         """Return the sample of a message."""
         ...
 
     def notes(self) -> list[str]:
-        """Return what is worth knowing about what was converted, one line each."""
+        """Return notes on the converted messages for the user, one line each."""
         ...
 
 
-def converter(kind: TopicKind, options: Options) -> Converter:
+def make_converter(kind: TopicKind, options: BagOptions) -> Converter:
     """Return a new converter."""
     match kind:
         case TopicKind.GPS:
@@ -111,15 +111,15 @@ def converter(kind: TopicKind, options: Options) -> Converter:
 _FIX_TYPES = {
     0: FixType.FIX_3D,
     1: FixType.DIFFERENTIAL,  # satellite-based augmentation
-    # Ground-based augmentation: a differential fix at least. Drivers report RTK so as well; the message has no
-    # word for it, and its covariance says how good the fix is.
+    # Ground-based augmentation: at least a differential fix. Drivers report RTK as this too; the covariance has
+    # their quality.
     2: FixType.DIFFERENTIAL,
 }
 
 
 @dataclass(slots=True)
 class GpsConverter:
-    """NavSatFix. Heights are taken as the option says; a sample never holds both from one number."""
+    """NavSatFix. The altitude is ellipsoidal or MSL by option; the other height needs the undulation."""
 
     altitude: Altitude
     undulation: float = NAN
@@ -148,12 +148,12 @@ class GpsConverter:
         )
 
     def notes(self) -> list[str]:
-        """Return what is worth knowing."""
+        """Return notes for the user."""
         lines = []
         if self._unknown_covariances:
-            lines.append(f"{self._unknown_covariances} fixes do not say how good they are")
+            lines.append(f"{self._unknown_covariances} fixes have no covariance")
         if self.altitude is Altitude.MSL and not math.isfinite(self.undulation):
-            lines.append("heights above the ellipsoid are not known: give --undulation with --altitude msl")
+            lines.append("ellipsoidal heights are unknown: give --undulation with --altitude msl")
         return lines
 
 
@@ -162,12 +162,12 @@ class GpsConverter:
 
 @dataclass(slots=True)
 class ImuConverter:
-    """Imu. A first covariance of -1 marks what the unit does not give (the message's own rule)."""
+    """Imu. A first covariance element of -1 marks a missing value (the message's definition)."""
 
     orientation: ImuOrientation
     _count: int = 0
     _force: float = 0.0
-    _turned: Array = field(default_factory=lambda: np.zeros(3))
+    _rotated: Array = field(default_factory=lambda: np.zeros(3))
     _oriented: int = 0
 
     def convert(self, header: SensorHeader, message: Any) -> ImuSample:
@@ -180,7 +180,7 @@ class ImuConverter:
             self._force += math.hypot(*force)
             if quaternion is not None:
                 self._oriented += 1
-                self._turned += so3.rotate(quaternion, force)
+                self._rotated += so3.rotate(quaternion, force)
         reference = OrientationReference[self.orientation.name]
         wanted = quaternion is not None and reference is not OrientationReference.NONE
         return ImuSample(
@@ -189,7 +189,7 @@ class ImuConverter:
             specific_force=force,
             orientation=quaternion if wanted else None,
             orientation_reference=reference if wanted else OrientationReference.NONE,
-            # what turns the unit's yaw is not said either: its zero counts as arbitrary
+            # the message does not define the zero of yaw
             yaw_source=YawSource.NONE,
             angular_velocity_covariance=_covariance(message.angular_velocity_covariance),
             specific_force_covariance=_covariance(message.linear_acceleration_covariance),
@@ -204,24 +204,24 @@ class ImuConverter:
         values = (float(q.w), float(q.x), float(q.y), float(q.z))
         length = math.hypot(*values)
         if not math.isfinite(length) or abs(length - 1.0) > 0.05:
-            return None  # all zeros is what drivers send that have none
+            return None  # drivers without orientation send zeros
         w, x, y, z = (value / length for value in values)
         return (w, x, y, z)
 
     def notes(self) -> list[str]:
-        """Return what is worth knowing."""
+        """Return notes for the user."""
         lines = []
         if self._count and not 8.5 < (mean := self._force / self._count) < 11.5:
-            lines.append(f"the specific force averages {mean:.2f} m/s2, not 9.81: another unit, or gravity taken out?")
+            lines.append(f"the mean specific force is {mean:.2f} m/s2, not 9.81: wrong unit, or gravity removed?")
         if self._oriented:
-            up = self._turned[2] / self._oriented
-            seems = "enu" if up > 8.0 else "ned" if up < -8.0 else ""
+            up = self._rotated[2] / self._oriented
+            likely = "enu" if up > 8.0 else "ned" if up < -8.0 else ""
             if self.orientation is ImuOrientation.NONE:
-                hint = f"; by gravity it is of kind {seems}" if seems else ""
-                lines.append(f"the unit's own orientation is left out (--imu-orientation){hint}")
-            elif seems != self.orientation.value:
+                hint = f"; by gravity it is {likely}" if likely else ""
+                lines.append(f"the IMU's own orientation is dropped (--imu-orientation){hint}")
+            elif likely != self.orientation.value:
                 lines.append(
-                    f"the unit's orientation turns gravity's reaction to {up:+.1f} m/s2 along z: this does not look "
+                    f"the IMU's orientation gives {up:+.1f} m/s2 of gravity's reaction along z: this does not look "
                     f"like {self.orientation.value}"
                 )
         return lines
@@ -233,10 +233,9 @@ class ImuConverter:
 class WheelsConverter:
     """Odometry, as two virtual wheels `left` and `right` at half the track width to either side of the base.
 
-    Their speeds are those that the published twist gives two points of the base: v -+ w track/2. Their travel
-    comes from the steps of the published pose. The two differ in time: controllers average the twist (the
-    Husky's over ten cycles, half a second late), and do not average the pose. The encoders of a wheel that skids
-    read otherwise; what they read is not in the message.
+    Speed: that of two points of the base by the published twist, v -+ w track/2. Travel: from the steps of the
+    published pose. The two differ in latency: controllers average the twist (the Husky's over ten cycles, 0.5 s) and
+    not the pose. The encoder counts of a skidding wheel are not in the message.
     """
 
     def __init__(self, track_width: float):
@@ -252,11 +251,11 @@ class WheelsConverter:
         twist = message.twist.twist
         speed, turn = float(twist.linear.x), float(twist.angular.z)
         self._sideways = max(self._sideways, abs(float(twist.linear.y)))
-        way, angle = self._step(header.utime, message.pose.pose, speed, turn)
+        distance, angle = self._step(header.utime, message.pose.pose, speed, turn)
         covariance = np.asarray(message.twist.covariance, float).reshape(6, 6)
         wheels = []
         for n, (name, arm) in enumerate((("left", -self._half), ("right", self._half))):
-            self._travel[n] += way + arm * angle
+            self._travel[n] += distance + arm * angle
             rolled = speed + arm * turn
             spread = covariance[0, 0] + 2 * arm * covariance[0, 5] + arm * arm * covariance[5, 5]
             known = covariance[0, 0] > 0 and covariance[5, 5] > 0 and spread > 0
@@ -272,41 +271,41 @@ class WheelsConverter:
         return WheelsSample(header, tuple(wheels))
 
     def _step(self, utime: int, pose: Any, speed: float, turn: float) -> tuple[float, float]:
-        """Return the way forward, metres, and the turn, radians, since the message before."""
-        place = np.array([pose.position.x, pose.position.y, pose.position.z], float)
+        """Return the forward distance, meters, and the turn, radians, since the previous message."""
+        position = np.array([pose.position.x, pose.position.y, pose.position.z], float)
         q = pose.orientation
-        ahead = np.array(so3.rotate((float(q.w), float(q.x), float(q.y), float(q.z)), (1.0, 0.0, 0.0)))
-        good = bool(np.isfinite(place).all()) and 0.9 < float(np.linalg.norm(ahead)) < 1.1
-        before, self._previous = self._previous, (utime, place, ahead) if good else None
+        forward = np.array(so3.rotate((float(q.w), float(q.x), float(q.y), float(q.z)), (1.0, 0.0, 0.0)))
+        good = bool(np.isfinite(position).all()) and 0.9 < float(np.linalg.norm(forward)) < 1.1
+        before, self._previous = self._previous, (utime, position, forward) if good else None
         if before is None:
             return (0.0, 0.0)
         seconds = max(0.0, (utime - before[0]) * 1e-6)
         by_twist = (speed * seconds, turn * seconds)
         if not good:
             return by_twist
-        middle = ahead + before[2]
+        middle = forward + before[2]
         length = float(np.linalg.norm(middle))
-        way = float((place - before[1]) @ middle) / length if length > 1e-6 else math.inf
-        if abs(way - by_twist[0]) > 1.0 + 5.0 * seconds:
-            self._jumps += 1  # the odometry was set anew: its pose says nothing of this step, its twist does
+        distance = float((position - before[1]) @ middle) / length if length > 1e-6 else math.inf
+        if abs(distance - by_twist[0]) > 1.0 + 5.0 * seconds:
+            self._jumps += 1  # the odometry was reset: use the twist for this step
             return by_twist
-        cross = before[2][0] * ahead[1] - before[2][1] * ahead[0]
-        return (way, math.atan2(cross, float(before[2][:2] @ ahead[:2])))
+        cross = before[2][0] * forward[1] - before[2][1] * forward[0]
+        return (distance, math.atan2(cross, float(before[2][:2] @ forward[:2])))
 
     def notes(self) -> list[str]:
-        """Return what is worth knowing."""
+        """Return notes for the user."""
         lines = []
         if self._jumps:
             lines.append(f"the odometry's pose jumped {self._jumps} times; there the travel is that of its twist")
         if self._sideways > 0.01:
-            lines.append(f"the base moves sideways at up to {self._sideways:.2f} m/s, which wheels cannot say")
+            lines.append(f"the base moves sideways at up to {self._sideways:.2f} m/s, which wheels do not measure")
         return lines
 
 
 def _direction(speed: float) -> Direction:
     if not math.isfinite(speed):
         return Direction.UNKNOWN
-    if abs(speed) < STANDSTILL:
+    if abs(speed) < STATIONARY_SPEED:
         return Direction.STOPPED
     return Direction.FORWARD if speed > 0 else Direction.BACKWARD
 
@@ -315,7 +314,7 @@ def _direction(speed: float) -> Direction:
 
 
 class JointsConverter:
-    """JointState: names, positions and rates; efforts have no counterpart."""
+    """JointState: names, positions and rates; efforts are dropped."""
 
     def convert(self, header: SensorHeader, message: Any) -> JointsSample:
         """Return the sample of a JointState."""
@@ -333,7 +332,7 @@ class JointsConverter:
         )
 
     def notes(self) -> list[str]:
-        """Return what is worth knowing."""
+        """Return notes for the user."""
         return []
 
 
@@ -341,7 +340,7 @@ class JointsConverter:
 
 
 def _covariance(values: Sequence[float]) -> Matrix3 | None:
-    """Return nine numbers, or None where they say nothing: -1 first, all zero, or not finite."""
+    """Return nine numbers, or None for an unknown covariance: first element -1, all zero, or not finite."""
     a, b, c, d, e, f, g, h, i = (float(value) for value in values)
     if not all(map(math.isfinite, (a, b, c, d, e, f, g, h, i))) or not (a > 0 and e > 0 and i > 0):
         return None

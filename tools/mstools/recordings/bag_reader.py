@@ -1,4 +1,4 @@
-"""ROS bags, through the library rosbags: opened, listed and read, with one clear error for all that can be wrong."""
+"""Reader of ROS bags (library rosbags), with one clear error for all that can be wrong."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ INSTALL = "pip install 'modelserver[bags]'"
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One topic of a bag: its name, its type as ROS 2 writes it (sensor_msgs/msg/Imu), how many messages."""
+    """One topic of a bag: its name, its type in ROS 2 notation (sensor_msgs/msg/Imu), number of messages."""
 
     name: str
     type_name: str
@@ -23,8 +23,8 @@ class Topic:
 
 
 @dataclass(frozen=True, slots=True)
-class Received:
-    """One message of a bag: its topic, when the recorder received it (nanoseconds), what it says."""
+class BagMessage:
+    """One message of a bag, with its topic and receive time in nanoseconds."""
 
     topic: str
     received_ns: int
@@ -43,20 +43,20 @@ class Bag:
             counts[key] = counts.get(key, 0) + connection.msgcount
         self.topics = tuple(Topic(name, type_name, count) for (name, type_name), count in sorted(counts.items()))
 
-    def messages(self, topics: set[str]) -> Iterator[Received]:
-        """Yield the messages of some topics in the order they were received. Raises RecordingError."""
+    def messages(self, topics: set[str]) -> Iterator[BagMessage]:
+        """Yield the messages of some topics in the order received. Raises RecordingError."""
         connections = [each for each in self._reader.connections if each.topic in topics]
         stream = iter(self._reader.messages(connections=connections)) if connections else iter(())
         count = 0
         while True:
-            with _explained(self._path, f"after {count} messages"):
+            with _explain_errors(self._path, f"after {count} messages"):
                 try:
                     connection, received_ns, raw = next(stream)
                 except StopIteration:
                     return
                 message = self._reader.deserialize(raw, connection.msgtype)
             count += 1
-            yield Received(connection.topic, received_ns, message)
+            yield BagMessage(connection.topic, received_ns, message)
 
 
 @contextmanager
@@ -72,11 +72,11 @@ def open_bag(path: Path) -> Iterator[Bag]:
             if path.suffix == ".bag" and not file.read(9).startswith(b"#ROSBAG V"):
                 raise RecordingError(f"{path}: not a ROS bag: it does not begin with #ROSBAG")
     elif not path.is_dir():
-        # a FIFO or a device would be waited for
+        # reading a FIFO or a device would block
         raise RecordingError(f"{path}: {'neither a file nor a folder' if path.exists() else 'no such file'}")
     reader = None
-    with _explained(path, "on opening it"):
-        # ROS 2 bags may come without their type definitions; those of ROS itself have been stable
+    with _explain_errors(path, "on opening it"):
+        # ROS 2 bags may lack their type definitions; those of ROS itself have been stable
         reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
         reader.open()
     try:
@@ -86,15 +86,15 @@ def open_bag(path: Path) -> Iterator[Bag]:
 
 
 @contextmanager
-def _explained(path: Path, place: str) -> Iterator[None]:
-    """Turn whatever the library raises on a damaged bag into one readable error."""
+def _explain_errors(path: Path, place: str) -> Iterator[None]:
+    """Convert any exception of the library on a damaged bag to one readable error."""
     try:
         yield
     except (RecordingError, OSError, MemoryError):
         raise
-    except Exception as error:  # the library promises no set of exceptions for damaged bytes
+    except Exception as error:  # the library documents no exceptions for damaged files
         what = str(error).strip() or type(error).__name__
         raise RecordingError(
             f"{path}: the bag cannot be read {place}: {what.rstrip('.')}. It may be cut short or never have been "
-            "closed; `rosbag reindex` mends such bags of ROS 1, `ros2 bag reindex` those of ROS 2"
+            "closed; `rosbag reindex` repairs such bags of ROS 1, `ros2 bag reindex` those of ROS 2"
         ) from None

@@ -1,7 +1,8 @@
-"""Whether innovations are as large as the filter expects them: NIS by kind of measurement. Pure.
+"""Consistency of the innovations: NIS by kind of measurement. Pure.
 
-NIS is a decision's statistic, residual' S^-1 residual. If all is well it is chi-square distributed with as many degrees
-of freedom as numbers were compared: its mean over them is 1, and one in twenty passes the 95 % limit.
+NIS is a decision's statistic y' S^-1 y of the innovation y with covariance S. In a consistent filter it is chi-square
+distributed with as many degrees of freedom as y has components: its mean per degree of freedom is 1, and 5 % exceed the
+95 % limit (Bar-Shalom, Li and Kirubarajan (2001) 5.4).
 """
 
 from __future__ import annotations
@@ -10,41 +11,45 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from modelserver.localization.filter.kalman import gate_limit
+from modelserver.estimation.filter.kalman import gate_limit
 from modelserver.messages import Decision, Verdict
 
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """The innovations of one kind. `mean` is of NIS over its degrees of freedom, `beyond` the share over 95 %.
+    """Innovations of one kind of measurement.
 
-    `count` were compared, `refused` of them by the gate; those count in `mean` and `beyond` as well. `numbers` is how
-    many numbers were compared in all.
+    Attributes
+    ----------
+    count, numbers : innovations and their components
+    rejected : innovations that the gate rejected; included in `mean` and `beyond`
+    mean : mean NIS per degree of freedom
+    beyond : share of innovations beyond the 95 % limit
     """
 
     kind: str
     count: int
     numbers: int
-    refused: int
+    rejected: int
     mean: float
     beyond: float
 
 
-def counts(decision: Decision) -> bool:
-    """Return whether a decision's statistic speaks of consistency: compared, and not set aside on purpose."""
+def has_nis(decision: Decision) -> bool:
+    """Return whether a decision has an innovation and was not set aside on purpose."""
     return decision.dof > 0 and math.isfinite(decision.statistic) and decision.verdict is not Verdict.MONITORED
 
 
-def by_kind(decisions: Iterable[Decision]) -> list[Consistency]:
-    """Return the consistency of each kind that was compared, by name."""
+def compute_consistency(decisions: Iterable[Decision]) -> list[Consistency]:
+    """Return the consistency of each kind of measurement, by name."""
     kinds: dict[str, list[Decision]] = {}
     for each in decisions:
-        if counts(each):
+        if has_nis(each):
             kinds.setdefault(each.kind, []).append(each)
-    return [_of(kind, found) for kind, found in sorted(kinds.items())]
+    return [_summarize(kind, found) for kind, found in sorted(kinds.items())]
 
 
-def _of(kind: str, found: list[Decision]) -> Consistency:
+def _summarize(kind: str, found: list[Decision]) -> Consistency:
     numbers = sum(each.dof for each in found)
     beyond = sum(each.statistic > gate_limit(each.dof, 0.05) for each in found)
     return Consistency(
@@ -57,21 +62,21 @@ def _of(kind: str, found: list[Decision]) -> Consistency:
     )
 
 
-def running(decisions: Iterable[Decision], window_s: float) -> tuple[list[int], list[float]]:
-    """Return instants (utime) and the mean of NIS over its degrees of freedom in the `window_s` before each."""
+def compute_running_nis(decisions: Iterable[Decision], window_s: float) -> tuple[list[int], list[float]]:
+    """Return utimes and the mean NIS per degree of freedom in the `window_s` before each."""
     utimes: list[int] = []
     means: list[float] = []
-    held: list[Decision] = []
+    window: list[Decision] = []
     first = 0
     total = 0.0
     numbers = 0
-    for each in sorted(filter(counts, decisions), key=lambda decision: decision.utime):
-        held.append(each)
+    for each in sorted(filter(has_nis, decisions), key=lambda decision: decision.utime):
+        window.append(each)
         total += each.statistic
         numbers += each.dof
-        while held[first].utime < each.utime - window_s * 1e6:
-            total -= held[first].statistic
-            numbers -= held[first].dof
+        while window[first].utime < each.utime - window_s * 1e6:
+            total -= window[first].statistic
+            numbers -= window[first].dof
             first += 1
         utimes.append(each.utime)
         means.append(max(total, 0.0) / numbers)

@@ -1,7 +1,12 @@
-"""What a replay's decisions and states say is wrong with the vehicle file, the sensors or the settings. Pure.
+"""Findings of a replay: what its decisions and states reveal about vehicle file, sensors and settings. Pure.
 
-Each check is a function of all that was gathered, and says what was seen, what it probably means and what to do. A
-check keeps silent where there is too little to judge by.
+Each check is a function of `ReplayData` and yields findings: what was observed, the probable cause, and what to do. It
+yields nothing where there is too little data. Tests of consistency compare the mean NIS per degree of freedom with 1
+(consistency.py). The GNSS latency tau is a least-squares fit of the horizontal residuals r to the velocity v, both
+high-pass filtered by subtracting a running mean: a fix that is tau old lies at -tau v, so tau = -sum(r v) / sum(v^2);
+its sigma is from the scatter over parts of the drive.
+Order: causes from the raw sensor data (sensor_checks.py) first; with one of them, checks that would only repeat its
+consequences are left out, and so are checks of the state of a filter that diverged.
 """
 
 from __future__ import annotations
@@ -13,74 +18,70 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from modelserver.messages import Decision, Invalid, Verdict
-from modelserver.spatial.so3 import Array
+from modelserver.transforms.so3 import Array
 from mstools.report import consistency
-from mstools.report.causes import CAUSES
-from mstools.report.data import Replayed, StateSample, WheelTurn
-from mstools.report.finding import FindingLevel, ReportFinding
-from mstools.terminal.output import counted
+from mstools.report.replay_data import FindingLevel, ReplayData, ReportFinding, StateSample, WheelComparison
+from mstools.report.sensor_checks import SENSOR_CHECKS
+from mstools.terminal.output import format_count
 
-MOVING = 0.3
-"""Speed, m/s, from which a wheel's or a fix's error tells something."""
+MOVING_SPEED = 0.3
+"""Speed, m/s, above which the errors of wheels and fixes are evaluated."""
 
-LEAST_TURNS = 20
-"""Fewest wheel samples on the move that a wheel is judged by."""
+MIN_WHEEL_SAMPLES = 20
+"""Fewest samples in motion to evaluate a wheel."""
 
 
-def findings(replayed: Replayed) -> list[ReportFinding]:
-    """Return all findings, worst first, and of equals the causes first.
-
-    What only follows from a sensor that is wrong, or from a filter that had to begin anew, is left out.
-    """
-    causes = [finding for check in CAUSES for finding in check(replayed)]
+def collect_findings(data: ReplayData) -> list[ReportFinding]:
+    """Return all findings, worst first, and of equals the causes first."""
+    causes = [finding for check in SENSOR_CHECKS for finding in check(data)]
     checks = list(CHECKS)
     if not causes:
-        checks += LOOKING_AT_SENSORS
-        if not any(_has_diverged(each) for each in replayed.decisions):
-            checks += OF_A_SOUND_STATE
-        checks.append(refused_fixes)
-    found = causes + [finding for check in (*checks, stamps, gaps) for finding in check(replayed)]
-    found += validity(replayed, explained=bool(causes))
-    return sorted(found, key=lambda each: each.grade)
+        checks += SENSOR_RESIDUAL_CHECKS
+        if not any(_has_diverged(each) for each in data.decisions):
+            checks += STATE_CHECKS
+        checks.append(check_rejected_fixes)
+    found = causes + [finding for check in (*checks, check_stamps, check_gaps) for finding in check(data)]
+    found += check_validity(data, has_cause=bool(causes))
+    return sorted(found, key=lambda each: each.level)
 
 
 # --- wheels -------------------------------------------------------------------------------------------------
 
 
-def wheels_reversed(replayed: Replayed) -> Iterable[ReportFinding]:
-    """Look for wheels that tell the negative of what is expected of them, and for wheels that tell nothing."""
-    for name, turns in sorted(_by_wheel(replayed.wheels).items()):
-        moving = [each for each in turns if abs(each.expected) > MOVING]
-        if len(moving) < LEAST_TURNS:
+def check_wheels(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find wheels with reversed sign, and wheels without pulses."""
+    for name, turns in sorted(_group_by_wheel(data.wheels).items()):
+        moving = [each for each in turns if abs(each.expected) > MOVING_SPEED]
+        if len(moving) < MIN_WHEEL_SAMPLES:
             continue
         against = [each for each in moving if abs(each.measured + each.expected) < 0.3 * abs(each.expected)]
         if len(against) > 0.5 * len(moving):
             yield ReportFinding(
-                FindingLevel.WRONG,
+                FindingLevel.ERROR,
                 f"Wheel {name} counts backward",
-                f"In {len(against)} of {len(moving)} samples on the move it told the negative of what was expected.",
-                "Turn the sign of this wheel in its driver, or swap its encoder's two channels.",
+                f"In {len(against)} of {len(moving)} samples in motion it measured the negative of the expected speed.",
+                "Reverse the sign of this wheel in its driver, or swap its encoder's two channels.",
             )
             continue
         silent = [each for each in moving if abs(each.measured) < 0.02]
-        longest = _longest(silent, moving)
+        longest = _longest_run(silent, moving)
         if len(silent) > 0.5 * len(moving) or longest > 5.0:
             yield ReportFinding(
-                FindingLevel.WRONG,
-                f"Wheel {name} stands while the vehicle drives",
-                f"It told no motion in {len(silent)} of {len(moving)} samples on the move, for up to {longest:.0f} s.",
-                "Look at its encoder, cable and plug; a wheel without encoder is left out of sensors.wheels.frames.",
+                FindingLevel.ERROR,
+                f"Wheel {name} is stationary while the vehicle drives",
+                f"It measured no motion in {len(silent)} of {len(moving)} samples, for up to {longest:.0f} s.",
+                "Check its encoder, cable and plug; leave a wheel without encoder out of sensors.wheels.frames.",
             )
 
 
-def _by_wheel(turns: Iterable[WheelTurn]) -> dict[str, list[WheelTurn]]:
-    wheels: dict[str, list[WheelTurn]] = {}
+def _group_by_wheel(turns: Iterable[WheelComparison]) -> dict[str, list[WheelComparison]]:
+    wheels: dict[str, list[WheelComparison]] = {}
     for each in turns:
         wheels.setdefault(each.name, []).append(each)
     return wheels
 
 
-def _longest(marked: list[WheelTurn], among: list[WheelTurn]) -> float:
+def _longest_run(marked: list[WheelComparison], among: list[WheelComparison]) -> float:
     """Return the longest time over which all of `among` are marked, seconds."""
     chosen = set(map(id, marked))
     longest, since = 0.0, math.nan
@@ -93,79 +94,79 @@ def _longest(marked: list[WheelTurn], among: list[WheelTurn]) -> float:
     return longest
 
 
-def always_backward(replayed: Replayed) -> Iterable[ReportFinding]:
-    """Look for a vehicle that drives backward nearly all the time: then front and rear are mistaken."""
-    moving = [each for each in replayed.snapshots if abs(each.speed) > MOVING]
+def check_direction(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find a vehicle that drives backward nearly all the time: front and rear are swapped."""
+    moving = [each for each in data.snapshots if abs(each.speed) > MOVING_SPEED]
     backward = sum(each.speed < 0.0 for each in moving)
-    if len(moving) >= 2 * LEAST_TURNS and backward > 0.8 * len(moving):
+    if len(moving) >= 2 * MIN_WHEEL_SAMPLES and backward > 0.8 * len(moving):
         yield ReportFinding(
-            FindingLevel.DOUBTFUL,
+            FindingLevel.WARNING,
             "The vehicle drives backward nearly all the time",
-            f"Forward speed is negative in {backward / len(moving):.0%} of the time on the move.",
-            "If it drove forward: all wheels count backward, or the inertial unit's mount is turned by 180 degrees.",
+            f"Forward speed is negative in {backward / len(moving):.0%} of the time in motion.",
+            "If it drove forward: all wheels count backward, or the IMU mount is rotated by 180 degrees.",
         )
 
 
-def wheel_scale(replayed: Replayed) -> Iterable[ReportFinding]:
-    """Look for wheels of another size than their driver takes them for, or at another angle than in the geometry."""
-    last = _last(replayed)
-    settings = replayed.settings
-    scale, sigma = _state(last, "wheel_scale")
+def check_wheel_scale(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find wheels whose radius or rolling direction differs from driver and geometry."""
+    last = _last_state(data)
+    settings = data.settings
+    scale, sigma = _get_state(last, "wheel_scale")
     if math.isfinite(scale) and abs(scale) > max(2.0 * settings.wheel_scale_sigma, 3.0 * sigma):
-        word = "too far" if scale > 0.0 else "too short"
+        word = "too long" if scale > 0.0 else "too short"
         yield ReportFinding(
-            FindingLevel.DOUBTFUL,
-            f"The wheels tell {abs(scale):.1%} {word}",
-            f"wheel_scale ended at {scale:+.3f} +- {sigma:.3f}; {settings.wheel_scale_sigma:.3f} was expected of it.",
-            f"Set the wheels' radius in their driver to {1.0 / (1.0 + scale):.3f} of what it is.",
+            FindingLevel.WARNING,
+            f"The distance by the wheels is {abs(scale):.1%} {word}",
+            f"wheel_scale ended at {scale:+.3f} +- {sigma:.3f}; its prior sigma is {settings.wheel_scale_sigma:.3f}.",
+            f"Multiply the wheel radius in the driver by {1.0 / (1.0 + scale):.3f}.",
         )
-    yaw, sigma = _state(last, "wheel_yaw")
+    yaw, sigma = _get_state(last, "wheel_yaw")
     if math.isfinite(yaw) and abs(yaw) > max(3.0 * settings.wheel_yaw_sigma, 3.0 * sigma):
         yield ReportFinding(
-            FindingLevel.DOUBTFUL,
+            FindingLevel.WARNING,
             f"The wheels roll {abs(math.degrees(yaw)):.1f} degrees to the {'left' if yaw > 0.0 else 'right'}",
             f"wheel_yaw ended at {math.degrees(yaw):+.2f} +- {math.degrees(sigma):.2f} degrees from the geometry's x.",
-            "Survey the rolling frame's yaw, or the inertial unit's: gravity and wheels cannot tell the two apart.",
+            "Survey the yaw of the rolling frame and of the IMU: gravity and wheels cannot distinguish the two.",
         )
 
 
-# --- the inertial unit --------------------------------------------------------------------------------------
+# --- IMU ----------------------------------------------------------------------------------------------------
 
 
-def frozen_unit(replayed: Replayed) -> Iterable[ReportFinding]:
-    """Look for an inertial unit that repeats one value."""
-    if replayed.frozen:
-        total = sum(b - a for a, b in replayed.frozen)
-        begin = replayed.frozen[0][0]
+def check_frozen_imu(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find an IMU that repeats one sample."""
+    if data.frozen:
+        total = sum(b - a for a, b in data.frozen)
+        begin = data.frozen[0][0]
         yield ReportFinding(
-            FindingLevel.WRONG,
-            "The inertial unit froze",
-            f"It repeated one value {counted(len(replayed.frozen), 'time')}, {total:.1f} s in all, first at "
+            FindingLevel.ERROR,
+            "The IMU froze",
+            f"It repeated one sample {format_count(len(data.frozen), 'time')}, {total:.1f} s in all, first at "
             f"{begin:.0f} s.",
-            "Its driver passes on the last value when the unit is silent: let it send nothing then, and look at the "
-            "unit's cable.",
+            "Its driver repeats the last sample when the unit is silent: it must send nothing then. Check the unit's "
+            "cable.",
         )
 
 
-def biases(replayed: Replayed) -> Iterable[ReportFinding]:
-    """Look for biases far outside the data sheet's."""
-    last, settings = _last(replayed), replayed.settings
+def check_biases(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find biases far outside the data sheet."""
+    last, settings = _last_state(data), data.settings
     for kind, limit, unit, factor in (
         ("gyro_bias", settings.gyro_bias_sigma, "deg/s", math.degrees(1.0)),
         ("accelerometer_bias", settings.accelerometer_bias_sigma, "m/s2", 1.0),
     ):
         for axis in "xyz":
-            value, sigma = _state(last, f"{kind}_{axis}")
+            value, sigma = _get_state(last, f"{kind}_{axis}")
             if math.isfinite(value) and abs(value) > 3.0 * limit and abs(value) > 3.0 * sigma:
                 yield ReportFinding(
-                    FindingLevel.DOUBTFUL,
+                    FindingLevel.WARNING,
                     f"{kind.replace('_', ' ').capitalize()} about {axis} is far outside its data sheet"
                     if kind == "gyro_bias"
                     else f"Accelerometer bias along {axis} is far outside its data sheet",
                     f"It ended at {value * factor:+.3g} +- {sigma * factor:.2g} {unit}; {kind}_sigma is "
                     f"{limit * factor:.3g}.",
-                    f"Look at the unit and its mount; if this is how the unit is, set localization.filter.{kind}_sigma "
-                    "to what its data sheet says.",
+                    f"Check the unit and its mount; if the unit is that poor, set localization.filter.{kind}_sigma "
+                    "to the data sheet's value.",
                 )
 
 
@@ -173,60 +174,60 @@ def biases(replayed: Replayed) -> Iterable[ReportFinding]:
 
 
 ADVICE = {
-    "gps_height": "The receiver's height is worse than it says, as heights are. Where height matters take a better "
-    "source; gps_wander_time and uere say how fixes err.",
-    "gps_position": "Its stated sigma is too small, or there is a latency, a wrong place of the antenna, or multipath: "
-    "look at the track, and try modelserver tune.",
-    "wheel_speed": "wheel_sigma and slip_share are too small for these wheels, or their stamps are late: "
+    "gps_height": "The receiver's height is worse than stated, as is usual. Where height matters use a better "
+    "source; gps_correlation_time and uere model the error of fixes.",
+    "gps_position": "Its stated sigma is too small, or there is a latency, a wrong antenna lever arm, or multipath: "
+    "see the track, and try modelserver tune.",
+    "wheel_speed": "wheel_sigma and slip_ratio are too small for these wheels, or their stamps have a latency: "
     "try modelserver tune.",
-    "non_holonomic": "The vehicle slides more than side_sigma, side_slip and roll_point_sigma say, or the rolling "
+    "non_holonomic": "The vehicle slides more than side_sigma, side_slip and roll_point_sigma model, or the rolling "
     "frame is another point: try modelserver tune.",
-    "zero_rate": "The gyros are noisier at rest than gyro_noise says: modelserver calibrate imu measures it.",
-    "zero_velocity": "It rocks more at rest than standing_sigma says, or it does not stand: look at its speed then.",
+    "zero_rate": "The stationary gyros are noisier than gyro_noise: modelserver calibrate imu measures it.",
+    "zero_velocity": "It rocks more at rest than stationary_sigma, or it is not stationary: see its speed then.",
 }
-"""What to do about a kind that errs more than expected; others have a general advice."""
+"""What to do about a kind of measurement with too large innovations; GENERAL_ADVICE for the others."""
 
-GENERAL = "Take its stated sigma for what it is worth; look for a mount, a latency or a sensor's place."
+GENERAL_ADVICE = "Its stated sigma may be too small; check mount, latency and position of the sensor."
 
 
-def stated_sigma(replayed: Replayed) -> Iterable[ReportFinding]:
-    """Look for kinds of measurement whose innovations are far from what is expected of them."""
-    # what is known without a sensor has its noise widened on purpose
-    constraints = {each.kind for each in replayed.decisions if each.source == "filter"}
-    for each in consistency.by_kind(replayed.decisions):
+def check_stated_sigma(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find kinds of measurement with inconsistent innovations (NIS far from 1)."""
+    # the noise of constraints without a sensor is inflated on purpose
+    constraints = {each.kind for each in data.decisions if each.source == "filter"}
+    for each in consistency.compute_consistency(data.decisions):
         if each.count < 30:
             continue
         seen = (
-            f"NIS is {each.mean:.2f} in the mean of {each.count}, where 1 is expected; {each.beyond:.0%} are beyond "
-            "the 95 % limit."
+            f"Mean NIS is {each.mean:.2f} over {each.count} innovations, expected 1; {each.beyond:.0%} exceed the 95 % "
+            "limit."
         )
         if each.mean > 2.5:
-            advice = ADVICE.get(each.kind, GENERAL)
-            yield ReportFinding(FindingLevel.DOUBTFUL, f"{each.kind} errs more than its sigma says", seen, advice)
+            advice = ADVICE.get(each.kind, GENERAL_ADVICE)
+            yield ReportFinding(FindingLevel.WARNING, f"{each.kind}: errors larger than its sigma", seen, advice)
         elif each.mean < 0.15 and each.kind not in constraints:
             yield ReportFinding(
                 FindingLevel.NOTE,
-                f"{each.kind} errs less than its sigma says",
+                f"{each.kind}: errors smaller than its sigma",
                 seen,
-                "Nothing is wrong; it could count for more. modelserver tune says whether it is worth it.",
+                "Nothing is wrong; a smaller sigma would give it more weight. modelserver tune measures the gain.",
             )
 
 
-def latency(replayed: Replayed) -> Iterable[ReportFinding]:
-    """Look for fixes that lie behind the vehicle by a constant time."""
-    found = fix_latency(replayed)
+def check_latency(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find fixes with a constant latency relative to the other sensors."""
+    found = estimate_fix_latency(data)
     if found is None:
         return
     seconds, sigma = found
     if abs(seconds) > max(0.1, 4.0 * sigma):
         where = "behind" if seconds > 0.0 else "ahead of"
         yield ReportFinding(
-            FindingLevel.DOUBTFUL,
+            FindingLevel.WARNING,
             f"Fixes lie {abs(seconds):.2f} s {where} the vehicle",
-            f"Their residuals along the way go with the speed: {seconds:+.2f} +- {sigma:.2f} s.",
-            f"If the receiver's stamps are late, set sensors.gps.latency: {seconds:.2f} and see whether NIS falls."
+            f"Their residuals along the path are proportional to the speed: {seconds:+.2f} +- {sigma:.2f} s.",
+            f"If the receiver's stamps have this latency, set sensors.gps.latency: {seconds:.2f}; NIS should fall."
             if seconds > 0.0
-            else "The other sensors' stamps may be late: see the inertial unit's and the wheels' latency.",
+            else "The other sensors' stamps may have a latency: check those of IMU and wheels.",
         )
 
 
@@ -234,25 +235,21 @@ LATENCY_BLOCKS = 8
 LATENCY_WINDOW = 60.0
 
 
-def fix_latency(replayed: Replayed) -> tuple[float, float] | None:
-    """Return by how many seconds fixes are older than their stamps, with sigma; None where it cannot be told.
-
-    A fix that is late by tau lies off by -tau times the velocity. What changes slowly (the wandering of fixes) is taken
-    off both first. Sigma is from the scatter of the same figure over parts of the drive.
-    """
-    fixes = [each for each in replayed.fixes if each.off is not None and each.velocity is not None]
+def estimate_fix_latency(data: ReplayData) -> tuple[float, float] | None:
+    """Return the latency of the fixes and its sigma, s; None without enough change of velocity."""
+    fixes = [each for each in data.fixes if each.residual is not None and each.velocity is not None]
     if len(fixes) < 5 * LATENCY_BLOCKS:
         return None
     t = np.array([each.t for each in fixes])
-    off = np.array([each.off for each in fixes])
+    off = np.array([each.residual for each in fixes])
     v = np.array([each.velocity for each in fixes])
     for series in (off, v):
-        series -= _smoothed(t, series)
+        series -= _smooth(t, series)
     part = np.minimum((np.arange(len(t)) * LATENCY_BLOCKS) // len(t), LATENCY_BLOCKS - 1)
     cross = np.array([-float((off[part == n] * v[part == n]).sum()) for n in range(LATENCY_BLOCKS)])
     square = np.array([float((v[part == n] ** 2).sum()) for n in range(LATENCY_BLOCKS)])
     total = float(square.sum())
-    if total < 0.05 * len(t):  # less than 0.2 m/s rms of change tells nothing
+    if total < 0.05 * len(t):  # too little change: 0.2 m/s rms
         return None
     tau = float(cross.sum()) / total
     scatter = cross - tau * square
@@ -260,7 +257,7 @@ def fix_latency(replayed: Replayed) -> tuple[float, float] | None:
     return tau, sigma
 
 
-def _smoothed(t: Array, series: Array) -> Array:
+def _smooth(t: Array, series: Array) -> Array:
     """Return the mean of each column within a window around each time."""
     sums = np.vstack([np.zeros((1, series.shape[1])), np.cumsum(series, axis=0)])
     low = np.searchsorted(t, t - 0.5 * LATENCY_WINDOW, side="left")
@@ -269,29 +266,29 @@ def _smoothed(t: Array, series: Array) -> Array:
     return means
 
 
-WORDS = {
-    "gate": "gate: fixes and motion contradict each other, see the track",
-    "nan": "nan: the driver passed on no number",
-    "no_fix": "no_fix: the receiver says that it has none, or a lesser one than localization.filter.minimum_fix_type",
+REJECT_REASONS = {
+    "gate": "gate: fixes disagree with the motion, see the track",
+    "nan": "nan: the driver sent a non-finite number",
+    "no_fix": "no_fix: the receiver reports none, or a fix type below localization.filter.minimum_fix_type",
     "satellites": "satellites: fewer than localization.filter.minimum_satellites",
     "dilution": "dilution: hdop above localization.filter.maximum_hdop",
-    "sigma": "sigma: less sure than localization.filter.maximum_sigma",
-    "range": "range: no place on Earth, or out of reach of the origin's zone",
+    "sigma": "sigma: above localization.filter.maximum_sigma",
+    "range": "range: no position on Earth, or outside the origin's UTM zone",
 }
-"""What to know of the reasons for which fixes are refused."""
+"""Explanation of the reasons for which fixes are rejected."""
 
 
-def refused_fixes(replayed: Replayed) -> Iterable[ReportFinding]:
-    """Look for a large share of fixes that were refused, and why."""
-    reasons = Counter(each.reason or each.verdict for each in replayed.fixes if each.verdict == "rejected")
-    refused, total = sum(reasons.values()), len(replayed.fixes)
-    if total >= 20 and refused > 0.2 * total:
+def check_rejected_fixes(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find a large share of rejected fixes, with the reasons."""
+    reasons = Counter(each.reason or each.verdict for each in data.fixes if each.verdict == "rejected")
+    rejected, total = sum(reasons.values()), len(data.fixes)
+    if total >= 20 and rejected > 0.2 * total:
         words = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common(3))
-        known = [WORDS.get(reason, f"{reason}: docs/localization.md") for reason, _ in reasons.most_common(3)]
+        known = [REJECT_REASONS.get(reason, f"{reason}: docs/localization.md") for reason, _ in reasons.most_common(3)]
         yield ReportFinding(
-            FindingLevel.DOUBTFUL,
-            f"{refused / total:.0%} of the fixes were refused",
-            f"Of {counted(total, 'fix', 'fixes')} as positions: {words}.",
+            FindingLevel.WARNING,
+            f"{rejected / total:.0%} of the fixes were rejected",
+            f"Of {format_count(total, 'fix', 'fixes')} as positions: {words}.",
             f"{'; '.join(known)}.",
         )
 
@@ -299,76 +296,76 @@ def refused_fixes(replayed: Replayed) -> Iterable[ReportFinding]:
 # --- all ----------------------------------------------------------------------------------------------------
 
 
-def stamps(replayed: Replayed) -> Iterable[ReportFinding]:
-    """Look for samples that came too late, twice, or out of order."""
+def check_stamps(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find delayed, duplicate and future samples."""
     for reason, advice in (
-        ("late", "They arrive longer after their stamps than localization.filter.horizon: look at the clock or link."),
-        ("duplicate", "A driver sends samples twice, or two sensors share one name in header.source."),
-        ("future", "The sensor's clock is ahead of the host's: synchronise them."),
+        ("too_old", "Their latency exceeds localization.filter.horizon: check clock and link."),
+        ("duplicate", "A driver sends samples twice, or two sensors share one header.source."),
+        ("future", "The sensor's clock is ahead of the host's: synchronize them."),
     ):
         by_source: Counter[str] = Counter()
-        for (source, why), count in replayed.rejected.items():
+        for (source, why), count in data.rejected.items():
             if why == reason:
                 by_source[source] += count
         for source, count in sorted(by_source.items()):
             if count >= 5:
                 yield ReportFinding(
-                    FindingLevel.DOUBTFUL,
-                    f"{source}: {counted(count, 'sample')} {reason}",
+                    FindingLevel.WARNING,
+                    f"{source}: {format_count(count, 'sample')} {reason}",
                     "They were not used.",
                     advice,
                 )
 
 
-def gaps(replayed: Replayed) -> Iterable[ReportFinding]:
-    """Look for sensors with gaps that cost accuracy."""
-    for sensor in replayed.sensors:
-        found = [(a, b) for a, b in sensor.gaps() if b - a > max(1.0, 5.0 * sensor.period)]
+def check_gaps(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find sensors with gaps that cost accuracy."""
+    for sensor in data.sensors:
+        found = [(a, b) for a, b in sensor.find_gaps() if b - a > max(1.0, 5.0 * sensor.period)]
         if found:
             longest = max(b - a for a, b in found)
             yield ReportFinding(
                 FindingLevel.NOTE,
-                f"{sensor.name}: {counted(len(found), 'gap')}, the longest {longest:.1f} s",
-                f"It speaks every {sensor.period:.3g} s otherwise; the first gap begins at {found[0][0]:.0f} s.",
-                "See what the position's sigma does meanwhile; look at the device's link if it was not meant.",
+                f"{sensor.name}: {format_count(len(found), 'gap')}, the longest {longest:.1f} s",
+                f"Its period is {sensor.period:.3g} s; the first gap begins at {found[0][0]:.0f} s.",
+                "See the position's sigma in the gap; check the device's link if it was not intended.",
             )
 
 
-def validity(replayed: Replayed, explained: bool = False) -> Iterable[ReportFinding]:
-    """Look for poses that were not valid for long after the start, and for headings that were never found.
+def check_validity(data: ReplayData, has_cause: bool = False) -> Iterable[ReportFinding]:
+    """Find poses that were invalid for long after the start, and headings that were never found.
 
-    `explained`: other findings say why; then the reasons given with poses, which only follow, are not repeated.
+    `has_cause`: other findings explain it; then the reasons given with poses are not repeated.
     """
-    if not replayed.snapshots:
+    if not data.snapshots:
         yield ReportFinding(
-            FindingLevel.WRONG,
+            FindingLevel.ERROR,
             "There was never a state",
-            "It may follow from what stands above."
-            if explained
-            else "No sample of a sensor that the vehicle file names could be used.",
-            "Put that right first." if explained else "Compare the channels in the log with those in the vehicle file.",
+            "Probably a consequence of the findings above."
+            if has_cause
+            else "No sample of a configured sensor could be used.",
+            "Fix those first." if has_cause else "Compare the channels in the log with those in the vehicle file.",
         )
         return
-    first = next((n for n, each in enumerate(replayed.snapshots) if not each.invalid), None)
+    first = next((n for n, each in enumerate(data.snapshots) if not each.invalid), None)
     if first is None:
-        words = replayed.snapshots[-1].invalid.explain()
+        words = data.snapshots[-1].invalid.explain()
         yield ReportFinding(
-            FindingLevel.WRONG,
+            FindingLevel.ERROR,
             "The pose was never valid",
-            "It may follow from what stands above." if explained else f"At the end: {words}.",
-            "Put that right first."
-            if explained
-            else "Heading takes a few metres of driving with fixes; the strip of reasons below says what was missing "
-            "when.",
+            "Probably a consequence of the findings above." if has_cause else f"At the end: {words}.",
+            "Fix those first."
+            if has_cause
+            else "Heading alignment takes a few meters of driving with fixes; the strip below shows the reasons over "
+            "time.",
         )
         return
-    after = replayed.snapshots[first:]
+    after = data.snapshots[first:]
     bad = [each for each in after if each.invalid]
     if len(bad) > 0.05 * len(after):
         reasons = Counter(flag for each in bad for flag in Invalid if flag in each.invalid)
         words = "; ".join(flag.explain() for flag, _ in reasons.most_common(2))
         yield ReportFinding(
-            FindingLevel.DOUBTFUL,
+            FindingLevel.WARNING,
             f"The pose was not valid in {len(bad) / len(after):.0%} of the time after it first was",
             f"Mostly: {words}.",
             "See the strip of reasons below.",
@@ -376,42 +373,42 @@ def validity(replayed: Replayed, explained: bool = False) -> Iterable[ReportFind
 
 
 def _has_diverged(decision: Decision) -> bool:
-    return decision.verdict is Verdict.TOOK_UP and "diverged" in decision.reason
+    return decision.verdict is Verdict.RESET and "diverged" in decision.reason
 
 
-def diverged(replayed: Replayed) -> Iterable[ReportFinding]:
-    """Look for a filter that had to begin anew, or that took its position up anew."""
-    anew = [each for each in replayed.decisions if _has_diverged(each)]
-    taken = [each for each in replayed.decisions if each.verdict is Verdict.TOOK_UP and "agree" in each.reason]
-    for title, found in (("The state was begun anew", anew), ("Position was taken up anew", taken)):
+def check_divergence(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find a filter that restarted after divergence, or that reset its position."""
+    restarts = [each for each in data.decisions if _has_diverged(each)]
+    resets = [each for each in data.decisions if each.verdict is Verdict.RESET and "agree" in each.reason]
+    for title, found in (("The filter was restarted", restarts), ("The position was reset", resets)):
         if found:
             first = found[0]
             times = "" if len(found) == 1 else f", first of {len(found)} times"
             yield ReportFinding(
-                FindingLevel.DOUBTFUL,
+                FindingLevel.WARNING,
                 title,
-                f"At {replayed.t(first.utime):.0f} s{times}: {first.reason}.",
-                "See the innovations before it: which kind went wrong first?",
+                f"At {data.to_seconds(first.utime):.0f} s{times}: {first.reason}.",
+                "See the innovations before it: which kind failed first?",
             )
 
 
-Check = Callable[[Replayed], Iterable[ReportFinding]]
+Check = Callable[[ReplayData], Iterable[ReportFinding]]
 
-CHECKS: tuple[Check, ...] = (frozen_unit, diverged)
+CHECKS: tuple[Check, ...] = (check_frozen_imu, check_divergence)
 
-LOOKING_AT_SENSORS: tuple[Check, ...] = (wheels_reversed, always_backward)
-"""Those that look at sensors beside the filter's state: with a cause known they only repeat it."""
+SENSOR_RESIDUAL_CHECKS: tuple[Check, ...] = (check_wheels, check_direction)
+"""Checks that compare sensors with the filter's state: with a known cause they only repeat it."""
 
-OF_A_SOUND_STATE: tuple[Check, ...] = (wheel_scale, biases, latency, stated_sigma)
-"""Those that take the filter's state for good."""
-
-
-def _last(replayed: Replayed) -> StateSample | None:
-    return next((each for each in reversed(replayed.snapshots) if each.values), None)
+STATE_CHECKS: tuple[Check, ...] = (check_wheel_scale, check_biases, check_latency, check_stated_sigma)
+"""Checks that need a filter without divergence."""
 
 
-def _state(snapshot: StateSample | None, name: str) -> tuple[float, float]:
-    """Return a state's value and sigma, nan where it is not there."""
+def _last_state(data: ReplayData) -> StateSample | None:
+    return next((each for each in reversed(data.snapshots) if each.values), None)
+
+
+def _get_state(snapshot: StateSample | None, name: str) -> tuple[float, float]:
+    """Return the value and sigma of a state, nan where there is none."""
     if snapshot is None or name not in snapshot.values:
         return math.nan, math.nan
     return snapshot.values[name], snapshot.sigmas[name]

@@ -1,4 +1,4 @@
-"""Small drawings as SVG text: axes with ticks, lines and points, and a page to put them on. Nothing is loaded."""
+"""Charts as SVG text: axes with ticks, lines and points, and an HTML page for them. Self-contained, no scripts."""
 
 from __future__ import annotations
 
@@ -10,41 +10,41 @@ from dataclasses import dataclass
 WIDTH, HEIGHT = 640, 420
 LEFT, RIGHT, TOP, BOTTOM = 78, 150, 34, 52
 
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#666666")
-"""Told apart by the colour-blind as well: M. Okabe and K. Ito, "Color Universal Design", 2008."""
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#666666")
+"""Distinguishable with color blindness: M. Okabe and K. Ito, "Color Universal Design", 2008."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlotLine:
-    """A curve or a cloud of points in the data's units, with its name in the legend."""
+    """A curve or point cloud in data units, with its name in the legend."""
 
     name: str
     x: Sequence[float]
     y: Sequence[float]
-    colour: str
-    dashed: bool = False
-    dots: bool = False
+    color: str
+    is_dashed: bool = False
+    is_dotted: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """An axis from `low` to `high`; where `logarithmic`, both are powers of ten."""
+    """An axis from `low` to `high`, powers of ten where `is_logarithmic`."""
 
     label: str
     low: float
     high: float
-    logarithmic: bool = False
+    is_logarithmic: bool = False
 
-    def share(self, value: float) -> float:
-        """Return where a value lies, 0 at the low end and 1 at the high one."""
+    def fraction(self, value: float) -> float:
+        """Return the position of a value on the axis, 0 at the low end and 1 at the high end."""
         low, high = self.low, self.high
-        if self.logarithmic:
+        if self.is_logarithmic:
             value, low, high = math.log10(value), math.log10(low), math.log10(high)
         return (value - low) / (high - low)
 
     def ticks(self) -> list[float]:
-        """Return where ticks stand: at powers of ten, or at even steps of 1, 2 or 5."""
-        if self.logarithmic:
+        """Return the ticks: powers of ten, or even steps of 1, 2 or 5."""
+        if self.is_logarithmic:
             first, last = round(math.log10(self.low)), round(math.log10(self.high))
             return [10.0**each for each in range(first, last + 1)]
         rough = (self.high - self.low) / 6.0
@@ -55,15 +55,15 @@ class Axis:
         return [(first + n) * step + 0.0 for n in range(count + 1)]
 
 
-def decades(label: str, values: Iterable[float]) -> Axis:
-    """Return a logarithmic axis over whole decades that holds all values, which are above 0."""
+def decade_axis(label: str, values: Iterable[float]) -> Axis:
+    """Return a logarithmic axis of whole decades around positive values."""
     known = list(values)
     low, high = math.floor(math.log10(min(known))), math.ceil(math.log10(max(known)))
-    return Axis(label, 10.0**low, 10.0 ** max(high, low + 1), logarithmic=True)
+    return Axis(label, 10.0**low, 10.0 ** max(high, low + 1), is_logarithmic=True)
 
 
-def chart(title: str, x: Axis, y: Axis, lines: Sequence[PlotLine], square: bool = False) -> str:
-    """Return an SVG element: title, axes, grid, lines and their legend. `square`: equal lengths on both axes."""
+def render_chart(title: str, x: Axis, y: Axis, lines: Sequence[PlotLine], square: bool = False) -> str:
+    """Return an SVG element: title, axes, grid, lines and legend. `square`: equal lengths on both axes."""
     width = HEIGHT - TOP - BOTTOM if square else WIDTH - LEFT - RIGHT
     height = HEIGHT - TOP - BOTTOM
     parts = [
@@ -73,16 +73,16 @@ def chart(title: str, x: Axis, y: Axis, lines: Sequence[PlotLine], square: bool 
     ]
 
     def at(px: float, py: float) -> tuple[float, float]:
-        return LEFT + x.share(px) * width, TOP + (1.0 - y.share(py)) * height
+        return LEFT + x.fraction(px) * width, TOP + (1.0 - y.fraction(py)) * height
 
     for tick in x.ticks():
         px, _ = at(tick, y.low)
-        parts.append(_grid(px, TOP, px, TOP + height))
-        parts.append(f'<text x="{px:.1f}" y="{TOP + height + 16}" text-anchor="middle">{_number(tick)}</text>')
+        parts.append(_render_grid(px, TOP, px, TOP + height))
+        parts.append(f'<text x="{px:.1f}" y="{TOP + height + 16}" text-anchor="middle">{_format_number(tick)}</text>')
     for tick in y.ticks():
         _, py = at(x.low, tick)
-        parts.append(_grid(LEFT, py, LEFT + width, py))
-        parts.append(f'<text x="{LEFT - 6}" y="{py + 4:.1f}" text-anchor="end">{_number(tick)}</text>')
+        parts.append(_render_grid(LEFT, py, LEFT + width, py))
+        parts.append(f'<text x="{LEFT - 6}" y="{py + 4:.1f}" text-anchor="end">{_format_number(tick)}</text>')
     parts.append(f'<rect x="{LEFT}" y="{TOP}" width="{width}" height="{height}" fill="none" stroke="#333"/>')
     parts.append(f'<text x="{LEFT + width / 2}" y="{HEIGHT - 12}" text-anchor="middle">{html.escape(x.label)}</text>')
     middle = TOP + height / 2
@@ -92,17 +92,19 @@ def chart(title: str, x: Axis, y: Axis, lines: Sequence[PlotLine], square: bool 
     )
     for row, line in enumerate(lines):
         points = [at(a, b) for a, b in zip(line.x, line.y, strict=True)]
-        parts.append(_dots(points, line) if line.dots else _curve(points, line))
+        parts.append(_render_dots(points, line) if line.is_dotted else _render_curve(points, line))
         key_x, key_y = LEFT + width + 12, TOP + 12 + 18 * row
-        parts.append(_dots([(key_x + 11, key_y)], line) if line.dots else _key(key_x, key_y, line))
+        parts.append(
+            _render_dots([(key_x + 11, key_y)], line) if line.is_dotted else _render_legend(key_x, key_y, line)
+        )
         parts.append(f'<text x="{key_x + 28}" y="{key_y + 4}">{html.escape(line.name)}</text>')
     parts.append("</svg>")
     return "\n".join(parts)
 
 
-def page(title: str, words: Sequence[str], charts: Sequence[str]) -> str:
-    """Return an HTML page by itself: a heading, text kept as it is laid out, drawings."""
-    text = html.escape("\n".join(words))
+def render_page(title: str, lines: Sequence[str], charts: Sequence[str]) -> str:
+    """Return an HTML page with a heading, preformatted text and charts."""
+    text = html.escape("\n".join(lines))
     figures = "\n".join(f"<figure>{each}</figure>" for each in charts)
     return f"""<!DOCTYPE html>
 <html lang="en">
@@ -125,29 +127,29 @@ svg {{ width: 100%; height: auto; }}
 """
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     return f"{value:.6g}" if value == 0.0 or 1e-3 <= abs(value) < 1e5 else f"{value:.0e}"
 
 
-def _grid(x1: float, y1: float, x2: float, y2: float) -> str:
+def _render_grid(x1: float, y1: float, x2: float, y2: float) -> str:
     return f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="#ddd"/>'
 
 
 def _style(line: PlotLine) -> str:
-    dashes = ' stroke-dasharray="5 4"' if line.dashed else ""
-    return f'stroke="{line.colour}" stroke-width="1.6"{dashes}'
+    dashes = ' stroke-dasharray="5 4"' if line.is_dashed else ""
+    return f'stroke="{line.color}" stroke-width="1.6"{dashes}'
 
 
-def _curve(points: Sequence[tuple[float, float]], line: PlotLine) -> str:
+def _render_curve(points: Sequence[tuple[float, float]], line: PlotLine) -> str:
     path = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
     return f'<polyline points="{path}" fill="none" {_style(line)}/>'
 
 
-def _key(x: float, y: float, line: PlotLine) -> str:
+def _render_legend(x: float, y: float, line: PlotLine) -> str:
     return f'<line x1="{x}" y1="{y}" x2="{x + 22}" y2="{y}" {_style(line)}/>'
 
 
-def _dots(points: Sequence[tuple[float, float]], line: PlotLine) -> str:
-    # strokes of no length with round ends: one element for thousands of points
+def _render_dots(points: Sequence[tuple[float, float]], line: PlotLine) -> str:
+    # zero-length strokes with round caps: one element for thousands of points
     path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
-    return f'<path d="{path}" stroke="{line.colour}" stroke-width="3" stroke-linecap="round" fill="none"/>'
+    return f'<path d="{path}" stroke="{line.color}" stroke-width="3" stroke-linecap="round" fill="none"/>'

@@ -1,1 +1,1 @@
-"""Channels decoded for watching: in the terminal, or for lcm-spy."""
+"""Decoded traffic of all channels: in the terminal, or for lcm-spy."""

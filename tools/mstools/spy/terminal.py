@@ -1,83 +1,160 @@
-"""The table of all channels in the terminal, and the decoded fields of a chosen one."""
+"""The spy in the terminal: a live table of all channels, and the decoded fields of a selected one."""
 
 from __future__ import annotations
 
 import math
+import os
+import re
 import select
 import sys
+import termios
 import time
-from collections.abc import Callable
+import tty
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum, auto
+from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
 import mslcm
-from modelserver.errors import ModelServerError, WireError, nearest_names, shown
-from modelserver.wire.codec import decode, type_names
-from modelserver.wire.kinds import type_name_of
-from modelserver.wire.provider import take_message
-from mstools.spy.fields import fields
-from mstools.spy.keys import KeyBinding, Keyboard
-from mstools.spy.traffic import BusTraffic, Seen
-from mstools.spy.types import known_constants
+from modelserver.errors import ModelServerError, WireError, find_nearest_names, quote
+from modelserver.wire.codec import decode, get_type_names
+from modelserver.wire.encoded import type_name_of
+from modelserver.wire.provider import handle_message
+from mstools.spy.fields import format_fields, load_constants
+from mstools.spy.traffic import BusTraffic, ChannelStatistics
+from mstools.terminal.health_text import format_duration
 from mstools.terminal.interrupts import Interrupts
-from mstools.terminal.output import safe
-from mstools.terminal.status_text import duration
-from mstools.terminal.table import drawable, table
+from mstools.terminal.output import escape, format_table, replace_unencodable
 
 if TYPE_CHECKING:
     import lcm
     from rich.text import Text
 
+
+class KeyBinding(Enum):
+    """A key of the live view."""
+
+    UP = auto()
+    DOWN = auto()
+    PAGE_UP = auto()
+    PAGE_DOWN = auto()
+    HOME = auto()
+    END = auto()
+    ENTER = auto()
+    BACK = auto()
+    QUIT = auto()
+
+
+_KEYS: Final = {
+    b"\x1b[A": KeyBinding.UP,
+    b"\x1bOA": KeyBinding.UP,
+    b"k": KeyBinding.UP,
+    b"\x1b[B": KeyBinding.DOWN,
+    b"\x1bOB": KeyBinding.DOWN,
+    b"j": KeyBinding.DOWN,
+    b"\x1b[5~": KeyBinding.PAGE_UP,
+    b"\x1b[6~": KeyBinding.PAGE_DOWN,
+    b" ": KeyBinding.PAGE_DOWN,
+    b"\x1b[H": KeyBinding.HOME,
+    b"\x1b[1~": KeyBinding.HOME,
+    b"\x1b[F": KeyBinding.END,
+    b"\x1b[4~": KeyBinding.END,
+    b"\r": KeyBinding.ENTER,
+    b"\n": KeyBinding.ENTER,
+    b"\x1b[C": KeyBinding.ENTER,
+    b"\x1b[D": KeyBinding.BACK,
+    b"\x7f": KeyBinding.BACK,
+    b"\x1b": KeyBinding.BACK,
+    b"q": KeyBinding.QUIT,
+    b"Q": KeyBinding.QUIT,
+    b"\x03": KeyBinding.QUIT,
+    b"\x04": KeyBinding.QUIT,
+}
+
+_KEY_PATTERN: Final = re.compile(rb"\x1b\[[0-9;]*[A-Za-z~]|\x1bO[A-Za-z]|.", re.DOTALL)
+"""A key as a terminal sends it: an escape sequence (ECMA-48 and xterm), or a byte."""
+
+
+def parse_keys(data: bytes) -> Sequence[KeyBinding]:
+    """Return the known keys in the input of a terminal."""
+    return [_KEYS[piece] for piece in _KEY_PATTERN.findall(data) if piece in _KEYS]
+
+
+class Keyboard:
+    """Standard input as single keys without echo; `fileno` is -1 where it is no terminal."""
+
+    def __init__(self) -> None:
+        self.fileno = sys.stdin.fileno() if sys.stdin is not None and sys.stdin.isatty() else -1
+        self._previous: list[Any] | None = None
+
+    def __enter__(self) -> Keyboard:
+        if self.fileno >= 0:
+            self._previous = termios.tcgetattr(self.fileno)
+            tty.setcbreak(self.fileno)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        if self._previous is not None:
+            termios.tcsetattr(self.fileno, termios.TCSADRAIN, self._previous)
+
+    def read(self) -> Sequence[KeyBinding]:
+        """Read the pressed keys; call it when `fileno` is ready."""
+        data = os.read(self.fileno, 1024)
+        # no data: the terminal was closed
+        return parse_keys(data) if data else [KeyBinding.QUIT]
+
+
 REFRESH_S: Final = 0.25
-"""Seconds between two pictures."""
+"""Refresh period of the live view, seconds."""
 
 LISTEN_S: Final = 2.0
-"""For how long is listened where a single picture is wanted."""
+"""Duration of listening for a single table, seconds."""
 
-HEAD: Final = ("channel", "type", "count", "Hz", "jitter ms", "kB/s", "bytes", "age", "bad")
+HEADER: Final = ("channel", "type", "count", "Hz", "jitter ms", "kB/s", "bytes", "age", "bad")
 
-NUMBERS: Final = tuple(range(2, 9))
+NUMERIC_COLUMNS: Final = tuple(range(2, 9))
 
-HELP: Final = "up/down choose, enter shows the fields, left goes back, q ends"
+HELP: Final = "up/down select, enter shows the fields, left goes back, q quits"
 
 
 class BusListener:
-    """Hears everything on a bus."""
+    """Subscriber of all channels of a bus."""
 
     def __init__(self, bus: lcm.LCM, clock: Callable[[], float] = time.monotonic):
-        self.traffic = BusTraffic(clock(), type_name_of, is_whole)
+        self.traffic = BusTraffic(clock(), type_name_of, is_decodable)
         self._bus = bus
         self._clock = clock
         self.fileno = bus.fileno()
-        # 0 is no limit: what LCM would drop could not be counted
-        bus.subscribe(".*", self._heard).set_queue_capacity(0)
+        # 0 is no limit: messages that LCM drops could not be counted
+        bus.subscribe(".*", self._on_message).set_queue_capacity(0)
 
-    def _heard(self, channel: str, data: bytes) -> None:
-        self.traffic.heard(channel, data, self._clock())
+    def _on_message(self, channel: str, data: bytes) -> None:
+        self.traffic.add(channel, data, self._clock())
 
-    def take(self, until: float) -> None:
-        """Take what has come, without waiting, and not for longer than `until`: a flood must not stop the picture."""
-        while take_message(self._bus) and self._clock() < until:
+    def drain(self, until: float) -> None:
+        """Process the queued messages, but not after `until`: a flood must not stop the display."""
+        while handle_message(self._bus) and self._clock() < until:
             pass
 
-    def listen(self, until: float, also: int = -1) -> bool:
-        """Listen until then; return true at once where there is something to read from the file `also`."""
-        files = (self.fileno,) if also < 0 else (self.fileno, also)
+    def listen(self, until: float, extra_file: int = -1) -> bool:
+        """Listen until that time; return True at once when `extra_file` is readable."""
+        files = (self.fileno,) if extra_file < 0 else (self.fileno, extra_file)
         while (left := until - self._clock()) > 0.0:
             ready, _, _ = select.select(files, (), (), left)
             if self.fileno in ready:
-                self.take(until)
-            if also in ready:
+                self.drain(until)
+            if extra_file in ready:
                 return True
         return False
 
 
-def is_whole(type_name: str, data: bytes) -> bool:
-    """Return whether a message of a known type is one that the service would take."""
-    if type_name not in _TOP:
-        return True  # a part of others; nobody sends it by itself
+def is_decodable(type_name: str, data: bytes) -> bool:
+    """Return whether a message of a known type decodes as the server decodes it."""
+    if type_name not in _TOP_LEVEL_TYPES:
+        return True  # only a part of other messages
     try:
         decode(type_name, data)
     except WireError:
@@ -85,87 +162,91 @@ def is_whole(type_name: str, data: bytes) -> bool:
     return True
 
 
-_TOP: Final = frozenset(type_names())
+_TOP_LEVEL_TYPES: Final = frozenset(get_type_names())
 
 
-def rows(traffic: BusTraffic, now: float) -> list[tuple[str, ...]]:
-    """Return the rows of the table."""
-    return [_row(traffic, seen, now) for seen in traffic.ordered()]
+def format_rows(traffic: BusTraffic, now: float) -> list[tuple[str, ...]]:
+    """Format the rows of the table."""
+    return [_format_row(traffic, seen, now) for seen in traffic.list_channels()]
 
 
-def _row(traffic: BusTraffic, seen: Seen, now: float) -> tuple[str, ...]:
-    rate, flow = traffic.rates(seen, now)
+def _format_row(traffic: BusTraffic, seen: ChannelStatistics, now: float) -> tuple[str, ...]:
+    rate, flow = traffic.get_rates(seen, now)
     return (
-        shorter(safe(seen.channel), 40),
+        truncate(escape(seen.channel), 40),
         seen.type_name or "(unknown)",
         str(seen.count),
         f"{rate:.1f}",
         "-" if math.isnan(seen.jitter) else f"{seen.jitter * 1e3:.1f}",
         f"{flow / 1e3:.1f}",
         str(seen.size),
-        duration(max(0.0, now - seen.last_s)),
+        format_duration(max(0.0, now - seen.last_s)),
         str(seen.undecodable or ""),
     )
 
 
-def shorter(text: str, width: int) -> str:
-    """Return a text cut to a width."""
+def truncate(text: str, width: int) -> str:
+    """Truncate a text to a width."""
     return text if len(text) <= width else f"{text[: width - 3]}..."
 
 
-def summary(traffic: BusTraffic, now: float) -> str:
-    """Return in a line what came altogether."""
-    every = [traffic.rates(seen, now) for seen in traffic.channels.values()]
+def format_summary(traffic: BusTraffic, now: float) -> str:
+    """Format the totals of the bus in one line."""
+    every = [traffic.get_rates(seen, now) for seen in traffic.channels.values()]
     text = f"{len(traffic.channels)} channels, {sum(each for each, _ in every):.0f} messages/s, "
     text += f"{sum(each for _, each in every) / 1e3:.1f} kB/s"
     if traffic.others:
-        text += f"; {traffic.others} messages on further channels, which are too many to list"
+        text += f"; {traffic.others} messages on further channels (too many to list)"
     return text
 
 
-def message_lines(seen: Seen) -> list[str]:
-    """Return the decoded fields of the last message of a channel, or why there are none."""
+def format_message(seen: ChannelStatistics) -> list[str]:
+    """Format the decoded fields of a channel's last message, or the reason why there are none."""
     if not seen.type_name:
         head = seen.last[:32].hex(" ")
-        return ["of no type of this project; it begins with", head or "nothing"]
+        return ["unknown type; its first bytes are", head or "nothing"]
     try:
         message: Any = getattr(mslcm, seen.type_name).decode(seen.last)
     except Exception as error:
-        return [f"a {seen.type_name} that cannot be decoded: {safe(shorter(str(error), 200))}"]
-    return fields(message, known_constants())
+        return [f"{seen.type_name} that cannot be decoded: {escape(truncate(str(error), 200))}"]
+    return format_fields(message, load_constants())
 
 
-def print_once(ear: BusListener, seconds: float, channel: str = "") -> None:
-    """Listen for a while, print the table and the fields of a channel. Raises ModelServerError where that is silent."""
-    ear.listen(time.monotonic() + seconds)
-    now, traffic = time.monotonic(), ear.traffic
-    typer.echo(f"{summary(traffic, now)}, in {seconds:g} s")
+def print_once(listener: BusListener, seconds: float, channel: str = "") -> None:
+    """Listen, then print the table and the fields of a channel. Raises ModelServerError if that is silent."""
+    listener.listen(time.monotonic() + seconds)
+    now, traffic = time.monotonic(), listener.traffic
+    typer.echo(f"{format_summary(traffic, now)}, in {seconds:g} s")
     if traffic.channels:
-        typer.echo(drawable(table(HEAD, rows(traffic, now), indent="", numbers=NUMBERS)))
+        typer.echo(
+            replace_unencodable(format_table(HEADER, format_rows(traffic, now), indent="", numbers=NUMERIC_COLUMNS))
+        )
     else:
-        typer.echo("nothing was heard: is anyone running, on this bus (--url)? modelserver doctor looks at the bus")
+        typer.echo("no message received: is the daemon running, on this bus (--url)? modelserver doctor checks the bus")
     if channel:
         typer.echo("")
-        typer.echo("\n".join([safe(channel), *(f"  {each}" for each in message_lines(_chosen(traffic, channel)))]))
+        typer.echo(
+            "\n".join([escape(channel), *(f"  {each}" for each in format_message(_select_channel(traffic, channel)))])
+        )
 
 
-def _chosen(traffic: BusTraffic, channel: str) -> Seen:
+def _select_channel(traffic: BusTraffic, channel: str) -> ChannelStatistics:
     if channel in traffic.channels:
         return traffic.channels[channel]
-    near = nearest_names(channel, traffic.channels)
-    offer = f"; nearest: {', '.join(shown(each, 64) for each in near)}" if near else ""
-    raise ModelServerError(f"nothing came on {shown(channel, 64)}{offer}")
+    near = find_nearest_names(channel, traffic.channels)
+    offer = f"; nearest: {', '.join(quote(each, 64) for each in near)}" if near else ""
+    raise ModelServerError(f"no message on {quote(channel, 64)}{offer}")
 
 
 @dataclass(frozen=True, slots=True)
-class View:
-    """What of the traffic is being looked at: the chosen channel, and whether its fields are shown."""
+class SpyView:
+    """The selected channel, and whether its fields are shown."""
 
     channel: str = ""
     is_open: bool = False
 
-    def after(self, key: KeyBinding, names: list[str], page: int) -> View | None:
-        """Return the view after a key, None where it ends; `names` are the channels in their order."""
+    def handle_key(self, key: KeyBinding, names: list[str], page: int) -> SpyView | None:
+        """Return the view after a key, None for quit; `names` are the channels in display order."""
         if key is KeyBinding.QUIT:
             return None
         if key is KeyBinding.ENTER:
@@ -182,23 +263,25 @@ class View:
         return replace(self, channel=names[max(0, min(to, len(names) - 1))])
 
 
-def picture(traffic: BusTraffic, view: View, now: float, height: int, note: str = HELP) -> Text:
-    """Return what is shown: the table around the chosen channel, its fields below where they are open, and a note."""
+def render(traffic: BusTraffic, view: SpyView, now: float, height: int, note: str = HELP) -> Text:
+    """Render the table around the selected channel, its fields if they are open, and a note."""
     from rich.text import Text
 
     text = Text(no_wrap=True, overflow="crop")
-    text.append(f"{summary(traffic, now)}\n", "bold")
-    seen = traffic.ordered()
-    lines = drawable(table(HEAD, rows(traffic, now), indent=" ", numbers=NUMBERS)).split("\n")
+    text.append(f"{format_summary(traffic, now)}\n", "bold")
+    seen = traffic.list_channels()
+    lines = replace_unencodable(
+        format_table(HEADER, format_rows(traffic, now), indent=" ", numbers=NUMERIC_COLUMNS)
+    ).split("\n")
     text.append(f"{lines[0]}\n", "bold underline")
     names = [each.channel for each in seen]
     at = names.index(view.channel) if view.channel in names else 0
     space = max(1, height - 3)
     found: list[str] = []
     if view.is_open:
-        chosen = traffic.channels.get(view.channel)
-        found = message_lines(chosen) if chosen is not None else ["nothing came yet"]
-        # a third for the table, and more where the fields leave it
+        selected = traffic.channels.get(view.channel)
+        found = format_message(selected) if selected is not None else ["no message yet"]
+        # a third for the table, more if the fields leave it
         space = max(1, min(len(seen), max((height - 6) // 3, height - 6 - len(found))))
     first = max(0, min(at - space // 2, len(seen) - space))
     for number in range(first, min(first + space, len(seen))):
@@ -206,43 +289,43 @@ def picture(traffic: BusTraffic, view: View, now: float, height: int, note: str 
         style = "red" if each.undecodable else "dim" if now - each.last_s > 5.0 or not each.type_name else ""
         text.append(f"{lines[number + 1]}\n", f"{style} reverse".strip() if number == at else style)
     if view.is_open:
-        text.append(f"\n{safe(view.channel)}\n", "bold")
+        text.append(f"\n{escape(view.channel)}\n", "bold")
         room = max(1, height - space - 6)
         text.append("\n".join(f"  {each}" for each in found[:room]) + "\n")
         if len(found) > room:
-            text.append(f"  ... {len(found) - room} lines more: make the terminal higher\n", "dim")
+            text.append(f"  ... {len(found) - room} more lines: enlarge the terminal\n", "dim")
     text.append(note, "dim")
     return text
 
 
-def watch(ear: BusListener, channel: str = "") -> None:
-    """Show the table until q, Ctrl-C, or the order to end."""
+def watch(listener: BusListener, channel: str = "") -> None:
+    """Show the live table until q, Ctrl-C or SIGTERM."""
     from rich.console import Console
     from rich.live import Live
 
     console = Console(highlight=False)
-    view = View(channel, bool(channel))
+    view = SpyView(channel, bool(channel))
     with Interrupts() as stop, Keyboard() as keyboard, Live(console=console, screen=True, auto_refresh=False) as live:
-        while not stop.came:
-            names = [each.channel for each in ear.traffic.ordered()]
+        while not stop.is_set:
+            names = [each.channel for each in listener.traffic.list_channels()]
             if not view.channel and names:
                 view = replace(view, channel=names[0])
-            note = HELP if keyboard.fileno >= 0 else "Ctrl-C ends"
-            if view.is_open and view.channel not in names and (near := nearest_names(view.channel, names)):
-                note = f"nothing came on {safe(view.channel)}; nearest: {', '.join(map(safe, near))}. {note}"
-            live.update(picture(ear.traffic, view, time.monotonic(), console.height, note), refresh=True)
-            if ear.listen(time.monotonic() + REFRESH_S, keyboard.fileno):
+            note = HELP if keyboard.fileno >= 0 else "Ctrl-C quits"
+            if view.is_open and view.channel not in names and (near := find_nearest_names(view.channel, names)):
+                note = f"no message on {escape(view.channel)}; nearest: {', '.join(map(escape, near))}. {note}"
+            live.update(render(listener.traffic, view, time.monotonic(), console.height, note), refresh=True)
+            if listener.listen(time.monotonic() + REFRESH_S, keyboard.fileno):
                 for key in keyboard.read():
-                    after = view.after(key, names, max(1, console.height // 2))
+                    after = view.handle_key(key, names, max(1, console.height // 2))
                     if after is None:
                         return
                     view = after
 
 
 def show(bus: lcm.LCM, channel: str, seconds: float) -> None:
-    """Show the table: live in a terminal, else, or where `seconds` are given, once."""
-    ear = BusListener(bus)
+    """Show the table live in a terminal, else, or with `seconds`, print it once."""
+    listener = BusListener(bus)
     if seconds or not sys.stdout.isatty():
-        print_once(ear, seconds or LISTEN_S, channel)
+        print_once(listener, seconds or LISTEN_S, channel)
     else:
-        watch(ear, channel)
+        watch(listener, channel)

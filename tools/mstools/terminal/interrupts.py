@@ -1,4 +1,4 @@
-"""Ending a picture in the terminal in order, on Ctrl-C and when the process is told to end."""
+"""Signals that end a live display in order."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupts:
-    """Within it, signals to end are noted in `came` and do nothing else; after it they are as before.
+    """Within the block, SIGINT, SIGTERM and SIGHUP set `is_set` and do nothing else.
 
-    KeyboardInterrupt would not do: LCM's binding raises it for a signal that Python then raises once more, and SIGTERM
-    would leave the terminal as it was made for the picture.
+    KeyboardInterrupt is no alternative: LCM's binding raises it, and Python raises it again for the same signal; and
+    SIGTERM would not restore the terminal.
     """
 
     def __init__(self) -> None:
-        self.came = False
-        self._before: dict[signal.Signals, Any] = {}
+        self.is_set = False
+        self._previous: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> Interrupts:
         for number in SIGNALS:
-            self._before[number] = signal.signal(number, self._note)
+            self._previous[number] = signal.signal(number, self._on_signal)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        for number, handler in self._before.items():
+        for number, handler in self._previous.items():
             signal.signal(number, handler)
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self.came = True
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.is_set = True

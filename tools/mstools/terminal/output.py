@@ -1,11 +1,12 @@
-"""Printing for people, and writing files whole or not at all."""
+"""Output of commands: text and tables for the terminal, and atomically written files."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TextIO
 
 import typer
@@ -14,81 +15,81 @@ from modelserver.errors import ModelServerError, Problem
 from modelserver.geometry.model import Model
 
 
-def safe(text: str) -> str:
-    """Return `text` with control characters escaped: what comes from a file must not steer the terminal."""
+def escape(text: str) -> str:
+    """Escape control characters: text from a file or the bus must not control the terminal."""
     if text.isprintable():
         return text
     return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
 
 
 def print_problem(problem: Problem, err: bool = False) -> None:
-    """Print a problem as compilers do, `file:line: severity: message`, with the rest indented below."""
+    """Print a problem as `file:line: severity: message`, with element, fix and suggestions indented below."""
     place = f"{problem.file}:{problem.line}" if problem.line else problem.file
-    typer.echo(safe(f"{place}: {problem.severity}: {problem.message}" if place else str(problem)), err=err)
+    typer.echo(escape(f"{place}: {problem.severity}: {problem.message}" if place else str(problem)), err=err)
     for name, value in (("in", problem.element), ("fix", problem.fix), ("nearest", ", ".join(problem.nearest))):
         if value:
-            typer.echo(f"    {name + ':':<9}{safe(value)}", err=err)
+            typer.echo(f"    {name + ':':<9}{escape(value)}", err=err)
 
 
-def counted(count: int, one: str, several: str = "") -> str:
+def format_count(count: int, one: str, several: str = "") -> str:
     """Return e.g. `1 body`, `3 bodies`."""
     return f"{count} {one if count == 1 else several or one + 's'}"
 
 
-def size_of(model: Model) -> str:
-    """Return how many of what a model holds."""
+def describe_size(model: Model) -> str:
+    """Return the numbers of bodies, frames and constraints."""
     frames = sum(len(body.frames) for body in model.bodies)
     return ", ".join(
         (
-            counted(len(model.bodies), "body", "bodies"),
-            counted(frames, "frame"),
-            counted(len(model.constraints), "constraint"),
+            format_count(len(model.bodies), "body", "bodies"),
+            format_count(frames, "frame"),
+            format_count(len(model.constraints), "constraint"),
         )
     )
 
 
-def check_target(path: str) -> None:
-    """Raise what `written_whole` would where a file cannot be written: to be asked before work that takes a while.
+def check_writable(path: str) -> None:
+    """Raise the error of `open_atomic` for a file that cannot be written, before long work.
 
-    A file that exists is no objection; empty and - (standard output) name no file.
+    An existing file is accepted; an empty path and - (standard output) are no files.
     """
     if path in ("", "-"):
         return
     target = os.path.realpath(path)
     if os.path.isdir(target):
-        raise ModelServerError(f"{safe(path)} is a directory; name a file in it")
+        raise ModelServerError(f"{escape(path)} is a directory; name a file in it")
     if os.path.exists(target) and not os.path.isfile(target):
         return
     folder = os.path.dirname(target)
     if not os.path.isdir(folder):
-        raise ModelServerError(f"{safe(path)} cannot be written: there is no folder {safe(folder)}; make it first")
+        raise ModelServerError(f"{escape(path)} cannot be written: folder {escape(folder)} is missing; create it first")
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise ModelServerError(f"{safe(path)} cannot be written: nothing may be written in the folder {safe(folder)}")
+        raise ModelServerError(f"{escape(path)} cannot be written: no write permission for folder {escape(folder)}")
 
 
 def write_file(path: str, text: str, replace: bool) -> None:
-    """Write a file so that it is there whole or not at all; as `written_whole`."""
-    with written_whole(path, replace) as stream:
+    """Write a file atomically; see `open_atomic`."""
+    with open_atomic(path, replace) as stream:
         stream.write(text)
 
 
 @contextlib.contextmanager
-def written_whole(path: str, replace: bool) -> Iterator[TextIO]:
-    """Give a stream to write; the file is there, whole, when the block has ended well, and else as it was.
+def open_atomic(path: str, replace: bool) -> Iterator[TextIO]:
+    """Open a file for writing that replaces the old one when the block ends without an error.
 
-    What is no regular file (a device, a pipe) is written to as it is. Raises ModelServerError where the file exists
-    and `replace` is false, OSError where it cannot be written.
+    A device or a pipe is written directly. Raises ModelServerError where the file exists and `replace` is false,
+    OSError where it cannot be written.
     """
     target = os.path.realpath(path)
     if os.path.isdir(target):
-        raise ModelServerError(f"{safe(path)} is a directory; name a file in it")
+        raise ModelServerError(f"{escape(path)} is a directory; name a file in it")
     if os.path.exists(target) and not os.path.isfile(target):
         with open(target, "w", encoding="utf-8", newline="\n") as stream:
             yield stream
         return
     if os.path.lexists(target):
         if not replace:
-            raise _exists(path)
+            raise _make_exists_error(path)
         mode = os.stat(target).st_mode & 0o777
     else:
         umask = os.umask(0)
@@ -97,7 +98,7 @@ def written_whole(path: str, replace: bool) -> Iterator[TextIO]:
     try:
         handle, draft = tempfile.mkstemp(prefix=".", suffix=".part", dir=os.path.dirname(target))
     except OSError as error:
-        # the draft's name says nothing to who asked for the file
+        # the name of the temporary file means nothing to the user
         raise OSError(error.errno, error.strerror, path) from None
     try:
         with open(handle, "w", encoding="utf-8", newline="\n") as stream:
@@ -109,14 +110,42 @@ def written_whole(path: str, replace: bool) -> Iterator[TextIO]:
             os.replace(draft, target)
         else:
             try:
-                # a link is made only where nothing is: what came into being meanwhile is not lost
+                # os.link fails where a file was created meanwhile, so that it is not lost
                 os.link(draft, target)
             except FileExistsError:
-                raise _exists(path) from None
+                raise _make_exists_error(path) from None
     finally:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(draft)
 
 
-def _exists(path: str) -> ModelServerError:
-    return ModelServerError(f"{safe(path)} exists already; give --force to replace it, or another name")
+def _make_exists_error(path: str) -> ModelServerError:
+    return ModelServerError(f"{escape(path)} already exists; give --force to replace it, or another name")
+
+
+_ASCII = str.maketrans({"→": ">", "├": "|", "└": "`", "─": "-", "│": "|", "·": ".", "⟲": "@"})
+
+
+def format_table(
+    head: Sequence[str], rows: Sequence[Sequence[str]], indent: str = "  ", numbers: Sequence[int] = ()
+) -> str:
+    """Format rows as aligned columns; the columns in `numbers` are right-aligned."""
+    lines = [[escape(cell) for cell in row] for row in (head, *rows)]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        indent
+        + "  ".join(
+            cell.rjust(width) if number in numbers else cell.ljust(width)
+            for number, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )
+
+
+def replace_unencodable(text: str, encoding: str | None = None) -> str:
+    """Replace box-drawing characters and arrows by ASCII if the terminal's encoding does not have them."""
+    try:
+        text.encode(encoding or sys.stdout.encoding or "utf-8")
+    except (UnicodeEncodeError, LookupError):
+        return text.translate(_ASCII).encode("ascii", "replace").decode()
+    return text

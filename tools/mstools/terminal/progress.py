@@ -1,4 +1,4 @@
-"""Progress of long work, on stderr, where somebody watches."""
+"""Progress bar on stderr."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 
 @contextmanager
-def progress(label: str, total: float) -> Iterator[Callable[[float], None]]:
-    """Show a bar while the block runs; the block calls what it is given with how much of `total` is done.
+def show_progress(label: str, total: float) -> Iterator[Callable[[float], None]]:
+    """Show a progress bar while the block runs; the block calls the given function with the part of `total` done.
 
-    Nothing is shown where stderr is no terminal, or for work that ends at once.
+    Nothing is shown where stderr is no terminal.
     """
     console = Console(stderr=True)
     bar = Progress(

@@ -1,4 +1,9 @@
-"""The search of `modelserver tune`: steps of a factor of two, one setting after the other. Pure, deterministic."""
+"""Coordinate search of `modelserver tune`: each setting is multiplied or divided by 2 while that helps. Pure.
+
+Objective: mean log-likelihood of withheld fixes, with the constraints that neither their RMSE nor the error at the ends
+of gaps gets noticeably worse. A step must gain MIN_GAIN, or it would fit the noise of this log. Settings that change
+nothing are left out after the first round. Deterministic; converges to a local optimum within MAX_FACTOR.
+"""
 
 from __future__ import annotations
 
@@ -11,24 +16,23 @@ Settings: TypeAlias = Mapping[str, float]
 
 FACTOR = 2.0
 
-LEAST_GAIN = 0.02
-"""Gain in mean log-likelihood below which a step is not taken: it would follow this recording's chance."""
+MIN_GAIN = 0.02
+"""Gain in mean log-likelihood below which a step is not accepted."""
 
-UNSEEN = 1e-4
-"""Change of the likelihood below which a setting does nothing on this recording."""
+MIN_EFFECT = 1e-4
+"""Change of the likelihood below which a setting has no effect on this log."""
 
 RMSE_SLACK = 1.02
 GAPS_SLACK = 1.05
-"""By how much a step may worsen the error at withheld fixes, and at the ends of gaps: likelihood must not be bought
-with accuracy."""
+"""Factors by which a step may worsen the error at withheld fixes, and at the ends of gaps."""
 
-FARTHEST = 8.0
-"""A proposal is at most so many times the setting, or this part of it, that the search began with."""
+MAX_FACTOR = 8.0
+"""Largest ratio of a proposal to the initial setting, and its reciprocal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """How well settings do: mean log-likelihood and RMSE at withheld fixes, mean error at gap ends (nan: no gaps)."""
+    """Score of settings: mean log-likelihood and RMSE at withheld fixes, mean error at gap ends (nan: no gaps)."""
 
     likelihood: float
     rmse: float
@@ -37,7 +41,7 @@ class Score:
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A setting to search: its least and largest value. `from_value`: where steps upward begin at least."""
+    """A setting to search, with its bounds. `from_value`: smallest start of upward steps."""
 
     name: str
     low: float = 0.0
@@ -47,7 +51,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class SearchStep:
-    """A step that was taken."""
+    """An accepted step."""
 
     name: str
     before: float
@@ -57,16 +61,16 @@ class SearchStep:
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
-    """Where the search came to: the settings that changed, the steps there, and what did nothing on this recording."""
+    """Result of the search: changed settings, accepted steps, and settings without effect on this log."""
 
     settings: Settings
     score: Score
     steps: tuple[SearchStep, ...]
-    unseen: tuple[str, ...]
+    insensitive: tuple[str, ...]
 
 
 Evaluate: TypeAlias = Callable[[Sequence[Settings]], Sequence[Score | None]]
-"""Scores settings, each a change of those that the search began with; None for settings that cannot be."""
+"""Scores settings, each given as changes of the initial ones; None for settings out of range."""
 
 
 def search(
@@ -75,69 +79,69 @@ def search(
     parameters: Sequence[Parameter],
     evaluate: Evaluate,
     rounds: int = 2,
-    told: Callable[[SearchStep], object] | None = None,
+    on_step: Callable[[SearchStep], object] | None = None,
 ) -> SearchResult:
-    """Step each parameter up and down by `FACTOR` while that helps, round after round while anything moves.
+    """Step each parameter up and down by `FACTOR` while that helps, round after round until nothing changes.
 
-    `begin` has the values of all parameters, `first` their score. `told` is called with each step taken.
+    `begin` has the initial values of all parameters, `first` their score. `on_step` is called with each accepted step.
     """
     values = dict(begin)
     best = first
     steps: list[SearchStep] = []
-    unseen: list[str] = []
+    insensitive: list[str] = []
 
     def change(trial: Settings) -> dict[str, float]:
         return {name: value for name, value in trial.items() if value != begin[name]}
 
     for number in range(rounds):
-        moved = False
+        changed = False
         for parameter in parameters:
             name = parameter.name
-            if name in unseen:
+            if name in insensitive:
                 continue
-            trials = [t for t in (_stepped(parameter, values[name], begin[name], up) for up in (True, False)) if t]
+            trials = [t for t in (_step(parameter, values[name], begin[name], up) for up in (True, False)) if t]
             scores = evaluate([change({**values, name: trial}) for trial in trials])
-            if number == 0 and all(s is None or abs(s.likelihood - best.likelihood) < UNSEEN for s in scores):
-                unseen.append(name)
+            if number == 0 and all(s is None or abs(s.likelihood - best.likelihood) < MIN_EFFECT for s in scores):
+                insensitive.append(name)
                 continue
-            taken = _best(best, trials, scores)
-            while taken is not None:
-                trial, score = taken
+            accepted = _best(best, trials, scores)
+            while accepted is not None:
+                trial, score = accepted
                 up = trial > values[name]
                 step = SearchStep(name, values[name], trial, score)
-                values[name], best, moved = trial, score, True
+                values[name], best, changed = trial, score, True
                 steps.append(step)
-                if told is not None:
-                    told(step)
-                farther = _stepped(parameter, trial, begin[name], up)
-                taken = None
+                if on_step is not None:
+                    on_step(step)
+                farther = _step(parameter, trial, begin[name], up)
+                accepted = None
                 if farther:
-                    taken = _best(best, [farther], evaluate([change({**values, name: farther})]))
-        if not moved:
+                    accepted = _best(best, [farther], evaluate([change({**values, name: farther})]))
+        if not changed:
             break
-    return SearchResult(change(values), best, tuple(steps), tuple(unseen))
+    return SearchResult(change(values), best, tuple(steps), tuple(insensitive))
 
 
-def _stepped(parameter: Parameter, value: float, begin: float, up: bool) -> float | None:
-    """Return the value a step on, None where that is out of bounds."""
+def _step(parameter: Parameter, value: float, begin: float, up: bool) -> float | None:
+    """Return the value after a step, None where it is out of bounds."""
     trial = max(value, parameter.from_value) * FACTOR if up else value / FACTOR
     start = max(begin, parameter.from_value) if up else begin
-    high, low = min(parameter.high, start * FARTHEST), max(parameter.low, start / FARTHEST)
+    high, low = min(parameter.high, start * MAX_FACTOR), max(parameter.low, start / MAX_FACTOR)
     trial = min(max(trial, low), high)
     return None if trial == value or (trial > value) != up else trial
 
 
 def _best(best: Score, trials: Sequence[float], scores: Sequence[Score | None]) -> tuple[float, Score] | None:
-    """Return the trial that gains most, of those that gain enough and cost no accuracy; None where none does."""
+    """Return the trial with the largest sufficient gain without loss of accuracy; None without one."""
     good = [
         (trial, score)
         for trial, score in zip(trials, scores, strict=True)
-        if score is not None and score.likelihood > best.likelihood + LEAST_GAIN and _as_accurate(score, best)
+        if score is not None and score.likelihood > best.likelihood + MIN_GAIN and _is_as_accurate(score, best)
     ]
     return max(good, key=lambda each: each[1].likelihood, default=None)
 
 
-def _as_accurate(score: Score, best: Score) -> bool:
+def _is_as_accurate(score: Score, best: Score) -> bool:
     if not score.rmse <= best.rmse * RMSE_SLACK:
         return False
     return math.isnan(best.gaps) or score.gaps <= best.gaps * GAPS_SLACK

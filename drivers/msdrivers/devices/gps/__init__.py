@@ -1,4 +1,4 @@
-"""Satellite receivers: NovAtel OEM4 and its heirs, and whatever speaks NMEA 0183."""
+"""Drivers of satellite receivers: NovAtel OEM4 and successors, NMEA 0183."""
 
 from msdrivers.devices.gps.driver import GpsDriver
 from msdrivers.devices.gps.settings import GpsSettings

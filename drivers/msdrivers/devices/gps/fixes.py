@@ -1,43 +1,180 @@
-"""Puts together what belongs to one fix: a position log with the velocity of its instant, or an NMEA epoch."""
+"""Assemble fixes from position logs with their velocity and heading, or from NMEA epochs; convert them to samples.
+
+NMEA epochs are used only while the position log is missing. Missing values stay nan.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from modelserver.messages import GpsSample, SensorHeader
-from msdrivers.devices.gps.samples import USABLE_TIME, nmea_sample, novatel_sample
+from modelserver.messages import FixType, GpsSample, SensorHeader
+from modelserver.messages.flags import NAN
+from modelserver.transforms.so3 import Matrix3, Vector3
+from msdrivers.endpoint import HostTime
 from msdrivers.protocol import gps_time
 from msdrivers.protocol.nmea import NmeaEpoch
-from msdrivers.protocol.novatel import HeadingLog, LogHeader, NovatelLog, Position, PositionType, Velocity
-from msdrivers.station import Now
+from msdrivers.protocol.novatel import (
+    HeadingLog,
+    LogHeader,
+    NovatelLog,
+    Position,
+    PositionType,
+    SolutionStatus,
+    TimeStatus,
+    Velocity,
+)
 
-WGS84 = 61
+USABLE_TIME = frozenset(
+    {
+        TimeStatus.COARSE,
+        TimeStatus.COARSESTEERING,
+        TimeStatus.FREEWHEELING,
+        TimeStatus.FINEADJUSTING,
+        TimeStatus.FINE,
+        TimeStatus.FINEBACKUPSTEERING,
+        TimeStatus.FINESTEERING,
+    }
+)
+"""With the other statuses the header's time may be wrong by seconds or years."""
+
+FIX_TYPES: dict[int, FixType] = {
+    PositionType.FIXEDHEIGHT: FixType.FIX_2D,
+    PositionType.FLOATCONV: FixType.RTK_FLOAT,
+    PositionType.WIDELANE: FixType.RTK_FIXED,
+    PositionType.NARROWLANE: FixType.RTK_FIXED,
+    PositionType.SINGLE: FixType.FIX_3D,
+    PositionType.PSRDIFF: FixType.DIFFERENTIAL,
+    PositionType.WAAS: FixType.DIFFERENTIAL,
+    PositionType.PROPAGATED: FixType.DEAD_RECKONING,
+    PositionType.OMNISTAR: FixType.DIFFERENTIAL,
+    PositionType.L1_FLOAT: FixType.RTK_FLOAT,
+    PositionType.IONOFREE_FLOAT: FixType.RTK_FLOAT,
+    PositionType.NARROW_FLOAT: FixType.RTK_FLOAT,
+    PositionType.L1_INT: FixType.RTK_FIXED,
+    PositionType.WIDE_INT: FixType.RTK_FIXED,
+    PositionType.NARROW_INT: FixType.RTK_FIXED,
+    PositionType.RTK_DIRECT_INS: FixType.RTK_FIXED,
+    PositionType.INS_SBAS: FixType.DIFFERENTIAL,
+    PositionType.INS_PSRSP: FixType.FIX_3D,
+    PositionType.INS_PSRDIFF: FixType.DIFFERENTIAL,
+    PositionType.INS_RTKFLOAT: FixType.RTK_FLOAT,
+    PositionType.INS_RTKFIXED: FixType.RTK_FIXED,
+    PositionType.OMNISTAR_HP: FixType.DIFFERENTIAL,
+    PositionType.OMNISTAR_XP: FixType.DIFFERENTIAL,
+    PositionType.CDGPS: FixType.DIFFERENTIAL,
+    PositionType.PPP_CONVERGING: FixType.DIFFERENTIAL,
+    PositionType.PPP: FixType.DIFFERENTIAL,
+    PositionType.INS_PPP_CONVERGING: FixType.DIFFERENTIAL,
+    PositionType.INS_PPP: FixType.DIFFERENTIAL,
+    PositionType.PPP_BASIC_CONVERGING: FixType.DIFFERENTIAL,
+    PositionType.PPP_BASIC: FixType.DIFFERENTIAL,
+    PositionType.INS_PPP_BASIC_CONVERGING: FixType.DIFFERENTIAL,
+    PositionType.INS_PPP_BASIC: FixType.DIFFERENTIAL,
+}
+"""The others are no satellite positions: none, entered by hand (FIXEDPOS), velocity only, or unknown."""
+
+
+def course_from_track(track: float) -> float:
+    """Convert degrees clockwise from true north to radians counter-clockwise from true east, -pi to pi."""
+    return math.remainder(math.radians(90.0 - track), math.tau)
+
+
+def sample_from_nmea(header: SensorHeader, epoch: NmeaEpoch) -> GpsSample:
+    """Convert an NMEA epoch to a sample."""
+    return GpsSample(
+        header,
+        epoch.fix_type,
+        epoch.latitude,
+        epoch.longitude,
+        height_ellipsoidal=epoch.height_msl + epoch.undulation,
+        height_msl=epoch.height_msl,
+        undulation=epoch.undulation,
+        satellites=epoch.satellites,
+        hdop=epoch.hdop,
+        vdop=epoch.vdop,
+        pdop=epoch.pdop,
+        position_covariance=to_covariance(epoch.sigma_longitude, epoch.sigma_latitude, epoch.sigma_height),
+        speed=epoch.speed,
+        course=course_from_track(epoch.track),
+        baseline_yaw=course_from_track(epoch.heading),
+    )
+
+
+def sample_from_novatel(
+    header: SensorHeader, position: Position, velocity: Velocity | None = None, heading: HeadingLog | None = None
+) -> GpsSample:
+    """Convert a position log, with velocity and heading of the same instant if available, to a sample."""
+    # without a solution the receiver sends zeros
+    empty = position.type == PositionType.NONE and position.latitude == 0.0 and position.longitude == 0.0
+    height = NAN if empty else position.height
+    undulation = NAN if empty else position.undulation
+    moving = velocity is not None and _is_solved(velocity)
+    turned = heading is not None and _is_solved(heading)
+    return GpsSample(
+        header,
+        FIX_TYPES.get(position.type, FixType.NONE) if _is_solved(position) else FixType.NONE,
+        NAN if empty else position.latitude,
+        NAN if empty else math.remainder(position.longitude, 360.0),
+        height_ellipsoidal=height + undulation,
+        height_msl=height,
+        undulation=undulation,
+        satellites=position.used,
+        position_covariance=to_covariance(position.sigma_longitude, position.sigma_latitude, position.sigma_height),
+        velocity=_to_enu(velocity) if moving and velocity else None,
+        velocity_latency=max(0.0, velocity.latency - position.solution_age) if moving and velocity else NAN,
+        speed=velocity.horizontal if moving and velocity else NAN,
+        course=course_from_track(velocity.track) if moving and velocity else NAN,
+        baseline_yaw=course_from_track(heading.heading) if turned and heading else NAN,
+        baseline_yaw_sigma=math.radians(heading.sigma_heading)
+        if turned and heading and heading.sigma_heading > 0.0
+        else NAN,
+    )
+
+
+def to_covariance(east: float, north: float, up: float) -> Matrix3 | None:
+    """Return the covariance of standard deviations, m2; None if one is missing (nan or 0)."""
+    if not (east > 0.0 and north > 0.0 and up > 0.0):
+        return None
+    return (east * east, 0.0, 0.0, 0.0, north * north, 0.0, 0.0, 0.0, up * up)
+
+
+def _is_solved(log: Position | Velocity | HeadingLog) -> bool:
+    return log.status == SolutionStatus.SOL_COMPUTED and log.type != PositionType.NONE
+
+
+def _to_enu(velocity: Velocity) -> Vector3:
+    track = math.radians(velocity.track)
+    return velocity.horizontal * math.sin(track), velocity.horizontal * math.cos(track), velocity.vertical
+
+
+WGS84_DATUM = 61
 
 
 @dataclass(frozen=True, slots=True)
 class GpsFix:
-    """A fix to publish. device_utime: 0 where the receiver's time cannot be used. delay: seconds by which the fix is
-    older than that. origin: the log or sentences it is from, for people."""
+    """A fix to publish. device_utime: 0 if the receiver's time is not usable. delay: seconds by which the fix is older
+    than that. origin: name of the log, or NMEA."""
 
     host_utime: int
     device_utime: int
     origin: str
-    said: NmeaEpoch | Position
+    solution: NmeaEpoch | Position
     velocity: Velocity | None = None
     heading: HeadingLog | None = None
     delay: float = 0.0
 
-    def sample(self, header: SensorHeader) -> GpsSample:
-        """Return the sample with its header."""
-        if isinstance(self.said, NmeaEpoch):
-            return nmea_sample(header, self.said)
-        return novatel_sample(header, self.said, self.velocity, self.heading)
+    def to_sample(self, header: SensorHeader) -> GpsSample:
+        """Convert to a sample."""
+        if isinstance(self.solution, NmeaEpoch):
+            return sample_from_nmea(header, self.solution)
+        return sample_from_novatel(header, self.solution, self.velocity, self.heading)
 
 
 class FixAssembler:
-    """Takes logs and epochs; gives fixes, each instant once.
+    """Assembles logs and epochs to fixes, each instant once.
 
     logs: the names of the position log and of what belongs to it; empty for NMEA only.
     """
@@ -53,38 +190,38 @@ class FixAssembler:
         self._last_epoch: tuple[int, int | None] | None = None
         self._last_solution = -1
         self._problems: list[str] = []
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self.counts: Counter[str] = Counter()
-        """`repeated`: instants that came again. `superseded`: NMEA epochs beside the position log. `rejected.datum`:
+        """`repeated`: duplicate instants. `superseded`: NMEA epochs beside the position log. `rejected.datum`:
         positions on another datum than WGS 84. `rejected.secondary_antenna`: logs of the secondary antenna.
         `unknown_type`: fixes published as none for their type."""
 
     def clear(self) -> None:
-        """Forget what waits: the line was closed, or the receiver has started anew."""
+        """Discard pending data: the line was closed, or the receiver has restarted."""
         self._parts.clear()
         self._waiting = None
         self._last_log_ns = None
 
-    def problems(self) -> list[str]:
-        """Return what a person should know, once."""
+    def pop_problems(self) -> list[str]:
+        """Return new warnings."""
         found, self._problems = self._problems, []
         return found
 
-    def _problem(self, text: str) -> None:
-        if text not in self._told:
-            self._told.add(text)
+    def _add_problem(self, text: str) -> None:
+        if text not in self._reported:
+            self._reported.add(text)
             self._problems.append(text)
 
-    def due(self) -> int | None:
-        """Return the monotonic nanoseconds at which a position has waited long enough."""
+    def get_deadline(self) -> int | None:
+        """Return the release time of the pending position, monotonic nanoseconds."""
         return self._waiting[2] if self._waiting else None
 
-    def woken(self, now: Now) -> list[GpsFix]:
-        """Return the position that has waited long enough."""
+    def on_timer(self, now: HostTime) -> list[GpsFix]:
+        """Release a position whose hold time has passed."""
         return self._release() if self._waiting and now.monotonic_ns >= self._waiting[2] else []
 
-    def epoch(self, epoch: NmeaEpoch, host_utime: int, now: Now) -> list[GpsFix]:
-        """Take an NMEA epoch that began to come in at `host_utime`."""
+    def add_epoch(self, epoch: NmeaEpoch, host_utime: int, now: HostTime) -> list[GpsFix]:
+        """Process an NMEA epoch whose first byte was received at `host_utime`."""
         if self._last_log_ns is not None and now.monotonic_ns - self._last_log_ns < self._silence_ns:
             self.counts["superseded"] += 1
             return []
@@ -93,15 +230,15 @@ class FixAssembler:
             self.counts["repeated"] += 1
             return []
         self._last_epoch = instant
-        return [GpsFix(host_utime, _device_utime(epoch, now.utime), "NMEA", epoch)]
+        return [GpsFix(host_utime, _get_epoch_utime(epoch, now.utime), "NMEA", epoch)]
 
-    def log(self, log: NovatelLog, host_utime: int, now: Now) -> list[GpsFix]:
-        """Take a log that began to come in at `host_utime`."""
+    def add_log(self, log: NovatelLog, host_utime: int, now: HostTime) -> list[GpsFix]:
+        """Process a log whose first byte was received at `host_utime`."""
         if log.header.name not in self._logs or log.body is None:
             return []
         if log.header.antenna:
             self.counts["rejected.secondary_antenna"] += 1
-            self._problem(
+            self._add_problem(
                 f"{log.header.label} is of the secondary antenna and is not used: log {log.header.name} without _1"
             )
             return []
@@ -109,28 +246,30 @@ class FixAssembler:
         if not isinstance(log.body, Position):
             assert isinstance(log.body, (Velocity, HeadingLog))
             self._parts[log.header.name] = (instant, log.body)
-            return self._complete(instant)
+            return self._release_if_complete(instant)
         solution = instant[0] * gps_time.WEEK // 1000 + instant[1] - round(log.body.solution_age * 1000.0)
         if instant == self._last_log or (log.body.solution_age > 0.0 and solution == self._last_solution):
             self.counts["repeated"] += 1
             return []
         self._last_solution = solution
-        if log.body.datum != WGS84:
+        if log.body.datum != WGS84_DATUM:
             self.counts["rejected.datum"] += 1
-            self._problem('positions are not on WGS 84 and not used: add "datum wgs84" to the settings `commands`')
+            self._add_problem('positions are not on WGS 84 and not used: add "datum wgs84" to the settings `commands`')
             return []
         if log.body.type not in PositionType.__members__.values():
             self.counts["unknown_type"] += 1
-            self._problem("the receiver names a position type that is not known here: its fixes are published as none")
+            self._add_problem(
+                "the receiver names a position type that is not known here: its fixes are published as none"
+            )
         fixes = self._release()
         self._last_log, self._last_log_ns = instant, now.monotonic_ns
-        device = device_utime(log.header, now.utime)
+        device = get_log_utime(log.header, now.utime)
         fix = GpsFix(host_utime, device, log.header.name, log.body, delay=max(0.0, log.body.solution_age))
         self._waiting = (fix, instant, now.monotonic_ns + self._hold_ns)
-        return fixes + self._complete(instant)
+        return fixes + self._release_if_complete(instant)
 
-    def _complete(self, instant: tuple[int, int]) -> list[GpsFix]:
-        """Release the position that waits if all that belongs to it is there."""
+    def _release_if_complete(self, instant: tuple[int, int]) -> list[GpsFix]:
+        """Release the pending position if its velocity and heading are complete."""
         if self._waiting is None or self._waiting[1] != instant:
             return []
         here = {name for name, (when, _) in self._parts.items() if when == instant}
@@ -147,19 +286,19 @@ class FixAssembler:
         return [fix]
 
 
-def device_utime(header: LogHeader, pivot: int) -> int:
-    """Return the utime of a log; 0 where the receiver does not know it well, or UTC has no name for it."""
+def get_log_utime(header: LogHeader, pivot: int) -> int:
+    """Return the utime of a log; 0 if the receiver's time is not usable or within a leap second."""
     microseconds = header.milliseconds * 1000
-    if header.time_status not in USABLE_TIME or gps_time.in_leap_second(header.week, microseconds, pivot):
+    if header.time_status not in USABLE_TIME or gps_time.is_in_leap_second(header.week, microseconds, pivot):
         return 0
     return gps_time.utime_of(header.week, microseconds, pivot)
 
 
-def _device_utime(epoch: NmeaEpoch, pivot: int) -> int:
-    if epoch.time_of_day is None or epoch.leap_second:
+def _get_epoch_utime(epoch: NmeaEpoch, pivot: int) -> int:
+    if epoch.time_of_day is None or epoch.is_leap_second:
         return 0
     if epoch.utime:
-        return gps_time.unrolled(epoch.utime, pivot)
-    # a receiver that never tells the date: the day that brings it nearest to the host's clock
+        return gps_time.resolve_rollover(epoch.utime, pivot)
+    # without a date: the day that is nearest to the host's clock
     days = round((pivot - epoch.time_of_day) / gps_time.DAY)
     return max(0, days * gps_time.DAY + epoch.time_of_day)

@@ -1,4 +1,4 @@
-"""How a satellite receiver is to be used."""
+"""Settings of the driver of a satellite receiver."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ HEADING_LOGS = ("", "HEADING", "HEADING2")
 
 @dataclass(frozen=True, slots=True)
 class GpsSettings:
-    """How to use the receiver. Seconds; raises ValueError where a setting cannot be.
+    """Settings of the receiver. Seconds; raises ValueError with the key for an invalid value.
 
-    protocol: "novatel" sets the receiver up by commands; "nmea" sends nothing but `commands` and takes what comes.
+    protocol: "novatel" configures the receiver by commands; "nmea" only sends `commands` and reads.
     rate_hz: of the logs that a NovAtel receiver is asked for, 0.1 to 20. log_format: "binary" or "ascii".
-    position_log: where the position comes from; NMEA positions are used only while it is missing.
+    position_log: source of the position; NMEA positions are used only while it is missing.
     heading_log: of a dual-antenna receiver, empty for none. device_port: the receiver's port, as its commands name it.
     commands: lines sent before the logs are asked for, e.g. "fix none"; with "nmea" they are not acknowledged.
     bauds: the rates to try; the line is opened at the first. Empty: the line has none, or one that is right.
-    silence: without a fix's sample for so long the receiver is set up anew.
-    answer: how long to wait for the answer to a command; it is sent `attempts` times.
-    hold: how long a position waits for the velocity of its instant. gap: how long the line must be still for the
-    sentences of an instant to be complete.
-    delay: by how much the shortest way from a fix to the first byte of its log is long, mostly the receiver's
-    computing; it cannot be told from the offset of the clocks. delay_sigma: standard deviation of that.
-    restore_on_leaving: stop the logs that were asked for when the driver leaves.
+    silence: timeout for fixes, after which the setup is repeated.
+    answer_timeout: for the response to a command, which is sent `attempts` times.
+    hold: how long a position waits for the velocity of its instant. gap: pause of the line after which the sentences of
+    an instant are complete.
+    delay: shortest time from a fix to the first byte of its log, mostly the receiver's processing; it cannot be
+    distinguished from the offset of the clocks. delay_sigma: its standard deviation.
+    restore_on_exit: stop the logs that were asked for when the driver leaves.
     """
 
     source: str
@@ -39,11 +39,11 @@ class GpsSettings:
     commands: tuple[str, ...] = ()
     bauds: tuple[int, ...] = ()
     silence: float = 2.0
-    answer: float = 1.0
+    answer_timeout: float = 1.0
     attempts: int = 3
     hold: float = 0.1
     gap: float = 0.04
-    restore_on_leaving: bool = True
+    restore_on_exit: bool = True
     delay: float = 0.0
     delay_sigma: float = 0.02
 
@@ -67,7 +67,7 @@ class GpsSettings:
                 raise ValueError(f"commands: {command!r} is no line of text")
         for name, seconds, least in (
             ("silence", self.silence, 0.1),
-            ("answer", self.answer, 0.05),
+            ("answer_timeout", self.answer_timeout, 0.05),
             ("hold", self.hold, 0.0),
             ("gap", self.gap, 0.001),
             ("delay", self.delay, 0.0),
@@ -88,16 +88,16 @@ class GpsSettings:
             return ()
         return (self.position_log, "BESTVEL", *((self.heading_log,) if self.heading_log else ()))
 
-    def set_up(self) -> tuple[str, ...]:
+    def make_setup_commands(self) -> tuple[str, ...]:
         """Return the commands that set the receiver up, in order."""
         if self.protocol != "novatel":
             return self.commands
-        wanted = (f"log {self.device_port} {log} ontime {1.0 / self.rate_hz:.6g}" for log in self._named())
+        wanted = (f"log {self.device_port} {log} ontime {1.0 / self.rate_hz:.6g}" for log in self._list_log_names())
         return (f"unlogall {self.device_port}", *self.commands, *wanted)
 
-    def undo(self) -> tuple[str, ...]:
+    def make_undo_commands(self) -> tuple[str, ...]:
         """Return the commands that stop the logs again."""
-        return tuple(f"unlog {self.device_port} {log}" for log in self._named())
+        return tuple(f"unlog {self.device_port} {log}" for log in self._list_log_names())
 
-    def _named(self) -> tuple[str, ...]:
+    def _list_log_names(self) -> tuple[str, ...]:
         return tuple(log.lower() + ("b" if self.log_format == "binary" else "a") for log in self.logs)

@@ -1,4 +1,13 @@
-"""The driver of a MicroStrain 3DM-GX1: finds it, sets it up, streams a measurement and polls others between."""
+"""Driver of a MicroStrain 3DM-GX1: finds the device, configures it, streams one measurement and polls others.
+
+Time: the samples carry the device's unwrapped ticks. The length of a tick comes from the EEPROM's timer words, which
+take effect only after a power cycle, so `TickRateCheck` compares it with the host's clock and disables the device's
+time while two consecutive windows of 5 s contradict it by more than 0.5 %. Smaller errors are drift, which
+`device_clock` estimates.
+
+Sign: documents differ on whether the device reports specific force or its opposite; `GravityCheck` decides it while
+the device is stationary.
+"""
 
 from __future__ import annotations
 
@@ -6,236 +15,375 @@ from collections import Counter
 from collections.abc import Mapping
 
 from modelserver.messages import NAN, SensorHeader
-from msdrivers.devices.gx1.contact import RETRY_S, ContactState, Part, UnusableError, contact, read_gains, read_words
-from msdrivers.devices.gx1.conversion import GravityCheck, imu_sample, saturated_fields
-from msdrivers.devices.gx1.dialogue import Ask, Dialogue, NoReplyError, Pause, Script
-from msdrivers.devices.gx1.link import Gx1Link, Reply
-from msdrivers.devices.gx1.polls import Polls
+from msdrivers.devices.gx1.conversion import GravityCheck, find_saturated_fields, sample_from_packet
+from msdrivers.devices.gx1.discovery import (
+    RETRY_DELAY_S,
+    LineState,
+    ScriptPart,
+    UnusableDeviceError,
+    find_device,
+    read_gains,
+    read_words,
+)
+from msdrivers.devices.gx1.script import (
+    Gx1Receiver,
+    Gx1Reply,
+    NoReplyError,
+    PauseStep,
+    RequestStep,
+    Script,
+    ScriptRunner,
+)
 from msdrivers.devices.gx1.settings import Gx1Settings
-from msdrivers.devices.gx1.tick_rate import TickRate
-from msdrivers.protocol.gx1 import DATA, LENGTHS, Address, CommandByte, Gains, requests
-from msdrivers.protocol.gx1.scaling import DOCUMENTED_TIMERS, temperature_celsius, tick_seconds
-from msdrivers.station import Measured, Now, Output, Send, StationPhase, StationStatus
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Send
+from msdrivers.protocol.gx1 import LENGTHS, MEASUREMENTS, CommandByte, EepromAddress, Gains, requests
+from msdrivers.protocol.gx1.scaling import DOCUMENTED_TIMERS, temperature_from_word, tick_from_timer_words
 
-BIAS_S = 9.0
-"""How long a capture of the gyros' biases may take: less than until a line that brings nothing is opened anew."""
+NEVER = 1 << 62
+REPLY_TIMEOUT_NS = 500_000_000
+"""Reply timeout."""
 
-GRAVITY_POLL_S = 1.0
-_POSTURE = (CommandByte.EULER_VECTORS, CommandByte.QUATERNION_VECTORS)
-"""Messages that tell whether specific force points up: with it, rates and orientation."""
+
+class PollSchedule:
+    """Commands that are polled periodically. Instants are monotonic nanoseconds."""
+
+    __slots__ = ("_next", "_pending", "_periods")
+
+    def __init__(self) -> None:
+        self._periods: dict[int, int] = {}
+        self._next: dict[int, int] = {}
+        self._pending: dict[int, int] = {}
+
+    def add(self, command: int, period_s: float, now_ns: int) -> None:
+        """Start to poll a command."""
+        self._periods[command] = round(period_s * 1e9)
+        self._next[command] = now_ns
+
+    def remove(self, command: int) -> None:
+        """Stop to poll a command."""
+        for table in (self._periods, self._next, self._pending):
+            table.pop(command, None)
+
+    @property
+    def deadline_ns(self) -> int:
+        """Next poll or timeout."""
+        return min((*self._next.values(), *self._pending.values()), default=NEVER)
+
+    def pop_due(self, now_ns: int) -> list[int]:
+        """Return the commands to poll now, except those whose reply is pending."""
+        commands = [command for command, at in self._next.items() if at <= now_ns]
+        asked = []
+        for command in commands:
+            self._next[command] = max(self._next[command] + self._periods[command], now_ns + 1)
+            if command not in self._pending:
+                self._pending[command] = now_ns + REPLY_TIMEOUT_NS
+                asked.append(command)
+        return asked
+
+    def pop_timed_out(self, now_ns: int) -> list[int]:
+        """Return the commands whose reply timed out."""
+        late = [command for command, until in self._pending.items() if until <= now_ns]
+        for command in late:
+            del self._pending[command]
+        return late
+
+    def on_reply(self, command: int) -> None:
+        """Record a reply."""
+        self._pending.pop(command, None)
+
+
+WINDOW_NS = 5_000_000_000
+TOLERANCE = 0.005
+"""Largest relative deviation of a tick within a window: 25 ms, a tick or two plus the variation of the delay."""
+
+
+class TickRateCheck:
+    """Compares ticks with the host's clock; `is_consistent` changes after two consecutive windows that agree.
+
+    The earliest reply of each window is compared, because delays vary.
+    """
+
+    __slots__ = ("_agreeing_windows", "_before", "_begin_ns", "_earliest", "_measured", "_tick_s", "is_consistent")
+
+    def __init__(self, tick_s: float):
+        """`tick_s` is the configured tick."""
+        self._tick_s = tick_s
+        self._begin_ns: int | None = None
+        self._before: tuple[int, int] | None = None
+        self._earliest = (0, 0)
+        self._agreeing_windows = 0
+        self._measured = tick_s
+        self.is_consistent = True
+
+    def update(self, count: int, at_ns: int) -> bool:
+        """Process unwrapped ticks and their receive time, monotonic nanoseconds; return whether the result changed."""
+        if self._begin_ns is None or at_ns - self._begin_ns < WINDOW_NS:
+            if self._begin_ns is None or self._get_latency(count, at_ns) < self._get_latency(*self._earliest):
+                self._earliest = (count, at_ns)
+            self._begin_ns = self._begin_ns or at_ns
+            return False
+        before, self._before = self._before, self._earliest
+        self._begin_ns, self._earliest = at_ns, (count, at_ns)
+        return before is not None and self._compare(before, self._before)
+
+    def _get_latency(self, count: int, at_ns: int) -> float:
+        return at_ns - count * self._tick_s * 1e9
+
+    def _compare(self, before: tuple[int, int], earliest: tuple[int, int]) -> bool:
+        ticks, elapsed_ns = earliest[0] - before[0], earliest[1] - before[1]
+        last, self._measured = self._measured, elapsed_ns * 1e-9 / max(ticks, 1)
+        contradicts = _is_different(self._measured, self._tick_s)
+        if contradicts != self.is_consistent:
+            self._agreeing_windows = 0
+            return False
+        # a host that was late makes one window too long and the next too short
+        self._agreeing_windows = 1 if _is_different(self._measured, last) else self._agreeing_windows + 1
+        if self._agreeing_windows < 2:
+            return False
+        self._agreeing_windows = 0
+        self.is_consistent = not self.is_consistent
+        return True
+
+    def describe(self) -> str:
+        """Describe the result."""
+        expected = f"{self._tick_s * 1e3:.4g} ms"
+        if self.is_consistent:
+            return f"the device's ticks take {expected} again, as they should: its time is used"
+        return (
+            f"the device's ticks take {self._measured * 1e3:.4g} ms by the host's clock, expected {expected}: its time "
+            "is not used; switch its power off and on if its timer words were changed, or set tick in the settings"
+        )
+
+
+def _is_different(measured: float, expected: float) -> bool:
+    return abs(measured / expected - 1.0) > TOLERANCE
+
+
+BIAS_CAPTURE_TIMEOUT_S = 9.0
+"""Timeout of the gyro bias capture: shorter than the runner's reopen timeout."""
+
+GRAVITY_POLL_PERIOD_S = 1.0
+_GRAVITY_MESSAGES = (CommandByte.EULER_VECTORS, CommandByte.QUATERNION_VECTORS)
+"""Messages with specific force, rates and orientation, as `GravityCheck` needs."""
 
 
 class Gx1Driver:
-    """A `Station` of bytes; see `Gx1Settings`. The line is to be opened at the first baud rate of the settings.
+    """An `Endpoint` of bytes; see `Gx1Settings`. The line must be opened at the first baud rate of the settings.
 
-    The times in the samples are the device's ticks, unwrapped: they never go back by more than two ticks, and go ahead
-    by more than a turn of the counter when the device was set up anew.
+    The device times of the samples go back by at most two ticks, and advance by more than the counter's range when the
+    setup was repeated.
     """
 
     def __init__(self, settings: Gx1Settings):
-        """Take the settings."""
         self.settings = settings
         self.tick_s = settings.tick or 0.0
         """Seconds of a tick; 0 before that is known."""
-        self._link = Gx1Link()
-        self._dialogue = Dialogue(self._link, self._set_up)
-        self._found = ContactState(list(settings.bauds))
+        self._link = Gx1Receiver()
+        self._script = ScriptRunner(self._link, self._run_setup)
+        self._line_state = LineState(list(settings.bauds))
         self._gains = Gains(1, 1, 1)
         self._device = "3DM-GX1"
         self._bias_pending = settings.capture_bias_at_start
-        self._gravity = GravityCheck()
-        self._rate = TickRate(1.0)
-        self._polls = Polls()
+        self._gravity_check = GravityCheck()
+        self._tick_check = TickRateCheck(1.0)
+        self._polls = PollSchedule()
         self._seq = 0
         self._celsius = NAN
-        self._spoke_ns = 0
-        self._streams = False
+        self._streamed_ns = 0
+        self._is_streaming = False
         self._counts: Counter[str] = Counter()
 
-    def opened(self, now: Now) -> list[Output[bytes]]:
+    def on_open(self, now: HostTime) -> list[Output[bytes]]:
         """Begin, or go on at another baud rate."""
-        return self._dialogue.opened(now)
+        return self._script.on_open(now)
 
-    def received(self, unit: bytes, now: Now) -> list[Output[bytes]]:
-        """Take bytes."""
+    def on_receive(self, unit: bytes, now: HostTime) -> list[Output[bytes]]:
+        """Process received bytes."""
         outputs: list[Output[bytes]] = []
         for reply in self._link.feed(unit, now):
-            if self._dialogue.running:
-                outputs += self._dialogue.take(reply, now)
+            if self._script.is_running:
+                outputs += self._script.on_reply(reply, now)
             else:
-                outputs += self._streamed(reply, now)
+                outputs += self._on_streamed_reply(reply, now)
         return outputs
 
-    def woken(self, now: Now) -> list[Output[bytes]]:
-        """Ask for what is due, or see that nothing comes any more."""
+    def on_timer(self, now: HostTime) -> list[Output[bytes]]:
+        """Send due polls; restart the setup after a timeout."""
         self._link.now = now
-        if self._dialogue.running:
-            return self._dialogue.woken(now)
-        if now.monotonic_ns >= self._silent_ns():
-            return self._restarted(now, self._why_silent())
-        for command in self._polls.overdue(now.monotonic_ns):
-            self._link.parser.give_up(command)
+        if self._script.is_running:
+            return self._script.on_timer(now)
+        if now.monotonic_ns >= self._silence_deadline_ns():
+            return self._restart(now, self._explain_silence())
+        for command in self._polls.pop_timed_out(now.monotonic_ns):
+            self._link.parser.cancel(command)
             self._counts[f"unanswered.{CommandByte(command).name.lower()}"] += 1
         outputs: list[Output[bytes]] = []
-        for command in self._polls.take_due(now.monotonic_ns):
+        for command in self._polls.pop_due(now.monotonic_ns):
             self._link.parser.expect(command)
-            outputs.append(Send(requests.poll(command)))
+            outputs.append(Send(requests.make_poll(command)))
         return outputs
 
-    def due(self) -> int | None:
-        """Return when to be woken."""
-        if self._dialogue.running:
-            return self._dialogue.due
-        return min(self._silent_ns(), self._polls.due)
+    def get_deadline(self) -> int | None:
+        """Return when to call `on_timer`, monotonic nanoseconds."""
+        if self._script.is_running:
+            return self._script.deadline_ns
+        return min(self._silence_deadline_ns(), self._polls.deadline_ns)
 
-    def leaving(self, now: Now) -> list[Output[bytes]]:
-        """Leave the continuous mode as it was found: stopped, or with what was streamed then."""
-        self._dialogue.stop()
-        self._link.begin_anew()
-        return [] if self._found.streamed is None else [Send(self._found.restored())]
+    def on_close(self, now: HostTime) -> list[Output[bytes]]:
+        """Restore the continuous mode as it was found."""
+        self._script.stop()
+        self._link.reset()
+        return [] if self._line_state.found_stream is None else [Send(self._line_state.make_restore_request())]
 
     @property
     def counts(self) -> Mapping[str, int]:
         """Messages by kind, bytes skipped, rejected and unanswered by reason, restarts, saturated vectors."""
         return self._link.messages + self._link.parser.counts + self._counts
 
-    def _set_up(self) -> Script:
+    def _run_setup(self) -> Script:
         while True:
             try:
-                self._device = yield from contact(self._link, self._found)
-                yield StationStatus(StationPhase.CONFIGURING, f"{self._device} answers{self._found.at}")
+                self._device = yield from find_device(self._link, self._line_state)
+                yield EndpointStatus(
+                    EndpointPhase.CONFIGURING, f"{self._device} answers{self._line_state.at_baud_text}"
+                )
                 self._gains = yield from read_gains()
                 yield from self._read_timer()
                 if self.settings.capture_bias_at_start:
                     yield from self._capture_bias()
-                yield from self._start()
+                yield from self._start_stream()
                 return
             except NoReplyError as silence:
                 why = f"{self._device} fell silent while it was set up: {silence}; check its cable and power"
-            except UnusableError as unusable:
+            except UnusableDeviceError as unusable:
                 why = f"{self._device} cannot be used: {unusable}"
-            yield StationStatus(StationPhase.SILENT, f"{why}; nothing is published, trying again in {RETRY_S:g} s")
-            yield Pause(RETRY_S)
+            yield EndpointStatus(
+                EndpointPhase.SILENT, f"{why}; nothing is published, trying again in {RETRY_DELAY_S:g} s"
+            )
+            yield PauseStep(RETRY_DELAY_S)
 
-    def _read_timer(self) -> Part[None]:
+    def _read_timer(self) -> ScriptPart[None]:
         if self.settings.tick is None:
-            words = yield from read_words(Address.TIMER)
-            self.tick_s = tick_seconds(words)
+            words = yield from read_words(EepromAddress.TIMER)
+            self.tick_s = tick_from_timer_words(words)
             if not 1e-3 <= self.tick_s <= 0.1:
-                raise UnusableError(
+                raise UnusableDeviceError(
                     f"its EEPROM gives a timer tick of {self.tick_s:g} s (words {list(words)} at addresses "
-                    f"{list(Address.TIMER)}); write the defaults 16 16 256 1 to them, or set tick in the settings"
+                    f"{list(EepromAddress.TIMER)}); write the defaults 16 16 256 1 to them, or set tick in the settings"
                 )
             if words not in DOCUMENTED_TIMERS:
-                yield StationStatus(
-                    StationPhase.CONFIGURING,
+                yield EndpointStatus(
+                    EndpointPhase.CONFIGURING,
                     f"the timer words {list(words)} are not documented; a tick of {self.tick_s * 1e3:g} ms is "
                     "inferred from them and will be compared with the host's clock",
                 )
-        self._link.watch.clock(self.tick_s)
-        self._rate = TickRate(self.tick_s)
+        self._link.ticks.set_tick(self.tick_s)
+        self._tick_check = TickRateCheck(self.tick_s)
 
-    def _capture_bias(self) -> Part[None]:
+    def _capture_bias(self) -> ScriptPart[None]:
         if not self._bias_pending:
-            yield StationStatus(
-                StationPhase.CONFIGURING,
+            yield EndpointStatus(
+                EndpointPhase.CONFIGURING,
                 "the gyro biases are not captured again, since the vehicle may be moving; for that restart the driver "
-                "at rest",
+                "while the vehicle is stationary",
             )
             return
-        yield StationStatus(StationPhase.CONFIGURING, "capturing the gyro biases: keep the vehicle still")
+        yield EndpointStatus(EndpointPhase.CONFIGURING, "capturing the gyro biases: keep the vehicle still")
         self._bias_pending = False
         try:
-            yield Ask(requests.poll(CommandByte.CAPTURE_BIAS), timeout=BIAS_S, tries=1)
+            yield RequestStep(requests.make_poll(CommandByte.CAPTURE_BIAS), timeout=BIAS_CAPTURE_TIMEOUT_S, attempts=1)
         except NoReplyError:
-            text = (
-                f"the capture of the gyro biases did not end within {BIAS_S:g} s; going on with the biases from before"
-            )
+            text = f"the gyro bias capture timed out after {BIAS_CAPTURE_TIMEOUT_S:g} s; using the previous biases"
         else:
             text = "the gyro biases are captured"
-        yield StationStatus(StationPhase.CONFIGURING, text)
+        yield EndpointStatus(EndpointPhase.CONFIGURING, text)
 
-    def _start(self) -> Part[None]:
+    def _start_stream(self) -> ScriptPart[None]:
         message = self.settings.message
-        self._link.stream(message)
-        yield Ask(requests.stream(message), value=message)
-        self._link.stream(message)
+        self._link.set_streamed(message)
+        yield RequestStep(requests.make_stream(message), value=message)
+        self._link.set_streamed(message)
         now_ns = self._link.now.monotonic_ns
-        self._link.mark()
-        self._spoke_ns, self._streams = now_ns, False
+        self._link.reset_input()
+        self._streamed_ns, self._is_streaming = now_ns, False
         self._celsius = NAN
-        self._gravity = GravityCheck()
-        self._polls = Polls()
+        self._gravity_check = GravityCheck()
+        self._polls = PollSchedule()
         if self.settings.temperature_period:
             self._polls.add(CommandByte.TEMPERATURE, self.settings.temperature_period, now_ns)
         if self.settings.polled is not None:
             self._polls.add(self.settings.polled, self.settings.poll_period, now_ns)
-        if message not in _POSTURE and self.settings.polled not in _POSTURE:
-            self._polls.add(CommandByte.EULER_VECTORS, GRAVITY_POLL_S, now_ns)
+        if message not in _GRAVITY_MESSAGES and self.settings.polled not in _GRAVITY_MESSAGES:
+            self._polls.add(CommandByte.EULER_VECTORS, GRAVITY_POLL_PERIOD_S, now_ns)
 
-    def _streamed(self, reply: Reply, now: Now) -> list[Output[bytes]]:
-        """Take a reply while the device streams."""
-        if self._link.watch.jumped:
-            return self._restarted(now, "its ticks jumped, so it has restarted or is another one")
+    def _on_streamed_reply(self, reply: Gx1Reply, now: HostTime) -> list[Output[bytes]]:
+        """Process a reply while the device streams."""
+        if self._link.ticks.has_jumped:
+            return self._restart(now, "its ticks jumped, so it has restarted or is another one")
         packet, count = reply
         command = packet.command
-        self._polls.answered(command)
+        self._polls.on_reply(command)
         if command == CommandByte.TEMPERATURE:
-            self._celsius = temperature_celsius(packet.unsigned)
-        if command not in DATA:
+            self._celsius = temperature_from_word(packet.unsigned)
+        if command not in MEASUREMENTS:
             return []
         outputs: list[Output[bytes]] = []
         if command == self.settings.message:
-            self._spoke_ns = now.monotonic_ns
-            self._link.mark()
-            if not self._streams:
-                self._streams = True
-                outputs.append(StationStatus(StationPhase.STREAMING, f"{self._device} streams message {int(command)}"))
-            if self._rate.take(count, now.monotonic_ns):
-                outputs.append(StationStatus(StationPhase.STREAMING, self._rate.text()))
-        device_utime = round(count * self.tick_s * 1e6) if self._rate.agrees else 0
+            self._streamed_ns = now.monotonic_ns
+            self._link.reset_input()
+            if not self._is_streaming:
+                self._is_streaming = True
+                outputs.append(
+                    EndpointStatus(EndpointPhase.STREAMING, f"{self._device} streams message {int(command)}")
+                )
+            if self._tick_check.update(count, now.monotonic_ns):
+                outputs.append(EndpointStatus(EndpointPhase.STREAMING, self._tick_check.describe()))
+        device_utime = round(count * self.tick_s * 1e6) if self._tick_check.is_consistent else 0
         header = SensorHeader(0, self.settings.source, self._seq, now.utime, device_utime)
-        sample = imu_sample(
+        sample = sample_from_packet(
             packet, self._gains, self.settings.specific_force_sign, self.settings.heading, header, self._celsius
         )
-        if self._gravity.take(sample):
-            outputs += self._gravity_found()
+        if self._gravity_check.update(sample):
+            outputs += self._on_gravity_known()
         if command not in (self.settings.message, self.settings.polled):
             return outputs
-        for name in saturated_fields(packet):
+        for name in find_saturated_fields(packet):
             self._counts[f"saturated.{name}"] += 1
         self._seq += 1
         self._celsius = NAN
         # without the device's time the way over the line is part of the delay
-        line = LENGTHS[command] * 10.0 / self._found.bauds[0] if self._found.bauds and not device_utime else 0.0
-        return [*outputs, Measured(sample, self.settings.delay + line, self.settings.delay_sigma, self.tick_s)]
+        line = (
+            LENGTHS[command] * 10.0 / self._line_state.bauds[0] if self._line_state.bauds and not device_utime else 0.0
+        )
+        return [*outputs, MeasuredSample(sample, self.settings.delay + line, self.settings.delay_sigma, self.tick_s)]
 
-    def _gravity_found(self) -> list[Output[bytes]]:
+    def _on_gravity_known(self) -> list[Output[bytes]]:
         if CommandByte.EULER_VECTORS not in (self.settings.message, self.settings.polled):
             # it was polled for this only
             self._polls.remove(CommandByte.EULER_VECTORS)
-            self._link.parser.give_up(CommandByte.EULER_VECTORS)
-        if self._gravity.upwards:
+            self._link.parser.cancel(CommandByte.EULER_VECTORS)
+        if self._gravity_check.is_upward:
             return []
         sign = self.settings.specific_force_sign
         return [
-            StationStatus(
-                StationPhase.STREAMING,
-                "at rest the specific force points down by the device's own orientation, and must point up: this "
+            EndpointStatus(
+                EndpointPhase.STREAMING,
+                "while stationary the specific force points down by the device's own orientation instead of up: this "
                 f"device gives the opposite of specific force; set specific_force_sign to {-sign} (it is {sign})",
             )
         ]
 
-    def _silent_ns(self) -> int:
-        return self._spoke_ns + round(self.settings.silence * 1e9)
+    def _silence_deadline_ns(self) -> int:
+        return self._streamed_ns + round(self.settings.silence * 1e9)
 
-    def _why_silent(self) -> str:
+    def _explain_silence(self) -> str:
         message = self.settings.message
-        why = f"no message {int(message)} that can be used for {self.settings.silence:g} s, heard {self._link.heard()}"
+        received = self._link.describe_input()
+        why = f"no usable message {int(message)} for {self.settings.silence:g} s, received {received}"
         rejected = ", ".join(f"{reason} {count}" for reason, count in sorted(self._link.rejected.items()))
         return f"{why}" + (f", rejected since the start: {rejected}" if rejected else "")
 
-    def _restarted(self, now: Now, why: str) -> list[Output[bytes]]:
+    def _restart(self, now: HostTime, why: str) -> list[Output[bytes]]:
         self._counts["restarts"] += 1
-        told = StationStatus(StationPhase.SILENT, f"{self._device}: {why}; setting it up anew")
-        return [told, *self._dialogue.start(now)]
+        status = EndpointStatus(EndpointPhase.SILENT, f"{self._device}: {why}; repeating the setup")
+        return [status, *self._script.start(now)]

@@ -1,8 +1,9 @@
-"""The hard-iron procedure of the 3DM-GX1: turn the vehicle, let the device find its own field, check the result.
+"""Hard-iron calibration of the 3DM-GX1's magnetometer by its built-in procedure, with checks.
 
-The device notes the least and greatest field of each axis while it is turned (0x40, then 0x41 again and again), finds
-the offsets of the middle between them and stores them (0x42). Here the turns are checked before, and the offsets after:
-against the extremes, and by reading them back. What fails leaves the offsets as they were.
+The device records minimum and maximum of the field on each axis while the vehicle turns (0x40, then 0x41 repeatedly),
+computes the offsets as their middle and stores them in its EEPROM (0x42). Before that the spans are checked, so that
+the turns were sufficient; afterwards the offsets are compared with the extremes and read back. After a failure the
+previous offsets are restored.
 """
 
 from __future__ import annotations
@@ -10,39 +11,38 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from modelserver.spatial.so3 import Vector3
-from msdrivers.devices.gx1.contact import (
-    RETRY_S,
-    ContactState,
-    Part,
-    UnusableError,
-    contact,
+from modelserver.transforms.so3 import Vector3
+from msdrivers.devices.gx1.discovery import (
+    RETRY_DELAY_S,
+    LineState,
+    ScriptPart,
+    UnusableDeviceError,
+    find_device,
     read_gains,
     read_word,
     read_words,
     write_word,
 )
-from msdrivers.devices.gx1.dialogue import Ask, Dialogue, NoReplyError, Pause, Script
-from msdrivers.devices.gx1.link import Gx1Link
-from msdrivers.protocol.gx1 import Address, CommandByte, Packet, requests
-from msdrivers.protocol.gx1.scaling import TESLA, is_saturated, vector
-from msdrivers.station import Now, Output, Send, StationPhase, StationStatus
+from msdrivers.devices.gx1.script import Gx1Receiver, NoReplyError, PauseStep, RequestStep, Script, ScriptRunner
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Send
+from msdrivers.protocol.gx1 import CommandByte, EepromAddress, Gx1Packet, requests
+from msdrivers.protocol.gx1.scaling import TESLA, is_saturated, vector_from_words
 
-PROGRESS_S = 5.0
-AGREE = 0.02
-"""How far an offset may lie from the middle of its extremes, as a share of their distance; a few counts besides."""
+PROGRESS_PERIOD_S = 5.0
+OFFSET_TOLERANCE = 0.02
+"""Largest deviation of an offset from the middle of its extremes, as a fraction of their distance."""
 
-FEW = 4
-COMPUTE_S = 5.0
+OFFSET_TOLERANCE_COUNTS = 4
+COMPUTE_TIMEOUT_S = 5.0
 _AXES = "xyz"
 
 
 @dataclass(frozen=True, slots=True)
 class HardIronSettings:
-    """How the procedure is to be done.
+    """Settings of the procedure.
 
     duration: seconds of turning. period: from one collection to the next. two_dimensional: the vehicle turns on level
-    ground only; then x and y are found and `magnitude_z` is the device's own word for the vertical field there.
+    ground only; then x and y are found and `magnitude_z` is the raw value of the vertical field there.
     least_span: tesla that the greatest and least field of an axis must lie apart. bauds: the rates to try; the line is
     opened at the first. Empty: the line has none.
     """
@@ -51,7 +51,7 @@ class HardIronSettings:
     period: float = 0.1
     two_dimensional: bool = True
     magnitude_z: int = 0
-    least_span: float = 15e-6
+    min_span: float = 15e-6
     bauds: tuple[int, ...] = (38400, 115200)
 
     def __post_init__(self) -> None:
@@ -63,12 +63,12 @@ class HardIronSettings:
 
 @dataclass(frozen=True, slots=True)
 class HardIronResult:
-    """How the procedure ended. Offsets and spans are along the sensor's axes, tesla; None where it did not come so far.
+    """Result of the procedure. Offsets and spans along the sensor's axes, tesla; None if not reached.
 
-    `stored`: the device holds the new offsets, and they were read back. Else `text` says why not.
+    is_stored: the new offsets were stored and read back; else `text` has the reason.
     """
 
-    stored: bool
+    is_stored: bool
     text: str
     offsets: Vector3 | None = None
     spans: Vector3 | None = None
@@ -78,57 +78,56 @@ class _FailedError(Exception):
     """The procedure cannot give a good result."""
 
 
-class HardIron:
-    """A `Station` of bytes that does the procedure once; then `result` is there and the line may be closed."""
+class HardIronProcedure:
+    """An `Endpoint` of bytes that runs the procedure once; `result` is set at its end."""
 
     def __init__(self, settings: HardIronSettings):
-        """Take the settings."""
         self.settings = settings
         self.result: HardIronResult | None = None
-        self._link = Gx1Link()
-        self._dialogue = Dialogue(self._link, self._procedure)
-        self._found = ContactState(list(settings.bauds))
+        self._link = Gx1Receiver()
+        self._script = ScriptRunner(self._link, self._run_procedure)
+        self._line_state = LineState(list(settings.bauds))
         self._gain = 1
         self._before: tuple[int, ...] = ()
-        self._begun = False
+        self._is_started = False
         self._extremes: tuple[tuple[int, ...], tuple[int, ...]] = ((), ())
 
-    def opened(self, now: Now) -> list[Output[bytes]]:
+    def on_open(self, now: HostTime) -> list[Output[bytes]]:
         """Begin, or go on at another baud rate."""
-        return [] if self.result else self._dialogue.opened(now)
+        return [] if self.result else self._script.on_open(now)
 
-    def received(self, unit: bytes, now: Now) -> list[Output[bytes]]:
-        """Take bytes."""
+    def on_receive(self, unit: bytes, now: HostTime) -> list[Output[bytes]]:
+        """Process received bytes."""
         outputs: list[Output[bytes]] = []
         for reply in self._link.feed(unit, now):
-            if self._dialogue.running:
-                outputs += self._dialogue.take(reply, now)
+            if self._script.is_running:
+                outputs += self._script.on_reply(reply, now)
         return outputs
 
-    def woken(self, now: Now) -> list[Output[bytes]]:
+    def on_timer(self, now: HostTime) -> list[Output[bytes]]:
         """Ask for what is due."""
-        return self._dialogue.woken(now) if self._dialogue.running else []
+        return self._script.on_timer(now) if self._script.is_running else []
 
-    def due(self) -> int | None:
-        """Return when to be woken."""
-        return self._dialogue.due
+    def get_deadline(self) -> int | None:
+        """Return when to call `on_timer`, monotonic nanoseconds."""
+        return self._script.deadline_ns
 
-    def leaving(self, now: Now) -> list[Output[bytes]]:
-        """Leave offsets and continuous mode as they were found, if the procedure was not done to its end."""
-        self._dialogue.stop()
+    def on_close(self, now: HostTime) -> list[Output[bytes]]:
+        """Restore offsets and continuous mode if the procedure was not completed."""
+        self._script.stop()
         outputs: list[Output[bytes]] = []
-        if self._begun and self.result is None:
+        if self._is_started and self.result is None:
             outputs += [
-                Send(requests.write_eeprom(address, value))
-                for address, value in zip(Address.HARD_IRON, self._before, strict=True)
+                Send(requests.make_write_eeprom(address, value))
+                for address, value in zip(EepromAddress.HARD_IRON, self._before, strict=True)
             ]
             outputs.append(
-                StationStatus(
-                    StationPhase.CONFIGURING, "hard iron: interrupted, the offsets from before are written back"
+                EndpointStatus(
+                    EndpointPhase.CONFIGURING, "hard iron: interrupted, the offsets from before are written back"
                 )
             )
-        if self._found.streamed is not None and self.result is None:
-            outputs.append(Send(self._found.restored()))
+        if self._line_state.found_stream is not None and self.result is None:
+            outputs.append(Send(self._line_state.make_restore_request()))
         return outputs
 
     @property
@@ -136,121 +135,126 @@ class HardIron:
         """Messages by kind, bytes skipped, rejected by reason."""
         return self._link.messages + self._link.parser.counts
 
-    def _procedure(self) -> Script:
+    def _run_procedure(self) -> Script:
         while True:
             try:
                 yield from self._prepare()
             except NoReplyError as silence:
                 why = str(silence)
-            except UnusableError as unusable:
+            except UnusableDeviceError as unusable:
                 why = str(unusable)
             else:
                 break
-            yield StationStatus(StationPhase.SILENT, f"hard iron: cannot begin: {why}; trying again in {RETRY_S:g} s")
-            yield Pause(RETRY_S)
+            yield EndpointStatus(
+                EndpointPhase.SILENT, f"hard iron: cannot begin: {why}; trying again in {RETRY_DELAY_S:g} s"
+            )
+            yield PauseStep(RETRY_DELAY_S)
         try:
-            offsets = yield from self._find()
-            text = f"hard iron: done, offsets {_microtesla(offsets)} are stored and were read back"
-            self.result = HardIronResult(True, text, offsets, self._spans())
+            offsets = yield from self._find_offsets()
+            text = f"hard iron: done, offsets {_format_microtesla(offsets)} are stored and were read back"
+            self.result = HardIronResult(True, text, offsets, self._get_spans())
         except (_FailedError, NoReplyError) as failure:
-            text = yield from self._undo(str(failure))
-            self.result = HardIronResult(False, text, spans=self._spans() if self._extremes[0] else None)
-        yield Send(self._found.restored())
-        yield StationStatus(StationPhase.CONFIGURING, text)
+            text = yield from self._restore_offsets(str(failure))
+            self.result = HardIronResult(False, text, spans=self._get_spans() if self._extremes[0] else None)
+        yield Send(self._line_state.make_restore_request())
+        yield EndpointStatus(EndpointPhase.CONFIGURING, text)
 
-    def _prepare(self) -> Part[None]:
-        device = yield from contact(self._link, self._found)
+    def _prepare(self) -> ScriptPart[None]:
+        device = yield from find_device(self._link, self._line_state)
         self._gain = (yield from read_gains()).magnetometer
-        # begun before and the line lost: the device has no offsets now
-        if not self._begun:
-            self._before = yield from read_words(Address.HARD_IRON)
-        yield StationStatus(
-            StationPhase.CONFIGURING, f"hard iron: {device}, offsets before {_signed(self._before)} counts"
+        # after a reconnect the device has no offsets: keep those found first
+        if not self._is_started:
+            self._before = yield from read_words(EepromAddress.HARD_IRON)
+        yield EndpointStatus(
+            EndpointPhase.CONFIGURING, f"hard iron: {device}, offsets before {_to_signed(self._before)} counts"
         )
 
-    def _find(self) -> Part[Vector3]:
-        self._begun = True
-        yield Ask(requests.hard_iron_start())
+    def _find_offsets(self) -> ScriptPart[Vector3]:
+        self._is_started = True
+        yield RequestStep(requests.make_hard_iron_start())
         how = "on level ground through full circles" if self.settings.two_dimensional else "about all its axes"
-        yield StationStatus(
-            StationPhase.CONFIGURING, f"hard iron: turn the vehicle {how}, for {self.settings.duration:g} s"
+        yield EndpointStatus(
+            EndpointPhase.CONFIGURING, f"hard iron: turn the vehicle {how}, for {self.settings.duration:g} s"
         )
-        yield from self._collect()
-        self._check_turns()
+        yield from self._collect_extremes()
+        self._check_spans()
         kind = self.settings.two_dimensional
-        (reply,) = yield Ask(requests.hard_iron_compute(kind, self.settings.magnitude_z), timeout=COMPUTE_S, tries=1)
+        (reply,) = yield RequestStep(
+            requests.make_hard_iron_compute(kind, self.settings.magnitude_z), timeout=COMPUTE_TIMEOUT_S, attempts=1
+        )
         yield from self._check_offsets(reply)
-        return vector(reply.field("offset"), self._gain, TESLA)
+        return vector_from_words(reply.field("offset"), self._gain, TESLA)
 
-    def _collect(self) -> Part[None]:
+    def _collect_extremes(self) -> ScriptPart[None]:
         link, seconds = self._link, 1e9
-        begin = told = link.now.monotonic_ns
+        begin = reported = link.now.monotonic_ns
         while link.now.monotonic_ns - begin < self.settings.duration * seconds:
-            (reply,) = yield Ask(requests.poll(CommandByte.HARD_IRON_COLLECT))
+            (reply,) = yield RequestStep(requests.make_poll(CommandByte.HARD_IRON_COLLECT))
             self._extremes = (reply.field("minimum"), reply.field("maximum"))
-            if link.now.monotonic_ns - told >= PROGRESS_S * seconds:
-                told = link.now.monotonic_ns
-                done = (told - begin) / seconds
-                yield StationStatus(
-                    StationPhase.CONFIGURING,
-                    f"hard iron: {done:.0f} of {self.settings.duration:g} s, field spans {_microtesla(self._spans())}",
+            if link.now.monotonic_ns - reported >= PROGRESS_PERIOD_S * seconds:
+                reported = link.now.monotonic_ns
+                done = (reported - begin) / seconds
+                spans = _format_microtesla(self._get_spans())
+                yield EndpointStatus(
+                    EndpointPhase.CONFIGURING,
+                    f"hard iron: {done:.0f} of {self.settings.duration:g} s, field spans {spans}",
                 )
-            yield Pause(self.settings.period)
+            yield PauseStep(self.settings.period)
 
-    def _spans(self) -> Vector3:
+    def _get_spans(self) -> Vector3:
         low, high = self._extremes
-        return vector((b - a for a, b in zip(low, high, strict=True)), self._gain, TESLA)
+        return vector_from_words((b - a for a, b in zip(low, high, strict=True)), self._gain, TESLA)
 
-    def _checked_axes(self) -> range:
+    def _list_checked_axes(self) -> range:
         return range(2 if self.settings.two_dimensional else 3)
 
-    def _check_turns(self) -> None:
-        spans = self._spans()
+    def _check_spans(self) -> None:
+        spans = self._get_spans()
         for low_or_high in self._extremes:
             if is_saturated(low_or_high):
                 raise _FailedError("the field is stronger than the device can measure: a magnet or motor is near")
-        for axis in self._checked_axes():
-            if spans[axis] < self.settings.least_span:
+        for axis in self._list_checked_axes():
+            if spans[axis] < self.settings.min_span:
                 raise _FailedError(
                     f"the field along {_AXES[axis]} changed by {spans[axis] * 1e6:.1f} uT, and at least "
-                    f"{self.settings.least_span * 1e6:.1f} uT are needed: turn the vehicle further, for the whole time"
+                    f"{self.settings.min_span * 1e6:.1f} uT are needed: turn the vehicle further, for the whole time"
                 )
 
-    def _check_offsets(self, reply: Packet) -> Part[None]:
+    def _check_offsets(self, reply: Gx1Packet) -> ScriptPart[None]:
         low, high = self._extremes
         offsets = reply.field("offset")
-        for axis in self._checked_axes():
+        for axis in self._list_checked_axes():
             middle, span = (low[axis] + high[axis]) / 2, high[axis] - low[axis]
-            if abs(offsets[axis] - middle) > FEW + AGREE * span:
+            if abs(offsets[axis] - middle) > OFFSET_TOLERANCE_COUNTS + OFFSET_TOLERANCE * span:
                 raise _FailedError(
                     f"the device's offset along {_AXES[axis]} is {offsets[axis]} counts, but the middle of its "
                     f"extremes is {middle:g}: do the procedure again, away from iron and currents"
                 )
-        for axis, address in enumerate(Address.HARD_IRON):
+        for axis, address in enumerate(EepromAddress.HARD_IRON):
             stored = yield from read_word(address)
             if stored != offsets[axis] & 0xFFFF:
                 raise _FailedError(
                     f"the device gave an offset of {offsets[axis]} counts along {_AXES[axis]}, but its EEPROM (address "
-                    f"{address}) holds {_signed((stored,))[0]}: it was not stored; do the procedure again"
+                    f"{address}) holds {_to_signed((stored,))[0]}: it was not stored; do the procedure again"
                 )
 
-    def _undo(self, why: str) -> Part[str]:
+    def _restore_offsets(self, why: str) -> ScriptPart[str]:
         try:
-            for address, value in zip(Address.HARD_IRON, self._before, strict=True):
+            for address, value in zip(EepromAddress.HARD_IRON, self._before, strict=True):
                 yield from write_word(address, value)
                 if (yield from read_word(address)) != value:
-                    raise _FailedError(f"address {address} did not take {_signed((value,))[0]}")
+                    raise _FailedError(f"address {address} did not take {_to_signed((value,))[0]}")
         except (NoReplyError, _FailedError) as failure:
             return (
-                f"hard iron: failed: {why}; and the offsets from before, {_signed(self._before)} counts, could not be "
-                f"written back: {failure}; do the procedure again before the magnetometer is used"
+                f"hard iron: failed: {why}; and the offsets from before, {_to_signed(self._before)} counts, could not "
+                f"be restored: {failure}; repeat the procedure before the magnetometer is used"
             )
         return f"hard iron: failed: {why}; the offsets are as they were before"
 
 
-def _signed(words: Iterable[int]) -> list[int]:
+def _to_signed(words: Iterable[int]) -> list[int]:
     return [word - 65536 if word > 32767 else word for word in words]
 
 
-def _microtesla(value: Vector3) -> str:
+def _format_microtesla(value: Vector3) -> str:
     return "(" + ", ".join(f"{axis * 1e6:.1f}" for axis in value) + ") uT"

@@ -1,15 +1,15 @@
-"""How a 3DM-GX1 is to be used."""
+"""Settings of the driver of a 3DM-GX1."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
 
-from msdrivers.protocol.gx1 import DATA, CommandByte
+from msdrivers.protocol.gx1 import MEASUREMENTS, CommandByte
 
 
 class HeadingSource(Enum):
-    """Where the yaw of the device's own orientation comes from, as it is set up."""
+    """Source of the yaw of the device's own orientation."""
 
     VERTICAL_GYRO = "vertical_gyro"
     """From its gyros alone: it begins anywhere and drifts."""
@@ -19,17 +19,18 @@ class HeadingSource(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Gx1Settings:
-    """How to use the device. Seconds; raises ValueError where one setting contradicts another.
+    """Settings of the device. Seconds; raises ValueError with the key for an invalid value.
 
-    message: what is streamed, one of `protocol.gx1.DATA`. polled: another of them that is polled every `poll_period`.
-    heading: what the yaw of a stabilised orientation is; an instantaneous one is always magnetic.
+    message: the streamed message, one of `protocol.gx1.MEASUREMENTS`. polled: another of them, polled every
+    `poll_period`.
+    heading: what the yaw of a stabilized orientation is; an instantaneous one is always magnetic.
     temperature_period: between polls of the temperature, 0 for never.
-    capture_bias_at_start: let the device find its gyros' biases once, at the first set-up; the vehicle must stand.
+    capture_bias_at_start: capture the gyro biases once, at the first setup; the vehicle must be stationary.
     bauds: the rates to try; the line is opened at the first. Empty: the line has none.
-    silence: without a streamed message for so long the device is set up anew.
+    silence: timeout for streamed messages, after which the setup is repeated.
     tick: of the device's timer; None to take it from the EEPROM.
-    specific_force_sign: 1 where the device's acceleration is specific force, against gravity at rest, -1 where it is
-    its opposite: documents differ, and the driver says which it is when the device rests.
+    specific_force_sign: 1 if the device's acceleration is specific force, -1 if it is the opposite: documents differ,
+    and the driver reports which it is while the device is stationary.
     delay, delay_sigma: from the measurement to the instant that its ticks name.
     """
 
@@ -48,9 +49,9 @@ class Gx1Settings:
     delay_sigma: float = 0.0
 
     def __post_init__(self) -> None:
-        known = ", ".join(str(int(command)) for command in sorted(DATA))
+        known = ", ".join(str(int(command)) for command in sorted(MEASUREMENTS))
         for name, command in (("message", self.message), ("polled", self.polled)):
-            if command is not None and command not in DATA:
+            if command is not None and command not in MEASUREMENTS:
                 raise ValueError(f"{name}: {command} is no measurement of a 3DM-GX1; there are {known}")
         if self.polled == self.message:
             raise ValueError(f"polled: {int(self.message)} is streamed already; leave it out or choose another")
@@ -60,7 +61,7 @@ class Gx1Settings:
         ):
             raise ValueError(
                 "heading: the instantaneous orientation (13) has its yaw from the magnetometers, which a vertical "
-                "gyro does not use; choose heading magnetic, or the stabilised orientation (14)"
+                "gyro does not use; choose heading magnetic, or the stabilized orientation (14)"
             )
         if self.specific_force_sign not in (1, -1):
             raise ValueError(f"specific_force_sign: must be 1 or -1, got {self.specific_force_sign}")

@@ -1,1 +1,1 @@
-"""CAN: frames, what a DBC file says of them, and which signal of it is what for this vehicle."""
+"""CAN: frames, DBC databases, and the mapping of their signals to this vehicle."""

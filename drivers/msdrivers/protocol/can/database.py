@@ -1,27 +1,36 @@
-"""What a DBC file says: signals found by name, frames to numbers, numbers to frames. cantools does the bits."""
+"""DBC databases (by cantools): bind signals by name, decode and encode frames, assemble the frames of one instant."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from modelserver.errors import ConfigError, Location, ModelServerError, Problem, Severity, Suggested, shown, suggestions
+from modelserver.errors import (
+    ConfigError,
+    Location,
+    ModelServerError,
+    Problem,
+    Severity,
+    Suggestion,
+    quote,
+    suggest_name,
+)
 from msdrivers.protocol.can.frame import CanFrame, FrameKey
 
 if TYPE_CHECKING:
     from cantools.database.can import Message, Signal
 
-MAX_TEXT = 8 << 20
-"""Characters of a DBC file; more is taken for another file."""
+MAX_DBC_CHARS = 8 << 20
+"""Largest DBC file in characters."""
 
-_UNFIT = "is this the DBC file of the vehicle, saved as plain text?"
+_WRONG_FILE_FIX = "is this the DBC file of the vehicle, saved as plain text?"
 _LINE = re.compile(r"at line (\d+)")
 
 
 class FrameError(ModelServerError, ValueError):
-    """A frame does not hold what the DBC says of its identifier. `reason` is one word."""
+    """A frame that does not match the DBC; `reason` is the counter's name."""
 
     def __init__(self, reason: str, message: str):
         self.reason = reason
@@ -30,10 +39,7 @@ class FrameError(ModelServerError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class BoundSignal:
-    """A signal that is there: of which frame, which bits, which range.
-
-    `minimum` and `maximum` are physical values, None without.
-    """
+    """A signal of the database; `minimum` and `maximum` are physical values, None without limits."""
 
     key: FrameKey
     message: str
@@ -46,8 +52,8 @@ class BoundSignal:
     minimum: float | None
     maximum: float | None
 
-    def physical(self, raw: float) -> float | None:
-        """Return the physical value of the bits; None where it is no number or out of the DBC's range: not said."""
+    def to_physical(self, raw: float) -> float | None:
+        """Return the physical value of raw bits; None (missing) if it is non-finite or outside the DBC's range."""
         value = raw * self.scale + self.offset
         slack = 1e-6 * abs(self.scale)
         if value != value or value in (float("inf"), float("-inf")):
@@ -58,8 +64,8 @@ class BoundSignal:
             return None
         return value
 
-    def raw(self, physical: float) -> int:
-        """Return the bits nearest to a physical value, within the signal's length and the DBC's range."""
+    def to_raw(self, physical: float) -> int:
+        """Return the raw bits nearest to a physical value, clamped to the signal's length and the DBC's range."""
         if self.minimum is not None:
             physical = max(physical, self.minimum)
         if self.maximum is not None:
@@ -67,9 +73,9 @@ class BoundSignal:
         low = -(1 << (self.length - 1)) if self.is_signed else 0
         return min(max(round((physical - self.offset) / self.scale), low), low + (1 << self.length) - 1)
 
-    def bits(self, physical: float) -> float:
-        """Return what `CanDatabase.encode` takes for a physical value: for a floating-point signal a number."""
-        return (physical - self.offset) / self.scale if self.is_float else self.raw(physical)
+    def to_bits(self, physical: float) -> float:
+        """Return the input of `CanDatabase.encode` for a physical value: raw bits, or a float for a float signal."""
+        return (physical - self.offset) / self.scale if self.is_float else self.to_raw(physical)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,10 +87,9 @@ class CanDatabase:
     by_key: Mapping[FrameKey, Message] = field(repr=False)
 
     def decode(self, frame: CanFrame) -> dict[str, float]:
-        """Return the bits of each signal of a frame, by name, without scale.
+        """Decode a frame to the raw value of each signal by name.
 
-        Raises FrameError: `unknown` identifier, `length` that the DBC does not give it, `multiplexer` that it does
-        not know, `bits` that make no value.
+        Raises FrameError with the reason `unknown` (identifier), `length`, `multiplexer` or `bits`.
         """
         message = self.by_key.get(frame.key)
         if message is None:
@@ -92,7 +97,7 @@ class CanDatabase:
         if len(frame.data) != message.length:
             raise FrameError(
                 "length",
-                f"frame {frame.key} ({message.name}) has {len(frame.data)} bytes where {self.name} says "
+                f"frame {frame.key} ({message.name}) has {len(frame.data)} bytes, {self.name} expects "
                 f"{message.length}: the DBC is of another version of the controller, or another device uses the same "
                 f"identifier",
             )
@@ -109,31 +114,31 @@ class CanDatabase:
         return {name: value for name, value in values.items() if isinstance(value, int | float)}
 
     def encode(self, message: str, raw: Mapping[str, float]) -> CanFrame:
-        """Return the frame of a message; `raw` holds the bits of each of its signals, as `BoundSignal.raw` gives."""
+        """Encode a message; `raw` has the raw value of each of its signals."""
         found = self.messages[message]
         data = found.encode(dict(raw), scaling=False, strict=False)
         return CanFrame(found.frame_id, bytes(data), found.is_extended_frame)
 
-    def signals(self, message: str) -> dict[str, BoundSignal]:
-        """Return the signals of a message by name; KeyError for a message that it does not have."""
+    def bind_signals(self, message: str) -> dict[str, BoundSignal]:
+        """Return the signals of a message by name. Raises KeyError for an unknown message."""
         found = self.messages[message]
-        return {signal.name: _bound(found, signal) for signal in found.signals}
+        return {signal.name: _bind_signal(found, signal) for signal in found.signals}
 
 
 def parse_dbc(text: str, name: str) -> CanDatabase:
-    """Return what the text of a DBC file called `name` says. Raises ConfigError with the line."""
+    """Parse the text of a DBC file called `name`. Raises ConfigError with the line."""
     from cantools.database import load_string
     from cantools.database.can import Database
     from cantools.database.errors import UnsupportedDatabaseFormatError
 
-    if len(text) > MAX_TEXT:
-        raise ConfigError([Problem(Severity.ERROR, "larger than 8 MiB", Location(name), _UNFIT)])
+    if len(text) > MAX_DBC_CHARS:
+        raise ConfigError([Problem(Severity.ERROR, "larger than 8 MiB", Location(name), _WRONG_FILE_FIX)])
     try:
         database = load_string(text, "dbc")
     except UnsupportedDatabaseFormatError as error:
         line = _LINE.search(str(error))
-        said = f"not a DBC file that can be read: {shown(str(error.e_dbc or error), 100)}"
-        problem = Problem(Severity.ERROR, said, Location(name, int(line[1]) if line else 0), _UNFIT)
+        message = f"not a DBC file that can be read: {quote(str(error.e_dbc or error), 100)}"
+        problem = Problem(Severity.ERROR, message, Location(name, int(line[1]) if line else 0), _WRONG_FILE_FIX)
         raise ConfigError([problem]) from None
     assert isinstance(database, Database)
     messages = {message.name: message for message in database.messages}
@@ -143,73 +148,74 @@ def parse_dbc(text: str, name: str) -> CanDatabase:
         key = FrameKey(found.frame_id, found.is_extended_frame)
         other = by_key.setdefault(key, found)
         if other is not found:
-            fix = "keep the one that the controller speaks"
-            said = f"messages {other.name} and {found.name} have one identifier, {key}"
-            problems.append(Problem(Severity.ERROR, said, Location(name), fix))
+            fix = "keep the one that the controller uses"
+            text = f"messages {other.name} and {found.name} have one identifier, {key}"
+            problems.append(Problem(Severity.ERROR, text, Location(name), fix))
     if problems:
         raise ConfigError(problems)
     return CanDatabase(name, messages, by_key)
 
 
-class Binder:
-    """Looks mapped signals up and gathers every problem, so that a person sees all of them at once."""
+class SignalBinder:
+    """Looks up mapped signals and collects every problem, so that all are reported at once."""
 
     def __init__(self, database: CanDatabase, place: str):
-        """Take the database, and where in the settings the mapping stands, e.g. `drivers.wheels`."""
+        """`place` is the mapping's key path in the settings, e.g. `drivers.wheels`."""
         self._database = database
         self._place = place
         self.problems: list[Problem] = []
 
-    def signal(self, path: str, key: str, *, whole: bool = False, bits: int = 64) -> BoundSignal | None:
-        """Return the signal `Message.Signal` that stands at `key` in the settings; None and a problem without.
+    def bind_signal(self, path: str, key: str, *, whole: bool = False, bits: int = 64) -> BoundSignal | None:
+        """Return the signal `Message.Signal` of the setting `key`; add a problem and return None if it is unknown.
 
-        `whole`: its bits are needed as a whole number of at most `bits` bits.
+        `whole`: it must be an integer of at most `bits` bits.
         """
         message_name, _, name = path.partition(".")
-        message = self.message(message_name, key, f"{{}}.{name}" if name else "{}")
+        message = self.find_message(message_name, key, f"{{}}.{name}" if name else "{}")
         if message is None:
             return None
         signal = next((each for each in message.signals if each.name == name), None)
         if signal is None:
             known = [each.name for each in message.signals]
-            # at a key of its own name the signal stands without its message
+            # a key with the signal's own name has no message name in its value
             form = "{}" if key.endswith(f".{name}") else f"{message_name}.{{}}"
-            self._missing(key, f"message {message_name} has no signal", name, known, form)
+            self._add_missing(key, f"message {message_name} has no signal", name, known, form)
             return None
         if whole and (signal.is_float or signal.length > bits):
             kind = "a floating-point number" if signal.is_float else f"{signal.length} bits long"
-            self.problem(
+            self.add_problem(
                 key, f"{path} is {kind}; a whole number of at most {bits} bits is needed", "map another signal"
             )
             return None
-        return _bound(message, signal)
+        return _bind_signal(message, signal)
 
-    def message(self, name: str, key: str, form: str = "{}") -> Message | None:
-        """Return the message of that name; None and a problem without. `form` is how the settings write it."""
+    def find_message(self, name: str, key: str, form: str = "{}") -> Message | None:
+        """Return a message; add a problem and return None if it is unknown. `form`: its spelling in the settings."""
         message = self._database.messages.get(name)
         if message is None:
-            self._missing(key, "there is no message", name, list(self._database.messages), form)
+            self._add_missing(key, "there is no message", name, list(self._database.messages), form)
         return message
 
-    def problem(self, key: str, message: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
-        """Note something wrong with the setting at `key`: there it is mended, not in the DBC file."""
+    def add_problem(self, key: str, message: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
+        """Add a problem of the setting `key`: it is fixed there, not in the DBC file."""
         source = Location(element=f"{self._place}.{key}")
-        said = f"{self._database.name}: {message}"
-        self.problems.append(Problem(Severity.ERROR, said, source, fix, nearest))
+        self.problems.append(Problem(Severity.ERROR, f"{self._database.name}: {message}", source, fix, nearest))
 
     def finish(self) -> None:
-        """Raise ConfigError where there were problems."""
+        """Raise ConfigError if there were problems."""
         if self.problems:
             raise ConfigError(self.problems)
 
-    def _missing(self, key: str, what: str, name: str, known: list[str], form: str) -> None:
-        near = Suggested.of(form.replace("{}", name), *(form.replace("{}", each) for each in suggestions(name, known)))
+    def _add_missing(self, key: str, what: str, name: str, known: list[str], form: str) -> None:
+        near = Suggestion.of(
+            form.replace("{}", name), *(form.replace("{}", each) for each in suggest_name(name, known))
+        )
         listed = ", ".join(known[:10]) + (", ..." if len(known) > 10 else "")
         fix = f"write {near[0]}" if near else f"known there: {listed or 'nothing'}"
-        self.problem(key, f"{what} {shown(name)}", fix, near)
+        self.add_problem(key, f"{what} {quote(name)}", fix, near)
 
 
-def _bound(message: Message, signal: Signal) -> BoundSignal:
+def _bind_signal(message: Message, signal: Signal) -> BoundSignal:
     return BoundSignal(
         FrameKey(message.frame_id, message.is_extended_frame),
         message.name,
@@ -222,3 +228,70 @@ def _bound(message: Message, signal: Signal) -> BoundSignal:
         None if signal.minimum is None else float(signal.minimum),
         None if signal.maximum is None else float(signal.maximum),
     )
+
+
+class CanFrameSet(NamedTuple):
+    """Raw signal values of the frames of one instant, by frame and name, with the first frame's receive time."""
+
+    monotonic_ns: int
+    utime: int
+    values: dict[FrameKey, dict[str, float]]
+    is_complete: bool
+
+    def raw(self, signal: BoundSignal | None) -> float | None:
+        """Return the raw value of a signal; None if it was not received."""
+        if signal is None:
+            return None
+        return self.values.get(signal.key, {}).get(signal.name)
+
+    def physical(self, signal: BoundSignal | None) -> float | None:
+        """Return the physical value of a signal; None if it is missing."""
+        raw = self.raw(signal)
+        return None if raw is None or signal is None else signal.to_physical(raw)
+
+
+class CanFrameAssembler:
+    """Collects the frames of one instant, for at most `window_ns` after the first.
+
+    A repeated frame starts the next instant: the missing frames of the last one were lost.
+    """
+
+    __slots__ = ("_needed", "_pending", "_started_ns", "_utime", "_window_ns")
+
+    def __init__(self, needed: frozenset[FrameKey], window_ns: int):
+        """`needed` are the kinds of frame that make an instant."""
+        self._needed = needed
+        self._window_ns = window_ns
+        self.clear()
+
+    def clear(self) -> None:
+        """Discard the incomplete instant."""
+        self._pending: dict[FrameKey, dict[str, float]] = {}
+        self._started_ns = 0
+        self._utime = 0
+
+    def add(self, key: FrameKey, values: dict[str, float], monotonic_ns: int, utime: int) -> list[CanFrameSet]:
+        """Add a frame's values; return the instants that it completes or ends."""
+        ended = self.pop_expired(monotonic_ns)
+        if key in self._pending:
+            ended.append(self._finish_set(False))
+        if not self._pending:
+            self._started_ns, self._utime = monotonic_ns, utime
+        self._pending[key] = values
+        if self._pending.keys() >= self._needed:
+            ended.append(self._finish_set(True))
+        return ended
+
+    def pop_expired(self, monotonic_ns: int) -> list[CanFrameSet]:
+        """Return the incomplete instant whose window has passed, if any."""
+        due = self.get_deadline()
+        return [self._finish_set(False)] if due is not None and monotonic_ns >= due else []
+
+    def get_deadline(self) -> int | None:
+        """Return when the window of the incomplete instant ends, monotonic nanoseconds; None without one."""
+        return self._started_ns + self._window_ns if self._pending else None
+
+    def _finish_set(self, is_complete: bool) -> CanFrameSet:
+        ended = CanFrameSet(self._started_ns, self._utime, self._pending, is_complete)
+        self._pending = {}
+        return ended

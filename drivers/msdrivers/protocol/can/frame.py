@@ -1,4 +1,4 @@
-"""A CAN frame as it comes from the bus, and the reports of the interface itself."""
+"""CAN frames and the error frames of the interface."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RESTARTED = 0x100
 
 
 class FrameKey(NamedTuple):
-    """What tells one kind of frame from another."""
+    """Identifier of a kind of frame."""
 
     arbitration_id: int
     is_extended: bool = False
@@ -29,10 +29,10 @@ class FrameKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CanFrame:
-    """A frame of data, or with `is_error` a word of the interface about the bus.
+    """A data frame, or with `is_error` an error frame of the interface.
 
-    In an error frame `arbitration_id` holds the classes of error. `utime`: when it came, microseconds of the host's
-    clock; 0: no more is known than when it was read. Frames of one content are equal whenever they came.
+    In an error frame `arbitration_id` holds the error classes. `utime`: receive time by the host's clock, microseconds;
+    0: unknown. Frames are compared by content only.
     """
 
     arbitration_id: int
@@ -43,15 +43,15 @@ class CanFrame:
 
     @property
     def key(self) -> FrameKey:
-        """What kind of frame this is."""
+        """Identifier of this kind of frame."""
         return FrameKey(self.arbitration_id, self.is_extended)
 
     @property
     def is_bus_off(self) -> bool:
-        """Whether the interface says that it has left the bus: too many of its frames failed."""
+        """Whether the interface reports bus-off: too many of its frames failed."""
         return self.is_error and bool(self.arbitration_id & BUS_OFF)
 
 
-def bus_off() -> CanFrame:
-    """Return the word of an interface that it has left the bus."""
+def make_bus_off_frame() -> CanFrame:
+    """Make the error frame of an interface that went bus-off."""
     return CanFrame(BUS_OFF, is_error=True)

@@ -1,8 +1,8 @@
-"""Which signal of a DBC file is what: the part of the settings that another vehicle writes instead of code.
+"""Mapping of a DBC file's signals to measurements and commands: what another vehicle configures instead of coding.
 
 A signal is named `Message.Signal` as in the DBC. Its value is the DBC's physical one, with the DBC's own scale and
 offset; `scale` here brings it to SI units and our signs, e.g. 0.2778 for km/h, -1 for a sign that is the other way.
-Values beyond the range that the DBC gives count as not said.
+Values outside the DBC's range count as missing.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ STRICT: dict[str, object] = {"extra": "forbid", "strict": True, "allow_inf_nan":
 
 
 def check_signal(signal: str, key: str = "signal") -> None:
-    """Raise ValueError for a text that names no signal."""
+    """Raise ValueError unless the text is a signal path."""
     message, dot, name = signal.partition(".")
     if not (message and dot and name) or "." in name:
         raise ValueError(f"{key} is written Message.Signal as the DBC file names them, got {signal!r}")
 
 
 def check_factor(value: float, key: str) -> None:
-    """Raise ValueError for a factor that makes every value 0 or none."""
+    """Raise ValueError for a factor that is 0 or not finite."""
     if not math.isfinite(value) or value == 0.0:
         raise ValueError(f"{key} is a number and not 0, got {value:g}")
 
@@ -37,9 +37,9 @@ class SignalMap:
     signal: str
     """Message.Signal in the DBC file."""
     scale: float = 1.0
-    """What the signal's physical value is multiplied by."""
+    """Factor of the signal's physical value."""
     offset: float = 0.0
-    """What is added afterwards."""
+    """Offset after scaling."""
 
     def __post_init__(self) -> None:
         check_signal(self.signal)
@@ -50,42 +50,42 @@ class SignalMap:
 
 @dataclass(frozen=True, slots=True)
 class CountMap:
-    """A counter of an encoder's edges. It counts up and down, and wraps."""
+    """Encoder counter that wraps."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     signal: str
-    """Message.Signal in the DBC file. Its bits are read without the DBC's scale, since they are what wraps."""
-    metres_per_count: float
-    """Way of the wheel's contact point from one count to the next, metres: circumference by edges of a turn; negative
-    for an encoder that counts down when the wheel rolls forward."""
+    """Message.Signal in the DBC file; the raw bits are read, since they are what wraps."""
+    meters_per_count: float
+    """Distance of the wheel's contact point per count, meters: circumference / edges per turn; negative for an
+    encoder that counts down when the wheel rolls forward."""
     wrap: int = 0
-    """The counter goes from wrap - 1 to 0; 0: as many as its bits hold."""
-    up_only: bool = False
-    """The encoder counts up whichever way the wheel turns; the sign is the direction signal's, or not known."""
+    """The counter goes from wrap - 1 to 0; 0: 2 to the number of its bits."""
+    counts_up_only: bool = False
+    """The encoder counts up in both directions; the sign is that of the direction signal, or unknown."""
 
     def __post_init__(self) -> None:
         check_signal(self.signal)
-        check_factor(self.metres_per_count, "metres_per_count")
+        check_factor(self.meters_per_count, "meters_per_count")
         if self.wrap and not 4 <= self.wrap <= 1 << 64:
             raise ValueError(f"wrap is 0 (by the signal's bits) or 4 to 2^64, got {self.wrap}")
 
 
 @dataclass(frozen=True, slots=True)
 class SpeedMap:
-    """The speed of a wheel's contact point."""
+    """Speed of a wheel's contact point."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     signal: str
     """Message.Signal in the DBC file."""
     scale: float = 1.0
-    """m/s for each unit of the signal: 0.2778 for km/h, the wheel's radius for rad/s."""
+    """m/s per unit of the signal: 0.2778 for km/h, the wheel's radius for rad/s."""
     is_magnitude: bool = False
-    """The signal has no sign, as from a frequency-to-voltage divider; it comes from the direction signal, or is not
-    known."""
+    """The signal has no sign, e.g. from a frequency-to-voltage converter; the sign is that of the direction signal, or
+    unknown."""
     sigma: float = 0.0
-    """Standard deviation, m/s; 0: not known."""
+    """Standard deviation, m/s; 0: unknown."""
 
     def __post_init__(self) -> None:
         check_signal(self.signal)
@@ -96,7 +96,7 @@ class SpeedMap:
 
 @dataclass(frozen=True, slots=True)
 class DirectionMap:
-    """Which way a wheel turns: the numbers that the signal has for each. Any other number tells nothing."""
+    """Direction of a wheel's rotation: the signal's number for each; any other number means unknown."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
@@ -117,53 +117,52 @@ class DirectionMap:
 
 @dataclass(frozen=True, slots=True)
 class WheelMap:
-    """What the bus tells of one wheel. What is left out is published as not measured."""
+    """Signals of one wheel; omitted ones are published as not measured."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     count: CountMap | None = None
-    """Where its travel comes from."""
+    """Source of its travel."""
     speed: SpeedMap | None = None
-    """Where its speed comes from."""
+    """Source of its speed."""
     direction: DirectionMap | None = None
-    """Where the direction of turning comes from."""
-    steers: bool = False
-    """The wheel turns about the vehicle's up axis: its steering angle is published as not measured, or as `steering`
-    tells, and not as 0."""
+    """Source of its direction of rotation."""
+    is_steered: bool = False
+    """The wheel steers: its steering angle is published from `steering`, or as not measured, instead of 0."""
     steering: SignalMap | None = None
-    """Where its steering angle comes from; radians, to the left positive."""
+    """Source of its steering angle; radians, positive to the left."""
 
     def __post_init__(self) -> None:
         if self.count is None and self.speed is None:
-            raise ValueError("count or speed is needed: of a wheel of which neither is told nothing can be said")
-        signs = self._signs()
+            raise ValueError("count or speed is missing: a wheel needs at least one of them")
+        signs = self._get_signs()
         if self.direction is None and len(set(signs.values())) > 1:
             without = next(key for key, has_sign in signs.items() if not has_sign)
             raise ValueError(f"direction is needed with {without}: the other signal of the wheel has a sign")
 
-    def _signs(self) -> dict[str, bool]:
-        """Return for each mapped signal, by its key, whether it has a sign of its own."""
+    def _get_signs(self) -> dict[str, bool]:
+        """Return for each mapped signal, by its key, whether it has a sign."""
         signs = {}
         if self.count is not None:
-            signs["count.up_only"] = not self.count.up_only
+            signs["count.counts_up_only"] = not self.count.counts_up_only
         if self.speed is not None:
             signs["speed.is_magnitude"] = not self.speed.is_magnitude
         return signs
 
     @property
     def is_unsigned(self) -> bool:
-        """Whether nothing says which way the wheel turns."""
-        return self.direction is None and not any(self._signs().values())
+        """Whether no signal gives the direction of rotation."""
+        return self.direction is None and not any(self._get_signs().values())
 
 
 @dataclass(frozen=True, slots=True)
 class StatusMap:
-    """What the bus tells of the vehicle controller. What is left out is published as not said."""
+    """Signals of the vehicle controller's status; omitted ones are published as missing."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     mode: str = ""
-    """Message.Signal that tells who drives; empty: the controller does not say."""
+    """Message.Signal of the driving mode; empty: the controller has none."""
     modes: Mapping[str, int] = field(default_factory=dict)
     """The mode signal's number, without the DBC's scale, for each of manual, autonomous, emergency_stop, fault."""
     forward_speed: SignalMap | None = None
@@ -176,11 +175,11 @@ class StatusMap:
     """rad/s; scale 0.10472 for revolutions a minute."""
     fault_bits: str = ""
     """Message.Signal of the controller's fault word, at most 32 bits."""
-    commands_refused: str = ""
-    """Message.Signal of the controller's own count of commands that it refused."""
+    commands_rejected: str = ""
+    """Message.Signal of the controller's count of rejected commands."""
 
     def __post_init__(self) -> None:
-        for key in ("mode", "fault_bits", "commands_refused"):
+        for key in ("mode", "fault_bits", "commands_rejected"):
             if getattr(self, key):
                 check_signal(getattr(self, key), key)
         known = ("manual", "autonomous", "emergency_stop", "fault")
@@ -195,7 +194,7 @@ class StatusMap:
 
 @dataclass(frozen=True, slots=True)
 class CommandMap:
-    """How a command is said to the vehicle controller."""
+    """Signals of a command to the vehicle controller."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
@@ -204,12 +203,12 @@ class CommandMap:
     steering_angle: SignalMap
     """Radians, to the left positive; a signal of the same message."""
     alive: str = ""
-    """Message.Signal that counts the frames and wraps by its bits; empty: there is none."""
-    driving: Mapping[str, float] = field(default_factory=dict)
-    """Signals of the message that stand beside a command, by name without the message, in physical units: an enable
-    bit, a gear."""
-    stopping: Mapping[str, float] = field(default_factory=dict)
-    """The same beside the command to stop; what is left out is as in `driving`."""
+    """Message.Signal of the alive counter, which wraps by its bits; empty: none."""
+    drive_signals: Mapping[str, float] = field(default_factory=dict)
+    """Other signals of the message while driving, by name without the message, in physical units: an enable bit, a
+    gear."""
+    stop_signals: Mapping[str, float] = field(default_factory=dict)
+    """The same in the stop command; omitted ones are as in `drive_signals`."""
 
     def __post_init__(self) -> None:
         message = self.message

@@ -1,40 +1,39 @@
-"""The vehicle controller's status and command as the mapping has them, bound to the signals of a DBC file."""
+"""The vehicle controller's status and command: the mapping bound to the signals of a DBC file."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from modelserver.messages import NAN, VehicleMode
-from msdrivers.protocol.can.assembly import CanFrameSet
-from msdrivers.protocol.can.database import Binder, BoundSignal, CanDatabase
+from msdrivers.protocol.can.database import BoundSignal, CanDatabase, CanFrameSet, SignalBinder
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.can.mapping import CommandMap, SignalMap, StatusMap
 
-NUMBERS = ("forward_speed", "steering_angle", "supply_voltage", "engine_speed")
-"""What of a status is a number with a unit."""
+NUMERIC_FIELDS = ("forward_speed", "steering_angle", "supply_voltage", "engine_speed")
+"""Fields of a status that are physical quantities."""
 
 
 @dataclass(frozen=True, slots=True)
 class BoundStatus:
-    """The status: its mapping and its signals by the name of the value."""
+    """Mapping and signals of the status, by field."""
 
     map: StatusMap
     signals: dict[str, BoundSignal]
 
-    def mode(self, instant: CanFrameSet) -> VehicleMode:
-        """Return who drives; UNKNOWN where it is not said, or with a number that the mapping does not have."""
+    def get_mode(self, instant: CanFrameSet) -> VehicleMode:
+        """Return the driving mode; UNKNOWN if it is missing or its number is not mapped."""
         raw = instant.raw(self.signals.get("mode"))
         numbers = {number: VehicleMode[name.upper()] for name, number in self.map.modes.items()}
         return VehicleMode.UNKNOWN if raw is None else numbers.get(int(raw), VehicleMode.UNKNOWN)
 
-    def number(self, name: str, instant: CanFrameSet) -> float:
-        """Return one of `NUMBERS`, in SI units; nan where it is not said."""
+    def get_number(self, name: str, instant: CanFrameSet) -> float:
+        """Return one of `NUMERIC_FIELDS` in SI units; nan if it is missing."""
         physical = instant.physical(self.signals.get(name))
         mapped: SignalMap | None = getattr(self.map, name)
         return NAN if physical is None or mapped is None else physical * mapped.scale + mapped.offset
 
-    def word(self, name: str, instant: CanFrameSet) -> int | None:
-        """Return `fault_bits` or `commands_refused`: 0 where the controller has none, None where it did not come."""
+    def get_word(self, name: str, instant: CanFrameSet) -> int | None:
+        """Return `fault_bits` or `commands_rejected`: 0 if not mapped, None if not received."""
         if name not in self.signals:
             return 0
         raw = instant.raw(self.signals[name])
@@ -42,17 +41,17 @@ class BoundStatus:
 
 
 def bind_status(status: StatusMap, database: CanDatabase, place: str) -> BoundStatus:
-    """Return the status with its signals. Raises ConfigError with every signal that is not in the DBC or unfit."""
-    binder = Binder(database, place)
+    """Bind the status mapping. Raises ConfigError with every unknown or unsuitable signal."""
+    binder = SignalBinder(database, place)
     signals: dict[str, BoundSignal] = {}
-    for name in ("mode", "fault_bits", "commands_refused"):
+    for name in ("mode", "fault_bits", "commands_rejected"):
         path = getattr(status, name)
-        found = binder.signal(path, name, whole=True, bits=32 if name == "fault_bits" else 63) if path else None
+        found = binder.bind_signal(path, name, whole=True, bits=32 if name == "fault_bits" else 63) if path else None
         if found is not None:
             signals[name] = found
-    for name in NUMBERS:
+    for name in NUMERIC_FIELDS:
         mapped: SignalMap | None = getattr(status, name)
-        found = binder.signal(mapped.signal, name) if mapped is not None else None
+        found = binder.bind_signal(mapped.signal, name) if mapped is not None else None
         if found is not None:
             signals[name] = found
     binder.finish()
@@ -61,86 +60,89 @@ def bind_status(status: StatusMap, database: CanDatabase, place: str) -> BoundSt
 
 @dataclass(frozen=True, slots=True)
 class BoundCommand:
-    """The command: its mapping, its message and signals, and what stands beside them, as bits."""
+    """Mapping and signals of the command, and the raw values of the other signals of its message."""
 
     map: CommandMap
     database: CanDatabase
     forward_speed: BoundSignal
     steering_angle: BoundSignal
     alive: BoundSignal | None
-    driving: dict[str, float]
-    stopping: dict[str, float]
+    drive_bits: dict[str, float]
+    stop_bits: dict[str, float]
 
-    def frame(self, forward_speed: float, steering_angle: float, number: int, *, is_stop: bool = False) -> CanFrame:
-        """Return the frame of a command, m/s and radians; `number` counts the frames."""
-        raw = dict(self.stopping if is_stop else self.driving)
+    def make_frame(
+        self, forward_speed: float, steering_angle: float, number: int, *, is_stop: bool = False
+    ) -> CanFrame:
+        """Encode a command, m/s and radians; `number` is the frame count for the alive counter."""
+        raw = dict(self.stop_bits if is_stop else self.drive_bits)
         for signal, mapped, value in (
             (self.forward_speed, self.map.forward_speed, forward_speed),
             (self.steering_angle, self.map.steering_angle, steering_angle),
         ):
-            physical = (value - mapped.offset) / mapped.scale
-            raw[signal.name] = signal.bits(physical)
+            raw[signal.name] = signal.to_bits((value - mapped.offset) / mapped.scale)
         if self.alive is not None:
             raw[self.alive.name] = number % (1 << self.alive.length)
         return self.database.encode(self.map.message, raw)
 
-    def beyond(self, forward_speed: float, steering_angle: float) -> str:
-        """Return what the signals cannot hold of a speed and an angle; empty where they can."""
+    def find_range_problem(self, forward_speed: float, steering_angle: float) -> str:
+        """Describe why the signals cannot represent a speed or an angle; empty if they can."""
         for signal, mapped, value, unit in (
             (self.forward_speed, self.map.forward_speed, forward_speed, "m/s"),
             (self.steering_angle, self.map.steering_angle, steering_angle, "rad"),
         ):
-            held = _held(signal, (value - mapped.offset) / mapped.scale) * mapped.scale + mapped.offset
+            held = _round_trip(signal, (value - mapped.offset) / mapped.scale) * mapped.scale + mapped.offset
             if abs(held - value) > 1e-9 + abs(mapped.scale * signal.scale):
                 return f"{signal.message}.{signal.name} holds {held:g} {unit} at most, {value:g} is allowed"
         return ""
 
 
 def bind_command(command: CommandMap, database: CanDatabase, place: str) -> BoundCommand:
-    """Return the command with its signals. Raises ConfigError with every signal that is missing, unknown or unfit."""
-    binder = Binder(database, place)
-    speed = binder.signal(command.forward_speed.signal, "forward_speed")
-    steering = binder.signal(command.steering_angle.signal, "steering_angle")
-    alive = binder.signal(command.alive, "alive", whole=True) if command.alive else None
-    driving = _beside(binder, command, "driving")
-    stopping = driving | _beside(binder, command, "stopping")
+    """Bind the command mapping. Raises ConfigError with every missing, unknown or unsuitable signal."""
+    binder = SignalBinder(database, place)
+    speed = binder.bind_signal(command.forward_speed.signal, "forward_speed")
+    steering = binder.bind_signal(command.steering_angle.signal, "steering_angle")
+    alive = binder.bind_signal(command.alive, "alive", whole=True) if command.alive else None
+    drive_bits = _bind_constants(binder, command, "drive_signals")
+    stop_bits = drive_bits | _bind_constants(binder, command, "stop_signals")
     if speed is not None:
-        _check_stop(binder, command, speed, driving != stopping)
+        _check_stop(binder, command, speed, drive_bits != stop_bits)
     if alive is not None and alive.is_signed:
-        binder.problem("alive", f"{command.alive} is signed; a counter of frames is not", "map the counter")
+        binder.add_problem("alive", f"{command.alive} is signed; a counter of frames is not", "map the counter")
     if command.message in database.messages:
-        told = {signal.name for signal in (speed, steering, alive) if signal is not None} | driving.keys()
-        for name in database.signals(command.message).keys() - told:
+        bound = {signal.name for signal in (speed, steering, alive) if signal is not None} | drive_bits.keys()
+        for name in database.bind_signals(command.message).keys() - bound:
             fix = f"add {name}: 0, or what the controller expects there"
-            binder.problem("driving", f"{command.message}.{name} is given no value, and the frame needs one", fix)
+            binder.add_problem(
+                "drive_signals", f"{command.message}.{name} is given no value, and the frame needs one", fix
+            )
     binder.finish()
     assert speed is not None
     assert steering is not None
-    return BoundCommand(command, database, speed, steering, alive, driving, stopping)
+    return BoundCommand(command, database, speed, steering, alive, drive_bits, stop_bits)
 
 
-def _check_stop(binder: Binder, command: CommandMap, speed: BoundSignal, has_stop: bool) -> None:
-    """Note a stop that would be a motion: its speed of 0 rounds to another, and nothing beside it says stop."""
+def _check_stop(binder: SignalBinder, command: CommandMap, speed: BoundSignal, has_stop: bool) -> None:
+    """Report a stop that would be a motion: speed 0 rounds to another value, and no other signal means stop."""
     mapped = command.forward_speed
-    held = _held(speed, -mapped.offset / mapped.scale) * mapped.scale + mapped.offset
+    held = _round_trip(speed, -mapped.offset / mapped.scale) * mapped.scale + mapped.offset
     if abs(held) > 1e-9 and not has_stop:
         path = f"{speed.message}.{speed.name}"
-        fix = "give a signal that stops it another value in `stopping` than in `driving`, or correct scale and offset"
-        binder.problem("forward_speed", f"{path} cannot say 0: stop would be said as {held:g} m/s", fix)
+        fix = "set a signal in `stop_signals` that differs from `drive_signals`, or correct scale and offset"
+        binder.add_problem("forward_speed", f"{path} cannot represent 0: stop would be sent as {held:g} m/s", fix)
 
 
-def _beside(binder: Binder, command: CommandMap, key: str) -> dict[str, float]:
+def _bind_constants(binder: SignalBinder, command: CommandMap, key: str) -> dict[str, float]:
     given = {}
     for name, value in getattr(command, key).items():
-        signal = binder.signal(f"{command.message}.{name}", f"{key}.{name}")
+        signal = binder.bind_signal(f"{command.message}.{name}", f"{key}.{name}")
         if signal is None:
             continue
-        given[name] = signal.bits(value)
-        if abs(_held(signal, value) - value) > 1e-9 + 0.5 * abs(signal.scale):
-            fix = f"{_held(signal, value):g} is the nearest that it holds"
-            binder.problem(f"{key}.{name}", f"{command.message}.{name} cannot hold {value:g}", fix)
+        given[name] = signal.to_bits(value)
+        if abs(_round_trip(signal, value) - value) > 1e-9 + 0.5 * abs(signal.scale):
+            fix = f"{_round_trip(signal, value):g} is the nearest that it holds"
+            binder.add_problem(f"{key}.{name}", f"{command.message}.{name} cannot hold {value:g}", fix)
     return given
 
 
-def _held(signal: BoundSignal, physical: float) -> float:
-    return physical if signal.is_float else signal.raw(physical) * signal.scale + signal.offset
+def _round_trip(signal: BoundSignal, physical: float) -> float:
+    return physical if signal.is_float else signal.to_raw(physical) * signal.scale + signal.offset

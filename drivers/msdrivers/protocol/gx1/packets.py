@@ -1,7 +1,8 @@
-"""Replies of the 3DM-GX1: which there are, how long they are, which words they hold; from bytes and to bytes.
+"""Layouts of the 3DM-GX1's replies; decode and encode them.
 
-A reply is the echo of the command byte, big-endian 16-bit words, in most of them the timer ticks, and a checksum. There
-is no sync byte. Source: MicroStrain, "3DM-GX1 Data Communications Protocol", and public drivers that follow it.
+A reply is the echo of the command byte, big-endian 16-bit words, mostly the timer ticks, and a checksum: the first byte
+plus every 16-bit word after it, modulo 65536. There is no sync byte. Source: MicroStrain, "3DM-GX1 Data Communications
+Protocol", and public drivers that follow it.
 """
 
 from __future__ import annotations
@@ -11,19 +12,33 @@ from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
-from msdrivers.protocol.gx1.checksum import sealed
+
+def compute_checksum(body: bytes) -> int:
+    """Return the checksum of a reply without its last word: a command byte and big-endian 16-bit words.
+
+    Raises ValueError for a body of even length.
+    """
+    if len(body) % 2 == 0:
+        raise ValueError(f"a reply is a byte and whole words before its checksum, got {len(body)} bytes")
+    words: tuple[int, ...] = struct.unpack(f">B{len(body) // 2}H", body)
+    return sum(words) & 0xFFFF
+
+
+def append_checksum(body: bytes) -> bytes:
+    """Return the reply with its checksum behind it."""
+    return body + compute_checksum(body).to_bytes(2, "big")
 
 
 class CommandByte(IntEnum):
     """The command byte of a request, and of the reply to it."""
 
-    STABILISED_VECTORS = 0x02
+    STABILIZED_VECTORS = 0x02
     INSTANTANEOUS_VECTORS = 0x03
     CAPTURE_BIAS = 0x06
     TEMPERATURE = 0x07
     QUATERNION_VECTORS = 0x0C
     INSTANTANEOUS_EULER = 0x0D
-    STABILISED_EULER = 0x0E
+    STABILIZED_EULER = 0x0E
     CONTINUOUS = 0x10
     READ_EEPROM = 0x28
     WRITE_EEPROM = 0x29
@@ -36,13 +51,10 @@ class CommandByte(IntEnum):
 
 
 class ReplyLayout(NamedTuple):
-    """What stands in a reply between the command byte and the checksum, in order.
-
-    `fields` are names and numbers of words; `ticks`: whether the timer's ticks follow them.
-    """
+    """Content of a reply between the command byte and the checksum: fields with their numbers of words, ticks."""
 
     fields: tuple[tuple[str, int], ...]
-    ticks: bool = True
+    has_ticks: bool = True
 
     @property
     def words(self) -> int:
@@ -52,40 +64,40 @@ class ReplyLayout(NamedTuple):
     @property
     def length(self) -> int:
         """Length of the reply in bytes."""
-        return 1 + 2 * self.words + 2 * self.ticks + 2
+        return 1 + 2 * self.words + 2 * self.has_ticks + 2
 
 
 _VECTORS = (("field", 3), ("acceleration", 3), ("rate", 3))
 
 LAYOUTS: dict[int, ReplyLayout] = {
-    CommandByte.STABILISED_VECTORS: ReplyLayout(_VECTORS),
+    CommandByte.STABILIZED_VECTORS: ReplyLayout(_VECTORS),
     CommandByte.INSTANTANEOUS_VECTORS: ReplyLayout(_VECTORS),
     CommandByte.CAPTURE_BIAS: ReplyLayout(()),
     CommandByte.TEMPERATURE: ReplyLayout((("temperature", 1),)),
     CommandByte.QUATERNION_VECTORS: ReplyLayout((("quaternion", 4), *_VECTORS)),
     CommandByte.INSTANTANEOUS_EULER: ReplyLayout((("euler", 3),)),
-    CommandByte.STABILISED_EULER: ReplyLayout((("euler", 3),)),
-    # a zero byte and the command now streamed; the second word is zero or the ticks, sources differ: not read as ticks
-    CommandByte.CONTINUOUS: ReplyLayout((("streamed", 1), ("unsettled", 1)), ticks=False),
+    CommandByte.STABILIZED_EULER: ReplyLayout((("euler", 3),)),
+    # a zero byte and the streamed command; the second word is zero or the ticks, sources differ: not read as ticks
+    CommandByte.CONTINUOUS: ReplyLayout((("streamed", 1), ("unsettled", 1)), has_ticks=False),
     CommandByte.READ_EEPROM: ReplyLayout((("value", 1),)),
     CommandByte.WRITE_EEPROM: ReplyLayout((("value", 1),)),
     CommandByte.EULER_VECTORS: ReplyLayout((("euler", 3), ("acceleration", 3), ("rate", 3))),
     CommandByte.HARD_IRON_START: ReplyLayout(()),
     CommandByte.HARD_IRON_COLLECT: ReplyLayout((("field", 3), ("minimum", 3), ("maximum", 3))),
     CommandByte.HARD_IRON_COMPUTE: ReplyLayout((("offset", 3),)),
-    CommandByte.FIRMWARE: ReplyLayout((("version", 1),), ticks=False),
-    CommandByte.SERIAL: ReplyLayout((("serial", 1),), ticks=False),
+    CommandByte.FIRMWARE: ReplyLayout((("version", 1),), has_ticks=False),
+    CommandByte.SERIAL: ReplyLayout((("serial", 1),), has_ticks=False),
 }
 
 LENGTHS: dict[int, int] = {command: layout.length for command, layout in LAYOUTS.items()}
 
-DATA = frozenset(
+MEASUREMENTS = frozenset(
     {
-        CommandByte.STABILISED_VECTORS,
+        CommandByte.STABILIZED_VECTORS,
         CommandByte.INSTANTANEOUS_VECTORS,
         CommandByte.QUATERNION_VECTORS,
         CommandByte.INSTANTANEOUS_EULER,
-        CommandByte.STABILISED_EULER,
+        CommandByte.STABILIZED_EULER,
         CommandByte.EULER_VECTORS,
     }
 )
@@ -103,7 +115,7 @@ _STRUCTS = {command: struct.Struct(f">{layout.words}h") for command, layout in L
 _UNSIGNED = {command: struct.Struct(f">B{(length - 3) // 2}HH") for command, length in LENGTHS.items()}
 
 
-class Packet(NamedTuple):
+class Gx1Packet(NamedTuple):
     """A reply: its command, its words as signed numbers, and the timer's ticks, 0..65535, or None without."""
 
     command: int
@@ -124,15 +136,15 @@ class Packet(NamedTuple):
         return self.words[0] & 0xFFFF
 
     def to_bytes(self) -> bytes:
-        """Return the reply as it goes over the line. Raises ValueError for words that its layout does not have."""
+        """Encode the reply. Raises ValueError for words that do not match its layout."""
         layout = LAYOUTS[self.command]
-        if len(self.words) != layout.words or (self.ticks is None) == layout.ticks:
-            raise ValueError(f"a reply 0x{self.command:02x} has {layout.words} words, ticks: {layout.ticks}")
+        if len(self.words) != layout.words or (self.ticks is None) == layout.has_ticks:
+            raise ValueError(f"a reply 0x{self.command:02x} has {layout.words} words, ticks: {layout.has_ticks}")
         words: Sequence[int] = self.words if self.ticks is None else (*self.words, self.ticks)
-        return sealed(struct.pack(f">B{len(words)}H", self.command, *(word & 0xFFFF for word in words)))
+        return append_checksum(struct.pack(f">B{len(words)}H", self.command, *(word & 0xFFFF for word in words)))
 
 
-def decoded(data: bytes | bytearray, at: int, command: int) -> Packet | None:
+def decode_packet(data: bytes | bytearray, at: int, command: int) -> Gx1Packet | None:
     """Return the reply that begins at `at`, whose first byte is `command`; None if its checksum is wrong.
 
     The whole reply must be there: `LENGTHS[command]` bytes.
@@ -141,4 +153,4 @@ def decoded(data: bytes | bytearray, at: int, command: int) -> Packet | None:
     if (sum(unsigned) - 2 * unsigned[-1]) & 0xFFFF:
         return None
     words = _STRUCTS[command].unpack_from(data, at + 1)
-    return Packet(command, words, unsigned[-2] if LAYOUTS[command].ticks else None)
+    return Gx1Packet(command, words, unsigned[-2] if LAYOUTS[command].has_ticks else None)

@@ -1,4 +1,9 @@
-"""Replies of the 3DM-GX1 out of the bytes of a line."""
+"""Parse the replies of the 3DM-GX1 from a byte stream.
+
+The protocol has no sync byte, so random bytes pass for a reply one time in 65,536. A reply therefore counts only if
+its command is streamed or expected, its checksum is right and the validator accepts it; else one byte is skipped and
+the search continues. At most 30 bytes are buffered.
+"""
 
 from __future__ import annotations
 
@@ -6,65 +11,60 @@ import re
 from collections import Counter
 from collections.abc import Callable
 
-from msdrivers.protocol.gx1.packets import LENGTHS, Packet, decoded
+from msdrivers.protocol.gx1.packets import LENGTHS, Gx1Packet, decode_packet
 
-Judge = Callable[[Packet], str]
-"""Says in one word why a reply whose checksum is right does not count; empty where it does."""
+ReplyValidator = Callable[[Gx1Packet], str]
+"""Returns the reason to reject a reply with a valid checksum; empty to accept it."""
 
 
-def _accept(_: Packet) -> str:
+def _accept_all(_: Gx1Packet) -> str:
     return ""
 
 
 class Gx1Parser:
-    """Finds the replies that were asked for. Without a sync byte random bytes pass for a reply one time in 65,536.
+    """Finds the expected replies; see the module."""
 
-    So a reply counts only if its command is streamed or expected, its checksum is right, and the judge has nothing
-    against it; else one byte is skipped and the search goes on behind it. At most 30 bytes wait for more.
-    """
+    __slots__ = ("_buffer", "_expected", "_start_pattern", "_streamed", "_validate", "counts")
 
-    __slots__ = ("_buffer", "_expected", "_head", "_judge", "_streamed", "counts")
-
-    def __init__(self, judge: Judge = _accept):
-        """Take what judges replies beyond their checksum."""
-        self._judge = judge
+    def __init__(self, judge: ReplyValidator = _accept_all):
+        self._validate = judge
         self._buffer = bytearray()
         self._streamed: frozenset[int] = frozenset()
         self._expected: Counter[int] = Counter()
-        self._head = _search(set())
+        self._start_pattern = _compile_pattern(set())
         self.counts: Counter[str] = Counter()
-        """`skipped` bytes that were part of no reply, and `rejected.` by reason."""
+        """`skipped` bytes outside of replies, and `rejected.<reason>`."""
 
-    def stream(self, *commands: int) -> None:
-        """Tell which replies may come unasked from now on, any number of them."""
+    def set_streamed(self, *commands: int) -> None:
+        """Set the commands whose replies are accepted without a request."""
         self._streamed = frozenset(commands)
-        self._look()
+        self._update_pattern()
 
     def expect(self, command: int) -> None:
-        """Tell that a reply was asked for: one more of it counts."""
+        """Accept one more reply to a command."""
         self._expected[command] += 1
-        self._look()
+        self._update_pattern()
 
-    def give_up(self, command: int) -> None:
-        """Tell that the replies to a command are not waited for any more."""
+    def cancel(self, command: int) -> None:
+        """Expect no more replies to a command."""
         self._expected.pop(command, None)
-        self._look()
+        self._update_pattern()
 
     def clear(self) -> None:
-        """Skip the bytes that wait for more, and expect nothing."""
+        """Discard buffered bytes and expectations."""
         self.counts["skipped"] += len(self._buffer)
         self._buffer.clear()
         self._expected.clear()
-        self.stream()
+        self.set_streamed()
 
-    def feed(self, data: bytes) -> list[Packet]:
-        """Return the replies that are complete now, in order."""
+    def feed(self, data: bytes) -> list[Gx1Packet]:
+        """Return the replies that `data` completes, in order."""
         buffer = self._buffer
         buffer += data
-        found: list[Packet] = []
+        found: list[Gx1Packet] = []
         at = 0
         while True:
-            match = self._head.search(buffer, at)
+            match = self._start_pattern.search(buffer, at)
             begin = len(buffer) if match is None else match.start()
             self.counts["skipped"] += begin - at
             at = begin
@@ -73,8 +73,8 @@ class Gx1Parser:
             command = buffer[at]
             if at + LENGTHS[command] > len(buffer):
                 break
-            packet = decoded(buffer, at, command)
-            reason = "checksum" if packet is None else self._judge(packet)
+            packet = decode_packet(buffer, at, command)
+            reason = "checksum" if packet is None else self._validate(packet)
             if packet is None or reason:
                 self.counts[f"rejected.{reason}"] += 1
                 self.counts["skipped"] += 1
@@ -83,22 +83,22 @@ class Gx1Parser:
             at += LENGTHS[command]
             found.append(packet)
             if command not in self._streamed:
-                self._answered(command)
-        # a match holds on to the buffer, which then cannot shrink
+                self._on_expected_reply(command)
+        # a match object locks the buffer against resizing
         del match
         del buffer[:at]
         return found
 
-    def _answered(self, command: int) -> None:
+    def _on_expected_reply(self, command: int) -> None:
         self._expected[command] -= 1
         if not self._expected[command]:
-            self.give_up(command)
+            self.cancel(command)
 
-    def _look(self) -> None:
-        self._head = _search(self._streamed | self._expected.keys())
+    def _update_pattern(self) -> None:
+        self._start_pattern = _compile_pattern(self._streamed | self._expected.keys())
 
 
-def _search(commands: set[int] | frozenset[int]) -> re.Pattern[bytes]:
+def _compile_pattern(commands: set[int] | frozenset[int]) -> re.Pattern[bytes]:
     """Return the pattern of a reply's first byte; of nothing where no reply is expected."""
     if not commands:
         return re.compile(b"(?!)")

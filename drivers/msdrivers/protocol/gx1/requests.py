@@ -14,36 +14,36 @@ _WRITE_KEY, _WRITE_END = 0x71, 0xAA
 LAST_ADDRESS = 254
 
 
-def poll(command: int) -> bytes:
+def make_poll(command: int) -> bytes:
     """Return the request for one reply of a command that takes no data."""
     return bytes((command,))
 
 
-def stream(command: int) -> bytes:
+def make_stream(command: int) -> bytes:
     """Return the request to stream a reply."""
     return bytes((CommandByte.CONTINUOUS, 0, command))
 
 
-def read_eeprom(address: int) -> bytes:
+def make_read_eeprom(address: int) -> bytes:
     """Return the request for a word of the EEPROM, at an even address up to 254."""
-    return bytes((CommandByte.READ_EEPROM, *_address(address)))
+    return bytes((CommandByte.READ_EEPROM, *_encode_address(address)))
 
 
-def write_eeprom(address: int, value: int) -> bytes:
+def make_write_eeprom(address: int, value: int) -> bytes:
     """Return the request to write a word, signed or unsigned 16 bit, to the EEPROM."""
     word = (value & 0xFFFF).to_bytes(2, "big")
-    return bytes((CommandByte.WRITE_EEPROM, _WRITE_KEY, *_address(address), *word, _WRITE_END))
+    return bytes((CommandByte.WRITE_EEPROM, _WRITE_KEY, *_encode_address(address), *word, _WRITE_END))
 
 
-def hard_iron_start() -> bytes:
+def make_hard_iron_start() -> bytes:
     """Return the request to begin the collection of the magnetic field's extremes."""
     return bytes((CommandByte.HARD_IRON_START,)) + HARD_IRON_KEY
 
 
-def hard_iron_compute(two_dimensional: bool, magnitude_z: int) -> bytes:
+def make_hard_iron_compute(two_dimensional: bool, magnitude_z: int) -> bytes:
     """Return the request to compute and store the hard-iron offsets.
 
-    The type byte is 1 for two dimensions and 0 for three. `magnitude_z` is the device's own word for the vertical
+    The type byte is 1 for two dimensions and 0 for three. `magnitude_z` is the raw value of the vertical
     field, which only the procedure in two dimensions uses.
     """
     kind = 1 if two_dimensional else 0
@@ -51,14 +51,14 @@ def hard_iron_compute(two_dimensional: bool, magnitude_z: int) -> bytes:
     return bytes((CommandByte.HARD_IRON_COMPUTE,)) + HARD_IRON_KEY + bytes((kind,)) + word
 
 
-def _address(address: int) -> bytes:
+def _encode_address(address: int) -> bytes:
     if not 0 <= address <= LAST_ADDRESS or address % 2:
         raise ValueError(f"an address of the EEPROM is even and 0..{LAST_ADDRESS}, got {address}")
     return address.to_bytes(2, "big")
 
 
-class Request(NamedTuple):
-    """What a host asks: the command, and its data bytes without keys."""
+class Gx1Request(NamedTuple):
+    """A request of the host: the command and its data bytes without keys."""
 
     command: int
     data: bytes = b""
@@ -82,7 +82,7 @@ class RequestParser:
         self._buffer = bytearray()
         self.skipped = 0
 
-    def feed(self, data: bytes) -> list[Request]:
+    def feed(self, data: bytes) -> list[Gx1Request]:
         """Return the requests that are complete; at most 6 bytes wait for more."""
         self._buffer += data
         buffer, at, found = self._buffer, 0, []
@@ -90,7 +90,7 @@ class RequestParser:
             length = _LENGTHS.get(buffer[at], 0)
             if length > len(buffer) - at:
                 break
-            request = _request(bytes(buffer[at : at + length])) if length else None
+            request = _parse_request(bytes(buffer[at : at + length])) if length else None
             if request is None:
                 at += 1
                 self.skipped += 1
@@ -105,15 +105,15 @@ class RequestParser:
         self._buffer.clear()
 
 
-def _request(raw: bytes) -> Request | None:
+def _parse_request(raw: bytes) -> Gx1Request | None:
     """Return the request that the bytes are; None if a key or a fixed byte in it is wrong."""
     command = raw[0]
     if command == CommandByte.CONTINUOUS:
-        return Request(command, raw[2:]) if raw[1] == 0 else None
+        return Gx1Request(command, raw[2:]) if raw[1] == 0 else None
     if command == CommandByte.READ_EEPROM:
-        return Request(command, raw[1:])
+        return Gx1Request(command, raw[1:])
     if command == CommandByte.WRITE_EEPROM:
-        return Request(command, raw[2:6]) if (raw[1], raw[6]) == (_WRITE_KEY, _WRITE_END) else None
+        return Gx1Request(command, raw[2:6]) if (raw[1], raw[6]) == (_WRITE_KEY, _WRITE_END) else None
     if command in (CommandByte.HARD_IRON_START, CommandByte.HARD_IRON_COMPUTE):
-        return Request(command, raw[3:]) if raw[1:3] == HARD_IRON_KEY else None
-    return Request(command)
+        return Gx1Request(command, raw[3:]) if raw[1:3] == HARD_IRON_KEY else None
+    return Gx1Request(command)

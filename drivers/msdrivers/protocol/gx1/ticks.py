@@ -1,86 +1,87 @@
-"""The 3DM-GX1's tick counter: 16 bits that wrap, unwrapped, and used to tell a reply from bytes that look like one.
+"""Unwrap the 3DM-GX1's 16-bit tick counter, and reject byte sequences that only look like a reply.
 
-A reply's ticks fit if they lie after those before, by no more than the time that has passed. They may lie less far
-ahead than that: what a busy host reads late comes all at once.
+The ticks of a reply are plausible if they are ahead of the previous ones by no more than the elapsed time (plus 0.5 s).
+They may be ahead by less: replies that a busy host reads late arrive all at once. Three consecutive implausible
+replies that agree with each other mean that the counter has jumped.
 """
 
 from __future__ import annotations
 
-TURN = 65536
-"""Ticks until the counter begins again."""
+COUNTER_RANGE = 65536
+"""Ticks until the counter wraps."""
 
 SLACK_NS = 500_000_000
-"""By how much more than the time passed the ticks may have advanced: the reply before came so late."""
+"""Tolerance: the previous reply may have been read this much late."""
 
-SHORTEST_S = 0.005
-"""A tick is at least so long, as long as its length is not known."""
+MIN_TICK_S = 0.005
+"""Shortest possible tick, used while its length is unknown."""
 
-LATE = 2
-"""Ticks by which the reply to a poll may lie behind a streamed one that was sent before it."""
+MAX_POLL_LAG = 2
+"""Ticks by which a polled reply may be behind a streamed one that was sent before it."""
 
-AGREEING = 3
-"""Replies in a row that fit each other but not those before: then the counter has jumped."""
+MIN_AGREEING = 3
+"""Consecutive replies that agree with each other but not with the previous ones: the counter has jumped."""
 
 
-class TickWatch:
-    """Unwraps ticks and judges whether they fit. Instants are the host's monotonic nanoseconds.
+class TickUnwrapper:
+    """Unwraps ticks and checks their plausibility. Instants are the host's monotonic nanoseconds.
 
-    The unwrapped count begins above zero, goes back by at most `LATE`, and goes ahead by more than a turn when the
-    counter has jumped or `forget` was called.
+    The unwrapped count starts above zero, goes back by at most `MAX_POLL_LAG`, and advances by more than
+    `COUNTER_RANGE` when the counter has jumped or `reset` was called.
     """
 
-    __slots__ = ("_agreeing", "_at_ns", "_candidate", "_count", "_last", "_per_ns", "jumped")
+    __slots__ = ("_agreeing_count", "_at_ns", "_candidate", "_count", "_last", "_ticks_per_ns", "has_jumped")
 
     def __init__(self) -> None:
         self._last: int | None = None
         self._at_ns = 0
         self._candidate: tuple[int, int] = (0, 0)
-        self._agreeing = 0
-        self._count = TURN
-        self._per_ns = 1e-9 / SHORTEST_S
-        self.jumped = False
-        """The counter has jumped since `forget` was called."""
+        self._agreeing_count = 0
+        self._count = COUNTER_RANGE
+        self._ticks_per_ns = 1e-9 / MIN_TICK_S
+        self.has_jumped = False
+        """The counter has jumped since `reset`."""
 
-    def clock(self, tick_s: float) -> None:
-        """Tell how long a tick is; the device's clock and the host's may differ by 5 %."""
-        self._per_ns = 1.05e-9 / tick_s
+    def set_tick(self, tick_s: float) -> None:
+        """Set the length of a tick; the device's clock and the host's may differ by 5 %."""
+        self._ticks_per_ns = 1.05e-9 / tick_s
 
-    def forget(self) -> None:
-        """Take whatever comes next for the beginning: the device may have been away."""
+    def reset(self) -> None:
+        """Accept any next count: the device may have restarted."""
         self._last = None
-        self._agreeing = 0
-        self._count = (self._count // TURN + 2) * TURN
-        self.jumped = False
+        self._agreeing_count = 0
+        self._count = (self._count // COUNTER_RANGE + 2) * COUNTER_RANGE
+        self.has_jumped = False
 
-    def take(self, ticks: int, at_ns: int, streamed: bool) -> int | None:
-        """Return the ticks of a reply, received at an instant, unwrapped; None if they do not fit."""
+    def unwrap(self, ticks: int, at_ns: int, streamed: bool) -> int | None:
+        """Return the unwrapped ticks of a reply; None if they are implausible."""
         if self._last is None:
-            return self._begin(ticks, at_ns)
-        ahead = (ticks - self._last) % TURN
-        if ahead <= self._reach(at_ns - self._at_ns):
+            return self._restart(ticks, at_ns)
+        ahead = (ticks - self._last) % COUNTER_RANGE
+        if ahead <= self._max_advance(at_ns - self._at_ns):
             self._count += ahead
             self._last, self._at_ns = ticks, at_ns
-            self._agreeing = 0
+            self._agreeing_count = 0
             return self._count
-        if not streamed and TURN - ahead <= LATE:
-            return self._count - (TURN - ahead)
-        return self._strayed(ticks, at_ns)
+        if not streamed and COUNTER_RANGE - ahead <= MAX_POLL_LAG:
+            return self._count - (COUNTER_RANGE - ahead)
+        return self._on_outlier(ticks, at_ns)
 
-    def _reach(self, elapsed_ns: int) -> float:
-        return (elapsed_ns + SLACK_NS) * self._per_ns + 1.0
+    def _max_advance(self, elapsed_ns: int) -> float:
+        return (elapsed_ns + SLACK_NS) * self._ticks_per_ns + 1.0
 
-    def _begin(self, ticks: int, at_ns: int) -> int:
-        self._last, self._at_ns, self._agreeing = ticks, at_ns, 0
-        self._count = self._count // TURN * TURN + ticks
+    def _restart(self, ticks: int, at_ns: int) -> int:
+        self._last, self._at_ns, self._agreeing_count = ticks, at_ns, 0
+        self._count = self._count // COUNTER_RANGE * COUNTER_RANGE + ticks
         return self._count
 
-    def _strayed(self, ticks: int, at_ns: int) -> int | None:
+    def _on_outlier(self, ticks: int, at_ns: int) -> int | None:
         before, since_ns = self._candidate
-        agrees = self._agreeing > 0 and (ticks - before) % TURN <= self._reach(at_ns - since_ns)
-        self._agreeing = self._agreeing + 1 if agrees else 1
+        agrees = self._agreeing_count > 0 and (ticks - before) % COUNTER_RANGE <= self._max_advance(at_ns - since_ns)
+        self._agreeing_count = self._agreeing_count + 1 if agrees else 1
         self._candidate = (ticks, at_ns)
-        if self._agreeing < AGREEING:
+        if self._agreeing_count < MIN_AGREEING:
             return None
-        self.forget()
-        self.jumped = True
-        return self._begin(ticks, at_ns)
+        self.reset()
+        self.has_jumped = True
+        return self._restart(ticks, at_ns)

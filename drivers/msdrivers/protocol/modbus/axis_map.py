@@ -1,4 +1,4 @@
-"""Which registers an axis has: the part of the settings that another axis writes instead of code."""
+"""Register map of an axis: what another axis configures instead of coding."""
 
 from __future__ import annotations
 
@@ -6,32 +6,31 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from msdrivers.protocol.modbus.numbers import RegisterMap
-from msdrivers.protocol.modbus.registers import MAX_READ
+from msdrivers.protocol.modbus.registers import MAX_READ, RegisterMap
 
 STRICT: dict[str, object] = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
 
 
 @dataclass(frozen=True, slots=True)
 class AxisRegisters:
-    """Which registers the axis has. Angles and rates are the joint's, in its positive sense."""
+    """Registers of the axis. Angles and rates are the joint's, in its positive direction."""
 
     __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     angle: RegisterMap
-    """Where the axis is."""
+    """Angle of the axis."""
     rate: RegisterMap | None = None
-    """How fast it turns; None: it does not say, and no rate is published."""
-    number: RegisterMap | None = None
-    """A number that the axis changes with each measurement: one that stays tells that nothing new was measured."""
+    """Rate of the axis; None: no rate is published."""
+    sequence: RegisterMap | None = None
+    """Sequence number of the measurement; an unchanged one means that nothing new was measured."""
     table: Literal["holding", "input"] = "holding"
-    """In which table angle, rate and number are; the others are holding registers."""
+    """Table of angle, rate and sequence; the others are holding registers."""
     lower_limit: RegisterMap | None = None
-    """Lowest angle of the nodding, written."""
+    """Lower limit of the nodding motion, written."""
     upper_limit: RegisterMap | None = None
-    """Highest angle of the nodding, written."""
+    """Upper limit of the nodding motion, written."""
     nod_rate: RegisterMap | None = None
-    """How fast to nod, written; 0 stands."""
+    """Rate of the nodding motion, written; 0: stationary."""
 
     def __post_init__(self) -> None:
         if self.table not in ("holding", "input"):
@@ -44,13 +43,13 @@ class AxisRegisters:
         spread = max(each.address + each.registers for each in self.measured.values()) - self.begin
         if spread > MAX_READ:
             raise ValueError(
-                f"angle, rate and number lie {spread} registers apart; at most {MAX_READ} are read at one instant"
+                f"angle, rate and sequence lie {spread} registers apart; at most {MAX_READ} are read at one instant"
             )
 
     @property
     def measured(self) -> Mapping[str, RegisterMap]:
-        """What is read at each poll, by name."""
-        given = {"angle": self.angle, "rate": self.rate, "number": self.number}
+        """Registers read at each poll, by name."""
+        given = {"angle": self.angle, "rate": self.rate, "sequence": self.sequence}
         return {name: each for name, each in given.items() if each is not None}
 
     @property
@@ -60,6 +59,6 @@ class AxisRegisters:
 
     @property
     def commanded(self) -> Mapping[str, RegisterMap]:
-        """What is written for nodding, by name, in the order of writing; empty for an axis that cannot be told."""
+        """Registers written to set the nodding motion, by name; empty for a read-only axis."""
         given = {"lower_limit": self.lower_limit, "upper_limit": self.upper_limit, "nod_rate": self.nod_rate}
         return {name: each for name, each in given.items() if each is not None}

@@ -1,4 +1,4 @@
-"""NMEA 0183 sentences to bytes: the receiver's side."""
+"""Encode NMEA 0183 sentences, as a receiver does."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def encode(talker: str, kind: str, fields: Sequence[str]) -> bytes:
     return str(pynmea2.TalkerSentence(talker, kind, fields)).encode("ascii") + b"\r\n"
 
 
-def angle(degrees: float, sides: str, digits: int) -> tuple[str, str]:
+def format_angle(degrees: float, sides: str, digits: int) -> tuple[str, str]:
     """Return `dddmm.mmmmmmm` with as many digits of whole degrees, and the hemisphere's letter; empty for nan."""
     if degrees != degrees:
         return "", ""
@@ -22,7 +22,7 @@ def angle(degrees: float, sides: str, digits: int) -> tuple[str, str]:
     return text, sides[0] if degrees >= 0.0 else sides[1]
 
 
-def time_of_day(microseconds: int) -> str:
+def format_time_of_day(microseconds: int) -> str:
     """Return `hhmmss.sss`, up to 23:59:60.999."""
     seconds, fraction = divmod(microseconds, 1_000_000)
     leap = max(0, seconds - 86_399)
@@ -30,6 +30,6 @@ def time_of_day(microseconds: int) -> str:
     return f"{hours:02d}{rest // 60:02d}{rest % 60 + leap:02d}.{fraction // 1000:03d}"
 
 
-def number(value: float, digits: int) -> str:
+def format_number(value: float, digits: int) -> str:
     """Return a decimal; empty for nan."""
     return "" if value != value else f"{value:.{digits}f}"

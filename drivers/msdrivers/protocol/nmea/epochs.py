@@ -1,41 +1,136 @@
-"""Puts the sentences of one instant together.
+"""Assemble the NMEA sentences of one instant to an epoch.
 
-An epoch is complete when a sentence of another instant comes, when the caller says that the line has fallen silent,
-or, once cycles have been alike for a second, when the sentence that ended the last one comes again (so that nobody
-waits for the next instant). Sentences without a time (VTG, GSA, HDT) belong to the epoch they follow, or to the one
-they lead: which, silence tells. Motion whose place is not known is left out, lest it be that of the next instant.
+An epoch is complete when a sentence of another instant arrives, when the caller reports silence (`flush`), or, once the
+cycles of sentences were equal for a second, when the sentence that ended the last cycle arrives again; so the last
+fix does not wait for the next instant. Sentences without a time (VTG, GSA, HDT) belong to the epoch that they follow or
+precede; the order is learned from the pauses of the line. Motion of unknown order is left out, because it could be
+that of the next instant.
+
+The fix type of an epoch is NONE if any sentence flags the fix invalid, else that of the most detailed sentence.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from modelserver.messages import FixType
 from modelserver.messages.flags import NAN
 from msdrivers.protocol.gps_time import DAY, SECOND
-from msdrivers.protocol.nmea.fix import fix_type, satellites_used
 from msdrivers.protocol.nmea.sentences import NmeaSentence
+
+_QUALITY = {
+    1: FixType.FIX_3D,
+    2: FixType.DIFFERENTIAL,
+    3: FixType.FIX_3D,
+    4: FixType.RTK_FIXED,
+    5: FixType.RTK_FLOAT,
+    6: FixType.DEAD_RECKONING,
+    9: FixType.DIFFERENTIAL,
+}
+"""GGA's indicator. 7 (typed in by hand) and 8 (simulated) are no measurement: NONE, as 0. 9 is not in the
+standard: NovAtel receivers send it for corrections by satellite (SBAS)."""
+
+_MODE = {
+    "A": FixType.FIX_3D,
+    "P": FixType.FIX_3D,
+    "D": FixType.DIFFERENTIAL,
+    "R": FixType.RTK_FIXED,
+    "F": FixType.RTK_FLOAT,
+    "E": FixType.DEAD_RECKONING,
+}
+"""The mode indicator of NMEA 2.3 and later. M (by hand), S (simulated), N (not valid) are NONE."""
+
+
+def determine_fix_type(sentences: Sequence[NmeaSentence]) -> FixType:
+    """Return the fix type; NONE if any sentence flags the fix invalid, or none has a position."""
+    placed = [each for each in sentences if each.has_position]
+    if not placed or any(_is_invalid(each) for each in sentences) or _has_no_satellites(sentences):
+        return FixType.NONE
+    dimensions = [each.dimension for each in sentences if each.dimension is not None]
+    dimension = max(dimensions, default=None)
+    if dimension == 1:
+        return FixType.NONE
+    found = next(_list_fix_types(placed), FixType.FIX_3D)
+    has_height = any(each.height_msl == each.height_msl for each in placed)
+    flat = dimension == 2 if dimension is not None else not has_height
+    return FixType.FIX_2D if flat and found is FixType.FIX_3D else found
+
+
+def _is_invalid(sentence: NmeaSentence) -> bool:
+    """Whether a sentence flags the fix invalid."""
+    if sentence.kind == "GGA":
+        return sentence.quality not in _QUALITY
+    if sentence.kind == "GNS":
+        return _best_mode(sentence.mode) is None
+    if sentence.kind in ("RMC", "GLL"):
+        # status V with mode E is dead reckoning, a fix of its kind
+        if sentence.mode and sentence.mode not in _MODE:
+            return True
+        return sentence.status != "A" and sentence.mode != "E"
+    return False
+
+
+def count_satellites(sentences: Sequence[NmeaSentence]) -> int:
+    """Return how many satellites the fix of one instant uses; -1 where no sentence counts them.
+
+    Some receivers (Furuno GL, Garmin 25) send a GGA with 0 in use while the GSA of the same instant lists them: then
+    the list counts.
+    """
+    counted = max((each.satellites for each in sentences if each.satellites is not None), default=-1)
+    return counted or sum(each.listed for each in sentences)
+
+
+def _has_no_satellites(sentences: Sequence[NmeaSentence]) -> bool:
+    """Return whether a GGA counts no satellites in use: some receivers keep the last quality when they lose all."""
+    counts = any(each.kind == "GGA" and each.satellites == 0 for each in sentences)
+    return counts and count_satellites(sentences) == 0
+
+
+def _list_fix_types(placed: Iterable[NmeaSentence]) -> Iterator[FixType]:
+    """Yield the fix types of the sentences with a position, the most detailed first."""
+    ordered = sorted(placed, key=lambda each: ("GGA", "GNS", "RMC", "GLL").index(each.kind))
+    for each in ordered:
+        found = _QUALITY.get(each.quality) if each.quality is not None else _best_mode(each.mode)
+        if found is not None:
+            yield found
+
+
+def _best_mode(mode: str) -> FixType | None:
+    """Return the best of a mode indicator's letters; unused satellite systems have N."""
+    found = [_MODE[letter] for letter in mode if letter in _MODE]
+    return max(found, key=_RANK.index, default=None)
+
+
+_RANK = (
+    FixType.DEAD_RECKONING,
+    FixType.FIX_3D,
+    FixType.DIFFERENTIAL,
+    FixType.RTK_FLOAT,
+    FixType.RTK_FIXED,
+)
+
 
 POSITION_KINDS = frozenset({"GGA", "GNS", "RMC", "GLL"})
 _MOTION = frozenset({"VTG", "HDT"})
-"""Sentences without a time that say how the receiver moves: what they say of another instant is wrong."""
-_SURE = 2
-"""Cycles that must have told the order of sentences."""
+"""Sentences with the receiver's motion but without a time: of another instant their content is wrong."""
+_MIN_LESSONS = 2
+"""Number of cycles that determine the order of sentences."""
 _TIMED = POSITION_KINDS | {"GST"}
 """Sentences whose time is that of the fix. ZDA's is the clock's, which in some receivers is seconds ahead."""
-_MOST = 64
-"""Sentences in an epoch; further ones of the same instant say nothing new."""
-_ALIKE = SECOND
-"""For so long cycles must have been alike; what comes less often than each instant mostly comes once a second."""
+_MAX_SENTENCES = 64
+"""Largest number of sentences in an epoch."""
+_MIN_STABLE_US = SECOND
+"""How long cycles must be equal; sentences that are not sent each instant are mostly sent once a second."""
 
 
 @dataclass(frozen=True, slots=True)
 class NmeaEpoch:
-    """What a receiver said of one instant; nan or -1 where it said nothing.
+    """Data of one instant; nan or -1 where missing.
 
     start: bytes from the beginning of the stream to the epoch's first sentence. kinds: the sentences it was made of.
-    utime: microseconds of UTC; 0 while the receiver has told no date. leap_second: the instant is within 23:59:60, and
+    utime: microseconds of UTC; 0 before the first date. leap_second: the instant is within 23:59:60, and
     utime is that of the second after it. Units as in `NmeaSentence`; coordinates are kept where the fix is flagged
     invalid, with `fix_type` NONE.
     """
@@ -61,7 +156,7 @@ class NmeaEpoch:
     sigma_height: float = NAN
 
     @property
-    def leap_second(self) -> bool:
+    def is_leap_second(self) -> bool:
         """Whether the instant lies in an inserted second."""
         return self.time_of_day is not None and self.time_of_day >= DAY
 
@@ -70,127 +165,131 @@ class EpochAssembler:
     """Sentences in, epochs out. Memory is bounded by one epoch."""
 
     def __init__(self) -> None:
-        self._open: list[NmeaSentence] = []
+        self._sentences: list[NmeaSentence] = []
         self._reference: int | None = None
-        self._done: int | None = None
+        self._last_instant: int | None = None
         self._cycle: Counter[str] = Counter()
-        self._alike_since: int | None = None
+        self._stable_since: int | None = None
         self._first = self._last = ""
-        self._by_end = False
-        self._regular = True
-        self._still = self._begun_after_silence = False
-        self._lessons: Counter[tuple[str, bool]] = Counter()
-        """How often silence told that a sentence of motion leads, or that it does not."""
+        self._is_closed_by_end = False
+        self._is_regular = True
+        self._is_line_silent = self._starts_after_silence = False
+        self._order_counts: Counter[tuple[str, bool]] = Counter()
+        """How often a pause showed that a kind of sentence comes first, or not."""
         self.late = 0
-        """Sentences that came after their epoch was complete, or too many for it; they were not used."""
+        """Unused sentences: received after their epoch was complete, or too many."""
 
     def add(self, sentence: NmeaSentence) -> list[NmeaEpoch]:
         """Return the epochs that the sentence completes: at most the one before it, and its own."""
         closed = []
         timed = sentence.kind in _TIMED
-        if self._starts_new(sentence) if timed else self._leads(sentence.kind) and self._instant()[0]:
+        if self._starts_epoch(sentence) if timed else self._is_leading(sentence.kind) and self._get_instant()[0]:
             closed += self._close(by_end=False)
-        if self._is_late(sentence, timed) or len(self._open) >= _MOST:
+        if self._is_late(sentence, timed) or len(self._sentences) >= _MAX_SENTENCES:
             self.late += 1
             return closed
         self._note_date(sentence)
-        if not self._open:
-            self._begun_after_silence, self._still = self._still, False
-        elif timed and self._begun_after_silence and not self._instant()[0]:
-            self._learn(self._open, leads=True)
-        self._open.append(sentence)
+        if not self._sentences:
+            self._starts_after_silence, self._is_line_silent = self._is_line_silent, False
+        elif timed and self._starts_after_silence and not self._get_instant()[0]:
+            self._learn_order(self._sentences, leads=True)
+        self._sentences.append(sentence)
         if self._is_end(sentence):
             closed += self._close(by_end=True)
         return closed
 
     def flush(self) -> list[NmeaEpoch]:
         """Return the epoch under way, if any: the line has been silent, so no more of it will come."""
-        self._still = True
-        begun = next((n for n, each in enumerate(self._open) if each.kind in _TIMED), len(self._open))
-        self._learn(self._open[begun:], leads=False)
+        self._is_line_silent = True
+        started = next((n for n, each in enumerate(self._sentences) if each.kind in _TIMED), len(self._sentences))
+        self._learn_order(self._sentences[started:], leads=False)
         return self._close(by_end=False, is_silent=True)
 
     def clear(self) -> None:
         """Forget the epoch under way, and the order of sentences: another receiver may speak."""
-        self._open, self._still = [], False
-        self._lessons.clear()
+        self._sentences, self._is_line_silent = [], False
+        self._order_counts.clear()
 
-    def _learn(self, sentences: list[NmeaSentence], leads: bool) -> None:
-        self._lessons.update((each.kind, leads) for each in sentences if each.kind in _MOTION)
+    def _learn_order(self, sentences: list[NmeaSentence], leads: bool) -> None:
+        self._order_counts.update((each.kind, leads) for each in sentences if each.kind in _MOTION)
 
-    def _leads(self, kind: str) -> bool | None:
-        """Whether a sentence of motion comes before those with the time; None where that is not known."""
+    def _is_leading(self, kind: str) -> bool | None:
+        """Whether a kind of motion sentence precedes those with a time; None if unknown."""
         for leads in (True, False):
-            # a pause amid a cycle tells the wrong thing
-            if self._lessons[kind, leads] >= max(_SURE, 4 * self._lessons[kind, not leads]):
+            # a pause within a cycle shows the wrong order
+            if self._order_counts[kind, leads] >= max(_MIN_LESSONS, 4 * self._order_counts[kind, not leads]):
                 return leads
         return None
 
-    def _belonging(self, sentences: list[NmeaSentence], is_silent: bool) -> list[NmeaSentence]:
-        """Leave out sentences of motion that are, or may be, another instant's."""
-        begun = next(n for n, each in enumerate(sentences) if each.kind in _TIMED)
+    def _select_sentences(self, sentences: list[NmeaSentence], is_silent: bool) -> list[NmeaSentence]:
+        """Return the sentences without those of motion that belong, or may belong, to another instant."""
+        started = next(n for n, each in enumerate(sentences) if each.kind in _TIMED)
 
-        def belongs(n: int, kind: str) -> bool:
-            leads = self._leads(kind)
-            return n > begun and is_silent if leads is None else (n < begun) is leads
+        def is_selected(n: int, kind: str) -> bool:
+            leads = self._is_leading(kind)
+            return n > started and is_silent if leads is None else (n < started) is leads
 
-        return [each for n, each in enumerate(sentences) if each.kind not in _MOTION or belongs(n, each.kind)]
+        return [each for n, each in enumerate(sentences) if each.kind not in _MOTION or is_selected(n, each.kind)]
 
-    def _instant(self) -> tuple[bool, int | None]:
-        """Whether the epoch under way has a sentence that has a time by its kind, and that time."""
-        for each in self._open:
+    def _get_instant(self) -> tuple[bool, int | None]:
+        """Return whether the pending epoch has a timed sentence, and its time."""
+        for each in self._sentences:
             if each.kind in _TIMED:
                 return True, each.time_of_day
         return False, None
 
-    def _starts_new(self, sentence: NmeaSentence) -> bool:
-        begun, instant = self._instant()
-        if not begun:
+    def _starts_epoch(self, sentence: NmeaSentence) -> bool:
+        started, instant = self._get_instant()
+        if not started:
             return False
         if sentence.time_of_day != instant:
             return True
-        return instant is None and any(each.kind == sentence.kind for each in self._open)
+        return instant is None and any(each.kind == sentence.kind for each in self._sentences)
 
     def _is_late(self, sentence: NmeaSentence, timed: bool) -> bool:
         if timed:
-            begun, _ = self._instant()
-            late = not begun and sentence.time_of_day is not None and sentence.time_of_day == self._done
-            self._regular = self._regular and not (late and self._by_end)
+            started, _ = self._get_instant()
+            late = not started and sentence.time_of_day is not None and sentence.time_of_day == self._last_instant
+            self._is_regular = self._is_regular and not (late and self._is_closed_by_end)
             return late
-        if not self._open and self._by_end and sentence.kind != self._first:
+        if not self._sentences and self._is_closed_by_end and sentence.kind != self._first:
             # it trails an epoch that was thought complete: this receiver's cycles differ, do not guess their end again
-            self._regular = False
+            self._is_regular = False
             return sentence.kind != "ZDA"
         return False
 
     def _is_end(self, sentence: NmeaSentence) -> bool:
-        if not self._regular or sentence.kind != self._last:
+        if not self._is_regular or sentence.kind != self._last:
             return False
-        if self._alike_since is None or self._done is None or self._done - self._alike_since < _ALIKE:
+        if (
+            self._stable_since is None
+            or self._last_instant is None
+            or self._last_instant - self._stable_since < _MIN_STABLE_US
+        ):
             return False
-        heard = Counter(each.kind for each in self._open)
-        return all(heard[kind] >= number for kind, number in self._cycle.items())
+        received = Counter(each.kind for each in self._sentences)
+        return all(received[kind] >= number for kind, number in self._cycle.items())
 
     def _note_date(self, sentence: NmeaSentence) -> None:
         if sentence.day is not None and sentence.time_of_day is not None:
             self._reference = sentence.day * DAY + sentence.time_of_day
 
     def _close(self, by_end: bool, is_silent: bool = False) -> list[NmeaEpoch]:
-        sentences, self._open = self._open, []
+        sentences, self._sentences = self._sentences, []
         if not any(each.kind in _TIMED for each in sentences):
             return []
         instant = next(each.time_of_day for each in sentences if each.kind in _TIMED)
         cycle = Counter(each.kind for each in sentences)
-        if cycle != self._cycle or self._alike_since is None or instant is None or instant < self._alike_since:
-            self._alike_since = instant
-        self._by_end, self._cycle, self._done = by_end, cycle, instant
+        if cycle != self._cycle or self._stable_since is None or instant is None or instant < self._stable_since:
+            self._stable_since = instant
+        self._is_closed_by_end, self._cycle, self._last_instant = by_end, cycle, instant
         self._first, self._last = sentences[0].kind, sentences[-1].kind
         if not any(each.kind in POSITION_KINDS for each in sentences):
             return []
-        return [merged(self._belonging(sentences, is_silent), instant, self._utime(instant))]
+        return [merge_sentences(self._select_sentences(sentences, is_silent), instant, self._to_utime(instant))]
 
-    def _utime(self, instant: int | None) -> int:
-        """Put a time of day on the day that brings it nearest to the last date heard."""
+    def _to_utime(self, instant: int | None) -> int:
+        """Return the utime of a time of day on the day that is nearest to the last received date."""
         if instant is None or self._reference is None:
             return 0
         day, clock = divmod(self._reference, DAY)
@@ -203,11 +302,11 @@ class EpochAssembler:
         return utime
 
 
-def merged(sentences: list[NmeaSentence], instant: int | None, utime: int) -> NmeaEpoch:
-    """Return what sentences of one instant say together.
+def merge_sentences(sentences: list[NmeaSentence], instant: int | None, utime: int) -> NmeaEpoch:
+    """Merge the sentences of one instant.
 
-    Where several say the same thing the more telling comes first: GGA and GNS before RMC before GLL for the position,
-    RMC before VTG for speed and course.
+    The more detailed sentence takes precedence: GGA and GNS before RMC before GLL for the position, RMC before VTG for
+    speed and course.
     """
     places = sorted(
         (each for each in sentences if each.has_position),
@@ -216,29 +315,29 @@ def merged(sentences: list[NmeaSentence], instant: int | None, utime: int) -> Nm
     motions = sorted(sentences, key=lambda each: each.kind != "RMC")
     last = list(reversed(sentences))
 
-    def said(name: str, among: list[NmeaSentence]) -> float:
+    def first_value(name: str, among: list[NmeaSentence]) -> float:
         return next((value for each in among if (value := float(getattr(each, name))) == value), NAN)
 
-    # the height goes with its own place, not with another sentence's
+    # the height belongs to its own sentence's position
     heights = [each for each in places if each.kind in ("GGA", "GNS")]
     return NmeaEpoch(
         start=sentences[0].start,
         kinds=tuple(each.kind for each in sentences),
         utime=utime,
         time_of_day=instant,
-        fix_type=fix_type(sentences),
-        latitude=said("latitude", places),
-        longitude=said("longitude", places),
-        height_msl=said("height_msl", heights),
-        undulation=said("undulation", heights),
-        satellites=satellites_used(sentences),
-        hdop=said("hdop", last),
-        vdop=said("vdop", last),
-        pdop=said("pdop", last),
-        speed=said("speed", motions),
-        track=said("track", motions),
-        heading=said("heading", last),
-        sigma_latitude=said("sigma_latitude", last),
-        sigma_longitude=said("sigma_longitude", last),
-        sigma_height=said("sigma_height", last),
+        fix_type=determine_fix_type(sentences),
+        latitude=first_value("latitude", places),
+        longitude=first_value("longitude", places),
+        height_msl=first_value("height_msl", heights),
+        undulation=first_value("undulation", heights),
+        satellites=count_satellites(sentences),
+        hdop=first_value("hdop", last),
+        vdop=first_value("vdop", last),
+        pdop=first_value("pdop", last),
+        speed=first_value("speed", motions),
+        track=first_value("track", motions),
+        heading=first_value("heading", last),
+        sigma_latitude=first_value("sigma_latitude", last),
+        sigma_longitude=first_value("sigma_longitude", last),
+        sigma_height=first_value("sigma_height", last),
     )

@@ -1,7 +1,7 @@
-"""Fields of NMEA 0183 sentences to numbers. An empty field is nothing said: nan or None, never zero.
+"""Parse the fields of NMEA 0183 sentences. An empty field is missing: nan or None, never zero.
 
 Raises ValueError with the field's text for what no receiver should write. pynmea2's own conversions are not used: they
-give 0 for a missing hemisphere, cut microseconds, refuse 23:59:60 and return the text where they fail.
+give 0 for a missing hemisphere, cut microseconds, reject 23:59:60 and return the text where they fail.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from datetime import date
 from modelserver.messages.flags import NAN
 
 KNOT = 1852.0 / 3600.0
-"""Metres per second."""
+"""Meters per second."""
 KMH = 1.0 / 3.6
 SECOND = 1_000_000
 
@@ -22,7 +22,7 @@ _ANGLE = re.compile(r"(\d{1,3}?)(\d\d(?:\.\d*)?)")
 _UNIX_DAY = date(1970, 1, 1).toordinal()
 
 
-def number(text: str) -> float:
+def parse_number(text: str) -> float:
     """Return a decimal number; nan for an empty field."""
     if not text:
         return NAN
@@ -31,7 +31,7 @@ def number(text: str) -> float:
     return float(text)
 
 
-def whole(text: str, least: int = 0, most: int = 1_000_000) -> int | None:
+def parse_integer(text: str, least: int = 0, most: int = 1_000_000) -> int | None:
     """Return an integer within bounds; None for an empty field."""
     if not text:
         return None
@@ -40,7 +40,7 @@ def whole(text: str, least: int = 0, most: int = 1_000_000) -> int | None:
     return int(text)
 
 
-def time_of_day(text: str) -> int | None:
+def parse_time_of_day(text: str) -> int | None:
     """Return microseconds since midnight of `hhmmss.ss`, up to 86401 s for 23:59:60.99; None for an empty field."""
     if not text:
         return None
@@ -55,22 +55,22 @@ def time_of_day(text: str) -> int | None:
     return (hours * 3600 + minutes * 60 + seconds) * SECOND + int(fraction)
 
 
-def days(day: int, month: int, year: int) -> int:
+def to_unix_days(day: int, month: int, year: int) -> int:
     """Return days since 1970-01-01. ValueError for a day that does not exist."""
     return date(year, month, day).toordinal() - _UNIX_DAY
 
 
-def date_of(text: str) -> int | None:
+def parse_date(text: str) -> int | None:
     """Return days since 1970 of `ddmmyy`, years from 1980 on; None for an empty field."""
     if not text:
         return None
     if len(text) != 6 or not text.isdecimal():
         raise ValueError(f"'{text}' is no date")
     year = int(text[4:])
-    return days(int(text[:2]), int(text[2:4]), year + (1900 if year >= 80 else 2000))
+    return to_unix_days(int(text[:2]), int(text[2:4]), year + (1900 if year >= 80 else 2000))
 
 
-def angle(text: str, side: str, sides: str, most: float) -> float:
+def parse_angle(text: str, side: str, sides: str, most: float) -> float:
     """Return signed degrees of `dddmm.mmmm` and its hemisphere; nan where both are empty.
 
     sides: the letters of the positive and the negative hemisphere. most: the largest angle, degrees.
@@ -87,17 +87,17 @@ def angle(text: str, side: str, sides: str, most: float) -> float:
     return degrees if side == sides[0] else -degrees
 
 
-def circle(text: str) -> float:
+def parse_direction(text: str) -> float:
     """Return a direction, degrees clockwise from north, 0 to 360; nan for an empty field."""
-    value = number(text)
+    value = parse_number(text)
     if value < 0.0 or value > 360.0:
         raise ValueError(f"'{text}' is no direction")
     return value
 
 
-def amount(text: str) -> float:
+def parse_nonnegative(text: str) -> float:
     """Return a number that cannot be negative; nan for an empty field."""
-    value = number(text)
+    value = parse_number(text)
     if value < 0.0:
         raise ValueError(f"'{text}' is negative")
     return value

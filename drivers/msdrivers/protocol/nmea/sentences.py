@@ -1,6 +1,6 @@
-"""One NMEA 0183 sentence: its frame, and what it says.
+"""Parse one NMEA 0183 sentence: frame and content.
 
-pynmea2 checks the sum, tells the talker and names the fields; their text is read by `fields`.
+pynmea2 checks the checksum and names the fields; `fields` parses their text.
 """
 
 from __future__ import annotations
@@ -12,26 +12,26 @@ from dataclasses import dataclass
 import pynmea2
 
 from modelserver.messages.flags import NAN
-from msdrivers.protocol.framing import CHANCE, Refused, Taken
+from msdrivers.protocol.framing import NO_FRAME, ParsedFrame, RejectedFrame
 from msdrivers.protocol.nmea import fields
 
-LONGEST = 164
-"""Characters from '$' to the checksum. The standard says 82 with the end of line; makers take more."""
+MAX_SENTENCE_BYTES = 164
+"""Characters from '$' to the checksum. The standard allows 82 with the end of line; receivers send more."""
 
 
 @dataclass(frozen=True, slots=True)
 class NmeaSentence:
-    """What a sentence says; nan, None or "" where it says nothing.
+    """Content of a sentence; nan, None or "" where missing.
 
     talker, kind: e.g. "GP" and "GGA". start: bytes from the beginning of the stream to its '$'.
     time_of_day: microseconds of UTC's day, 86,400 s and more inside a leap second. day: days since 1970-01-01.
-    latitude, longitude: degrees on WGS 84, or the receiver's own datum. height_msl, undulation: metres.
+    latitude, longitude: degrees on WGS 84, or the receiver's own datum. height_msl, undulation: meters.
     quality: GGA's indicator, 0 = no fix. status: "A" or "V" of RMC and GLL. mode: letters of the mode indicator, one
     per satellite system for GNS. dimension: 1 none, 2, 3, of GSA. satellites: the number in use, of GGA and GNS.
     listed: how many GSA names as in use.
     speed: m/s. track, heading: degrees clockwise from true north, of the motion and of the antenna baseline. Speed and
-    track are nan where the sentence says that they are not valid.
-    sigma_*: standard deviations along latitude, longitude and height, metres.
+    track are nan where the sentence flags them invalid.
+    sigma_*: standard deviations along latitude, longitude and height, meters.
     """
 
     talker: str
@@ -66,37 +66,39 @@ class NmeaSentence:
 
 
 class SentenceFormat:
-    """`$`, address, fields, `*` and two hexadecimal digits. Sentences without checksum are refused."""
+    """`$`, address, fields, `*` and two hexadecimal digits. Sentences without checksum are rejected."""
 
-    leads = b"$"
+    start_bytes = b"$"
     _body = re.compile(rb"\$[ -#%-)+-~]*")
     _sum = re.compile("[0-9A-Fa-f]{2}")
 
-    def scan(self, buffer: bytearray, at: int, start: int) -> Taken[NmeaSentence] | Refused | None:
-        """See `framing.Format`."""
-        body = self._body.match(buffer, at, at + LONGEST)
+    def scan(self, buffer: bytearray, at: int, start: int) -> ParsedFrame[NmeaSentence] | RejectedFrame | None:
+        """See `framing.FrameFormat`."""
+        body = self._body.match(buffer, at, at + MAX_SENTENCE_BYTES)
         assert body is not None
         end = body.end()
-        if end - at >= LONGEST:
-            return Refused("nmea_length")
+        if end - at >= MAX_SENTENCE_BYTES:
+            return RejectedFrame("nmea_length")
         if len(buffer) < end + 3 and (end == len(buffer) or buffer[end] == 0x2A):
             return None
         if buffer[end] != 0x2A or end - at < 6:
-            return Refused("nmea_unfinished") if buffer[end] in b"\r\n" and end - at > 6 else CHANCE
+            return RejectedFrame("nmea_incomplete") if buffer[end] in b"\r\n" and end - at > 6 else NO_FRAME
         text = buffer[at : end + 3].decode("latin-1")
         if not self._sum.fullmatch(text, end + 1 - at):
-            return Refused("nmea_checksum")
+            return RejectedFrame("nmea_checksum")
         if int(text[-2:], 16) != pynmea2.NMEASentence.checksum(text[1:-3]):
-            return Refused("nmea_checksum")
+            return RejectedFrame("nmea_checksum")
         try:
-            sentence = read(text, start)
+            sentence = parse_sentence(text, start)
         except ValueError:
-            return Refused("nmea_field")
-        return Taken(end + 3, f"nmea.{text[1:-3].partition(',')[0]}" if sentence else "nmea.unused", sentence)
+            return RejectedFrame("nmea_field")
+        return ParsedFrame(
+            end + 3, f"nmea.{text[1:-3].partition(',')[0]}" if sentence else "nmea.unsupported", sentence
+        )
 
 
-def read(text: str, start: int = 0) -> NmeaSentence | None:
-    """Return what `$...*hh` says; None for a sentence that is not used here.
+def parse_sentence(text: str, start: int = 0) -> NmeaSentence | None:
+    """Parse `$...*hh`; None for a sentence that is not supported.
 
     Raises:
         ValueError: a field is not what it should be, or the checksum is wrong.
@@ -108,11 +110,11 @@ def read(text: str, start: int = 0) -> NmeaSentence | None:
 
 
 VALID_MODES = frozenset("APDRFE")
-"""Letters of the mode indicator that say measured: M is typed in, S simulated, N not valid."""
+"""Letters of the mode indicator for measured data: M is manual input, S simulated, N not valid."""
 
 
-def _is_valid(mode: str) -> bool:
-    """Whether a mode indicator says that speed and course are measured; before NMEA 2.3 there was none."""
+def _is_valid_mode(mode: str) -> bool:
+    """Whether speed and course are measured by the mode indicator; before NMEA 2.3 there was none."""
     return not mode or mode in VALID_MODES
 
 
@@ -128,12 +130,12 @@ class _Fields:
         index = self._index[name]
         return self._data[index] if index < len(self._data) else ""
 
-    def place(self, valid: bool) -> tuple[float, float]:
-        """Latitude and longitude, degrees. Where there is no fix, receivers fill in what cannot be: nothing said."""
+    def parse_position(self, valid: bool) -> tuple[float, float]:
+        """Latitude and longitude, degrees. Where there is no fix, receivers fill in what cannot be: nothing raw."""
         try:
             return (
-                fields.angle(self["lat"], self["lat_dir"], "NS", 90.0),
-                fields.angle(self["lon"], self["lon_dir"], "EW", 180.0),
+                fields.parse_angle(self["lat"], self["lat_dir"], "NS", 90.0),
+                fields.parse_angle(self["lon"], self["lon_dir"], "EW", 180.0),
             )
         except ValueError:
             if valid:
@@ -141,52 +143,55 @@ class _Fields:
             return NAN, NAN
 
 
-def _gga(said: _Fields, start: int) -> NmeaSentence:
-    latitude, longitude = said.place(valid=said["gps_qual"] != "0")
+def _parse_gga(raw: _Fields, start: int) -> NmeaSentence:
+    latitude, longitude = raw.parse_position(valid=raw["gps_qual"] != "0")
     return NmeaSentence(
-        said.talker,
+        raw.talker,
         "GGA",
         start,
-        time_of_day=fields.time_of_day(said["timestamp"]),
+        time_of_day=fields.parse_time_of_day(raw["timestamp"]),
         latitude=latitude,
         longitude=longitude,
-        quality=fields.whole(said["gps_qual"], most=9),
-        satellites=fields.whole(said["num_sats"], most=999),
-        hdop=fields.amount(said["horizontal_dil"]),
-        height_msl=fields.number(said["altitude"]),
-        undulation=fields.number(said["geo_sep"]),
+        quality=fields.parse_integer(raw["gps_qual"], most=9),
+        satellites=fields.parse_integer(raw["num_sats"], most=999),
+        hdop=fields.parse_nonnegative(raw["horizontal_dil"]),
+        height_msl=fields.parse_number(raw["altitude"]),
+        undulation=fields.parse_number(raw["geo_sep"]),
     )
 
 
-def _gns(said: _Fields, start: int) -> NmeaSentence:
-    latitude, longitude = said.place(valid=said["mode_indicator"].strip("N") != "")
+def _parse_gns(raw: _Fields, start: int) -> NmeaSentence:
+    latitude, longitude = raw.parse_position(valid=raw["mode_indicator"].strip("N") != "")
     return NmeaSentence(
-        said.talker,
+        raw.talker,
         "GNS",
         start,
-        time_of_day=fields.time_of_day(said["timestamp"]),
+        time_of_day=fields.parse_time_of_day(raw["timestamp"]),
         latitude=latitude,
         longitude=longitude,
-        mode=said["mode_indicator"],
-        satellites=fields.whole(said["num_sats"], most=999),
-        hdop=fields.amount(said["hdop"]),
-        height_msl=fields.number(said["altitude"]),
-        undulation=fields.number(said["geo_sep"]),
+        mode=raw["mode_indicator"],
+        satellites=fields.parse_integer(raw["num_sats"], most=999),
+        hdop=fields.parse_nonnegative(raw["hdop"]),
+        height_msl=fields.parse_number(raw["altitude"]),
+        undulation=fields.parse_number(raw["geo_sep"]),
     )
 
 
-def _rmc(said: _Fields, start: int) -> NmeaSentence:
-    latitude, longitude = said.place(valid=said["status"] != "V")
-    speed, track = fields.amount(said["spd_over_grnd"]) * fields.KNOT, fields.circle(said["true_course"])
-    moves = (said["status"] == "A" and _is_valid(said["mode_indicator"])) or said["mode_indicator"] == "E"
+def _parse_rmc(raw: _Fields, start: int) -> NmeaSentence:
+    latitude, longitude = raw.parse_position(valid=raw["status"] != "V")
+    speed, track = (
+        fields.parse_nonnegative(raw["spd_over_grnd"]) * fields.KNOT,
+        fields.parse_direction(raw["true_course"]),
+    )
+    moves = (raw["status"] == "A" and _is_valid_mode(raw["mode_indicator"])) or raw["mode_indicator"] == "E"
     return NmeaSentence(
-        said.talker,
+        raw.talker,
         "RMC",
         start,
-        time_of_day=fields.time_of_day(said["timestamp"]),
-        day=fields.date_of(said["datestamp"]),
-        status=said["status"],
-        mode=said["mode_indicator"],
+        time_of_day=fields.parse_time_of_day(raw["timestamp"]),
+        day=fields.parse_date(raw["datestamp"]),
+        status=raw["status"],
+        mode=raw["mode_indicator"],
         latitude=latitude,
         longitude=longitude,
         speed=speed if moves else NAN,
@@ -194,45 +199,45 @@ def _rmc(said: _Fields, start: int) -> NmeaSentence:
     )
 
 
-def _gll(said: _Fields, start: int) -> NmeaSentence:
-    latitude, longitude = said.place(valid=said["status"] != "V")
+def _parse_gll(raw: _Fields, start: int) -> NmeaSentence:
+    latitude, longitude = raw.parse_position(valid=raw["status"] != "V")
     return NmeaSentence(
-        said.talker,
+        raw.talker,
         "GLL",
         start,
-        time_of_day=fields.time_of_day(said["timestamp"]),
-        status=said["status"],
-        mode=said["faa_mode"],
+        time_of_day=fields.parse_time_of_day(raw["timestamp"]),
+        status=raw["status"],
+        mode=raw["faa_mode"],
         latitude=latitude,
         longitude=longitude,
     )
 
 
-def _vtg(said: _Fields, start: int) -> NmeaSentence:
-    knots = fields.amount(said["spd_over_grnd_kts"]) * fields.KNOT
-    kmh = fields.amount(said["spd_over_grnd_kmph"]) * fields.KMH
-    speed, track = knots if knots == knots else kmh, fields.circle(said["true_track"])
-    moves = _is_valid(said["faa_mode"])
+def _parse_vtg(raw: _Fields, start: int) -> NmeaSentence:
+    knots = fields.parse_nonnegative(raw["spd_over_grnd_kts"]) * fields.KNOT
+    kmh = fields.parse_nonnegative(raw["spd_over_grnd_kmph"]) * fields.KMH
+    speed, track = knots if knots == knots else kmh, fields.parse_direction(raw["true_track"])
+    moves = _is_valid_mode(raw["faa_mode"])
     return NmeaSentence(
-        said.talker,
+        raw.talker,
         "VTG",
         start,
         track=track if moves else NAN,
         speed=speed if moves else NAN,
-        mode=said["faa_mode"],
+        mode=raw["faa_mode"],
     )
 
 
-def _gsa(said: _Fields, start: int) -> NmeaSentence:
+def _parse_gsa(raw: _Fields, start: int) -> NmeaSentence:
     return NmeaSentence(
-        said.talker,
+        raw.talker,
         "GSA",
         start,
-        dimension=fields.whole(said["mode_fix_type"], 1, 3),
-        listed=sum(bool(said[name]) for name in _LISTED),
-        pdop=fields.amount(said["pdop"]),
-        hdop=fields.amount(said["hdop"]),
-        vdop=fields.amount(said["vdop"]),
+        dimension=fields.parse_integer(raw["mode_fix_type"], 1, 3),
+        listed=sum(bool(raw[name]) for name in _LISTED),
+        pdop=fields.parse_nonnegative(raw["pdop"]),
+        hdop=fields.parse_nonnegative(raw["hdop"]),
+        vdop=fields.parse_nonnegative(raw["vdop"]),
     )
 
 
@@ -240,46 +245,46 @@ _LISTED = tuple(f"sv_id{number:02d}" for number in range(1, 13))
 """Fields of GSA with the satellites in use."""
 
 
-def _gst(said: _Fields, start: int) -> NmeaSentence:
+def _parse_gst(raw: _Fields, start: int) -> NmeaSentence:
     return NmeaSentence(
-        said.talker,
+        raw.talker,
         "GST",
         start,
-        time_of_day=fields.time_of_day(said["timestamp"]),
-        sigma_latitude=fields.amount(said["std_dev_latitude"]),
-        sigma_longitude=fields.amount(said["std_dev_longitude"]),
-        sigma_height=fields.amount(said["std_dev_altitude"]),
+        time_of_day=fields.parse_time_of_day(raw["timestamp"]),
+        sigma_latitude=fields.parse_nonnegative(raw["std_dev_latitude"]),
+        sigma_longitude=fields.parse_nonnegative(raw["std_dev_longitude"]),
+        sigma_height=fields.parse_nonnegative(raw["std_dev_altitude"]),
     )
 
 
-def _hdt(said: _Fields, start: int) -> NmeaSentence:
-    return NmeaSentence(said.talker, "HDT", start, heading=fields.circle(said["heading"]))
+def _parse_hdt(raw: _Fields, start: int) -> NmeaSentence:
+    return NmeaSentence(raw.talker, "HDT", start, heading=fields.parse_direction(raw["heading"]))
 
 
-def _zda(said: _Fields, start: int) -> NmeaSentence:
-    day = fields.whole(said["day"], 1, 31)
-    month = fields.whole(said["month"], 1, 12)
-    year = fields.whole(said["year"], 1980, 9999)
-    known = None if day is None or month is None or year is None else fields.days(day, month, year)
+def _parse_zda(raw: _Fields, start: int) -> NmeaSentence:
+    day = fields.parse_integer(raw["day"], 1, 31)
+    month = fields.parse_integer(raw["month"], 1, 12)
+    year = fields.parse_integer(raw["year"], 1980, 9999)
+    known = None if day is None or month is None or year is None else fields.to_unix_days(day, month, year)
     return NmeaSentence(
-        said.talker,
+        raw.talker,
         "ZDA",
         start,
-        time_of_day=fields.time_of_day(said["timestamp"]),
+        time_of_day=fields.parse_time_of_day(raw["timestamp"]),
         day=known,
     )
 
 
 _READERS: dict[str, Callable[[_Fields, int], NmeaSentence]] = {
-    "GGA": _gga,
-    "GNS": _gns,
-    "RMC": _rmc,
-    "GLL": _gll,
-    "VTG": _vtg,
-    "GSA": _gsa,
-    "GST": _gst,
-    "HDT": _hdt,
-    "ZDA": _zda,
+    "GGA": _parse_gga,
+    "GNS": _parse_gns,
+    "RMC": _parse_rmc,
+    "GLL": _parse_gll,
+    "VTG": _parse_vtg,
+    "GSA": _parse_gsa,
+    "GST": _parse_gst,
+    "HDT": _parse_hdt,
+    "ZDA": _parse_zda,
 }
 KINDS = frozenset(_READERS)
 """The sentences that are read."""

@@ -1,6 +1,13 @@
-"""NovAtel OEM4 and its heirs: logs in binary and ASCII, answers to commands, prompts."""
+"""NovAtel OEM4 and successors: logs in binary and ASCII, command responses, prompts."""
 
-from msdrivers.protocol.novatel.frames import Answer, AsciiFormat, BinaryFormat, Prompt, PromptFormat, TextFormat
+from msdrivers.protocol.novatel.frames import (
+    AsciiFormat,
+    BinaryFormat,
+    CommandResponse,
+    Prompt,
+    PromptFormat,
+    TextFormat,
+)
 from msdrivers.protocol.novatel.logs import (
     HeadingLog,
     LogHeader,
@@ -14,9 +21,9 @@ from msdrivers.protocol.novatel.logs import (
 )
 
 __all__ = [
-    "Answer",
     "AsciiFormat",
     "BinaryFormat",
+    "CommandResponse",
     "HeadingLog",
     "LogHeader",
     "NovatelLog",

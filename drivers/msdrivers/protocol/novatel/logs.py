@@ -1,5 +1,5 @@
-"""What NovAtel logs say, with the names of the OEM4 family's manuals. Numbers that a receiver newer than these tables
-uses stay plain numbers."""
+"""Contents of NovAtel logs, with the names of the OEM4 family's manuals. Numbers that are not in these tables, of newer
+receivers, stay plain numbers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeAlias
 
 
 class TimeStatus(IntEnum):
-    """How well the receiver knows GPS time."""
+    """Quality of the receiver's GPS time."""
 
     UNKNOWN = 20
     APPROXIMATE = 60
@@ -43,7 +43,7 @@ class SolutionStatus(IntEnum):
 
 
 class PositionType(IntEnum):
-    """What a position or velocity rests on."""
+    """Type of a position or velocity solution."""
 
     NONE = 0
     FIXEDPOS = 1
@@ -83,10 +83,10 @@ class PositionType(IntEnum):
 
 
 class LogHeader(NamedTuple):
-    """What stands before every log.
+    """Header of a log.
 
     name: e.g. "BESTPOS", or "id 1234" for an unknown binary log. week may be rolled over, see `gps_time`.
-    milliseconds: of the week. time_status: a `TimeStatus`; of a short header UNKNOWN, for it tells none.
+    milliseconds: of the week. time_status: a `TimeStatus`; UNKNOWN for a short header.
     port: as ASCII names it, or the binary address's number. antenna: the measurement source, 0 for the primary antenna,
     1 for the secondary one; ASCII writes it as a suffix of the name (`BESTPOSA_1`).
     """
@@ -98,17 +98,17 @@ class LogHeader(NamedTuple):
     port: str
     sequence: int
     receiver_status: int
-    binary: bool
+    is_binary: bool
     antenna: int = 0
 
     @property
     def label(self) -> str:
         """The name as receivers write it: `BESTPOSB`, `BESTPOSA_1`."""
-        return f"{self.name}{'B' if self.binary else 'A'}{f'_{self.antenna}' if self.antenna else ''}"
+        return f"{self.name}{'B' if self.is_binary else 'A'}{f'_{self.antenna}' if self.antenna else ''}"
 
 
 class Position(NamedTuple):
-    """Body of BESTPOS, PSRPOS and RTKPOS. Degrees; metres; ages in seconds; sigmas along north, east and up.
+    """Body of BESTPOS, PSRPOS and RTKPOS. Degrees; meters; ages in seconds; sigmas along north, east and up.
 
     height is above mean sea level; above the ellipsoid it is `height + undulation`.
     """
@@ -144,7 +144,7 @@ class Velocity(NamedTuple):
 
 
 class UtmPosition(NamedTuple):
-    """Body of BESTUTM. Metres; zone by number and letter; otherwise as `Position`."""
+    """Body of BESTUTM. Meters; zone by number and letter; otherwise as `Position`."""
 
     status: int
     type: int
@@ -168,7 +168,7 @@ class UtmPosition(NamedTuple):
 class HeadingLog(NamedTuple):
     """Body of HEADING and HEADING2: from the antenna whose position is given to the other one.
 
-    length: metres, -1 where it is not known. Degrees; heading clockwise from true north.
+    length: meters, -1 if unknown. Degrees; heading clockwise from true north.
     """
 
     status: int
@@ -215,7 +215,7 @@ MESSAGE_IDS = {
     1465: "INSPVAX",
 }
 
-GREATEST_ANTENNA = 31
+MAX_ANTENNA = 31
 """The largest measurement source: five bits of a binary log's message type."""
 
 DATUMS = {"WGS84": 61}

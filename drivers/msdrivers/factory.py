@@ -1,0 +1,130 @@
+"""Make drivers, emulators, links and unit codecs from the settings of a driver."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import struct
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, get_args
+
+from modelserver.config.reader import get_adapter
+from modelserver.errors import ConfigError
+from msdrivers.endpoint import Endpoint
+from msdrivers.fault_injection import InjectedFault
+from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings, TcpSettings, split_address
+from msdrivers.links import Link
+from msdrivers.protocol.can.frame import CanFrame
+from msdrivers.protocol.modbus.registers import ModbusUnit
+from msdrivers.raw_log import BytesCodec, UnitCodec
+from msdrivers.registry import EmulatorInputs
+from msdrivers.settings import BAUDS_FIELD, DriverSettings
+
+_CAN_HEADER = struct.Struct(">IB")
+
+_EXTENDED_FLAG, _ERROR_FLAG = 1, 2
+
+
+class CanFrameCodec:
+    """A CAN frame: its identifier, 4 bytes, most significant first; flags, 1 byte (1 extended, 2 error); its data."""
+
+    name = "can"
+
+    def pack(self, unit: CanFrame) -> bytes:
+        """Return the bytes of a frame."""
+        flags = _EXTENDED_FLAG * unit.is_extended + _ERROR_FLAG * unit.is_error
+        return _CAN_HEADER.pack(unit.arbitration_id, flags) + unit.data
+
+    def unpack(self, data: bytes) -> CanFrame:
+        """Return the frame of bytes. Raises ValueError for fewer than a frame has."""
+        if len(data) < _CAN_HEADER.size:
+            raise ValueError(f"{len(data)} bytes are no CAN frame")
+        identifier, flags = _CAN_HEADER.unpack_from(data)
+        return CanFrame(identifier, data[_CAN_HEADER.size :], bool(flags & _EXTENDED_FLAG), bool(flags & _ERROR_FLAG))
+
+
+class ModbusCodec:
+    """A Modbus request, reply or failure, as JSON: its kind and its fields."""
+
+    name = "modbus"
+
+    def pack(self, unit: ModbusUnit) -> bytes:
+        """Return the bytes of a unit."""
+        fields = {each.name: getattr(unit, each.name) for each in dataclasses.fields(unit)}
+        return json.dumps([type(unit).__name__, fields], default=lambda each: each.value).encode()
+
+    def unpack(self, data: bytes) -> ModbusUnit:
+        """Return the unit of bytes. Raises ValueError for bytes that are none."""
+        try:
+            name, fields = json.loads(data)
+            kind = _MODBUS_TYPES[name]
+            unit: ModbusUnit = get_adapter(kind).validate_python(fields)
+        except (TypeError, KeyError) as error:
+            raise ValueError(f"no Modbus unit: {error}") from None
+        return unit
+
+
+_MODBUS_TYPES: Mapping[str, Any] = {kind.__name__: kind for kind in get_args(ModbusUnit)}
+
+
+def make_codec(settings: DriverSettings) -> UnitCodec[Any]:
+    """Return how the units of a driver's line are recorded."""
+    if isinstance(settings.line, CanSettings):
+        return CanFrameCodec()
+    return ModbusCodec() if isinstance(settings.line, ModbusSettings) else BytesCodec()
+
+
+def make_link(settings: DriverSettings) -> Link[Any]:
+    """Return a driver's line, not opened yet."""
+    line = settings.line
+    # each kind of line needs another library, and some of them are slow to load
+    if isinstance(line, SerialSettings):
+        from msdrivers.links.serial_port import SerialLink
+
+        return SerialLink(line.port, choose_first_baud(settings))
+    if isinstance(line, TcpSettings):
+        from msdrivers.links.tcp import TcpLink
+
+        return TcpLink(*split_address(line.address))
+    if isinstance(line, CanSettings):
+        from msdrivers.links.can_bus import CanLink
+
+        return CanLink(line.can, line.interface, line.bitrate)
+    from msdrivers.links.modbus import make_modbus_link
+
+    return make_modbus_link(*split_address(line.address), line.unit_id)
+
+
+def choose_first_baud(settings: DriverSettings) -> int:
+    """Return the rate to open a serial port at: the first to be tried, the port's, or the maker's."""
+    bauds = getattr(settings.device_settings, BAUDS_FIELD, ())
+    given = settings.line.baud if isinstance(settings.line, SerialSettings) else 0
+    return bauds[0] if bauds else given or settings.kind.baud
+
+
+def make_driver(driver: DriverSettings, folder: Path) -> Endpoint[Any]:
+    """Return a driver's station; paths in its settings start from `folder`. Raises ConfigError."""
+    with _locate_errors(driver):
+        return driver.kind.load().make_driver(driver.device_settings, folder)
+
+
+def make_emulator(
+    driver: DriverSettings,
+    folder: Path,
+    samples: Iterable[Any],
+    faults: tuple[InjectedFault, ...] = (),
+    memory: Path | None = None,
+) -> Endpoint[Any]:
+    """Return the endpoint of the emulated device; see `EmulatorInputs`. Raises ConfigError."""
+    with _locate_errors(driver):
+        return driver.kind.make_emulator(EmulatorInputs(driver.device_settings, folder, samples, faults, memory))
+
+
+@contextmanager
+def _locate_errors(driver: DriverSettings) -> Iterator[None]:
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(driver.source_map.locate_problems(driver.name, error.problems)) from None

@@ -1,0 +1,160 @@
+"""Fault injection for emulated devices: parsing of faults, and a wrapper that applies them to any endpoint."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Generic, TypeVar
+
+from modelserver.errors import find_nearest_names, quote
+from msdrivers.emulate import InjectedFault as InjectedFault
+from msdrivers.endpoint import Endpoint, EndpointPhase, EndpointStatus, HostTime, Output, Send
+from msdrivers.protocol.can.frame import CanFrame
+from msdrivers.protocol.modbus.registers import Registers
+
+FAULT_AMOUNTS: Mapping[str, str] = {
+    "drop": "units that are lost",
+    "corrupt": "units that arrive damaged",
+    "stall": "seconds of silence",
+    "restart": "seconds that a restart takes",
+    "jump": "seconds by which its time jumps ahead",
+}
+"""Kinds of faults and the default meaning of their amounts."""
+
+
+def parse_fault(text: str, known: Mapping[str, str] = FAULT_AMOUNTS) -> InjectedFault:
+    """Return the fault of `KIND@SECONDS[:AMOUNT]`, one of the `known` kinds.
+
+    Raises ValueError for a malformed text.
+    """
+    kind, at_sign, when = text.partition("@")
+    if not at_sign:
+        raise ValueError(f"{quote(text, 40)} is not of the form KIND@SECONDS[:AMOUNT], e.g. stall@10:2")
+    if kind not in known:
+        near = find_nearest_names(kind, known)
+        kinds = "; ".join(f"{name}: {amount}" for name, amount in known.items())
+        hint = f"did you mean {near[0]}?" if near else f"there are, with their amounts: {kinds}"
+        raise ValueError(f"{quote(kind, 40)} is no fault; {hint}")
+    at, _, amount = when.partition(":")
+    try:
+        fault = InjectedFault(float(at), kind, float(amount) if amount else 1.0)
+    except ValueError:
+        raise ValueError(f"{quote(when, 40)} is not of the form SECONDS[:AMOUNT], e.g. 10:2") from None
+    if not (0.0 <= fault.at < 1e9 and 0.0 < fault.amount < 1e9):
+        raise ValueError(f"{quote(when, 40)}: seconds are 0 or more, an amount is above 0")
+    return fault
+
+
+U = TypeVar("U")
+
+
+class FaultInjector(Generic[U]):
+    """An `Endpoint` that wraps another and drops, corrupts or delays its output, restarts it, or shifts its clock.
+
+    `make` returns the device as after power-on.
+    """
+
+    def __init__(self, make: Callable[[], Endpoint[U]], faults: Sequence[InjectedFault]):
+        self._make = make
+        self._inner = make()
+        self._faults = sorted(faults, key=lambda fault: fault.at, reverse=True)
+        self._started_ns: int | None = None
+        self._silent_until_ns = 0
+        self._is_restarting = False
+        self._clock_jump_ns = 0
+        self._pending: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
+
+    def on_open(self, now: HostTime) -> Sequence[Output[U]]:
+        """Power on."""
+        if self._started_ns is None:
+            self._started_ns = now.monotonic_ns
+        return self._filter_outputs(self._inner.on_open(self._to_device_time(now)), now)
+
+    def on_receive(self, unit: U, now: HostTime) -> Sequence[Output[U]]:
+        """Pass on a received unit unless the device is silent."""
+        struck = self._apply_due_faults(now)
+        if now.monotonic_ns < self._silent_until_ns:
+            return struck
+        return [*struck, *self._filter_outputs(self._inner.on_receive(unit, self._to_device_time(now)), now)]
+
+    def on_timer(self, now: HostTime) -> Sequence[Output[U]]:
+        """Apply due faults; fire the device's timer."""
+        outputs = list(self._apply_due_faults(now))
+        if self._is_restarting and now.monotonic_ns >= self._silent_until_ns:
+            self._is_restarting = False
+            self._inner = self._make()
+            outputs += self._filter_outputs(self._inner.on_open(self._to_device_time(now)), now)
+        due = self._inner.get_deadline()
+        if not self._is_restarting and due is not None and now.monotonic_ns + self._clock_jump_ns >= due:
+            outputs += self._filter_outputs(self._inner.on_timer(self._to_device_time(now)), now)
+        return outputs
+
+    def get_deadline(self) -> int | None:
+        """Return when the device, or a fault, is due."""
+        due = None if self._is_restarting else self._inner.get_deadline()
+        dues = [due - self._clock_jump_ns] if due is not None else []
+        if self._is_restarting:
+            dues.append(self._silent_until_ns)
+        if self._faults and self._started_ns is not None:
+            dues.append(self._started_ns + round(self._faults[-1].at * 1e9))
+        return min(dues, default=None)
+
+    def on_close(self, now: HostTime) -> Sequence[Output[U]]:
+        """Close the device."""
+        return self._filter_outputs(self._inner.on_close(self._to_device_time(now)), now)
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """The device's counters, and the units that faults took or damaged."""
+        return {**self._inner.counts, **self._counts}
+
+    def _to_device_time(self, now: HostTime) -> HostTime:
+        return HostTime(now.monotonic_ns + self._clock_jump_ns, now.utime + self._clock_jump_ns // 1000)
+
+    def _apply_due_faults(self, now: HostTime) -> list[Output[U]]:
+        outputs: list[Output[U]] = []
+        since = 0 if self._started_ns is None else now.monotonic_ns - self._started_ns
+        while self._faults and round(self._faults[-1].at * 1e9) <= since:
+            fault = self._faults.pop()
+            amount_ns = round(fault.amount * 1e9)
+            if fault.kind in ("stall", "restart"):
+                self._silent_until_ns = now.monotonic_ns + amount_ns
+                self._is_restarting = self._is_restarting or fault.kind == "restart"
+            elif fault.kind == "jump":
+                self._clock_jump_ns += amount_ns
+            else:
+                self._pending[fault.kind] += round(fault.amount)
+            outputs.append(EndpointStatus(EndpointPhase.STREAMING, f"fault: {fault.kind}, {fault.amount:g}"))
+        return outputs
+
+    def _filter_outputs(self, outputs: Sequence[Output[U]], now: HostTime) -> list[Output[U]]:
+        passed: list[Output[U]] = []
+        for output in outputs:
+            if not isinstance(output, Send):
+                passed.append(output)
+            elif now.monotonic_ns < self._silent_until_ns:
+                self._counts["fault.silenced"] += 1
+            elif self._pending["drop"] > 0:
+                self._pending["drop"] -= 1
+                self._counts["fault.dropped"] += 1
+            elif self._pending["corrupt"] > 0:
+                self._pending["corrupt"] -= 1
+                self._counts["fault.corrupted"] += 1
+                passed.append(Send(corrupt_unit(output.unit)))
+            else:
+                passed.append(output)
+        return passed
+
+
+def corrupt_unit(unit: Any) -> Any:
+    """Return a unit with one bit flipped in its middle; one without anything in it as it is."""
+    if isinstance(unit, bytes):
+        middle = len(unit) // 2
+        return unit[:middle] + bytes((unit[middle] ^ 0x10,)) + unit[middle + 1 :] if unit else unit
+    if isinstance(unit, CanFrame):
+        return replace(unit, data=corrupt_unit(unit.data))
+    if isinstance(unit, Registers) and unit.values:
+        return replace(unit, values=(unit.values[0] ^ 0x10, *unit.values[1:]))
+    return unit

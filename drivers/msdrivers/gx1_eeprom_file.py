@@ -1,0 +1,51 @@
+"""The EEPROM of an emulated 3DM-GX1 in a file, so that it survives a restart of the emulator.
+
+The file is text: a word on each line, its address and its value in decimal.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from modelserver.errors import ModelServerError, quote
+from modelserver.files.regular import read_regular
+from msdrivers.emulate.gx1_unit import Eeprom
+
+MAX_EEPROM_FILE_BYTES = 1 << 16
+"""The EEPROM has 128 words; a larger file is rejected."""
+
+
+def read_eeprom(path: Path) -> Eeprom:
+    """Return the memory in a file, that of a new device where there is none.
+
+    Raises ModelServerError for a file that holds something else, OSError for one that cannot be read.
+    """
+    try:
+        text = read_regular(path, MAX_EEPROM_FILE_BYTES).decode("ascii", errors="replace")
+    except FileNotFoundError:
+        return Eeprom.make_factory()
+    words: dict[int, int] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        fields = line.split()
+        if len(fields) != 2 or not all(field.isascii() and field.isdecimal() for field in fields):
+            raise _make_error(path, number, line)
+        address, value = map(int, fields)
+        if address % 2 or address > 254 or value > 0xFFFF:
+            raise _make_error(path, number, line)
+        words[address] = value
+    return Eeprom().write(words)
+
+
+def write_eeprom(path: Path, eeprom: Eeprom) -> None:
+    """Write the memory to a file, which is whole at any time. Raises OSError."""
+    beside = path.with_name(f"{path.name}.new")
+    beside.write_text("".join(f"{2 * n} {word}\n" for n, word in enumerate(eeprom.words)), encoding="ascii")
+    os.replace(beside, path)
+
+
+def _make_error(path: Path, number: int, line: str) -> ModelServerError:
+    return ModelServerError(
+        f"{path}, line {number}: {quote(line, 40)} is no EEPROM word (an even address up to 254 and a value up to "
+        "65535); give the file that an emulator has written, or one that is not there yet"
+    )

@@ -1,0 +1,230 @@
+"""Serial ports: the link of a driver, and diagnostics of the ports of this machine (permissions, users, names)."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import getpass
+import glob
+import grp
+import os
+import termios
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import serial
+from serial.tools import list_ports
+
+from modelserver.errors import find_nearest_names
+from msdrivers.links import LinkError
+from msdrivers.links.descriptors import make_lost_error, read_available, wait_readable
+
+MAX_COMMAND_LENGTH = 60
+"""Characters of a process's command line that are shown."""
+
+
+class PortInfo(NamedTuple):
+    """Path and description of a port, and a hint if it cannot be used."""
+
+    path: str
+    description: str
+    hint: str
+
+
+def find_ports() -> list[PortInfo]:
+    """Return the serial ports found, those with something plugged in first."""
+    ports = sorted(list_ports.comports(), key=lambda port: (port.vid is None, port.device))
+    return [PortInfo(port.device, _describe_port(port), find_access_problem(port.device)) for port in ports]
+
+
+def _describe_port(port: object) -> str:
+    """Return the port's USB description; pyserial writes n/a for an empty field."""
+    parts = [str(getattr(port, name) or "") for name in ("description", "manufacturer", "serial_number")]
+    known = [part for part in dict.fromkeys(parts) if part and part != "n/a"]
+    return ", ".join(known) or "no description"
+
+
+def suggest_ports(path: str) -> tuple[str, ...]:
+    """Return the ports that a missing one may have been meant for: of the same name but its number, or by their id.
+
+    A name of the same letters counts as the same: /dev/ttyUBS0. Others are no help: /dev/ttyS0 is always there.
+    """
+    known = [port.path for port in find_ports() if _name_letters(port.path) == _name_letters(path)]
+    return (*find_nearest_names(path, known), *sorted(glob.glob("/dev/serial/by-id/*")))
+
+
+def _name_letters(path: str) -> list[str]:
+    return sorted(path.rstrip("0123456789"))
+
+
+def find_access_problem(path: str) -> str:
+    """Return what keeps this user from a port, empty where nothing does."""
+    try:
+        if not os.access(path, os.R_OK | os.W_OK):
+            return explain_permission(path)
+    except OSError:
+        return ""
+    users = [holder for holder in find_users(path) if not holder.startswith(f"process {os.getpid()} ")]
+    return f"in use by {', '.join(users)}" if users else ""
+
+
+def explain_permission(path: str) -> str:
+    """Return how this user gets to use a port: the command that joins its group, or a rule that gives it one."""
+    try:
+        status, group = get_owner(path)
+    except (OSError, KeyError):
+        return "give this user read and write access to it"
+    if status.st_gid != 0 and status.st_mode & 0o060 == 0o060:
+        return f"it belongs to group {group}: sudo usermod -aG {group} {_get_user()}, then log in again"
+    rule = f'KERNEL=="{os.path.basename(path)}", GROUP="dialout", MODE="0660"'
+    return (
+        f"no group but root's may use it: write {rule} into /etc/udev/rules.d/99-serial.rules, "
+        f"sudo usermod -aG dialout {_get_user()}, plug it in again and log in again"
+    )
+
+
+def get_owner(path: str) -> tuple[os.stat_result, str]:
+    """Return a file's status and the name of its group. Raises OSError, KeyError for a group without name."""
+    status = os.stat(path)
+    return status, grp.getgrgid(status.st_gid).gr_name
+
+
+def _get_user() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):
+        return "$USER"
+
+
+def find_users(path: str) -> list[str]:
+    """Return the processes that have a port open, as far as this user may see.
+
+    Of a pseudo-terminal that is who has it as a port; the emulator at its other end only where there is nobody else.
+    """
+    real = os.path.realpath(path)
+    found = list(_find_processes(real))
+    return [_describe_process(each) for each in [each for each in found if not _has_emulator_end(each, real)] or found]
+
+
+def find_emulators(path: str) -> list[str]:
+    """Return the emulators that speak on a pseudo-terminal: they have both its ends open, which no terminal does."""
+    return [_describe_process(each) for each in _find_processes(path) if _has_emulator_end(each, path)]
+
+
+def _find_processes(real: str) -> Iterator[Path]:
+    """Yield the processes that have a file open, as their folders below /proc."""
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            if any(os.readlink(each) == real for each in (process / "fd").iterdir()):
+                yield process
+        except OSError:
+            # gone meanwhile, or another user's
+            continue
+
+
+def _has_emulator_end(process: Path, path: str) -> bool:
+    """Return whether a process has the other end of the pseudo-terminal `path` too."""
+    line = f"tty-index:\t{path.rpartition('/')[2]}\n"
+    try:
+        return any(line in each.read_text() for each in (process / "fdinfo").iterdir())
+    except OSError:
+        return False
+
+
+def _describe_process(process: Path) -> str:
+    """Return a process's number, and its command line as it is typed: without folders and a script's interpreter."""
+    try:
+        words = (process / "cmdline").read_text(errors="replace").rstrip("\0").split("\0")
+        name = (process / "comm").read_text(errors="replace").strip()
+    except OSError:
+        return f"process {process.name}"
+    if os.path.basename(words[0]).startswith("python") and len(words) > 1:
+        # the code of -c is no name of a program
+        words = ["python", *words[3:]] if words[1] == "-c" else words[1:]
+    text = " ".join((os.path.basename(words[0]) or name, *words[1:]))
+    if len(text) > MAX_COMMAND_LENGTH:
+        text = f"{text[:MAX_COMMAND_LENGTH]}..."
+    return f"process {process.name} ({text})"
+
+
+DRAIN_ATTEMPTS, DRAIN_INTERVAL_S = 50, 0.01
+"""Number and interval, seconds, of the checks whether the output is drained."""
+
+
+class SerialLink:
+    """A serial port, 8 data bits, no parity, 1 stop bit, for this process alone."""
+
+    def __init__(self, port: str, baud: int):
+        self.description = port
+        self.baud = baud
+        self._serial: serial.Serial | None = None
+
+    def open(self, baud: int | None = None) -> None:
+        """Open the port. Raises LinkError that names the process which holds it."""
+        self.baud = baud or self.baud
+        try:
+            self._serial = serial.Serial(self.description, self.baud, timeout=0, write_timeout=1.0, exclusive=True)
+        # pyserial passes on termios.error, which is no OSError
+        except (OSError, ValueError, termios.error) as error:
+            raise self._explain_error(error) from None
+
+    def close(self) -> None:
+        """Drain the output, with a time limit, and close the port."""
+        port, self._serial = self._serial, None
+        if port is None:
+            return
+        # not port.flush(): that waits for ever where the other end does not take what was sent
+        with contextlib.suppress(OSError, termios.error):
+            for _ in range(DRAIN_ATTEMPTS):
+                if not port.out_waiting:
+                    break
+                time.sleep(DRAIN_INTERVAL_S)
+        with contextlib.suppress(OSError, termios.error):
+            port.close()
+
+    def poll(self, timeout: float) -> Sequence[bytes]:
+        """Return received bytes. Raises LinkError if the port is lost."""
+        file = self._require_port().fileno()
+        return read_available(file, self.description) if wait_readable(file, timeout) else ()
+
+    def send(self, unit: bytes) -> None:
+        """Send bytes. Raises LinkError."""
+        try:
+            self._require_port().write(unit)
+        except serial.SerialTimeoutException:
+            why, fix = f"{len(unit)} bytes are not taken", "look at the cable and at flow control"
+            raise LinkError(self.description, why, fix) from None
+        except OSError as error:
+            raise make_lost_error(self.description, error) from None
+
+    def _require_port(self) -> serial.Serial:
+        if self._serial is None:
+            raise LinkError(self.description, "the port is not open")
+        return self._serial
+
+    def _explain_error(self, error: Exception) -> LinkError:
+        path = self.description
+        number = error.args[0] if isinstance(error, termios.error) else getattr(error, "errno", None)
+        # pyserial reports a failed lock only as text
+        if number in (errno.EAGAIN, errno.EBUSY) or "exclusively lock" in str(error):
+            users = find_users(path)
+            return LinkError(
+                f"{path} is in use",
+                f"by {', '.join(users)}" if users else "by a process of another user",
+                "end it, or name another port",
+            )
+        if number in (errno.EACCES, errno.EPERM):
+            return LinkError(f"{path} may not be opened", "permission denied", explain_permission(path))
+        if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
+            near = suggest_ports(path)
+            fix = "plug it in; modelserver driver --list shows what is there"
+            fix += f"; nearest: {', '.join(near)}" if near else ""
+            return LinkError(path, "there is no such port", fix)
+        if isinstance(error, ValueError):
+            return LinkError(path, f"{self.baud} baud is not possible", "give another baud")
+        if isinstance(error, termios.error):
+            fix = f"is it a serial port, and does it know {self.baud} baud?"
+            return LinkError(path, f"its settings are rejected: {os.strerror(number or 0)}", fix)
+        return LinkError(path, os.strerror(number) if number else str(error), "is it a serial port?")

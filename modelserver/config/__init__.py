@@ -1,0 +1,1 @@
+"""Settings: the vehicle file, and the typed reader of YAML settings."""

@@ -1,0 +1,381 @@
+"""Read a YAML file into a dataclass: strict types, every problem at once, each with its line and a suggestion.
+
+The bytes are composed into YAML nodes (bounded in size and depth, without aliases), turned into plain values whose
+lines are recorded, and validated by pydantic with the dataclass as the schema: its attributes are the keys.
+
+pydantic examines the rules of a section (its `__post_init__`) only when every value in it has the right type. So the
+validation is repeated without the keys that were found wrong, until nothing new is found (`read_partly`). The value
+under a misspelled or renamed key moves to the key that is meant: it is examined, and not reported as missing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Mapping
+from fnmatch import fnmatchcase
+from functools import cache
+from typing import Any, Final, TypeVar, get_args, get_origin, get_type_hints
+
+import yaml
+from pydantic import TypeAdapter, ValidationError
+
+from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_key, suggest_name
+
+MAX_BYTES = 1 << 20
+
+MAX_DEPTH = 16
+"""No section is nested deeper than 3. PyYAML's composer is recursive in C: deep nesting would end the process."""
+
+MAX_ROUNDS = 8
+"""Validations of one file at most, each without what the ones before found wrong."""
+
+RENAMED_KEYS: Final[Mapping[str, str]] = {
+    "restart": "warm_start",
+    "warm_start.keep": "persist",
+    "origin.keep": "persist",
+    "sensors.second_writer": "publisher_conflict",
+    "limits.parked_requests": "waiting_requests",
+    "localization.*.clock_ahead": "clock_jump",
+    "localization.*.clock_samples": "clock_jump_samples",
+    "localization.*.standing_rate": "stationary_rate",
+    "localization.*.standing_speed": "stationary_speed",
+    "localization.*.standing_time": "stationary_time",
+    "localization.filter.standing_force": "stationary_force",
+    "localization.filter.standing_sigma": "stationary_sigma",
+    "localization.filter.levelling_time": "leveling_time",
+    "localization.filter.levelling_limit": "leveling_timeout",
+    "localization.filter.levelling_acceleration": "leveling_acceleration",
+    "localization.filter.slip_share": "slip_ratio",
+    "localization.filter.gps_wander_time": "gps_correlation_time",
+    "localization.filter.restless_time": "gps_inflation_time",
+    "localization.filter.restless_limit": "gps_inflation_limit",
+    "localization.filter.follow_speed": "position_slew_rate",
+    "localization.filter.conflict_time": "rejection_timeout",
+    "localization.raw.fix_error_time": "fix_correlation_time",
+    "localization.raw.course_refusals": "course_rejections",
+    "localization.raw.refusals": "fix_rejections",
+    "drivers.*.answer": "answer_timeout",
+    "drivers.*.command.driving": "drive_signals",
+    "drivers.*.command.stopping": "stop_signals",
+    "drivers.*.limits.beyond": "over_limit",
+    "drivers.*.registers.number": "sequence",
+    "drivers.*.reply": "reply_timeout",
+    "drivers.*.restore_on_leaving": "restore_on_exit",
+    "drivers.*.retry": "retry_delay",
+    "drivers.*.status.commands_refused": "commands_rejected",
+    "drivers.*.wheels.*.count.metres_per_count": "meters_per_count",
+    "drivers.*.wheels.*.count.up_only": "counts_up_only",
+    "drivers.*.wheels.*.steers": "is_steered",
+}
+"""Keys of earlier versions, by their path (`*` for any name; sections under their present names), and the new key."""
+
+S = TypeVar("S")
+Path_ = tuple[str | int, ...]
+"""Keys and list indices from the top of the file down to a value."""
+
+
+def find_renamed_key(path: str) -> str:
+    """Return the present name of a key of an earlier version by its dotted path, empty for any other key."""
+    return next((new for old, new in RENAMED_KEYS.items() if fnmatchcase(path, old)), "")
+
+
+def read(raw: bytes, name: str, schema: type[S]) -> S:
+    """Return the instance of a dataclass that the bytes of the file `name` hold.
+
+    Raises ConfigError with every problem.
+    """
+    found, problems = read_partly(raw, name, schema)
+    if found is None or problems:
+        raise ConfigError(problems)
+    return found
+
+
+def read_partly(
+    raw: bytes, name: str, schema: type[S], blanks: Mapping[str, str] | None = None
+) -> tuple[S | None, tuple[Problem, ...]]:
+    """Read as much of a file as is valid.
+
+    Parameters
+    ----------
+    raw, name : the bytes, and the file's name for problems
+    schema : dataclass whose attributes are the keys
+    blanks : values for required top-level keys that are missing or wrong, so that the rest can be examined
+
+    Returns
+    -------
+    The instance, None where too little is valid, and every problem in the order of the file.
+
+    Raises
+    ------
+    ConfigError
+        The file is not a YAML mapping.
+    """
+    reader, values = _compose(raw, name, schema)
+    problems = list(reader.problems)
+    if any(at[-1:] == ("?",) for at in reader.lines):
+        return None, tuple(problems)  # with keys that are no names the rest is not what was meant
+    dropped: set[Path_] = set()
+    found: S | None = None
+    adapter = get_adapter(schema)
+    for _ in range(MAX_ROUNDS):
+        try:
+            # strict JSON: "4" is not a number, while a mapping still makes a section
+            found = adapter.validate_json(json.dumps(values, default=str), strict=True)
+            break
+        except ValidationError as error:
+            explained = [each for detail in error.errors() for each in reader.explain(detail)]
+        renamed = [
+            at for at, problem in explained if problem.replaced and reader.rename(values, at, problem.nearest[0])
+        ]
+        meant = {(*at[:-1], problem.nearest[0]) for at, problem in explained if at in renamed}
+        new = [(at, problem) for at, problem in explained if at not in dropped and at not in meant]
+        problems += [problem for _, problem in new]
+        removed = [at in renamed or _remove(values, at, dropped) for at, _ in new]
+        filled = [key for key, value in (blanks or {}).items() if values.setdefault(key, value) is value]
+        removed = [True] if filled else removed
+        if not removed or not all(removed):
+            break
+    return found, tuple(sorted(problems, key=lambda each: each.line))
+
+
+_ADAPTERS: dict[type, TypeAdapter[Any]] = {}
+
+
+def get_adapter(schema: type[S]) -> TypeAdapter[S]:
+    """Return pydantic's validator of a dataclass, cached: building one takes a hundred times as long as using it."""
+    found = _ADAPTERS.get(schema)
+    if found is None:
+        found = _ADAPTERS[schema] = TypeAdapter(schema)
+    return found
+
+
+def _remove(values: Any, at: Path_, dropped: set[Path_]) -> bool:
+    """Remove the value at a path, or the nearest section around it; return whether there was any."""
+    steps = at[: next((n for n, step in enumerate(at) if isinstance(step, int)), len(at))]
+    while steps:
+        if steps in dropped:
+            return True
+        inside = _get_value(values, steps[:-1])
+        if isinstance(inside, dict) and steps[-1] in inside:
+            del inside[steps[-1]]
+            dropped.add(steps)
+            return True
+        steps = steps[:-1]
+    return False
+
+
+def _get_value(values: Any, at: Path_) -> Any:
+    for step in at:
+        values = values.get(step) if isinstance(values, dict) else None
+    return values
+
+
+def read_lines(raw: bytes, name: str, schema: type) -> dict[Path_, int]:
+    """Return the line of each key by its path. Raises ConfigError as `read_partly` does."""
+    return _compose(raw, name, schema)[0].lines
+
+
+def _compose(raw: bytes, name: str, schema: type) -> tuple[_SettingsReader, Any]:
+    """Return the plain values of a file, and the reader that has their lines."""
+    if len(raw) > MAX_BYTES:
+        raise _make_error(name, 0, f"the file is larger than {MAX_BYTES >> 20} MiB", "is this the vehicle file?")
+    try:
+        if not raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+            raw.decode()
+        _check_shape(raw, name)
+        node = yaml.compose(raw, Loader=yaml.CSafeLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        what = getattr(error, "problem", None) or str(error).splitlines()[0]
+        line = mark.line + 1 if mark else 0
+        raise _make_error(name, line, f"not YAML: {what}", "check indentation and quotes") from None
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        what = f"not text in UTF-8: byte 0x{raw[error.start]:02x} in this line"
+        raise _make_error(name, line, what, "save it as UTF-8; is this the vehicle file?") from None
+    if not isinstance(node, yaml.MappingNode):
+        missing = dataclasses.MISSING
+        required = [
+            each.name
+            for each in dataclasses.fields(schema)
+            if each.default is missing and each.default_factory is missing
+        ]
+        what = "the file is empty" if node is None else "the file is not a mapping (key: value, one per line)"
+        raise _make_error(name, 1, what, f"start with: {', '.join(required)}")
+    reader = _SettingsReader(name, schema)
+    return reader, reader.read_value(node, ())
+
+
+class _SettingsReader:
+    """Turns YAML nodes into plain values, records the line of each, and explains pydantic's errors."""
+
+    def __init__(self, name: str, schema: type):
+        self.name = name
+        self.schema = schema
+        self.lines: dict[Path_, int] = {}
+        self.problems: list[Problem] = []
+
+    def read_value(self, node: yaml.Node, at: Path_) -> Any:
+        self.lines.setdefault(at, node.start_mark.line + 1)
+        if isinstance(node, yaml.SequenceNode):
+            return [self.read_value(each, (*at, index)) for index, each in enumerate(node.value)]
+        if not isinstance(node, yaml.MappingNode):
+            return _read_scalar(node)
+        values: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            line = key_node.start_mark.line + 1
+            if not isinstance(key_node, yaml.ScalarNode):
+                self.lines[(*at, "?")] = line
+                self.add_problem((*at, "?"), "a key is a name, not a list or a mapping", "write name: value")
+                continue
+            key = str(key_node.value)
+            first = self.lines.get((*at, key), 0)
+            self.lines[(*at, key)] = line
+            if key in values:
+                self.add_problem((*at, key), f"{key} is given twice (first on line {first})", "remove one")
+                continue
+            value = self.read_value(value_node, (*at, key))
+            # a key without a value counts as absent, as when all of a section is commented out
+            if value is not None:
+                values[key] = value
+        return values
+
+    def add_problem(self, at: Path_, message: str, fix: str) -> None:
+        self.problems.append(Problem(Severity.ERROR, message, self.locate(at), fix))
+
+    def rename(self, values: Any, at: Path_, meant: str) -> bool:
+        """Move the value under a misspelled key to the key that is meant; return whether there is such a key."""
+        known, around = _list_known_keys(self.schema, at[:-1]), _get_value(values, at[:-1])
+        if meant not in known or at[-1] in known or not isinstance(around, dict) or meant in around:
+            return False
+        around[meant] = around.pop(at[-1])
+        below = {path: line for path, line in self.lines.items() if path[: len(at)] == at}
+        self.lines.update({(*at[:-1], meant, *path[len(at) :]): line for path, line in below.items()})
+        return True
+
+    def locate(self, at: Path_) -> Location:
+        line = next((self.lines[at[:n]] for n in range(len(at), -1, -1) if at[:n] in self.lines), 0)
+        return Location(self.name, line, ".".join(map(str, at)))
+
+    def explain(self, detail: Any) -> list[tuple[Path_, Problem]]:
+        """Turn one of pydantic's errors into problems, each with its path, line and suggestion."""
+        at: Path_ = tuple(detail["loc"])
+        kind = detail["type"]
+        if kind == "value_error":
+            return self._explain_section(at, str(detail["msg"]).removeprefix("Value error, "))
+        near: tuple[str, ...] = ()
+        fix = ""
+        if kind in ("unexpected_keyword_argument", "extra_forbidden"):
+            near, fix = self._suggest_keys(str(at[-1]), at[:-1])
+            message = f"unknown key {quote(str(at[-1]))}"
+        elif kind == "missing" and isinstance(at[-1], int):
+            at = at[:-1]
+            message = f"{at[-1]} has too few numbers"
+        elif kind == "missing":
+            fix, message = f"add a line: {at[-1]}: ...", f"{at[-1]} is missing"
+        else:
+            near, fix, message = _explain_value(detail)
+        return [(at, Problem(Severity.ERROR, message, self.locate(at), fix, near))]
+
+    def _explain_section(self, at: Path_, text: str) -> list[tuple[Path_, Problem]]:
+        """Return the problems that a section's own rules found, one per line; each begins with its key."""
+        found = []
+        for message in text.splitlines():
+            key = message.partition(" ")[0]
+            there = (*at, key) if (*at, key) in self.lines else at
+            found.append((there, Problem(Severity.ERROR, _shorten(message), self.locate(there))))
+        return found
+
+    def _suggest_keys(self, key: str, at: Path_) -> tuple[tuple[str, ...], str]:
+        """Return the known keys nearest to an unknown one at a path, and the fix."""
+        known = _list_known_keys(self.schema, at)
+        present = {each for each in known if (*at, each) in self.lines}
+        renamed = find_renamed_key(".".join(map(str, (*at, key))))
+        if renamed and renamed in present:
+            return (), f"remove it; {renamed} is its new name"
+        if renamed:
+            return Suggestion.of(key, renamed), f"write {renamed}, its new name"
+        below: dict[str, list[str]] = {}
+        for section in known:
+            for each in _list_known_keys(self.schema, (*at, section)):
+                below.setdefault(each, []).append(".".join(map(str, (*at, section))))
+        # a key that is present already is not what was meant
+        near = Suggestion() if key in below else suggest_key(key, [each for each in known if each not in present])
+        if near:
+            return near, f"write {near[0]}"
+        deeper = (key,) if key in below else tuple(suggest_key(key, below))
+        if deeper:
+            return deeper, f"write {deeper[0]} under {' or '.join(below[deeper[0]])}"
+        return (), f"known here: {', '.join(known)}"
+
+
+def _explain_value(detail: Any) -> tuple[tuple[str, ...], str, str]:
+    """Return suggestion, fix and message for a single wrong value."""
+    near: tuple[str, ...] = ()
+    message, got = str(detail["msg"]), detail.get("input")
+    if detail["type"] in ("dataclass_type", "dict_type"):
+        message = "expected a mapping (key: value, one per line)"
+    if isinstance(got, (str, int, float, bool)):
+        message += f", got {quote(str(got))}"
+    if detail["type"] == "literal_error" and isinstance(got, str):
+        near = suggest_name(got, re.findall(r"'([^']*)'", str(detail["ctx"]["expected"])))
+    return near, f"write {near[0]}" if near else "", _shorten(message)
+
+
+def _shorten(message: str) -> str:
+    if len(message) > 240:
+        message = f"{message[:240]}..."
+    return message[:1].lower() + message[1:]
+
+
+_EXPONENT = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+", re.ASCII)
+"""Numbers such as 1e-3, which are text in YAML 1.1."""
+
+
+def _read_scalar(node: yaml.Node) -> Any:
+    if isinstance(node, yaml.ScalarNode) and not node.style and _EXPONENT.fullmatch(node.value):
+        return float(node.value)
+    try:
+        return yaml.CSafeLoader("").construct_object(node, deep=True)
+    except (yaml.YAMLError, ValueError):
+        return str(node.value)
+
+
+def _list_known_keys(schema: type, at: Path_) -> list[str]:
+    """Return the keys of the schema at a path."""
+    kind: Any = schema
+    for step in at:
+        if get_origin(kind) is dict:
+            kind = get_args(kind)[1]
+        else:
+            is_section = isinstance(kind, type) and dataclasses.is_dataclass(kind)
+            kind = _get_type_hints(kind).get(str(step)) if is_section else None
+        section = (each for each in (kind, *get_args(kind)) if dataclasses.is_dataclass(each))
+        kind = kind if get_origin(kind) is dict else next(section, None)
+    return [each.name for each in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
+
+
+@cache
+def _get_type_hints(kind: type) -> dict[str, Any]:
+    return get_type_hints(kind)
+
+
+def _check_shape(raw: bytes, name: str) -> None:
+    """Raise ConfigError for deep nesting and for aliases, which the composer would expand without bound."""
+    depth = 0
+    for event in yaml.parse(raw, Loader=yaml.CSafeLoader):
+        line = event.start_mark.line + 1 if event.start_mark else 0
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+            if depth > MAX_DEPTH:
+                raise _make_error(name, line, "nested too deeply", "look for brackets that are not closed")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        elif isinstance(event, yaml.AliasEvent):
+            raise _make_error(name, line, f"aliases (*{event.anchor}) are not supported", "write the value again")
+
+
+def _make_error(name: str, line: int, message: str, fix: str) -> ConfigError:
+    return ConfigError([Problem(Severity.ERROR, message, Location(name, line), fix)])

@@ -1,0 +1,565 @@
+"""The vehicle file: every setting of the service in one typed, strict YAML file.
+
+`load_config(path)` returns a `VehicleConfig`, or raises ConfigError with every problem at once: file, line, key, what
+is wrong, and a suggestion for a misspelled key. The attributes of the dataclasses below are the keys of the file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from pydantic import ConfigDict
+
+from modelserver.config import reader
+from modelserver.errors import ConfigError, Location, Problem, Severity, quote
+from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.estimation.magnetometer import MagnetometerCalibration
+from modelserver.estimation.raw.settings import RawSettings
+from modelserver.files.kinds import FileKind, detect_file_kind, format_conversion_command
+from modelserver.files.regular import NotRegularFileError, read_start
+from modelserver.messages import Mode
+
+_STRICT: ConfigDict = {"extra": "forbid", "allow_inf_nan": False}
+
+MAX_CHANNEL = 39
+"""Characters of a sensor's channel: LCM allows 63, and a prefix has up to 24."""
+
+MAX_NAME = 64
+"""Characters of a source's name, as in the header of its messages."""
+
+MAX_LATENCY = 5.0
+"""Seconds: the localization retains the past for no longer."""
+
+
+def _check_ranges(section: object, *ranges: tuple[str, float, float]) -> list[str]:
+    """Return a problem for each setting of a section that is out of its range."""
+    return [
+        f"{name} is between {low:g} and {high:g}, got {getattr(section, name):g}"
+        for name, low, high in ranges
+        if not low <= getattr(section, name) <= high
+    ]
+
+
+def _check_channel(channel: str, key: str = "channel") -> list[str]:
+    if 0 < len(channel) <= MAX_CHANNEL and channel.isascii() and channel.isprintable() and " " not in channel:
+        return []
+    return [f"{key} has 1 to {MAX_CHANNEL} printable ASCII characters, no spaces, got {quote(channel)}"]
+
+
+def _check_latency(latency: float) -> list[str]:
+    if 0.0 <= latency <= MAX_LATENCY:
+        return []
+    hint = f": {latency:g} ms is {latency * 1e-3:g}" if latency > MAX_LATENCY else ""
+    return [f"latency is between 0 and {MAX_LATENCY:g} seconds, got {latency:g}{hint}"]
+
+
+def _raise_problems(problems: Iterable[str]) -> None:
+    """Raise ValueError with all problems, one per line, if there are any."""
+    if text := "\n".join(problems):
+        raise ValueError(text)
+
+
+@dataclass(frozen=True, slots=True)
+class LcmConfig:
+    """The message bus."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    url: str = ""
+    """LCM provider. ttl=0 limits traffic to this machine; empty: $LCM_DEFAULT_URL, else loopback."""
+    channel_prefix: str = ""
+    """Put before every channel name, to separate two vehicles on one network."""
+    reply_prefix: str = "REPLY_"
+    """Replies are sent only to channels that start with it."""
+
+    def __post_init__(self) -> None:
+        problems = [
+            f"{key} has at most 24 letters, digits and underscores, got {quote(value)}"
+            for key, value in (("channel_prefix", self.channel_prefix), ("reply_prefix", self.reply_prefix))
+            if not all(c.isascii() and (c.isalnum() or c == "_") for c in value) or len(value) > 24
+        ]
+        if not self.reply_prefix:
+            problems.append("reply_prefix must not be empty: with it no request can make the server publish on POSE")
+        _raise_problems(problems)
+
+
+@dataclass(frozen=True, slots=True)
+class PublishConfig:
+    """What the service publishes, and when."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    mode: Literal["timer", "event"] = "timer"
+    """`timer` publishes POSE at `rate_hz`; `event` at every accepted sample of the IMU or the GPS."""
+    rate_hz: float = 50.0
+    """Poses per second in timer mode."""
+    health_hz: float = 1.0
+    """Health reports per second."""
+    state_hz: float = 5.0
+    """Publications of the filter's whole state per second; 0: never."""
+    decisions: bool = True
+    """Whether each measurement's decision (used, or the reason why not) is published with the event that settles it."""
+    snapshot_s: float = 5.0
+    """Seconds between publications of the whole geometry, for mirrors and logs that start later."""
+
+    def __post_init__(self) -> None:
+        ranges = (("rate_hz", 0.1, 1000.0), ("health_hz", 0.01, 100.0), ("state_hz", 0.0, 50.0))
+        _raise_problems(_check_ranges(self, *ranges, ("snapshot_s", 0.5, 3600.0)))
+
+
+@dataclass(frozen=True, slots=True)
+class SensorConfig:
+    """A sensor: its channel, and the frame of the geometry at which it is mounted."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    channel: str
+    """Channel of its samples."""
+    frame: str
+    """Frame at which it is mounted, `Body:Frame`."""
+    latency: float = 0.0
+    """Seconds by which its stamps are later than the measurement; subtracted from each stamp."""
+
+    def __post_init__(self) -> None:
+        _raise_problems(_check_channel(self.channel) + _check_latency(self.latency))
+
+
+@dataclass(frozen=True, slots=True)
+class GpsConfig(SensorConfig):
+    """The GNSS receiver."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    second_frame: str = ""
+    """Frame of the other antenna of a dual-antenna receiver."""
+
+
+@dataclass(frozen=True, slots=True)
+class SteeringConfig:
+    """Source of the angle of steered wheels that do not measure it themselves."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    wheels: tuple[str, ...]
+    """Names of the wheels in `frames` that steer by the controller's steering_angle."""
+    channel: str = "VEHICLE_STATUS"
+    """Channel of the vehicle controller's status (vehicle_status_t)."""
+    geometry: Literal["ackermann", "parallel"] = "ackermann"
+    """`ackermann`: the angle is that of one equivalent wheel in the middle of the axle, and each wheel is tangent to
+    its own circle; `parallel`: all wheels have this angle."""
+    sigma: float = 0.035
+    """Standard deviation of the angle, radians: backlash, and deviation from the steering geometry."""
+    limit: float = 0.7
+    """Larger angles to either side are rejected as damaged, radians."""
+    max_age: float = 0.2
+    """Older angles are not used, seconds. Without an angle, wheels measure only the speed of their contact points."""
+    latency: float = 0.0
+    """Seconds by which the stamps are later than the measurement; subtracted from each stamp."""
+
+    def __post_init__(self) -> None:
+        problems = _check_channel(self.channel) + _check_latency(self.latency)
+        if not self.wheels:
+            problems.append("wheels names the wheels that steer, e.g. [front_left, front_right]; got none")
+        ranges = (("sigma", 1e-4, 0.5), ("limit", 0.05, 1.5), ("max_age", 0.01, 10.0))
+        _raise_problems(problems + _check_ranges(self, *ranges))
+
+
+@dataclass(frozen=True, slots=True)
+class WheelsConfig:
+    """The wheel odometry."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    channel: str = "WHEELS"
+    """Channel of its samples."""
+    frames: dict[str, str] = field(default_factory=dict)
+    """For each wheel's name the frame of its contact point."""
+    kinematics: Literal["skid_steer", "differential", "ackermann"] = "differential"
+    """How the vehicle turns. `skid_steer`: its sides roll at different speeds and wheels slip sideways, so only the
+    mean of all is used; `differential` and `ackermann`: each wheel rolls in its direction, straight ahead or as it is
+    steered. A wheel without a measured steering angle rolls in the direction in which its contact point moves."""
+    steering: SteeringConfig | None = None
+    """Source of the steering angle of wheels that do not measure it themselves."""
+    latency: float = 0.0
+    """Seconds by which the stamps are later than the measurement; subtracted from each stamp."""
+
+    def __post_init__(self) -> None:
+        _raise_problems(_check_channel(self.channel) + _check_latency(self.latency))
+
+
+@dataclass(frozen=True, slots=True)
+class AidingConfig:
+    """A further source of measurements. Its messages name their frames."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    channel: str
+    """Channel of its messages."""
+    type: Literal["absolute_pose", "relative_pose", "range"]
+    """What it measures."""
+    latency: float = 0.0
+    """Seconds by which its stamps are later than the measurement; subtracted from each stamp."""
+
+    def __post_init__(self) -> None:
+        _raise_problems(_check_channel(self.channel) + _check_latency(self.latency))
+
+
+@dataclass(frozen=True, slots=True)
+class JointsConfig:
+    """The joint positions, received if the geometry has joints that move."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    channel: str = "JOINTS"
+    """Channel on which the drivers publish them."""
+    latency: float = 0.0
+    """Seconds by which the stamps are later than the measurement; subtracted from each stamp."""
+
+    def __post_init__(self) -> None:
+        _raise_problems(_check_channel(self.channel) + _check_latency(self.latency))
+
+
+@dataclass(frozen=True, slots=True)
+class SensorsConfig:
+    """The sensors. Their mounting poses are in the geometry file alone."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    gps: GpsConfig | None = None
+    imu: SensorConfig | None = None
+    wheels: WheelsConfig | None = None
+    joints: JointsConfig = field(default_factory=JointsConfig)
+    aiding: dict[str, AidingConfig] = field(default_factory=dict)
+    """Further sources, each by the name in its messages (`header.source`)."""
+    publisher_conflict: Literal["ignore", "use"] = "ignore"
+    """Whether samples of a second publisher on a channel are ignored or used while the first one is active."""
+
+    def __post_init__(self) -> None:
+        for name in self.aiding:
+            if not (0 < len(name) <= MAX_NAME and name.isprintable()):
+                raise ValueError(f"aiding names sources with 1 to {MAX_NAME} printable characters, got {quote(name)}")
+        sensors = (self.gps, self.imu, self.wheels, self.steering, self.joints, *self.aiding.values())
+        channels = [each.channel for each in sensors if each]
+        twice = {channel for channel in channels if channels.count(channel) > 1}
+        if twice:
+            raise ValueError(f"each sensor has a channel of its own; {quote(min(twice))} is given twice")
+
+    @property
+    def steering(self) -> SteeringConfig | None:
+        """Source of the steering angle; None without one beside the wheels."""
+        return self.wheels.steering if self.wheels is not None else None
+
+
+@dataclass(frozen=True, slots=True)
+class OriginConfig:
+    """The origin of World:UTM. Without a configured one it is captured from the first good fixes."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    initial_utm: tuple[float, float, float] | None = None
+    """Grid easting, grid northing, height above the ellipsoid, meters: a datum that several runs share."""
+    zone: int | None = None
+    """UTM zone, 1 to 60."""
+    hemisphere: Literal["north", "south"] | None = None
+    """Hemisphere of the UTM zone."""
+    persist: bool = True
+    """Whether a captured origin is persisted across restarts (in `state_directory`)."""
+
+    def __post_init__(self) -> None:
+        given = [value is not None for value in (self.initial_utm, self.zone, self.hemisphere)]
+        if any(given) and not all(given):
+            raise ValueError("initial_utm, zone and hemisphere are given together or not at all")
+        if self.zone is not None and not 1 <= self.zone <= 60:
+            raise ValueError(f"a UTM zone is 1 to 60, got {self.zone}")
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizationConfig:
+    """How the pose is estimated."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    mode: Literal["full", "raw", "no_imu", "no_wheels", "no_gps", "dead_reckoning"] = "full"
+    """The sources that are used from the start, see `modelserver.messages.Mode`."""
+    mode_channel: str = ""
+    """Channel that signed requests for another mode name; empty: nobody can switch from the bus."""
+    raw: RawSettings = field(default_factory=RawSettings)
+    filter: FilterSettings = field(default_factory=FilterSettings)
+    magnetometer: MagnetometerCalibration = field(default_factory=MagnetometerCalibration)
+
+    def __post_init__(self) -> None:
+        if self.mode_channel:
+            _raise_problems(_check_channel(self.mode_channel, "mode_channel"))
+
+    @property
+    def initial_mode(self) -> Mode:
+        """The mode from the start, as the core represents it."""
+        return Mode[self.mode.upper()]
+
+
+@dataclass(frozen=True, slots=True)
+class LimitsConfig:
+    """Memory and processing time for requests, bounded so that no client can starve the pose."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    history_s: float = 60.0
+    """Seconds of poses stored for queries about the past, at most 600."""
+    waiting_requests: int = 64
+    """Requests that may wait for data at once."""
+    wait_ms: int = 2000
+    """The longest wait granted, milliseconds."""
+    queued_requests: int = 256
+    """Length of the request queue; more are dropped and counted."""
+    requests_per_pass: int = 16
+    """Requests answered before the loop reads sensors again."""
+    client_hz: float = 500.0
+    """Requests per second that are guaranteed to each client; more are answered while there is time."""
+    request_share: float = 0.25
+    """Share of the time for requests; beyond it clients get only their guaranteed rates while others need the time."""
+    client_reply_bytes: float = 5_000_000.0
+    """Bytes per second of long replies (many transformations, history) to each client."""
+
+    def __post_init__(self) -> None:
+        problems = _check_ranges(self, ("client_hz", 1.0, 100_000.0), ("request_share", 0.0, 1.0))
+        if not 1e4 <= self.client_reply_bytes <= 1e9:
+            problems.append(f"client_reply_bytes is between 10000 and 1e9, got {self.client_reply_bytes:g}")
+        if not 0.0 < self.history_s <= 600.0:
+            problems.append(f"history_s is above 0 and at most 600, got {self.history_s:g}")
+        for name, low, high in (
+            ("waiting_requests", 0, 4096),
+            ("wait_ms", 0, 60_000),
+            ("queued_requests", 1, 65536),
+            ("requests_per_pass", 1, 1024),
+        ):
+            if not low <= getattr(self, name) <= high:
+                problems.append(f"{name} is between {low} and {high}, got {getattr(self, name)}")
+        _raise_problems(problems)
+
+
+KEY_HINT = (
+    "only signed messages change the service; modelserver key new /etc/modelserver/commands.key makes a key, then "
+    "write key_file: /etc/modelserver/commands.key under commands"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class CommandsConfig:
+    """Commands from the bus that change the state of the service. None is allowed by default."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    reload: bool = False
+    """Whether the geometry file may be reloaded."""
+    set_pose: bool = False
+    """Whether the pose of the vehicle may be set."""
+    key_file: str = ""
+    """Keys with which such a message must be signed, relative to this file; see `modelserver.signing.key_files`."""
+    window_s: float = 5.0
+    """Greatest age of a signed message, seconds, by the vehicle's clock."""
+
+    def __post_init__(self) -> None:
+        problems = _check_ranges(self, ("window_s", 0.1, 300.0))
+        if not self.key_file:
+            enabled = [name for name in ("reload", "set_pose") if getattr(self, name)]
+            problems += [f"{name} needs a key_file beside it: {KEY_HINT}" for name in enabled]
+        _raise_problems(problems)
+
+
+@dataclass(frozen=True, slots=True)
+class WarmStartConfig:
+    """The state of the localization that is persisted in `state_directory`, and when the next start restores it."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    persist: bool = True
+    """Whether the state of the localization is persisted."""
+    period_s: float = 5.0
+    """Seconds between two writes."""
+    max_age_s: float = 86400.0
+    """Greatest age at which persisted biases and scales are restored, seconds."""
+    max_pose_age_s: float = 20.0
+    """Longest time without a running service after which the pose of a stationary vehicle is restored, seconds; 0:
+    never."""
+
+    def __post_init__(self) -> None:
+        ranges = (("period_s", 0.5, 600.0), ("max_age_s", 0.0, 31536000.0), ("max_pose_age_s", 0.0, 600.0))
+        _raise_problems(_check_ranges(self, *ranges))
+
+
+@dataclass(frozen=True, slots=True)
+class JournalConfig:
+    """The journal: everything that is received and sent, on disk; see docs/journal.md."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    directory: str = ""
+    """Its directory, relative to this file; empty: `journal-` and the vehicle's name in the state directory."""
+    megabytes: int | None = None
+    """Its greatest size, 32 at least; 0: no journal. Default: 1024 under systemd or with a directory, else 0."""
+    sync_s: float = 2.0
+    """Seconds between two calls of fsync: what a loss of power costs at most."""
+
+    def __post_init__(self) -> None:
+        problems = []
+        if self.megabytes is not None and self.megabytes != 0 and not 32 <= self.megabytes <= 1_000_000:
+            problems.append(f"megabytes is 0 for no journal, or 32 to 1000000, got {self.megabytes}")
+        if not 0.2 <= self.sync_s <= 60.0:
+            problems.append(f"sync_s is between 0.2 and 60 seconds, got {self.sync_s:g}")
+        _raise_problems(problems)
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleConfig:
+    """A vehicle: its geometry, its sensors, and the settings of its service."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    vehicle: str
+    """Name of the vehicle."""
+    geometry: str
+    """Path of the geometry file, relative to this file."""
+    base_frame: str
+    """The frame that POSE describes."""
+    rolling_frame: str = ""
+    """The frame that moves along its own x axis when the vehicle turns: the middle of the rear axle with steered front
+    wheels, the middle of the wheels with skid steering. Empty: `base_frame`."""
+    variables: dict[str, str] = field(default_factory=dict)
+    """Values of the $NAMES in a frame-tree file."""
+    state_directory: str = ""
+    """Directory of the persisted origin and state, relative to this file; empty: the user's state directory."""
+    lcm: LcmConfig = field(default_factory=LcmConfig)
+    publish: PublishConfig = field(default_factory=PublishConfig)
+    sensors: SensorsConfig = field(default_factory=SensorsConfig)
+    origin: OriginConfig = field(default_factory=OriginConfig)
+    localization: LocalizationConfig = field(default_factory=LocalizationConfig)
+    limits: LimitsConfig = field(default_factory=LimitsConfig)
+    commands: CommandsConfig = field(default_factory=CommandsConfig)
+    warm_start: WarmStartConfig = field(default_factory=WarmStartConfig)
+    journal: JournalConfig = field(default_factory=JournalConfig)
+    drivers: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """For each driver's name its type of device and that type's settings. The service does not read them;
+    `msdrivers.settings` does."""
+
+    def __post_init__(self) -> None:
+        for name in self.drivers:
+            # a word of the command line, and the source in the headers of its samples
+            if not (0 < len(name) <= MAX_NAME and name.isprintable() and " " not in name):
+                raise ValueError(
+                    f"drivers have names of 1 to {MAX_NAME} printable characters without spaces, got {quote(name)}"
+                )
+
+
+def load_config(path: str | Path) -> VehicleConfig:
+    """Read a vehicle file. Its paths become absolute.
+
+    Raises
+    ------
+    ConfigError
+        The file is wrong; with every problem.
+    OSError
+        The file cannot be read.
+    """
+    path = Path(path)
+    return _resolve_paths(parse_config(_read_bytes(path), str(path)), path)
+
+
+def load_partly(path: str | Path, *, blank: bool = False) -> tuple[VehicleConfig | None, tuple[Problem, ...]]:
+    """Read as much of a vehicle file as is valid.
+
+    Parameters
+    ----------
+    blank : replace a missing name, geometry or base frame by an empty text, so that the rest can be examined
+
+    Returns
+    -------
+    The configuration without what is wrong, None where too little is left, and every problem.
+
+    Raises
+    ------
+    ConfigError
+        The file is not a YAML mapping.
+    OSError
+        The file cannot be read.
+    """
+    path = Path(path)
+    config, problems = parse_partly(_read_bytes(path), str(path), blank=blank)
+    return None if config is None else _resolve_paths(config, path), problems
+
+
+def add_lines(problems: Iterable[Problem], path: str) -> list[Problem]:
+    """Return problems of a vehicle file with the line of the key, or of the section, that each is about."""
+    problems = list(problems)
+    try:
+        lines = {".".join(map(str, at)): line for at, line in read_config_lines(path).items()}
+    except (OSError, ConfigError):
+        return problems
+
+    def find_line(key: str) -> int:
+        while key and key not in lines:
+            key = key.rpartition(".")[0]
+        return lines.get(key, 0)
+
+    return [
+        dataclasses.replace(each, source=dataclasses.replace(each.source, line=find_line(each.element)))
+        if each.file == path and not each.line
+        else each
+        for each in problems
+    ]
+
+
+NOT_A_VEHICLE_FILE = "not a vehicle file"
+"""End of the message for a file of another type."""
+
+_START_HINT = "start with: vehicle, geometry, base_frame; docs/vehicle-file.md has an example"
+_MODEL_HINT = "query, bodies and frames take it with --model"
+_FIXES: dict[FileKind, str] = {
+    FileKind.EMPTY: _START_HINT,
+    FileKind.COMMENTS: _START_HINT,
+    FileKind.GEOMETRY: f"give the vehicle file, which names it (geometry: {{name}}); {_MODEL_HINT}",
+    FileKind.URDF: f"give the vehicle file, which names it (geometry: {{name}}); {_MODEL_HINT}",
+    FileKind.MIRO_PROCESS: "convert it to a vehicle file: {command}",
+    FileKind.XML: f"give the vehicle file, which is YAML; if this is a geometry file, {_MODEL_HINT}",
+    FileKind.LOG: "give the vehicle file; a log is played by modelserver replay",
+    FileKind.BINARY: "give the vehicle file, which is YAML",
+}
+
+
+def _read_bytes(path: Path) -> bytes:
+    """Read a vehicle file. Raises ConfigError for a file of another type, OSError."""
+    try:
+        # the beginning of a larger file shows its type; the reader rejects it
+        raw = read_start(path, reader.MAX_BYTES + 1)
+    except NotRegularFileError as error:
+        there = next((each for each in ("vehicle.yaml", "vehicle.yml") if (path / each).is_file()), "")
+        fix = f"give {path / there}" if error.is_directory and there else "give the vehicle file itself"
+        raise _make_error(path, f"this is {error.kind}, {NOT_A_VEHICLE_FILE}", fix) from None
+    kind = detect_file_kind(raw)
+    if kind in _FIXES:
+        what = kind.value if kind.is_empty else f"{kind.value}, {NOT_A_VEHICLE_FILE}"
+        command = format_conversion_command(str(path)) if kind is FileKind.MIRO_PROCESS else ""
+        raise _make_error(path, what, _FIXES[kind].format(name=path.name, command=command))
+    return raw
+
+
+def _make_error(path: Path, what: str, fix: str) -> ConfigError:
+    return ConfigError([Problem(Severity.ERROR, what, Location(str(path)), fix)])
+
+
+def _resolve_paths(config: VehicleConfig, path: Path) -> VehicleConfig:
+    def resolve(given: str) -> str:
+        return str((path.parent / Path(given).expanduser()).resolve()) if given else ""
+
+    return dataclasses.replace(
+        config,
+        geometry=resolve(config.geometry),
+        state_directory=resolve(config.state_directory),
+        commands=dataclasses.replace(config.commands, key_file=resolve(config.commands.key_file)),
+        journal=dataclasses.replace(config.journal, directory=resolve(config.journal.directory)),
+    )
+
+
+def read_config_lines(path: str | Path) -> dict[tuple[str | int, ...], int]:
+    """Return the line of each key of a vehicle file. Raises ConfigError, OSError."""
+    return reader.read_lines(_read_bytes(Path(path)), str(path), VehicleConfig)
+
+
+def parse_partly(
+    raw: bytes, name: str = "", *, blank: bool = False
+) -> tuple[VehicleConfig | None, tuple[Problem, ...]]:
+    """Parse the bytes of the vehicle file `name` as `load_partly` does, without resolving its paths."""
+    blanks = dict.fromkeys(("vehicle", "geometry", "base_frame"), "") if blank else None
+    return reader.read_partly(raw, name, VehicleConfig, blanks)
+
+
+def parse_config(raw: bytes, name: str = "") -> VehicleConfig:
+    """Parse the bytes of the vehicle file `name`. Raises ConfigError with every problem."""
+    return reader.read(raw, name, VehicleConfig)

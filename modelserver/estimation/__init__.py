@@ -1,0 +1,1 @@
+"""Localization: estimates the vehicle's pose and its uncertainty from sensor samples. Pure."""

@@ -1,0 +1,1 @@
+"""Calibration of inertial sensors and magnetometers from recordings. Pure."""

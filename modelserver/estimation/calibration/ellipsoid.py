@@ -1,0 +1,287 @@
+"""Magnetometer calibration: hard and soft iron from samples recorded while turning.
+
+The unit measures m = W h + b: the earth's field h distorted by soft iron, W, and the vehicle's own field b, hard iron.
+A symmetric A and b are fitted so that |A (m - b)| is the strength of the earth's field in every orientation. A rotation
+common to all samples cannot be determined from lengths; a symmetric A is the choice with the smallest.
+
+A ground vehicle turns about the vertical alone. Then the horizontal part of m moves on an ellipse, and the planar mode
+finds what maps it to a circle; the vertical, which such a turn does not determine, is left as it is. Limit: hard iron
+found so holds for level ground; on a slope, soft iron's share of the vertical field returns.
+
+Source: V. Renaudin, M. Afzal and G. Lachapelle, "Complete triaxis magnetometer calibration in the magnetic domain",
+2010; the fit itself is in quadric.py.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from modelserver.estimation.calibration import quadric
+from modelserver.estimation.calibration.errors import CalibrationError
+from modelserver.transforms.so3 import Array, Matrix3, Vector3, to_vector3
+
+SECTORS = 12
+"""Sectors of 30 degrees in which the directions are counted."""
+
+MIN_SECTORS = 10
+"""Sectors that must be covered: elsewhere the ellipse is extrapolated, and disturbances of the field would not show."""
+
+MIN_SPREAD = 0.3
+"""For calibration about all axes: share of the sphere's height that the directions must cover along their least covered
+axis: 17 degrees of elevation to both sides.
+"""
+
+MAX_RESIDUAL = 0.1
+"""Largest residual as a share of the strength: beyond, the samples are on no ellipse (6 degrees of heading)."""
+
+MAX_AXIS_RATIO = 3.0
+"""Largest ratio of the axes of the ellipse, and of its size and the known field's: soft iron distorts by a few tens of
+percent; beyond, the unit's scale is wrong or the turn was incomplete.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """Directions that the samples cover.
+
+    sectors: SECTORS flags, counter-clockwise about `axis` (unit vector along the sensor's axes). spread: share of the
+    sphere's height covered along `axis`; NaN in planar mode.
+    """
+
+    sectors: tuple[bool, ...]
+    axis: Vector3
+    spread: float
+
+    @property
+    def share(self) -> float:
+        """Share of the sectors that are covered."""
+        return sum(self.sectors) / len(self.sectors)
+
+
+@dataclass(frozen=True, slots=True)
+class MagnetometerFit:
+    """A magnetometer's calibration: the field is `soft_iron` (m - `hard_iron`).
+
+    hard_iron: along the sensor's axes, tesla. soft_iron: 3 x 3, symmetric, row-major. is_planar: whether only the
+    horizontal was fitted. strength: of the horizontal field in planar mode, else of the whole, tesla;
+    is_strength_known: whether it was given, or is the mean radius. rms: of the residuals of the inliers, tesla;
+    heading_rms: the resulting error of heading, radians, NaN where the horizontal field is unknown. samples: number of
+    finite ones; outliers: those not used.
+    """
+
+    hard_iron: Vector3
+    soft_iron: Matrix3
+    is_planar: bool
+    strength: float
+    is_strength_known: bool
+    rms: float
+    heading_rms: float
+    coverage: Coverage
+    samples: int
+    outliers: int
+
+    def apply(self, fields: npt.ArrayLike) -> Array:
+        """Return the corrected fields (n, 3), along the sensor's axes, tesla."""
+        away = np.asarray(fields, dtype=float) - np.array(self.hard_iron)
+        corrected: Array = away @ np.array(self.soft_iron).reshape(3, 3).T
+        return corrected
+
+
+def fit_all_axes(fields: npt.ArrayLike, strength: float = math.nan, horizontal: float = math.nan) -> MagnetometerFit:
+    """Return the calibration of a unit that was turned about all of its axes.
+
+    Parameters
+    ----------
+    fields : (n, 3) along the sensor's axes, tesla; rows that are not finite are ignored
+    strength : of the earth's field at the place, tesla (`magnetism.field_at`); NaN for the mean radius
+    horizontal : its horizontal part, for the error of heading
+
+    Raises
+    ------
+    CalibrationError
+        Where the turn was insufficient, with the directions covered.
+    """
+    points = _select_finite(fields)
+    found = quadric.fit(points)
+    known = math.isfinite(strength)
+    radius = float(np.linalg.det(found.matrix)) ** (-1.0 / 3.0)
+    target = strength if known else radius
+    unit = found.normalize(points[found.is_inlier])
+    coverage = _sphere_coverage(unit)
+    _check_coverage(coverage)
+    A = found.matrix * target
+    _check_axis_ratio(A, known)
+    rms = _rms(unit, found.weights[found.is_inlier]) * target
+    return MagnetometerFit(
+        hard_iron=to_vector3(found.center),
+        soft_iron=_matrix(A),
+        is_planar=False,
+        strength=target,
+        is_strength_known=known,
+        rms=_check_residual(rms, target),
+        heading_rms=rms / horizontal,
+        coverage=coverage,
+        samples=len(points),
+        outliers=int((~found.is_inlier).sum()),
+    )
+
+
+def fit_level(
+    fields: npt.ArrayLike, up: Vector3, horizontal: float = math.nan, vertical: float = math.nan
+) -> MagnetometerFit:
+    """Return the calibration of a unit on a vehicle that turned about the vertical alone, on level ground.
+
+    Without `vertical` the hard iron along the vertical is 0, and the strength of the corrected field is not comparable
+    with the earth's.
+
+    Parameters
+    ----------
+    fields : (n, 3) along the sensor's axes, tesla; rows that are not finite are ignored
+    up : direction of the mean specific force, along the sensor's axes
+    horizontal, vertical : the earth's field along magnetic north and up, tesla; NaN where unknown (mean radius)
+
+    Raises
+    ------
+    CalibrationError
+        Where the turn was insufficient, with the directions covered.
+    """
+    points = _select_finite(fields)
+    E = _level_axes(up)
+    level, height = points @ E[:, :2], points @ E[:, 2]
+    try:
+        found = quadric.fit(level)
+    except CalibrationError as error:
+        raise _add_coverage(error, level) from None
+    known = math.isfinite(horizontal)
+    radius = float(np.linalg.det(found.matrix)) ** -0.5
+    target = horizontal if known else radius
+    unit = found.normalize(level[found.is_inlier])
+    coverage = Coverage(_covered_sectors(unit[:, 0], unit[:, 1]), to_vector3(E[:, 2]), math.nan)
+    _check_coverage(coverage)
+    A = np.eye(3)
+    A[:2, :2] = found.matrix * target
+    _check_axis_ratio(A[:2, :2], known)
+    weights = found.weights[found.is_inlier]
+    rms = _rms(unit, weights) * target
+    offset = 0.0
+    if math.isfinite(vertical):
+        offset = float(np.average(height[found.is_inlier], weights=weights)) - vertical
+    return MagnetometerFit(
+        hard_iron=to_vector3(E @ np.array([*found.center, offset])),
+        soft_iron=_matrix(E @ A @ E.T),
+        is_planar=True,
+        strength=target,
+        is_strength_known=known,
+        rms=_check_residual(rms, target),
+        heading_rms=rms / target,
+        coverage=coverage,
+        samples=len(points),
+        outliers=int((~found.is_inlier).sum()),
+    )
+
+
+def project_to_level(fields: npt.ArrayLike, up: Vector3) -> Array:
+    """Return the horizontal parts (n, 2) of vectors (n, 3) along the sensor's axes, as in `fit_level`."""
+    plane: Array = np.asarray(fields, dtype=float) @ _level_axes(up)[:, :2]
+    return plane
+
+
+def _select_finite(fields: npt.ArrayLike) -> Array:
+    points = np.asarray(fields, dtype=float).reshape(-1, 3)
+    finite: Array = points[np.isfinite(points).all(axis=1)]
+    return finite
+
+
+def _level_axes(up: Vector3) -> Array:
+    """Return, as columns, two axes of the horizontal plane and up, right-handed, along the sensor's axes."""
+    length = math.hypot(*up)
+    if not (math.isfinite(length) and length > 0.0):
+        raise CalibrationError(f"up must be a direction, got {up}: the unit measures no specific force")
+    z = np.array(up) / length
+    # the most level axis of the sensor is the first
+    x = np.zeros(3)
+    x[int(np.argmin(np.abs(z)))] = 1.0
+    x = x - (x @ z) * z
+    x /= np.linalg.norm(x)
+    return np.column_stack((x, np.cross(z, x), z))
+
+
+def _sphere_coverage(unit: Array) -> Coverage:
+    """Return the coverage of directions on the sphere, about the axis along which they spread least."""
+    _, vectors = np.linalg.eigh(np.cov(unit.T))
+    E = _level_axes(to_vector3(vectors[:, 0]))
+    heights = unit @ E[:, 2]
+    low, high = np.quantile(heights, (0.02, 0.98))
+    return Coverage(_covered_sectors(unit @ E[:, 0], unit @ E[:, 1]), to_vector3(E[:, 2]), float(high - low) / 2.0)
+
+
+def _covered_sectors(x: Array, y: Array) -> tuple[bool, ...]:
+    sectors = np.floor(np.arctan2(y, x) / (2.0 * np.pi) * SECTORS).astype(int) % SECTORS
+    counts = np.bincount(sectors, minlength=SECTORS)
+    # a single outlier does not cover 30 degrees
+    return tuple(bool(count >= 3) for count in counts)
+
+
+def _add_coverage(error: CalibrationError, level: Array) -> CalibrationError:
+    """Return the error of a fit that found no ellipse with the coverage, where a circle fits roughly."""
+    center, radius = quadric.fit_circle(level)
+    if not radius > 0.0:
+        return error
+    away = level - center
+    off = np.linalg.norm(away, axis=1) / radius - 1.0
+    if not float(np.sqrt(np.mean(off**2))) <= MAX_RESIDUAL:
+        return error
+    seen = sum(_covered_sectors(away[:, 0], away[:, 1]))
+    return CalibrationError(f"{error}; the samples lie on about {seen} of {SECTORS} sectors of 30 degrees")
+
+
+def _check_coverage(coverage: Coverage) -> None:
+    seen = sum(coverage.sectors)
+    if seen < MIN_SECTORS:
+        raise CalibrationError(
+            f"the samples cover {seen} of {SECTORS} sectors of 30 degrees, {MIN_SECTORS} are needed: turn the "
+            "vehicle slowly through a full circle twice, on level ground and away from iron, and record again"
+        )
+    if coverage.spread < MIN_SPREAD:
+        raise CalibrationError(
+            f"the directions reach over {coverage.spread:.0%} of the sphere's height along the sensor's axis "
+            f"({', '.join(f'{each:.2f}' for each in coverage.axis)}), {MIN_SPREAD:.0%} are needed: roll and pitch "
+            "the unit more; use the level mode for a vehicle that stays level"
+        )
+
+
+def _check_axis_ratio(A: Array, known: bool) -> None:
+    values = np.linalg.eigvalsh(A)
+    if values[-1] > MAX_AXIS_RATIO * values[0]:
+        raise CalibrationError(
+            f"the samples are on an ellipse {values[-1] / values[0]:.1f} times as long as wide, and iron distorts a "
+            "field by less: turn through full circles in one place, away from iron, and record again"
+        )
+    if known and not 1.0 / MAX_AXIS_RATIO < float(np.mean(values)) < MAX_AXIS_RATIO:
+        raise CalibrationError(
+            f"the measured field is {1.0 / float(np.mean(values)):.2g} times the earth's at the place: check its "
+            "scale (tesla; 1 gauss is 1e-4 tesla), or whether it turned at all"
+        )
+
+
+def _rms(unit: Array, weights: Array) -> float:
+    off = np.linalg.norm(unit, axis=1) - 1.0
+    return math.sqrt(float(np.average(off**2, weights=weights)))
+
+
+def _check_residual(rms: float, strength: float) -> float:
+    if rms > MAX_RESIDUAL * strength:
+        raise CalibrationError(
+            f"the samples scatter by {rms / strength:.0%} of the field about the fit, {MAX_RESIDUAL:.0%} are "
+            "allowed: the vehicle was not turned, or something else moved the field; turn in one place, away from iron"
+        )
+    return rms
+
+
+def _matrix(values: Array) -> Matrix3:
+    a, b, c, d, e, f, g, h, i = (float(each) for each in ((values + values.T) / 2.0).ravel())
+    return (a, b, c, d, e, f, g, h, i)

@@ -1,0 +1,362 @@
+"""Wheel speeds: each wheel measures the speed of its contact point along the direction in which it rolls.
+
+Measurement. With v the velocity of the rolling frame, w the turn rate and c the contact point (body axes; x and y span
+the ground plane), the contact point moves with u = v + w x c. A wheel at the steering angle a measures
+
+    z = (1 + s) d(a) . u + noise,   d(a) = (cos(a + m), sin(a + m)),
+
+s the scale error and m the mounting yaw of the wheels (states of the filter). H follows from du/d(v, attitude, bias).
+
+Steering angle. It is 0 for a wheel that does not steer, or measured: by the wheel's own encoder, or by the vehicle
+controller for the whole axle (`SteeringSignal`). A wheel that steers and whose angle nobody measures rolls where its
+contact point goes, so it measures |u| with the sign of its encoder. |u| has no derivative at u = 0, and the direction
+of u is noise there; so the angle is estimated from both that are known of it, as a weighted mean of
+
+    the prior m +- steering_sigma   and   the course of u, atan2(u_y, u_x) +- sqrt(V), V = var(u across) / |u|^2.
+
+With the weight k = steering_sigma^2 / (steering_sigma^2 + V) the measurement is |u| where the course is known (k = 1),
+and a wheel that points ahead by an uncertain angle where it is not (k = 0), with a continuous transition. The angle's
+remaining variance P = k V acts through u across the wheel, to the second order: (u_across)^2 P + 3/4 (|u| P)^2.
+
+Sign. An encoder without a direction (`Direction.UNSIGNED`) measures |z|. Its sign is that of the predicted speed where
+that is certain to three sigmas; otherwise the sample is not used.
+
+Slip acts as for every wheel: a share of speed, larger under acceleration. Of a skid-steered vehicle, whose wheels slide
+in every turn, the mean of all wheels is one measurement; a wheel that steers has no place there.
+
+Limits: one steering angle for the time between two samples; a wheel beyond 3 steering_sigma needs a measured angle.
+Read top-down: `rolling` -> `WheelSpeed.compare` -> `_steer` -> `standing_wheels`, `turn_rate`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar, NamedTuple, Self
+
+import numpy as np
+
+from modelserver.estimation.filter.layout import ErrorState
+from modelserver.estimation.filter.measurements.base import INSTANT, Compared, Scene, register
+from modelserver.estimation.filter.nav import jacobian_of_body_velocity
+from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.estimation.sensor_rig import SensorRig, SteeringSignal
+from modelserver.messages import Direction, WheelsSample
+from modelserver.transforms.so3 import Array, Vector3, cross
+
+SCALE, YAW = "wheel_scale", "wheel_yaw"
+"""How much too far all wheels tell, and by how much the way they roll is turned to the left of the geometry's x."""
+
+EASED = 4.0
+"""Up to so many times its limit a slip is used with wider noise: twice what the gate lets through."""
+
+LONGEST = 1.0
+"""Seconds between two samples over which travel still tells a speed."""
+
+SIGN_KNOWN = 3.0
+"""Sigmas by which a predicted speed must differ from 0 to give an unsigned measurement its sign."""
+
+TURN_STEPS = 6
+"""Iterations for the directions of steered wheels: at full lock each reduces the error to a fifth."""
+
+NO_ANGLES: Mapping[str, float] = MappingProxyType({})
+
+
+def wheel_states(settings: FilterSettings) -> tuple[ErrorState, ...]:
+    """Return the error states of wheels."""
+    return (
+        ErrorState((SCALE,), settings.wheel_scale_sigma, settings.wheel_scale_walk),
+        ErrorState((YAW,), settings.wheel_yaw_sigma, settings.wheel_yaw_walk),
+    )
+
+
+class Rolling(NamedTuple):
+    """One wheel between two samples: mean speed (m/s) and its variance, steering angle (rad), contact point (body, m).
+
+    `mean`: of the whole time between, from travel; else of the instant. `steering` is nan where nobody measures it,
+    `steering_sigma` its standard deviation where the vehicle controller does. `unsigned`: `speed` is a magnitude.
+    """
+
+    speed: float
+    variance: float
+    steering: float
+    contact: Vector3
+    mean: bool
+    steering_sigma: float = 0.0
+    unsigned: bool = False
+
+
+def rolling(
+    sample: WheelsSample,
+    before: WheelsSample | None,
+    contacts: Mapping[str, Vector3],
+    settings: FilterSettings,
+    angles: Mapping[str, float] = NO_ANGLES,
+    angle_sigma: float = 0.0,
+) -> list[Rolling]:
+    """Return what each known wheel of a sample measures: from its travel since `before`, else from its speed.
+
+    `angles` are the steering angles (rad) that the vehicle controller measures, to `angle_sigma`, by the wheel's name:
+    for wheels that steer and do not measure it themselves.
+    """
+    dt = 0.0 if before is None else (sample.header.utime - before.header.utime) * 1e-6
+    earlier = {wheel.name: wheel for wheel in before.wheels} if before is not None and 0.0 < dt <= LONGEST else {}
+    found = []
+    for wheel in sample.wheels:
+        contact = contacts.get(wheel.name)
+        if contact is None:
+            continue
+        steering, steering_sigma = wheel.steering, 0.0
+        if not math.isfinite(steering) and wheel.name in angles:
+            steering, steering_sigma = angles[wheel.name], angle_sigma
+        unsigned = wheel.direction is Direction.UNSIGNED
+        last = earlier.get(wheel.name)
+        way = wheel.travel - last.travel if last is not None else math.nan
+        if math.isfinite(way):
+            sigma = wheel.travel_sigma if 0.0 < wheel.travel_sigma < 10.0 else settings.wheel_sigma * 0.5
+            speed, variance, mean = way / dt, 2.0 * (sigma / dt) ** 2, True
+        elif math.isfinite(wheel.speed):
+            sigma = wheel.speed_sigma if 0.0 < wheel.speed_sigma < 10.0 else settings.wheel_sigma
+            speed, variance, mean = wheel.speed, sigma * sigma, False
+        else:
+            continue
+        speed = abs(speed) if unsigned else speed
+        found.append(Rolling(speed, variance, steering, contact, mean, steering_sigma, unsigned))
+    return found
+
+
+class Steered(NamedTuple):
+    """The direction of a wheel: its angle (rad), how much of the course's change it follows, and its variance (rad2).
+
+    `follow` is the weight k of the module's theory, `course_gradient` d(course)/du (rad per m/s).
+    """
+
+    angle: float
+    follow: float
+    variance: float
+    course_gradient: tuple[float, float]
+
+
+@register
+@dataclass(frozen=True, slots=True)
+class WheelSpeed:
+    """Speed of the wheels: measured = (1 + scale) d . (v + w x c), d the way a wheel rolls, c its contact point.
+
+    Each wheel is one number; of a skid-steered vehicle, whose wheels slide in every turn, the mean of all is.
+    """
+
+    kind: ClassVar[str] = "wheel_speed"
+    sample: ClassVar[type] = WheelsSample
+    states: ClassVar[tuple[ErrorState, ...]] = ()
+    contacts: dict[str, Vector3]
+    skid: bool
+    half_track: float
+    imu: Vector3
+    steering: SteeringSignal | None = None
+
+    @classmethod
+    def of(cls, rig: SensorRig, settings: FilterSettings) -> Self | None:
+        """Return it where the vehicle file names wheels."""
+        if not rig.wheel_frames:
+            return None
+        contacts = {name: rig.pose(frame).xyz for name, frame in rig.wheel_frames.items()}
+        half = max(abs(contact[1]) for contact in contacts.values())
+        return cls(contacts, rig.kinematics == "skid_steer", half, rig.imu, rig.steering)
+
+    def instant(self, sample: WheelsSample) -> int | None:
+        """Return the sample's stamp."""
+        return sample.header.utime
+
+    def compare(self, scene: Scene, sample: WheelsSample) -> Compared | str:
+        """Compare the mean speeds since the sample before with the mean motion since then, or speeds of the instant."""
+        settings = scene.settings
+        wheels = self.rolling(sample, scene.before, settings, scene.steering)
+        if not wheels:
+            known = [wheel for wheel in sample.wheels if wheel.name in self.contacts]
+            if not known:
+                return "names" if sample.wheels else "empty"
+            measured = any(math.isfinite(wheel.speed) or math.isfinite(wheel.travel) for wheel in known)
+            return "steering" if self.skid and measured else "nan"
+        top = settings.maximum_speed
+        if not all(abs(wheel.speed) <= top for wheel in wheels):
+            return "range"
+        if self.skid:
+            wheels = [_mean(wheels)]
+        return self._compared(scene, wheels)
+
+    def rolling(
+        self, sample: WheelsSample, before: WheelsSample | None, settings: FilterSettings, steering: float = math.nan
+    ) -> list[Rolling]:
+        """Return what each wheel measures that can be used; `steering` is the controller's steering angle, rad.
+
+        On a skid-steered vehicle a wheel that steers by an unknown angle cannot be averaged with the others.
+        """
+        angles, sigma = NO_ANGLES, 0.0
+        if self.steering is not None and math.isfinite(steering):
+            angles, sigma = self.steering.wheel_angles(steering, self.contacts), self.steering.sigma
+        found = rolling(sample, before, self.contacts, settings, angles, sigma)
+        return [each for each in found if math.isfinite(each.steering)] if self.skid else found
+
+    def by_travel(self, sample: WheelsSample, before: WheelsSample | None) -> bool:
+        """Return whether a wheel tells the way since a sample before."""
+        earlier = {wheel.name: wheel.travel for wheel in before.wheels} if before is not None else {}
+        return any(math.isfinite(wheel.travel - earlier.get(wheel.name, math.nan)) for wheel in sample.wheels)
+
+    def _compared(self, scene: Scene, wheels: list[Rolling]) -> Compared | str:
+        nav, layout, settings = scene.nav, scene.layout, scene.settings
+        dt = scene.age
+        scale, yaw = 1.0 + scene.extra(SCALE), scene.extra(YAW)
+        base = scene.rig.base
+        now = nav.body_velocity(base)
+        rate = nav.turn_rate
+        residuals, rows, noises = [], [], []
+        body = jacobian_of_body_velocity(nav, base, layout.size)
+        for wheel in wheels:
+            if wheel.mean:
+                motion = nav.rolled
+                swing = cross(nav.turned, wheel.contact)
+                v = (
+                    (motion[0] + swing[0]) / dt,
+                    (motion[1] + swing[1]) / dt,
+                    (motion[2] + swing[2]) / dt,
+                )
+            else:
+                swing = cross(rate, wheel.contact)
+                v = (now[0] + swing[0], now[1] + swing[1], now[2] + swing[2])
+            steered = _steer(wheel, v, yaw, body, nav.covariance, settings)
+            c, s = math.cos(steered.angle), math.sin(steered.angle)
+            along, across = c * v[0] + s * v[1], c * v[1] - s * v[0]
+            # d(along)/du: the angle follows the course of u, and so turns what is across into what is along
+            gx, gy = steered.course_gradient
+            rx, ry = c + steered.follow * across * gx, s + steered.follow * across * gy
+            row = scale * _row(rx, ry, wheel.contact, body)
+            row[layout.index(SCALE)] = along
+            row[layout.index(YAW)] = scale * (1.0 - steered.follow) * across
+            variance = wheel.variance
+            if not wheel.mean:
+                # the rate of the instant has the gyro's noise, which a longer way averages
+                x, y, _ = wheel.contact
+                variance += ((c * y - s * x) * settings.gyro_noise) ** 2 / INSTANT
+            fast = max(math.hypot(v[0], v[1]), abs(wheel.speed))
+            variance += (across * across + 0.75 * fast * fast * steered.variance) * steered.variance
+            speed = wheel.speed
+            if wheel.unsigned:
+                certain = along * along > SIGN_KNOWN**2 * float(row @ nav.covariance @ row)
+                if not certain and speed > settings.stationary_speed:
+                    continue
+                speed = math.copysign(speed, along) if certain else 0.0
+            residuals.append(speed - scale * along)
+            rows.append(row)
+            noises.append(variance + self._slip(nav.force, along, rate[2], settings) * _lasting(dt, settings))
+        if not rows:
+            return "direction"
+        return Compared(np.array(residuals), np.array(rows), np.diag(noises), separable=True, eased=EASED)
+
+    def _slip(self, force: Vector3, speed: float, turn: float, settings: FilterSettings) -> float:
+        """Return the variance of slip, (m/s)2: on firm ground, under acceleration, and of a skid-steered in turns."""
+        push = min(abs(force[0]), 5.0)
+        share = settings.slip_ratio + settings.slip_acceleration * push
+        turning = settings.slip_turn * turn * self.half_track if self.skid else 0.0
+        return (share * speed) ** 2 + turning * turning
+
+
+def _lasting(dt: float, settings: FilterSettings) -> float:
+    """Return by how much a noise that lasts must be widened where samples `dt` seconds apart count as independent."""
+    return max(settings.slip_time / dt, 1.0) if 0.0 < dt < settings.slip_time else 1.0
+
+
+def _row(rx: float, ry: float, contact: Vector3, body: Array) -> Array:
+    """Return the Jacobian (n) of rx u_x + ry u_y, u the velocity of a contact point; `body` that of the body's."""
+    row: Array = rx * body[0] + ry * body[1]
+    # an error of the gyro's bias changes w x c by c x error: r . (c x error) = (r x c) . error
+    x, y, z = contact
+    row[9:12] += (ry * z, -rx * z, rx * y - ry * x)
+    return row
+
+
+def _steer(wheel: Rolling, u: Vector3, yaw: float, body: Array, covariance: Array, settings: FilterSettings) -> Steered:
+    """Return the direction of a wheel whose contact point moves with `u` (body axes, m/s); see the module's theory."""
+    if math.isfinite(wheel.steering):
+        return Steered(wheel.steering + yaw, 0.0, wheel.steering_sigma**2, (0.0, 0.0))
+    prior = settings.steering_sigma**2
+    square = u[0] * u[0] + u[1] * u[1]
+    if square < 1e-12:
+        return Steered(yaw, 0.0, prior, (0.0, 0.0))
+    # a wheel does not turn round: rolling backward it points away from the course
+    ahead = math.copysign(1.0, u[0])
+    course = math.atan2(ahead * u[1], ahead * u[0])
+    size = math.sqrt(square)
+    row = _row(-u[1] / size, u[0] / size, wheel.contact, body)
+    variance = max(float(row @ covariance @ row), 0.0) / square
+    follow = prior / (prior + variance)
+    most = 3.0 * settings.steering_sigma
+    turned = course - yaw
+    # no wheel steers farther than its stop: the angle follows the course no longer
+    gradient = (-u[1] / square, u[0] / square) if abs(turned) <= most else (0.0, 0.0)
+    angle = yaw + follow * min(max(turned, -most), most)
+    return Steered(angle, follow, follow * variance, gradient)
+
+
+def _mean(wheels: list[Rolling]) -> Rolling:
+    """Return the mean of the left and of the right wheels, so that the turn falls out, also with a wheel missing."""
+    sides: dict[bool, list[Rolling]] = {}
+    for wheel in wheels:
+        sides.setdefault(wheel.contact[1] > 0.0, []).append(wheel)
+    speed = variance = y = z = 0.0
+    for side in sides.values():
+        part = 1.0 / (len(side) * len(sides))
+        for wheel in side:
+            speed += part * wheel.speed
+            variance += part * part * wheel.variance
+            y, z = y + part * wheel.contact[1], z + part * wheel.contact[2]
+    # along x the mean contact point does not matter to the way it rolls, and in a skid nothing rolls about it
+    return Rolling(speed, variance, 0.0, (0.0, y, z), all(wheel.mean for wheel in wheels))
+
+
+def standing_wheels(
+    sample: WheelsSample, before: WheelsSample | None, contacts: Mapping[str, Vector3], settings: FilterSettings
+) -> bool | None:
+    """Return whether the wheels are stationary; None where they do not measure it. Steering does not matter here."""
+    wheels = rolling(sample, before, contacts, settings)
+    if not wheels:
+        return None
+    return all(abs(wheel.speed) <= settings.stationary_speed for wheel in wheels)
+
+
+def turn_rate(
+    sample: WheelsSample,
+    before: WheelsSample | None,
+    measurement: WheelSpeed,
+    settings: FilterSettings,
+    steering: float = math.nan,
+) -> float:
+    """Return the turn rate that the wheels measure, rad/s; 0 where they do not. `steering`: as in `rolling`.
+
+    Each wheel rolls at d . (v + w x c): two unknowns, forward speed and turn rate, by least squares. The direction of a
+    wheel whose angle is not measured follows from the two, so it is found by iteration from straight ahead. A
+    skid-steered vehicle's wheels slide: it turns by less than its sides' difference says, by an unknown share.
+    """
+    wheels = [each for each in measurement.rolling(sample, before, settings, steering) if not each.unsigned]
+    if len(wheels) < 2:
+        return 0.0
+    speeds = np.array([wheel.speed for wheel in wheels])
+    angles = [wheel.steering if math.isfinite(wheel.steering) else 0.0 for wheel in wheels]
+    free = [n for n, wheel in enumerate(wheels) if not math.isfinite(wheel.steering)]
+    most = 3.0 * settings.steering_sigma
+    for _ in range(TURN_STEPS if free else 1):
+        A = np.array(
+            [
+                (math.cos(a), math.sin(a) * wheel.contact[0] - math.cos(a) * wheel.contact[1])
+                for a, wheel in zip(angles, wheels, strict=True)
+            ]
+        )
+        (v, w), _, rank, _ = np.linalg.lstsq(A, speeds, rcond=1e-6)
+        if rank < 2:
+            return 0.0
+        for n in free:
+            x, y, _ = wheels[n].contact
+            ahead = math.copysign(1.0, v - w * y)
+            angles[n] = min(max(math.atan2(ahead * w * x, ahead * (v - w * y)), -most), most)
+    return float(w) if abs(w) < 10.0 else 0.0

@@ -1,0 +1,110 @@
+"""Quality check of GNSS fixes: which are good enough, and their covariance.
+
+The receiver's own covariance is used where it is valid. Otherwise the standard deviation is range error (UERE) times
+dilution of precision: HDOP covers both horizontal axes, each has (UERE HDOP)^2 / 2.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from modelserver.earth.geodesy import NORTHERN_LIMIT, SOUTHERN_LIMIT
+from modelserver.estimation.settings import FixSettings
+from modelserver.messages import FixType, GpsSample
+
+_MIN_VARIANCE = 1e-6
+"""m2; no receiver is better than a millimeter."""
+
+_MAX_VARIANCE = 1e8
+"""m2; a height with a sigma of 10 km is unknown."""
+
+_VERTICAL_RATIO = 1.6
+"""Vertical over horizontal sigma where the receiver states none: satellites are above the horizon only."""
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptedFix:
+    """The position of an antenna, degrees and ellipsoidal meters (nan: unknown), with its covariance, m2.
+
+    `east_variance`, `north_variance`, `cross` and `up_variance` are along true east, north, up.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height: float
+    east_variance: float
+    north_variance: float
+    cross: float
+    up_variance: float
+
+    @property
+    def sigma(self) -> float:
+        """Sigma of each horizontal axis, root mean square, meters."""
+        return math.sqrt(0.5 * (self.east_variance + self.north_variance))
+
+
+def evaluate_fix(sample: GpsSample, settings: FixSettings) -> AcceptedFix | str:
+    """Return the fix, or the reason why it is not good enough.
+
+    Reasons: no_fix, satellites, dilution, sigma, range (an invalid place, latitude 0 with longitude 0, beyond UTM),
+    nan.
+    """
+    latitude, longitude = sample.latitude_deg, sample.longitude_deg
+    # the receiver's dead reckoning is not an independent measurement
+    if sample.fix_type < settings.minimum_fix_type or sample.fix_type == FixType.DEAD_RECKONING:
+        return "no_fix"
+    if not (math.isfinite(latitude) and math.isfinite(longitude)):
+        return "nan"
+    if not (SOUTHERN_LIMIT <= latitude <= NORTHERN_LIMIT and -180.0 <= longitude <= 360.0):
+        return "range"
+    if abs(latitude) < 1e-7 and abs(longitude) < 1e-7:
+        return "range"  # sent by receivers and drivers without a fix
+    if 0 <= sample.satellites < settings.minimum_satellites:
+        return "satellites"
+    if sample.hdop > settings.maximum_hdop:
+        return "dilution"
+    height = sample.height_ellipsoidal
+    if math.isnan(height):
+        height = sample.height_msl + sample.undulation
+    over_sea = math.isnan(height)
+    if over_sea:
+        height = sample.height_msl  # without undulation: wrong by its size
+    if math.isinf(height) or abs(height) > 1e5:
+        return "range"
+    east, north, cross, up = _covariance(sample, settings)
+    if over_sea:
+        up = max(up, settings.assumed_height_sigma**2)
+    fix = AcceptedFix(latitude, longitude, height, east, north, cross, up)
+    return fix if fix.sigma <= settings.maximum_sigma else "sigma"
+
+
+def range_error(fix_type: FixType, settings: FixSettings) -> float:
+    """Return the range error (UERE) of a fix type, meters."""
+    if fix_type == FixType.RTK_FIXED:
+        return settings.uere_rtk_fixed
+    if fix_type == FixType.RTK_FLOAT:
+        return settings.uere_rtk_float
+    if fix_type == FixType.DIFFERENTIAL:
+        return settings.uere_differential
+    return settings.uere
+
+
+def _covariance(sample: GpsSample, settings: FixSettings) -> tuple[float, float, float, float]:
+    """Return variances east and north, covariance, variance up: the receiver's, else range error times dilution."""
+    stated = sample.position_covariance
+    if stated is not None:
+        east, cross, north, up = stated[0], stated[1], stated[4], stated[8]
+        if 0.0 < east < math.inf and 0.0 < north < math.inf:
+            if not cross * cross < east * north:
+                cross = 0.0
+            if not 0.0 < up < math.inf:
+                up = _VERTICAL_RATIO**2 * 0.5 * (east + north)
+            least = _MIN_VARIANCE
+            return max(east, least), max(north, least), cross, min(max(up, least), _MAX_VARIANCE)
+    uere = range_error(sample.fix_type, settings)
+    hdop = sample.hdop if sample.hdop > 0.0 else settings.assumed_hdop
+    vdop = sample.vdop if 0.0 < sample.vdop < math.inf else _VERTICAL_RATIO * hdop
+    # HDOP is of both axes together
+    each = max(0.5 * (uere * hdop) ** 2, _MIN_VARIANCE)
+    return each, each, 0.0, min(max(uere * vdop * uere * vdop, _MIN_VARIANCE), _MAX_VARIANCE)

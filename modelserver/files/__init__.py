@@ -1,0 +1,1 @@
+"""Files by path: bounded reading of regular files, and detection of what a file is."""

@@ -1,0 +1,414 @@
+"""Read Miro frame-tree XML: `<instance type="rapid::FrameRpyParameters" name=...>` elements, as NASA's rovers use.
+
+Each instance is a frame at X, Y, Z (meters) in its Parent, rotated by Roll, Pitch, Yaw (degrees, about fixed axes:
+Rz(yaw) Ry(pitch) Rx(roll)); omitted values are 0. The format has no bodies, so the frames are grouped:
+
+- A frame that is a Parent, or has no Parent, is a body; the body's frame `Origin` is the frame itself.
+- Every other frame is a frame of its parent's body.
+- A body with a parent is also a frame of the parent's body, and the constraint `<name>Fixed`, an identity, joins that
+  frame to the body's Origin.
+
+So a frame keeps its own name, `Parent:Frame`, and what is mounted together moves together. Numbers are used as written:
+NASA's own files are x forward, y right, z down.
+
+A Parent is a path, see `frame_paths`. The parents are found in two passes: first those with a unique name, then, as the
+paths above them become known, those whose name several frames have. A Parent that is not in the file but outside a
+vehicle by its nature (an absolute path, the earth, a UTM grid) becomes a root, so that its children stay connected.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from modelserver.errors import Location, Severity, Suggestion, find_suggestion, quote, suggest_name
+from modelserver.formats.frame_paths import ANY, ROOT, Ancestry, FramePath, parse_path
+from modelserver.formats.reading import MAX_SUGGESTIONS, ORIGIN, check_position, find_cycles, label, parse_number
+from modelserver.formats.xml_document import NamedParameters, get_line
+from modelserver.geometry import names
+from modelserver.geometry.builder import ModelBuilder
+from modelserver.geometry.draft import BodyBuilder
+from modelserver.transforms.pose import Pose
+
+if TYPE_CHECKING:
+    from lxml.etree import _Element as Element
+
+_POSITION = ("X", "Y", "Z")
+_ROTATION = ("Roll", "Pitch", "Yaw")
+_PARAMETERS = ("Name", "Parent", *_POSITION, *_ROTATION)
+_VARIABLE = re.compile(r"\$(?:\{(\w+)\}|(\w+))", re.ASCII)
+
+
+def find_instances(root: Element) -> Iterator[Element]:
+    """Yield the elements of this format."""
+    for element in root.iter("{*}instance"):
+        if (element.get("type") or "").strip().endswith("FrameRpyParameters"):
+            yield element
+
+
+def load(root: Element, builder: ModelBuilder, file: str, variables: Mapping[str, str]) -> ModelBuilder:
+    """Add the frames below `root`, grouped into bodies, and their problems to `builder`.
+
+    `$NAME` and `${NAME}` are replaced from `variables`, else from the environment.
+    """
+    reader = _FrameTreeReader(builder, file, variables)
+    for element in find_instances(root):
+        reader.read_frame(element)
+    reader.report_other_types(root)
+    reader.report_variables()
+    if reader.find_parents():
+        reader.add_bodies()
+    return builder
+
+
+_EXTERNAL_FRAME = re.compile(r"Earth|UtmGrid\d{1,2}[A-Z]|\$\{?SITE_FRAME\}?")
+"""Frames that NASA's frame store has without a file: the earth, its UTM grids, and the robot's site."""
+
+
+@dataclass(slots=True)
+class _FrameInstance:
+    name: str
+    parent: str
+    pose: Pose
+    source: Location
+    parent_source: Location
+    path: FramePath
+
+
+class _FrameTreeReader:
+    def __init__(self, builder: ModelBuilder, file: str, variables: Mapping[str, str]):
+        self.builder = builder
+        self.file = file
+        self.variables = variables
+        self.frames: dict[str, _FrameInstance] = {}
+        """By name; a second frame of a name, with another parent, by parent and name."""
+        self.parents: dict[str, str] = {}
+        """Key of the parent of each frame, empty for a root."""
+        self.undefined: dict[str, list[Location]] = {}
+
+    def read_frame(self, element: Element) -> None:
+        """Read one instance; a second one of the same name and parent is ignored with a warning."""
+        own = (element.get("name") or "").strip()
+        parts = NamedParameters(element, _PARAMETERS, self.builder, self.file, f"frame {label(own)}")
+        name = self.expand(own, parts.locate())
+        stated = self.expand(parts.read_text("Name") or "", parts.locate("Name"))
+        if not name:
+            name = stated
+        elif stated and stated != name:
+            self.builder.add_warning(
+                f"the instance is named {label(name)}, its parameter Name {label(stated)}; {label(name)} is used",
+                parts.locate("Name"),
+                "make the two alike, or remove the parameter Name",
+            )
+        parent = self.expand(parts.read_text("Parent") or "", parts.locate("Parent"))
+        pose = self.read_pose(parts)
+        path = parse_path(parent)
+        frame = _FrameInstance(name, parent, pose or Pose.identity(), parts.locate(), parts.locate("Parent"), path)
+        first = self.frames.get(name)
+        key = name
+        if first is not None and first.path != path:
+            # names are unique below one parent only
+            key = f"{parent}/{name}"
+            first = self.frames.get(key)
+        if first is None:
+            self.frames[key] = frame
+        else:
+            self.report_duplicate(first, frame)
+
+    def report_duplicate(self, first: _FrameInstance, second: _FrameInstance) -> None:
+        """Report a second frame of a name in the same parent."""
+        moved, turned = first.pose.distance(second.pose)
+        lines = f"on line {first.source.line} and on line {second.source.line}"
+        self.builder.add_warning(
+            f"frame {label(first.name)} is defined twice: {lines}; "
+            f"the two are {moved:.6g} m and {math.degrees(turned):.6g} deg apart; the first is used",
+            second.source,
+            "rename one of the two, or remove the wrong one",
+        )
+
+    def read_pose(self, parts: NamedParameters) -> Pose | None:
+        """Read the pose from X to Yaw; None, with an error, if one is not a number."""
+        values: list[float] = []
+        for key in (*_POSITION, *_ROTATION):
+            if key not in parts.elements:
+                values.append(0.0)
+                continue
+            text = parts.read_text(key)
+            if text is None:
+                continue
+            unit = "meters" if key in _POSITION else "degrees"
+            filled, missing = self.substitute(text)
+            if missing:
+                self.builder.add_error(
+                    f"{key} takes its number from ${missing[0]}, which is not defined",
+                    parts.locate(key),
+                    f"give it: --set {missing[0]}=NUMBER, or export {missing[0]}",
+                    tuple(suggest_name(missing[0], self.variables)),
+                )
+                continue
+            try:
+                values.append(parse_number(filled.strip()))
+            except ValueError as error:
+                self.builder.add_error(f"{key}: {error}", parts.locate(key), f"write one number, in {unit}")
+        if len(values) != 6 or not check_position(values[:3], self.builder, parts.locate()):
+            return None
+        return Pose.from_rpy(values[:3], *(math.radians(value) for value in values[3:]))
+
+    def substitute(self, text: str) -> tuple[str, list[str]]:
+        """Replace the variables in a text; return it, and the names of those that are not defined."""
+        if "$" not in text:
+            return text, []
+        missing: list[str] = []
+
+        def replace_variable(match: re.Match[str]) -> str:
+            name = match[1] or match[2]
+            found = self.variables.get(name, os.environ.get(name))
+            if found is None:
+                missing.append(name)
+                return match[0]
+            return found
+
+        return _VARIABLE.sub(replace_variable, text), missing
+
+    def expand(self, text: str, source: Location) -> str:
+        """Replace the variables in a name; undefined ones stay, and are recorded."""
+        filled, missing = self.substitute(text)
+        for name in missing:
+            self.undefined.setdefault(name, []).append(source)
+        return filled.strip()
+
+    def report_variables(self) -> None:
+        """Report each undefined variable once, at its first use."""
+        for name, places in self.undefined.items():
+            uses = f" (used {len(places)} times)" if len(places) > 1 else ""
+            self.builder.add_warning(
+                f"${name} is not defined{uses}; it stays in names as it is written",
+                places[0],
+                f"give it: --set {name}=NAME, or export {name}",
+                tuple(suggest_name(name, self.variables)),
+            )
+
+    def report_other_types(self, root: Element) -> None:
+        """Report instances of other types, which are not read."""
+        passed: dict[str, list[int]] = {}
+        for element in root.iter("{*}instance"):
+            kind = (element.get("type") or "").strip()
+            if not kind.endswith("FrameRpyParameters"):
+                passed.setdefault(kind, []).append(get_line(element))
+        for kind, lines in passed.items():
+            # a type with "frame" in its name is probably meant as one
+            severity = Severity.WARNING if "frame" in kind.casefold() else Severity.NOTE
+            self.builder.add_problem(
+                severity,
+                f"{len(lines)} instance{'' if len(lines) == 1 else 's'} of type {label(kind)} ignored",
+                Location(self.file, lines[0]),
+                "frames have type rapid::FrameRpyParameters" if severity is Severity.WARNING else "",
+            )
+
+    def find_parents(self) -> bool:
+        """Find the parent of each frame; report missing parents and cycles. Return whether there are none."""
+        named = {frame.name for frame in self.frames.values()}
+        for frame in self.frames.values():
+            if "/" in frame.parent and frame.parent in named:
+                # a name may hold slashes
+                frame.path = FramePath((frame.parent,), False)
+        self.add_external_roots()
+        keys: dict[str, list[str]] = {}
+        for key, frame in self.frames.items():
+            keys.setdefault(frame.name, []).append(key)
+        ancestry = Ancestry({key: frame.name for key, frame in self.frames.items()}, self.parents)
+        several: list[str] = []
+        for key, frame in self.frames.items():
+            candidates = keys.get(frame.path.name, [])
+            if not frame.path.parts:
+                self.parents[key] = ""
+            elif len(candidates) == 1:
+                # its ancestors are compared with the path when all parents are known
+                self.parents[key] = candidates[0]
+            elif candidates:
+                several.append(key)
+        self.resolve_shared_names(several, keys, ancestry)
+        missing = [key for key in self.frames if key not in self.parents]
+        is_tree = self.has_no_cycles()
+        if is_tree:
+            for key, frame in self.frames.items():
+                parent = self.parents.get(key, "")
+                if parent and not frame.path.is_plain and not self.is_parent_on_path(frame, parent, keys, ancestry):
+                    missing.append(key)
+        if not ancestry.is_exhausted:
+            self.report_missing(missing, keys, ancestry)
+        else:
+            self.builder.add_error(
+                "the paths of parents are too many and too deep", Location(self.file), "write plain names"
+            )
+        return is_tree and not missing and not ancestry.is_exhausted
+
+    def add_external_roots(self) -> None:
+        """Add a root for each parent that is outside the file by its nature."""
+        known = {frame.name for frame in self.frames.values()}
+        meant: dict[str, str] = {}
+        for frame in tuple(self.frames.values()):
+            path = frame.path
+            if not path.parts or not known.isdisjoint(path.parts) or path.name == ANY:
+                continue
+            is_outside = bool(_EXTERNAL_FRAME.fullmatch(path.name))
+            if not is_outside:
+                if path.is_absolute and path.name not in meant:
+                    meant[path.name] = find_suggestion(path.name, known) if len(meant) < MAX_SUGGESTIONS else ""
+                if not path.is_absolute or meant[path.name]:
+                    continue
+            if path.name in names.RESERVED_BODIES:
+                # the service has a frame of this name itself: its children are roots
+                frame.path = ROOT
+            elif path.name not in self.frames:
+                source = frame.parent_source
+                self.frames[path.name] = _FrameInstance(path.name, "", Pose.identity(), source, source, ROOT)
+                self.builder.add_problem(
+                    Severity.NOTE, f"Parent {label(frame.parent)} is not in the file; it becomes a root", source
+                )
+
+    def resolve_shared_names(self, several: list[str], keys: dict[str, list[str]], ancestry: Ancestry) -> None:
+        """Find the parents whose name several frames have, when the ancestors of those are known."""
+        while several:
+            left: list[str] = []
+            for key in several:
+                if ancestry.is_exhausted:
+                    return
+                path = self.frames[key].path
+                above = {each: ancestry.of(each) for each in keys[path.name] if each != key}
+                fitting = [(len(at), each) for each, at in above.items() if at is not None and ancestry.match(path, at)]
+                if None in above.values() and not any(depth == 1 for depth, _ in fitting):
+                    left.append(key)
+                elif fitting:
+                    self.parents[key] = min(fitting, key=lambda found: found[0])[1]
+                    if len(fitting) > 1:
+                        self.report_ambiguous(key, [each for _, each in fitting], ancestry)
+            if len(left) == len(several):
+                return
+            several = left
+
+    def report_ambiguous(self, key: str, fitting: list[str], ancestry: Ancestry) -> None:
+        frame = self.frames[key]
+        paths = ["/".join(ancestry.of(each) or ()) for each in fitting]
+        chosen = "/".join(ancestry.of(self.parents[key]) or ())
+        self.builder.add_warning(
+            f"Parent {label(frame.parent)} names {len(fitting)} frames: {', '.join(map(label, paths[:4]))}; "
+            f"{label(chosen)} is used",
+            frame.parent_source,
+            "write the path of the one that is meant",
+        )
+
+    def is_parent_on_path(self, frame: _FrameInstance, parent: str, named: Collection[str], ancestry: Ancestry) -> bool:
+        """Return whether the ancestors of a frame's parent match its path."""
+        above = ancestry.of(parent)
+        if above is None:
+            return ancestry.is_exhausted
+        path = frame.path
+        if path.is_absolute:
+            # the part above the roots of the file cannot be compared
+            inside = next((n for n, part in enumerate(path.parts) if part in named or part == ANY), 0)
+            path = FramePath(path.parts[inside:], True)
+        return ancestry.match(path, above) or ancestry.is_exhausted
+
+    def report_missing(self, missing: list[str], keys: dict[str, list[str]], ancestry: Ancestry) -> None:
+        """Report missing parents, each with a suggestion if it is unambiguous."""
+        meant: dict[FramePath, str] = {}
+        for key in missing:
+            frame = self.frames[key]
+            path = frame.path
+            if path not in meant:
+                meant[path] = self.suggest_parent(frame, keys, ancestry) if len(meant) < MAX_SUGGESTIONS else ""
+            near = meant[path]
+            why = ""
+            if self.parents.get(key):
+                why = f": {label(path.name)} is {label('/'.join(ancestry.of(self.parents[key]) or ()))}"
+            self.builder.add_error(
+                f"Parent names {quote(frame.parent)}, which does not exist{why}",
+                frame.parent_source,
+                f"write {near}" if near else "name a frame of this file, or leave it empty for a root",
+                Suggestion.of(frame.parent, near),
+            )
+
+    def suggest_parent(self, frame: _FrameInstance, keys: dict[str, list[str]], ancestry: Ancestry) -> str:
+        """Return the path of which one name is misspelled in a Parent; empty if that is ambiguous.
+
+        It has as many names: an ancestor is another place, and a frame cannot be its own parent.
+        """
+        parts = list(frame.path.parts)
+        unknown = [n for n, part in enumerate(parts) if part not in keys and part != ANY]
+        if len(unknown) != 1:
+            return ""
+        (at,) = unknown
+        near = find_suggestion(parts[at], [name for name in keys if name != frame.name and name not in parts])
+        if not near:
+            return ""
+        parts[at] = near
+        found = FramePath(tuple(parts), frame.path.is_absolute)
+        placed = (ancestry.of(key) for key in keys[found.name])
+        if not found.is_plain and not any(above is not None and ancestry.match(found, above) for above in placed):
+            return ""
+        return ("/" if found.is_absolute else "") + "/".join(parts)
+
+    def has_no_cycles(self) -> bool:
+        """Report cycles of parents; return whether there are none."""
+        is_tree = True
+        for cycle in find_cycles(self.frames, lambda key: self.parents.get(key) or None):
+            is_tree = False
+            self.builder.add_error(
+                f"parents form a cycle: {' in '.join(map(label, cycle))}",
+                self.frames[cycle[-1]].parent_source,
+                "one of them must have a Parent outside the cycle, or an empty one",
+            )
+        return is_tree
+
+    def add_bodies(self) -> None:
+        """Add the bodies, frames and constraints; see the module's description."""
+        self.remove_duplicates()
+        inner = {parent for parent in self.parents.values() if parent}
+        roots = [key for key in self.frames if not self.parents[key]]
+        mounted = [key for key in self.frames if self.parents[key] and key in inner]
+        bodies: dict[str, BodyBuilder] = {}
+        taken: set[str] = set()
+        for key in (*roots, *mounted):
+            frame = self.frames[key]
+            name = frame.name
+            if name in taken:
+                name = f"{self.frames[self.parents[key]].name}.{name}" if self.parents[key] else name
+            taken.add(name)
+            bodies[key] = self.builder.add_body(name, source=frame.source)
+            bodies[key].add_frame(ORIGIN, source=frame.source)
+        for key, frame in self.frames.items():
+            parent = self.parents[key]
+            if not parent:
+                if frame.pose != Pose.identity():
+                    bodies[key].pose = frame.pose
+                continue
+            if frame.name == ORIGIN:
+                where = label(bodies[parent].name)
+                self.builder.add_error(
+                    f"a frame in {where} is named {ORIGIN}, which is the name of the frame of {where} itself",
+                    frame.source,
+                    "rename it",
+                )
+                continue
+            bodies[parent].add_frame(frame.name, frame.pose, source=frame.source)
+            if key in bodies:
+                name = bodies[key].name
+                end = f"{bodies[parent].name}:{frame.name}"
+                self.builder.add_constraint(f"{name}Fixed", end, f"{name}:{ORIGIN}", source=frame.source)
+
+    def remove_duplicates(self) -> None:
+        """Remove frames of the same name whose parents are equal but written differently, e.g. as a name and a path."""
+        first: dict[tuple[str, str], str] = {}
+        replaced: dict[str, str] = {}
+        for key, frame in tuple(self.frames.items()):
+            replaced[key] = first.setdefault((frame.name, self.parents[key]), key)
+        for key, other in replaced.items():
+            if key != other:
+                self.report_duplicate(self.frames[other], self.frames.pop(key))
+                del self.parents[key]
+        self.parents = {key: replaced.get(parent, parent) for key, parent in self.parents.items()}

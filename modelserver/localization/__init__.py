@@ -1,1 +1,0 @@
-"""Localization: from sensor samples to the vehicle's pose and how sure it is. Pure."""

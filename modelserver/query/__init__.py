@@ -1,0 +1,6 @@
+"""Queries: where a frame is in another at a time, from geometry, joints and the vehicle's estimates. Pure."""
+
+from modelserver.query.view import HISTORY_LIMIT, PREDICTION_LIMIT_S, PlatformView
+from modelserver.query.world_frames import WORLD_FRAMES
+
+__all__ = ["HISTORY_LIMIT", "PREDICTION_LIMIT_S", "WORLD_FRAMES", "PlatformView"]

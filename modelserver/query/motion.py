@@ -1,0 +1,143 @@
+"""Motion of a frame in another: velocity and acceleration, from the joints' rates and the vehicle's own motion.
+
+The rigid motion of each edge is composed along the path (`transforms.kinematics`). A joint moves by J q' and
+J q'' + J' q', with its Jacobian J differenced along q'. The vehicle's acceleration is measured at the inertial unit and
+transferred by the lever arm: a + dw x r + w x (w x r). The covariance of the velocities is first order in the chain.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from modelserver.errors import NoPoseError
+from modelserver.geometry.joint import Joint
+from modelserver.geometry.topology import EdgeKind
+from modelserver.joints.history import Provenance
+from modelserver.messages import NAN, Estimate, MotionAnswer, Policy, TimeQuery
+from modelserver.query.path import PathStep, lookup_path
+from modelserver.query.view import PlatformView
+from modelserver.transforms import chain, so3
+from modelserver.transforms.chain import ChainLink
+from modelserver.transforms.kinematics import UNKNOWN, RigidMotion
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Array, add, cross, to_vector3
+
+_STEP = 1e-4
+"""Seconds over which the Jacobian of a joint is differenced."""
+
+
+def compute_motion(
+    view: PlatformView, interest: str, reference: str, expressed_in: str, time: TimeQuery, now: int = 0
+) -> MotionAnswer:
+    """Return the velocity and acceleration of `interest` relative to `reference`, as observed in `reference`.
+
+    Vectors are along the axes of `expressed_in`, empty for the frame of reference. Raises QueryError as
+    `PlatformView.transformation`; NoPoseError where the vehicle's velocity is unknown.
+    """
+    answer = view.transformation(interest, reference, time, now)
+    path = lookup_path(view, interest, reference, time, now)
+    moved = RigidMotion(Pose.identity())
+    uncertain: list[ChainLink] = []
+    for step in path.steps:
+        each, factor = _step_motion(view, step)
+        moved = moved.compose(each if step.edge.forward else each.inverse())
+        # the vehicle has one motion, in whichever world it is expressed
+        source = step.source if step.estimate is None else (EdgeKind.VEHICLE,)
+        uncertain.append(ChainLink(step.X_FT, step.edge.forward, factor, source))
+    R = so3.IDENTITY
+    axes = expressed_in or reference
+    if axes != reference:
+        has_time = bool(time.at) and time.policy is not Policy.LATEST
+        at = TimeQuery(path.utime, time.policy if has_time else Policy.PREDICTED)
+        turned = view.transformation(reference, axes, at, now)
+        R = turned.transformation.pose.wxyz
+        # an invalid rotation makes the vectors invalid
+        answer = answer._replace(
+            transformation=answer.transformation.with_invalid_reasons(turned.transformation.invalid_reasons),
+            quality=answer.quality | turned.quality,
+        )
+    covariance = chain.covariance(uncertain)
+    if covariance is not None and axes != reference:
+        turn = np.kron(np.eye(2), np.array(so3.matrix_rows(R)))
+        covariance = turn @ covariance @ turn.T
+    return MotionAnswer(
+        answer,
+        axes,
+        so3.rotate(R, moved.velocity),
+        so3.rotate(R, moved.angular_velocity),
+        so3.rotate(R, moved.acceleration),
+        so3.rotate(R, moved.angular_acceleration),
+        None if covariance is None else tuple(covariance.ravel().tolist()),
+    )
+
+
+def _step_motion(view: PlatformView, step: PathStep) -> tuple[RigidMotion, Array | None]:
+    """Return the motion of a step's far end in its near end, and the factor of that velocity's covariance."""
+    if step.estimate is not None:
+        return _vehicle_motion(view, step.X_FT, step.estimate)
+    if step.edge.joint is None:
+        return RigidMotion(step.X_FT), _EXACT
+    return _joint_motion(view, step, step.edge.joint)
+
+
+def _joint_motion(view: PlatformView, step: PathStep, joint: Joint) -> tuple[RigidMotion, Array | None]:
+    drive = view.model.drives[step.edge.name]
+    position, rates, changes, sigmas = [], [], [], []
+    for name, reading in zip(drive.names, step.readings, strict=True):
+        track = view.joints.tracks.get(name)
+        rate, change = reading.rate, NAN
+        if reading.provenance is Provenance.DEFAULT:
+            rate = change = 0.0
+        elif track is not None:
+            # the track is that of the leader
+            read = reading._replace(rate=reading.rate / drive.multiplier if drive.multiplier else 0.0)
+            rate, change = track.estimate_derivatives(read)
+            rate, change = rate * drive.multiplier, change * drive.multiplier
+        position.append(reading.position)
+        rates.append(rate)
+        changes.append(change)
+        # a joint and its followers have common errors
+        sigmas.append(reading.rate_sigma)
+    J = joint.jacobian(position)
+    qd = np.array(rates)
+    twist = _multiply_known(J, qd)
+    after = joint.jacobian([q + _STEP * r for q, r in zip(position, rates, strict=True)])
+    before = joint.jacobian([q - _STEP * r for q, r in zip(position, rates, strict=True)])
+    second = _multiply_known(J, np.array(changes)) + _multiply_known((after - before) / (2.0 * _STEP), qd)
+    factor = None if any(map(np.isnan, sigmas)) else J * np.array(sigmas)
+    moved = RigidMotion(
+        step.X_FT, to_vector3(twist[:3]), to_vector3(twist[3:]), to_vector3(second[:3]), to_vector3(second[3:])
+    )
+    return moved, factor
+
+
+def _multiply_known(J: Array, rates: Array) -> Array:
+    """Return J @ rates, where an unknown rate affects only what it moves."""
+    return np.asarray(np.where(J == 0.0, 0.0, J * rates).sum(axis=1))
+
+
+def _vehicle_motion(view: PlatformView, X_WB: Pose, estimate: Estimate) -> tuple[RigidMotion, Array | None]:
+    own = estimate.motion
+    if own is None:
+        raise NoPoseError(
+            "the vehicle's velocity is not known: localization has none for this time"
+            + (f" ({estimate.invalid.explain()})" if estimate.invalid else "")
+        )
+    q = X_WB.wxyz
+    turning = view.history.angular_acceleration(estimate.utime)
+    w = own.angular_velocity
+    acceleration, change = UNKNOWN, UNKNOWN if turning is None else turning
+    if turning is not None:
+        x, y, z = own.imu_position
+        arm = (-x, -y, -z)
+        acceleration = add(own.acceleration, cross(turning, arm), cross(w, cross(w, arm)))
+    factor = None
+    if own.covariance is not None:
+        turn = np.kron(np.eye(2), np.array(so3.matrix_rows(q)))
+        factor = turn @ chain.factor(np.array(own.covariance()).reshape(6, 6))
+    return RigidMotion(
+        X_WB, so3.rotate(q, own.velocity), so3.rotate(q, w), so3.rotate(q, acceleration), so3.rotate(q, change)
+    ), factor
+
+
+_EXACT = np.zeros((6, 1))

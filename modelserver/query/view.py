@@ -1,0 +1,448 @@
+"""PlatformView: answers queries from an immutable view of geometry, joints and estimates. Pure.
+
+The poses of all frames in the base frame at the time of the query give every pair: `X_RI = inverse(X_BR) X_BI`. For a
+frame of the vehicle it comes from the model and the joints; for a world frame it is the inverse of the vehicle's pose
+there, which localization computes for each world frame by geodesy at the vehicle's position.
+
+Covariances: the vehicle's is transported to a frame by the lever arm, also for large heading errors
+(`transforms.large_angle`), and the independent one of the mount and its joints is added.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Final, TypeAlias
+
+import numpy as np
+
+from modelserver.errors import (
+    LimitError,
+    MalformedRequestError,
+    NoPoseError,
+    NotConnectedError,
+    QueryError,
+    TooNewError,
+    TooOldError,
+)
+from modelserver.estimation.interface import Localizer
+from modelserver.geometry import names
+from modelserver.geometry.kinematic_path import KinematicPath
+from modelserver.geometry.model import Model
+from modelserver.geometry.path_covariance import as_array
+from modelserver.history import History, restamp
+from modelserver.joints.history import NO_JOINTS, JointHistory, JointTrack
+from modelserver.messages import (
+    NAN,
+    NO_FLAGS,
+    STALE_SENSORS,
+    VALID,
+    Estimate,
+    Invalid,
+    Policy,
+    PoseAnswer,
+    Quality,
+    TimeQuery,
+)
+from modelserver.query.joint_lookup import NO_READINGS, JointReadings, find_tracks, lookup_joints
+from modelserver.query.steps import Steps, complete
+from modelserver.query.world_frames import (
+    WORLD_FRAMES,
+    check_not_reserved,
+    find_vehicle_pose,
+    get_vehicle_pose,
+    is_absolute,
+)
+from modelserver.transforms import covariance as cov
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Array
+from modelserver.transforms.transformation import Transformation
+
+PREDICTION_LIMIT_S: Final = 5.0
+"""Largest time after the newest sample for which a pose is predicted; by then its protection level is long exceeded."""
+
+HISTORY_LIMIT: Final = 1000
+"""Poses in one reply to getHistory."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlatformView:
+    """The current state for queries: geometry, joints, and the history of the vehicle's estimates.
+
+    base_frame: the frame whose pose is queried and published. rolling_frame: the frame of the estimates, the point of
+    the vehicle that moves along its own x axis; empty for the base frame. invalid: reasons against every pose, besides
+    those of its own estimate.
+    """
+
+    model: Model
+    base_frame: str
+    localizer: Localizer | None
+    history: History
+    rolling_frame: str = ""
+    invalid: Invalid = VALID
+    joints: JointHistory = NO_JOINTS
+
+    def __post_init__(self) -> None:
+        if not self.rolling_frame:
+            object.__setattr__(self, "rolling_frame", self.base_frame)
+
+    def transformation(
+        self, frame_of_interest: str, frame_of_reference: str, time: TimeQuery, now: int = 0
+    ) -> PoseAnswer:
+        """Return where a frame is in another. Raises a QueryError for each cause.
+
+        `now` is the utime of the query: the latest pose is invalid where the sensors timed out.
+        """
+        interest = frame_of_interest in WORLD_FRAMES
+        reference = frame_of_reference in WORLD_FRAMES
+        if not interest and not reference:
+            return self._lookup_within_vehicle(frame_of_interest, frame_of_reference, time, now)
+        for frame, world in ((frame_of_interest, interest), (frame_of_reference, reference)):
+            if not world:
+                check_not_reserved(frame)
+                self.check_on_vehicle(frame)
+        if frame_of_interest == frame_of_reference:
+            return PoseAnswer(Transformation(frame_of_interest, frame_of_reference, Pose.identity(), _ZERO))
+        if interest and reference:
+            estimate = self.estimate(time, now)
+            X_RB = get_vehicle_pose(frame_of_reference, estimate)
+            X_IB = get_vehicle_pose(frame_of_interest, estimate)
+            return self._build_answer(frame_of_interest, frame_of_reference, X_RB @ X_IB.inverse(), None, estimate)
+        frame, world_frame = (
+            (frame_of_interest, frame_of_reference) if reference else (frame_of_reference, frame_of_interest)
+        )
+        path = self.get_path_from_vehicle(frame)
+        estimate, joints = self.lookup_vehicle_and_joints(path, time, now)
+        pose, covariance = self._in_world(frame, world_frame, estimate, path, joints, inverted=not reference)
+        return self._build_answer(frame_of_interest, frame_of_reference, pose, covariance, estimate, joints, path)
+
+    def _lookup_within_vehicle(
+        self, frame_of_interest: str, frame_of_reference: str, time: TimeQuery, now: int
+    ) -> PoseAnswer:
+        """Return a relation within the vehicle."""
+        model = self.model
+        try:
+            rigid = model.rigid_transformation(frame_of_interest, frame_of_reference)
+            if rigid is not None:
+                # constant in time: no stamp
+                return PoseAnswer(rigid)
+            path = model.get_kinematic_path(frame_of_interest, frame_of_reference)
+        except QueryError:
+            check_not_reserved(frame_of_interest)
+            check_not_reserved(frame_of_reference)
+            raise
+        if not path.joints:
+            fixed = PoseAnswer(model.get_transformation(frame_of_interest, frame_of_reference))
+            return fixed._replace(quality=Quality.LOOP) if path.is_in_loop else fixed
+        utime, joints = self.lookup_joints(path, time, now)
+        places = path.compute_joint_poses(joints.positions)
+        return PoseAnswer(
+            Transformation(
+                frame_of_interest,
+                frame_of_reference,
+                path.to_pose(places),
+                lambda: path.compute_covariance(joints.positions, joints.sigmas, joint_poses=places),
+                utime,
+                # as numbers: combining flags costs more than the pose
+                self.invalid.value & _CLOCK_STEPPED | joints.invalid.value,
+                model_revision=self.model.revision,
+            ),
+            quality=joints.quality | Quality.LOOP if path.is_in_loop else joints.quality,
+        )
+
+    def get_path_from_vehicle(self, frame: str) -> KinematicPath:
+        """Return the kinematic path from the rolling frame to a frame of the vehicle. Raises QueryError."""
+        return self.model.get_kinematic_path(frame, self.rolling_frame)
+
+    def lookup_joints(self, path: KinematicPath, time: TimeQuery, now: int) -> tuple[int, JointReadings]:
+        """Return time and positions of the joints of a path; the latest time is one that all joints have reached."""
+        if time.at and time.policy is not Policy.LATEST:
+            return time.at, lookup_joints(path, self.model, self.joints, time.at, time.policy)
+        tracks = find_tracks(path, self.model, self.joints)
+        # joints that were never received are at their defaults, which holds now
+        utime = min(track.last for _, track in tracks) if tracks else now
+        try:
+            return utime, lookup_joints(path, self.model, self.joints, utime, Policy.INTERPOLATED, now)
+        except TooOldError as error:
+            raise self._no_common_time_error(tracks, error) from None
+
+    def lookup_vehicle_and_joints(
+        self, path: KinematicPath, time: TimeQuery, now: int
+    ) -> tuple[Estimate, JointReadings]:
+        """Return the vehicle's estimate and the positions of the joints of a path from it, at one time."""
+        if not path.joints:
+            return self.estimate(time, now), NO_READINGS
+        if time.at and time.policy is not Policy.LATEST:
+            return self.estimate(time, now), lookup_joints(path, self.model, self.joints, time.at, time.policy)
+        newest = self.estimate(time, now)
+        tracks = find_tracks(path, self.model, self.joints)
+        utime = min((track.last for _, track in tracks), default=newest.utime)
+        try:
+            if utime < newest.utime:
+                stale = newest.invalid & STALE_SENSORS
+                newest = self.history.at(utime)
+                if stale not in newest.invalid:
+                    newest = replace(newest, invalid=newest.invalid | stale)
+            return newest, lookup_joints(path, self.model, self.joints, newest.utime, Policy.INTERPOLATED, now)
+        except TooOldError as error:
+            raise self._no_common_time_error(tracks, error) from None
+
+    def _no_common_time_error(self, tracks: list[tuple[str, JointTrack]], error: TooOldError) -> TooOldError:
+        name, track = min(tracks, key=lambda each: each[1].last)
+        return TooOldError(
+            f"no time is covered by all joints and the vehicle: joint {name} was received last at {track.last}. "
+            f"{error}. Query with a time and policy HELD, or check the driver of the joint"
+        )
+
+    def vehicle_pose(self, time: TimeQuery, now: int = 0) -> PoseAnswer:
+        """Return the base frame's pose in World:UTM; as `transformation`."""
+        return self.transformation(self.base_frame, names.WORLD_UTM, time, now)
+
+    def vehicle_history(self, start_utime: int, end_utime: int, rate_hz: float) -> tuple[PoseAnswer, ...]:
+        """Return the result of `vehicle_history_in_steps` at once."""
+        return complete(self.vehicle_history_in_steps(start_utime, end_utime, rate_hz))
+
+    def vehicle_history_in_steps(
+        self, start_utime: int, end_utime: int, rate_hz: float
+    ) -> Steps[tuple[PoseAnswer, ...]]:
+        """Return the base frame's poses in World:UTM at a constant rate; times outside the history are omitted.
+
+        Raises MalformedRequestError for a range that ends before it starts or a rate that is not positive, LimitError
+        for too many poses, NoPoseError.
+        """
+        if not (rate_hz > 0.0 and rate_hz < 1e6):
+            raise MalformedRequestError(f"rate_hz is above 0 and below 1e6, got {rate_hz}")
+        if end_utime < start_utime:
+            raise MalformedRequestError(f"the range ends ({end_utime}) before it starts ({start_utime})")
+        count = int((end_utime - start_utime) * 1e-6 * rate_hz + 1e-9) + 1
+        if count > HISTORY_LIMIT:
+            raise LimitError(
+                f"{count} poses were requested; at most {HISTORY_LIMIT} are allowed in one reply. Split the request."
+            )
+        if self.localizer is None or not len(self.history):
+            raise self.no_pose_error()
+        answers = []
+        for n in range(count):
+            utime = start_utime + round(n * 1e6 / rate_hz)
+            if self.history.first <= utime <= self.history.last:
+                estimate = self.history.at(utime)
+                if estimate.utm is not None:
+                    answers.append(self.get_published_pose(estimate, names.WORLD_UTM))
+                yield
+        return tuple(answers)
+
+    def estimate(self, time: TimeQuery, now: int = 0) -> Estimate:
+        """Return the vehicle's estimate for a time, queried at `now`. Raises NoPoseError, TooOldError, TooNewError."""
+        if self.localizer is None or not len(self.history):
+            raise self.no_pose_error()
+        if time.at == 0 or time.policy is Policy.LATEST:
+            newest = self.history.newest
+            stale = self.localizer.find_stale_sensors(now) if now > newest.utime else VALID
+            return newest if stale in newest.invalid else replace(newest, invalid=newest.invalid | stale)
+        if time.policy is Policy.HELD:
+            held = self.history.hold(time.at)
+            if held.utime == time.at:
+                return held
+            # sensors that have timed out since make it invalid: up to the next estimate, or up to the time of the query
+            following = self.history.next_after(time.at)
+            since = (following or self.localizer.estimate(time.at)).invalid
+            return restamp(held, time.at, Quality.HELD, since)
+        if time.policy is Policy.PREDICTED and time.at > self.history.last:
+            if time.at > self.history.last + PREDICTION_LIMIT_S * 1e6:
+                raise TooNewError(
+                    f"{time.at} is {(time.at - self.history.last) / 1e6:.3f} s after the newest sample "
+                    f"({self.history.last}); poses are predicted {PREDICTION_LIMIT_S:g} s ahead at most"
+                )
+            return self.localizer.estimate(time.at)
+        return self.history.at(time.at)
+
+    def is_covered(self, utime: int, frame_of_interest: str = "", frame_of_reference: str = "") -> bool:
+        """Return whether a query for a time can be answered without prediction; without frames, for the vehicle.
+
+        True for a query that has no answer at all: waiting would not help.
+        """
+        ends = [frame for frame in (frame_of_interest, frame_of_reference) if frame not in WORLD_FRAMES and frame]
+        try:
+            path = (
+                self.model.get_kinematic_path(*ends)
+                if len(ends) == 2
+                else self.get_path_from_vehicle(ends[0])
+                if ends
+                else None
+            )
+        except QueryError:
+            return True
+        if len(ends) < 2 and (not len(self.history) or utime > self.history.last):
+            return False
+        if path is None:
+            return True
+        return all(utime <= track.last for _, track in find_tracks(path, self.model, self.joints))
+
+    def is_awaiting_data(self, time: TimeQuery, frame_of_interest: str, frame_of_reference: str) -> bool:
+        """Return whether a query should wait for data: its time is not covered yet."""
+        ends = (frame_of_interest, frame_of_reference)
+        of_world = any(end.partition(":")[0] in names.RESERVED_BODIES for end in ends)
+        if of_world and self.localizer is None:
+            return False
+        if time.at and time.policy is not Policy.LATEST:
+            return not self.is_covered(time.at, *ends)
+        return of_world and not len(self.history)
+
+    def get_published_pose(self, estimate: Estimate, world: str) -> PoseAnswer:
+        """Return the base frame's pose in a world frame, for publication; an invalid identity where it is unknown."""
+        if find_vehicle_pose(world, estimate) is None:
+            return self._build_answer(self.base_frame, world, Pose.identity(), None, estimate)
+        path = self.get_path_from_vehicle(self.base_frame)
+        pose, covariance = self._in_world(self.base_frame, world, estimate, path, NO_READINGS)
+        return self._build_answer(self.base_frame, world, pose, covariance, estimate)
+
+    def _in_world(
+        self,
+        frame: str,
+        world: str,
+        estimate: Estimate,
+        path: KinematicPath,
+        joints: JointReadings,
+        inverted: bool = False,
+    ) -> tuple[Pose, Callable[[], Array | None] | None]:
+        """Return a frame's pose in a world frame and a function for its covariance, None where it is unknown.
+
+        `inverted`: the world frame's pose in the frame.
+        """
+        X_WB = get_vehicle_pose(world, estimate)
+        numbers = estimate.odom_covariance if world == names.ODOM else estimate.covariance
+        if frame == self.rolling_frame:
+            at_base = (
+                None
+                if numbers is None
+                else partial(_inverse_world_covariance if inverted else _world_covariance, numbers, X_WB)
+            )
+            return X_WB.inverse() if inverted else X_WB, at_base
+        if path.joints:
+            X_BF = path.compute_pose(joints.positions)
+            survey = partial(_mount_covariance, path, joints)
+        else:
+            fixed = self.model.get_transformation(frame, self.rolling_frame)
+            X_BF = fixed.pose
+            survey = partial(_fixed_covariance, fixed, path)
+        function = _inverse_frame_covariance if inverted else _frame_covariance
+        X_WF = X_WB @ X_BF
+        known = None if numbers is None else partial(function, numbers, X_WB, X_BF, survey)
+        return X_WF.inverse() if inverted else X_WF, known
+
+    def check_on_vehicle(self, frame: str) -> None:
+        """Raise a QueryError where the frame does not exist, or is not joined to the rolling frame."""
+        try:
+            self.model.get_kinematic_path(frame, self.rolling_frame)
+        except NotConnectedError as error:
+            raise NotConnectedError(f"the world is known at {self.rolling_frame} only: {error}") from None
+
+    def _build_answer(
+        self,
+        interest: str,
+        reference: str,
+        pose: Pose,
+        covariance: Callable[[], Array | None] | None,
+        estimate: Estimate,
+        joints: JointReadings = NO_READINGS,
+        path: KinematicPath | None = None,
+    ) -> PoseAnswer:
+        odom_only = names.ODOM in (interest, reference) and not (is_absolute(interest) or is_absolute(reference))
+        origin = None if odom_only else estimate.origin
+        invalid = self.invalid | (estimate.invalid & ODOM_INVALID if odom_only else estimate.invalid) | joints.invalid
+        quality = estimate.quality
+        if path is not None:
+            quality |= joints.quality | (Quality.LOOP if path.is_in_loop else NO_FLAGS)
+        of_vehicle = self.base_frame in (interest, reference) and not odom_only
+        horizontal, heading = self._protection_levels(estimate) if of_vehicle else (NAN, NAN)
+        return PoseAnswer(
+            Transformation(
+                interest,
+                reference,
+                pose,
+                covariance,
+                estimate.utime,
+                int(invalid),
+                estimate.pose_epoch,
+                0 if origin is None else origin.origin_id,
+                self.model.revision,
+            ),
+            origin,
+            quality,
+            horizontal,
+            heading,
+            NAN if odom_only else estimate.seconds_to_limit,
+        )
+
+    def _protection_levels(self, estimate: Estimate) -> tuple[float, float]:
+        """Return the protection levels at the base frame, which the heading error moves about the rolling frame."""
+        x, y, _ = self.model.get_transformation(self.base_frame, self.rolling_frame).pose.xyz
+        # a chord is no longer than its arc, nor than twice the lever arm
+        error = math.hypot(x, y) * min(estimate.heading_protection_level, 2.0)
+        return estimate.horizontal_protection_level + error, estimate.heading_protection_level
+
+    def no_pose_error(self) -> NoPoseError:
+        """Return the error that explains why there is no pose in the world."""
+        if self.localizer is None:
+            return NoPoseError("the vehicle file names no GPS and IMU, so there is no pose in the world")
+        invalid = self.localizer.estimate(0).invalid
+        return NoPoseError(f"the vehicle's pose is not known yet: {invalid.explain() or 'no sensor sample yet'}")
+
+
+_ZERO = np.zeros((6, 6))
+_CLOCK_STEPPED: Final = Invalid.CLOCK_STEPPED.value
+ODOM_INVALID = Invalid.NO_IMU | Invalid.STALE_IMU | Invalid.CLOCK_STEPPED | Invalid.TILTED
+"""Reasons against a pose in Odom, which needs no fix and no origin."""
+
+
+CovarianceFunction: TypeAlias = Callable[[], Array | None]
+"""Returns the covariance of the path from the vehicle to a frame."""
+
+
+def _world_covariance(numbers: tuple[float, ...], X_WB: Pose) -> Array:
+    return np.array(numbers).reshape(6, 6)
+
+
+def _inverse_world_covariance(numbers: tuple[float, ...], X_WB: Pose) -> Array:
+    """Return the covariance of a world's pose in the vehicle, whose origin is at the end of a long lever arm."""
+    return cov.rotate(X_WB.rotation.T, cov.apply_lever_arm(_world_covariance(numbers, X_WB), -X_WB.position))
+
+
+def _frame_covariance(numbers: tuple[float, ...], X_WB: Pose, X_BF: Pose, survey: CovarianceFunction) -> Array | None:
+    """Return the covariance of a frame of the vehicle in a world."""
+    joints = survey()
+    if joints is None:
+        return None
+    # the heading may be off by tens of degrees before the vehicle has moved
+    return cov.apply_lever_arm(_world_covariance(numbers, X_WB), X_WB.rotation @ X_BF.position) + cov.rotate(
+        X_WB.rotation, joints
+    )
+
+
+def _inverse_frame_covariance(
+    numbers: tuple[float, ...], X_WB: Pose, X_BF: Pose, survey: CovarianceFunction
+) -> Array | None:
+    """Return the covariance of a world in a frame of the vehicle."""
+    joints = survey()
+    if joints is None:
+        return None
+    return cov.compose(
+        X_BF.inverse(), cov.invert(X_BF, joints), X_WB.inverse(), _inverse_world_covariance(numbers, X_WB)
+    )
+
+
+def _mount_covariance(path: KinematicPath, joints: JointReadings) -> Array | None:
+    """Return the covariance of a path from the vehicle, with its joints at their positions.
+
+    A mount without sigmas counts as exact: the vehicle's own error is far larger. A joint without a sigma does not: the
+    end of a long arm may be anywhere.
+    """
+    found = path.compute_covariance(joints.positions, joints.sigmas, unstated_is_exact=True)
+    return None if found is None else as_array(found)
+
+
+def _fixed_covariance(fixed: Transformation, path: KinematicPath) -> Array | None:
+    found = fixed.covariance
+    return _mount_covariance(path, NO_READINGS) if found is None else found

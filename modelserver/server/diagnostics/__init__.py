@@ -1,0 +1,1 @@
+"""Diagnostics of bus, host clock, machine and other servers."""

@@ -1,0 +1,435 @@
+"""Schema of stored types: nodes built from annotations, description and fingerprint, self-describing documents.
+
+A build reads what a build with the same schema wrote, on any Python, numpy or machine. The description holds the fields
+of every record in order with their types, and the members of every enumeration; its SHA-256 is the fingerprint. It
+depends only on the declarations: classes and alternatives are sorted by name, so import order, hash seeds and the
+formatting of annotations do not matter.
+
+The fields of a class are found by the first rule that applies:
+- NamedTuple, dataclass: as declared, rebuilt without the constructor, so that no bit changes;
+- a class with `__slots__`, all annotated in its body, none of them a function: the same;
+- any other: the parameters of its constructor, each an attribute of the same name. Where that is a property, its return
+  type is used, so that a lazy value is evaluated.
+
+Document: magic (8) | fingerprint (32) | length of the description (4) | description, deflated | tokens
+"""
+
+from __future__ import annotations
+
+import collections.abc
+import dataclasses
+import hashlib
+import inspect
+import json
+import struct
+import types
+import typing
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from enum import Enum
+from functools import lru_cache
+from operator import attrgetter
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from modelserver.errors import RecordingError
+from modelserver.server.encoding.nodes import (
+    AnyRecord,
+    ArrayNode,
+    ClassNode,
+    Complex,
+    EnumNode,
+    FixedTuple,
+    MappingNode,
+    NumpyArray,
+    OptionalNode,
+    RecordNode,
+    Scalar,
+    TupleNode,
+    TypeNode,
+    UnionNode,
+)
+from modelserver.server.encoding.tokens import EncodingError, TokenReader, TokenWriter
+
+_SCALARS: Final[Mapping[Any, str]] = {
+    type(None): "None", bool: "bool", int: "int", float: "float", str: "str", bytes: "bytes",
+}  # fmt: skip
+
+_SEQUENCES: Final = (tuple, list, collections.abc.Iterable, collections.abc.Sequence)
+
+MAX_DIFFERENCES: Final = 5
+"""Differences between two schemas in one message."""
+
+MAX_DIFFERENCE_LENGTH: Final = 300
+"""Characters of one difference."""
+
+_OWN: Final = "modelserver."
+
+
+class SchemaError(TypeError):
+    """A declared type cannot be stored; the message names the type and the field."""
+
+
+class _IntArray:
+    pass
+
+
+class _FloatArray:
+    pass
+
+
+class _Arrays:
+    """Replaces `array` in annotations: before Python 3.12 it takes no element type."""
+
+    def __class_getitem__(cls, element: type) -> type:
+        return {int: _IntArray, float: _FloatArray}[element]
+
+
+_TYPECODES: Final[Mapping[Any, str]] = {_IntArray: "q", _FloatArray: "d"}
+
+
+def _get_hints(declared: Any) -> dict[str, Any]:
+    return typing.get_type_hints(declared, localns={"array": _Arrays})
+
+
+def _expand_alias(hint: Any) -> Any:
+    """Expand a type alias (PEP 695): since numpy 2.5 NDArray is one."""
+    alias = typing.get_origin(hint) or hint
+    if not hasattr(alias, "__value__") or not hasattr(alias, "__type_params__"):
+        return hint
+    arguments = typing.get_args(hint)
+    return alias.__value__[arguments] if arguments else alias.__value__
+
+
+def _get_name(cls: type) -> str:
+    return f"{cls.__module__}.{cls.__qualname__}".removeprefix(_OWN)
+
+
+class Schema:
+    """Encoder and decoder of the types reachable from `roots`.
+
+    Parameters
+    ----------
+    roots: annotation of each root by name.
+    implementations: classes that implement a protocol.
+    omitted: fields that are not stored; they get their default on decoding.
+
+    Raises
+    ------
+    SchemaError: a type cannot be stored.
+    """
+
+    def __init__(
+        self,
+        roots: Mapping[str, Any],
+        implementations: Mapping[Any, Sequence[type]] | None = None,
+        omitted: Mapping[type, frozenset[str]] | None = None,
+    ):
+        self._implementations = implementations or {}
+        self._omitted = omitted or {}
+        self._records: dict[type, RecordNode] = {}
+        self._enums: dict[type, EnumNode] = {}
+        self._undefined: list[RecordNode] = []
+        self._roots = {name: self._make_node(annotation, f"root {name}") for name, annotation in sorted(roots.items())}
+        while self._undefined:
+            self._define(self._undefined.pop())
+        records = sorted(self._records.values(), key=lambda record: record.text)
+        for index, record in enumerate(records):
+            if index and record.text == records[index - 1].text:
+                raise SchemaError(f"two classes are named {record.text}")
+            record.set_index(index)
+        self.description: Final = json.dumps(self._describe(records), sort_keys=True, separators=(",", ":"))
+        """The schema as JSON text."""
+        self.fingerprint: Final = hashlib.sha256(self.description.encode()).digest()
+
+    @property
+    def classes(self) -> tuple[type, ...]:
+        """The classes whose instances can be stored."""
+        return tuple(self._records)
+
+    def encode(self, root: str, value: object, pause: Callable[[], object] = lambda: None) -> bytes:
+        """Encode a value; `pause` is called about every 0.2 ms.
+
+        Raises EncodingError, which names the field, for a value that does not have its declared type.
+        """
+        out = TokenWriter(pause)
+        try:
+            self._roots[root].encode(value, out)
+        except EncodingError:
+            raise
+        except TypeError as error:
+            raise EncodingError(f"{root} is {error}") from error
+        return out.close()
+
+    def decode(self, root: str, data: bytes) -> Any:
+        """Decode a value. Raises RecordingError for invalid data."""
+        source = TokenReader(data)
+        try:
+            value = self._roots[root].decode(source.take(), source)
+            source.close()
+        except RecordingError:
+            raise
+        except StopIteration:
+            raise RecordingError("it ends early") from None
+        except (Exception, RecursionError) as error:
+            raise RecordingError(f"{type(error).__name__}: {str(error)[:MAX_DIFFERENCE_LENGTH]}") from error
+        return value
+
+    def check_same(self, fingerprint: bytes, description: str) -> None:
+        """Raise RecordingError, which names the differences, if the writer had another schema."""
+        if fingerprint == self.fingerprint:
+            return
+        try:
+            found = list_differences(json.loads(description), json.loads(self.description))
+        except (ValueError, TypeError, AttributeError, RecursionError):
+            found = []
+        more = f"; and {len(found) - MAX_DIFFERENCES} more" if len(found) > MAX_DIFFERENCES else ""
+        raise RecordingError(
+            "it was written by a build with other types: "
+            + ("; ".join(found[:MAX_DIFFERENCES]) + more or "their description is damaged")
+        )
+
+    def _describe(self, records: Sequence[RecordNode]) -> dict[str, Any]:
+        return {
+            "records": {record.text: record.describe() for record in records},
+            "enums": {node.text: node.describe() for node in self._enums.values()},
+            "roots": {name: node.text for name, node in self._roots.items()},
+        }
+
+    # --- from annotations to nodes ---
+
+    def _make_node(self, hint: Any, place: str) -> TypeNode:
+        hint = _expand_alias(hint)
+        origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+        if hint in _SCALARS:
+            return Scalar([_SCALARS[hint]])
+        if hint in self._implementations:
+            classes = sorted(self._implementations[hint], key=_get_name)
+            return AnyRecord([self._get_record(cls, place) for cls in classes], f"any {_get_name(hint)}")
+        if origin in (typing.Union, types.UnionType):
+            return self._make_union(arguments, place)
+        if origin is Literal:
+            return Scalar(sorted({_SCALARS[type(value)] for value in arguments}), arguments)
+        if origin is typing.ClassVar or hint is Any:
+            raise SchemaError(f"{place}: {hint} cannot be stored; declare what it holds")
+        if origin is type:
+            return ClassNode([self._get_record(cls, place) for cls in self._find_classes(arguments[0], place)])
+        if origin in _SEQUENCES:
+            return self._make_sequence(origin, arguments, place)
+        if origin in (dict, collections.abc.Mapping):
+            key, element = (self._make_node(each, place) for each in arguments)
+            return MappingNode(key, element, mutable=origin is dict)
+        if hint in _TYPECODES:
+            return ArrayNode(_TYPECODES[hint])
+        if origin is np.ndarray:
+            (scalar,) = typing.get_args(arguments[1])
+            return NumpyArray(np.dtype(scalar).name)
+        if hint is complex:
+            return Complex()
+        if isinstance(hint, type) and issubclass(hint, Enum):
+            return self._enums.setdefault(hint, EnumNode(hint, _get_name(hint)))
+        if isinstance(hint, type) and origin is None:
+            return self._get_record(hint, place)
+        raise SchemaError(f"{place}: {hint} cannot be stored")
+
+    def _make_sequence(self, origin: Any, arguments: tuple[Any, ...], place: str) -> TypeNode:
+        if origin is tuple and arguments[-1:] != (...,):
+            return FixedTuple([self._make_node(each, place) for each in arguments])
+        return TupleNode(self._make_node(arguments[0], place), list if origin is list else tuple)
+
+    def _find_classes(self, hint: Any, place: str) -> list[type]:
+        if hint in self._implementations:
+            return sorted(self._implementations[hint], key=_get_name)
+        found = typing.get_args(hint) or (hint,)
+        if not all(isinstance(each, type) for each in found):
+            raise SchemaError(f"{place}: type[{hint}] cannot be stored")
+        return sorted(found, key=_get_name)
+
+    def _make_union(self, arguments: Sequence[Any], place: str) -> TypeNode:
+        nodes = [(self._make_node(each, place), each) for each in arguments if each is not type(None)]
+        nodes.sort(key=lambda pair: pair[0].text)
+        inner: TypeNode
+        if len(nodes) == 1:
+            inner = nodes[0][0]
+        elif all(isinstance(node, Scalar) for node, _ in nodes):
+            return Scalar(sorted({_SCALARS[each] for each in arguments}))
+        elif all(isinstance(node, (RecordNode, AnyRecord)) for node, _ in nodes):
+            inner = AnyRecord([record for node, _ in nodes for record in _records_of(node)])
+        else:
+            inner = UnionNode([node for node, _ in nodes], [typing.get_origin(each) or each for _, each in nodes])
+        if len(nodes) == len(arguments):
+            return inner
+        if isinstance(inner, Scalar):
+            return Scalar(sorted({*inner.names, "None"}))
+        return OptionalNode(inner)
+
+    def _get_record(self, cls: type, place: str) -> RecordNode:
+        found = self._records.get(cls)
+        if found is None:
+            if cls.__module__ == "builtins" or getattr(cls, "_is_protocol", False):
+                raise SchemaError(f"{place}: {cls} cannot be stored; declare what it holds")
+            found = self._records[cls] = RecordNode(cls, _get_name(cls))
+            self._undefined.append(found)
+        return found
+
+    def _define(self, record: RecordNode) -> None:
+        cls, name = record.cls, record.text
+        omitted = self._omitted.get(cls, frozenset())
+        slots = _find_slots(cls)
+        fields: Sequence[str]
+        if issubclass(cls, tuple) and hasattr(cls, "_fields"):
+            hints = _get_hints(cls)
+            fields = cls._fields
+            record.build = cls._make  # type: ignore[attr-defined]
+        elif dataclasses.is_dataclass(cls):
+            hints = _get_hints(cls)
+            fields = [each.name for each in dataclasses.fields(cls) if each.name not in omitted]
+            defaults = [each for each in dataclasses.fields(cls) if each.name in omitted]
+            record.get_values, record.build = _make_getter(fields), _Rebuild(cls, fields, defaults)
+        elif (
+            slots and not slots - set(hints := _get_hints(cls)) and not any(_is_function(hints[each]) for each in slots)
+        ):
+            fields = sorted(slots)
+            record.get_values, record.build = _make_getter(fields), _Rebuild(cls, fields)
+        else:
+            hints = _get_hints(inspect.getattr_static(cls, "__init__"))
+            fields = list(inspect.signature(cls).parameters)
+            for each in fields:
+                found = inspect.getattr_static(cls, each, None)
+                if isinstance(found, property) and found.fget is not None:
+                    hints[each] = _get_hints(found.fget).get("return", Any)
+            missing = [each for each in fields if each not in hints]
+            if missing:
+                raise SchemaError(f"{name}: its constructor's {missing[0]} has no type, so it cannot be stored")
+            record.get_values, record.build = _make_getter(fields), _Construct(cls)
+            record.constructed = True
+        record.define(fields, [self._make_node(hints[each], f"{name}.{each}") for each in fields])
+
+
+def _records_of(node: TypeNode) -> Sequence[RecordNode]:
+    return node.records if isinstance(node, AnyRecord) else [node] if isinstance(node, RecordNode) else []
+
+
+def _is_function(hint: Any) -> bool:
+    found = (hint, *typing.get_args(hint))
+    return any(collections.abc.Callable in (each, typing.get_origin(each)) for each in found)
+
+
+def _find_slots(cls: type) -> set[str]:
+    return {slot for base in cls.__mro__ for slot in _to_sequence(base.__dict__.get("__slots__", ()))}
+
+
+def _to_sequence(slots: str | Sequence[str]) -> Sequence[str]:
+    return (slots,) if isinstance(slots, str) else slots
+
+
+def _make_getter(fields: Sequence[str]) -> Callable[[Any], Sequence[Any]]:
+    """Return a function that returns the values of an instance's fields."""
+    if not fields:
+        return lambda value: ()
+    get = attrgetter(*fields)
+    return get if len(fields) > 1 else lambda value: (get(value),)
+
+
+class _Rebuild:
+    """Builds an instance from the values of its fields bit for bit, without the constructor."""
+
+    def __init__(self, cls: type, fields: Sequence[str], defaults: Sequence[dataclasses.Field[Any]] = ()):
+        self._cls, self._fields, self._defaults = cls, tuple(fields), tuple(defaults)
+
+    def __call__(self, values: Sequence[Any]) -> Any:
+        made: object = object.__new__(self._cls)
+        put = object.__setattr__
+        for name, value in zip(self._fields, values, strict=True):
+            put(made, name, value)
+        for each in self._defaults:
+            factory = each.default_factory
+            put(made, each.name, each.default if factory is dataclasses.MISSING else factory())
+        return made
+
+
+class _Construct:
+    def __init__(self, cls: type):
+        self._cls = cls
+
+    def __call__(self, values: Sequence[Any]) -> Any:
+        return self._cls(*values)
+
+
+def list_differences(then: Any, now: Any) -> list[str]:
+    """List the differences between the descriptions of the writer and of this build, in words."""
+    found = []
+    for name, fields in sorted(then["records"].items()):
+        ours = now["records"].get(name)
+        if ours is None:
+            found.append(f"{name}: this build has no such type")
+        elif fields != ours:
+            found += _list_field_differences(name, dict(fields), dict(ours))
+    found += [f"{name}: the writer had no such type" for name in sorted(now["records"]) if name not in then["records"]]
+    for name, members in sorted(then["enums"].items()):
+        ours = now["enums"].get(name)
+        if ours is not None and members != ours:
+            changed = sorted(key for key in {**members, **ours} if members.get(key) != ours.get(key))
+            found.append(f"{name}: member {changed[0]} was {members.get(changed[0])}, is {ours.get(changed[0])}")
+    for name, text in sorted(then["roots"].items()):
+        if now["roots"].get(name) != text:
+            found.append(f"{name}: written as {text}, this build has {now['roots'].get(name)}")
+    return [each[:MAX_DIFFERENCE_LENGTH] for each in found]
+
+
+def _list_field_differences(name: str, then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    missing = [f"{name}.{field}: this build has no such field" for field in then if field not in now]
+    added = [f"{name}.{field}: the writer had no such field" for field in now if field not in then]
+    changed = [
+        f"{name}.{field}: written as {text}, this build has {now[field]}"
+        for field, text in then.items()
+        if field in now and now[field] != text
+    ]
+    return missing + added + changed or [f"{name}: its fields are in another order"]
+
+
+MAGIC: Final = b"MSvalue1"
+
+MAX_DESCRIPTION_BYTES: Final = 1 << 20
+"""Inflated bytes; this build needs some 20,000."""
+
+_HEAD: Final = struct.Struct(">8s32sI")
+
+
+@lru_cache(maxsize=4)
+def _deflate(description: str) -> bytes:
+    return zlib.compress(description.encode(), 9)
+
+
+def write_document(schema: Schema, root: str, value: object, pause: Callable[[], object] = lambda: None) -> bytes:
+    """Encode a value with the description of its types. Raises EncodingError; `pause`: see `Schema.encode`."""
+    description = _deflate(schema.description)
+    head = _HEAD.pack(MAGIC, schema.fingerprint, len(description))
+    return b"".join((head, description, schema.encode(root, value, pause)))
+
+
+def read_document(schema: Schema, root: str, data: bytes) -> Any:
+    """Decode a document of `write_document`.
+
+    Raises RecordingError, which names types and fields where the schema of the writer differs from this build's.
+    """
+    if len(data) < _HEAD.size:
+        raise RecordingError("it ends early")
+    magic, fingerprint, length = _HEAD.unpack_from(data)
+    if magic != MAGIC:
+        raise RecordingError("it is no document of this format")
+    if length > len(data) - _HEAD.size:
+        raise RecordingError("it ends early")
+    if fingerprint != schema.fingerprint:
+        schema.check_same(fingerprint, _inflate(data[_HEAD.size : _HEAD.size + length]))
+    return schema.decode(root, data[_HEAD.size + length :])
+
+
+def _inflate(data: bytes) -> str:
+    reader = zlib.decompressobj()
+    try:
+        text = reader.decompress(data, MAX_DESCRIPTION_BYTES)
+        return "" if reader.unconsumed_tail else text.decode()
+    except (zlib.error, UnicodeDecodeError):
+        return ""

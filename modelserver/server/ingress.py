@@ -1,0 +1,222 @@
+"""Ingress: decode samples, correct their latency, detect publisher conflicts, count what is rejected.
+
+For each message on a sensor's channel the loop
+
+1. reads source, seq and utime from the header at a fixed offset (`peek_sample_id`), without decoding the message;
+2. drops it if it is from a second publisher, unless configured otherwise (`PublisherConflictMonitor`);
+3. decodes it and subtracts the configured latency of the sensor (`SensorChannel.decode`).
+
+A flood of messages that are not used (undecodable bytes, a second publisher, unsigned commands) must not displace the
+vehicle's data in the journal, nor load the core. So `RejectionCounter` limits both by rate: `MAX_PER_SECOND` messages
+of a channel are recorded and counted one by one, the others are counted together once a second.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, replace
+from typing import Final
+
+from modelserver.core import Instant
+from modelserver.core.publisher_conflict import CONFLICT_TIMEOUT_NS, PublisherConflictDetector, SampleId
+from modelserver.errors import quote
+from modelserver.messages import Event, HealthWarning, Rejected, RelativePoseSample, Sample, SwitchMode
+from modelserver.server.journal.queue import Journal
+from modelserver.server.log import RateLimitedLog
+from modelserver.wire.codec import decode
+from modelserver.wire.fields import MAX_NAME, MAX_UTIME
+from modelserver.wire.journal import RecordKind
+
+_HEADER: Final = struct.Struct(">8sq24xqi")
+"""Start of every sensor message: fingerprint, header.utime, header.seq, length of header.source, which follows.
+
+Between utime and seq are utime_sigma, host_utime and device_utime (sensor_header_t.lcm).
+"""
+
+_new_tuple: Final = tuple.__new__
+"""Makes a NamedTuple at a third of the cost of its constructor."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorChannel:
+    """Wire type of a subscribed channel, and the latency that is subtracted from its stamps, microseconds."""
+
+    type_name: str
+    latency_us: int = 0
+
+    @property
+    def has_publisher(self) -> bool:
+        """Whether the channel has one publisher, as a sensor's; any client may command a mode."""
+        return self.type_name != "localization_mode_t"
+
+    def decode(self, data: bytes) -> Sample | SwitchMode:
+        """Decode a sample or a mode command. Raises WireError."""
+        value: Sample | SwitchMode = decode(self.type_name, data)
+        return subtract_latency(value, self.latency_us) if self.latency_us else value
+
+
+def peek_sample_id(data: bytes, fingerprint: bytes) -> SampleId | None:
+    """Read the identity of a sample at a tenth of the cost of decoding; None if the header is invalid.
+
+    `fingerprint` is that of the channel's type. The message may still be damaged behind its header.
+    """
+    if len(data) <= _HEADER.size:
+        return None
+    found, utime, seq, length = _HEADER.unpack_from(data)
+    end = _HEADER.size + length
+    if found != fingerprint or not 0 < utime < MAX_UTIME or not 0 < length <= MAX_NAME + 1 or end > len(data):
+        return None
+    return _new_tuple(SampleId, (utime, data[_HEADER.size : end - 1].decode("utf-8", "replace"), seq))
+
+
+def subtract_latency(sample: Sample | SwitchMode, microseconds: int) -> Sample | SwitchMode:
+    """Subtract a latency from the measurement times of a sample; its host_utime stays."""
+    header = replace(sample.header, utime=max(1, sample.header.utime - microseconds))
+    if isinstance(sample, RelativePoseSample):
+        return replace(sample, header=header, since_utime=max(1, sample.since_utime - microseconds))
+    return replace(sample, header=header)
+
+
+MAX_PER_SECOND: Final = 8
+"""Messages of a channel that are recorded, and rejections of one cause that are counted one by one, per second."""
+
+MAX_RECORDED_BYTES: Final = 512
+"""Bytes that the journal records of a message that is not used."""
+
+SECOND_NS: Final = 1_000_000_000
+
+
+class RateLimiter:
+    """Limits events by name: `per_second` in each window of a second, which starts with the first event."""
+
+    def __init__(self, per_second: int = MAX_PER_SECOND):
+        self._per_second = per_second
+        self._windows: dict[Hashable, tuple[int, int]] = {}
+
+    def try_acquire(self, name: Hashable, now_ns: int) -> bool:
+        """Count an event at an instant (monotonic, ns); return whether it is within the limit."""
+        begin, used = self._windows.get(name, (now_ns, 0))
+        if now_ns - begin >= SECOND_NS:
+            begin, used = now_ns, 0
+        if used >= self._per_second:
+            return False
+        self._windows[name] = (begin, used + 1)
+        return True
+
+
+class RejectionCounter:
+    """Counts rejected messages and records some of them, within rate limits. `step` passes an event to the core.
+
+    Channels and reasons are the server's own, so memory is bounded.
+    """
+
+    def __init__(self, step: Callable[[Rejected, Instant], None], journal: Journal):
+        self._step = step
+        self._journal = journal
+        self._records, self._events = RateLimiter(), RateLimiter()
+        self._waiting: dict[tuple[str, str], int] = {}
+        self._flushed_ns = 0
+
+    def record(self, kind: RecordKind, channel: str, data: bytes, now: Instant) -> None:
+        """Record the start of a message in the journal, within the channel's rate limit."""
+        if self._records.try_acquire(channel, now.monotonic_ns):
+            self._journal.record_message(kind, (channel, data[:MAX_RECORDED_BYTES]), now)
+
+    def count(self, channel: str, reason: str, now: Instant) -> bool:
+        """Count a message in the core, at once or with the next `flush`; return whether at once."""
+        key = (channel, reason)
+        if self._events.try_acquire(key, now.monotonic_ns):
+            self._step(Rejected(channel, reason), now)
+            return True
+        self._waiting[key] = self._waiting.get(key, 0) + 1
+        return False
+
+    def drop(self, kind: RecordKind, channel: str, reason: str, data: bytes, now: Instant) -> None:
+        """Count a message and record it, within the rate limits; beyond them this costs a microsecond."""
+        if self.count(channel, reason, now):
+            self.record(kind, channel, data, now)
+
+    def flush(self, now: Instant, at_once: bool = False) -> None:
+        """Count the waiting rejections in the core, once a second or `at_once`."""
+        if not self._waiting or not (at_once or now.monotonic_ns - self._flushed_ns >= SECOND_NS):
+            return
+        waiting, self._waiting, self._flushed_ns = self._waiting, {}, now.monotonic_ns
+        for (channel, reason), count in waiting.items():
+            self._step(Rejected(channel, reason, count), now)
+
+
+MAX_PUBLISHERS: Final = 256
+"""Sources with a detector of their own on shared channels; a vehicle has a dozen."""
+
+PUBLISHER_CONFLICT: Final = "publisher_conflict"
+"""Reason under which samples of a second publisher are counted."""
+
+RECORDING_AGE_S: Final = 5.0
+"""A second publisher whose stamps are this old plays a recording."""
+
+
+class PublisherConflictMonitor:
+    """Reports publisher conflicts as health warnings and in the log, and decides whether their samples are ignored.
+
+    Parameters
+    ----------
+    step: passes an event to the core.
+    count: counts a sample that is used all the same, by channel and reason; an ignored one is counted by the caller.
+    rule: `ignore`, `use`, or empty for no detection (`LoopSettings.publisher_conflict`).
+    """
+
+    def __init__(
+        self,
+        step: Callable[[Event, Instant], None],
+        count: Callable[[str, str, Instant], object],
+        log: RateLimitedLog,
+        rule: str,
+    ):
+        self._step = step
+        self._count = count
+        self._log = log
+        self.is_enabled, self._ignore = bool(rule), rule == "ignore"
+        self._detectors: dict[tuple[str, str], PublisherConflictDetector] = {}
+        self._active: dict[str, PublisherConflictDetector] = {}
+
+    def is_ignored(
+        self, channel: str, detector: PublisherConflictDetector | None, sample_id: SampleId, now: Instant
+    ) -> bool:
+        """Process a sample; return whether it is from a second publisher and to be ignored.
+
+        `detector` is that of the channel; None for a shared channel, where each source has one.
+        """
+        if detector is None:
+            key = (channel, sample_id.source)
+            detector = self._detectors.get(key)
+            if detector is None:
+                if len(self._detectors) >= MAX_PUBLISHERS:
+                    return False
+                detector = self._detectors[key] = PublisherConflictDetector()
+        if not detector.is_conflicting(sample_id, now.monotonic_ns):
+            return False
+        if not self._ignore:
+            self._count(channel, PUBLISHER_CONFLICT, now)
+        if channel not in self._active:
+            self._active[channel] = detector
+            text = self._format_warning(channel, detector, (now.utime - sample_id.utime) * 1e-6)
+            self._step(HealthWarning(f"channel {channel}", text), now)
+            self._log.warning(f"{channel}:publisher_conflict", "%s", text)
+        return self._ignore
+
+    def clear_expired(self, now: Instant) -> None:
+        """Clear the warnings on conflicts that have ended."""
+        for channel, detector in list(self._active.items()):
+            if now.monotonic_ns - detector.conflict_ns > CONFLICT_TIMEOUT_NS:
+                del self._active[channel]
+                self._step(HealthWarning(f"channel {channel}"), now)
+
+    def _format_warning(self, channel: str, detector: PublisherConflictDetector, age: float) -> str:
+        first, second = quote(detector.source, 40), quote(detector.other_source, 40)
+        who = f"two publishers with source {first}" if first == second else f"sources {first} and {second}"
+        done = "the second one is ignored" if self._ignore else "both are used (sensors.publisher_conflict)"
+        old = (
+            f" (its stamps are {age:,.0f} s old: a recording is played onto the bus?)" if age > RECORDING_AGE_S else ""
+        )
+        return f"{who} publish on {channel} at once, and {done}{old}: stop one of them"

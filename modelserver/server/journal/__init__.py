@@ -1,0 +1,1 @@
+"""Journal (black box): sealed segments of all inputs and outputs, and its verification by replay."""

@@ -1,0 +1,196 @@
+"""Queue between the loop and the journal's writer thread: recording costs the loop one append per record.
+
+The recorded objects are immutable, so that the writer may encode them at any later time.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple, Protocol, TypeAlias
+
+from modelserver.core import CoreState, Instant
+from modelserver.messages import HealthWarning
+from modelserver.wire.journal import RecordKind
+
+MAX_QUEUED_RECORDS: Final = 100_000
+MAX_QUEUED_BYTES: Final = 64 << 20
+"""Queued records and message bytes: at 1000 records a second a disk may block for minutes."""
+
+SUBJECT: Final = "journal"
+"""Subject of the health warning while nothing is recorded."""
+
+ReceivedMessage: TypeAlias = tuple[str, bytes]
+"""Channel and bytes of a message."""
+
+
+class Journal(Protocol):
+    """Recorder of the loop, called in processing order."""
+
+    @property
+    def wants_state(self) -> bool:
+        """Whether `begin` has to be called before the next record."""
+        ...
+
+    def begin(self, state: CoreState, now: Instant) -> None:
+        """Record the state: from here on a replay needs nothing from before."""
+        ...
+
+    def record_event(self, event: object, now: Instant, received: ReceivedMessage | None = None) -> None:
+        """Record an event before the core processes it; `received` is the message it was decoded from, if any."""
+        ...
+
+    def record_message(self, kind: RecordKind, received: ReceivedMessage, now: Instant) -> None:
+        """Record a received message that the core does not process, and what is done with it instead."""
+        ...
+
+    def record_published(self, channel: str, data: bytes) -> None:
+        """Record a message before it is published."""
+        ...
+
+    def poll_warnings(self) -> Sequence[HealthWarning]:
+        """Return the warnings about the journal since the last call, usually none."""
+        ...
+
+
+class NoJournal:
+    """Records nothing."""
+
+    wants_state = False
+
+    def begin(self, state: CoreState, now: Instant) -> None:
+        """Do nothing."""
+
+    def record_event(self, event: object, now: Instant, received: ReceivedMessage | None = None) -> None:
+        """Do nothing."""
+
+    def record_message(self, kind: RecordKind, received: ReceivedMessage, now: Instant) -> None:
+        """Do nothing."""
+
+    def record_published(self, channel: str, data: bytes) -> None:
+        """Do nothing."""
+
+    def poll_warnings(self) -> Sequence[HealthWarning]:
+        """Return no warnings."""
+        return ()
+
+
+class JournalEntry(NamedTuple):
+    """A queued record: a message, an event, or a state (`event` is a `SegmentStart`)."""
+
+    kind: RecordKind
+    now: Instant
+    channel: str
+    data: bytes
+    event: Any = None
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentStart:
+    """State at the start of a segment; `lost` records before it were dropped."""
+
+    state: CoreState
+    lost: int
+
+
+class JournalQueue:
+    """Bounded queue from the loop to the writer's thread.
+
+    On overflow, records are dropped and counted until the next `begin`, which the writer requests (`request_state`).
+    Lock-free: each attribute is written by one thread, and a deque is thread-safe at both ends.
+    """
+
+    __slots__ = (
+        "_entries",
+        "_is_started",
+        "_last",
+        "_open",
+        "_popped_bytes",
+        "_queued_bytes",
+        "_warnings",
+        "lost",
+        "wants_state",
+    )
+
+    def __init__(self) -> None:
+        self.wants_state = False
+        self.lost = 0
+        """Records dropped since the last `begin`. Written by the loop's thread."""
+        self._entries: deque[JournalEntry] = deque()
+        self._warnings: deque[HealthWarning] = deque()
+        self._open = False
+        self._is_started = 0  # 1 from the first `begin` on: before it nothing counts as lost
+        self._queued_bytes = self._popped_bytes = 0
+        self._last = Instant(0, 0)
+
+    # --- called by the loop's thread ---
+
+    def begin(self, state: CoreState, now: Instant) -> None:
+        """See `Journal`."""
+        self.wants_state = False
+        self._last = now
+        lost, self.lost = self.lost, 0
+        self._entries.append(JournalEntry(RecordKind.EVENT, now, "", b"", SegmentStart(state, lost)))
+        self._open, self._is_started = True, 1
+
+    def record_event(self, event: object, now: Instant, received: ReceivedMessage | None = None) -> None:
+        """See `Journal`."""
+        self._last = now
+        if not self._open:
+            self.lost += self._is_started
+        elif received is None:
+            self._put(JournalEntry(RecordKind.EVENT, now, "", b"", event))
+        else:
+            self._put(JournalEntry(RecordKind.REQUEST, now, received[0], received[1], event))
+
+    def record_message(self, kind: RecordKind, received: ReceivedMessage, now: Instant) -> None:
+        """See `Journal`."""
+        self._last = now
+        self._put(JournalEntry(kind, now, received[0], received[1]))
+
+    def record_published(self, channel: str, data: bytes) -> None:
+        """See `Journal`."""
+        self._put(JournalEntry(RecordKind.PUBLISHED, self._last, channel, data))
+
+    def poll_warnings(self) -> Sequence[HealthWarning]:
+        """See `Journal`."""
+        if not self._warnings:
+            return ()
+        return [self._warnings.popleft() for _ in range(len(self._warnings))]
+
+    def _put(self, entry: JournalEntry) -> None:
+        if not self._open:
+            self.lost += self._is_started
+            return
+        self._queued_bytes += len(entry.data)
+        if len(self._entries) >= MAX_QUEUED_RECORDS or self._queued_bytes - self._popped_bytes > MAX_QUEUED_BYTES:
+            self._open = False
+            self.lost += 1
+            return
+        self._entries.append(entry)
+
+    # --- called by the writer's thread ---
+
+    @property
+    def is_open(self) -> bool:
+        """Whether records are accepted; if not, request a state once there is room."""
+        return self._open
+
+    def pop(self, max_count: int) -> list[JournalEntry]:
+        """Remove and return the oldest records."""
+        entries = self._entries
+        popped = [entries.popleft() for _ in range(min(max_count, len(entries)))]
+        self._popped_bytes += sum(len(entry.data) for entry in popped)
+        return popped
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def request_state(self) -> None:
+        """Request a `begin` from the loop."""
+        self.wants_state = True
+
+    def set_warning(self, text: str) -> None:
+        """Set the health warning about the journal; an empty text clears it."""
+        self._warnings.append(HealthWarning(SUBJECT, text))

@@ -1,0 +1,174 @@
+"""Replay of a run from its journal: the same loop and core process the records, on a recording bus and a replay clock.
+
+Outputs that are published are collected per record; the effects of others (a reloaded geometry, a persisted state) are
+records of their own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Container, Mapping
+
+from modelserver import core
+from modelserver.core import AllOutputs, Instant
+from modelserver.core.answers import DeferredAnswer
+from modelserver.errors import RecordingError, WireError
+from modelserver.messages import (
+    PublishDecisions,
+    PublishHealth,
+    PublishNavigation,
+    PublishPose,
+    PublishSnapshot,
+    Request,
+    SendReply,
+)
+from modelserver.server.bus import Handler
+from modelserver.server.ingress import SensorChannel
+from modelserver.server.journal import state as journal_state
+from modelserver.server.loop import Hooks, Loop, LoopSettings
+from modelserver.server.requests.handler import get_request_type
+from modelserver.server.vehicle import Vehicle
+from modelserver.wire.channels import BY_NAME
+from modelserver.wire.codec import decode
+from modelserver.wire.journal import JournalRecord, RecordKind
+from modelserver.wire.queries import read_request_header
+
+PublishedMessage = tuple[str, bytes]
+
+PUBLISHING_OUTPUTS = (
+    SendReply,
+    DeferredAnswer,
+    PublishPose,
+    PublishHealth,
+    PublishDecisions,
+    PublishNavigation,
+    PublishSnapshot,
+)
+
+
+class _EmptyInbox:
+    """An inbox that receives nothing."""
+
+    def subscribe(self, channel: str, handler: Handler) -> None:
+        """Do nothing."""
+
+    def drain(self, limit: int, seconds: float = math.inf) -> int:
+        """Return 0."""
+        return 0
+
+
+class _ContainsAll(Container[object]):
+    def __contains__(self, thing: object) -> bool:
+        return True
+
+
+class _RecordingBus:
+    """A bus that records what is published."""
+
+    def __init__(self) -> None:
+        self.sensors = self.requests = _EmptyInbox()
+        self.published: list[PublishedMessage] = []
+
+    def publish(self, channel: str, data: bytes) -> None:
+        """Record a message."""
+        self.published.append((channel, data))
+
+    def wait(self, seconds: float, requests: bool = True) -> None:
+        """Do nothing."""
+
+
+class _ReplayClock:
+    """A clock that shows the instant of the replayed record."""
+
+    def __init__(self) -> None:
+        self.instant = Instant(0, 0)
+
+    def monotonic_ns(self) -> int:
+        return self.instant.monotonic_ns
+
+    def utime(self) -> int:
+        return self.instant.utime
+
+    def now(self) -> Instant:
+        return self.instant
+
+    def sleep(self, seconds: float) -> None:
+        """Do nothing."""
+
+
+class ReplayLoop(Loop):
+    """A loop that processes journal records and returns what it publishes."""
+
+    def __init__(self, state: bytes):
+        """Continue from the state of a segment. Raises RecordingError."""
+        config, known = journal_state.decode_run(state)
+        self.config = config
+        self._recording_bus, self._replay_clock = _RecordingBus(), _ReplayClock()
+        vehicle = Vehicle(config, known.model, None)
+        settings = LoopSettings(period_ns=1, channel_prefix=config.lcm.channel_prefix)
+        super().__init__(
+            self._recording_bus, self._replay_clock, known, settings, Hooks(snapshot=vehicle.encode_snapshot)
+        )
+        joints = config.sensors.joints
+        self._replayed_channels: Mapping[str, SensorChannel] = {
+            # stays subscribed after a reload from a geometry with joints to one without
+            f"{config.lcm.channel_prefix}{joints.channel}": SensorChannel("joints_t", round(joints.latency * 1e6)),
+            **vehicle.sensor_channels(),
+        }
+        # errors were logged by the recorded run
+        self._logged = _ContainsAll()  # type: ignore[assignment]
+
+    def handle(self, record: JournalRecord) -> list[PublishedMessage]:
+        """Process a record; return what is published. Raises RecordingError for an invalid record."""
+        self._recording_bus.published = []
+        now = self._replay_clock.instant = Instant(record.monotonic_ns, record.utime)
+        if record.kind is RecordKind.EVENT:
+            self._replay_event(journal_state.decode_event(record.data), now)
+        elif record.kind is RecordKind.SAMPLE:
+            channel = self._replayed_channels.get(record.channel)
+            if channel is None:
+                raise RecordingError(f"{record.channel} is no sensor channel of the vehicle file")
+            self._replay_event(channel.decode(record.data), now)
+        elif record.kind is RecordKind.DEFERRED_PART:
+            self._requests.send_deferred(int.from_bytes(record.data, "big"))
+        elif record.kind not in (RecordKind.UNDECODABLE, RecordKind.DROPPED):
+            self._replay_request(record, now)
+        return self._recording_bus.published
+
+    def _replay_request(self, record: JournalRecord, now: Instant) -> None:
+        channel = BY_NAME.get(record.channel.removeprefix(self.config.lcm.channel_prefix))
+        if channel is None:
+            raise RecordingError(f"{record.channel} is no request channel")
+        try:
+            request: Request = decode(channel.type_name, record.data)
+        except WireError as error:
+            header = read_request_header(record.data)
+            if record.kind is RecordKind.MALFORMED and header is not None:
+                kind = get_request_type(channel.type_name)
+                assert kind is not None
+                self.send(core.reply_malformed(self.state, kind, header, str(error), now))
+                return
+            raise RecordingError(f"a request on {record.channel} cannot be decoded: {error}") from error
+        if record.kind is RecordKind.REQUEST:
+            self._replay_event(request, now)
+        elif record.kind is RecordKind.CACHED:
+            # a static answer of the core equals the cached one; the state that counts it is discarded
+            self.send(core.step(self.state, request, now)[1])
+        elif record.kind is RecordKind.OVERLOAD:
+            self.send(core.reply_overloaded(self.state, request, now))
+        elif record.kind is RecordKind.FAILED:
+            self._requests.drop_deferred()
+            self.send(core.reply_internal_error(self.state, request, now))
+
+    def _replay_event(self, event: object, now: Instant) -> None:
+        try:
+            self.step(event, now)  # type: ignore[arg-type]
+        except Exception as error:
+            self.handle_error("", error)
+
+    def send(self, outputs: AllOutputs) -> None:
+        """Publish outputs; ignore the others."""
+        super().send(tuple(each for each in outputs if isinstance(each, PUBLISHING_OUTPUTS)))
+
+    def handle_error(self, channel: str, error: Exception, data: bytes = b"") -> None:
+        """Do nothing: the error is the next record of the journal."""

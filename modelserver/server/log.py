@@ -1,0 +1,229 @@
+"""Logging: rate-limited, escaped, to a terminal, a file or systemd's journal.
+
+- `RateLimitedLog` logs one cause at most every `LOG_PERIOD_S` seconds, so that a flood cannot fill the log.
+- Text from the bus is escaped, so that it cannot imitate a log line or a terminal sequence.
+- systemd's journal gets each record as one entry of fields, by its native protocol
+  (systemd.io/JOURNAL_NATIVE_PROTOCOL), or, if its socket cannot be reached, as lines with a priority prefix
+  (sd-daemon(3)).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import logging
+import os
+import socket
+import sys
+import traceback
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Final, TextIO
+
+if TYPE_CHECKING:
+    from modelserver.server.clock import Clock
+
+LOG_PERIOD_S = 5.0
+MAX_CAUSES = 256
+
+CAUSE: Final = "cause"
+"""Attribute of a log record: its cause, e.g. GPS:malformed; the journal's field MODELSERVER_CAUSE."""
+
+
+class RateLimitedLog:
+    """Logs a cause at most once in `LOG_PERIOD_S`, with the number of suppressed lines."""
+
+    def __init__(self, logger: logging.Logger, clock: Clock):
+        self._logger = logger
+        self._clock = clock
+        self._next_ns: dict[str, int] = {}
+        self._suppressed: dict[str, int] = {}
+
+    def warning(self, cause: str, message: str, *values: object) -> None:
+        """Log a warning."""
+        self._log(logging.WARNING, cause, message, values, trace=False)
+
+    def exception(self, cause: str, message: str, *values: object) -> None:
+        """Log an error with the traceback of the exception that is being handled."""
+        self._log(logging.ERROR, cause, message, values, trace=True)
+
+    def _log(self, level: int, cause: str, message: str, values: tuple[object, ...], trace: bool) -> None:
+        now = self._clock.monotonic_ns()
+        if cause not in self._next_ns and len(self._next_ns) >= MAX_CAUSES:
+            cause = "other"
+        if now < self._next_ns.get(cause, 0):
+            self._suppressed[cause] = self._suppressed.get(cause, 0) + 1
+            return
+        self._next_ns[cause] = now + round(LOG_PERIOD_S * 1e9)
+        suppressed = self._suppressed.pop(cause, 0)
+        text = message % tuple(escape_text(str(value)) for value in values)
+        if suppressed:
+            text += f" (and {suppressed} times since the last line)"
+        if trace:
+            text += "".join(f"\n    {escape_text(line)}" for line in traceback.format_exc().splitlines())
+        self._logger.log(level, "%s", text, extra={CAUSE: cause}, stacklevel=3)
+
+
+def escape_lines(text: str) -> str:
+    """Escape each line of a text and indent all but the first, so that none imitates a log line."""
+    return "\n    ".join(escape_text(line) for line in text.splitlines())
+
+
+def escape_text(text: str) -> str:
+    """Escape all characters of `text` that are not printable."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+FORMATS: Final = ("auto", "journal", "plain")
+"""`auto` is journal if standard error is connected to it, else plain."""
+
+JOURNAL_SOCKET: Final = "/run/systemd/journal/socket"
+
+MAX_MESSAGE_LENGTH: Final = 60_000
+"""Characters of a message; a longer one is truncated. A datagram to the journal has at most some 200 kB."""
+
+INDENT: Final = "    "
+
+
+def set_up_logging(level: str, form: str = "auto", identifier: str = "modelserver") -> None:
+    """Set up logging from `level` on, in a `form` of FORMATS, unless the program has set it up already.
+
+    A process that is killed by a fatal signal, such as the watchdog's, prints its stack.
+    """
+    root = logging.getLogger()
+    if not root.handlers:
+        root.setLevel(level.upper())
+        root.addHandler(make_handler(form, identifier))
+    with contextlib.suppress(OSError, ValueError):  # standard error is no file
+        faulthandler.enable()
+
+
+def make_handler(
+    form: str,
+    identifier: str = "modelserver",
+    environment: Mapping[str, str] = os.environ,
+    stream: TextIO | None = None,
+    path: str = JOURNAL_SOCKET,
+) -> logging.Handler:
+    """Make the log handler of a form; `identifier` is the process's name in the journal."""
+    stream = stream or sys.stderr
+    if form == "journal" or (form == "auto" and is_journal_stream(stream, environment)):
+        return JournalHandler(stream, identifier, path)
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(PlainFormatter())
+    return handler
+
+
+def is_journal_stream(stream: TextIO, environment: Mapping[str, str]) -> bool:
+    """Return whether a stream is connected to the journal: JOURNAL_STREAM names its device and inode."""
+    try:
+        status = os.fstat(stream.fileno())
+    except (OSError, ValueError):
+        return False
+    return environment.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
+
+
+class PlainFormatter(logging.Formatter):
+    """Formats as `LEVEL name: message`, further lines indented."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the record's lines."""
+        first, *rest = lines_of(record)
+        return "\n".join((f"{record.levelname} {record.name}: {first}", *rest))
+
+
+class PriorityFormatter(logging.Formatter):
+    """Formats with the syslog priority `<N>` before every line, and the cause at the end."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the record's lines."""
+        first, *rest = lines_of(record)
+        cause = getattr(record, CAUSE, "")
+        tail = f" cause={escape_text(str(cause))}" if cause else ""
+        head = f"<{get_priority(record.levelno)}>"
+        return "\n".join(f"{head}{line}" for line in (f"{record.name}: {first}{tail}", *rest))
+
+
+class JournalHandler(logging.StreamHandler[TextIO]):
+    """Sends records to the journal; if it cannot, writes them with priorities to a stream connected to it.
+
+    It never waits: if the journal does not keep up, entries are lost, and the next one reports how many.
+    """
+
+    def __init__(self, stream: TextIO, identifier: str, path: str = JOURNAL_SOCKET):
+        super().__init__(stream)
+        self.setFormatter(PriorityFormatter())
+        self._identifier, self._path = identifier, path
+        self._lost = 0
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        self._socket.setblocking(False)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send a record."""
+        try:
+            datagram = encode_journal_entry(self._fields(record))
+            try:
+                self._socket.sendto(datagram, self._path)
+            except BlockingIOError:
+                self._lost += 1
+            except OSError:
+                super().emit(record)
+            else:
+                self._lost = 0
+        except Exception:
+            self.handleError(record)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+        super().close()
+
+    def _fields(self, record: logging.LogRecord) -> Iterable[tuple[str, str]]:
+        text = "\n".join(lines_of(record))
+        if self._lost:
+            text += f" ({self._lost} entries before this one were lost: the journal did not keep up)"
+        yield "MESSAGE", text
+        yield "PRIORITY", str(get_priority(record.levelno))
+        yield "SYSLOG_IDENTIFIER", self._identifier
+        yield "LOGGER", record.name
+        yield "CODE_FILE", record.pathname
+        yield "CODE_LINE", str(record.lineno)
+        yield "CODE_FUNC", record.funcName or ""
+        cause = getattr(record, CAUSE, "")
+        if cause:
+            yield "MODELSERVER_CAUSE", escape_text(str(cause))
+
+
+def lines_of(record: logging.LogRecord) -> list[str]:
+    """Return message and traceback of a record as escaped lines of limited length, all but the first indented."""
+    text = record.getMessage()
+    if record.exc_info and not record.exc_text:
+        record.exc_text = logging.Formatter().formatException(record.exc_info)
+    if record.exc_text:
+        text += f"\n{record.exc_text}"
+    if len(text) > MAX_MESSAGE_LENGTH:
+        text = f"{text[:MAX_MESSAGE_LENGTH]}... ({len(text)} characters)"
+    # not splitlines, which would leave other line separators unescaped
+    first, *rest = (escape_text(line) for line in text.split("\n"))
+    return [first, *(line if line.startswith(INDENT) else f"{INDENT}{line}" for line in rest)]
+
+
+def get_priority(level: int) -> int:
+    """Return the syslog priority of a level: 2 critical, 3 error, 4 warning, 6 info, 7 debug."""
+    for least, number in ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6)):
+        if level >= least:
+            return number
+    return 7
+
+
+def encode_journal_entry(fields: Iterable[tuple[str, str]]) -> bytes:
+    """Encode fields for the journal: `NAME=value`, or with a length if the value has several lines."""
+    parts = []
+    for name, value in fields:
+        data = value.encode("utf-8", "backslashreplace")
+        if b"\n" in data:
+            parts.append(name.encode() + b"\n" + len(data).to_bytes(8, "little") + data + b"\n")
+        else:
+            parts.append(name.encode() + b"=" + data + b"\n")
+    return b"".join(parts)

@@ -1,0 +1,465 @@
+"""The server loop: one thread between the bus and the core.
+
+`run_once` makes one pass:
+
+1. samples from the bus (`ingress`), up to the next tick and at most `MAX_SAMPLES_NS`;
+2. the tick, if it is due (`tick_timer`);
+3. a slice of request work (`requests.handler`);
+4. wait for a message or the next tick.
+
+Everything that the core handles is first recorded in the journal, and so is every published message, so that a replay
+of the journal can be compared with them. An exception while handling a message is counted, logged, and does not stop
+the loop. What the loop needs beside bus and clock is in `Hooks`.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from modelserver import core
+from modelserver.core import AllOutputs, CoreState, Instant
+from modelserver.core.answers import DeferredAnswer
+from modelserver.core.commands import ModelLoaded
+from modelserver.core.publisher_conflict import PublisherConflictDetector
+from modelserver.errors import WireError
+from modelserver.geometry import names
+from modelserver.geometry.model import Model
+from modelserver.messages import (
+    Event,
+    Gauges,
+    HealthWarning,
+    LoadModel,
+    PersistedState,
+    PersistOrigin,
+    PersistState,
+    PublishDecisions,
+    PublishHealth,
+    PublishNavigation,
+    PublishPose,
+    PublishSnapshot,
+    Rejected,
+    ReportStart,
+    SendReply,
+    SignedCommand,
+    SnapshotPart,
+    SwitchMode,
+    Tick,
+)
+from modelserver.server.bus import Bus
+from modelserver.server.clock import Clock
+from modelserver.server.ingress import (
+    PUBLISHER_CONFLICT,
+    PublisherConflictMonitor,
+    RejectionCounter,
+    SensorChannel,
+    peek_sample_id,
+)
+from modelserver.server.journal.queue import Journal, NoJournal
+from modelserver.server.log import RateLimitedLog, escape_lines, escape_text
+from modelserver.server.requests.handler import RequestHandler
+from modelserver.server.requests.scheduler import RequestLimits
+from modelserver.server.requests.signed_commands import CommandVerifier
+from modelserver.server.tick_timer import TickTimer
+from modelserver.wire.codec import encode, fingerprint_of
+from modelserver.wire.journal import RecordKind
+from modelserver.wire.navigation import MAX_DECISIONS
+from modelserver.wire.snapshot import split_snapshot
+
+log = logging.getLogger(__name__)
+
+SAMPLES_PER_PASS = 100
+MAX_SAMPLES_NS = 2_000_000
+MIN_SAMPLES_NS = 500_000
+"""Samples of a pass, and nanoseconds for them: up to the next tick within these limits, so that a flood of samples does
+not delay ticks, nor a late tick samples."""
+
+NETWORK_ERRORS = frozenset({errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENODEV, errno.ENOBUFS})
+"""Errors of sending while the network is down: no error of the server."""
+
+FLOOD_PAUSE_S = 0.002
+"""How long requests wait for the next pass at most, seconds, in a flood or without time for them."""
+
+
+def _report_no_file(command: LoadModel, state: CoreState) -> ModelLoaded:
+    return ModelLoaded(command.request, why="this server has no geometry file to read")
+
+
+@dataclass(frozen=True, slots=True)
+class Hooks:
+    """Callbacks of a loop; by default they do nothing.
+
+    Attributes
+    ----------
+    on_origin: persists an origin that was captured.
+    on_mode_switch: gets a mode command and the states before and after it.
+    on_load: reads the geometry again.
+    snapshot: encodes the snapshot of the model for the bus.
+    channels: returns the sensor channels of a new geometry, which may have joints.
+    on_persist: persists a state without waiting for the disk; returns a warning or an empty text.
+    gauges: reads resources of the process for the health report, given the number of waiting requests.
+    run_delay: reads the run-queue delay of the loop's thread, nanoseconds; None if unknown.
+    on_tick: called after each tick without error.
+    verifier: verifies signed commands. Without one they are not received, and mode commands need no signature.
+    journal: records everything that is handled and published.
+    """
+
+    on_origin: Callable[[PersistOrigin], None] = lambda origin: None
+    on_mode_switch: Callable[[SwitchMode, CoreState, CoreState], None] = lambda command, before, after: None
+    on_load: Callable[[LoadModel, CoreState], ModelLoaded] = _report_no_file
+    snapshot: Callable[[CoreState], bytes] = lambda state: b""
+    channels: Callable[[CoreState], Mapping[str, SensorChannel]] = lambda state: {}
+    on_persist: Callable[[PersistedState], str] = lambda state: ""
+    gauges: Callable[[int], Gauges | None] = lambda waiting: None
+    run_delay: Callable[[], int | None] = lambda: None
+    on_tick: Callable[[CoreState], None] = lambda state: None
+    verifier: CommandVerifier | None = None
+    journal: Journal = field(default_factory=NoJournal)
+
+
+_NO_HOOKS = Hooks()
+
+
+class SnapshotEncoder:
+    """Encodes the model snapshot once per model."""
+
+    def __init__(self, encode_snapshot: Callable[[CoreState], bytes]):
+        self._encode_snapshot = encode_snapshot
+        self._model: Model | None = None
+        self._parts: list[SnapshotPart] = []
+
+    def encode_parts(self, state: CoreState, utime: int) -> list[SnapshotPart]:
+        """Return the messages to publish at `utime`."""
+        if self._model is not state.model:
+            self._parts = split_snapshot(self._encode_snapshot(state), state.model.revision, utime)
+            # last: after an error it is encoded again
+            self._model = state.model
+        return [replace(part, utime=utime) for part in self._parts]
+
+
+@dataclass(frozen=True, slots=True)
+class LoopSettings:
+    """Settings of a loop; see `modelserver.config.vehicle_file` for those not listed.
+
+    Attributes
+    ----------
+    period_ns: between ticks.
+    sensors: what each subscribed channel carries.
+    publisher_conflict: what to do with samples of a second publisher; empty = no detection.
+    shared_channels: channels with several publishers.
+    """
+
+    period_ns: int
+    sensors: Mapping[str, SensorChannel] = field(default_factory=dict)
+    channel_prefix: str = ""
+    requests_per_pass: int = 16
+    limits: RequestLimits = field(default_factory=RequestLimits)
+    publisher_conflict: Literal["", "ignore", "use"] = ""
+    shared_channels: frozenset[str] = frozenset()
+
+
+class Loop:
+    """Serves one core on one bus. `run` returns after `stop`."""
+
+    def __init__(self, bus: Bus, clock: Clock, state: CoreState, settings: LoopSettings, hooks: Hooks = _NO_HOOKS):
+        self.state = state
+        self._bus = bus
+        self._clock = clock
+        self._settings = settings
+        self._hooks = hooks
+        self._journal = hooks.journal
+        self._snapshot = SnapshotEncoder(hooks.snapshot)
+        self._log = RateLimitedLog(log, clock)
+        self._logged: set[tuple[str, str]] = set()
+        self._timer = TickTimer(clock, settings.period_ns)
+        self._reload_requested = self._stop_requested = False
+        self._has_backlog = False  # whether samples remained after the samples of the last pass
+        prefix = settings.channel_prefix
+        self._pose, self._pose_vector = f"{prefix}POSE", f"{prefix}POSE_VECTOR"
+        self._odom, self._health = f"{prefix}POSE_ODOM", f"{prefix}MODELSERVER_HEALTH"
+        self._model, self._held = f"{prefix}MODEL_SNAPSHOT", f"{prefix}JOINTS_HELD"
+        self._decisions, self._state = f"{prefix}LOCALIZATION_DECISIONS", f"{prefix}LOCALIZATION_STATE"
+        self._rejections = RejectionCounter(self.step, self._journal)
+        self._conflicts = PublisherConflictMonitor(
+            self.step, self._rejections.count, self._log, settings.publisher_conflict
+        )
+        self._sensor_channels: set[str] = set()
+        self._subscribe(settings.sensors)
+        self._requests = RequestHandler(
+            self,
+            bus,
+            clock,
+            self._log,
+            prefix,
+            settings.limits,
+            settings.requests_per_pass,
+            hooks.verifier,
+            hooks.run_delay,
+        )
+
+    def run(self) -> None:
+        """Serve until `stop` is called."""
+        while not self._stop_requested:
+            self.run_once()
+
+    def stop(self) -> None:
+        """Make `run` return after the current pass. May be called from a signal handler."""
+        self._stop_requested = True
+
+    def reload(self) -> None:
+        """Reload the geometry in the next pass. May be called from a signal handler."""
+        self._reload_requested = True
+
+    def is_sensor_channel(self, channel: str) -> bool:
+        """Return whether a subscribed channel carries samples."""
+        return channel in self._sensor_channels
+
+    @property
+    def requests_waiting(self) -> int:
+        """Requests that wait to be answered."""
+        return self._requests.waiting
+
+    def set_warning(self, subject: str, text: str = "") -> None:
+        """Set a warning of the health report; an empty text clears it."""
+        self.step(HealthWarning(subject, text), self._clock.now())
+
+    def run_once(self) -> None:
+        """Make one pass: samples, the tick if it is due, a slice of request work, then wait."""
+        requests, timer = self._requests, self._timer
+        # a deferred reply in progress rests on an older state than the one that a segment would begin with
+        if self._journal.wants_state and not requests.is_deferring:
+            self._journal.begin(self.state, self._clock.now())
+        if self._reload_requested:
+            self._reload_requested = False
+            self.send((LoadModel(),))
+        has_backlog = self._drain_sensors()
+        if has_backlog and self._has_backlog:
+            requests.contention.add_sensor_backlog(self._clock.monotonic_ns())
+        self._has_backlog = has_backlog
+        self._tick_if_due()
+        begin_ns = timer.begin_ns
+        requests.serve(begin_ns, may_defer=not self._journal.wants_state)
+        if has_backlog or self._stop_requested:
+            return
+        seconds = max(0.0, (begin_ns - self._clock.monotonic_ns()) * 1e-9)
+        if requests.is_flooded:
+            # waking for each request of a flood would be most of the work
+            self._bus.wait(0.0 if requests.is_ready else min(seconds, FLOOD_PAUSE_S), requests=False)
+        elif not requests.is_ready:
+            if requests.waiting:
+                seconds = min(seconds, FLOOD_PAUSE_S)
+            elif requests.prepare(begin_ns):
+                seconds = 0.0
+            self._bus.wait(seconds)
+
+    def _drain_sensors(self) -> bool:
+        """Handle the samples that have arrived, up to the next tick; return whether more may wait."""
+        now_ns = self._clock.monotonic_ns()
+        limit_ns = min(MAX_SAMPLES_NS, max(MIN_SAMPLES_NS, self._timer.begin_ns - now_ns))
+        count = self._bus.sensors.drain(SAMPLES_PER_PASS, limit_ns * 1e-9)
+        return count == SAMPLES_PER_PASS or (count > 0 and self._clock.monotonic_ns() - now_ns >= limit_ns)
+
+    def _tick_if_due(self) -> None:
+        tick = self._timer.start_tick()
+        if tick is None:
+            return
+        now, missed, latency_ns = tick
+        self._requests.contention.add_tick(
+            missed * self._settings.period_ns if missed else latency_ns, now.monotonic_ns
+        )
+        self._conflicts.clear_expired(now)
+        is_report_due = now.monotonic_ns >= self.state.health_due_ns
+        self._rejections.flush(now, is_report_due)
+        try:
+            try:
+                gauges = self._hooks.gauges(self._requests.waiting) if is_report_due else None
+                self.step(Tick(latency_ns * 1e-9, missed, self._requests.pop_answered(), gauges), now)
+                self._hooks.on_tick(self.state)
+            finally:
+                self._timer.finish_tick()
+        except Exception as error:
+            self.handle_error("tick", error)
+        for warning in self._journal.poll_warnings():
+            self.step(warning, self._clock.now())
+
+    def execute(self, command: SignedCommand, now: Instant) -> None:
+        """Execute a command whose signature is verified."""
+        before = self.state
+        self.step(command, now)
+        if isinstance(command.command, SwitchMode):
+            self._hooks.on_mode_switch(command.command, before, self.state)
+
+    def _subscribe(self, channels: Mapping[str, SensorChannel]) -> None:
+        for name, channel in channels.items():
+            if name not in self._sensor_channels:
+                self._sensor_channels.add(name)
+                self._bus.sensors.subscribe(name, self._make_sensor_handler(name, channel))
+
+    def _make_sensor_handler(self, name: str, sensor: SensorChannel) -> Callable[[str, bytes], None]:
+        detector = None if name in self._settings.shared_channels else PublisherConflictDetector()
+        is_monitored = sensor.has_publisher and self._conflicts.is_enabled
+        fingerprint = fingerprint_of(sensor.type_name)
+
+        def handle(channel: str, data: bytes) -> None:
+            try:
+                now = self._clock.now()
+                # before decoding, so that a flood of ignored samples costs little
+                sample_id = peek_sample_id(data, fingerprint) if is_monitored else None
+                if sample_id is not None and self._conflicts.is_ignored(channel, detector, sample_id, now):
+                    self._rejections.drop(RecordKind.DROPPED, channel, PUBLISHER_CONFLICT, data, now)
+                    return
+                event = sensor.decode(data)
+                if isinstance(event, SwitchMode):
+                    self._handle_mode_command(channel, event, now)
+                else:
+                    self.step(event, now, (channel, data))
+            except Exception as error:
+                self.handle_error(channel, error, data)
+
+        return handle
+
+    def _handle_mode_command(self, channel: str, command: SwitchMode, now: Instant) -> None:
+        """Execute an unsigned mode command if no signature is required; else reject it."""
+        if self._hooks.verifier is None:
+            self.execute(SignedCommand(command), now)
+            return
+        self._rejections.count(channel, "unsigned", now)
+        self._logged.add((channel, "unsigned"))
+        self._log.warning(
+            f"{channel}:unsigned", "rejected a mode command on %s: it is not signed (commands.key_file)", channel
+        )
+
+    def handle_error(self, channel: str, error: Exception, data: bytes = b"") -> None:
+        """Count and log an error while handling a message or a tick."""
+        now = self._clock.now()
+        if isinstance(error, WireError):
+            reason = error.reason
+            if data:
+                self._rejections.record(RecordKind.UNDECODABLE, channel, data, now)
+            self._rejections.count(channel, reason, now)
+            self._log.warning(f"{channel}:{reason}", "rejected a message on %s: %s", channel, error)
+        elif isinstance(error, OSError) and error.errno in NETWORK_ERRORS:
+            reason = "network"
+            self.step(Rejected(channel, reason), now)
+            self._log.warning(f"{channel}:{reason}", "%s could not be sent: %s", channel, error)
+        else:
+            reason = "handler"
+            self.step(Rejected(channel, reason), now)
+            self._log.exception(f"{channel}:{reason}", "internal error while handling %s", channel)
+        self._logged.add((channel, reason))
+
+    def step(self, event: Event | ModelLoaded, now: Instant, received: tuple[str, bytes] | None = None) -> None:
+        """Pass an event to the core and send its outputs; `received` is the message that it was decoded from."""
+        self._journal.record_event(event, now, received)
+        self.state, outputs = core.step(self.state, event, now)
+        if outputs:
+            self.send(outputs)
+
+    def record(self, kind: RecordKind, channel: str, data: bytes, now: Instant) -> None:
+        """Record in the journal a request that is not passed to the core, whole, so that its reply can be replayed."""
+        self._journal.record_message(kind, (channel, data), now)
+
+    def publish(self, channel: str, data: bytes) -> None:
+        """Publish a message: the only place that does."""
+        self._journal.record_published(channel, data)
+        try:
+            self._bus.publish(channel, data)
+        except Exception as error:
+            self.handle_error(channel, error)
+
+    def send(self, outputs: AllOutputs) -> None:
+        """Send outputs of the core; an error in one does not affect the others."""
+        for output in outputs:
+            try:
+                _SENDERS[type(output)](self, output)
+            except Exception as error:
+                self.handle_error(type(output).__name__, error)
+
+    def _send_reply(self, output: SendReply) -> None:
+        encoded = encode(output.reply)
+        self.publish(output.channel, encoded)
+        self._requests.cache(output, encoded)
+
+    def _defer(self, output: DeferredAnswer) -> None:
+        self._requests.defer(output)
+
+    def _send_pose(self, output: PublishPose) -> None:
+        world, vector, odom = encode(output.world), encode(output.world, "pose_vector_t"), encode(output.odom)
+        self._timer.wait_to_publish()
+        self.publish(self._pose, world)
+        self.publish(self._pose_vector, vector)
+        self.publish(self._odom, odom)
+
+    def _send_decisions(self, output: PublishDecisions) -> None:
+        for start in range(0, len(output.decisions), MAX_DECISIONS):
+            part = output.decisions[start : start + MAX_DECISIONS]
+            self.publish(self._decisions, encode(PublishDecisions(output.utime, part)))
+
+    def _send_navigation(self, output: PublishNavigation) -> None:
+        self.publish(self._state, encode(output.state))
+
+    def _send_health(self, output: PublishHealth) -> None:
+        self.publish(self._health, encode(output.health))
+        for source, reason, count in output.health.rejected:
+            if (source, reason) not in self._logged:
+                self._logged.add((source, reason))
+                log.warning(
+                    "%s: %d rejected so far, reason: %s; later counts are published on %s",
+                    escape_text(source),
+                    count,
+                    escape_text(reason),
+                    self._health,
+                )
+
+    def _load(self, output: LoadModel) -> None:
+        before = self.state.model.revision
+        loaded = self._hooks.on_load(output, self.state)
+        self.step(loaded, self._clock.now())
+        if loaded.model is None:
+            log.error(
+                "the geometry could not be reloaded, revision %s stays in use: %s", before, escape_lines(loaded.why)
+            )
+        elif output.request is None or not output.request.dry_run:
+            self._subscribe(self._hooks.channels(self.state))
+            log.info("the geometry was reloaded: revision %s, before %s", loaded.model.revision, before)
+
+    def _send_snapshot(self, output: PublishSnapshot) -> None:
+        for part in self._snapshot.encode_parts(self.state, output.utime):
+            self.publish(self._model, encode(part))
+        for held in self.state.view.joints.get_newest_samples(output.utime):
+            self.publish(self._held, encode(held))
+
+    def _send_origin(self, output: PersistOrigin) -> None:
+        origin = output.origin
+        log.info(
+            "origin of %s set at %.3f E %.3f N %.3f m, zone %d%s",
+            names.WORLD_UTM,
+            *origin.initial_utm,
+            origin.zone,
+            "N" if origin.north else "S",
+        )
+        self._hooks.on_origin(output)
+
+    def _persist(self, output: PersistState) -> None:
+        self.step(HealthWarning("restart", self._hooks.on_persist(output.state)), self._clock.now())
+
+    def _log_start(self, output: ReportStart) -> None:
+        log.info("%s", output.text)
+
+
+_SENDERS: Mapping[type, Callable[[Loop, Any], None]] = {
+    SendReply: Loop._send_reply,
+    DeferredAnswer: Loop._defer,
+    PublishPose: Loop._send_pose,
+    PublishHealth: Loop._send_health,
+    PersistOrigin: Loop._send_origin,
+    PublishDecisions: Loop._send_decisions,
+    PublishNavigation: Loop._send_navigation,
+    LoadModel: Loop._load,
+    PublishSnapshot: Loop._send_snapshot,
+    PersistState: Loop._persist,
+    ReportStart: Loop._log_start,
+}

@@ -1,0 +1,186 @@
+"""Process a recording through the core, without a bus: the same core as the daemon's, the same results bit for bit.
+
+Causality: the estimate for a time t uses the events that precede, in the log, the first one whose arrival (the log's
+timestamp, not the sample's stamp) is t or later. It is the answer to a client that asks at t with policy PREDICTED:
+predicted beyond the newest sample, or interpolated if a sample with a later stamp has arrived.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+from modelserver import core
+from modelserver.core import CoreState, Instant
+from modelserver.errors import NoPoseError, TooNewError, TooOldError, WireError
+from modelserver.estimation.interface import Localizer
+from modelserver.geometry import names
+from modelserver.messages import NAN, Decision, Envelope, Event, Policy, PublishDecisions, Rejected, TimeQuery
+from modelserver.server.ingress import SensorChannel
+from modelserver.server.requests.signed_commands import MODE_TYPE
+from modelserver.server.vehicle import Vehicle
+from modelserver.transforms.so3 import Quaternion
+from modelserver.wire.channels import SIGNED
+from modelserver.wire.codec import decode
+from modelserver.wire.eventlog import LogEvent
+
+CSV_HEADER: Final = "utime,easting,northing,up,qw,qx,qy,qz,pose_valid,invalid_reasons"
+
+_NO_ROTATION: Final = (NAN, NAN, NAN, NAN)
+
+
+@dataclass(frozen=True, slots=True)
+class TrackRow:
+    """Estimated pose of a frame: UTM easting and northing, height above the ellipsoid, meters; nan = no pose.
+
+    `rotation` maps from the frame to grid east, grid north, up (w, x, y, z). `invalid` are the reason bits.
+    """
+
+    utime: int
+    easting: float = NAN
+    northing: float = NAN
+    up: float = NAN
+    rotation: Quaternion = _NO_ROTATION
+    valid: bool = False
+    invalid: int = 0
+
+    def to_csv(self) -> str:
+        """Format the row as a CSV line: positions to 0.01 mm, rotations to a nanoradian."""
+        quaternion = ",".join(f"{value:.9f}" for value in self.rotation)
+        place = f"{self.easting:.5f},{self.northing:.5f},{self.up:.5f}"
+        return f"{self.utime},{place},{quaternion},{int(self.valid)},{self.invalid}"
+
+
+@dataclass(slots=True)
+class OfflineRun:
+    """One pass through a recording. Iterate `rows`; the counts are updated meanwhile.
+
+    Attributes
+    ----------
+    on_decision: gets each decision on a measurement, in the order of the decisions, also if the vehicle file does not
+        publish them. Measurements that are undecided at the end of the log have none.
+    on_sample: gets each decodable sample, and the localizer after it.
+    events, samples: all events of the log, and those that were passed to the core.
+    unconfigured_channels: channels of the log that the vehicle file does not name.
+    rejected: rejected messages and samples by channel or source, and reason.
+    position: bytes of the log read so far.
+    """
+
+    vehicle: Vehicle
+    log: Iterable[LogEvent]
+    frame: str
+    on_decision: Callable[[Decision], object] | None = None
+    on_sample: Callable[[Event, Localizer], object] | None = None
+    events: int = 0
+    samples: int = 0
+    unconfigured_channels: set[str] = field(default_factory=set)
+    rejected: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    first_utime: int = 0
+    last_utime: int = 0
+    position: int = 0
+    _state: CoreState | None = None
+
+    def __post_init__(self) -> None:
+        self.vehicle.model.get_transformation(self.frame, self.vehicle.config.base_frame)
+
+    def rows(self, times: Iterable[int] | None, rate_hz: float = 50.0) -> Iterator[TrackRow]:
+        """Yield the estimate at each of `times`, which must not decrease; without them at a constant rate.
+
+        The constant rate begins with the first event of the log and ends with the last one.
+        """
+        channels = self.vehicle.sensor_channels()
+        ticks = iter(times) if times is not None else None
+        due: int | None = None
+        number = 0
+        for event in self.log:
+            if self._state is None:
+                self.first_utime = event.utime
+                self._state = self._start(_instant(event.utime))
+                due = event.utime if ticks is None else next(ticks, None)
+            while due is not None and due <= event.utime:
+                yield self._estimate_row(due)
+                number += 1
+                due = next(ticks, None) if ticks else self.first_utime + round(number * 1e6 / rate_hz)
+            if event.channel.endswith(SIGNED):
+                event = _unwrap_mode_command(event, channels)
+            self._process(event, channels.get(event.channel))
+        while ticks and due is not None:
+            yield self._estimate_row(due)
+            due = next(ticks, None)
+
+    def _start(self, now: Instant) -> CoreState:
+        state = self.vehicle.start_core(now)
+        return state._replace(settings=replace(state.settings, publish_decisions=self.on_decision is not None))
+
+    def _process(self, event: LogEvent, channel: SensorChannel | None) -> None:
+        assert self._state is not None
+        self.events += 1
+        self.position = event.end
+        self.last_utime = max(self.last_utime, event.utime)
+        if channel is None:
+            self.unconfigured_channels.add(event.channel)
+            return
+        self.samples += 1
+        now = _instant(event.utime)
+        sample: Event
+        try:
+            sample = channel.decode(event.data)
+        except WireError as error:
+            sample = Rejected(event.channel, error.reason)
+        self._state, outputs = core.step(self._state, sample, now)
+        if self.on_decision is not None:
+            for output in outputs:
+                if isinstance(output, PublishDecisions):
+                    for decision in output.decisions:
+                        self.on_decision(decision)
+        self.rejected = self._state.rejected
+        if self.on_sample is not None and self._state.localizer is not None:
+            self.on_sample(sample, self._state.localizer)
+
+    @property
+    def localizer(self) -> Localizer | None:
+        """The localizer after the events read so far; None before the first."""
+        return None if self._state is None else self._state.localizer
+
+    def _estimate_row(self, utime: int) -> TrackRow:
+        assert self._state is not None
+        try:
+            answer = self._state.view.transformation(self.frame, names.WORLD_UTM, TimeQuery(utime, Policy.PREDICTED))
+        except (NoPoseError, TooOldError, TooNewError):
+            localizer = self._state.localizer
+            return TrackRow(utime, invalid=0 if localizer is None else int(localizer.estimate(utime).invalid))
+        found, origin = answer.transformation, answer.origin
+        if origin is None:
+            return TrackRow(utime, invalid=int(found.invalid_reasons))
+        x, y, z = found.pose.xyz
+        return TrackRow(
+            utime,
+            origin.easting + x,
+            origin.northing + y,
+            origin.height + z,
+            found.pose.wxyz,
+            found.is_valid,
+            int(found.invalid_reasons),
+        )
+
+
+def _unwrap_mode_command(event: LogEvent, channels: Mapping[str, SensorChannel]) -> LogEvent:
+    """Unwrap a mode command from its signed envelope; return any other event unchanged.
+
+    The signature is not verified: a recording has no key.
+    """
+    try:
+        envelope: Envelope = decode("signed_t", event.data)
+    except WireError:
+        return event
+    channel = f"{event.channel.removesuffix(SIGNED)}{envelope.channel}"
+    sensor = channels.get(channel)
+    if sensor is None or sensor.type_name != MODE_TYPE:
+        return event
+    return replace(event, channel=channel, data=envelope.payload)
+
+
+def _instant(utime: int) -> Instant:
+    """Return the instant of an event: the log's time stands for both clocks of the host."""
+    return Instant(utime * 1000, utime)

@@ -1,0 +1,151 @@
+"""The state directory: a file lock for its one writer, and descriptions of its errors with their remedies."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import shlex
+import threading
+from pathlib import Path
+from typing import Final
+
+from modelserver.server.log import escape_text
+
+FILE_MODE: Final = 0o640
+
+MAX_PID_DIGITS: Final = 20
+"""Digits of the process id that are read from a lock file."""
+
+
+class LockHeldError(BlockingIOError):
+    """Another process, `pid` (0 = not known), holds the lock."""
+
+    def __init__(self, path: Path, pid: int = 0):
+        self.pid = pid
+        super().__init__(errno.EWOULDBLOCK, f"{self.holder} writes there already", str(path))
+
+    @property
+    def holder(self) -> str:
+        """The holder in words."""
+        return f"another service (process {self.pid})" if self.pid else "another service"
+
+
+class FileLock:
+    """A lock file (flock(2)) with its holder's process id. Thread-safe; the kernel releases it when the process ends.
+
+    Releasing does not remove the file: then two processes could each lock one of the same name.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._file: int | None = None
+        self._mutex = threading.Lock()
+
+    def acquire(self) -> None:
+        """Acquire the lock if not held yet. Raises LockHeldError, OSError where the file cannot be opened."""
+        with self._mutex:
+            if self._file is not None:
+                # a directory that was removed and created again has another lock file
+                with contextlib.suppress(FileNotFoundError):
+                    if os.path.samestat(os.fstat(self._file), self.path.stat()):
+                        return
+                self._close_file()
+            self._file = _open_locked(self.path)
+
+    def claim(self) -> None:
+        """Acquire the lock, creating its directory. Raises LockHeldError.
+
+        Other errors (disk full, read-only, missing) are ignored here: the write that follows reports them.
+        """
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.acquire()
+        except LockHeldError:
+            raise
+        except OSError:
+            return
+
+    def release(self) -> None:
+        """Release the lock."""
+        with self._mutex:
+            self._close_file()
+
+    def _close_file(self) -> None:
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+
+
+def _open_locked(path: Path) -> int:
+    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, FILE_MODE)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        pid = _read_pid(file)
+        os.close(file)
+        raise LockHeldError(path, pid) from None
+    except OSError:
+        os.close(file)
+        raise
+    # for people; the lock is valid without it, also on a full disk
+    with contextlib.suppress(OSError):
+        os.ftruncate(file, 0)
+        os.pwrite(file, f"{os.getpid()}\n".encode(), 0)
+    return file
+
+
+def _read_pid(file: int) -> int:
+    with contextlib.suppress(OSError):
+        digits = os.pread(file, MAX_PID_DIGITS, 0).strip()
+        return int(digits) if digits.isdigit() else 0
+    return 0
+
+
+_DISK_FULL: Final = (errno.ENOSPC, errno.EDQUOT)
+_ACCESS_DENIED: Final = (errno.EACCES, errno.EPERM)
+_PATH_BLOCKED: Final = (errno.EEXIST, errno.ENOTDIR, errno.ELOOP)
+
+
+def describe_error(error: OSError, directory: Path, setting: str) -> str:
+    """Return cause and remedy of an error of a directory, in one line for people.
+
+    `setting` is the key of the vehicle file that names the directory.
+    """
+    return f"{describe_cause(error, directory)}; {suggest_remedy(error, directory, setting)}"
+
+
+def describe_cause(error: OSError, directory: Path) -> str:
+    """Return the system's message, with the path where it is outside the directory (temporary names inside vary)."""
+    if isinstance(error, LockHeldError):
+        return f"{error.holder} writes there already"
+    why = error.strerror or str(error)
+    named = str(error.filename or "")
+    return escape_text(f"{why} ({named})" if named and not Path(named).is_relative_to(directory) else why)
+
+
+def suggest_remedy(error: OSError, directory: Path, setting: str) -> str:
+    """Return the remedy for an error of a directory."""
+    place = shlex.quote(escape_text(str(directory)))
+    if not error.errno:
+        return "the log has its traceback; report it"
+    if isinstance(error, LockHeldError):
+        return f"stop one of the two, or set another {setting} in the vehicle file of this one"
+    if error.errno in _DISK_FULL:
+        return f"free space on its disk (df -h {place}), or set another {setting} in the vehicle file"
+    if error.errno in _ACCESS_DENIED:
+        return (
+            f"let the service's user write there (sudo chown -R {os.geteuid()} {place}), or set another {setting} in "
+            "the vehicle file"
+        )
+    if error.errno == errno.EROFS:
+        return (
+            f"set a writable {setting} in the vehicle file (under systemd: /var/lib/modelserver), or "
+            "mount its file system read-write"
+        )
+    if error.errno in _PATH_BLOCKED:
+        return f"move the file at this path away (ls -ld {place}), or set another {setting}"
+    if error.errno == errno.ENOENT:
+        return "it is created again"
+    return f"see the kernel log (sudo dmesg | tail), or set another {setting} in the vehicle file"

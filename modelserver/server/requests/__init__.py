@@ -1,0 +1,1 @@
+"""Request handling: per-client queues, scheduling, signature verification, deferred replies."""

@@ -1,0 +1,480 @@
+"""Request handler: receives requests from the bus into per-client queues, and answers them as time permits.
+
+One pass of the server loop gives it a slice of at most a millisecond:
+
+1. Receive. The requests in liblcm's queue go into the per-client queues, undecoded. So fairness begins at the socket:
+   in a queue shared by all clients a flood would delay everyone. Only the first request of a pass, if none waits, is
+   answered before the next one is received: the latency of a single client.
+2. Answer queued requests in the order of the scheduler (`scheduler`).
+3. Work on the deferred reply in progress, one at a time: steps of about half a millisecond, begun only if they end
+   before the next tick (`deferred`).
+4. Reply to some of the requests that were dropped.
+
+A pass without work computes static replies ahead of time (`prepare`, `StaticReplyCache`) after the first such request.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from itertools import islice, product
+from typing import Final, Protocol
+
+from modelserver import core
+from modelserver.core import CoreState, Instant
+from modelserver.core.answers import DeferredAnswer, compute_replies, effort_of, is_deferred
+from modelserver.errors import QueryError, WireError
+from modelserver.geometry import names
+from modelserver.messages import (
+    CHANNEL_OF,
+    Event,
+    GetTransformation,
+    HealthWarning,
+    Output,
+    Rejected,
+    Request,
+    RequestHeader,
+    SendReply,
+    SignedCommand,
+    SwitchMode,
+    TimeQuery,
+)
+from modelserver.messages.requests import is_answerable
+from modelserver.server.bus import Bus
+from modelserver.server.clock import Clock
+from modelserver.server.log import RateLimitedLog, escape_text
+from modelserver.server.requests.deferred import DeferredReply, estimate_reply_bytes
+from modelserver.server.requests.scheduler import (
+    SIGNED_CLIENT,
+    ContentionDetector,
+    DeferredRequest,
+    QueuedRequest,
+    RequestLimits,
+    RequestScheduler,
+)
+from modelserver.server.requests.signed_commands import CommandVerifier
+from modelserver.wire.channels import BY_NAME, REQUESTS, SIGNED
+from modelserver.wire.codec import decode, encode
+from modelserver.wire.journal import RecordKind
+from modelserver.wire.queries import read_request_header
+from modelserver.wire.reply_cache import CACHED_TYPE, MAX_ENTRIES, StaticReplyCache
+
+log = logging.getLogger(__name__)
+
+SLICE_NS: Final = 1_000_000
+"""Time of a pass for requests; the last request is finished."""
+
+RECEIVE_BATCH: Final = 16
+"""Requests received between two readings of the clock."""
+
+MAX_RECEIVED: Final = 1024
+"""Requests received in one pass."""
+
+STEP_ROOM_NS: Final = 1_500_000
+"""A step of deferred work begins only this long before the next tick: most steps take less."""
+
+STARVED_NS: Final = 50_000_000
+"""Deferred work without a step for so long gets one in any case."""
+
+PREPARE_NS: Final = 100_000
+"""Time for preparing replies before the loop looks for messages again."""
+
+MAX_PREPARED: Final = 16
+"""Pairs of frames whose replies are prepared at once."""
+
+REJECTIONS_PER_PASS: Final = 2
+REJECTIONS_WAITING: Final = 128
+
+SIGNED_TYPE: Final = BY_NAME[SIGNED].type_name
+
+
+class RequestContext(Protocol):
+    """Services that the request handler gets from the server loop."""
+
+    state: CoreState
+
+    def step(self, event: Event, now: Instant, received: tuple[str, bytes] | None = None) -> None:
+        """Pass an event to the core and send its outputs; `received` is the message that it was decoded from."""
+        ...
+
+    def record(self, kind: RecordKind, channel: str, data: bytes, now: Instant) -> None:
+        """Record in the journal a message that is not passed to the core."""
+        ...
+
+    def publish(self, channel: str, data: bytes) -> None:
+        """Publish a message."""
+        ...
+
+    def send(self, outputs: tuple[Output, ...]) -> None:
+        """Send outputs of the core."""
+        ...
+
+    def handle_error(self, channel: str, error: Exception, data: bytes = b"") -> None:
+        """Count and log an error while handling a message."""
+        ...
+
+    def execute(self, command: SignedCommand, now: Instant) -> None:
+        """Execute a signed command."""
+        ...
+
+
+class RequestHandler:
+    """Serves the request channels of one bus; `serve` makes one pass."""
+
+    def __init__(
+        self,
+        context: RequestContext,
+        bus: Bus,
+        clock: Clock,
+        log: RateLimitedLog,
+        prefix: str,
+        limits: RequestLimits,
+        per_pass: int,
+        verifier: CommandVerifier | None = None,
+        run_delay: Callable[[], int | None] = lambda: None,
+    ):
+        self._context = context
+        self._bus = bus
+        self._clock = clock
+        self._log = log
+        self._prefix = prefix
+        self._verifier = verifier
+        self._per_pass = per_pass
+        self._run_delay = run_delay
+        self._scheduler = RequestScheduler(limits, clock.monotonic_ns())
+        self.contention = ContentionDetector()
+        self._cache = StaticReplyCache()
+        self._unprepared: Iterator[tuple[str, str]] | None = None
+        self._answered = 0
+        self._dropped: dict[str, int] = {}
+        self._rejections: deque[QueuedRequest] = deque()
+        self._report = ""
+        self._current: QueuedRequest | None = None
+        self._deferred: DeferredReply | None = None
+        self._deferred_request: QueuedRequest | None = None
+        self._stepped_ns = 0
+        self._is_first = False
+        self.is_flooded = False
+        """Whether requests were dropped in the last pass."""
+        self.is_ready = False
+        """Whether there is something that can be done now."""
+        for request in REQUESTS:
+            bus.requests.subscribe(f"{prefix}{request.name}", self._receiver(request.type_name))
+        if verifier is not None:
+            bus.requests.subscribe(f"{prefix}{SIGNED}", self._receiver(SIGNED_TYPE))
+
+    @property
+    def waiting(self) -> int:
+        """Requests that wait for a reply, also for one about being dropped."""
+        scheduler = self._scheduler
+        return scheduler.queued + scheduler.deferred + (self._deferred is not None) + len(self._rejections)
+
+    @property
+    def is_deferring(self) -> bool:
+        """Whether a deferred reply is in progress."""
+        return self._deferred is not None
+
+    def pop_answered(self) -> int:
+        """Return how many requests were answered from the cache since the last call."""
+        answered, self._answered = self._answered, 0
+        return answered
+
+    def serve(self, due_ns: int, may_defer: bool = True) -> None:
+        """Make one pass; `due_ns` is when the next tick begins. Without `may_defer` no deferred reply is begun."""
+        scheduler, clock = self._scheduler, self._clock
+        begin = clock.monotonic_ns()
+        end = min(begin + SLICE_NS, max(due_ns, begin + SLICE_NS // 4))
+        contention = self.contention
+        if contention.wants_delay(begin):
+            contention.add_delay(self._run_delay(), begin)
+        scheduler.set_contended(contention.is_contended(begin), begin)
+        self._is_first = True
+        unread = self._receive(begin + SLICE_NS // 2)
+        now = clock.monotonic_ns() if scheduler.queued else begin
+        defers = self._deferred is not None or (may_defer and scheduler.deferred > 0)
+        # each kind of work gets half if both wait
+        until = end - SLICE_NS // 2 if defers else end
+        budget = self._per_pass - (not self._is_first)
+        while budget > 0 and (request := scheduler.next(now)) is not None:
+            budget -= 1
+            self._answer(request)
+            now = clock.monotonic_ns()
+            if now >= until:
+                break
+        stepped = defers and self._work_deferred(now, end, due_ns, may_defer)
+        if self._rejections:
+            for _ in range(min(REJECTIONS_PER_PASS, len(self._rejections))):
+                self._send_rejection(self._rejections.popleft())
+        now = clock.monotonic_ns()
+        scheduler.spend((now - begin) * 1e-9, now)
+        self.is_flooded = bool(self._dropped)
+        self.is_ready = unread or scheduler.is_ready or stepped or bool(self._rejections)
+        if self._dropped:
+            self._count_dropped()
+        report = scheduler.report(now)
+        if report is not None and report != self._report:
+            self._report = report
+            self._context.step(HealthWarning("requests", report), clock.now())
+
+    def prepare(self, until_ns: int) -> bool:
+        """Compute some static replies ahead of time, before `until_ns`; return whether there are more.
+
+        It begins with the first request for a transformation, and again after a change of model.
+        """
+        if self._unprepared is None:
+            return False  # first, since every idle pass asks
+        now = self._clock.now()
+        view = self._context.state.view
+        if (
+            until_ns - now.monotonic_ns < 2 * PREPARE_NS
+            or not self._cache.is_of(view.model)
+            or self.contention.is_contended(now.monotonic_ns)
+        ):
+            return False
+        for _ in range(MAX_PREPARED):
+            pair = next(self._unprepared, None)
+            if pair is None:
+                self._unprepared = None
+                return False
+            with suppress(QueryError):
+                if view.model.rigid_transformation(*pair) is None:
+                    continue
+                request = GetTransformation(RequestHeader(0, ""), *pair, TimeQuery())
+                for reply in compute_replies(view, request, now.utime):
+                    self._cache.add(encode(request), b"", reply, encode(reply))
+            if self._clock.monotonic_ns() - now.monotonic_ns >= PREPARE_NS:
+                break
+        return True
+
+    def cache(self, output: SendReply, encoded: bytes) -> None:
+        """Cache a reply that has just been sent, if it answers the current request and does not depend on time."""
+        current = self._current
+        if current is not None and current.type_name == CACHED_TYPE and current.client:
+            self._model_cache().add(current.data, current.client, output.reply, encoded)
+
+    def defer(self, answer: DeferredAnswer) -> None:
+        """Begin a deferred answer; one is in progress at a time."""
+        self._deferred = DeferredReply(answer)
+        self._deferred_request = self._current
+
+    def send_deferred(self, count: int) -> None:
+        """Send the next messages of the deferred reply in progress, also in a replay of the journal."""
+        deferred = self._deferred
+        if deferred is None:
+            return
+        deferred.complete()
+        for message in deferred.pop(count):
+            self._context.publish(deferred.channel, message)
+        if not deferred.portion:
+            self.drop_deferred()
+
+    def drop_deferred(self) -> None:
+        """Abort the deferred reply in progress."""
+        self._deferred = self._deferred_request = None
+
+    def _receive(self, until_ns: int) -> bool:
+        """Receive requests into their clients' queues; return whether more may wait in liblcm's queue."""
+        drain = self._bus.requests.drain
+        for _ in range(MAX_RECEIVED // RECEIVE_BATCH):
+            if drain(RECEIVE_BATCH) < RECEIVE_BATCH:
+                return False
+            if self._clock.monotonic_ns() >= until_ns:
+                return True
+        return True
+
+    def _receiver(self, type_name: str) -> Callable[[str, bytes], None]:
+        signed = type_name == SIGNED_TYPE
+        scheduler, monotonic_ns = self._scheduler, self._clock.monotonic_ns
+
+        def receive(channel: str, data: bytes) -> None:
+            now_ns = monotonic_ns()
+            name = SIGNED_CLIENT if signed else client_of(data)
+            client = scheduler.client(name, now_ns)
+            request = QueuedRequest(name, channel, type_name, data)
+            if self._is_first and scheduler.admit(client, now_ns):
+                self._is_first = False
+                self._answer(request)
+                return
+            dropped = scheduler.enqueue(client, request, now_ns)
+            if dropped is not None:
+                self._drop(dropped)
+
+        return receive
+
+    def _drop(self, request: QueuedRequest) -> None:
+        channel = request.channel
+        self._dropped[channel] = self._dropped.get(channel, 0) + 1
+        if (
+            self._scheduler.count_dropped(request.client)
+            and request.type_name != SIGNED_TYPE
+            and len(self._rejections) < REJECTIONS_WAITING
+        ):
+            self._rejections.append(request)
+
+    def _send_rejection(self, dropped: QueuedRequest) -> None:
+        """Reply to a dropped request that the server is overloaded."""
+        try:
+            request = decode(dropped.type_name, dropped.data)
+        except Exception:
+            return  # counted already: as dropped
+        now = self._clock.now()
+        self._context.record(RecordKind.OVERLOAD, dropped.channel, dropped.data, now)
+        self._context.send(core.reply_overloaded(self._context.state, request, now))
+
+    def _count_dropped(self) -> None:
+        """Count the dropped requests in the core, together: counting each one costs more than dropping it."""
+        dropped, self._dropped = self._dropped, {}
+        now = self._clock.now()
+        for channel, count in dropped.items():
+            self._context.step(Rejected(channel, "overload", count), now)
+
+    def _work_deferred(self, now_ns: int, end_ns: int, due_ns: int, may_defer: bool) -> bool:
+        """Work on the deferred reply, or begin the next one; return whether the work can continue at once."""
+        scheduler, monotonic_ns = self._scheduler, self._clock.monotonic_ns
+        if self._deferred is None:
+            deferred = scheduler.next_deferred(now_ns) if may_defer and scheduler.may_exceed else None
+            if deferred is None:
+                return False
+            self._handle(deferred.queued, deferred.request)
+        while self._deferred is not None and scheduler.may_exceed:
+            now = monotonic_ns()
+            if due_ns - now < STEP_ROOM_NS and now - self._stepped_ns < STARVED_NS:
+                return False
+            if now >= end_ns and self._stepped_ns >= now_ns:
+                return True
+            self._stepped_ns = now
+            self._step_deferred(self._deferred)
+        return self._deferred is None and scheduler.deferred > 0 and may_defer
+
+    def _step_deferred(self, deferred: DeferredReply) -> None:
+        """Do one step of the deferred work, or send a portion of its messages."""
+        if not deferred.ready:
+            try:
+                deferred.step()
+            except Exception as error:
+                request = self._deferred_request
+                self.drop_deferred()
+                assert request is not None
+                self._fail(request, deferred.request, error)
+                return
+        if deferred.ready:
+            count = deferred.portion
+            # a record of its own, so that a replay of the journal sends the portion at the same place
+            self._context.record(
+                RecordKind.DEFERRED_PART, deferred.channel, count.to_bytes(4, "big"), self._clock.now()
+            )
+            self.send_deferred(count)
+
+    def _answer(self, queued: QueuedRequest) -> None:
+        """Answer a request, also a malformed one or one whose handling fails."""
+        client, channel, type_name, data = queued
+        context = self._context
+        try:
+            if type_name == SIGNED_TYPE:
+                self._execute_signed(channel, data)
+                return
+            if type_name == CACHED_TYPE and client and self._send_cached(client, channel, data):
+                return
+            request = decode(type_name, data)
+        except Exception as error:
+            context.handle_error(channel, error, data)
+            header = read_request_header(data) if isinstance(error, WireError) and error.reason == "malformed" else None
+            kind = get_request_type(type_name)
+            if header is not None and kind is not None:
+                now = self._clock.now()
+                context.record(RecordKind.MALFORMED, channel, data, now)
+                context.send(core.reply_malformed(context.state, kind, header, str(error), now))
+            return
+        effort = effort_of(request)
+        if is_deferred(request):
+            if not self._scheduler.enqueue_deferred(
+                DeferredRequest(queued, request, estimate_reply_bytes(request), effort)
+            ):
+                self._drop(queued)
+            return
+        if effort > 1.0:
+            self._scheduler.charge(client, effort - 1.0, self._clock.monotonic_ns())
+        self._handle(queued, request)
+
+    def _handle(self, queued: QueuedRequest, request: Request) -> None:
+        """Pass a request to the core."""
+        self._current = queued
+        try:
+            self._context.step(request, self._clock.now(), (queued.channel, queued.data))
+        except Exception as error:
+            self._fail(queued, request, error)
+        self._current = None
+
+    def _send_cached(self, client: bytes, channel: str, data: bytes) -> bool:
+        """Answer a request from the cache; return whether that was possible."""
+        now = self._clock.now()
+        context = self._context
+        reply = self._model_cache().find(data, client, now.utime)
+        if reply is None:
+            return False
+        header = RequestHeader(0, client.decode("utf-8", "replace"))
+        if not is_answerable(header, context.state.settings.reply_prefix):
+            return False
+        context.record(RecordKind.CACHED, channel, data, now)
+        context.publish(header.reply_channel, reply)
+        self._answered += 1
+        return True
+
+    def _model_cache(self) -> StaticReplyCache:
+        """Return the cache, emptied after a change of model."""
+        model = self._context.state.view.model
+        if not self._cache.is_of(model):
+            frames = [names.join(body.name, frame.name) for body in model.bodies for frame in body]
+            self._cache.reset(model, len(frames))
+            self._unprepared = islice(product(frames, frames), MAX_ENTRIES)
+        return self._cache
+
+    def _fail(self, queued: QueuedRequest, request: Request, error: Exception) -> None:
+        """Reply to a request whose handling failed."""
+        context, now = self._context, self._clock.now()
+        context.handle_error(queued.channel, error)
+        context.record(RecordKind.FAILED, queued.channel, queued.data, now)
+        context.send(core.reply_internal_error(context.state, request, now))
+
+    def _execute_signed(self, channel: str, data: bytes) -> None:
+        """Execute the command in an envelope, or reply with the reason to a sender that knows the key."""
+        if self._verifier is None:
+            return
+        now = self._clock.now()
+        result = self._verifier.verify(data, now)
+        if isinstance(result, SignedCommand):
+            log.info("%s, signed by %s", type(result.command).__name__, escape_text(result.sender))
+            try:
+                self._context.execute(result, now)
+            except Exception as error:
+                self._context.handle_error(channel, error)
+                if not isinstance(result.command, SwitchMode):
+                    own = f"{self._prefix}{CHANNEL_OF[type(result.command)]}"
+                    self._context.record(RecordKind.FAILED, own, encode(result.command), now)
+                    self._context.send(core.reply_internal_error(self._context.state, result.command, now))
+            return
+        self._context.step(result, now)
+        self._log.warning(
+            f"{channel}:{result.reason}",
+            "denied a signed command (%s): %s",
+            result.reason,
+            result.message or "no detail",
+        )
+
+
+def client_of(data: bytes) -> bytes:
+    """Return the reply channel in the bytes of a request; empty if no reply could be sent to it."""
+    end = 19 + int.from_bytes(data[16:20], "big")
+    # names that begin with a control character are reserved: `SIGNED_CLIENT`
+    return data[20:end] if 20 < end <= 83 and end < len(data) and data[20] > 0x20 else b""
+
+
+def get_request_type(type_name: str) -> type[Request] | None:
+    """Return the request class of a wire type."""
+    return _REQUEST_TYPES.get(type_name)
+
+
+_REQUEST_TYPES: Mapping[str, type[Request]] = {BY_NAME[channel].type_name: kind for kind, channel in CHANNEL_OF.items()}
+"""Request class of each wire type."""

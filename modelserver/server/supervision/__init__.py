@@ -1,0 +1,1 @@
+"""Supervision by systemd: notification, watchdog, restart."""

@@ -1,0 +1,185 @@
+"""systemd notification protocol (sd_notify(3)): READY, STATUS, RELOADING, STOPPING and the watchdog.
+
+The protocol is one datagram of `KEY=value` lines to the socket that NOTIFY_SOCKET names. Without that variable, or if
+the socket is gone, nothing happens: a missing service manager is no error.
+
+The watchdog is pinged only while the service makes progress (`StallDetector`). A restart helps a program that hangs or
+fails permanently, and nothing else. So only failures without any success in between count; a silent sensor or rejected
+samples are no failure, since they would be the same after a restart.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Final
+
+from modelserver.server.log import escape_text
+
+MAX_STATUS_LENGTH: Final = 400
+"""Characters of a status line."""
+
+STATUS_PERIOD_NS: Final = 1_000_000_000
+"""Least period of status lines."""
+
+PINGS_PER_TIMEOUT: Final = 4
+"""Watchdog pings per watchdog timeout."""
+
+STEP_TIMEOUT_S: Final = 60.0
+"""Timeout of one step of the start, or of a reload, for the service manager."""
+
+Send = Callable[[bytes], object]
+
+
+def open_manager_socket(environment: Mapping[str, str] = os.environ) -> Send | None:
+    """Return a function that sends a datagram to the service manager; None without one.
+
+    NOTIFY_SOCKET is a path, or with a leading @ a name in the abstract namespace; anything else is ignored.
+    """
+    address = environment.get("NOTIFY_SOCKET", "")
+    if address[:1] not in ("/", "@") or len(address) < 2:
+        return None
+    if address.startswith("@"):
+        address = f"\0{address[1:]}"
+
+    def send(datagram: bytes) -> None:
+        # a few per second: a socket for each needs no close
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
+            # a manager that does not read must not block the service: the datagram is lost
+            channel.setblocking(False)
+            channel.sendto(datagram, address)
+
+    return send
+
+
+def get_watchdog_ns(environment: Mapping[str, str] = os.environ, pid: int | None = None) -> int:
+    """Return the watchdog timeout of this process, nanoseconds; 0 without one."""
+    meant_for = environment.get("WATCHDOG_PID", "")
+    if meant_for and meant_for != str(os.getpid() if pid is None else pid):
+        return 0
+    given = environment.get("WATCHDOG_USEC", "")
+    return int(given) * 1000 if given.isascii() and given.isdigit() else 0
+
+
+class Notifier:
+    """Notifies the service manager. `send` is None without one; `watchdog` is its timeout, nanoseconds, 0 for none."""
+
+    def __init__(self, send: Send | None, watchdog: int = 0, monotonic_ns: Callable[[], int] = time.monotonic_ns):
+        self._send, self._watchdog_ns, self._monotonic_ns = send, watchdog, monotonic_ns
+        self._ping_due_ns = 0
+        self._status, self._status_due_ns = "", 0
+        self._is_ready = False
+
+    @classmethod
+    def from_environment(cls) -> Notifier:
+        """Make the notifier that the environment of this process asks for."""
+        return cls(open_manager_socket(), get_watchdog_ns())
+
+    @property
+    def is_active(self) -> bool:
+        """Whether there is a service manager."""
+        return self._send is not None
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether READY was sent."""
+        return self._is_ready
+
+    def send(self, *lines: str) -> None:
+        """Send lines of the protocol."""
+        if self._send is not None:
+            self._send("\n".join(lines).encode("utf-8", "replace"))
+
+    def notify_starting(self, what: str, seconds: float = STEP_TIMEOUT_S) -> None:
+        """Report a step of the start and extend its timeout; without effect after READY."""
+        if not self._is_ready:
+            self._status = _truncate(what)
+            self.send(f"STATUS={self._status}", f"EXTEND_TIMEOUT_USEC={round(seconds * 1e6)}")
+
+    def notify_ready(self, status: str) -> None:
+        """Report that the service is ready."""
+        self._is_ready = True
+        self._set_status(status)
+        self.send("READY=1", f"STATUS={self._status}")
+
+    def update_status(self, status: Callable[[], str]) -> None:
+        """Report the status if it has changed; at most once a second `status` is called."""
+        if self._send is None or self._monotonic_ns() < self._status_due_ns:
+            return
+        before = self._status
+        self._set_status(status())
+        if self._status != before:
+            self.send(f"STATUS={self._status}")
+
+    def ping_watchdog(self) -> None:
+        """Ping the watchdog if there is one and the last ping is old enough."""
+        now = self._monotonic_ns()
+        if self._watchdog_ns and now >= self._ping_due_ns:
+            self._ping_due_ns = now + self._watchdog_ns // PINGS_PER_TIMEOUT
+            self.send("WATCHDOG=1")
+
+    @contextlib.contextmanager
+    def reloading(self, seconds: float = STEP_TIMEOUT_S) -> Iterator[None]:
+        """Report a reload until the block ends, with `seconds` as watchdog timeout.
+
+        systemd 253 needs the monotonic time, to ignore the answer to an earlier reload.
+        """
+        lines = ["RELOADING=1", f"MONOTONIC_USEC={self._monotonic_ns() // 1000}", "STATUS=reloading the geometry"]
+        if self._watchdog_ns:
+            # a new timeout counts from now, and needs a ping
+            lines += [f"WATCHDOG_USEC={round(seconds * 1e6)}", "WATCHDOG=1"]
+        self.send(*lines)
+        try:
+            yield
+        finally:
+            lines = ["READY=1", f"STATUS={self._status}"]
+            if self._watchdog_ns:
+                lines += [f"WATCHDOG_USEC={self._watchdog_ns // 1000}", "WATCHDOG=1"]
+            self.send(*lines)
+            self._ping_due_ns = self._status_due_ns = 0
+
+    def notify_stopping(self) -> None:
+        """Report that the service stops."""
+        self.send("STOPPING=1", "STATUS=stopping")
+
+    def _set_status(self, status: str) -> None:
+        self._status = _truncate(status)
+        self._status_due_ns = self._monotonic_ns() + STATUS_PERIOD_NS
+
+
+def _truncate(text: str) -> str:
+    """Escape and truncate a text to a status line."""
+    text = escape_text(text)
+    return text if len(text) <= MAX_STATUS_LENGTH else f"{text[: MAX_STATUS_LENGTH - 3]}..."
+
+
+STALL_TIMEOUT_S: Final = 5.0
+"""How long failures without success may last before the watchdog is no longer pinged."""
+
+
+class StallDetector:
+    """Detects permanent failure from two numbers: one that changes with each success, and a count of failures."""
+
+    def __init__(self, timeout: float = STALL_TIMEOUT_S):
+        self._timeout_ns = round(timeout * 1e9)
+        self._successes: int | None = None
+        self._failures = 0
+        self._first_ns: int | None = None
+        self._last_ns = 0
+
+    def is_progressing(self, successes: int, failures: int, now_ns: int) -> bool:
+        """Return whether the service makes progress or is idle; to be called often. `now_ns` is monotonic time."""
+        if successes != self._successes:
+            self._successes, self._failures, self._first_ns = successes, failures, None
+            return True
+        if self._first_ns is not None and now_ns - self._last_ns >= self._timeout_ns:
+            # rare failures are no permanent one
+            self._first_ns = None
+        if failures != self._failures:
+            self._failures, self._last_ns = failures, now_ns
+            if self._first_ns is None:
+                self._first_ns = now_ns
+        return self._first_ns is None or self._last_ns - self._first_ns < self._timeout_ns

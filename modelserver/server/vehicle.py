@@ -1,0 +1,444 @@
+"""A vehicle: its file and its geometry, checked against each other, and what the server makes of them.
+
+`load_vehicle` checks everything before a server starts, and reports all problems at once: frames, channels, origin,
+keys. `Vehicle` makes the first core state, the sensor channels, the command verifier and the snapshot.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from modelserver import core
+from modelserver.config.vehicle_file import KEY_HINT, VehicleConfig, WheelsConfig, add_lines
+from modelserver.core import CoreSettings, CoreState, ExpectedSensor, Instant
+from modelserver.core.commands import ModelLoaded
+from modelserver.earth.geodesy import GeodesyError, make_origin
+from modelserver.errors import (
+    ConfigError,
+    GeometryError,
+    KeyFileError,
+    Location,
+    Problem,
+    QueryError,
+    Severity,
+    Suggestion,
+)
+from modelserver.estimation.findings import find_unusable
+from modelserver.estimation.sensor_rig import Mounts, SensorRig, SteeringSignal
+from modelserver.formats import FileExamination, examine_file
+from modelserver.formats.snapshot import ModelSnapshot, encode_snapshot
+from modelserver.geometry import Model
+from modelserver.geometry.parts import suggest_frame
+from modelserver.messages import (
+    AbsolutePoseSample,
+    GpsSample,
+    ImuSample,
+    JointsSample,
+    LoadModel,
+    Origin,
+    RangeSample,
+    RelativePoseSample,
+    RestoredState,
+    Sample,
+    SensorFinding,
+    VehicleStatusSample,
+    WheelsSample,
+)
+from modelserver.server.ingress import SensorChannel
+from modelserver.server.requests.signed_commands import CommandVerifier
+from modelserver.signing.key_files import read_keys
+from modelserver.signing.signatures import Key
+from modelserver.wire.channels import CHANNELS, ChannelUse
+
+if TYPE_CHECKING:
+    from modelserver.estimation.modes import LocalizerConfig
+
+log = logging.getLogger(__name__)
+
+HOUSEKEEPING_HZ = 50.0
+"""Least rate of ticks: for waiting requests, the health report and signals."""
+
+MODE_CHANNEL = "LOCALIZATION_MODE"
+"""Default channel of mode commands."""
+
+AIDING_SAMPLES: Mapping[str, type[Sample]] = {
+    "absolute_pose": AbsolutePoseSample,
+    "relative_pose": RelativePoseSample,
+    "range": RangeSample,
+}
+"""Samples of aiding sources, by their type in the vehicle file."""
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicle:
+    """A vehicle file and its geometry, checked against each other.
+
+    `rig` is None without any localization sensor, `mounts` without GPS or IMU.
+    """
+
+    config: VehicleConfig
+    model: Model
+    mounts: Mounts | None
+    rig: SensorRig | None = None
+
+    def start_core(
+        self, now: Instant, origin: Origin | None = None, restored: RestoredState | None = None
+    ) -> CoreState:
+        """Make the first state of the core.
+
+        Parameters
+        ----------
+        origin: persisted origin of an earlier run; a configured one has precedence.
+        restored: persisted state of an earlier run for a warm start; None if none is configured.
+        """
+        config = self.config
+        localizer = None
+        start_report = ""
+        setup = self.make_localizer_setup()
+        if setup is not None:
+            from modelserver.estimation.filter.persistence import opened
+            from modelserver.estimation.modes import ModeLocalizer
+
+            origin = get_configured_origin(config) or origin
+            mode = config.localization.initial_mode
+            restored, start_report = opened(restored, config.vehicle, setup.setup, mode)
+            localizer = ModeLocalizer.start(setup, mode, origin, restored)
+        settings = CoreSettings(
+            base_frame=config.base_frame,
+            rolling_frame=config.rolling_frame,
+            vehicle=config.vehicle,
+            publish=config.publish.mode,
+            ticks_per_pose=self.ticks_per_pose(),
+            ticks_per_state=self.ticks_per_state(),
+            publish_decisions=config.publish.decisions,
+            health_period_ns=round(1e9 / config.publish.health_hz),
+            history_s=config.limits.history_s,
+            waiting_requests=config.limits.waiting_requests,
+            wait_ms=config.limits.wait_ms,
+            reply_prefix=config.lcm.reply_prefix,
+            snapshot_period_ns=round(config.publish.snapshot_s * 1e9),
+            may_reload=config.commands.reload,
+            may_set_pose=config.commands.set_pose,
+            persist_period_ns=round(config.warm_start.period_s * 1e9) if config.warm_start.persist else 0,
+            sensors=self.expected_sensors(),
+        )
+        state = core.start(settings, self.model, localizer, now)
+        return state._replace(warnings={core.START: start_report}) if start_report else state
+
+    def make_localizer_setup(self) -> LocalizerConfig | None:
+        """Make the configuration of the localizers; None without a localization sensor."""
+        if self.rig is None:
+            return None
+        from modelserver.estimation.filter.setup import Setup
+        from modelserver.estimation.modes import LocalizerConfig
+
+        return LocalizerConfig(
+            Setup(self.rig, self.config.localization.filter), self.config.localization.raw, self.mounts
+        )
+
+    def find_unusable_sensors(self) -> tuple[SensorFinding, ...]:
+        """Find the configured sensors that localization cannot use in its initial mode, with the reasons."""
+        return () if self.rig is None else find_unusable(self.rig, self.config.localization.initial_mode)
+
+    def read_keys(self, file: str = "") -> tuple[Key, ...]:
+        """Read the vehicle's keys; none without a key file. Raises ConfigError if the file is invalid."""
+        path = self.config.commands.key_file
+        try:
+            return read_keys(path) if path else ()
+        except KeyFileError as error:
+            problem = Problem(Severity.ERROR, str(error), Location(file, element="commands.key_file"))
+            raise ConfigError(add_lines([problem], file)) from None
+
+    def make_command_verifier(self, started_ns: int, file: str = "") -> CommandVerifier:
+        """Make the verifier of signed commands. Raises ConfigError if the key file is invalid."""
+        config = self.config
+        keys = self.read_keys(file)
+        mode_channel = config.localization.mode_channel
+        return CommandVerifier(keys, config.lcm.channel_prefix, config.commands.window_s, mode_channel, started_ns)
+
+    def encode_snapshot(self, state: CoreState) -> bytes:
+        """Encode a snapshot of the current model."""
+        view = state.view
+        return encode_snapshot(
+            ModelSnapshot(
+                self.config.vehicle,
+                view.model,
+                view.base_frame,
+                view.rolling_frame,
+                self.config.limits.history_s,
+                f"{self.config.lcm.channel_prefix}{self.config.sensors.joints.channel}",
+                round(self.config.sensors.joints.latency * 1e6),
+            )
+        )
+
+    def reload_model(self, command: LoadModel, state: CoreState, file: str = "") -> ModelLoaded:
+        """Read the geometry file again, and check all of it against the vehicle file."""
+        try:
+            vehicle = load_vehicle(self.config, file)
+        except (GeometryError, ConfigError) as error:
+            return ModelLoaded(command.request, why=str(error))
+        except Exception as error:
+            log.exception("reloading the geometry failed")
+            return ModelLoaded(command.request, why=f"internal error while reading it: {error}")
+        lost = find_disconnected(vehicle.model) - find_disconnected(state.model)
+        if lost:
+            why = (
+                f"{', '.join(sorted(lost))}: no longer connected to the root; if the file is still being written, "
+                "write a temporary file and rename it; to use the geometry as it is, restart the server"
+            )
+            return ModelLoaded(command.request, why=why)
+        localizer, setup = state.localizer, vehicle.make_localizer_setup()
+        if setup is not None:
+            from modelserver.estimation.modes import ModeLocalizer
+
+            if isinstance(localizer, ModeLocalizer):
+                localizer = localizer.reconfigure(setup)
+        return ModelLoaded(command.request, vehicle.model, localizer)
+
+    def ticks_per_pose(self) -> int:
+        """Return the ticks per POSE in timer mode; more than one if POSE is slower than `HOUSEKEEPING_HZ`."""
+        publish = self.config.publish
+        return math.ceil(HOUSEKEEPING_HZ / publish.rate_hz) if publish.mode == "timer" else 1
+
+    def tick_hz(self) -> float:
+        """Return the rate of ticks, a whole multiple of that of POSE."""
+        publish = self.config.publish
+        return publish.rate_hz * self.ticks_per_pose() if publish.mode == "timer" else HOUSEKEEPING_HZ
+
+    def ticks_per_state(self) -> int:
+        """Return the ticks per LOCALIZATION_STATE; 0 if it is not configured."""
+        state_hz = self.config.publish.state_hz
+        return max(1, round(self.tick_hz() / state_hz)) if state_hz else 0
+
+    def expected_sensors(self) -> tuple[ExpectedSensor, ...]:
+        """Return the configured sensors with their channels."""
+        return tuple(ExpectedSensor(each.channel, each.sample, each.source) for each in _list_sensors(self.config))
+
+    def sensor_channels(self, model: Model | None = None) -> dict[str, SensorChannel]:
+        """Return the channels to subscribe to: those of sensors, and the one of mode commands if it is configured.
+
+        The joints' channel is included if `model` (default: the loaded one) has joints.
+        """
+        has_joints = bool((model or self.model).joints)
+        channels = {
+            each.channel: SensorChannel(each.type_name, each.latency_us)
+            for each in _list_sensors(self.config)
+            if has_joints or each.sample is not JointsSample
+        }
+        if self.config.localization.mode_channel:
+            name = f"{self.config.lcm.channel_prefix}{self.config.localization.mode_channel}"
+            channels[name] = SensorChannel("localization_mode_t")
+        return channels
+
+
+class _ConfiguredSensor(NamedTuple):
+    """A sensor of the vehicle file: its key below `sensors`, its channel with prefix, its types, its source name."""
+
+    key: str
+    channel: str
+    latency_us: int
+    sample: type[Sample]
+    type_name: str
+    source: str = ""
+
+
+def _list_sensors(config: VehicleConfig) -> list[_ConfiguredSensor]:
+    prefix, sensors = config.lcm.channel_prefix, config.sensors
+    listed: list[tuple[str, Any, type[Sample], str, str]] = [
+        ("gps", sensors.gps, GpsSample, "gps_t", ""),
+        ("imu", sensors.imu, ImuSample, "imu_t", ""),
+        ("wheels", sensors.wheels, WheelsSample, "wheels_t", ""),
+        ("wheels.steering", sensors.steering, VehicleStatusSample, "vehicle_status_t", ""),
+        ("joints", sensors.joints, JointsSample, "joints_t", ""),
+        *(
+            (f"aiding.{name}", each, AIDING_SAMPLES[each.type], f"{each.type}_t", name)
+            for name, each in sensors.aiding.items()
+        ),
+    ]
+    return [
+        _ConfiguredSensor(key, f"{prefix}{each.channel}", round(each.latency * 1e6), sample, type_name, source)
+        for key, each, sample, type_name, source in listed
+        if each is not None
+    ]
+
+
+def find_disconnected(model: Model) -> frozenset[str]:
+    """Find the bodies that no constraint connects to the root."""
+    return frozenset(name for assembly in model.assemblies[1:] for name in assembly)
+
+
+def load_vehicle(config: VehicleConfig, file: str = "", strict: bool = False) -> Vehicle:
+    """Load the geometry and check it against the vehicle file.
+
+    Parameters
+    ----------
+    file: path of the vehicle file, for messages.
+    strict: permit at most one constraint per frame.
+
+    Raises
+    ------
+    GeometryError, ConfigError: with all problems.
+    """
+    geometry, problems = examine_vehicle(config, file, strict)
+    model = geometry.model
+    if model is None and geometry.problems:
+        raise GeometryError(geometry.problems)
+    if model is None or problems:
+        raise ConfigError(problems)
+    mounts = None
+    gps, imu = config.sensors.gps, config.sensors.imu
+    if gps is not None and imu is not None:
+        mounts = Mounts.from_model(model, config.rolling_frame or config.base_frame, gps.frame, imu.frame)
+    return Vehicle(config, model, mounts, _make_rig(config, model))
+
+
+def examine_vehicle(
+    config: VehicleConfig, file: str = "", strict: bool = False
+) -> tuple[FileExamination, tuple[Problem, ...]]:
+    """Find all problems of the geometry and of the vehicle file at once.
+
+    Frames are looked up also in a geometry with errors, as far as its bodies can be read. An empty name of the geometry
+    or of the base frame means that the vehicle file lacks it.
+    """
+    geometry = FileExamination()
+    problems: list[Problem] = []
+    if config.geometry:
+        try:
+            geometry = examine_file(config.geometry, config.variables, strict=strict)
+        except OSError as error:
+            why = f"the geometry file {config.geometry} cannot be read: {error.strerror}"
+            problems.append(Problem(Severity.ERROR, why, Location(file, element="geometry")))
+    if geometry.partial_model is not None:
+        problems += _find_frame_problems(config, geometry.partial_model, file, is_whole=geometry.model is not None)
+    gps, imu = config.sensors.gps, config.sensors.imu
+    if config.localization.mode == "raw" and (gps is None or imu is None):
+        why = "raw mode needs a GPS and an IMU, and the section sensors does not have both"
+        problems.append(Problem(Severity.ERROR, why, Location(file, element="localization.mode"), "write mode: full"))
+    problems += _find_channel_problems(config, file)
+    if config.localization.mode_channel and not config.commands.key_file:
+        why = f"mode commands must be signed: {KEY_HINT}"
+        problems.append(Problem(Severity.ERROR, why, Location(file, element="localization.mode_channel")))
+    try:
+        get_configured_origin(config)
+    except GeodesyError as error:
+        problems.append(Problem(Severity.ERROR, str(error), Location(file, element="origin.initial_utm")))
+    return geometry, tuple(add_lines(problems, file))
+
+
+def _find_frame_problems(config: VehicleConfig, model: Model, file: str, is_whole: bool) -> list[Problem]:
+    """Check the frames that the vehicle file names; only an `is_whole` model has constraints."""
+    gps, imu = config.sensors.gps, config.sensors.imu
+    named = [("base_frame", config.base_frame), ("rolling_frame", config.rolling_frame)]
+    named += [(f"sensors.{key}.frame", each.frame) for key, each in (("gps", gps), ("imu", imu)) if each is not None]
+    named += [("sensors.gps.second_frame", gps.second_frame)] if gps is not None else []
+    if config.sensors.wheels is not None:
+        named += [(f"sensors.wheels.frames.{name}", frame) for name, frame in config.sensors.wheels.frames.items()]
+    problems: list[Problem] = []
+    unknown: set[str] = set()
+    for key, frame in named:
+        if not frame and key in ("base_frame", "rolling_frame", "sensors.gps.second_frame"):
+            continue
+        try:
+            model.frame(frame)
+        except QueryError as error:
+            unknown.add(frame)
+            near = Suggestion.of(frame, suggest_frame(frame, {body.name: body for body in model.bodies}))
+            fix = f"write {near[0]}" if near else f"see: modelserver bodies --model {config.geometry}"
+            problems.append(Problem(Severity.ERROR, str(error), Location(file, element=key), fix, near))
+    if not is_whole or not config.base_frame or config.base_frame in unknown:
+        return problems
+    body = config.rolling_frame or config.base_frame
+    for key, frame in named:
+        if not frame or frame in unknown:
+            continue
+        try:
+            model.get_transformation(frame, config.base_frame)
+            joints = () if body in unknown else model.get_kinematic_path(frame, body).joints
+        except QueryError as error:
+            fix = f"see: modelserver bodies --model {config.geometry}"
+            problems.append(Problem(Severity.ERROR, str(error), Location(file, element=key), fix))
+            continue
+        if joints:
+            why = f"joint {joints[0].name} moves {frame} relative to the vehicle; localization needs a rigid mount"
+            fix = "name a frame that is fixed to the vehicle, or make the constraint fixed"
+            problems.append(Problem(Severity.ERROR, why, Location(file, element=key), fix))
+    return problems
+
+
+def _make_rig(config: VehicleConfig, model: Model) -> SensorRig | None:
+    """Make the sensor rig of the filter; None without a localization sensor."""
+    gps, imu, wheels = config.sensors.gps, config.sensors.imu, config.sensors.wheels
+    if gps is None and imu is None and wheels is None:
+        return None
+    return SensorRig(
+        model,
+        config.rolling_frame or config.base_frame,
+        imu.frame if imu is not None else "",
+        gps.frame if gps is not None else "",
+        gps.second_frame if gps is not None else "",
+        wheels.frames if wheels is not None else {},
+        wheels.kinematics if wheels is not None else "differential",
+        config.localization.magnetometer,
+        _make_steering_signal(wheels),
+        wheels is not None,
+    )
+
+
+def _make_steering_signal(wheels: WheelsConfig | None) -> SteeringSignal | None:
+    if wheels is None or wheels.steering is None:
+        return None
+    steering = wheels.steering
+    return SteeringSignal(steering.wheels, steering.geometry, steering.sigma, steering.limit, steering.max_age)
+
+
+def _find_channel_problems(config: VehicleConfig, file: str) -> list[Problem]:
+    """Check that no channel has two uses."""
+    prefix, reply_prefix = config.lcm.channel_prefix, config.lcm.reply_prefix
+    used = {f"sensors.{each.key}.channel": each.channel for each in _list_sensors(config)}
+    own = {f"{prefix}{channel.name}" for channel in CHANNELS}
+    not_for_sensors = {f"{prefix}{channel.name}" for channel in CHANNELS if channel.use is not ChannelUse.SENSOR}
+    problems = [
+        Problem(
+            Severity.ERROR,
+            f"{channel} is a channel of the server itself, not of a sensor",
+            Location(file, element=key),
+            "give the sensor another channel",
+        )
+        for key, channel in used.items()
+        if channel in not_for_sensors
+    ]
+    if config.localization.mode_channel:
+        channel = f"{prefix}{config.localization.mode_channel}"
+        if channel in used.values() or (channel in own and channel != f"{prefix}{MODE_CHANNEL}"):
+            problems.append(
+                Problem(
+                    Severity.ERROR,
+                    f"{channel} has another use, so it cannot be the channel of mode commands",
+                    Location(file, element="localization.mode_channel"),
+                    f"write {MODE_CHANNEL}",
+                )
+            )
+        used["localization.mode_channel"] = channel
+    clashing = sorted(name for name in own | set(used.values()) if name.startswith(reply_prefix))
+    if clashing:
+        problems.append(
+            Problem(
+                Severity.ERROR,
+                f"with the reply prefix {reply_prefix} a request could make the server reply on {clashing[0]}",
+                Location(file, element="lcm.reply_prefix"),
+                "choose a prefix that no other channel has, e.g. REPLY_",
+            )
+        )
+    return problems
+
+
+def get_configured_origin(config: VehicleConfig) -> Origin | None:
+    """Return the configured origin; None if it is to be captured."""
+    origin = config.origin
+    if origin.initial_utm is None or origin.zone is None:
+        return None
+    return make_origin(*origin.initial_utm, zone=origin.zone, north=origin.hemisphere == "north")

@@ -1,1 +1,0 @@
-"""The daemon: bus, clocks, loop, and what it keeps across restarts."""

@@ -1,1 +1,0 @@
-"""Binary encoding of declared types for stored state: no pickle, no code in the bytes, floats bit for bit."""

@@ -1,1 +1,0 @@
-"""What a service manager is told."""

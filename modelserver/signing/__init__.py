@@ -1,0 +1,1 @@
+"""Signed commands: key files, signatures, and protection against replayed messages."""

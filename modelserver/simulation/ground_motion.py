@@ -1,0 +1,295 @@
+"""Vehicle motion on uneven ground with side slip, in closed form with exact derivatives.
+
+State: position, velocity and acceleration of the rolling frame, attitude with angular rate and acceleration.
+Ground: a plane plus sine waves, z(x, y). Along the path each wave is a function of its phase u(t), so height and slopes
+and their time rates follow from the chain rule. Attitude (`_Slope`): fixed-axis angles yaw, pitch = -atan q and
+roll = atan(p / sqrt(1 + q^2)) with the slopes q along the heading and p to the left; the vehicle's z is the ground's
+normal.
+Side slip: the slip angle b = course - yaw is a cornering compliance times lateral acceleration plus a sum of sines. It
+yaws the vehicle relative to the path instead of moving the path, so nothing is integrated.
+Assumptions: one point of contact (the rolling frame); the path in the plan is the trajectory's whatever the slope.
+Limits: waves shorter than a few wheelbases are steeper for this vehicle than for a real one.
+Read top-down: `make_motion` -> `GroundMotion.at` -> `SlipAngle.at`, `Terrain.evaluate`, `_Slope`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from modelserver.simulation.noise import NoiseSource
+from modelserver.simulation.trajectory import Attitude, MotionModel, Trajectory, TrajectoryMotion
+from modelserver.transforms import so3
+from modelserver.transforms.so3 import Vector3
+
+
+@dataclass(frozen=True, slots=True)
+class SideSlip:
+    """Lateral sliding of a vehicle, which its wheels do not measure.
+
+    Attributes
+    ----------
+    cornering : slip angle per lateral acceleration, rad/(m/s2); the vehicle slides out of the turn
+    random_sigma : root mean square of a random lateral speed, m/s: `count` sines of random phase
+    periods : shortest and longest period of the sines, s; drawn evenly in their logarithm
+    fade_speed : the random part is scaled by v^2 / (v^2 + fade_speed^2), m/s: a stationary vehicle does not slide
+    """
+
+    cornering: float = 0.0
+    random_sigma: float = 0.0
+    periods: tuple[float, float] = (3.0, 30.0)
+    count: int = 5
+    fade_speed: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not (0 < self.periods[0] <= self.periods[1] and self.count >= 1 and self.fade_speed > 0):
+            raise ValueError(f"periods and fade_speed must be positive, and count at least 1; got {self}")
+
+
+class SlipAngle:
+    """Slip angle of one run: course minus yaw (of the direction of forward speed), with its rates."""
+
+    __slots__ = ("_cornering", "_fade", "_sines")
+
+    def __init__(self, model: SideSlip, seed: int):
+        noise = NoiseSource(seed, "side slip")
+        amplitude = model.random_sigma * math.sqrt(2.0 / model.count)
+        shortest, longest = map(math.log, model.periods)
+        self._cornering = model.cornering
+        self._fade = model.fade_speed**2
+        self._sines = [
+            (amplitude, math.tau / math.exp(noise.uniform(shortest, longest)), noise.uniform(-math.pi, math.pi))
+            for _ in range(model.count if amplitude else 0)
+        ]
+
+    def at(self, t: float, motion: TrajectoryMotion, higher: Vector3) -> Vector3:
+        """Return the slip angle at `t` seconds and its first and second rate, rad, rad/s, rad/s2.
+
+        `motion` is the trajectory's at `t`, and `higher` the result of `Trajectory.higher_rates`.
+        """
+        v, v1, v2 = motion.speed, motion.forward_acceleration, higher[2]
+        size, sign = abs(v), math.copysign(1.0, v)
+        k, k1, k2 = motion.curvature, higher[0], higher[1]
+        # tires slip against the lateral acceleration k v^2, forward and in reverse
+        c = -self._cornering
+        angle = c * k * v * size
+        rate = c * (k1 * v * size + 2.0 * k * size * v1)
+        acceleration = c * (k2 * v * size + 4.0 * k1 * size * v1 + 2.0 * k * (sign * v1 * v1 + size * v2))
+        if self._sines:
+            w = w1 = w2 = 0.0
+            for amplitude, omega, phase in self._sines:
+                sine, cosine = amplitude * math.sin(omega * t + phase), amplitude * math.cos(omega * t + phase)
+                w += sine
+                w1 += omega * cosine
+                w2 -= omega * omega * sine
+            below = v * v + self._fade
+            g, gv = v / below, (self._fade - v * v) / (below * below)
+            gvv = 2.0 * v * (v * v - 3.0 * self._fade) / (below * below * below)
+            g1, g2 = gv * v1, gvv * v1 * v1 + gv * v2
+            angle += w * g
+            rate += w1 * g + w * g1
+            acceleration += w2 * g + 2.0 * w1 * g1 + w * g2
+        return (angle, rate, acceleration)
+
+
+@dataclass(frozen=True, slots=True)
+class Wave:
+    """A sine wave of the ground: `amplitude` and `length` in meters.
+
+    `direction` is in radians counter-clockwise from east, `phase` in radians at the origin.
+    """
+
+    amplitude: float
+    length: float
+    direction: float = 0.0
+    phase: float = 0.0
+
+    def __post_init__(self) -> None:
+        numbers = (self.amplitude, self.length, self.direction, self.phase)
+        if not (all(map(math.isfinite, numbers)) and self.length > 0):
+            raise ValueError(f"a wave must have a positive length and finite numbers; got {self}")
+
+
+class GroundState(NamedTuple):
+    """Ground under a moving point: height (m), slope to east and to north, each with its first and second time rate."""
+
+    height: Vector3
+    east: Vector3
+    north: Vector3
+
+
+@dataclass(frozen=True, slots=True)
+class Terrain:
+    """Height of the ground above the tangent plane: z = slope_east x + slope_north y + sum of the waves."""
+
+    slope_east: float = 0.0
+    slope_north: float = 0.0
+    waves: tuple[Wave, ...] = ()
+    _waves: tuple[tuple[float, float, float, float], ...] = field(init=False, repr=False, compare=False)
+    """Amplitude, wave numbers to east and north, phase: computed once for `evaluate`, which is in the inner loop."""
+
+    def __post_init__(self) -> None:
+        waves = []
+        for wave in self.waves:
+            k = math.tau / wave.length
+            waves.append((wave.amplitude, k * math.cos(wave.direction), k * math.sin(wave.direction), wave.phase))
+        object.__setattr__(self, "_waves", tuple(waves))
+
+    @classmethod
+    def hills(
+        cls, seed: int, steepness: float = 0.05, count: int = 4, lengths: tuple[float, float] = (20.0, 120.0)
+    ) -> Terrain:
+        """Return waves of random direction, phase and length whose slope has the root mean square `steepness`."""
+        noise = NoiseSource(seed, "terrain")
+        waves = []
+        for _ in range(count):
+            length = math.exp(noise.uniform(math.log(lengths[0]), math.log(lengths[1])))
+            amplitude = steepness * math.sqrt(2.0 / count) * length / math.tau
+            waves.append(Wave(amplitude, length, noise.uniform(-math.pi, math.pi), noise.uniform(-math.pi, math.pi)))
+        return cls(waves=tuple(waves))
+
+    def height(self, east: float, north: float) -> float:
+        """Return the ground's height at a position, all in meters."""
+        return self.evaluate((east, north, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)).height[0]
+
+    def evaluate(self, position: Vector3, velocity: Vector3, acceleration: Vector3) -> GroundState:
+        """Return the ground under a point that moves in the plan; the arguments' vertical components are not used."""
+        x, y, _ = position
+        vx, vy, _ = velocity
+        ax, ay, _ = acceleration
+        se, sn = self.slope_east, self.slope_north
+        z0, z1, z2 = se * x + sn * y, se * vx + sn * vy, se * ax + sn * ay
+        e0, e1, e2, n0, n1, n2 = se, 0.0, 0.0, sn, 0.0, 0.0
+        for amplitude, ke, kn, phase in self._waves:
+            # along the path a wave is a function of its phase u(t): chain rule
+            u = ke * x + kn * y + phase
+            u1, u2 = ke * vx + kn * vy, ke * ax + kn * ay
+            sine, cosine = amplitude * math.sin(u), amplitude * math.cos(u)
+            first, second = cosine * u1, cosine * u2 - sine * u1 * u1
+            bend, bend_rate = -sine * u1, -sine * u2 - cosine * u1 * u1
+            z0 += sine
+            z1 += first
+            z2 += second
+            e0 += ke * cosine
+            e1 += ke * bend
+            e2 += ke * bend_rate
+            n0 += kn * cosine
+            n1 += kn * bend
+            n2 += kn * bend_rate
+        return GroundState((z0, z1, z2), (e0, e1, e2), (n0, n1, n2))
+
+
+def make_motion(
+    trajectory: Trajectory, terrain: Terrain | None = None, side_slip: SideSlip | None = None, seed: int = 1
+) -> MotionModel:
+    """Return the motion of a trajectory on the given ground; the trajectory itself for level ground without slip."""
+    if terrain is None and side_slip is None:
+        return trajectory
+    return GroundMotion(trajectory, terrain, side_slip, seed)
+
+
+class GroundMotion:
+    """`MotionModel` of a trajectory on uneven ground, with side slip, or both."""
+
+    __slots__ = ("_slip", "_terrain", "_trajectory")
+
+    def __init__(self, trajectory: Trajectory, terrain: Terrain | None, side_slip: SideSlip | None, seed: int):
+        self._trajectory = trajectory
+        self._terrain = terrain
+        self._slip = None if side_slip is None else SlipAngle(side_slip, seed)
+
+    def at(self, t: float) -> TrajectoryMotion:
+        """Return the motion `t` seconds after the start."""
+        plan = self._trajectory.at(t)
+        turn = (plan.yaw, plan.yaw_rate, plan.yaw_acceleration)
+        along, across = plan.speed, 0.0
+        if self._slip is not None:
+            b, b1, b2 = self._slip.at(t, plan, self._trajectory.higher_rates(t))
+            turn = (plan.yaw - b, plan.yaw_rate - b1, plan.yaw_acceleration - b2)
+            along, across = plan.speed * math.cos(b), plan.speed * math.sin(b)
+        yaw, yaw_rate, yaw_acceleration = turn
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        ax, ay, _ = plan.acceleration
+        push = ax * cos + ay * sin
+        if self._terrain is None:
+            return TrajectoryMotion(
+                plan.position,
+                plan.velocity,
+                plan.acceleration,
+                yaw,
+                yaw_rate,
+                yaw_acceleration,
+                along,
+                push + yaw_rate * across,
+                plan.distance,
+                plan.curvature,
+                across,
+            )
+        ground = self._terrain.evaluate(plan.position, plan.velocity, plan.acceleration)
+        slope = _Slope(turn, cos, sin, ground)
+        attitude = slope.attitude
+        z, vz, az = ground.height
+        # forward is (cos, sin, ahead) / length; a distance to the left is longer along the ground than in the plan
+        left = across * slope.steepness / slope.length
+        return TrajectoryMotion(
+            (plan.position[0], plan.position[1], z),
+            (plan.velocity[0], plan.velocity[1], vz),
+            (ax, ay, az),
+            yaw,
+            yaw_rate,
+            yaw_acceleration,
+            (along + slope.ahead * vz) / slope.length,
+            (push + slope.ahead * az) / slope.length + attitude.rate[2] * left,
+            plan.distance,
+            plan.curvature,
+            left,
+            attitude,
+        )
+
+
+class _Slope:
+    """Slope along and across a heading, and the attitude with rates of a vehicle on it (fixed-axis angles).
+
+    `ahead` is the slope q along the heading, `length` sqrt(1 + q^2), `steepness` sqrt(1 + q^2 + p^2).
+    """
+
+    __slots__ = ("ahead", "attitude", "length", "steepness")
+
+    def __init__(self, turn: Vector3, cos: float, sin: float, ground: GroundState):
+        yaw, w, w1 = turn
+        e, e1, e2 = ground.east
+        n, n1, n2 = ground.north
+        q, p = e * cos + n * sin, n * cos - e * sin
+        f1, g1 = e1 * cos + n1 * sin, n1 * cos - e1 * sin
+        q1, p1 = f1 + w * p, g1 - w * q
+        q2 = e2 * cos + n2 * sin + w * g1 + w1 * p + w * p1
+        p2 = n2 * cos - e2 * sin - w * f1 - w1 * q - w * q1
+        # D = sqrt(1 + q^2) and r = p / D, with their rates
+        D2 = 1.0 + q * q
+        D = math.sqrt(D2)
+        D_1 = q * q1 / D
+        D_2 = (q1 * q1 + q * q2 - D_1 * D_1) / D
+        r = p / D
+        r1 = (p1 - r * D_1) / D
+        r2 = (p2 - 2.0 * r1 * D_1 - r * D_2) / D
+        pitch, pitch1, pitch2 = -math.atan(q), -q1 / D2, (2.0 * q * q1 * q1 / D2 - q2) / D2
+        R2 = 1.0 + r * r
+        roll, roll1, roll2 = math.atan(r), r1 / R2, (r2 - 2.0 * r * r1 * r1 / R2) / R2
+        sp, cp = -q / D, 1.0 / D
+        cr = 1.0 / math.sqrt(R2)
+        sr = r * cr
+        # body rates from the angle rates; their derivatives are the parts of the angular acceleration
+        wx, wy, wz = roll1 - w * sp, pitch1 * cr + w * cp * sr, w * cp * cr - pitch1 * sr
+        # w cp and its rate
+        level1 = w1 * cp - w * sp * pitch1
+        self.ahead, self.length, self.steepness = q, D, math.sqrt(D2 + p * p)
+        self.attitude = Attitude(
+            so3.from_rpy(roll, pitch, yaw),
+            (wx, wy, wz),
+            (
+                roll2 - w1 * sp - w * cp * pitch1,
+                pitch2 * cr + level1 * sr + roll1 * wz,
+                level1 * cr - pitch2 * sr - roll1 * wy,
+            ),
+        )

@@ -1,0 +1,240 @@
+"""Pose: a position and an orientation, as one immutable value (report 3.1 and Annex F)."""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections.abc import Iterable
+from typing import Self, TypeGuard
+
+import numpy as np
+import numpy.typing as npt
+
+from modelserver.transforms import so3
+from modelserver.transforms.so3 import Array, Quaternion, Vector3
+
+
+def _freeze(values: object) -> Array:
+    array = np.array(values, dtype=float)
+    array.flags.writeable = False
+    return array
+
+
+def _floats(values: Iterable[float], expected: str) -> tuple[float, ...]:
+    """Return the values as floats. Raises ValueError with what was `expected` where they are no flat row."""
+    try:
+        # + 0.0 turns a negative zero into zero, so that equal poses have equal bits
+        found = tuple([float(value) + 0.0 for value in values])
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError(f"{expected}, got {reprlib.repr(values)}") from None
+    if isinstance(values, np.ndarray) and values.ndim != 1:
+        raise ValueError(f"{expected}, got an array of shape {values.shape}")
+    return found
+
+
+def _is_vector3(values: tuple[float, ...]) -> TypeGuard[Vector3]:
+    return len(values) == 3
+
+
+def _is_quaternion(values: tuple[float, ...]) -> TypeGuard[Quaternion]:
+    return len(values) == 4
+
+
+class Pose:
+    """The position and orientation of a frame in another: `X_AB` maps points of B to A by `p_A = R p_B + p`.
+
+    Orientation is stored as a unit quaternion from which every other representation derives, so there is no gimbal
+    lock. Immutable and hashable; arrays returned are read-only.
+
+    Create one by `Pose(position, quaternion)`, or by `from_matrix`, `from_rpy`, `from_state_vector`.
+    """
+
+    __slots__ = ("_p", "_q")
+    __array_ufunc__ = None  # keep numpy out of products: array @ Pose is a TypeError
+
+    _p: Vector3
+    _q: Quaternion
+
+    def __init__(
+        self,
+        position: Iterable[float] = (0.0, 0.0, 0.0),
+        quaternion: Iterable[float] = so3.IDENTITY,
+    ):
+        """Create a pose.
+
+        Parameters
+        ----------
+        position : 3 numbers, meters
+        quaternion : 4 numbers, scalar first, of any length but 0; normalized, with w >= 0
+
+        Raises
+        ------
+        ValueError
+            For a wrong count, a number that is not finite, or a zero quaternion.
+        """
+        p = _floats(position, "a position is 3 finite numbers in meters")
+        q = _floats(quaternion, "a quaternion is 4 numbers, scalar first")
+        if not _is_vector3(p) or not all(map(math.isfinite, p)):
+            raise ValueError(f"a position is 3 finite numbers in meters, got {reprlib.repr(p)}")
+        if not _is_quaternion(q):
+            raise ValueError(f"a quaternion is 4 numbers, scalar first, got {reprlib.repr(q)}")
+        _put_p(self, p)
+        _put_q(self, so3.normalize(q))
+
+    @classmethod
+    def _of(cls, p: Vector3, q: Quaternion) -> Self:
+        """Build from values that are already floats and a quaternion that is already unit, w >= 0."""
+        self = object.__new__(cls)
+        _put_p(self, p)
+        _put_q(self, q)
+        return self
+
+    @classmethod
+    def identity(cls) -> Self:
+        """Return the pose of a frame in itself."""
+        return cls._of((0.0, 0.0, 0.0), so3.IDENTITY)
+
+    @classmethod
+    def from_matrix(cls, matrix: npt.ArrayLike, tolerance: float = 0.05) -> Self:
+        """Return the pose of a homogeneous transform, (4, 4) or its upper rows (3, 4), with the nearest rotation.
+
+        Raises ValueError where |R'R - I| exceeds `tolerance`, where the matrix is singular or a reflection, or where
+        the last row is not 0 0 0 1.
+        """
+        m = np.asarray(matrix, dtype=float)
+        if m.shape not in ((3, 4), (4, 4)):
+            raise ValueError(f"a homogeneous transform is a (4, 4) or (3, 4) matrix, got shape {m.shape}")
+        if not np.isfinite(m).all():
+            raise ValueError(f"a homogeneous transform has finite numbers only, got {m.tolist()}")
+        if m.shape == (4, 4) and not np.allclose(m[3], (0.0, 0.0, 0.0, 1.0), rtol=0, atol=1e-9):
+            raise ValueError(f"the last row of a homogeneous transform is 0 0 0 1, got {m[3].tolist()}")
+        rotation, deviation = so3.nearest_rotation(m[:3, :3])
+        if deviation > tolerance:
+            raise ValueError(f"not a rotation: |R'R - I| is {deviation:.3g}, more than {tolerance:g}")
+        return cls(m[:3, 3].tolist(), so3.from_matrix(rotation))
+
+    @classmethod
+    def from_rpy(cls, position: Iterable[float], roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> Self:
+        """Return the pose at `position` rotated by fixed-axis roll, pitch, yaw in radians (REP-103)."""
+        if not (math.isfinite(roll) and math.isfinite(pitch) and math.isfinite(yaw)):
+            raise ValueError(f"roll, pitch and yaw must be finite, got {roll}, {pitch}, {yaw}")
+        return cls(position, so3.from_rpy(roll, pitch, yaw))
+
+    @classmethod
+    def from_state_vector(cls, vector: Iterable[float]) -> Self:
+        """Return the pose of a 7-vector `px py pz qs qx qy qz` (report eq. 4)."""
+        values = _floats(vector, "a state vector is 7 numbers, px py pz qs qx qy qz")
+        if len(values) != 7:
+            raise ValueError(f"a state vector is 7 numbers, px py pz qs qx qy qz, got {len(values)}")
+        return cls(values[:3], values[3:])
+
+    @property
+    def xyz(self) -> Vector3:
+        """The position in meters, as plain floats."""
+        return self._p
+
+    @property
+    def wxyz(self) -> Quaternion:
+        """The unit quaternion, scalar first, w >= 0, as plain floats."""
+        return self._q
+
+    @property
+    def position(self) -> Array:
+        """The position (3) in meters."""
+        return _freeze(self._p)
+
+    @property
+    def quaternion(self) -> Array:
+        """The unit quaternion (4), scalar first, w >= 0."""
+        return _freeze(self._q)
+
+    @property
+    def rpy(self) -> Array:
+        """Fixed-axis roll, pitch, yaw (3) in radians."""
+        return _freeze(so3.to_rpy(self._q))
+
+    @property
+    def rotation(self) -> Array:
+        """The rotation matrix (3, 3)."""
+        return _freeze(so3.matrix_rows(self._q))
+
+    @property
+    def matrix(self) -> Array:
+        """The homogeneous transform (4, 4)."""
+        return _freeze(self.matrix_rows())
+
+    def matrix_rows(self) -> tuple[tuple[float, float, float, float], ...]:
+        """Return the four rows of the homogeneous transform as plain floats."""
+        (a, b, c), (d, e, f), (g, h, i) = so3.matrix_rows(self._q)
+        x, y, z = self._p
+        return ((a, b, c, x), (d, e, f, y), (g, h, i, z), (0.0, 0.0, 0.0, 1.0))
+
+    @property
+    def state_vector(self) -> Array:
+        """The 7-vector `px py pz qs qx qy qz` (report eq. 4)."""
+        return _freeze(self._p + self._q)
+
+    def inverse(self) -> Pose:
+        """Return the pose of the other frame in this one: `[R' -R'p]`."""
+        q = so3.conjugate(self._q)
+        x, y, z = so3.rotate(q, self._p)
+        return Pose._of((-x + 0.0, -y + 0.0, -z + 0.0), so3.normalize(q))
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """Return `X_AB @ X_BC = X_AC` (report eq. 5)."""
+        if not isinstance(other, Pose):
+            return NotImplemented
+        x, y, z = so3.rotate(self._q, other._p)
+        px, py, pz = self._p
+        return Pose._of((px + x, py + y, pz + z), so3.normalize(so3.multiply(self._q, other._q)))
+
+    def transform(self, points: npt.ArrayLike) -> Array:
+        """Return the points, (3) or (n, 3) in B, in A: `p_A = X_AB p_B`."""
+        p = np.asarray(points, dtype=float)
+        if p.shape[-1:] != (3,) or p.ndim > 2:
+            raise ValueError(f"points have shape (3,) or (n, 3), got {p.shape}")
+        return np.asarray(p @ np.array(so3.matrix_rows(self._q)).T + self._p)
+
+    def interpolate(self, other: Pose, fraction: float) -> Pose:
+        """Return the pose at `fraction` between this and `other`: position linear, rotation by slerp."""
+        p = tuple(a + (b - a) * fraction for a, b in zip(self._p, other._p, strict=True))
+        assert _is_vector3(p)
+        return Pose._of(p, so3.slerp(self._q, other._q, fraction))
+
+    def distance(self, other: Pose) -> tuple[float, float]:
+        """Return the distance to `other`: meters, and radians."""
+        angle = so3.logarithm(so3.normalize(so3.multiply(so3.conjugate(self._q), other._q)))
+        return math.dist(self._p, other._p), math.hypot(*angle)
+
+    def is_close(self, other: Pose, meters: float = 1e-9, radians: float = 1e-9) -> bool:
+        """Return whether `other` is the same pose within the tolerances."""
+        moved, turned = self.distance(other)
+        return moved <= meters and turned <= radians
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Pose) and self._p == other._p and self._q == other._q
+
+    def __hash__(self) -> int:
+        return hash((self._p, self._q))
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise AttributeError("a Pose is immutable; make a new one")
+
+    def __delattr__(self, name: str) -> None:
+        raise AttributeError("a Pose is immutable; make a new one")
+
+    def __reduce__(self) -> tuple[type[Pose], tuple[Vector3, Quaternion]]:
+        return (Pose, (self._p, self._q))
+
+    def __repr__(self) -> str:
+        return f"Pose(position={list(self._p)}, quaternion={list(self._q)})"
+
+    def __str__(self) -> str:
+        x, y, z = self._p
+        roll, pitch, yaw = (math.degrees(angle) for angle in so3.to_rpy(self._q))
+        return f"position ({x:.3f}, {y:.3f}, {z:.3f}) m, roll {roll:.2f} pitch {pitch:.2f} yaw {yaw:.2f} deg"
+
+
+# Setting a slot by its descriptor bypasses the guard above, at half the cost of object.__setattr__.
+_put_p = Pose.__dict__["_p"].__set__
+_put_q = Pose.__dict__["_q"].__set__

@@ -1,0 +1,136 @@
+"""Arrays of poses: positions (n, 3) and unit quaternions (n, 4), scalar first.
+
+For batch queries, as the thousand beams of a scan. A single pose is faster in plain floats: see `so3`, which has the
+same functions and formulas for one rotation.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Array
+
+
+class PoseArray(NamedTuple):
+    """Poses X_AB, one a row, or a single row for all: positions (n, 3), quaternions (n, 4)."""
+
+    p: Array
+    q: Array
+
+    @classmethod
+    def of(cls, pose: Pose) -> PoseArray:
+        """Return a single pose that holds for all rows."""
+        return cls(np.array([pose.xyz]), np.array([pose.wxyz]))
+
+    def __matmul__(self, other: PoseArray) -> PoseArray:
+        """Return X_AB @ X_BC."""
+        return PoseArray(self.p + rotate(self.q, other.p), multiply(self.q, other.q))
+
+    def inverse(self) -> PoseArray:
+        """Return X_BA."""
+        q = conjugate(self.q)
+        return PoseArray(-rotate(q, self.p), q)
+
+    def canonical(self) -> PoseArray:
+        """Return the same poses with quaternions at unit length and w >= 0."""
+        q = self.q / np.linalg.norm(self.q, axis=1, keepdims=True)
+        return PoseArray(self.p, np.where(q[:, :1] < 0.0, -q, q) + 0.0)
+
+
+def multiply(a: Array, b: Array) -> Array:
+    """Return the products a b."""
+    aw, ax, ay, az = a.T
+    bw, bx, by, bz = b.T
+    return np.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        axis=1,
+    )
+
+
+def conjugate(q: Array) -> Array:
+    """Return the inverse rotations."""
+    return q * (1.0, -1.0, -1.0, -1.0)
+
+
+def rotate(q: Array, v: Array) -> Array:
+    """Return R(q) v."""
+    w, x, y, z = q.T
+    vx, vy, vz = v.T
+    tx = 2.0 * (y * vz - z * vy)
+    ty = 2.0 * (z * vx - x * vz)
+    tz = 2.0 * (x * vy - y * vx)
+    return np.stack(
+        (vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx), axis=1
+    )
+
+
+def from_axis_angle(axis: Array, angles: Array) -> Array:
+    """Return the rotations by angles (n) about one axis (3)."""
+    half = 0.5 * angles
+    return np.concatenate((np.cos(half)[:, None], np.sin(half)[:, None] * axis), axis=1)
+
+
+def exponential(v: Array) -> Array:
+    """Return the rotations by |v| radians about v (n, 3)."""
+    angles = np.sqrt(np.einsum("ij,ij->i", v, v))
+    # np.sinc(x) is sin(pi x) / (pi x), and 1 at 0
+    s = 0.5 * np.sinc(angles / (2.0 * math.pi))
+    return np.concatenate((np.cos(0.5 * angles)[:, None], s[:, None] * v), axis=1)
+
+
+def left_jacobian(v: Array) -> Array:
+    """Return the left Jacobians (n, 3, 3) of SO(3) at rotation vectors (n, 3); see `so3.left_jacobian`."""
+    square = np.einsum("ij,ij->i", v, v)
+    angles = np.sqrt(square)
+    small = angles < 1e-4
+    divisor = np.where(small, 1.0, square)
+    a = np.where(small, 0.5, (1.0 - np.cos(angles)) / divisor)
+    b = np.where(small, 1.0 / 6.0, (angles - np.sin(angles)) / (divisor * np.where(small, 1.0, angles)))
+    K = skew(v)
+    return np.asarray(np.eye(3) + a[:, None, None] * K + b[:, None, None] * (K @ K))
+
+
+def skew(v: Array) -> Array:
+    """Return the matrices (n, 3, 3) of the cross products with v (n, 3)."""
+    K = np.zeros((len(v), 3, 3))
+    x, y, z = v.T
+    K[:, 0, 1], K[:, 0, 2] = -z, y
+    K[:, 1, 0], K[:, 1, 2] = z, -x
+    K[:, 2, 0], K[:, 2, 1] = -y, x
+    return K
+
+
+def slerp(a: Array, b: Array, fraction: Array) -> Array:
+    """Return the rotations at `fraction` (n) between a and b, at constant rate along the shorter arc."""
+    d = multiply(conjugate(a), b)
+    d = np.where(d[:, :1] < 0.0, -d, d)
+    length = np.linalg.norm(d[:, 1:], axis=1)
+    angle = 2.0 * np.arctan2(length, d[:, 0])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        axis = np.where(length[:, None] > 0.0, d[:, 1:] / length[:, None], 0.0)
+    half = 0.5 * angle * fraction
+    step = np.concatenate((np.cos(half)[:, None], np.sin(half)[:, None] * axis), axis=1)
+    return multiply(a, step)
+
+
+def to_matrices(q: Array) -> Array:
+    """Return the rotation matrices (n, 3, 3)."""
+    w, x, y, z = q.T
+    xx, yy, zz = x * x, y * y, z * z
+    xy, xz, yz = x * y, x * z, y * z
+    wx, wy, wz = w * x, w * y, w * z
+    rows = (
+        (1.0 - 2.0 * (yy + zz), 2.0 * (xy - wz), 2.0 * (xz + wy)),
+        (2.0 * (xy + wz), 1.0 - 2.0 * (xx + zz), 2.0 * (yz - wx)),
+        (2.0 * (xz - wy), 2.0 * (yz + wx), 1.0 - 2.0 * (xx + yy)),
+    )
+    return np.moveaxis(np.array(rows), 2, 0)

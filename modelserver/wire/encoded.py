@@ -1,0 +1,84 @@
+"""Inspect and restamp encoded messages, without decoding them."""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+import mslcm
+from modelserver.errors import WireError
+from modelserver.wire.channels import CHANNELS, SIGNED, ChannelUse
+from modelserver.wire.codec import get_type_names
+from modelserver.wire.fields import read_text
+from modelserver.wire.journal import MAGIC
+from mslcm.relative_pose_t import relative_pose_t
+
+_INPUTS: Final = frozenset(
+    getattr(mslcm, channel.type_name)._get_packed_fingerprint()
+    for channel in CHANNELS
+    # signed commands are no inputs for playback: signatures protect against replayed commands
+    if channel.use in (ChannelUse.SENSOR, ChannelUse.COMMAND) and channel.name != SIGNED
+)
+_SERVICE: Final = frozenset(getattr(mslcm, name)._get_packed_fingerprint() for name in get_type_names()) - _INPUTS | {
+    MAGIC
+}
+
+
+def _is_stamped(type_name: str) -> bool:
+    return isinstance(getattr(getattr(mslcm, type_name)(), "header", None), mslcm.sensor_header_t)
+
+
+_STAMPED: Final = frozenset(
+    getattr(mslcm, channel.type_name)._get_packed_fingerprint()
+    for channel in CHANNELS
+    if _is_stamped(channel.type_name)
+)
+
+
+_TYPES: Final = {getattr(mslcm, name)._get_packed_fingerprint(): name for name in dir(mslcm) if name.endswith("_t")}
+
+
+def type_name_of(data: bytes) -> str:
+    """Return the name of the wire type of a message, empty for a foreign type."""
+    return _TYPES.get(data[:8], "")
+
+
+def is_stamped(data: bytes) -> bool:
+    """Return whether a message begins with a sensor header: a sample, or a localization mode command."""
+    return data[:8] in _STAMPED
+
+
+def is_of_service(data: bytes) -> bool:
+    """Return whether a message is a report, request, signed command or reply of the service, or a journal section."""
+    return data[:8] in _SERVICE
+
+
+_STAMPS = struct.Struct(">qdq")
+"""First fields of the sensor header, behind the fingerprint: utime, utime_sigma, host_utime."""
+
+_SINCE = struct.Struct(">q")
+_SOURCE_AT: Final = 48
+"""Offset of the source, the last field of the sensor header."""
+
+_RELATIVE: Final[bytes] = relative_pose_t._get_packed_fingerprint()
+
+
+def restamp(data: bytes, shift: int) -> bytes:
+    """Return a stamped message with its stamps shifted by `shift` microseconds; other messages are returned unchanged.
+
+    The stamps are utime, host_utime, and since_utime of a relative pose.
+    """
+    if not is_stamped(data) or len(data) < 8 + _STAMPS.size:
+        return data
+    utime, sigma, host_utime = _STAMPS.unpack_from(data, 8)
+    restamped = bytearray(data)
+    try:
+        _STAMPS.pack_into(restamped, 8, utime + shift, sigma, host_utime + shift if host_utime else 0)
+        if data[:8] == _RELATIVE:
+            # since_utime is the first field behind the header
+            _, at = read_text(data, _SOURCE_AT)
+            (since,) = _SINCE.unpack_from(data, at)
+            _SINCE.pack_into(restamped, at, since + shift)
+    except (WireError, struct.error):
+        return data  # damaged: the receiver counts it
+    return bytes(restamped)

@@ -1,0 +1,46 @@
+"""A persisted state of the vehicle of the filter's scenario tests."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from modelserver.estimation.filter.persistence import named
+from modelserver.estimation.filter.setup import Setup
+from modelserver.messages import PersistedPose, PersistedState
+from tests.support_filter import RIG
+
+SETUP = Setup(RIG)
+UTIME = 1_750_000_000_000_000
+
+POSE = PersistedPose(
+    50.27,
+    -111.18,
+    700.0,
+    (1.5, -2.25, 0.5),
+    (0.8, 0.0, 0.0, 0.6),
+    (0.1, -0.1, 0.0),
+    (0.01, 0.01, 0.02),
+    0.25,
+    1.5,
+    UTIME - 300_000,
+    1000,
+    2,
+    "wheels",
+    1234,
+    (("left", 56.25), ("right", 57.5)),
+)
+
+PERSISTED = PersistedState(
+    "cart",
+    UTIME,
+    5_000_000_000,
+    "",
+    named(SETUP),
+    UTIME - 10_000,
+    SETUP.layout.names,
+    (0.001, -0.002, 0.003),
+    (0.01, 0.02, -0.03),
+    tuple(0.01 * k for k in range(SETUP.layout.size - 15)),
+    tuple((np.eye(SETUP.layout.size) * 1e-4).ravel().tolist()),
+    POSE,
+)

@@ -1,0 +1,392 @@
+"""Every measurement against the state: nothing left where state and sample agree, and its Jacobian by differences."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from support_cart import (
+    ANTENNA,
+    CAMERA,
+    GEODESY,
+    IMU,
+    SECOND,
+    SITE,
+    STEERED,
+    WHEELS,
+    model,
+    rig,
+    some_nav,
+)
+
+from modelserver.earth.geodesy import geodetic_from_ecef
+from modelserver.estimation.filter.measurements import REGISTRY, Compared, Measurement, Scene, constraints
+from modelserver.estimation.filter.measurements.gps import stated_velocity
+from modelserver.estimation.filter.nav import Nav, cross
+from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.magnetometer import magnetic_field
+from modelserver.estimation.sensor_rig import SensorRig
+from modelserver.messages import (
+    AbsolutePoseSample,
+    FixType,
+    GpsSample,
+    ImuSample,
+    OrientationReference,
+    RangeSample,
+    RelativePoseSample,
+    Sample,
+    SensorHeader,
+    WheelSample,
+    WheelsSample,
+    YawSource,
+)
+from modelserver.simulation.scenario import START_UTIME
+from modelserver.transforms import Pose, so3
+from modelserver.transforms.so3 import Quaternion, Vector3
+
+SETTINGS = FilterSettings(use_magnetometer=True)
+FOUR = tuple(WHEELS)
+HEADER = SensorHeader(START_UTIME, "test")
+STEP = 1e-5
+SEEDS = range(4)
+DT = 0.4
+
+
+# --- what each sensor would say of a state ------------------------------------------------------------------
+
+
+def fix(nav: Nav, the_rig: SensorRig, **more: object) -> GpsSample:
+    lever = the_rig.lever_arm(ANTENNA)
+    latitude, longitude, height = geodetic_from_ecef(SITE.to_ecef(nav.point(lever)))
+    east, north, _ = (
+        b - a
+        for a, b in zip(
+            so3.rotate(nav.attitude, lever), so3.rotate(nav.attitude, the_rig.lever_arm(SECOND)), strict=True
+        )
+    )
+    return GpsSample(
+        HEADER, FixType.DIFFERENTIAL, latitude, longitude, height, hdop=1.0,
+        velocity=nav.point_velocity(lever), baseline_yaw=math.atan2(north, east), **more,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def course(nav: Nav, the_rig: SensorRig) -> GpsSample:
+    lever = the_rig.lever_arm(ANTENNA)
+    latitude, longitude, _ = geodetic_from_ecef(SITE.to_ecef(nav.point(lever)))
+    x, y, _ = nav.point_velocity(lever)
+    return GpsSample(
+        HEADER, FixType.DIFFERENTIAL, latitude, longitude, hdop=1.0, speed=math.hypot(x, y), course=math.atan2(y, x)
+    )
+
+
+def inertial(nav: Nav, the_rig: SensorRig, reference: OrientationReference = OrientationReference.ENU) -> ImuSample:
+    mount = model().get_transformation(IMU, "Cart:Base").pose.wxyz
+    q = so3.multiply(nav.attitude, mount)
+    if reference is OrientationReference.NED:
+        q = so3.multiply((0.0, math.sqrt(0.5), math.sqrt(0.5), 0.0), q)
+    latitude, longitude, height = geodetic_from_ecef(SITE.ecef)
+    field = magnetic_field(latitude, longitude, height, START_UTIME)
+    assert field is not None
+    return ImuSample(
+        HEADER,
+        nav.rate,
+        nav.force,
+        so3.rotate(so3.conjugate(so3.multiply(nav.attitude, mount)), field),
+        q,
+        reference,
+        YawSource.TRUE,
+    )
+
+
+def steering(the_rig: SensorRig, name: str) -> float:
+    return 0.3 if the_rig.kinematics == "ackermann" and name in STEERED else 0.0
+
+
+def speeds(nav: Nav, the_rig: SensorRig, names: tuple[str, ...]) -> dict[str, float]:
+    """How fast each wheel rolls by rigid-body motion, in which the further states have no part."""
+    found = {}
+    for name in names:
+        contact = the_rig.pose(WHEELS[name]).xyz
+        v = np.add(nav.body_velocity(the_rig.base), np.cross(nav.turn_rate, contact))
+        found[name] = math.cos(steering(the_rig, name)) * v[0] + math.sin(steering(the_rig, name)) * v[1]
+    return found
+
+
+def wheels(nav: Nav, the_rig: SensorRig, names: tuple[str, ...] = ("RL", "RR")) -> WheelsSample:
+    return WheelsSample(
+        HEADER,
+        tuple(WheelSample(n, speed=v, steering=steering(the_rig, n)) for n, v in speeds(nav, the_rig, names).items()),
+    )
+
+
+def in_enu(nav: Nav, the_rig: SensorRig, frame: str) -> Pose:
+    """A frame's pose in World:ENU, by way of the earth's centre."""
+    turn = so3.conjugate(SITE.rotation_of(GEODESY.tangent))
+    place = GEODESY.tangent.from_ecef(SITE.to_ecef(nav.point(the_rig.lever_arm(frame))))
+    return Pose(place, so3.multiply(turn, so3.multiply(nav.attitude, the_rig.pose(frame).wxyz)))
+
+
+def pose(nav: Nav, the_rig: SensorRig, reference: str) -> AbsolutePoseSample:
+    X = in_enu(nav, the_rig, CAMERA)
+    X = GEODESY.pose_in_utm(X) if reference == "World:UTM" else X
+    return AbsolutePoseSample(HEADER, CAMERA, reference, X.xyz, X.wxyz)
+
+
+def distance(nav: Nav, the_rig: SensorRig) -> RangeSample:
+    beacon = (300.0, -150.0, 20.0)
+    place = in_enu(nav, the_rig, CAMERA).xyz
+    return RangeSample(HEADER, CAMERA, "b", beacon, "World:ENU", math.dist(place, beacon), 0.2)
+
+
+def moved(nav: Nav, the_rig: SensorRig) -> RelativePoseSample:
+    """The frame's way in a tenth of a second at constant twist, by small steps."""
+    n, dt = 400, 0.1
+    X_BF = the_rig.pose(CAMERA)
+    v, w = nav.body_velocity(the_rig.base), nav.turn_rate
+    step = Pose(
+        (v[0] * dt / n, v[1] * dt / n, v[2] * dt / n), so3.exponential((w[0] * dt / n, w[1] * dt / n, w[2] * dt / n))
+    )
+    X = Pose.identity()
+    for _ in range(n):
+        X = X @ step
+    found = X_BF.inverse() @ X @ X_BF
+    header = SensorHeader(START_UTIME + 50_000, "vo")
+    return RelativePoseSample(header, CAMERA, START_UTIME - 50_000, found.xyz, found.wxyz)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A kind of measurement, of which vehicle, and its sample; `left` is what a sound one may leave."""
+
+    kind: str
+    sample: object
+    rig: SensorRig
+    left: float = 1e-7
+
+
+PAIR, SKID, ACKERMANN = rig(), rig("skid_steer", FOUR), rig("ackermann", ("FL", "FR"))
+CASES = {
+    "position": Case("gps_position", fix, PAIR, 2e-7),
+    "height": Case("gps_height", fix, PAIR, 2e-7),
+    "velocity": Case("gps_velocity", fix, PAIR),
+    "course and speed": Case("gps_velocity", course, PAIR),
+    "baseline": Case("gps_baseline", fix, PAIR),
+    "tilt": Case("imu_tilt", inertial, PAIR),
+    "tilt ned": Case("imu_tilt", lambda nav, the_rig: inertial(nav, the_rig, OrientationReference.NED), PAIR),
+    "yaw": Case("imu_yaw", inertial, PAIR),
+    "magnetometer": Case("magnetometer", inertial, PAIR),
+    "wheels": Case("wheel_speed", wheels, PAIR),
+    "wheels that skid": Case("wheel_speed", lambda nav, the_rig: wheels(nav, the_rig, FOUR), SKID),
+    "wheels that steer": Case("wheel_speed", lambda nav, the_rig: wheels(nav, the_rig, ("FL", "FR")), ACKERMANN),
+    "pose in ENU": Case("absolute_pose", lambda nav, the_rig: pose(nav, the_rig, "World:ENU"), PAIR, 2e-7),
+    "pose in UTM": Case("absolute_pose", lambda nav, the_rig: pose(nav, the_rig, "World:UTM"), PAIR, 1e-5),
+    "range": Case("range", distance, PAIR, 2e-7),
+    "relative pose": Case("relative_pose", moved, PAIR, 1e-3),
+}
+
+
+def prepared(case: Case, seed: int, *, extras: bool) -> tuple[Measurement, Scene, Sample]:
+    setup = Setup(case.rig, SETTINGS)
+    nav = some_nav(setup, seed, extras=extras)
+    sample = case.sample(nav, case.rig)  # type: ignore[operator]
+    (measurement,) = (each for each in setup.measurements[type(sample)] if each.kind == case.kind)
+    return measurement, Scene(nav, setup.layout, SETTINGS, case.rig, SITE, GEODESY), sample
+
+
+def compared(measurement: Measurement, scene: Scene, sample: Sample) -> Compared:
+    found = measurement.compare(scene, sample)
+    assert isinstance(found, Compared), found
+    return found
+
+
+def differences(residual: object, nav: Nav, size: int) -> np.ndarray:
+    """The Jacobian by differences: what is put into the state is taken from the residual."""
+    columns = []
+    for k in range(size):
+        error = np.zeros(size)
+        error[k] = STEP
+        ahead = residual(nav.injected(error, nav.covariance))  # type: ignore[operator]
+        behind = residual(nav.injected(-error, nav.covariance))  # type: ignore[operator]
+        columns.append((behind - ahead) / (2.0 * STEP))
+    return np.array(columns).T
+
+
+def test_given_the_registered_measurements_then_each_has_its_case_here():
+    assert {case.kind for case in CASES.values()} == set(REGISTRY)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", CASES)
+def test_given_a_sample_of_the_very_state_when_compared_then_nothing_is_left(name, seed):
+    case = CASES[name]
+    found = compared(*prepared(case, seed, extras=False))
+    assert np.abs(found.residual).max() < case.left
+    assert np.linalg.eigvalsh(found.noise)[0] > 0.0
+    assert found.noise == pytest.approx(found.noise.T, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", CASES)
+def test_given_a_state_when_it_is_off_a_little_then_the_residual_goes_as_the_jacobian_says(name, seed):
+    measurement, scene, sample = prepared(CASES[name], seed, extras=True)
+    H = compared(measurement, scene, sample).jacobian
+    by_differences = differences(
+        lambda nav: compared(measurement, scene._replace(nav=nav), sample).residual, scene.nav, scene.layout.size
+    )
+    assert by_differences == pytest.approx(H, abs=1e-5)
+    assert np.abs(H).max() > 0.01
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", ["wheels", "wheels that skid", "wheels that steer"])
+def test_given_wheels_by_their_travel_when_the_motion_is_steady_then_residual_and_jacobian_are_those_of_speeds(
+    name, seed
+):
+    measurement, scene, speed = prepared(CASES[name], seed, extras=True)
+    assert isinstance(speed, WheelsSample)
+    before = WheelsSample(
+        SensorHeader(START_UTIME - round(DT * 1e6), "test"),
+        tuple(WheelSample(w.name, travel=7.0) for w in speed.wheels),
+    )
+    way = WheelsSample(
+        speed.header, tuple(WheelSample(w.name, travel=7.0 + DT * w.speed, steering=w.steering) for w in speed.wheels)
+    )
+
+    def steady(nav: Nav) -> Scene:
+        rolled, turned = nav.body_velocity(scene.rig.base), nav.turn_rate
+        nav = nav._replace(
+            rolled=(rolled[0] * DT, rolled[1] * DT, rolled[2] * DT),
+            turned=(turned[0] * DT, turned[1] * DT, turned[2] * DT),
+        )
+        return scene._replace(nav=nav, age=DT, before=before)
+
+    found = compared(measurement, steady(scene.nav), way)
+    assert found.residual == pytest.approx(compared(measurement, scene, speed).residual, abs=1e-9)
+    by_differences = differences(
+        lambda nav: compared(measurement, steady(nav), way).residual, scene.nav, scene.layout.size
+    )
+    assert by_differences == pytest.approx(found.jacobian, abs=1e-5)
+
+
+# --- what is known without a sensor -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_given_a_constraint_when_the_state_is_off_a_little_then_the_residual_goes_as_its_jacobian_says(seed):
+    setup = Setup(PAIR, SETTINGS)
+    nav = some_nav(setup, seed)
+    scene = Scene(nav, setup.layout, SETTINGS, PAIR, SITE, GEODESY)
+    rolling = Setup(rig(wheels=()), SETTINGS)
+    bare = Scene(some_nav(rolling, seed), rolling.layout, SETTINGS, rolling.rig)
+    for each, know in (
+        (scene, lambda s: constraints.non_holonomic(s, 0.1)),
+        (bare, lambda s: constraints.non_holonomic(s, 0.1)),
+        (scene, lambda s: constraints.zero_velocity(s, 0.1)),
+        (scene, lambda s: constraints.zero_rate(s, (0.1, 0.2, 0.3), (0.0, 0.0, 0.0), 1.0)),
+    ):
+        by_differences = differences(
+            lambda nav, each=each, know=know: know(each._replace(nav=nav)).residual, each.nav, each.layout.size
+        )
+        assert by_differences == pytest.approx(know(each).jacobian, abs=1e-5)
+
+
+def test_given_a_vehicle_that_does_what_it_must_when_compared_then_nothing_is_left():
+    setup = Setup(PAIR, SETTINGS)
+    nav = some_nav(setup, 3, extras=False)
+    forward = so3.rotate(nav.attitude, (3.0, 0.0, 0.0))
+    arm = so3.rotate(nav.attitude, cross(nav.turn_rate, PAIR.base))
+    rolling = nav._replace(velocity=(forward[0] - arm[0], forward[1] - arm[1], forward[2] - arm[2]))
+    scene = Scene(rolling, setup.layout, SETTINGS, PAIR)
+    assert constraints.non_holonomic(scene, 0.1).residual == pytest.approx([0.0, 0.0], abs=1e-12)
+    standing = scene._replace(nav=nav._replace(velocity=(0.0, 0.0, 0.0)))
+    assert constraints.zero_velocity(standing, 0.1).residual == pytest.approx([0.0, 0.0, 0.0])
+    earth = (0.0, 4.7e-5, 5.6e-5)
+    felt = np.add(nav.gyro_bias, so3.rotate(so3.conjugate(nav.attitude), earth))
+    assert constraints.zero_rate(scene, tuple(felt), earth, 1.0).residual == pytest.approx([0.0, 0.0, 0.0], abs=1e-12)
+
+
+# --- what is refused, and what is taken instead -------------------------------------------------------------
+
+
+def refusal(kind: str, sample: Sample, **scene: object) -> str | Compared:
+    setup = Setup(PAIR, SETTINGS)
+    nav = some_nav(setup, 1)
+    given = Scene(nav, setup.layout, SETTINGS, PAIR, SITE, GEODESY)._replace(**scene)
+    (measurement,) = (each for each in setup.measurements[type(sample)] if each.kind == kind)
+    return measurement.compare(given, sample)
+
+
+def turned(q: Quaternion) -> ImuSample:
+    return ImuSample(HEADER, (0.0,) * 3, (0.0,) * 3, None, q, OrientationReference.ENU)
+
+
+NAN3: Vector3 = (math.nan, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "sample", "word"),
+    [
+        ("gps_position", GpsSample(HEADER, FixType.NONE, 50.0, -111.0), "no_fix"),
+        ("wheel_speed", WheelsSample(HEADER, ()), "empty"),
+        ("wheel_speed", WheelsSample(HEADER, (WheelSample("RL", speed=math.nan),)), "nan"),
+        ("wheel_speed", WheelsSample(HEADER, (WheelSample("nobody", speed=1.0),)), "names"),
+        ("wheel_speed", WheelsSample(HEADER, (WheelSample("RL", speed=1e3),)), "range"),
+        ("imu_tilt", turned((0.0, 0.0, 0.0, 0.0)), "orientation"),
+        ("imu_tilt", turned((math.nan, 0.0, 0.0, 0.0)), "orientation"),
+        ("magnetometer", ImuSample(HEADER, magnetic_field=NAN3), "nan"),
+        ("magnetometer", ImuSample(HEADER, magnetic_field=(9e-5, 0.0, 9e-5)), "disturbed"),
+        ("absolute_pose", AbsolutePoseSample(HEADER, "Cart:Nowhere", "World:ENU", (0.0,) * 3), "frame"),
+        ("absolute_pose", AbsolutePoseSample(HEADER, CAMERA, "Odom:Origin", (0.0,) * 3), "frame"),
+        ("absolute_pose", AbsolutePoseSample(HEADER, CAMERA, "World:ENU", NAN3), "nan"),
+        ("absolute_pose", AbsolutePoseSample(HEADER, CAMERA, "World:ENU", None, (0.0,) * 4), "nan"),
+        ("absolute_pose", AbsolutePoseSample(HEADER, CAMERA, "World:ENU"), "empty"),
+        ("absolute_pose", AbsolutePoseSample(HEADER, CAMERA, "World:UTM", (1e9, 0.0, 0.0)), "range"),
+        ("range", RangeSample(HEADER, CAMERA, "b", (0.0,) * 3, "World:ENU", math.nan), "nan"),
+        ("range", RangeSample(HEADER, CAMERA, "b", (500.0, 0.0, 0.0), "World:ENU", -1.0), "range"),
+        ("range", RangeSample(HEADER, "Cart:Nowhere", "b", (500.0, 0.0, 0.0), "World:ENU", 1.0), "frame"),
+        ("relative_pose", RelativePoseSample(HEADER, CAMERA, START_UTIME, (0.0,) * 3, so3.IDENTITY), "interval"),
+        ("relative_pose", RelativePoseSample(HEADER, CAMERA, 0, (0.0,) * 3, so3.IDENTITY), "interval"),
+        ("relative_pose", RelativePoseSample(HEADER, CAMERA, START_UTIME - 1000, NAN3, so3.IDENTITY), "nan"),
+    ],
+)
+def test_given_a_sample_that_says_nothing_when_compared_then_one_word_tells_why(kind, sample, word):
+    assert refusal(kind, sample) == word
+
+
+def test_given_no_place_in_the_world_when_compared_then_what_is_of_the_world_waits_and_is_not_counted():
+    setup = Setup(PAIR, SETTINGS)
+    nav = some_nav(setup, 1)
+    for name in ("position", "height", "velocity", "baseline", "yaw", "magnetometer", "pose in ENU", "range"):
+        case = CASES[name]
+        assert refusal(case.kind, case.sample(nav, PAIR), site=None) == ""  # type: ignore[operator]
+
+
+def test_given_a_beacon_too_near_when_compared_then_its_direction_is_not_known():
+    setup = Setup(PAIR, SETTINGS)
+    near = in_enu(some_nav(setup, 1), PAIR, CAMERA).xyz
+    assert refusal("range", RangeSample(HEADER, CAMERA, "b", near, "World:ENU", 0.1)) == "near"
+
+
+def test_given_a_magnetic_heading_in_vertical_gyro_mode_then_it_is_compared_and_not_used():
+    measurement, scene, sample = prepared(CASES["magnetometer"], 1, extras=False)
+    found = compared(measurement, scene._replace(settings=FilterSettings()), sample)
+    assert found.monitored == "vertical_gyro"
+    assert compared(measurement, scene, sample).monitored == ""
+
+
+def test_given_a_velocity_without_covariance_or_a_slow_course_then_the_settings_speak():
+    told = stated_velocity(GpsSample(HEADER, FixType.FIX_3D, 50.0, -111.0, velocity=(1.0, 2.0, 3.0)), SETTINGS)
+    assert told is not None
+    assert told[1] == pytest.approx(np.eye(3) * SETTINGS.velocity_sigma**2)
+    slow = GpsSample(HEADER, FixType.FIX_3D, 50.0, -111.0, speed=0.9 * SETTINGS.course_speed, course=1.0)
+    assert stated_velocity(slow, SETTINGS) is None
+    fast = GpsSample(HEADER, FixType.FIX_3D, 50.0, -111.0, speed=10.0, course=0.5, speed_sigma=0.2, course_sigma=0.1)
+    velocity, R = stated_velocity(fast, SETTINGS) or ((), np.zeros(0))
+    along, across = np.array((math.cos(0.5), math.sin(0.5))), np.array((-math.sin(0.5), math.cos(0.5)))
+    assert velocity == pytest.approx((*(10.0 * along), 0.0))
+    assert along @ R @ along == pytest.approx(0.2**2)
+    assert across @ R @ across == pytest.approx((10.0 * 0.1) ** 2)
+    assert along @ R @ across == pytest.approx(0.0, abs=1e-12)

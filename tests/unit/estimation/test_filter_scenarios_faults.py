@@ -1,0 +1,246 @@
+"""The filter and sensors that fail: numbers that are none, clocks that step, wheels that slip, an iron bridge."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from modelserver.estimation.filter.localizer import FilterLocalizer
+from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.estimation.filter.setup import Setup
+from modelserver.estimation.magnetometer import magnetic_field
+from modelserver.messages import Invalid, Phase, Verdict, WheelsSample, YawSource
+from modelserver.simulation import (
+    EncoderModel,
+    Event,
+    MagnetometerModel,
+    WheelsModel,
+    faults,
+    figure_eight,
+    stationary,
+)
+from modelserver.simulation.scenario import START_UTIME
+from modelserver.transforms.pose import Pose
+from tests.support_filter import IMU, ORIGIN, RIG, WHEELS_TIMING, Run, drive, rig, simulation
+
+pytestmark = pytest.mark.slow
+
+EIGHT = figure_eight(speed=2.5, radius=8.0, stationary=4.0, laps=2)
+FIELD = magnetic_field(50.27, -111.18, 700.0, START_UTIME)
+ODD = (math.nan, math.inf, -math.inf)
+
+
+def _all_well(found: Run, begin: float, most: float = 1.2) -> None:
+    rows = found.between(begin)
+    assert all(row.valid for row in rows)
+    assert max(row.off for row in rows) < most
+    assert max(abs(row.heading) for row in rows) < math.radians(6.0)
+    assert all(row.off < row.estimate.horizontal_protection_level for row in rows)
+
+
+def _numbers_only(found: Run) -> None:
+    for row in found.rows:
+        numbers = (*row.estimate.odom.xyz, *row.estimate.odom.wxyz)
+        if row.estimate.enu is not None:
+            numbers += (*row.estimate.enu.xyz, *row.estimate.enu.wxyz, *row.estimate.covariance)
+        assert all(map(math.isfinite, numbers))
+
+
+def _put(sample: Event, field: str, value: float) -> Event:
+    """The sample with a number, or the second number of a vector, or a wheel's number, replaced."""
+    if isinstance(sample, WheelsSample):
+        first, *others = sample.wheels
+        return replace(sample, wheels=(replace(first, **{field: value}), *others))
+    before = getattr(sample, field)
+    if isinstance(before, tuple):
+        # the fifth number of nine is a variance too
+        at = 4 if len(before) == 9 else 1
+        return replace(sample, **{field: (*before[:at], value, *before[at + 1 :])})
+    return replace(sample, **{field: value})
+
+
+FIELDS = {
+    "gps": (
+        *("latitude_deg", "longitude_deg", "height_ellipsoidal", "height_msl", "undulation", "hdop", "vdop"),
+        *("position_covariance", "velocity", "velocity_covariance", "velocity_latency"),
+        *("speed", "speed_sigma", "course", "course_sigma", "baseline_yaw", "baseline_yaw_sigma"),
+    ),
+    "imu": ("angular_velocity", "specific_force", "orientation", "magnetic_field", "angular_velocity_covariance"),
+    "wheels": ("travel", "travel_sigma", "speed", "speed_sigma", "steering"),
+}
+SPREADS = ("position_covariance", "velocity_covariance", "speed_sigma", "course_sigma", "baseline_yaw_sigma")
+SPREADS += ("travel_sigma", "angular_velocity_covariance")
+
+
+def _spoilt(events, source: str) -> Iterator[Event]:
+    """Every fifth sample of a source from the 20th second on has an odd number in one field, all in turn."""
+    odd = [(field, value) for field in FIELDS[source] for value in ODD]
+    odd += [(field, value) for field in FIELDS[source] if field in SPREADS for value in (0.0, -1.0)]
+    every = 1 if source == "gps" else 3
+    count = 0
+    for event in events:
+        if event.header.source == source and event.header.utime > START_UTIME + 20_000_000:
+            count += 1
+            if count % every == 0:
+                yield _put(event, *odd[(count // every) % len(odd)])
+                continue
+        yield event
+
+
+@pytest.mark.parametrize("source", list(FIELDS))
+def test_given_numbers_that_are_none_in_every_field_when_driven_then_the_pose_stays_right(source):
+    run = simulation(
+        EIGHT, second_gps_frame="Car:Second", imu_model=replace(IMU, magnetometer=MagnetometerModel(FIELD))
+    )
+
+    found = drive(run, 45.0, transform=lambda events: _spoilt(events, source))
+
+    _numbers_only(found)
+    _all_well(found, 20.0)
+
+
+def test_given_messages_twice_when_driven_then_each_counts_once():
+    once = drive(simulation(EIGHT), 35.0)
+    twice = drive(simulation(EIGHT), 35.0, transform=lambda events: faults.duplicate(events, 3, 0.3, max_delay=0.05))
+
+    assert twice.last.estimate.enu == once.last.estimate.enu
+    assert twice.last.estimate.covariance == once.last.estimate.covariance
+    assert {word.reason for word in twice.ledger if word.verdict is Verdict.REJECTED} <= {"duplicate"}
+
+
+def test_given_the_receivers_clock_set_back_when_driven_then_only_its_fixes_are_refused():
+    back_at = START_UTIME + 30_000_000
+
+    found = drive(simulation(EIGHT), 50.0, transform=lambda events: faults.step_clock_back(events, back_at, 5.0, "gps"))
+
+    refused = [word for word in found.decisions("gps_position", Verdict.REJECTED) if word.utime >= back_at - 5_000_000]
+    assert {word.reason for word in refused} <= {"out_of_sequence", "too_old"}
+    assert refused
+    assert len({row.estimate.pose_epoch for row in found.between(20.0)}) == 1
+    _all_well(found, 20.0)
+
+
+@pytest.mark.parametrize("seconds", [100.0, -3600.0], ids=["back", "ahead"])
+def test_given_the_computers_clock_set_when_driven_then_the_pose_comes_back_and_odom_goes_on(seconds):
+    at = START_UTIME + 30_000_000
+    run = simulation(EIGHT)
+    localizer = FilterLocalizer.start(Setup(RIG), ORIGIN)
+    poses, anew, epochs = [], [], []
+    true = list(run.events(75.0))
+    for original, event in zip(true, faults.step_clock_back(true, at, seconds), strict=True):
+        localizer, _ = localizer.process(event)
+        estimate = localizer.estimate(localizer.utime)
+        poses.append((estimate.utime, estimate.odom.xyz))
+        if original.header.utime < at - 100_000:
+            epochs.append(estimate.pose_epoch)
+        if original.header.utime > at + 30_000_000:
+            anew.append((estimate, run.truth(estimate.utime + round(seconds * 1e6)).enu))
+
+    for (before, a), (after, b) in pairwise(poses):
+        # over a time that nobody saw Odom goes on as it did for half a second at most
+        assert math.dist(a, b) < 0.05 + 2.6 * min(max((after - before) * 1e-6, 0.02), 0.5)
+    assert all(estimate.enu is not None and not estimate.invalid for estimate, _ in anew)
+    assert max(math.dist(estimate.enu.xyz[:2], true.xyz[:2]) for estimate, true in anew) < 1.5
+    if seconds > 0.0:
+        assert anew[-1][0].pose_epoch > epochs[-1]
+
+
+def test_given_one_stamp_far_ahead_when_driven_then_that_sample_alone_is_refused():
+    def ahead(events):
+        for event in events:
+            odd = event.header.source == "gps" and event.header.seq == 100
+            yield replace(event, header=replace(event.header, utime=event.header.utime + 10**10)) if odd else event
+
+    found = drive(simulation(EIGHT), 40.0, transform=ahead)
+
+    assert [word.seq for word in found.ledger if word.reason == "future"][:1] == [100]
+    assert len([word for word in found.decisions("gps_position") if word.reason == "future"]) == 1
+    _all_well(found, 20.0)
+
+
+def test_given_an_inertial_unit_that_freezes_when_driven_then_it_is_refused_and_the_pose_is_not_valid():
+    found = drive(simulation(EIGHT, imu_model=replace(IMU, frozen_from=25.0)), 40.0)
+
+    assert found.decisions("inertial", Verdict.REJECTED, "frozen")
+    assert all(Invalid.STALE_IMU in row.estimate.invalid for row in found.between(27.0))
+    assert found.at(24.0).valid
+
+
+def test_given_gaps_of_the_inertial_unit_when_driven_then_they_are_bridged_and_the_bound_covers_the_error():
+    model = replace(IMU, outages=((25.0, 25.4), (30.0, 32.0)))
+
+    found = drive(simulation(EIGHT, imu_model=model), 45.0)
+
+    assert len(found.decisions("inertial", Verdict.MONITORED, "gap")) == 2
+    assert Invalid.STALE_IMU in found.at(31.2).estimate.invalid
+    assert found.last.valid
+    assert found.last.off < 1.2
+    assert all(row.off < row.estimate.horizontal_protection_level for row in found.between(20.0) if row.valid)
+
+
+@pytest.mark.parametrize(
+    "encoder",
+    [
+        EncoderModel(stuck=(("left", 25.0),)),
+        EncoderModel(stuck=(("left", 25.0), ("right", 25.0))),
+        EncoderModel(swapped=frozenset({"left"})),
+        EncoderModel(burst_rate=0.1, burst_excess=0.5),
+    ],
+    ids=["one_stuck", "all_stuck", "one_swapped", "bursts"],
+)
+def test_given_wheels_that_fail_when_driven_with_fixes_then_the_pose_stays_right(encoder):
+    found = drive(simulation(EIGHT, wheels_model=WheelsModel(WHEELS_TIMING, encoder=encoder)), 50.0)
+
+    _all_well(found, 22.0, most=1.5)
+    assert not any(row.estimate.invalid for row in found.between(26.0))
+
+
+def test_given_gravity_along_another_axis_than_the_mount_says_when_driven_then_the_pose_is_never_valid_and_says_why():
+    wrong = rig(imu=Pose.from_rpy((0.3, -0.3, 0.5), 0.0, 0.0, 0.0))
+
+    found = drive(simulation(EIGHT), 40.0, on=wrong)
+
+    assert all(Invalid.TILTED in row.estimate.invalid for row in found.between(8.0))
+    assert found.decisions("inertial", Verdict.REJECTED, "mount")
+    assert found.localizer.head.phase is Phase.LEVELING
+
+
+PULLED = ((30.0, 40.0, (3e-5, 0.0, 5e-5)),)
+
+
+def test_given_iron_beside_the_way_when_magnetic_headings_are_used_then_the_field_is_refused():
+    model = replace(IMU, magnetometer=MagnetometerModel(FIELD, noise=2e-7, disturbances=PULLED))
+
+    found = drive(simulation(EIGHT, imu_model=model), 45.0, settings=FilterSettings(use_magnetometer=True))
+
+    refused = [found.seconds(word) for word in found.decisions("magnetometer", Verdict.REJECTED)]
+    assert len([t for t in refused if 30.0 <= t < 40.0]) >= 15
+    assert found.decisions("magnetometer", Verdict.USED)
+    _all_well(found, 20.0)
+
+
+def test_given_a_field_that_is_wrong_always_when_in_vertical_gyro_mode_then_it_is_watched_and_changes_nothing():
+    turned = (FIELD[1], -FIELD[0], FIELD[2])
+    without = drive(simulation(EIGHT), 35.0)
+    beside = drive(simulation(EIGHT, imu_model=replace(IMU, magnetometer=MagnetometerModel(turned))), 35.0)
+
+    watched = beside.decisions("magnetometer", Verdict.MONITORED, "vertical_gyro")
+    assert watched
+    assert not beside.decisions("magnetometer", Verdict.USED)
+    assert abs(np.mean([word.residual[0] for word in watched if beside.seconds(word) > 20.0])) > 0.5
+    # measuring it takes the state to the same instants by other steps: rounding remains
+    assert math.dist(beside.last.estimate.enu.xyz, without.last.estimate.enu.xyz) < 1e-2
+
+
+def test_given_a_unit_with_a_magnetic_yaw_when_it_stands_in_magnetometer_mode_then_heading_is_known():
+    model = replace(IMU, yaw_source=YawSource.MAGNETIC, yaw_noise=0.01, magnetometer=MagnetometerModel(FIELD))
+
+    found = drive(simulation(stationary(30.0), imu_model=model), 30.0, settings=FilterSettings(use_magnetometer=True))
+
+    assert all(row.valid for row in found.between(15.0))
+    assert max(abs(row.heading) for row in found.between(15.0)) < math.radians(3.0)

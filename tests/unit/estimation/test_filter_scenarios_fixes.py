@@ -1,0 +1,159 @@
+"""The filter and its fixes: jumps, outages, lateness, velocities of the past, and what stands in for fixes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from modelserver.messages import Invalid, Mode, Verdict
+from modelserver.simulation import (
+    AbsolutePoseModel,
+    DrivePhase,
+    GpsModel,
+    RangeModel,
+    RelativePoseModel,
+    faults,
+    figure_eight,
+    stop_and_go,
+)
+from tests.support_filter import GPS_TIMING, PLAIN_GPS, RTK_LIKE, drive, rms, simulation
+
+pytestmark = pytest.mark.slow
+
+EIGHT = figure_eight(speed=3.0, radius=8.0, stationary=4.0, laps=3)
+BEACONS = {"a": (40.0, 40.0, 3.0), "b": (-40.0, 40.0, 3.0), "c": (-40.0, -40.0, 3.0), "d": (40.0, -40.0, 3.0)}
+FOREVER = 1e9
+
+
+@pytest.mark.parametrize(
+    ("model", "far"), [(PLAIN_GPS, 700.0), (PLAIN_GPS, 20.0), (RTK_LIKE, 5.0)], ids=["700m", "20m", "5m_rtk"]
+)
+def test_given_fixes_that_jump_for_ten_seconds_when_driven_on_then_the_pose_does_not_follow(model, far):
+    gps = replace(model, jumps=((40.0, 50.0, far * 0.8, far * 0.6),))
+
+    found = drive(simulation(EIGHT, gps_model=gps), 65.0, every=0.1)
+    plain = drive(simulation(EIGHT, gps_model=model), 65.0, every=0.1)
+
+    pairs = list(zip(found.between(40.0), plain.between(40.0), strict=True))
+    assert max(math.dist(a.estimate.enu.xyz[:2], b.estimate.enu.xyz[:2]) for a, b in pairs) < 1.0
+    refused = [found.seconds(word) for word in found.decisions("gps_position", Verdict.REJECTED, "gate")]
+    assert len([t for t in refused if 40.0 <= t < 50.0]) >= 38
+    assert not [t for t in refused if t >= 53.0]
+    assert len({row.estimate.pose_epoch for row in found.between(20.0)}) == 1
+    assert max(found.odom_steps) < 0.05
+
+
+def test_given_fixes_that_jump_for_good_when_it_stands_then_drives_then_the_pose_is_taken_up_anew_only_by_driving():
+    standing_until = 110.0
+    ahead = figure_eight(speed=3.0, radius=8.0, stationary=4.0)
+    driven = sum(phase.duration for phase in ahead)
+    phases = (*ahead, DrivePhase(standing_until - driven), *figure_eight(speed=3.0, radius=8.0, stationary=1.0, laps=2))
+    gps = replace(PLAIN_GPS, jumps=((driven + 3.0, FOREVER, 30.0, 0.0),))
+
+    found = drive(simulation(phases, gps_model=gps), standing_until + 60.0, every=0.1)
+
+    resting = found.between(driven + 3.0, standing_until)
+    anew = [word for word in found.decisions("gps_position", Verdict.RESET) if found.seconds(word) > driven]
+    assert max(row.off for row in resting) < 1.5
+    assert Invalid.GPS_REJECTED in resting[-1].estimate.invalid
+    assert len(anew) == 1
+    assert found.seconds(anew[0]) > standing_until + 5.0
+    assert found.last.valid
+    assert abs(found.last.east - 30.0) < 2.0
+    assert abs(found.last.north) < 2.0
+    assert found.last.estimate.pose_epoch == resting[-1].estimate.pose_epoch + 1
+    assert max(found.odom_steps) < 0.05
+
+
+def test_given_an_outage_of_a_minute_when_driven_on_then_the_bound_grows_covers_the_error_and_shrinks_again():
+    gps = replace(RTK_LIKE, outages=((40.0, 100.0),))
+
+    found = drive(simulation(figure_eight(speed=3.0, radius=8.0, laps=4), gps_model=gps), 120.0)
+
+    silent = found.between(41.0, 100.0)
+    bounds = [row.estimate.horizontal_protection_level for row in silent]
+    assert bounds[-1] > 3.0 * bounds[0]
+    # not at every step: on the way back a wrong heading takes back what it did
+    assert np.mean(bounds[-40:]) > 1.5 * np.mean(bounds[:40])
+    assert all(row.off < row.estimate.horizontal_protection_level for row in found.between(30.0))
+    assert all(row.valid for row in silent)
+    assert found.last.off < 0.3
+    assert found.last.estimate.horizontal_protection_level < 0.5 * bounds[-1]
+
+
+def test_given_fixes_half_a_second_late_and_out_of_order_when_driven_then_the_pose_is_that_of_punctual_ones():
+    phases = figure_eight(speed=3.0, radius=8.0)
+    seconds = sum(phase.duration for phase in phases)
+
+    punctual = drive(simulation(phases), seconds + 3.0)
+    late = drive(simulation(phases), seconds + 3.0, transform=lambda events: faults.delay(events, 2, "gps", 0.5))
+
+    assert not late.decisions("gps_position", Verdict.REJECTED)
+    assert math.dist(late.last.estimate.enu.xyz, punctual.last.estimate.enu.xyz) < 0.02
+    assert rms(row.off for row in late.between(20.0)) < 1.2 * rms(row.off for row in punctual.between(20.0)) + 0.05
+
+
+def test_given_fixes_later_than_the_horizon_when_they_come_then_they_are_refused_as_late():
+    found = drive(simulation(EIGHT), 40.0, transform=lambda events: faults.delay(events, 2, "gps", 1.8, min_delay=1.5))
+
+    assert found.decisions("gps_position", Verdict.REJECTED, "too_old")
+    assert not found.decisions("gps_position", Verdict.USED)
+
+
+def test_given_velocities_of_the_past_when_their_age_is_told_then_they_fit_the_drive():
+    phases = stop_and_go(speed=4.0, go=2.0, ramp=1.5, times=6, curvature=0.1)
+    gps = GpsModel(GPS_TIMING, correlated_sigma=0.3, white_sigma=0.05, velocity_latency=0.3)
+    seconds = sum(phase.duration for phase in phases)
+
+    told = drive(simulation(phases, gps_model=gps), seconds)
+    untold = drive(simulation(phases, gps_model=gps), seconds, transform=_of_now)
+
+    fits = [word.statistic / word.dof for word in told.decisions("gps_velocity") if word.dof]
+    misfits = [word.statistic / word.dof for word in untold.decisions("gps_velocity") if word.dof]
+    assert np.mean(fits) < 2.0
+    assert np.mean(misfits) > 5.0 * np.mean(fits)
+    assert len(told.decisions("gps_velocity", Verdict.REJECTED)) < 0.02 * len(fits)
+
+
+def _of_now(events):
+    for event in events:
+        yield replace(event, velocity_latency=0.0) if event.header.source == "gps" else event
+
+
+def test_given_no_fixes_when_a_pose_is_told_then_it_is_taken_and_ranges_to_beacons_hold_it():
+    phases = figure_eight(speed=2.0, radius=8.0, laps=2)
+    once = AbsolutePoseModel(outages=((6.0, 200.0),))
+    without_fixes = {"gps_frame": None, "pose_frame": "Car:Camera", "pose_model": once}
+
+    alone = drive(simulation(phases, **without_fixes), 100.0)
+    held = drive(
+        simulation(phases, **without_fixes, range_frame="Car:Antenna", beacons=BEACONS, range_model=RangeModel()), 100.0
+    )
+
+    assert len(held.decisions("absolute_pose", Verdict.RESET)) == 1
+    assert all(row.valid for row in held.between(8.0))
+    assert max(row.off for row in held.between(8.0)) < 0.5
+    assert all(row.off < row.estimate.horizontal_protection_level for row in alone.between(8.0, 60.0))
+    assert held.last.estimate.horizontal_protection_level < 0.3 * alone.last.estimate.horizontal_protection_level
+
+
+def test_given_an_outage_without_wheels_when_a_camera_tells_the_way_then_the_error_is_far_smaller():
+    gps = replace(RTK_LIKE, outages=((40.0, 70.0),))
+    phases = figure_eight(speed=2.0, radius=8.0, laps=2)
+    bare = {"gps_model": gps, "wheel_frames": None}
+
+    blind = drive(simulation(phases, **bare), 70.0, mode=Mode.NO_WHEELS)
+    seeing = drive(
+        simulation(phases, **bare, odometry_frame="Car:Camera", odometry_model=RelativePoseModel()),
+        70.0,
+        mode=Mode.NO_WHEELS,
+    )
+
+    assert len(seeing.decisions("relative_pose", Verdict.USED)) > 200
+    assert seeing.last.off < 1.0
+    assert seeing.last.off < seeing.last.estimate.horizontal_protection_level
+    assert seeing.last.estimate.horizontal_protection_level < 0.5 * blind.last.estimate.horizontal_protection_level
+    assert blind.last.off < blind.last.estimate.horizontal_protection_level

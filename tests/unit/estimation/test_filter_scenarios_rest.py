@@ -1,0 +1,138 @@
+"""The filter on drives as users make them: standing for long, in reverse, on slopes, with the body turned."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from modelserver.messages import Invalid, Quality, Verdict
+from modelserver.simulation import (
+    GpsModel,
+    SideSlip,
+    Terrain,
+    Timing,
+    WheelsModel,
+    figure_eight,
+    reverse_eight,
+    stationary,
+)
+from tests.support_filter import IMU, PLAIN_GPS, drive, rig, simulation
+
+pytestmark = pytest.mark.slow
+
+SLOW_IMU = replace(IMU, timing=Timing(12.5))
+SLOW_WHEELS = WheelsModel(Timing(2.5))
+WANDERING = GpsModel(Timing(1.0), correlated_sigma=1.0, white_sigma=0.15, time_constant=60.0)
+TEN_MINUTES = 600.0
+
+
+def test_given_fixes_that_wander_when_it_stands_ten_minutes_after_a_drive_then_the_pose_stays():
+    eight = figure_eight(speed=2.5, radius=8.0, stationary=4.0, ramp=3.0)
+    driven = sum(phase.duration for phase in eight)
+    run = simulation(
+        (*eight, *stationary(TEN_MINUTES)), gps_model=WANDERING, imu_model=SLOW_IMU, wheels_model=SLOW_WHEELS, seed=4
+    )
+
+    found = drive(run, driven + TEN_MINUTES, every=2.0)
+
+    rest = found.between(driven + 1.0)
+    places = np.array([row.estimate.enu.xyz[:2] for row in rest])
+    headings = np.array([row.heading for row in rest])
+    assert np.ptp(places, axis=0).max() < 0.3
+    assert np.ptp(headings) < math.radians(1.0)
+    assert all(row.valid for row in rest)
+    assert all(row.off < row.estimate.horizontal_protection_level for row in rest)
+    assert math.dist(rest[0].estimate.odom.xyz, rest[-1].estimate.odom.xyz) < 0.01
+
+
+def test_given_two_antennas_when_it_stands_ten_minutes_from_the_start_then_pose_and_heading_are_known_and_stay():
+    run = simulation(
+        stationary(TEN_MINUTES),
+        gps_model=WANDERING,
+        imu_model=SLOW_IMU,
+        wheels_model=SLOW_WHEELS,
+        second_gps_frame="Car:Second",
+    )
+
+    found = drive(run, TEN_MINUTES, every=2.0)
+
+    rest = found.between(10.0)
+    places = np.array([row.estimate.enu.xyz[:2] for row in rest])
+    assert all(row.valid for row in rest)
+    assert max(abs(row.heading) for row in rest) < math.radians(1.0)
+    assert np.ptp(places, axis=0).max() < 0.3
+
+
+def test_given_one_antenna_when_it_stands_from_the_start_then_the_pose_is_not_valid_for_want_of_heading():
+    found = drive(simulation(stationary(30.0)), 30.0)
+
+    assert all(Invalid.NOT_MOVED_YET in row.estimate.invalid for row in found.rows)
+    assert not found.decisions("gps_position", Verdict.RESET)
+
+
+REVERSE = reverse_eight(speed=2.0, radius=6.0, stationary=4.0)
+
+
+@pytest.mark.parametrize("turned", [0.0, math.pi], ids=["body_ahead", "body_turned"])
+def test_given_a_drive_in_reverse_from_the_start_when_an_eight_is_driven_then_heading_is_not_half_a_turn_off(turned):
+    on = rig(turned)
+    seconds = sum(phase.duration for phase in REVERSE)
+
+    found = drive(simulation(REVERSE, on), seconds, on=on)
+
+    known = found.between(20.0)
+    assert all(row.valid for row in known)
+    assert max(abs(row.heading) for row in known) < math.radians(5.0)
+    assert max(row.off for row in known) < 1.5
+    assert all(row.off < row.estimate.horizontal_protection_level for row in known)
+    assert any(Quality.REVERSING in row.estimate.quality for row in known)
+
+
+def test_given_the_body_mounted_the_other_way_round_when_the_same_is_driven_then_the_answers_are_the_same():
+    phases = figure_eight(speed=2.0, radius=6.0)
+    seconds = sum(phase.duration for phase in phases)
+    exact = {"gps_model": GpsModel.noise_free(), "wheels_model": WheelsModel.noise_free(Timing(10.0))}
+
+    ahead = drive(simulation(phases, **exact), seconds)
+    turned = drive(simulation(phases, rig(math.pi), **exact), seconds, on=rig(math.pi))
+
+    for a, b in zip(ahead.between(20.0), turned.between(20.0), strict=True):
+        assert math.dist(a.estimate.enu.xyz[:2], b.estimate.enu.xyz[:2]) < 0.1
+        assert abs(math.remainder(a.heading - b.heading, math.tau)) < math.radians(1.0)
+
+
+def test_given_hills_and_a_vehicle_that_slides_when_driven_then_pose_tilt_and_height_are_right():
+    phases = figure_eight(speed=3.0, radius=8.0, laps=2)
+    run = simulation(
+        phases, terrain=Terrain.hills(3, steepness=0.1), side_slip=SideSlip(cornering=0.006, random_sigma=0.02)
+    )
+
+    found = drive(run, 90.0)
+
+    for row in found.between(25.0):
+        true = run.truth(row.estimate.utime).enu
+        up = [pose.rpy[:2] for pose in (row.estimate.enu, true)]
+        assert row.valid
+        assert row.off < 1.5
+        assert abs(row.heading) < math.radians(4.0)
+        assert math.dist(*up) < math.radians(2.0)
+        assert abs(row.estimate.enu.xyz[2] - true.xyz[2]) < 2.5
+
+
+def test_given_a_course_and_a_speed_only_when_driven_then_heading_is_found():
+    phases = figure_eight(speed=2.5, radius=8.0)
+    run = simulation(phases, gps_model=PLAIN_GPS)
+
+    found = drive(run, 45.0, transform=lambda events: (_without_velocity(event) for event in events))
+
+    assert all(row.valid for row in found.between(20.0))
+    assert max(abs(row.heading) for row in found.between(20.0)) < math.radians(4.0)
+    assert all(len(word.residual) == 2 for word in found.decisions("gps_velocity", Verdict.USED))
+    assert found.decisions("gps_velocity", Verdict.USED)
+
+
+def _without_velocity(event):
+    return replace(event, velocity=None, velocity_covariance=None) if event.header.source == "gps" else event

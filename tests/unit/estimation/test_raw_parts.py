@@ -1,0 +1,420 @@
+"""The parts of raw mode, each by itself."""
+
+from __future__ import annotations
+
+import cmath
+import dataclasses
+import inspect
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from support_localization import GEODESY, MOUNTS, START
+
+from modelserver.errors import UnknownFrameError
+from modelserver.estimation import fix_quality as gate
+from modelserver.estimation.origin import OriginCapture
+from modelserver.estimation.raw import bounds, track
+from modelserver.estimation.raw.attitude import read
+from modelserver.estimation.raw.heading import Course, Heading
+from modelserver.estimation.raw.motion import Motion, attitude, levelled, roll_pitch
+from modelserver.estimation.raw.settings import RawSettings
+from modelserver.estimation.raw.stamps import Stamps, Verdict
+from modelserver.estimation.raw.track import TrackFix
+from modelserver.estimation.sensor_rig import Mounts
+from modelserver.estimation.settings import FixSettings
+from modelserver.geometry.model import Model
+from modelserver.geometry.parts import Body, BodyFrame, Constraint
+from modelserver.messages import FixType, GpsSample, ImuSample, OrientationReference, SensorHeader
+from modelserver.transforms import Pose, so3
+
+S = RawSettings()
+SECOND = 1_000_000
+
+
+# --- settings -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"gps_timeout": 0.0},
+        {"gps_timeout": -1.0},
+        {"uere": math.nan},
+        {"uere": math.inf},
+        {"minimum_fix_type": 6},
+        {"risk": 0.9},
+        {"fix_noise_share": 1.5},
+        {"origin_fixes": 5000},
+    ],
+)
+def test_a_wrong_setting_is_named(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        RawSettings(**wrong)
+
+
+def test_every_setting_is_a_plain_number_with_its_words():
+    source = dataclasses.fields(RawSettings)
+    text = inspect.getsource(FixSettings) + inspect.getsource(RawSettings)
+    for field in source:
+        assert field.type in ("int", "float")
+        after = text.split(f"    {field.name}: ", 1)[1].split("\n", 2)[1]
+        assert after.strip().startswith('"""'), field.name
+
+
+# --- mounts -------------------------------------------------------------------------------------------------
+
+
+def model():
+    car = Body(
+        "Car",
+        (
+            BodyFrame("CG", Pose((1.0, 0.0, 0.5))),
+            BodyFrame("Antenna", Pose((0.2, 0.1, 1.5))),
+            BodyFrame("Bolt", Pose.from_rpy((1.5, 0.0, 0.6), 0.0, 0.0, 0.3)),
+        ),
+    )
+    imu = Body(
+        "Imu",
+        (BodyFrame("Sensor", Pose.from_rpy((0.0, 0.0, 0.02), math.pi, 0.0, 0.0)), BodyFrame("Base", Pose.identity())),
+    )
+    return Model((car, imu), (Constraint("bolted", "Car:Bolt", "Imu:Base", Pose.identity()),))
+
+
+def test_mounts_come_from_the_model():
+    mounts = Mounts.from_model(model(), "Car:CG", "Car:Antenna", "Imu:Sensor")
+    assert mounts.X_base_antenna.xyz == pytest.approx((-0.8, 0.1, 1.0))
+    assert mounts.X_base_imu.xyz == pytest.approx((0.5, 0.0, 0.12))
+    assert mounts.X_base_imu.is_close(Pose.from_rpy((0.5, 0.0, 0.12), math.pi, 0.0, 0.3))
+
+
+def test_a_mount_that_the_model_lacks_is_an_error():
+    with pytest.raises(UnknownFrameError):
+        Mounts.from_model(model(), "Car:CG", "Car:Antena", "Imu:Sensor")
+
+
+# --- stamps -------------------------------------------------------------------------------------------------
+
+
+def verdicts(*seconds):
+    stamps, found = Stamps(), []
+    for t in seconds:
+        stamps, verdict = stamps.take(round(t * SECOND), S)
+        found.append(verdict)
+    return found
+
+
+def test_stamps_in_order_repeated_and_late():
+    good, duplicate, order = Verdict.GOOD, Verdict.DUPLICATE, Verdict.ORDER
+    assert verdicts(5.0, 5.1, 5.1, 5.05, 5.2, 14.9) == [good, good, duplicate, order, good, good]
+
+
+def test_one_odd_stamp_is_the_samples_fault_three_in_a_row_the_clocks():
+    good, order, future = Verdict.GOOD, Verdict.ORDER, Verdict.FUTURE
+    assert verdicts(100.0, 50.0, 100.1) == [good, order, good]
+    assert verdicts(100.0, 50.0, 50.1, 50.2, 50.3) == [good, order, order, Verdict.STEPPED_BACK, good]
+    assert verdicts(100.0, 50.0, 40.0, 30.0) == [good, order, order, order]
+    assert verdicts(100.0, 500.0, 100.1, 100.2) == [good, future, good, good]
+    assert verdicts(100.0, 500.0, 500.1, 500.2, 500.3) == [good, future, future, good, good]
+
+
+# --- gate ---------------------------------------------------------------------------------------------------
+
+
+def fix(**changes):
+    base = GpsSample(
+        SensorHeader(START, "gps"), FixType.FIX_3D, 50.27, -111.1, height_ellipsoidal=700.0, satellites=8, hdop=1.0
+    )
+    return replace(base, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"fix_type": FixType.NONE}, "no_fix"),
+        ({"fix_type": FixType.DEAD_RECKONING}, "no_fix"),
+        ({"latitude_deg": math.nan}, "nan"),
+        ({"longitude_deg": math.inf}, "nan"),
+        ({"latitude_deg": 0.0, "longitude_deg": 0.0}, "range"),
+        ({"latitude_deg": 84.5}, "range"),
+        ({"latitude_deg": 500.0}, "range"),
+        ({"height_ellipsoidal": math.inf}, "range"),
+        ({"satellites": 3}, "satellites"),
+        ({"hdop": 9.0}, "dilution"),
+        ({"hdop": math.inf}, "dilution"),
+        ({"position_covariance": (900.0, 0, 0, 0, 900.0, 0, 0, 0, 900.0)}, "sigma"),
+    ],
+)
+def test_a_bad_fix_is_refused_in_a_word(changes, word):
+    assert gate.evaluate_fix(fix(**changes), S) == word
+
+
+def test_sigma_is_the_receivers_or_that_of_the_kind_of_fix():
+    stated = gate.evaluate_fix(fix(position_covariance=(0.81, 0.1, 0, 0.1, 1.21, 0, 0, 0, 3.24)), S)
+    assert (stated.east_variance, stated.north_variance, stated.cross, stated.up_variance) == (0.81, 1.21, 0.1, 3.24)
+    # HDOP 1: horizontal radius is the range error
+    assert gate.evaluate_fix(fix(), S).sigma * math.sqrt(2) == pytest.approx(S.uere)
+    assert gate.evaluate_fix(fix(fix_type=FixType.RTK_FIXED, hdop=2.0), S).sigma == pytest.approx(0.04 / math.sqrt(2))
+    unknown = gate.evaluate_fix(fix(hdop=math.nan, satellites=-1, position_covariance=(0.0,) * 9), S)
+    assert unknown.sigma == pytest.approx(S.uere * S.assumed_hdop / math.sqrt(2))
+
+
+def test_height_may_be_told_above_the_sea_or_not_at_all():
+    assert gate.evaluate_fix(fix(height_ellipsoidal=math.nan, height_msl=720.0, undulation=-18.0), S).height == 702.0
+    over_sea = gate.evaluate_fix(fix(height_ellipsoidal=math.nan, height_msl=720.0), S)
+    assert over_sea.height == 720.0
+    assert over_sea.up_variance == S.assumed_height_sigma**2
+    assert math.isnan(gate.evaluate_fix(fix(height_ellipsoidal=math.nan), S).height)
+
+
+# --- attitude and motion ------------------------------------------------------------------------------------
+
+angles = st.floats(-1.4, 1.4)
+
+
+@given(angles, angles, st.floats(-3, 3))
+def test_up_holds_roll_and_pitch(roll, pitch, yaw):
+    R = Rotation.from_euler("xyz", [roll, pitch, yaw])
+    up = tuple(R.inv().apply([0.0, 0.0, 1.0]))
+    assert roll_pitch(up) == pytest.approx((roll, pitch), abs=1e-9)
+    assert attitude(up, yaw) == pytest.approx(so3.from_rpy(roll, pitch, yaw), abs=1e-9)
+    level = Rotation.from_euler("xyz", [roll, pitch, 0.0]).apply([1.0, -2.0, 3.0])
+    assert levelled(up, (1.0, -2.0, 3.0)) == pytest.approx(tuple(level), abs=1e-9)
+
+
+@given(angles, angles, st.tuples(*[st.floats(-1, 1)] * 3))
+def test_motion_turns_as_a_rotation_does(roll, pitch, rate):
+    R = Rotation.from_euler("xyz", [roll, pitch, 0.4])
+    motion = Motion(0, yaw=0.4, up=tuple(R.inv().apply([0.0, 0.0, 1.0])))
+    for i in range(1, 21):
+        motion = motion.advanced(i * 1000, rate, S)
+    expected = R * Rotation.from_rotvec([each * 0.02 for each in rate])
+    got = Rotation.from_quat(motion.pose.wxyz, scalar_first=True)
+    assert (expected.inv() * got).magnitude() < 2e-3  # 1 ms Euler steps of yaw
+
+
+@given(st.floats(-5, 5), st.floats(-0.5, 0.5), st.floats(0.3, 8.0), st.integers(1, 50))
+def test_one_long_step_ends_where_many_short_ones_do(speed, turn, seconds, n):
+    motion = Motion(START, rate=(0.0, 0.0, turn), speed=speed, speed_utime=START)
+    whole = motion.advanced(START + round(seconds * 1e6), motion.rate, S)
+    parts = motion.advanced(START + round(S.rate_hold * 1e6), motion.rate, S)
+    for i in range(1, n + 1):
+        t = START + round((S.rate_hold + (seconds - S.rate_hold) * i / n) * 1e6)
+        parts = parts.advanced(t, (0.0, 0.0, 0.0), S)
+    assert (parts.x, parts.y, parts.yaw) == pytest.approx((whole.x, whole.y, whole.yaw), abs=1e-6)
+    assert math.hypot(whole.x, whole.y) <= abs(speed) * 2.0 * S.gps_timeout + 1e-9
+
+
+def inertial(**changes):
+    base = ImuSample(SensorHeader(START, "imu"), angular_velocity=(0.1, 0.2, 0.3), specific_force=(0.0, 0.0, 9.8))
+    return replace(base, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"angular_velocity": None}, "nan"),
+        ({"angular_velocity": (0.0, math.nan, 0.0)}, "nan"),
+        ({"angular_velocity": (0.0, 100.0, 0.0)}, "range"),
+        ({"specific_force": (0.0, 0.0, math.inf)}, "nan"),
+        ({"specific_force": (0.0, 0.0, 1e9)}, "range"),
+    ],
+)
+def test_a_bad_inertial_sample_is_refused_in_a_word(changes, word):
+    assert read(inertial(**changes), MOUNTS.X_base_imu) == word
+
+
+@given(angles, angles, st.floats(-3, 3), st.sampled_from((OrientationReference.ENU, OrientationReference.NED)))
+def test_gravity_is_read_from_the_device_whatever_its_reference_and_mount(roll, pitch, yaw, reference):
+    R_world_base = Rotation.from_euler("xyz", [roll, pitch, yaw])
+    R_base_imu = Rotation.from_quat(MOUNTS.X_base_imu.wxyz, scalar_first=True)
+    R = R_world_base * R_base_imu
+    force = tuple(R.inv().apply([0.0, 0.0, 9.8]))
+    if reference == OrientationReference.NED:
+        R = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]]) * R
+    sample = inertial(
+        orientation=tuple(R.as_quat(scalar_first=True)), orientation_reference=reference, specific_force=force
+    )
+    found = read(sample, MOUNTS.X_base_imu)
+    assert found.up == pytest.approx(tuple(R_world_base.inv().apply([0, 0, 1])), abs=1e-9)
+    assert found.rate == pytest.approx(tuple(R_base_imu.apply([0.1, 0.2, 0.3])), abs=1e-12)
+
+
+def test_a_device_whose_vertical_contradicts_its_specific_force_is_refused():
+    # the right orientation of a level vehicle, said to be against the wrong reference: upside down
+    R = Rotation.from_quat(MOUNTS.X_base_imu.wxyz, scalar_first=True)
+    force = tuple(R.inv().apply([0.0, 0.0, 9.8]))
+    level = tuple(R.as_quat(scalar_first=True))
+    right = inertial(orientation=level, orientation_reference=OrientationReference.ENU, specific_force=force)
+    wrong = replace(right, orientation_reference=OrientationReference.NED)
+    assert read(right, MOUNTS.X_base_imu).up == pytest.approx((0.0, 0.0, 1.0))
+    assert read(wrong, MOUNTS.X_base_imu) == "orientation"
+    # hard braking tilts the force, but not that far; a shock is not near g and says nothing of where up is
+    braking = tuple(R.inv().apply([-6.0, 0.0, 9.8]))
+    assert read(replace(right, specific_force=braking), MOUNTS.X_base_imu).up is not None
+    shock = tuple(R.inv().apply([0.0, 0.0, -30.0]))
+    assert read(replace(right, specific_force=shock), MOUNTS.X_base_imu).up is not None
+
+
+@pytest.mark.parametrize("q", [(0.0,) * 4, (math.nan,) * 4, (2.0, 0.0, 0.0, 0.0)])
+def test_an_orientation_that_is_no_rotation_is_left_out(q):
+    sample = inertial(orientation=q, orientation_reference=OrientationReference.ENU)
+    assert read(sample, MOUNTS.X_base_imu).up is None
+
+
+# --- heading ------------------------------------------------------------------------------------------------
+
+KNOWN = Heading(True, 0.5, 0.01, 0.0, 1e-6)
+
+
+def test_the_first_course_sets_the_heading():
+    heading, met = Heading().met(2.0, 0.02, S)
+    assert met is Course.ANEW
+    assert (heading.known, heading.offset, heading.variance) == (True, 2.0, 0.02)
+
+
+def test_courses_draw_heading_by_their_weight_across_the_cut():
+    heading, met = replace(KNOWN, offset=math.pi - 0.05).met(-math.pi + 0.05, 0.01, S)
+    assert met is Course.TAKEN
+    assert abs(heading.offset) == pytest.approx(math.pi)
+    assert heading.variance == pytest.approx(0.005)
+
+
+def test_a_course_half_a_turn_off_is_driving_backwards():
+    heading, met = KNOWN.met(0.5 + math.pi + 0.1, 0.01, S)
+    assert met is Course.BACKWARDS
+    assert heading.offset == pytest.approx(0.55)
+
+
+def test_a_course_that_fits_neither_is_refused_until_a_run_of_them_agrees():
+    heading = KNOWN
+    for i in range(S.course_rejections - 1):
+        heading, met = heading.met(0.5 + math.pi / 2, 0.001, S)
+        assert (met, heading.refused, heading.offset) == (Course.REFUSED, i + 1, 0.5)
+    heading, met = heading.met(0.5 + math.pi / 2, 0.001, S)
+    assert met is Course.ANEW
+    assert heading.offset == pytest.approx(0.5 + math.pi / 2)
+
+
+def test_refused_courses_that_disagree_are_no_run():
+    heading = KNOWN
+    for i in range(20):
+        heading, met = heading.met(0.5 + (1 if i % 2 else -1) * math.pi / 2, 0.001, S)
+        assert met is Course.REFUSED
+
+
+def test_standing_tells_the_bias_and_the_bias_the_drift():
+    heading = replace(KNOWN, bias_variance=S.gyro_bias_sigma**2)
+    true_bias = 0.01
+    for _ in range(1000):  # 20 s
+        heading = heading.carried(0.02, S).stood(true_bias - heading.bias, S.gyro_noise**2 / 0.02)
+    assert heading.bias == pytest.approx(true_bias, abs=1e-4)
+    settled = heading
+    grown = settled
+    for _ in range(600):
+        grown = grown.carried(0.1, S)
+    assert math.degrees(grown.sigma - settled.sigma) < 2.0  # the report: 1 to 2 deg a minute
+
+
+def test_unmeasured_turns_make_heading_unsure_but_never_more_than_unknown():
+    assert KNOWN.carried(1.0, S, measured=False).sigma > KNOWN.carried(1.0, S).sigma
+    assert KNOWN.carried(1e12, S, measured=False).variance == pytest.approx(math.pi**2 / 3)
+
+
+# --- track --------------------------------------------------------------------------------------------------
+
+
+def path_fixes(speed, turn, offset, n=12, dt=0.5, lever=0.4 - 0.3j):
+    """Fixes of an antenna on a vehicle at constant speed and turn: the closed form of an arc."""
+    direction = cmath.rect(1.0, offset)
+    made = []
+    for i in range(n):
+        t = i * dt
+        path = t if turn == 0 else (cmath.exp(1j * turn * t) - 1) / (1j * turn)
+        arm = lever * cmath.rect(1.0, turn * t)
+        made.append(
+            TrackFix(START + round(t * 1e6), speed * direction * path + direction * arm, 0.02, path, arm, turn * t)
+        )
+    return tuple(made)
+
+
+@given(st.floats(0.5, 10), st.floats(-0.4, 0.4).filter(lambda w: abs(w) > 1e-3) | st.just(0.0), st.floats(-3, 3))
+def test_speed_and_course_of_an_arc_are_exact(speed, turn, offset):
+    made = path_fixes(speed, turn, offset)
+    found = track.course(made, None, S)
+    assert found is not None
+    assert math.remainder(found[0] - offset, math.tau) == pytest.approx(0.0, abs=0.05)  # the arm's phase is iterated
+    found = track.course(made, cmath.rect(1.0, offset), S)
+    assert math.remainder(found[0] - offset, math.tau) == pytest.approx(0.0, abs=1e-9)
+    slope = track.best_speed(made, cmath.rect(1.0, offset), S)
+    assert abs(slope.velocity) == pytest.approx(speed, abs=1e-6)
+
+
+def test_a_sure_receiver_tells_speed_from_a_short_stretch_and_an_unsure_one_from_a_long():
+    sure = track.best_speed(path_fixes(2.0, 0.0, 0.0), 1 + 0j, S)
+    unsure = track.best_speed(tuple(replace(f, sigma=2.0) for f in path_fixes(2.0, 0.0, 0.0)), 1 + 0j, S)
+    assert sure.seconds < unsure.seconds <= S.speed_window
+
+
+def test_a_stretch_is_bounded():
+    fixes = ()
+    for i in range(500):
+        fixes = track.kept(fixes, TrackFix(START + i * 50_000, 0j, 1.0, 0j, 0j, 0.0), 30.0)
+        assert len(fixes) <= track.MOST_FIXES
+        assert fixes[-1].utime - fixes[0].utime <= 30 * SECOND
+
+
+# --- origin -------------------------------------------------------------------------------------------------
+
+
+def captured(places, sigma=0.5):
+    capture, origin = OriginCapture(), None
+    for i, (east, north) in enumerate(places):
+        ecef = GEODESY.tangent.to_ecef((east, north, 0.0))
+        capture, origin = capture.add_fix(START + i * SECOND, ecef, sigma, S)
+        if origin is not None:
+            return i, origin
+    return None
+
+
+def test_the_origin_is_the_mean_of_the_first_good_fixes():
+    i, origin = captured([(1.0, 0.0), (-1.0, 0.5), (0.0, -0.5), (0.5, 0.5), (-0.5, -0.5)])
+    assert i == S.origin_fixes - 1
+    assert math.dist(origin.initial_utm, GEODESY.origin.initial_utm) < 1e-3
+
+
+def test_an_origin_is_found_on_the_move_but_not_in_scattered_fixes():
+    assert captured([(20.0 * i, -10.0 * i) for i in range(5)]) is not None
+    wild = [(30.0 * (i % 2), 0.0) for i in range(20)]
+    assert captured(wild) is None
+    assert captured(wild + [(0.0, 0.0)] * 5)[0] == 24
+
+
+# --- bounds -------------------------------------------------------------------------------------------------
+
+
+def test_bounds_are_passed_with_the_stated_probability():
+    horizontal, heading = bounds.factors(1e-3)
+    assert math.exp(-(horizontal**2) / 2) == pytest.approx(1e-3)
+    assert math.erfc(heading / math.sqrt(2)) == pytest.approx(1e-3)
+
+
+def test_the_time_to_the_limit_is_where_the_bound_meets_it():
+    variance, sigma_v = 4.0, 0.3
+    t = bounds.seconds_to_horizontal_limit(variance, 0.0, sigma_v, S)
+    bound = bounds.factors(S.risk)[0] * math.sqrt(variance + bounds.grown(t, sigma_v, S))
+    assert bound == pytest.approx(S.horizontal_limit)
+    assert bounds.seconds_to_horizontal_limit(1e6, 0.0, sigma_v, S) == 0.0
+
+
+def test_an_error_of_yaw_moves_the_base_about_the_antenna():
+    good = gate.evaluate_fix(fix(), S)
+    cov = bounds.covariance(good, 0.0, 3.0 - 4.0j, 0.01, S)
+    assert cov[0] == pytest.approx(good.east_variance + 0.16)
+    assert cov[7] == pytest.approx(good.north_variance + 0.09)
+    assert cov[1] == cov[6] == pytest.approx(0.12)
+    assert (cov[5], cov[11]) == pytest.approx((0.04, 0.03))
+    assert bounds.longest(cov[0], cov[7], cov[1]) == pytest.approx(good.east_variance + 0.25)

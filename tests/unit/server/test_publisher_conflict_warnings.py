@@ -1,0 +1,116 @@
+"""A publisher conflict in the loop: counted, a health warning, logged once, and by default ignored."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from support_samples import START, ScriptedLocalizer, imu, start_core, write_vehicle
+
+from modelserver.config.vehicle_file import load_config
+from modelserver.core.publisher_conflict import CONFLICT_TIMEOUT_NS
+from modelserver.messages import Health, JointSample, JointsSample, SensorHeader
+from modelserver.server.clock import FakeClock
+from modelserver.server.fake_bus import FakeBus
+from modelserver.server.ingress import SensorChannel
+from modelserver.server.loop import Loop, LoopSettings
+from modelserver.wire.codec import decode, encode
+
+
+class Rig:
+    """A loop that detects publisher conflicts, and one IMU."""
+
+    def __init__(self, rule: Any = "ignore"):
+        self.clock = FakeClock(START)
+        self.bus = FakeBus(self.clock)
+        sensors = {"IMU": SensorChannel("imu_t"), "JOINTS": SensorChannel("joints_t")}
+        settings = LoopSettings(20_000_000, sensors, publisher_conflict=rule, shared_channels=frozenset({"JOINTS"}))
+        self.loop = Loop(self.bus, self.clock, start_core(ScriptedLocalizer()), settings)
+        self.number = 0
+
+    def publish(self, count: int = 1, other: str = "", age_s: float = 0.0) -> None:
+        """Publish IMU samples at 100 Hz, with `other` also those of a second publisher."""
+        for _ in range(count):
+            self.clock.advance(0.01)
+            self.number += 1
+            self.put("imu", self.number, self.clock.utime())
+            if other:
+                self.put(other, 90_000 + self.number, self.clock.utime() - 1 - round(age_s * 1e6))
+            self.loop.run_once()
+
+    def put(self, source: str, seq: int, utime: int) -> None:
+        sample = imu(utime, source)
+        header = SensorHeader(utime, source, seq)
+        self.bus.sensors.put("IMU", encode(type(sample)(header, sample.angular_velocity, sample.specific_force)))
+
+    @property
+    def health(self) -> Health:
+        health: Health = decode("health_t", self.bus.get_published("MODELSERVER_HEALTH")[-1])
+        return health
+
+    @property
+    def accepted(self) -> int:
+        accepted: int = self.loop.state.localizer.count  # type: ignore[union-attr]
+        return accepted
+
+
+@pytest.mark.parametrize(("rule", "used"), [("ignore", 57), ("use", 64), ("", 64)])
+def test_given_another_source_on_the_channel_then_the_first_owns_it(
+    rule: str, used: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    rig = Rig(rule)
+    rig.publish(50)
+    rig.publish(7, other="intruder")
+    assert rig.accepted == used
+    counted = rig.loop.state.rejected.get(("IMU", "publisher_conflict"), 0)
+    assert counted == (7 if rule else 0)
+    if not rule:
+        assert rig.loop.state.warnings == {}
+        return
+    text = rig.loop.state.warnings["channel IMU"]
+    assert "sources 'imu' and 'intruder' publish on IMU at once" in text
+    assert ("ignored" in text) is (rule == "ignore")
+    assert sum("intruder" in message for message in caplog.messages) == 1
+    rig.publish(100)
+    assert ("channel IMU", text) in rig.health.warnings
+    # until it has ended for a while
+    rig.publish(CONFLICT_TIMEOUT_NS // 10_000_000 + 1)
+    assert rig.health.warnings == ()
+
+
+def test_given_a_recording_played_beside_the_driver_then_the_warning_suspects_it() -> None:
+    rig = Rig()
+    rig.publish(50)
+    rig.publish(10, other="imu", age_s=86_400.0)
+    # its first two samples could be from a restarted driver
+    assert rig.loop.state.rejected["IMU", "publisher_conflict"] in (8, 9)
+    text = rig.loop.state.warnings["channel IMU"]
+    assert "two publishers with source 'imu'" in text
+    assert "86,400 s old: a recording" in text
+
+
+def test_given_a_name_with_control_characters_then_warning_and_log_are_clean(caplog: pytest.LogCaptureFixture) -> None:
+    rig = Rig()
+    rig.publish(5)
+    rig.publish(5, other="x\nERROR\x1b[31m")
+    assert rig.loop.state.warnings["channel IMU"].isprintable()
+    rig.publish(200)
+    assert all(message.isprintable() for message in caplog.messages)
+
+
+def test_given_several_drivers_of_joints_then_they_share_the_channel() -> None:
+    rig = Rig()
+    for n in range(20):
+        for source in ("arm", "axis"):
+            header = SensorHeader(START + n * 1000, source, n)
+            rig.bus.sensors.put("JOINTS", encode(JointsSample(header, (JointSample("Mounted", 0.1),))))
+    rig.loop.run_once()
+    assert not any(why == "publisher_conflict" for _, why in rig.loop.state.rejected)
+    assert rig.loop.state.traffic["sensor:axis"].count == 20
+
+
+def test_given_the_vehicle_file_then_a_second_publisher_is_ignored_unless_configured_otherwise(tmp_path: Any) -> None:
+    path = write_vehicle(tmp_path)
+    assert load_config(path).sensors.publisher_conflict == "ignore"
+    path.write_text(path.read_text().replace("sensors:\n", "sensors:\n  publisher_conflict: use\n"))
+    assert load_config(path).sensors.publisher_conflict == "use"

@@ -1,0 +1,269 @@
+"""The state file: valid or not used, and never a reason not to start or to wait."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from modelserver.core import Instant
+from modelserver.messages import PersistedState, RestoredState
+from modelserver.server.persistence import state as restart
+from modelserver.server.persistence.origin import write_atomically
+from modelserver.server.persistence.state import (
+    MAX_BYTES,
+    PersistedStateError,
+    StateStore,
+    _pack,
+    decode_state,
+    encode_state,
+    read_boot_id,
+)
+from tests.support_persistence import PERSISTED, POSE, UTIME
+
+NOW = Instant(PERSISTED.monotonic_ns + 7_000_000_000, UTIME + 7_000_000)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> StateStore:
+    return StateStore(tmp_path, "cart", boot="b1")
+
+
+def save(store: StateStore, state: PersistedState = PERSISTED) -> None:
+    store.close(state)
+    assert store.path.is_file()
+
+
+def restore(store: StateStore, now: Instant = NOW) -> RestoredState:
+    return store.restore(now, 20.0, 86400.0)
+
+
+def test_given_a_saved_state_then_it_is_restored_bit_for_bit_with_its_age(store: StateStore) -> None:
+    save(store)
+    assert restore(store) == RestoredState(PERSISTED._replace(boot="b1"), 7.0, "", 20.0, 86400.0)
+    assert [path.name for path in store.path.parent.iterdir()] == ["state-cart.json"]
+
+
+numbers = st.floats(-1e9, 1e9)
+vectors = st.tuples(numbers, numbers, numbers)
+
+
+@given(vectors, vectors, st.lists(st.tuples(st.text(max_size=20), numbers), max_size=8), st.text(max_size=64))
+def test_given_any_finite_numbers_then_they_survive_encoding_bit_for_bit(gyro, place, wheels, vehicle) -> None:
+    pose = POSE._replace(position=place, wheels=tuple(wheels))
+    state = PERSISTED._replace(vehicle=vehicle, gyro_bias=gyro, pose=pose)
+    assert decode_state(encode_state(state)) == state
+    assert decode_state(encode_state(state._replace(pose=None))).pose is None
+
+
+def test_given_no_file_then_the_start_is_cold_with_a_reason(store: StateStore) -> None:
+    assert restore(store) == RestoredState(reason="no state of an earlier run is stored")
+
+
+def test_given_a_file_truncated_at_any_byte_then_it_is_rejected() -> None:
+    whole = encode_state(PERSISTED)
+    for length in range(len(whole)):
+        with pytest.raises(PersistedStateError):
+            decode_state(whole[:length])
+
+
+@given(st.integers(0, len(encode_state(PERSISTED)) - 1), st.integers(1, 255))
+def test_given_any_byte_changed_then_it_is_rejected(at: int, change: int) -> None:
+    data = bytearray(encode_state(PERSISTED))
+    data[at] ^= change
+    with pytest.raises(PersistedStateError):
+        decode_state(bytes(data))
+
+
+@given(st.binary(max_size=300))
+def test_given_any_bytes_then_they_are_rejected(data: bytes) -> None:
+    with pytest.raises(PersistedStateError):
+        decode_state(data)
+
+
+def _content(**change: Any) -> bytes:
+    return _pack({**PERSISTED._asdict(), "pose": POSE._asdict(), **change})
+
+
+def _pose(**change: Any) -> bytes:
+    return _content(pose={**POSE._asdict(), **change})
+
+
+def _nan() -> bytes:
+    text = json.dumps({**PERSISTED._asdict(), "pose": None, "gyro_bias": [float("nan"), 0, 0]}).encode()
+    import hashlib
+
+    return b"modelserver-state 1 " + hashlib.sha256(text).hexdigest().encode() + b"\n" + text + b"\n"
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (b"", "the file is empty"),
+        (b"\0" * 300, "it is no state file"),
+        (b"modelserver-state 1\n{}\n", "it is no state file"),
+        (encode_state(PERSISTED).replace(b" 1 ", b" 2 ", 1), "its format is version '2'; expected 1"),
+        (encode_state(PERSISTED).replace(b"56.25", b"56.26", 1), "the checksum is wrong"),
+        (encode_state(PERSISTED) + b"x", "the checksum is wrong"),
+        (b"x" * (MAX_BYTES + 1), f"the file is larger than {MAX_BYTES} bytes"),
+        (_nan(), "it contains NaN"),
+        (_pack({}), "unknown or missing keys"),
+        (_content(more=1), "unknown or missing keys"),
+        (_content(names=["a"] * 3), "names: expected 15 to 100"),
+        (_content(names=[7] * 21), "names: expected texts"),
+        (_content(gyro_bias=[0, 0]), "gyro_bias: expected 3 numbers"),
+        (_content(gyro_bias=[0, 0, True]), "gyro_bias: expected 3 numbers"),
+        (_content(gyro_bias=[0, 0, 1e300]), "gyro_bias: expected 3 numbers"),
+        (_content(gyro_bias=[0, 0, 10**400]), "gyro_bias: expected 3 numbers"),
+        (_content(covariance=[0.0] * 5), "covariance: expected 441 numbers"),
+        (_content(covariance=[-1.0] * 441), "covariance: negative variance"),
+        (_content(utime=-1), "utime: expected a count"),
+        (_content(utime=1.5), "utime: expected a count"),
+        (_content(vehicle=7), "vehicle: expected a text"),
+        (_content(vehicle="x" * 300), "vehicle: expected a text"),
+        (_content(pose=[]), "unknown or missing keys"),
+        (_pose(latitude_deg=91.0), "latitude 91, longitude -111.18: out of range"),
+        (_pose(attitude=[1.0, 1.0, 0.0, 0.0]), "attitude: expected a unit quaternion"),
+        (_pose(correlated_error_variance=[-1.0, 0.0, 0.0]), "gnss_noise_inflation: out of range"),
+        (_pose(wheels=[["left"]]), "wheels: expected pairs"),
+        (_pose(wheels=[["left", "1"]]), "wheels: expected pairs"),
+        (_pose(wheels={}), "wheels: expected at most 64 pairs"),
+    ],
+)
+def test_given_an_invalid_file_then_the_start_is_cold_with_a_reason(store: StateStore, data: bytes, why: str) -> None:
+    store.path.write_bytes(data)
+    found = restore(store)
+    assert found.state is None
+    assert why in found.reason
+    assert found.reason.isprintable()
+    save(store)
+    assert restore(store).state is not None
+
+
+def test_given_a_directory_or_a_pipe_in_its_place_then_the_start_is_cold(tmp_path: Path) -> None:
+    (tmp_path / "state-cart.json").mkdir()
+    os.mkfifo(tmp_path / "state-van.json")
+    assert "cannot be read: this is a directory" in restore(StateStore(tmp_path, "cart")).reason
+    assert "cannot be read: this is a FIFO" in restore(StateStore(tmp_path, "van")).reason
+
+
+@pytest.mark.parametrize(
+    ("now", "boot", "why", "age"),
+    [
+        (Instant(NOW.monotonic_ns, UTIME - 3_600_000_000), "b1", "3600 s ahead of the clock", 0.0),
+        (Instant(5, UTIME - 86_400_000_000_000), "b2", "ahead of the clock", 0.0),
+        (Instant(PERSISTED.monotonic_ns + 7_200 * 10**9, UTIME + 3_600_000_000), "b1", "was set back by 3600 s", 0.0),
+        (Instant(PERSISTED.monotonic_ns - 1, UTIME + 7_000_000), "b1", "was set back", 0.0),
+        (Instant(PERSISTED.monotonic_ns + 10**9, UTIME + 3_600_000_000), "b1", "", 3600.0),
+        (Instant(PERSISTED.monotonic_ns + 8 * 10**9, UTIME + 7_000_000), "b1", "", 8.0),
+        (Instant(5, UTIME + 7_000_000), "b2", "", 7.0),
+        (Instant(PERSISTED.monotonic_ns, UTIME - 500_000), "b1", "", 0.0),
+    ],
+)
+def test_given_a_clock_then_the_age_is_the_greater_of_two_or_nothing_is_used(
+    tmp_path: Path, now: Instant, boot: str, why: str, age: float
+) -> None:
+    save(StateStore(tmp_path, "cart", boot="b1"))
+    found = restore(StateStore(tmp_path, "cart", boot=boot), now)
+    assert (found.state is None) == bool(why)
+    assert why in found.reason
+    assert found.age == pytest.approx(age)
+
+
+def test_given_a_disk_error_then_it_is_logged_once_and_cleared(
+    store: StateStore, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    caplog.set_level(logging.INFO)
+    with monkeypatch.context() as patched:
+        patched.setattr(restart, "write_atomically", fail)
+        store._write(PERSISTED)
+        store._write(PERSISTED)
+        warning = store.save(PERSISTED)
+    assert "No space left on device" in warning
+    assert "The next start will be cold" in warning
+    assert [record.levelno for record in caplog.records].count(logging.WARNING) == 1
+    save(store)
+    assert "stored again" in caplog.records[-1].getMessage()
+
+
+def test_given_a_disk_that_hangs_then_the_loop_does_not_wait_and_the_newest_is_written(
+    store: StateStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started, go_on, written = threading.Event(), threading.Event(), []
+
+    def slow(path: Path, data: bytes) -> None:
+        started.set()
+        go_on.wait(60)
+        written.append(decode_state(data).utime)
+
+    monkeypatch.setattr(restart, "write_atomically", slow)
+    store.save(PERSISTED)
+    assert started.wait(60)
+    for utime in range(1, 100):
+        assert store.save(PERSISTED._replace(utime=utime)) == ""
+    go_on.set()
+    store.close(PERSISTED._replace(utime=100))
+    assert written in ([UTIME, 100], [UTIME, 99, 100])
+
+
+def test_given_files_of_runs_that_were_killed_while_writing_then_they_are_removed(store: StateStore) -> None:
+    save(store)
+    (store.path.parent / "state-cart.jsonabcd1234").write_bytes(b"torn")
+    (store.path.parent / "state-cartel.json").write_bytes(b"another vehicle's")
+    assert restore(store).state is not None
+    assert sorted(path.name for path in store.path.parent.iterdir()) == ["state-cart.json", "state-cartel.json"]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root writes into read-only directories")
+def test_given_a_read_only_directory_then_the_state_is_not_saved_and_nothing_raises(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    try:
+        store = StateStore(tmp_path, "cart")
+        store.close(PERSISTED)
+        assert restore(store).state is None
+    finally:
+        tmp_path.chmod(0o700)
+
+
+def test_given_a_new_name_then_the_directory_is_on_the_disk_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[str] = []
+    fsync = os.fsync
+
+    def watch(number: int) -> None:
+        synced.append(os.readlink(f"/proc/self/fd/{number}"))
+        fsync(number)
+
+    monkeypatch.setattr(os, "fsync", watch)
+    write_atomically(tmp_path / "a" / "file", b"data")
+    assert synced[-1] == str(tmp_path / "a")
+    assert len(synced) == 2
+
+
+def test_given_this_machine_then_it_has_a_boot_id_or_none() -> None:
+    assert len(read_boot_id()) in (0, 36)
+
+
+def test_given_a_unit_without_proc_sys_then_the_boot_id_comes_from_its_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As systemd's specifier %b writes it, without hyphens; the same id as outside of the unit."""
+    monkeypatch.setattr("modelserver.server.persistence.state.BOOT_ID", tmp_path / "hidden")
+    for named, found in (
+        ("143ed63e8a1544ff9db3048c46529278", "143ed63e-8a15-44ff-9db3-048c46529278"),
+        ("", ""),
+        ("no name", ""),
+    ):
+        monkeypatch.setenv("MODELSERVER_BOOT_ID", named)
+        assert read_boot_id() == found

@@ -1,0 +1,249 @@
+"""The generated reference of the documentation has every setting, channel, type and reason that the code defines."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from enum import Enum
+from pathlib import Path
+from types import ModuleType
+from typing import Any, get_args, get_type_hints
+
+import pytest
+
+from modelserver.config.vehicle_file import VehicleConfig
+from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.estimation.raw.settings import RawSettings
+from modelserver.estimation.settings import FixSettings
+from modelserver.messages import Invalid
+from modelserver.wire.channels import CHANNELS
+from msdrivers.registry import KINDS
+from msdrivers.settings import COMMON_KEYS, SOURCE_FIELD
+from mstools.cli import COMMANDS
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+WORDS_AT_MOST = 26_000
+"""Over all hand-written pages and README, as `wc -w` counts; they were 52,000."""
+
+
+@pytest.fixture(scope="module")
+def pages() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("docs_pages", ROOT / "tools" / "docs_pages.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["docs_pages"] = module  # its dataclasses look themselves up there
+    spec.loader.exec_module(module)
+    return module
+
+
+def read(name: str) -> str:
+    return (DOCS / name).read_text(encoding="utf-8")
+
+
+def read_rows(markdown: str) -> list[list[str]]:
+    """Return the cells of the rows of all tables."""
+    return [
+        [cell.strip() for cell in line.strip("|").split(" | ")] for line in markdown.splitlines() if line[:2] == "| "
+    ]
+
+
+def find_names(markdown: str) -> set[str]:
+    """Return the names in the first columns of all tables."""
+    return {name for row in read_rows(markdown) for name in re.findall(r"`([\w.-]+)`", row[0])}
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+def keys_of(kind: type) -> tuple[set[str], set[str]]:
+    """Return the keys of a section and of those in it, and the names of the sections; not those of another page."""
+    keys, sections = set(), set()
+    for field, hint in get_type_hints(kind).items():
+        inner = [each for each in (hint, *get_args(hint)) if dataclasses.is_dataclass(each)]
+        if field.startswith("__"):
+            continue
+        (sections if inner else keys).add(field)
+        for each in inner:
+            if not issubclass(each, FixSettings):
+                more, parts = keys_of(each)
+                keys, sections = keys | more, sections | parts
+    return keys, sections
+
+
+def test_given_the_page_on_the_vehicle_file_then_it_names_every_key_and_no_other(pages: ModuleType) -> None:
+    keys, sections = keys_of(VehicleConfig)
+    assert keys <= find_names(pages.fill(read("vehicle-file.md"))) <= keys | sections
+
+
+@pytest.mark.parametrize("kind", [FixSettings, FilterSettings, RawSettings])
+def test_given_settings_of_localization_then_their_page_has_each_with_default_and_meaning(
+    pages: ModuleType, kind: type
+) -> None:
+    text = pages.fill(read("filter-settings.md"))
+    table = {row[0].strip("`"): row for row in read_rows(text)}
+    for field in dataclasses.fields(kind):
+        assert len(table[field.name][2]) > 20
+    own = {each.name: each for each in pages.read_settings(kind)}
+    for field in dataclasses.fields(kind):
+        assert ast.literal_eval(own[field.name].default.strip("`").capitalize()) == field.default
+
+
+DEVICES = {
+    "device-gps.md": {"novatel", "nmea"},
+    "device-gx1.md": {"gx1"},
+    "device-wheels.md": {"wheels", "vehicle"},
+    "device-axis.md": {"axis"},
+}
+
+
+@pytest.mark.parametrize("page", DEVICES)
+def test_given_the_page_of_a_device_then_its_tables_have_every_setting(pages: ModuleType, page: str) -> None:
+    found = find_names(pages.fill(read(page)))
+    for name in DEVICES[page]:
+        missing = settings_of(KINDS[name].load().settings) - found - {SOURCE_FIELD, "protocol"}
+        assert not missing, f"{page} lacks {missing}"
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_given_a_setting_of_a_device_then_the_default_is_what_the_code_has(pages: ModuleType, name: str) -> None:
+    kind = KINDS[name].load().settings
+    shown = {each.name: each.default.strip("`") for each in pages.read_settings(kind)}
+    for field in dataclasses.fields(kind):
+        if field.name in shown and type(field.default) in (int, float, bool, str) and field.default != "":
+            text = shown[field.name]
+            assert (text if type(field.default) is str else ast.literal_eval(text.capitalize())) == field.default
+
+
+def settings_of(kind: Any) -> set[str]:
+    """Return the keys of a device's settings and of the sections in them."""
+    found = set()
+    for field, hint in get_type_hints(kind).items():
+        if field.startswith("__") or field in ("about",):
+            continue
+        found.add(field)
+        for each in (hint, *get_args(hint)):
+            if dataclasses.is_dataclass(each) and not issubclass(each, Enum):  # type: ignore[arg-type]
+                found |= settings_of(each)
+    return found
+
+
+def test_given_a_kind_of_device_then_the_overview_names_it_its_faults_and_the_keys_of_lines(pages: ModuleType) -> None:
+    text = pages.fill(read("drivers.md"))
+    found = find_names(text)
+    for kind in KINDS.values():
+        assert kind.name in found
+        assert set(kind.faults) <= found
+        for line in kind.lines:
+            assert {each.name for each in dataclasses.fields(line)} <= found
+    assert all(f"`{key}`" in text for key in COMMON_KEYS)
+
+
+def test_given_a_setting_without_a_description_then_the_build_fails(pages: ModuleType) -> None:
+    with pytest.raises(ValueError, match="port has no description"):
+        pages.settings_table(Bare)
+
+
+def test_given_a_supplement_then_the_code_has_no_description_of_its_own(
+    pages: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used: set[str] = set()
+
+    class Recorder(dict[str, str]):
+        def get(self, key: str, default: Any = None) -> Any:
+            used.add(key)
+            return super().get(key, default)
+
+    supplement = pages.SUPPLEMENT
+    monkeypatch.setattr(pages, "SUPPLEMENT", Recorder(supplement))
+    for path in PAGES:
+        pages.fill(path.read_text(encoding="utf-8"))
+    assert set(supplement) <= used, "described in the code now: remove it from SUPPLEMENT"
+
+
+@dataclasses.dataclass
+class Bare:
+    port: str
+
+
+# --- wire, words, commands --------------------------------------------------------------------------------------------
+
+
+def test_given_the_channels_then_the_wire_page_has_each_with_its_type(pages: ModuleType) -> None:
+    text = pages.fill(read("wire.md"))
+    for channel in CHANNELS:
+        assert f"| `{channel.name}` | [`{channel.type_name}`]" in text
+
+
+def test_given_the_types_then_their_page_has_every_field_with_a_meaning(pages: ModuleType) -> None:
+    for each in pages.read_types():
+        assert each.comment, each.name
+        assert each.members or not each.name.startswith("pose")
+        assert all(member.comment for member in each.members), each.name
+    text = pages.types_page()
+    assert text.count("\n## ") == len(list((ROOT / "lcmtypes").glob("*.lcm")))
+
+
+def test_given_the_reasons_then_the_page_has_each_and_its_words_exist_in_the_code(
+    pages: ModuleType,
+) -> None:
+    text = pages.fill(read("words.md"))
+    for flag in Invalid:
+        assert f"| {flag.value} | `{flag.name}` |" in text
+        assert text.count(f"`{flag.name}`") >= 2, f"{flag.name} has no remedy"
+    pages.check_words(text)
+    with pytest.raises(ValueError, match="no_such_word"):
+        pages.check_words("| `gate`, `no_such_word` | x |")
+
+
+def test_given_the_commands_then_their_page_has_the_help_of_each(pages: ModuleType) -> None:
+    text = pages.cli_page()
+    for name in COMMANDS:
+        assert f"\n## {name}\n" in text
+        assert f"Usage: modelserver {name}" in text
+    assert "\n### calibrate imu\n" in text
+
+
+# --- all pages --------------------------------------------------------------------------------------------------------
+
+
+def test_given_the_pages_then_they_are_short_together() -> None:
+    files = [*PAGES, ROOT / "README.md"]
+    counts = {path.relative_to(ROOT).as_posix(): len(path.read_text(encoding="utf-8").split()) for path in files}
+    assert sum(counts.values()) <= WORDS_AT_MOST, sorted(counts.items(), key=lambda each: -each[1])[:8]
+
+
+@pytest.mark.parametrize("path", [*PAGES, ROOT / "README.md"], ids=lambda path: path.stem)
+def test_given_a_page_then_its_links_and_paths_lead_somewhere(path: Path, pages: ModuleType) -> None:
+    text = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL)
+    generated = {DOCS / place for place in pages.PAGES}
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text):
+        if not target.startswith("https://"):
+            place = (path.parent / target).resolve()
+            assert place.exists() or place in generated, f"{path.name} names {target}"
+    for place in re.findall(r"`((?:tests|benchmarks|examples|config|tools|lcmtypes|modelserver)/[\w./*-]+)`", text):
+        assert list(ROOT.glob(place.rstrip("/"))), f"{path.name} names {place}"
+
+
+@pytest.mark.slow
+def test_given_the_pages_then_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    """`make docs` in .ci/run does the same where mkdocs is not installed here."""
+    pytest.importorskip("material", reason="the extra docs is not installed; make docs")
+    pytest.importorskip("mkdocstrings", reason="the extra docs is not installed; make docs")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", tmp_path / "site"],
+        cwd=ROOT,
+        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "Usage: modelserver query" in (tmp_path / "site" / "reference" / "cli.html").read_text(encoding="utf-8")

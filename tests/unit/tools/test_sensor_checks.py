@@ -1,0 +1,183 @@
+"""Findings on sensors and vehicle file, each from data with just one fault."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import pytest
+
+from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.messages import VALID, Decision, FixType, GpsSample, ImuSample, Mode, Phase, SensorHeader, Verdict
+from mstools.report.findings import collect_findings
+from mstools.report.replay_data import FindingLevel, ReplayData, ReportFinding, SourceTimes, StateSample
+from mstools.report.sensor_motion import SensorMotion, SensorMotionCollector
+
+START = 1_700_000_000
+SECONDS = 120
+TRACK = 0.6
+RADIUS = 6_371_000.0
+
+
+def make_motion(
+    left: float = 1.0,
+    right: float = 1.0,
+    gyro: float = 1.0,
+    degrees: float = 1.0,
+    with_gyro: bool = True,
+    swapped: bool = False,
+) -> SensorMotion:
+    """Return the motion of a drive, alternately 20 s straight and 20 s in a wide turn; factors corrupt the sensors."""
+    collector = SensorMotionCollector((1.0, 0.0, 0.0, 0.0) if with_gyro else None)
+    turns = []
+    x = y = yaw = 0.0
+    for n in range(SECONDS):
+        rate = (0.0, 0.1, 0.0, -0.1)[n // 20 % 4]
+        yaw += rate
+        x, y = x + 2.0 * math.cos(yaw), y + 2.0 * math.sin(yaw)
+        header = SensorHeader((START + n) * 1_000_000, "any")
+        if with_gyro:
+            collector.on_imu(ImuSample(header, angular_velocity=(0.0, 0.0, gyro * rate)))
+        north, east = (math.degrees(each / RADIUS) * degrees for each in (y, x))
+        collector.on_fix(GpsSample(header, FixType.FIX_3D, north, east))
+        speeds = {"left": left * (2.0 - rate * TRACK / 2.0), "right": right * (2.0 + rate * TRACK / 2.0)}
+        if swapped:
+            speeds = {"left": speeds["right"], "right": speeds["left"]}
+        turns += [(header.utime, name, speed, 0.0) for name, speed in speeds.items()]
+    return collector.finish(turns, {"left": TRACK / 2.0, "right": -TRACK / 2.0})
+
+
+def make_data(**more: object) -> ReplayData:
+    states = tuple(
+        StateSample(
+            t, VALID, 0, (t, 0.0, 0.0), 0.0, 0.1, 0.01, speed=1.0, lateral_speed=0.0, yaw_rate=0.0, phase=Phase.ALIGNED
+        )
+        for t in range(100)
+    )
+    given = ReplayData(
+        "cart", "drive.lcm", START * 1_000_000, 100.0, FilterSettings(), states, sensor_motion=make_motion()
+    )
+    return replace(given, **more)  # type: ignore[arg-type]
+
+
+def make_rejections(reason: str, source: str = "wheels", kind: str = "wheel_speed") -> tuple[Decision, ...]:
+    return tuple(Decision(START + n, source, n, kind, Verdict.REJECTED, reason) for n in range(100))
+
+
+def only(given: ReplayData) -> ReportFinding:
+    (found,) = collect_findings(given)
+    return found
+
+
+def titles(found: Iterable[ReportFinding]) -> list[str]:
+    return [each.title for each in found]
+
+
+def test_given_a_good_drive_then_nothing_is_found() -> None:
+    assert collect_findings(make_data()) == []
+    assert collect_findings(make_data(sensor_motion=make_motion(with_gyro=False))) == []
+
+
+@pytest.mark.parametrize("with_gyro", [True, False])
+@pytest.mark.parametrize("name", ["left", "right"])
+def test_given_one_wheel_whose_sign_is_swapped_then_it_is_named(name: str, with_gyro: bool) -> None:
+    found = only(make_data(sensor_motion=make_motion(**{name: -1.0}, with_gyro=with_gyro)))  # type: ignore[arg-type]
+    assert (found.level, found.title) == (FindingLevel.ERROR, f"Wheel {name} counts backward")
+    assert ("gyro" if with_gyro else "course") in found.observation
+
+
+@pytest.mark.parametrize("with_gyro", [True, False])
+def test_given_wheels_whose_names_are_swapped_then_they_are_named(with_gyro: bool) -> None:
+    found = only(make_data(sensor_motion=make_motion(swapped=True, with_gyro=with_gyro)))
+    assert (found.level, found.title) == (FindingLevel.ERROR, "Left and right wheels are swapped")
+
+
+def test_given_a_gyro_that_turns_against_wheels_and_fixes_then_it_is_the_gyro() -> None:
+    assert (
+        only(make_data(sensor_motion=make_motion(gyro=-1.0))).title
+        == "The gyro's rate has the opposite sign of wheels and fixes"
+    )
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_given_a_gyro_in_degrees_then_that_is_found_first(sign: float) -> None:
+    found = collect_findings(
+        make_data(sensor_motion=make_motion(gyro=sign * math.degrees(1.0)), mean_force=(0.0, 0.1, 9.8))
+    )
+    assert found[0].title == "The gyro is in degrees per second"
+    assert not any("mount" in each.title for each in found)
+
+
+def test_given_positions_in_radians_then_the_distances_differ_by_57() -> None:
+    found = only(make_data(sensor_motion=make_motion(degrees=math.radians(1.0))))
+    assert found.title.startswith("Fixes moved 4.")
+    assert "m while the wheels rolled" in found.title
+    assert "radians" in found.advice
+
+
+def test_given_wheels_in_millimeters_then_the_unit_is_named_once_for_each_finding() -> None:
+    given = make_data(
+        sensor_motion=make_motion(1000.0, 1000.0), decisions=make_rejections("range"), sensor_keys={"wheels": "wheels"}
+    )
+    found = collect_findings(given)
+    assert titles(found)[0] == "No sample of sensors.wheels is used: range"
+    assert "mm" in found[0].advice
+    assert "The fastest second is 2030 m/s" in found[0].observation
+    assert "mm per m" in found[1].advice
+
+
+@pytest.mark.parametrize("reason", ["names", "nan"])
+def test_given_wheels_of_other_names_then_both_lists_are_named(reason: str) -> None:
+    found = only(make_data(decisions=make_rejections(reason), sensor_keys={"wheels": "wheels"}, wheel_names=("l", "r")))
+    assert found.title == f"No sample of sensors.wheels is used: {reason}"
+    assert "The log's wheels are l, r; sensors.wheels.frames has left, right." in found.observation
+    assert "sensors.wheels.frames" in found.advice
+
+
+def test_given_an_inertial_unit_without_numbers_then_it_is_not_used() -> None:
+    given = make_data(
+        decisions=make_rejections("nan", "imu", "inertial"),
+        sensor_keys={"imu": "imu"},
+        sensors=(SourceTimes("imu", tuple(range(102))),),
+    )
+    assert titles(collect_findings(given))[0] == "No sample of sensors.imu is used: nan"
+    # a tenth of them may be bad without that
+    many = replace(given, sensors=(SourceTimes("imu", tuple(range(1000))),))
+    assert collect_findings(many) == []
+
+
+def test_given_a_sensor_that_is_used_then_rejected_samples_do_not_make_it_unused() -> None:
+    used = tuple(each._replace(verdict=Verdict.USED, seq=each.seq + 1000) for each in make_rejections(""))
+    given = make_data(decisions=(*make_rejections("nan"), *used), sensor_keys={"wheels": "wheels"})
+    assert collect_findings(given) == []
+
+
+def test_given_a_sensor_of_which_the_log_has_nothing_then_channel_and_remedies_come_first() -> None:
+    given = make_data(snapshots=(), missing_channels=(("imu", "IMU"),), channels=("GPS", "WHEELS"))
+    found = collect_findings(given)
+    assert titles(found) == ["No messages on channel IMU (sensors.imu)", "There was never a state"]
+    assert found[0].observation == "The log has GPS, WHEELS."
+    assert "localization.mode: no_imu" in found[0].advice
+    assert "Probably a consequence" in found[1].observation
+    # a mode without it needs none
+    assert collect_findings(make_data(missing_channels=(("imu", "IMU"),), mode=Mode.NO_IMU)) == []
+
+
+def test_given_a_filter_that_was_restarted_then_checks_of_its_state_are_left_out() -> None:
+    values = {"gyro_bias_x": 1.0}
+    states = tuple(replace(each, values=values, sigmas={"gyro_bias_x": 0.001}) for each in make_data().snapshots)
+    assert titles(collect_findings(make_data(snapshots=states))) == ["Gyro bias about x is far outside its data sheet"]
+    restarts = tuple(
+        Decision(START * 1_000_000 + n, "filter", n, "state", Verdict.RESET, "diverged: too fast") for n in (1, 2, 3)
+    )
+    (found,) = collect_findings(make_data(snapshots=states, decisions=restarts))
+    assert found.title == "The filter was restarted"
+    assert "first of 3 times" in found.observation
+
+
+def test_given_a_drive_then_its_distance_is_known_without_any_state() -> None:
+    assert make_motion().distance_travelled() == pytest.approx(2.0 * SECONDS, rel=0.05)
+    assert SensorMotion().distance_travelled() != SensorMotion().distance_travelled()  # not known
+    distances = make_motion().compare_distances()
+    assert distances.fixes == pytest.approx(distances.wheels, rel=0.1)

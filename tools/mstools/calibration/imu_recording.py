@@ -1,0 +1,118 @@
+"""IMU samples of a log as arrays."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from modelserver.errors import RecordingError, WireError, find_nearest_names
+from modelserver.messages import FixType, GpsSample, ImuSample
+from modelserver.transforms.so3 import Array, Vector3
+from modelserver.wire.codec import decode
+from modelserver.wire.eventlog import LogFile
+from mstools.terminal.output import format_count
+from mstools.terminal.progress import show_progress
+
+_NONE = (math.nan, math.nan, math.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class ImuRecording:
+    """Samples of an IMU in the order of the log; missing values are NaN.
+
+    Attributes
+    ----------
+    utimes : (n,) times of measurement
+    times : (n,) seconds into the log, by arrival
+    rates, forces, fields : (n, 3) rad/s, m/s2, tesla
+    position : latitude and longitude in degrees, ellipsoidal height in meters, of the median fix; None without fixes
+    malformed : messages of the channel that are no IMU samples
+    damage : descriptions of the log's damage
+    """
+
+    utimes: npt.NDArray[np.int64]
+    times: Array
+    rates: Array
+    forces: Array
+    fields: Array
+    position: Vector3 | None
+    malformed: int
+    damage: tuple[str, ...]
+
+
+def read_recording(log: Path, channel: str, gps_channel: str, begin: float, end: float) -> ImuRecording:
+    """Return the samples of a log between two times in seconds since its first message.
+
+    Raises RecordingError where there is no log, nothing on the channel, or no inertial samples; OSError.
+    """
+    rows: list[tuple[float, ...]] = []
+    utimes: list[int] = []
+    fixes: list[Vector3] = []
+    counts: Counter[str] = Counter()
+    bad = 0
+    why = ""
+    with LogFile(log) as recording, show_progress(f"reading {log.name}", recording.size) as show:
+        first: int | None = None
+        for number, event in enumerate(recording):
+            first = event.utime if first is None else first
+            counts[event.channel] += 1
+            if number % 4096 == 0:
+                show(event.end)
+            at = (event.utime - first) * 1e-6
+            if event.channel not in (channel, gps_channel) or not begin <= at < end:
+                continue
+            try:
+                if event.channel == channel:
+                    sample: ImuSample = decode("imu_t", event.data)
+                    rate, force, field = sample.angular_velocity, sample.specific_force, sample.magnetic_field
+                    rows.append((at, *(rate or _NONE), *(force or _NONE), *(field or _NONE)))
+                    utimes.append(sample.header.utime)
+                else:
+                    fix: GpsSample = decode("gps_t", event.data)
+                    if fix.fix_type is not FixType.NONE:
+                        fixes.append((fix.latitude_deg, fix.longitude_deg, fix.height_ellipsoidal))
+            except WireError as error:
+                bad += event.channel == channel
+                why = why or str(error)
+        damage = tuple(map(str, recording.damage))
+    if channel not in counts:
+        near = find_nearest_names(channel, counts)
+        offer = f"nearest: {', '.join(near)}" if near else f"it has: {', '.join(sorted(counts))}"
+        raise RecordingError(f"{log}: no messages on channel {channel}; {offer}; select the IMU's with --channel")
+    if not rows and bad:
+        raise RecordingError(f"{log}: channel {channel} has no imu_t: {why}; select the IMU's with --channel")
+    if not rows:
+        raise RecordingError(
+            f"{log}: none of {format_count(counts[channel], 'message')} on {channel} lies between --from and --to"
+        )
+    table = np.array(rows)
+    return ImuRecording(
+        utimes=np.array(utimes, dtype=np.int64),
+        times=table[:, 0],
+        rates=table[:, 1:4],
+        forces=table[:, 4:7],
+        fields=table[:, 7:10],
+        position=_median_fix(fixes),
+        malformed=bad,
+        damage=damage,
+    )
+
+
+def finite_rows(*columns: Array) -> npt.NDArray[np.bool_]:
+    """Return a mask (n,) of the rows that are finite in all arrays (n, 3)."""
+    return np.asarray(np.isfinite(np.hstack(columns)).all(axis=1), dtype=np.bool_)
+
+
+def _median_fix(fixes: list[Vector3]) -> Vector3 | None:
+    good = [each for each in fixes if math.isfinite(each[0]) and math.isfinite(each[1])]
+    if not good:
+        return None
+    latitude, longitude, _ = sorted(good)[len(good) // 2]
+    heights = [each[2] for each in good if math.isfinite(each[2])]
+    # a kilometer of height changes the field by 0.05 %
+    return (latitude, longitude, float(np.median(heights)) if heights else 0.0)

@@ -1,0 +1,109 @@
+"""Local connections of `modelserver demo`: a vehicle file whose drivers connect to emulated devices."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from modelserver.wire.urls import make_route_command
+from mstools.demo.processes import DemoError
+
+BUS_GROUP = "239.255.76.67"
+"""LCM's multicast group."""
+
+CAN_GROUP = "239.74.163.2"
+"""Multicast group of python-can's bus over UDP."""
+
+PROBE_TIMEOUT_S = 1.0
+"""Timeout for a datagram over loopback, seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class DemoConnections:
+    """LCM provider, vehicle file, and the options of `modelserver emulate` for each of its drivers."""
+
+    url: str
+    vehicle: Path
+    devices: Mapping[str, tuple[str, ...]]
+
+
+def make_connections(vehicle: Path, folder: Path) -> DemoConnections:
+    """Write a copy of a vehicle file into `folder` whose drivers use free local connections.
+
+    Serial ports become pseudo-terminals, CAN buses one bus over UDP, TCP servers those of loopback. Raises OSError, and
+    DemoError if multicast does not work.
+    """
+    content = yaml.safe_load(vehicle.read_text(encoding="utf-8"))
+    content["geometry"] = str(vehicle.parent / content["geometry"])
+    devices: dict[str, tuple[str, ...]] = {}
+    with contextlib.ExitStack() as held:
+        url = f"udpm://{BUS_GROUP}:{_find_multicast_port(BUS_GROUP, held)}?ttl=0"
+        bus = f"{CAN_GROUP}:{_find_multicast_port(CAN_GROUP, held)}"
+        for name, driver in content["drivers"].items():
+            devices[name] = _redirect_driver(driver, folder / name, bus, held)
+            if "dbc" in driver:
+                driver["dbc"] = str(vehicle.parent / driver["dbc"])
+    path = folder / "vehicle.yaml"
+    path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    return DemoConnections(url, path, devices)
+
+
+def _redirect_driver(driver: dict[str, Any], port: Path, bus: str, held: contextlib.ExitStack) -> tuple[str, ...]:
+    """Change a driver's connection; return the options of its emulator."""
+    if "can" in driver:
+        driver |= {"can": bus, "interface": "udp_multicast"}
+        return ("--can", bus)
+    if "port" in driver:
+        driver["port"] = str(port)
+        return ("--pty", "--link", str(port))
+    number = _reserve_port(socket.SOCK_STREAM, held)
+    driver["address"] = f"127.0.0.1:{number}"
+    return ("--tcp", str(number))
+
+
+def _find_multicast_port(group: str, held: contextlib.ExitStack) -> int:
+    """Return a free UDP port of a working multicast group. Raises DemoError if it does not work."""
+    port = _reserve_port(socket.SOCK_DGRAM, held)
+    if not has_multicast_loopback(group, port):
+        raise DemoError(
+            f"multicast does not work on this machine: a datagram to {group} is not received. LCM and CAN over UDP "
+            "need it. Try: sudo ip link set lo up "
+            f"multicast on && sudo {make_route_command(group)}"
+        )
+    return port
+
+
+def _reserve_port(kind: socket.SocketKind, held: contextlib.ExitStack) -> int:
+    """Return a free port, so that two demos, or a demo and a vehicle, do not share a bus.
+
+    It is reserved until `held` is closed, so that the next call returns another.
+    """
+    probe = held.enter_context(socket.socket(socket.AF_INET, kind))
+    # the multicast probe must be able to share it meanwhile
+    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    probe.bind(("127.0.0.1", 0))
+    return int(probe.getsockname()[1])
+
+
+def has_multicast_loopback(group: str, port: int) -> bool:
+    """Return whether a datagram to a multicast group is received on this machine."""
+    word = b"modelserver demo"
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+            receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            receiver.bind(("", port))
+            membership = struct.pack("=4sl", socket.inet_aton(group), socket.INADDR_ANY)
+            receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+            receiver.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+            receiver.settimeout(PROBE_TIMEOUT_S)
+            receiver.sendto(word, (group, port))
+            return receiver.recv(64) == word
+    except OSError:
+        return False

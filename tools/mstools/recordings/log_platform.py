@@ -1,0 +1,232 @@
+"""`Platform` queries answered from an LCM log alone: the knowledge of a client that received all its messages.
+
+The log's POSE, JOINTS and MODEL_SNAPSHOT messages are fed to the client's `Knowledge` up to the instant of the query.
+Reading stops once later samples cover the instant plus a correction window; delayed samples may change it until then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from modelserver.client.local import LocalPlatform
+from modelserver.client.mirror_state import HISTORY_S, MirrorReceiver, MirrorState
+from modelserver.errors import QueryError, RecordingError, WireError
+from modelserver.formats.snapshot import ModelSnapshot, decode_snapshot
+from modelserver.messages import Explanation, MotionAnswer, Policy, PoseAnswer, SnapshotPart
+from modelserver.wire.codec import decode
+from modelserver.wire.eventlog import LogEvent, LogFile
+from modelserver.wire.snapshot import SnapshotAssembler
+
+CORRECTION_WINDOW_US: Final = 2_000_000
+"""Time after an instant in which delayed samples may still change its pose."""
+
+MAX_OUTSIDE_US: Final = 1_000_000
+"""Time by which an instant may lie outside the log."""
+
+TIME_UNITS: Final = (("seconds", 1_000_000.0), ("milliseconds", 1_000.0), ("nanoseconds", 0.001))
+"""Units in which a time may be given by mistake, with the factor to microseconds."""
+
+
+class LogContents(NamedTuple):
+    """Contents of a log: the first complete snapshot, and its time range in microseconds.
+
+    `begin` and `end` are the first and last stamp of a pose, without poses of a snapshot; `base_frame` and `revision`
+    are those of the first pose; `parts` describes an incomplete snapshot.
+    """
+
+    snapshot: ModelSnapshot | None
+    begin: int
+    end: int
+    base_frame: str
+    revision: str
+    parts: str
+
+
+class LogPlatform(LocalPlatform):
+    """`Platform` on a log. `prefix` is that of the channels.
+
+    `model` replaces the log's own geometry. Raises RecordingError where geometry is missing, OSError.
+    """
+
+    def __init__(self, path: Path, prefix: str = "", model: ModelSnapshot | None = None):
+        self.where = f"in {path}"
+        self._path = path
+        self._prefix = prefix
+        self._given_model = model
+        with LogFile(path) as log:
+            self._contents = scan_log(log, prefix, with_geometry=model is None)
+        if model is not None and self._contents.base_frame:
+            base = self._contents.base_frame
+            self._given_model = ModelSnapshot(
+                model.vehicle, model.model, base, base, model.history_s, model.joints_channel
+            )
+        elif model is None and self._contents.snapshot is None:
+            raise RecordingError(self._no_geometry())
+        self._read: tuple[MirrorState, int] = (MirrorState(), 0)
+
+    def _no_geometry(self) -> str:
+        channel = f"{self._prefix}MODEL_SNAPSHOT"
+        found = f"only {self._contents.parts}" if self._contents.parts else "none"
+        return (
+            f"{self._path}: no complete geometry on {channel} ({found}), which queries need. The service publishes it "
+            "since version 0.1.0, at its start and every few seconds: record all its channels for some seconds "
+            "(lcm-logger FILE); for a channel prefix use --prefix. Or give the geometry with --model FILE"
+        )
+
+    @property
+    def revision(self) -> str:
+        """Geometry revision of the first pose, empty without poses."""
+        return self._contents.revision
+
+    def read_state(self) -> tuple[MirrorState, int]:
+        """Return what was known at the time that was read up to."""
+        return self._read
+
+    def parse_time(self, text: str) -> int | None:
+        """Return the utime of a time like `+12.5`, seconds from the log's start; None for other texts."""
+        if not text.startswith("+"):
+            return None
+        try:
+            return self._contents.begin + round(float(text[1:]) * 1e6)
+        except (ValueError, OverflowError):
+            return None
+
+    def get_pose(
+        self,
+        frame_of_interest: str,
+        frame_of_reference: str,
+        *,
+        at: int = 0,
+        policy: Policy = Policy.INTERPOLATED,
+        wait_ms: int = 0,
+    ) -> PoseAnswer:
+        """Return the pose of one frame in another; `at` 0 is the latest in the log, with LATEST that as of `at`."""
+        self.read_for(at, policy, (frame_of_interest, frame_of_reference))
+        return super().get_pose(frame_of_interest, frame_of_reference, at=at, policy=policy)
+
+    def get_motion(
+        self,
+        frame_of_interest: str,
+        frame_of_reference: str,
+        *,
+        expressed_in: str = "",
+        at: int = 0,
+        policy: Policy = Policy.INTERPOLATED,
+        wait_ms: int = 0,
+    ) -> MotionAnswer:
+        """Return the motion of one frame in another; as `get_pose`."""
+        self.read_for(at, policy, (frame_of_interest, frame_of_reference))
+        return super().get_motion(
+            frame_of_interest, frame_of_reference, expressed_in=expressed_in, at=at, policy=policy
+        )
+
+    def explain(
+        self,
+        frame_of_interest: str,
+        frame_of_reference: str,
+        *,
+        at: int = 0,
+        policy: Policy = Policy.INTERPOLATED,
+        wait_ms: int = 0,
+    ) -> Explanation:
+        """Return the pose of one frame in another with its provenance; as `get_pose`."""
+        self.read_for(at, policy, (frame_of_interest, frame_of_reference))
+        return super().explain(frame_of_interest, frame_of_reference, at=at, policy=policy)
+
+    def read_for(self, at: int, policy: Policy, ends: Sequence[str]) -> None:
+        """Read the messages that a query at a time needs. Raises RecordingError for a time outside the log."""
+        begin, end = self._contents.begin, self._contents.end
+        if at and not begin - MAX_OUTSIDE_US <= at <= end + MAX_OUTSIDE_US:
+            raise RecordingError(self._describe_outside(at, begin, end))
+        snapshot = self._given_model or self._contents.snapshot
+        knowledge = MirrorReceiver(self._prefix, snapshot, self._given_model is not None)
+        channels = set(knowledge.channels)
+        # messages on these channels may be of any age
+        any_age = (f"{self._prefix}MODEL_SNAPSHOT", f"{self._prefix}JOINTS_HELD")
+        history_us = round((HISTORY_S if snapshot is None else snapshot.history_s) * 1e6)
+        oldest = (at or end) - history_us
+        now = 0
+        with LogFile(self._path) as log:
+            for event in log:
+                if event.channel not in channels:
+                    continue
+                stamp = _stamp(event)
+                if event.channel not in any_age and stamp < oldest:
+                    continue
+                if at and policy is Policy.LATEST and stamp > at:
+                    continue
+                if at and stamp > at and self._is_complete(knowledge.state, at, ends, history_us):
+                    break
+                now = event.utime
+                knowledge.feed(event.channel, event.data, now)
+                channels.update(knowledge.channels)
+        self._read = (knowledge.state, now)
+
+    def _is_complete(self, known: MirrorState, at: int, ends: Sequence[str], history_us: int) -> bool:
+        """Return whether later messages cannot change the result at a time."""
+        view = known.view
+        if view is None:
+            return False
+        newest = max([track.last for track in view.joints.tracks.values()], default=0)
+        newest = max(newest, view.history.last if len(view.history) else 0)
+        try:
+            covered = view.is_covered(at + CORRECTION_WINDOW_US, *ends)
+        except QueryError:
+            covered = True
+        return (covered and newest > at + CORRECTION_WINDOW_US) or newest > at + history_us // 2
+
+    def _describe_outside(self, at: int, begin: int, end: int) -> str:
+        away = f"{(begin - at) * 1e-6:.3f} s before" if at < begin else f"{(at - end) * 1e-6:.3f} s after"
+        text = (
+            f"{at} is {away} the log {self._path}, which extends from {begin} to {end}, in microseconds since 1970 "
+            f"({(end - begin) * 1e-6:.1f} s)"
+        )
+        for unit, factor in TIME_UNITS:
+            if begin <= at * factor <= end + MAX_OUTSIDE_US:
+                return f"{text}; this looks like {unit}"
+        return f"{text}; +SECONDS counts from its start"
+
+
+def _stamp(event: LogEvent) -> int:
+    """Return the stamp of a pose, snapshot part or joints (after the fingerprint), 0 for a message too short."""
+    return int.from_bytes(event.data[8:16], "big", signed=True) if len(event.data) >= 16 else 0
+
+
+def scan_log(log: LogFile, prefix: str, with_geometry: bool = True) -> LogContents:
+    """Return the contents of a log; `with_geometry` includes the snapshot."""
+    first: PoseAnswer | None = None
+    poses: list[int] = []
+    sent: list[int] = []
+    parts = ""
+    snapshot: ModelSnapshot | None = None
+    assembler, received = SnapshotAssembler(), set[tuple[str, int]]()
+    for event in log:
+        try:
+            if event.channel == f"{prefix}POSE":
+                first = first or decode("pose_transform_t", event.data)
+                _extend(poses, _stamp(event))
+            elif event.channel == f"{prefix}MODEL_SNAPSHOT":
+                _extend(sent, _stamp(event))
+                if not with_geometry or snapshot is not None:
+                    continue
+                part: SnapshotPart = decode("model_snapshot_t", event.data)
+                received.add((part.model_revision, part.part))
+                count = sum(revision == part.model_revision for revision, _ in received)
+                parts = f"{count} of {part.parts} parts of revision {part.model_revision}"
+                whole = assembler.add(part)
+                snapshot = None if whole is None else decode_snapshot(whole)
+        except WireError:
+            continue
+    begin, end = poses or sent or [0, 0]
+    transformation = None if first is None else first.transformation
+    base_frame, revision = (
+        ("", "") if transformation is None else (transformation.frame_of_interest, transformation.model_revision)
+    )
+    return LogContents(snapshot, begin, end, base_frame, revision, parts)
+
+
+def _extend(span: list[int], stamp: int) -> None:
+    """Extend a time range, empty or of two, by a stamp."""
+    span[:] = [min(span[0], stamp), max(span[1], stamp)] if span else [stamp, stamp]

@@ -1,0 +1,455 @@
+"""Data of a replay for its report: states, fixes, decisions, samples of each source, and findings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from itertools import pairwise
+
+import numpy as np
+
+from modelserver.earth.geodesy import Geodesy, GeodesyError
+from modelserver.estimation import fix_quality as gate
+from modelserver.estimation.filter.measurements.gps import WANDER, shares
+from modelserver.estimation.filter.settings import FilterSettings
+from modelserver.estimation.interface import Localizer
+from modelserver.messages import (
+    Decision,
+    Event,
+    GpsSample,
+    ImuSample,
+    Invalid,
+    Mode,
+    NavigationState,
+    Origin,
+    Phase,
+    SensorHeader,
+    WheelsSample,
+)
+from modelserver.server.vehicle import Vehicle
+from modelserver.transforms import so3
+from modelserver.transforms.pose import Pose
+from modelserver.transforms.so3 import Array, Vector3
+from mstools.report.sensor_motion import SensorMotion, SensorMotionCollector
+
+SNAPSHOT_PERIOD_US = 200_000
+"""Shortest interval between two stored states, microseconds."""
+
+FROZEN_S = 1.0
+"""Seconds without change until an IMU counts as frozen."""
+
+
+@dataclass(frozen=True, slots=True)
+class StateSample:
+    """State at `t` seconds from the log's first event. Unknown values are nan, None or empty.
+
+    Attributes
+    ----------
+    position : of the antenna (without a receiver of the rolling frame), east, north, up of the origin in World:UTM
+    yaw : of the rolling frame from grid east
+    sigma, yaw_sigma : longest axis of the horizontal position, m, and heading
+    horizontal_protection_level, heading_protection_level : of the pose
+    speed, lateral_speed, yaw_rate : forward and to the left, m/s; rad/s
+    values, sigmas : the filter's states by name
+    """
+
+    t: float
+    invalid: Invalid
+    epoch: int
+    position: Vector3 | None = None
+    yaw: float = math.nan
+    sigma: float = math.nan
+    yaw_sigma: float = math.nan
+    horizontal_protection_level: float = math.nan
+    heading_protection_level: float = math.nan
+    speed: float = math.nan
+    lateral_speed: float = math.nan
+    yaw_rate: float = math.nan
+    is_stationary: bool = False
+    mode: Mode | None = None
+    phase: Phase | None = None
+    values: Mapping[str, float] = field(default_factory=dict)
+    sigmas: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class FixRecord:
+    """A fix and the decision on it. `position` as in `StateSample`; None without a position or origin.
+
+    `residual` is fix minus antenna, east and north, m, including the time-correlated error; `velocity` the antenna's,
+    m/s; None where the fix was not compared. `verdict` is empty where nothing was decided.
+    """
+
+    t: float
+    position: Vector3 | None
+    sigma: float
+    verdict: str
+    reason: str
+    residual: tuple[float, float] | None = None
+    velocity: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class WheelComparison:
+    """Measured speed of a wheel at `t` and the one expected from the state, m/s along its rolling direction."""
+
+    t: float
+    name: str
+    measured: float
+    expected: float
+
+
+@dataclass(frozen=True, slots=True)
+class SourceTimes:
+    """Sorted times of the samples of one source, seconds from the log's first event."""
+
+    name: str
+    times: tuple[float, ...]
+
+    @property
+    def period(self) -> float:
+        """Median interval between two samples, seconds; nan with fewer than two."""
+        return float(np.median(np.diff(self.times))) if len(self.times) > 1 else math.nan
+
+    def find_gaps(self, factor: float = 3.0, min_gap: float = 0.2) -> list[tuple[float, float]]:
+        """Return begin and end of the intervals longer than `factor` periods and `min_gap` seconds."""
+        limit = max(factor * self.period, min_gap)
+        return [(a, b) for a, b in pairwise(self.times) if b - a > limit]
+
+
+@dataclass(frozen=True)
+class ReplayData:
+    """All data of a report. Times `t` are seconds from `first_utime`, the log's first event.
+
+    Attributes
+    ----------
+    settings, mode : of the filter, at the start
+    mean_force : mean specific force along the vehicle's axes, m/s2; None without IMU
+    frozen : intervals in which the IMU repeated one sample
+    missing_channels : sensors of the vehicle file without messages in the log: key under sensors, channel
+    channels : those of the log
+    sensor_keys : sensor of each source
+    wheel_names : names of the wheels in the log
+    sensor_motion : motion by each sensor alone
+    """
+
+    vehicle: str
+    log: str
+    first_utime: int
+    duration: float
+    settings: FilterSettings
+    snapshots: tuple[StateSample, ...] = ()
+    fixes: tuple[FixRecord, ...] = ()
+    decisions: tuple[Decision, ...] = ()
+    wheels: tuple[WheelComparison, ...] = ()
+    sensors: tuple[SourceTimes, ...] = ()
+    rejected: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    mean_force: Vector3 | None = None
+    frozen: tuple[tuple[float, float], ...] = ()
+    origin: Origin | None = None
+    mode: Mode = Mode.FULL
+    missing_channels: tuple[tuple[str, str], ...] = ()
+    channels: tuple[str, ...] = ()
+    sensor_keys: Mapping[str, str] = field(default_factory=dict)
+    wheel_names: tuple[str, ...] = ()
+    sensor_motion: SensorMotion = field(default_factory=SensorMotion)
+
+    def count_samples(self, source: str) -> int:
+        """Return the number of samples from a source."""
+        return next((len(each.times) for each in self.sensors if each.name == source), 0)
+
+    def to_seconds(self, utime: int) -> float:
+        """Return a utime as seconds from the log's first event."""
+        return (utime - self.first_utime) * 1e-6
+
+
+class ReplayCollector:
+    """Collects `ReplayData`: pass `on_sample` and `on_decision` to the offline run, then call `finish`."""
+
+    def __init__(self, vehicle: Vehicle):
+        """Start for a vehicle, which must have localization."""
+        assert vehicle.rig is not None
+        self._vehicle = vehicle
+        self._rig = vehicle.rig
+        gps = self._rig.gps_frame
+        self._X_rolling_antenna = self._rig.pose(gps) if gps else Pose.identity()
+        self._decisions: list[Decision] = []
+        self._states: list[tuple[int, StateSample]] = []
+        self._fixes: list[GpsSample] = []
+        self._wheel_speeds: list[tuple[int, str, float, float]] = []
+        self._previous_wheels: dict[str, WheelsSample] = {}
+        self._times: dict[str, list[int]] = {}
+        self._forces = np.zeros(3)
+        self._force_count = 0
+        self._imu: ImuSample | None = None
+        self._same_since = 0
+        self._frozen: list[tuple[int, int]] = []
+        self._origin: Origin | None = None
+        self._last_snapshot_utime = 0
+        self._keys: dict[str, str] = {}
+        self._wheel_names: dict[str, None] = {}
+        self._sensor_motion = SensorMotionCollector(
+            self._rig.pose(self._rig.imu_frame).wxyz if self._rig.imu_frame else None
+        )
+
+    def on_decision(self, decision: Decision) -> None:
+        """Store a decision."""
+        self._decisions.append(decision)
+
+    def on_sample(self, sample: Event, localizer: Localizer) -> None:
+        """Store a sample, and every SNAPSHOT_PERIOD_US the state after it."""
+        header = getattr(sample, "header", None)
+        if not isinstance(header, SensorHeader):
+            return
+        name = type(sample).__name__.removesuffix("Sample").lower()
+        self._times.setdefault(header.source or name, []).append(header.utime)
+        if name in ("gps", "imu", "wheels"):
+            self._keys[header.source] = name
+        if isinstance(sample, GpsSample):
+            self._fixes.append(sample)
+            self._sensor_motion.on_fix(sample)
+        elif isinstance(sample, WheelsSample):
+            self._add_wheels(sample)
+        elif isinstance(sample, ImuSample):
+            self._add_imu(sample)
+            self._sensor_motion.on_imu(sample)
+        # before the first state, the estimate at the sample has the reasons why there is none
+        utime = localizer.utime or header.utime
+        if utime >= self._last_snapshot_utime + SNAPSHOT_PERIOD_US or 0 < utime < self._last_snapshot_utime:
+            self._last_snapshot_utime = utime
+            self._states.append((utime, self._snapshot(utime, localizer)))
+
+    def finish(
+        self,
+        log: str,
+        first_utime: int,
+        last_utime: int,
+        rejected: Mapping[tuple[str, str], int],
+        channels: Collection[str] = (),
+    ) -> ReplayData:
+        """Return the data. `channels`: those of the log."""
+
+        def seconds(utime: int) -> float:
+            return (utime - first_utime) * 1e-6
+
+        snapshots = tuple(replace(each, t=seconds(utime)) for utime, each in self._states)
+        self._close_frozen()
+        return ReplayData(
+            vehicle=self._vehicle.config.vehicle,
+            log=log,
+            first_utime=first_utime,
+            duration=max(seconds(last_utime), 0.0),
+            settings=self._vehicle.config.localization.filter,
+            snapshots=snapshots,
+            fixes=self._evaluate_fixes(first_utime, snapshots),
+            decisions=tuple(self._decisions),
+            wheels=self._compare_wheels(first_utime, snapshots),
+            sensors=tuple(
+                SourceTimes(name, tuple(sorted(map(seconds, times)))) for name, times in sorted(self._times.items())
+            ),
+            rejected=dict(rejected),
+            mean_force=self._mean_force(),
+            frozen=tuple((seconds(a), seconds(b)) for a, b in self._frozen),
+            origin=self._origin,
+            mode=self._vehicle.config.localization.initial_mode,
+            missing_channels=self._find_missing_channels(channels),
+            channels=tuple(sorted(channels)),
+            sensor_keys=dict(self._keys),
+            wheel_names=tuple(self._wheel_names),
+            sensor_motion=self._sensor_motion.finish(self._wheel_speeds, self._lateral_offsets()),
+        )
+
+    def _find_missing_channels(self, channels: Collection[str]) -> tuple[tuple[str, str], ...]:
+        config = self._vehicle.config
+        sensors = config.sensors
+        named = [("gps", sensors.gps), ("imu", sensors.imu), ("wheels", sensors.wheels)]
+        return tuple(
+            (key, f"{config.lcm.channel_prefix}{each.channel}")
+            for key, each in (*named, *((f"aiding.{name}", each) for name, each in sensors.aiding.items()))
+            if each is not None and f"{config.lcm.channel_prefix}{each.channel}" not in channels
+        )
+
+    def _lateral_offsets(self) -> dict[str, float]:
+        return {name: self._rig.pose(frame).xyz[1] for name, frame in self._rig.wheel_frames.items()}
+
+    # --- during the replay ----------------------------------------------------------------------------------
+
+    def _snapshot(self, utime: int, localizer: Localizer) -> StateSample:
+        estimate = localizer.estimate(utime)
+        if estimate.origin is not None:
+            self._origin = estimate.origin
+        place, yaw, sigma, yaw_sigma = None, math.nan, math.nan, math.nan
+        if estimate.utm is not None:
+            place = (estimate.utm @ self._X_rolling_antenna).xyz
+            yaw = _yaw(estimate.utm)
+            if estimate.covariance is not None:
+                P = np.array(estimate.covariance).reshape(6, 6)
+                sigma = math.sqrt(max(float(np.linalg.eigvalsh(P[:2, :2])[-1]), 0.0))
+                yaw_sigma = math.sqrt(max(float(P[5, 5]), 0.0))
+        known = StateSample(
+            t=0.0,
+            invalid=estimate.invalid,
+            epoch=estimate.pose_epoch,
+            position=place,
+            yaw=yaw,
+            sigma=sigma,
+            yaw_sigma=yaw_sigma,
+            horizontal_protection_level=estimate.horizontal_protection_level,
+            heading_protection_level=estimate.heading_protection_level,
+        )
+        state = localizer.navigation(utime)
+        return known if state is None else _add_state(known, state)
+
+    def _add_wheels(self, sample: WheelsSample) -> None:
+        before = self._previous_wheels.get(sample.header.source)
+        self._previous_wheels[sample.header.source] = sample
+        earlier = {wheel.name: wheel.travel for wheel in before.wheels} if before is not None else {}
+        dt = (sample.header.utime - before.header.utime) * 1e-6 if before is not None else 0.0
+        for wheel in sample.wheels:
+            self._wheel_names[wheel.name] = None
+            way = wheel.travel - earlier.get(wheel.name, math.nan)
+            speed = way / dt if 0.0 < dt < 1.0 and math.isfinite(way) else wheel.speed
+            if math.isfinite(speed) and math.isfinite(wheel.steering):
+                middle = sample.header.utime - round(0.5e6 * min(dt, 1.0))
+                self._wheel_speeds.append((middle, wheel.name, speed, wheel.steering))
+
+    def _add_imu(self, sample: ImuSample) -> None:
+        if sample.specific_force is not None and all(map(math.isfinite, sample.specific_force)):
+            self._forces += sample.specific_force
+            self._force_count += 1
+        before = self._imu
+        same = (
+            before is not None
+            and before.specific_force == sample.specific_force
+            and before.angular_velocity == sample.angular_velocity
+        )
+        if not same:
+            self._close_frozen()
+            self._same_since = sample.header.utime
+        self._imu = sample
+
+    def _close_frozen(self) -> None:
+        last = self._imu
+        if last is not None and last.header.utime - self._same_since > FROZEN_S * 1e6:
+            self._frozen.append((self._same_since, last.header.utime))
+            self._same_since = last.header.utime
+
+    def _mean_force(self) -> Vector3 | None:
+        if not self._force_count or not self._rig.imu_frame:
+            return None
+        x, y, z = (self._forces / self._force_count).tolist()
+        return so3.rotate(self._rig.pose(self._rig.imu_frame).wxyz, (x, y, z))
+
+    # --- at the end -----------------------------------------------------------------------------------------
+
+    def _evaluate_fixes(self, first_utime: int, snapshots: tuple[StateSample, ...]) -> tuple[FixRecord, ...]:
+        settings = self._vehicle.config.localization.filter
+        decided = {(d.source, d.utime, d.seq): d for d in self._decisions if d.kind == "gps_position"}
+        geodesy = None if self._origin is None else Geodesy(self._origin)
+        times = np.array([each.t for each in snapshots])
+        found = []
+        for sample in self._fixes:
+            header = sample.header
+            fix = gate.evaluate_fix(sample, settings)
+            place = None
+            if geodesy is not None and not isinstance(fix, str):
+                height = 0.0 if math.isnan(fix.height) else fix.height
+                try:
+                    utm = geodesy.utm_from_geodetic(fix.latitude_deg, fix.longitude_deg, height)
+                    place = geodesy.to_relative_utm(utm)
+                except GeodesyError:
+                    place = None
+            decision = decided.get((header.source, header.utime, header.seq))
+            t = (header.utime - first_utime) * 1e-6
+            off = velocity = None
+            if decision is not None and decision.dof == 2 and not isinstance(fix, str):
+                before = _latest(snapshots, times, t)
+                if before is not None and math.isfinite(before.speed):
+                    east = shares(fix.east_variance, sample.fix_type, settings)[1]
+                    north = shares(fix.north_variance, sample.fix_type, settings)[1]
+                    a, b = (before.values.get(name, 0.0) for name in WANDER[:2])
+                    off = (decision.residual[0] + east * a, decision.residual[1] + north * b)
+                    velocity = _velocity(before)
+            sigma = math.nan if isinstance(fix, str) else fix.sigma
+            verdict, reason = ("", "") if decision is None else (decision.verdict.name.lower(), decision.reason)
+            # without decisions, as in raw mode, the gate's own
+            if not decided and isinstance(fix, str):
+                verdict, reason = "rejected", fix
+            found.append(FixRecord(t, place, sigma, verdict, reason, off, velocity))
+        return tuple(found)
+
+    def _compare_wheels(self, first_utime: int, snapshots: tuple[StateSample, ...]) -> tuple[WheelComparison, ...]:
+        known = [each for each in snapshots if math.isfinite(each.speed)]
+        if not known or not self._wheel_speeds:
+            return ()
+        times = [each.t for each in known]
+        speeds, turns = [each.speed for each in known], [each.yaw_rate for each in known]
+        contacts = {name: self._rig.pose(frame).xyz for name, frame in self._rig.wheel_frames.items()}
+        at = (np.array([utime for utime, _, _, _ in self._wheel_speeds]) - first_utime) * 1e-6
+        found = []
+        for t, v, w, (_, name, measured, steering) in zip(
+            at.tolist(),
+            np.interp(at, times, speeds).tolist(),
+            np.interp(at, times, turns).tolist(),
+            self._wheel_speeds,
+            strict=True,
+        ):
+            if name in contacts and times[0] <= t <= times[-1]:
+                x, y, _ = contacts[name]
+                expected = math.cos(steering) * (v - w * y) + math.sin(steering) * w * x
+                found.append(WheelComparison(t, name, measured, expected))
+        return tuple(found)
+
+
+def _add_state(snapshot: StateSample, state: NavigationState) -> StateSample:
+    variances = np.diagonal(np.array(state.covariance).reshape(len(state.names), -1))
+    return replace(
+        snapshot,
+        speed=state.linear_velocity[0],
+        lateral_speed=state.linear_velocity[1],
+        yaw_rate=state.angular_velocity[2],
+        is_stationary=state.stationary,
+        mode=state.mode,
+        phase=state.phase,
+        values=dict(zip(state.names, state.values, strict=True)),
+        sigmas=dict(zip(state.names, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True)),
+    )
+
+
+def _velocity(snapshot: StateSample) -> tuple[float, float]:
+    c, s = math.cos(snapshot.yaw), math.sin(snapshot.yaw)
+    return (c * snapshot.speed - s * snapshot.lateral_speed, s * snapshot.speed + c * snapshot.lateral_speed)
+
+
+def _latest(snapshots: tuple[StateSample, ...], times: Array, t: float) -> StateSample | None:
+    """Return the newest snapshot at or before `t` that is not older than a second."""
+    index = int(np.searchsorted(times, t, side="right")) - 1
+    return snapshots[index] if index >= 0 and t - times[index] < 1.0 else None
+
+
+def _yaw(pose: Pose) -> float:
+    x, y, _ = so3.rotate(pose.wxyz, (1.0, 0.0, 0.0))
+    return math.atan2(y, x)
+
+
+__all__ = ["FixRecord", "ReplayCollector", "ReplayData", "SourceTimes", "StateSample", "WheelComparison"]
+
+
+class FindingLevel(IntEnum):
+    """Severity of a finding, worst first."""
+
+    ERROR = 0
+    WARNING = 1
+    NOTE = 2
+
+
+@dataclass(frozen=True, slots=True)
+class ReportFinding:
+    """One finding: a headline, the observation, and what to do."""
+
+    level: FindingLevel
+    title: str
+    observation: str
+    advice: str

@@ -1,0 +1,277 @@
+"""Checks of sensors and vehicle file from the raw sensor data: the causes of the other findings. Pure.
+
+A sensor's unit, sign or name is verified by comparison with another sensor (sensor_motion.py), without any pose:
+turn rates of gyro, wheels and fixes; distances of wheels and fixes; mean specific force against gravity.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from modelserver.messages import Mode, Verdict
+from mstools.report.replay_data import FindingLevel, ReplayData, ReportFinding
+from mstools.report.sensor_motion import TurnRateComparison, compare_turn_rates
+from mstools.terminal.output import format_count
+
+UNUSED_SHARE = 0.05
+"""Share of accepted samples up to which a sensor counts as unused."""
+
+MIN_SAMPLES = 20
+"""Fewest samples to evaluate a sensor."""
+
+MODES_WITHOUT = {
+    "gps": (Mode.NO_GPS, Mode.DEAD_RECKONING),
+    "imu": (Mode.NO_IMU,),
+    "wheels": (Mode.NO_WHEELS, Mode.RAW),
+}
+"""Modes that need no such sensor."""
+
+DEGREES_PER_RADIAN = math.degrees(1.0)
+
+
+# --- missing and unused sensors -----------------------------------------------------------------------------
+
+
+def check_missing(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find sensors of the vehicle file without messages in the log."""
+    for key, channel in data.missing_channels:
+        if data.mode in MODES_WITHOUT.get(key, ()):
+            continue
+        remedy = "Correct the channel."
+        if key in MODES_WITHOUT:
+            mode = MODES_WITHOUT[key][0].name.lower()
+            remedy = f"Correct the channel; a vehicle without it: localization.mode: {mode}, or no sensors.{key}."
+        yield ReportFinding(
+            FindingLevel.ERROR,
+            f"No messages on channel {channel} (sensors.{key})",
+            f"The log has {', '.join(data.channels)}." if data.channels else "The log is empty.",
+            remedy,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _UnusedSource:
+    """A source whose samples are rejected: how many, and the most frequent reason."""
+
+    key: str
+    source: str
+    count: int
+    reason: str
+
+
+def _find_unused(data: ReplayData) -> Iterable[_UnusedSource]:
+    used: dict[str, set[tuple[int, int]]] = {}
+    refused: dict[str, dict[tuple[int, int], str]] = {}
+    for each in data.decisions:
+        stamp = (each.utime, each.seq)
+        if each.verdict is Verdict.REJECTED:
+            refused.setdefault(each.source, {}).setdefault(stamp, each.reason or "rejected")
+        else:
+            used.setdefault(each.source, set()).add(stamp)
+    for source, key in sorted(data.sensor_keys.items()):
+        reasons = refused.get(source, {})
+        good = len(used.get(source, ()))
+        if key == "imu":  # accepted IMU samples have no decisions
+            good = data.count_samples(source) - len(reasons)
+        if len(reasons) >= MIN_SAMPLES and good <= UNUSED_SHARE * (good + len(reasons)):
+            ((reason, _),) = Counter(reasons.values()).most_common(1)
+            yield _UnusedSource(key, source, len(reasons), reason)
+
+
+def check_unused(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find sensors whose samples are nearly all rejected."""
+    for each in _find_unused(data):
+        if each.reason == "gate":
+            continue  # fixes disagree with the motion; other checks find which of them is wrong
+        yield ReportFinding(
+            FindingLevel.ERROR,
+            f"No sample of sensors.{each.key} is used: {each.reason}",
+            f"Of {format_count(each.count, 'sample')} of {each.source} with a decision, nearly all were "
+            f"rejected. {_describe(data, each)}".strip(),
+            _advice(data, each),
+        )
+
+
+def _has_wrong_names(data: ReplayData, each: _UnusedSource) -> bool:
+    return (
+        each.key == "wheels"
+        and each.reason in ("names", "nan")
+        and bool(data.wheel_names)
+        and not set(data.wheel_names) & set(data.sensor_motion.lateral_offsets)
+    )
+
+
+def _describe(data: ReplayData, each: _UnusedSource) -> str:
+    if _has_wrong_names(data, each):
+        return (
+            f"The log's wheels are {', '.join(data.wheel_names)}; sensors.wheels.frames has "
+            f"{', '.join(data.sensor_motion.lateral_offsets)}."
+        )
+    if each.key == "wheels" and each.reason == "range":
+        fastest = max(
+            (abs(v) for wheel in data.sensor_motion.wheels.values() for v in wheel.values()), default=math.nan
+        )
+        return (
+            f"The fastest second is {fastest:.0f} m/s; localization.filter.maximum_speed is "
+            f"{data.settings.maximum_speed:.0f}."
+        )
+    return ""
+
+
+def _advice(data: ReplayData, each: _UnusedSource) -> str:
+    if _has_wrong_names(data, each):
+        return "Use the log's names in sensors.wheels.frames, or the vehicle file's names in the driver."
+    if each.reason == "range":
+        return {
+            "wheels": "Check the units in the driver: speed in m/s and travel in m; mm are too large by 1000.",
+            "gps": "Check the units in the driver: latitude and longitude in degrees, height in meters.",
+            "imu": "Check the units in the driver: rates in rad/s, specific force in m/s2.",
+        }.get(each.key, "Check the units in the driver: meters, seconds and radians.")
+    return {
+        "nan": "The driver sends non-finite numbers: check its input.",
+        "no_fix": "The receiver reports no fix: check its antenna, and localization.filter.minimum_fix_type.",
+        "too_old": "Its stamps are older than localization.filter.horizon: check its clock and its latency.",
+        "future": "Its clock is ahead of the others': synchronize them.",
+        "sigma": "The sigma of its fixes is above localization.filter.maximum_sigma.",
+    }.get(each.reason, "docs/localization.md explains the reason.")
+
+
+# --- units, signs and names: comparison of sensors ----------------------------------------------------------
+
+
+def check_gyro_unit(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find a gyro in degrees per second: its rate is 57 times that of wheels or fixes."""
+    found = _compare_gyro(data)
+    if found is None:
+        return
+    compared, what = found
+    # wheels that skid through a turn measure up to twice its rate
+    if abs(compared.correlation) > 0.5 and 0.4 * DEGREES_PER_RADIAN < compared.ratio < 1.6 * DEGREES_PER_RADIAN:
+        yield ReportFinding(
+            FindingLevel.ERROR,
+            "The gyro is in degrees per second",
+            f"Its rate is {compared.ratio:.0f} times that of the {what}; a radian is 57.3 degrees.",
+            "angular_velocity must be in rad/s: check the unit in its driver.",
+        )
+
+
+def _compare_gyro(data: ReplayData) -> tuple[TurnRateComparison, str] | None:
+    """Return the gyro's turn rate compared with the wheels', else with the fixes'; None without enough turns."""
+    raw = data.sensor_motion
+    for compared, what in (
+        (compare_turn_rates(raw.gyro, raw.wheel_turn_rate), "wheels"),
+        (raw.compare_with_course(raw.gyro), "fixes"),
+    ):
+        if compared is not None and abs(compared.correlation) > 0.5:
+            return compared, what
+    return None
+
+
+def check_wheel_signs(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find wheels with reversed sign or swapped sides."""
+    raw = data.sensor_motion
+    by_gyro = bool(raw.gyro)
+    reference, what = (raw.gyro, "gyro") if by_gyro else (raw.course_turn_rate(), "fixes' course")
+    if _is_gyro_in_degrees(data):
+        reference = {second: math.radians(rate) for second, rate in raw.gyro.items()}
+    against, straight = raw.count_opposed(reference)
+    if straight >= 5 and against > 0.8 * straight:
+        backward = raw.backward_wheels()
+        names = ", ".join(backward)
+        yield ReportFinding(
+            FindingLevel.ERROR,
+            f"Wheel {names} counts backward" if backward else "The wheels of one side count backward",
+            f"In {against} of {straight} s of straight driving by the {what} the sides rolled against each other.",
+            "Reverse the sign of this wheel in its driver, or swap its encoder's two channels.",
+        )
+        return
+    course = raw.compare_with_course(raw.wheel_turn_rate)
+    compared = compare_turn_rates(raw.gyro, raw.wheel_turn_rate) if by_gyro else course
+    if compared is None or compared.correlation > -0.6:
+        return
+    if by_gyro and course is not None and course.correlation > 0.6:
+        yield ReportFinding(
+            FindingLevel.ERROR,
+            "The gyro's rate has the opposite sign of wheels and fixes",
+            f"Its correlation with the wheels' turn rate is {compared.correlation:.2f}).",
+            "Check the IMU mount in the geometry, and the signs in its driver.",
+        )
+        return
+    yield ReportFinding(
+        FindingLevel.ERROR,
+        "Left and right wheels are swapped",
+        f"The correlation of the wheels' turn rate with the {what} is {compared.correlation:.2f}).",
+        "Swap the names in sensors.wheels.frames, or the frames' positions in the geometry; where all wheels count "
+        "backward, reverse their signs.",
+    )
+
+
+def _is_gyro_in_degrees(data: ReplayData) -> bool:
+    return any(True for _ in check_gyro_unit(data))
+
+
+def check_distances(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find fixes and wheels with different distances: one of them has the wrong unit."""
+    found = data.sensor_motion.compare_distances()
+    if found.wheels < 20.0:
+        return
+    ratio = found.wheels / max(found.fixes, 1e-6)
+    if 1.0 / 3.0 < ratio < 3.0:
+        return
+    if 0.5 * DEGREES_PER_RADIAN < ratio < 2.0 * DEGREES_PER_RADIAN:
+        advice = "57 is degrees per radian: the receiver's driver must give degrees, not radians."
+    elif 500.0 < ratio < 2000.0:
+        advice = "1000 is mm per m: the wheels' driver must give travel in m and speed in m/s."
+    else:
+        advice = "Check the units in both drivers (m and m/s; degrees), and the wheel radius."
+    yield ReportFinding(
+        FindingLevel.ERROR,
+        f"Fixes moved {found.fixes:.1f} m while the wheels rolled {found.wheels:.0f} m",
+        f"The distance by the wheels is {ratio:.3g} times that of the fixes.",
+        advice,
+    )
+
+
+def check_gravity(data: ReplayData) -> Iterable[ReportFinding]:
+    """Find a mean specific force that differs from gravity in size or direction."""
+    if data.mean_force is None:
+        return
+    x, y, z = data.mean_force
+    angle = math.atan2(math.hypot(x, y), z)
+    size = math.sqrt(x * x + y * y + z * z)
+    if angle > 0.3 and size > 0.5:
+        yield ReportFinding(
+            FindingLevel.ERROR,
+            "The IMU mount differs from the geometry",
+            f"The mean specific force is {math.degrees(angle):.0f} degrees from the vehicle's up axis "
+            f"({x:+.1f}, {y:+.1f}, {z:+.1f} m/s2 along x, y, z).",
+            "Run modelserver calibrate imu LOG -c VEHICLE: it finds the mount that fits.",
+        )
+    if 0.9 < size < 1.1:
+        yield ReportFinding(
+            FindingLevel.ERROR,
+            "Specific force is in g, not in m/s2",
+            f"Its mean is {size:.2f}, and gravity is 9.81 m/s2.",
+            "specific_force must be in m/s2: check the unit in its driver.",
+        )
+    elif not 9.0 < size < 10.6:
+        yield ReportFinding(
+            FindingLevel.ERROR,
+            f"The mean specific force is {size:.2f} m/s2",
+            "In any drive its mean is close to 9.8 m/s2.",
+            "Check the unit of acceleration in the driver, and whether gravity is subtracted there.",
+        )
+
+
+SENSOR_CHECKS: tuple[Callable[[ReplayData], Iterable[ReportFinding]], ...] = (
+    check_missing,
+    check_unused,
+    check_gravity,
+    check_gyro_unit,
+    check_wheel_signs,
+    check_distances,
+)
+"""In the order of the report."""

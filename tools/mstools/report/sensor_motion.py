@@ -1,0 +1,259 @@
+"""Motion by each sensor alone, before any localization: turn rates of gyro, wheels and fixes, and distances.
+
+All series are means over one second, so that a long log needs little memory. Two series are compared by their
+correlation sum(ab) / sqrt(sum(a^2) sum(b^2)) and by the ratio of their root mean squares: a ratio of 57 reveals degrees
+instead of radians, a negative correlation a swapped sign. Fixes give a course from steps of at least COURSE_STEP_M.
+Limits: without turns or straight driving there is nothing to compare, and the comparison is None.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from modelserver.messages import FixType, GpsSample, ImuSample
+from modelserver.transforms import so3
+from modelserver.transforms.so3 import Quaternion
+
+EARTH_RADIUS = 6_371_000.0
+
+COURSE_STEP_M = 8.0
+"""Distance between two fixes that give a course, meters: several times their noise."""
+
+MAX_STEP_S = 30.0
+"""Longest duration of such a step, seconds."""
+
+DISTANCE_STEP_M = 10.0
+"""Distance by the wheels over which it is compared with the fixes', meters."""
+
+
+@dataclass(frozen=True, slots=True)
+class TurnRateComparison:
+    """Two turn rates compared: number of values, correlation, and ratio of the first's size to the second's."""
+
+    count: int
+    correlation: float
+    ratio: float
+
+
+@dataclass(frozen=True, slots=True)
+class DistanceComparison:
+    """Distance by wheels and by fixes over the same sections, meters."""
+
+    wheels: float
+    fixes: float
+
+
+@dataclass(frozen=True)
+class SensorMotion:
+    """Rates and speeds per second, each second by its number since 1970.
+
+    `gyro` is the measured turn rate about the vehicle's up axis, rad/s. `wheels` are the speeds of the wheels that the
+    vehicle file names, m/s; `lateral_offsets` their positions to the left, meters. `fixes` are seconds since 1970, east
+    and north, meters.
+    """
+
+    gyro: Mapping[int, float] = field(default_factory=dict)
+    wheels: Mapping[str, Mapping[int, float]] = field(default_factory=dict)
+    lateral_offsets: Mapping[str, float] = field(default_factory=dict)
+    fixes: tuple[tuple[float, float, float], ...] = ()
+
+    @property
+    def wheel_turn_rate(self) -> dict[int, float]:
+        """Turn rate by the wheels of both sides, rad/s; empty without two sides."""
+        left = self._side_speed(1.0)
+        right = self._side_speed(-1.0)
+        track = self._track()
+        if track < 0.05:
+            return {}
+        return {second: (right[second] - left[second]) / track for second in left.keys() & right.keys()}
+
+    def course_changes(self) -> list[tuple[float, float, float]]:
+        """Return begin, end (s since 1970) and angle (rad) of each change of the fixes' course."""
+        places = _thin_by_distance(self.fixes, COURSE_STEP_M)
+        courses = [
+            (0.5 * (a[0] + b[0]), math.atan2(b[2] - a[2], b[1] - a[1]))
+            for a, b in pairwise(places)
+            if 0.0 < b[0] - a[0] < MAX_STEP_S
+        ]
+        turns = []
+        for (t, before), (u, after) in pairwise(courses):
+            turn = math.remainder(after - before, 2.0 * math.pi)
+            # reversing looks like a turn on the spot
+            if 0.0 < u - t < MAX_STEP_S and abs(turn) < 2.0:
+                turns.append((t, u, turn))
+        return turns
+
+    def course_turn_rate(self) -> dict[int, float]:
+        """Return the turn rate of the fixes' course, rad/s."""
+        rates: dict[int, float] = {}
+        for t, u, turn in self.course_changes():
+            rates.update(dict.fromkeys(range(math.floor(t), math.floor(u)), turn / (u - t)))
+        return rates
+
+    def compare_with_course(self, rates: Mapping[int, float]) -> TurnRateComparison | None:
+        """Compare a turn rate with the fixes' course, integrated over the intervals of its changes."""
+        found: dict[int, tuple[float, float]] = {}
+        for t, u, turn in self.course_changes():
+            known = [rates[second] for second in range(math.floor(t), math.ceil(u)) if second in rates]
+            if known:
+                found[math.floor(t)] = (sum(known) / len(known) * (u - t), turn)
+        return _compare([a for a, _ in found.values()], [b for _, b in found.values()], 0.1)
+
+    def count_opposed(
+        self, turn: Mapping[int, float], min_speed: float = 0.3, max_turn_rate: float = 0.05
+    ) -> tuple[int, int]:
+        """Return the seconds of straight driving in which the sides rolled against each other, and all of them."""
+        left, right = self._side_speed(1.0), self._side_speed(-1.0)
+        moving = [
+            second
+            for second in left.keys() & right.keys()
+            if min(abs(left[second]), abs(right[second])) > min_speed
+            and abs(turn.get(second, math.inf)) < max_turn_rate
+        ]
+        return sum(left[second] * right[second] < 0.0 for second in moving), len(moving)
+
+    def backward_wheels(self) -> list[str]:
+        """Return the wheels that roll backward on average."""
+        found = []
+        for name, speeds in self.wheels.items():
+            moving = [each for each in speeds.values() if abs(each) > 0.3]
+            if moving and sum(moving) < 0.0:
+                found.append(name)
+        return sorted(found)
+
+    def compare_distances(self) -> DistanceComparison:
+        """Return the distances by wheels and by fixes, over sections of `DISTANCE_STEP_M` by the wheels."""
+        rolled = fixed = 0.0
+        speed = self._mean_speed()
+        way = 0.0
+        anchor: tuple[float, float, float] | None = None
+        before = -math.inf
+        for each in self.fixes:
+            if anchor is None or each[0] - before > 5.0:
+                anchor, way, before = each, 0.0, each[0]
+                continue
+            seconds = range(math.floor(before), math.floor(each[0]) + 1)
+            known = [speed[second] for second in seconds if second in speed]
+            if known:
+                way += sum(known) / len(known) * (each[0] - before)
+            before = each[0]
+            if way >= DISTANCE_STEP_M:
+                rolled += way
+                fixed += math.hypot(each[1] - anchor[1], each[2] - anchor[2])
+                anchor, way = each, 0.0
+        return DistanceComparison(rolled, fixed)
+
+    def distance_travelled(self) -> float:
+        """Return the distance by the wheels, without them by the fixes, meters; nan without both."""
+        if self.wheels:
+            return sum(self._mean_speed().values())
+        places = _thin_by_distance(self.fixes, COURSE_STEP_M)
+        if not places:
+            return math.nan
+        return sum(math.hypot(b[1] - a[1], b[2] - a[2]) for a, b in pairwise(places))
+
+    def _mean_speed(self) -> dict[int, float]:
+        """Return the mean magnitude of the wheels' speeds."""
+        seconds: dict[int, list[float]] = {}
+        for speeds in self.wheels.values():
+            for second, value in speeds.items():
+                seconds.setdefault(second, []).append(abs(value))
+        return {second: sum(values) / len(values) for second, values in sorted(seconds.items())}
+
+    def _wheel_names(self, sign: float) -> list[str]:
+        return [name for name, left in self.lateral_offsets.items() if left * sign > 0.05 and name in self.wheels]
+
+    def _track(self) -> float:
+        sides = [[self.lateral_offsets[name] for name in self._wheel_names(sign)] for sign in (1.0, -1.0)]
+        if not all(sides):
+            return 0.0
+        return sum(sides[0]) / len(sides[0]) - sum(sides[1]) / len(sides[1])
+
+    def _side_speed(self, sign: float) -> dict[int, float]:
+        names = self._wheel_names(sign)
+        if not names:
+            return {}
+        known = set.intersection(*(set(self.wheels[name]) for name in names))
+        return {second: sum(self.wheels[name][second] for name in names) / len(names) for second in known}
+
+
+def compare_turn_rates(first: Mapping[int, float], second: Mapping[int, float]) -> TurnRateComparison | None:
+    """Compare two turn rates second by second; None without enough turns."""
+    shared = sorted(first.keys() & second.keys())
+    return _compare([first[each] for each in shared], [second[each] for each in shared], 0.02)
+
+
+def _compare(first: Sequence[float], second: Sequence[float], least: float) -> TurnRateComparison | None:
+    """Compare turns; None with fewer than 12, or where the second series is smaller than `least` (rms)."""
+    a, b = np.array(first), np.array(second)
+    squares = float((a * a).sum()), float((b * b).sum())
+    if len(a) < 12 or not squares[0] > 0.0 or squares[1] < len(b) * least * least:
+        return None
+    return TurnRateComparison(
+        len(a), float((a * b).sum()) / math.sqrt(squares[0] * squares[1]), math.sqrt(squares[0] / squares[1])
+    )
+
+
+class SensorMotionCollector:
+    """Accumulates the sensor data of a `SensorMotion`. `q_base_imu` rotates the IMU's axes to the vehicle's."""
+
+    def __init__(self, q_base_imu: Quaternion | None):
+        self._q_base_imu = q_base_imu
+        self._rates: dict[int, tuple[float, int]] = {}
+        self._positions: list[tuple[float, float, float]] = []
+
+    def on_imu(self, sample: ImuSample) -> None:
+        """Add the rate about the vehicle's up axis."""
+        rate = sample.angular_velocity
+        if self._q_base_imu is None or rate is None or not all(map(math.isfinite, rate)):
+            return
+        up = so3.rotate(self._q_base_imu, rate)[2]
+        second = sample.header.utime // 1_000_000
+        total, count = self._rates.get(second, (0.0, 0))
+        self._rates[second] = (total + up, count + 1)
+
+    def on_fix(self, sample: GpsSample) -> None:
+        """Add the position of a fix."""
+        latitude, longitude = sample.latitude_deg, sample.longitude_deg
+        if sample.fix_type is not FixType.NONE and math.isfinite(latitude) and math.isfinite(longitude):
+            self._positions.append((sample.header.utime * 1e-6, latitude, longitude))
+
+    def finish(self, turns: Iterable[tuple[int, str, float, float]], sides: Mapping[str, float]) -> SensorMotion:
+        """Return the result. `turns` are utime, wheel, speed and steering; steered samples are left out."""
+        sums: dict[str, dict[int, tuple[float, int]]] = {}
+        for utime, name, speed, steering in turns:
+            if name in sides and abs(steering) < 0.02:
+                wheel = sums.setdefault(name, {})
+                total, count = wheel.get(utime // 1_000_000, (0.0, 0))
+                wheel[utime // 1_000_000] = (total + speed, count + 1)
+        return SensorMotion(
+            gyro={second: total / count for second, (total, count) in self._rates.items()},
+            wheels={
+                name: {second: total / count for second, (total, count) in wheel.items()}
+                for name, wheel in sums.items()
+            },
+            lateral_offsets=dict(sides),
+            fixes=self._fixes(),
+        )
+
+    def _fixes(self) -> tuple[tuple[float, float, float], ...]:
+        if not self._positions:
+            return ()
+        _, latitude, longitude = self._positions[0]
+        scale = math.radians(1.0) * EARTH_RADIUS
+        across = math.cos(math.radians(latitude))
+        return tuple((t, scale * across * (b - longitude), scale * (a - latitude)) for t, a, b in self._positions)
+
+
+def _thin_by_distance(places: Iterable[tuple[float, float, float]], least: float) -> list[tuple[float, float, float]]:
+    """Return the positions that are at least `least` from the one before."""
+    found: list[tuple[float, float, float]] = []
+    for each in places:
+        if not found or math.hypot(each[1] - found[-1][1], each[2] - found[-1][2]) >= least:
+            found.append(each)
+    return found

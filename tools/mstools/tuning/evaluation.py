@@ -1,0 +1,302 @@
+"""Evaluation of filter settings on a log by withheld fixes: error, likelihood and consistency.
+
+Two runs, each through the daemon's own core, as `modelserver replay` does it:
+
+- `half`: every second fix is withheld.
+- `outage`: all fixes are withheld in gaps that begin at 20, 40, 60 and 80 % of the time, each of 30 s, or of a tenth of
+  the time where the log is shorter than 300 s.
+
+At the stamp of each withheld fix the antenna's position is predicted from the samples that arrived before. Error: the
+horizontal distance to the fix. Likelihood: log density of the fix's residual y under the innovation covariance
+S = H P H' + R, as a mixture (1 - e) N(y; 0, S) + e N(y; 0, S + sigma_o^2 I) with a share e of outliers, so that a
+single outlier does not dominate the mean. Limits: fixes with time-correlated errors are not independent, so that the
+likelihoods compare settings on one log and are no absolute measure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from modelserver.config.vehicle_file import load_config
+from modelserver.earth.geodesy import Geodesy, GeodesyError
+from modelserver.errors import RecordingError
+from modelserver.estimation import fix_quality as gate
+from modelserver.estimation.filter import fixes, kalman, motion
+from modelserver.estimation.filter.localizer import FilterLocalizer
+from modelserver.estimation.filter.measurements.base import Scene
+from modelserver.estimation.filter.measurements.gps import GpsPosition
+from modelserver.estimation.interface import Localizer
+from modelserver.estimation.modes import ModeLocalizer
+from modelserver.messages import Decision, GpsSample, Phase
+from modelserver.server.offline import OfflineRun, TrackRow
+from modelserver.server.vehicle import Vehicle, load_vehicle
+from modelserver.transforms.so3 import Array
+from modelserver.wire.eventlog import LogEvent, LogFile
+from mstools.report.consistency import Consistency, compute_consistency
+
+SKIP_S = 30.0
+"""Seconds from the first fix that are not scored, for heading alignment; at most a quarter of the log."""
+
+GAP_S = 30.0
+GAP_STARTS = (0.2, 0.4, 0.6, 0.8)
+
+OUTLIER_SHARE = 0.02
+"""Share of fixes that are assumed to be outliers."""
+
+OUTLIER_SIGMA = 10.0
+"""Additional error of outliers, meters."""
+
+UNKNOWN_LOG_DENSITY = math.log(OUTLIER_SHARE / (2.0 * math.pi * 100.0**2))
+"""Log-likelihood of a withheld fix without an estimate: uniform within about 100 m."""
+
+Part = Literal["half", "outage"]
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationResult:
+    """Result of a run. `likelihood` is the mean log density of the withheld fixes, 1/m2; `rmse` in meters.
+
+    `gaps` are the mean errors over the last 2 s of each gap, meters; empty in `half`. `consistency` is that of the
+    measurements that were not withheld.
+    """
+
+    scored: int
+    missing: int
+    likelihood: float
+    rmse: float
+    gaps: tuple[float, ...] = ()
+    consistency: tuple[Consistency, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationJob:
+    """One run: `settings` are those of localization.filter that differ from the vehicle file."""
+
+    log: Path
+    config: Path
+    part: Part
+    settings: tuple[tuple[str, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class UsableFixes:
+    """The good fixes of a log, with their index on the channel (`numbers`)."""
+
+    samples: tuple[GpsSample, ...]
+    numbers: tuple[int, ...]
+
+    @property
+    def begin(self) -> int:
+        """Stamp of the first fix, utime."""
+        return self.samples[0].header.utime
+
+    @property
+    def seconds(self) -> float:
+        """Seconds from the first to the last fix."""
+        return (self.samples[-1].header.utime - self.begin) * 1e-6
+
+    @property
+    def gap(self) -> float:
+        """Length of a gap, seconds."""
+        return min(GAP_S, 0.1 * self.seconds)
+
+    def gap_of(self, sample: GpsSample) -> int | None:
+        """Return the number of the gap that contains a fix."""
+        t = (sample.header.utime - self.begin) * 1e-6
+        return next((n for n, s in enumerate(GAP_STARTS) if s * self.seconds < t <= s * self.seconds + self.gap), None)
+
+    def withheld(self, part: Part) -> list[int]:
+        """Return the indices of the withheld fixes."""
+        if part == "half":
+            return list(range(1, len(self.samples), 2))
+        return [n for n, sample in enumerate(self.samples) if self.gap_of(sample) is not None]
+
+
+@lru_cache(maxsize=4)
+def load(config: Path) -> Vehicle:
+    """Return the vehicle of a vehicle file."""
+    return load_vehicle(load_config(config), str(config))
+
+
+def gps_channel(vehicle: Vehicle) -> str:
+    """Return the channel of the GPS receiver. Raises RecordingError where none is configured."""
+    gps = vehicle.config.sensors.gps
+    if gps is None:
+        raise RecordingError(
+            f"{vehicle.config.vehicle}: no GPS is configured (sensors.gps); tune scores settings by withheld fixes"
+        )
+    return f"{vehicle.config.lcm.channel_prefix}{gps.channel}"
+
+
+def stated_sigma(sample: GpsSample, vehicle: Vehicle) -> float:
+    """Return the stated sigma of a good fix, meters; nan for a rejected one."""
+    fix = gate.evaluate_fix(sample, vehicle.config.localization.filter)
+    return math.nan if isinstance(fix, str) else fix.sigma
+
+
+@lru_cache(maxsize=4)
+def read_fixes(log: Path, config: Path) -> UsableFixes:
+    """Return the good fixes of a log. Raises RecordingError where there are too few, OSError."""
+    vehicle = load(config)
+    channel = gps_channel(vehicle)
+    codec = vehicle.sensor_channels()[channel]
+    settings = vehicle.config.localization.filter
+    samples, numbers, count = [], [], 0
+    with LogFile(log) as recording:
+        for event in recording:
+            if event.channel != channel:
+                continue
+            count += 1
+            try:
+                sample = codec.decode(event.data)
+            except ValueError:
+                continue
+            if isinstance(sample, GpsSample) and not isinstance(gate.evaluate_fix(sample, settings), str):
+                samples.append(sample)
+                numbers.append(count - 1)
+    if len(samples) < 20:
+        raise RecordingError(
+            f"{log}: {len(samples)} of {count} messages on {channel} are good fixes; at least 20 are needed to "
+            "withhold some of them; record a drive of a few minutes"
+        )
+    order = sorted(range(len(samples)), key=lambda n: samples[n].header.utime)
+    return UsableFixes(tuple(samples[n] for n in order), tuple(numbers[n] for n in order))
+
+
+def evaluate(job: EvaluationJob) -> EvaluationResult:
+    """Run the localization over a log with withheld fixes, and score it.
+
+    Raises ValueError for settings out of range, RecordingError where there are too few fixes, OSError.
+    """
+    vehicle = apply_settings(load(job.config), dict(job.settings))
+    known = read_fixes(job.log, job.config)
+    withheld = known.withheld(job.part)
+    skip = known.begin + round(1e6 * min(SKIP_S, 0.25 * known.seconds))
+    decisions: list[Decision] = []
+    gps = vehicle.config.sensors.gps
+    assert gps is not None
+    with LogFile(job.log) as recording:
+        events = _drop_withheld(recording, gps_channel(vehicle), {known.numbers[n] for n in withheld})
+        replay = OfflineRun(vehicle, events, gps.frame, on_decision=decisions.append)
+        scored = [known.samples[n] for n in withheld]
+        errors, densities, marks = [], [], []
+        for sample, row in zip(scored, replay.rows([s.header.utime for s in scored]), strict=True):
+            if job.part == "half" and sample.header.utime < skip:
+                continue
+            errors.append(_error(row, sample, replay.localizer))
+            densities.append(_log_density(replay.localizer, sample))
+            marks.append(sample)
+    good = [error for error in errors if math.isfinite(error)]
+    return EvaluationResult(
+        len(errors),
+        len(errors) - len(good),
+        sum(densities) / len(densities) if densities else math.nan,
+        math.sqrt(sum(error * error for error in good) / len(good)) if good else math.inf,
+        _gap_ends(known, marks, errors) if job.part == "outage" else (),
+        tuple(compute_consistency(decisions)),
+    )
+
+
+def apply_settings(vehicle: Vehicle, settings: Mapping[str, float]) -> Vehicle:
+    """Return the vehicle with changed filter settings. Raises ValueError for one out of range."""
+    if not settings:
+        return vehicle
+    localization = vehicle.config.localization
+    settled = replace(localization.filter, **dict[str, Any](settings))
+    return replace(vehicle, config=replace(vehicle.config, localization=replace(localization, filter=settled)))
+
+
+def _drop_withheld(events: Iterable[LogEvent], channel: str, withheld: set[int]) -> Iterator[LogEvent]:
+    """Yield the events without the withheld fixes, which are identified by their index on the channel."""
+    number = -1
+    for event in events:
+        if event.channel == channel:
+            number += 1
+            if number in withheld:
+                continue
+        yield event
+
+
+def _error(row: TrackRow, sample: GpsSample, localizer: Localizer | None) -> float:
+    if localizer is None or not math.isfinite(row.easting):
+        return math.nan
+    origin = localizer.estimate(sample.header.utime).origin
+    if origin is None:
+        return math.nan
+    height = sample.height_ellipsoidal if math.isfinite(sample.height_ellipsoidal) else 0.0
+    try:
+        east, north, _ = Geodesy(origin).utm_from_geodetic(sample.latitude_deg, sample.longitude_deg, height)
+    except GeodesyError:
+        return math.nan
+    return math.hypot(row.easting - east, row.northing - north)
+
+
+def _log_density(localizer: Localizer | None, sample: GpsSample) -> float:
+    """Return the log density of a withheld fix under the filter's prediction."""
+    if not isinstance(localizer, ModeLocalizer) or not isinstance(localizer.active, FilterLocalizer):
+        return UNKNOWN_LOG_DENSITY
+    setup, utime = localizer.active.setup, sample.header.utime
+    state = localizer.active.defer_estimate(utime).state
+    measurement = next((each for each in setup.measurements.get(GpsSample, ()) if isinstance(each, GpsPosition)), None)
+    if state.phase is not Phase.ALIGNED or measurement is None:
+        return UNKNOWN_LOG_DENSITY
+    state = motion.caught_up(setup, motion.at(setup, state, utime))
+    nav = state.nav
+    assert nav is not None
+    seconds = (utime - state.fixed.utime) * 1e-6 if state.fixed is not None else 0.0
+    nav = fixes.widened(setup, nav, state.restless, seconds)
+    scene = Scene(nav, setup.layout, setup.settings, setup.rig, state.site, state.geodesy, state.standing)
+    compared = measurement.compare(scene, sample)
+    if isinstance(compared, str):
+        return UNKNOWN_LOG_DENSITY
+    S = kalman.innovation(nav.covariance, compared.jacobian, compared.noise)
+    return mixture_log_density(compared.residual, S)
+
+
+def mixture_log_density(residual: Array, S: Array) -> float:
+    """Return the log density of a residual (m) under its covariance S (m, m), with a share of outliers."""
+    right = math.log(1.0 - OUTLIER_SHARE) + _normal_log_density(residual, S)
+    wrong = math.log(OUTLIER_SHARE) + _normal_log_density(residual, S + np.eye(len(S)) * OUTLIER_SIGMA**2)
+    return float(np.logaddexp(right, wrong))
+
+
+def _normal_log_density(residual: Array, S: Array) -> float:
+    sign, size = np.linalg.slogdet(S)
+    if sign <= 0.0:
+        return -math.inf
+    return -0.5 * (kalman.statistic(residual, S) + float(size) + len(residual) * math.log(2.0 * math.pi))
+
+
+def _gap_ends(known: UsableFixes, marks: list[GpsSample], errors: list[float]) -> tuple[float, ...]:
+    """Return the mean error over the last 2 s of each gap; a gap without an estimate at its end is left out."""
+    ends = []
+    for number, start in enumerate(GAP_STARTS):
+        end = known.begin + round(1e6 * (start * known.seconds + known.gap))
+        last = [
+            error
+            for sample, error in zip(marks, errors, strict=True)
+            if known.gap_of(sample) == number and sample.header.utime > end - 2_000_000 and math.isfinite(error)
+        ]
+        if last:
+            ends.append(sum(last) / len(last))
+    return tuple(ends)
+
+
+__all__ = [
+    "EvaluationJob",
+    "EvaluationResult",
+    "UsableFixes",
+    "apply_settings",
+    "evaluate",
+    "load",
+    "mixture_log_density",
+    "read_fixes",
+    "stated_sigma",
+]
