@@ -19,11 +19,11 @@ from benchmarks.support import free_url, measure_interleaved, print_verdict, run
 from modelserver.client.remote import Platform
 from modelserver.core.answers import DeferredAnswer
 from modelserver.errors import NoServerError
+from modelserver.estimation.history import History
 from modelserver.geometry import names
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType
 from modelserver.geometry.parts import Sigma
-from modelserver.history import History
 from modelserver.joints.history import JointHistory
 from modelserver.messages import (
     CHANNEL_OF,

@@ -21,6 +21,7 @@ from benchmarks.support import free_url, print_verdict, run_process
 from modelserver.client.remote import Platform
 from modelserver.errors import NoPoseError, NoServerError, OverloadedError
 from modelserver.messages import (
+    FixType,
     GetTransformation,
     GpsSample,
     Health,
@@ -30,7 +31,6 @@ from modelserver.messages import (
     WheelSample,
     WheelsSample,
 )
-from modelserver.messages import FixType
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.provider import resolve_url
 

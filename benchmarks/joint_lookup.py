@@ -18,10 +18,10 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.support import measure_interleaved, print_verdict, ratio
+from modelserver.estimation.history import History
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType
 from modelserver.geometry.parts import Sigma
-from modelserver.history import History
 from modelserver.joints.history import JointHistory
 from modelserver.messages import JointSample, JointsSample, SensorHeader, TimeQuery
 from modelserver.query import PlatformView

@@ -13,6 +13,7 @@ from support_drive import CHANNELS, SimulatedDrive, compare_pose
 from modelserver.config.vehicle_file import load_config
 from modelserver.messages import (
     AbsolutePoseSample,
+    FixType,
     GpsSample,
     ImuSample,
     Invalid,
@@ -27,7 +28,6 @@ from modelserver.messages import (
     WheelSample,
     WheelsSample,
 )
-from modelserver.messages import FixType
 from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus
 from modelserver.server.loop import Loop, LoopSettings

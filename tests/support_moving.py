@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
+from modelserver.estimation.history import History
 from modelserver.geometry import names
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType, Mimic
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Sigma
-from modelserver.history import History
 from modelserver.joints.history import JointHistory
 from modelserver.messages import Estimate, JointSample, JointsSample, Origin, SensorHeader, VehicleMotion
 from modelserver.query import PlatformView

@@ -1,4 +1,4 @@
-"""Time stamps from a device's clock: offset and drift against the host's monotonic clock, with their uncertainty.
+"""Time stamps from a device's clock: clock offset and clock drift against the monotonic clock of the host, and sigmas.
 
 A device measures at its own time t_d; the host receives the sample at t_h = t_d + offset(t_d) + delay with delay >= 0.
 The offset is therefore the lower envelope of t_h - t_d, a line whose slope is the drift (Moon, Skelly and Towsley,

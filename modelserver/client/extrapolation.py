@@ -24,7 +24,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from modelserver.earth.geodesy import Geodesy, GeodesyError
-from modelserver.history import DeferredEstimate
+from modelserver.estimation.history import DeferredEstimate
 from modelserver.messages import (
     NAN,
     STALE_SENSORS,

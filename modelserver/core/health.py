@@ -4,7 +4,7 @@ A full report is due once a period (`health_period_ns`). Between two of them, th
 (`HealthConditions`) are evaluated every `CHANGE_PERIOD_NS`, and a report is sent at once when they have changed. Rates,
 delays and the distribution of tick delays always cover a whole period: a report for a change repeats the last ones.
 
-A source is silent after `get_silence_limit` of its usual interval, an exponential moving average (`state`).
+Sensor timeout: a source is silent after `get_silence_limit` of its usual interval, a moving average (`state`).
 """
 
 from __future__ import annotations

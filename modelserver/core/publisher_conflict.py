@@ -1,4 +1,4 @@
-"""Detect a second publisher on a sensor's channel. Pure of clocks; one mutable detector per channel.
+"""Detect a duplicate publisher on a sensor's channel. Pure of clocks; one mutable detector per channel.
 
 A channel has one publisher, named by header.source and counting its messages in header.seq. A conflict (a driver that
 was started twice, a recording played onto the live bus, a stranger) shows as

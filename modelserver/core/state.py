@@ -10,9 +10,9 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 from modelserver.core.answers import DeferredAnswer
 from modelserver.core.host_clock import HostClock, Instant
 from modelserver.errors import NotConnectedError
+from modelserver.estimation.history import History
 from modelserver.estimation.interface import Localizer
 from modelserver.geometry.model import Model
-from modelserver.history import History
 from modelserver.joints.history import JointHistory
 from modelserver.messages import (
     NAN,

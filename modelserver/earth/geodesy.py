@@ -1,7 +1,8 @@
 """Geodesy on WGS 84: geodetic, earth-centered (ECEF), UTM with a pinned zone, and local tangent planes (ENU). Pure.
 
-Projections and ellipsoid are those of PROJ (pyproj). Latitudes and longitudes are degrees, north and east positive;
-lengths are meters; heights are above the ellipsoid, up. Importing this module loads pyproj.
+UTM is the transverse Mercator projection; projections and ellipsoid are those of PROJ (pyproj). Latitudes and
+longitudes are degrees, north and east positive; lengths are meters; heights are above the ellipsoid, up. Importing this
+module loads pyproj.
 
 Sources: J. Snyder, "Map projections: a working manual", USGS 1395, 1987 (UTM zones, convergence); NGA.SIG.0012, 2014, 7
 (the zones of Norway and Svalbard, latitude limits of UTM).

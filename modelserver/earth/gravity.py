@@ -1,4 +1,4 @@
-"""Gravity and earth rate, as an inertial unit at rest measures them.
+"""Normal gravity (Somigliana) and Earth rotation, as a stationary IMU measures them.
 
 Source: NGA.STND.0036, WGS 84, 2014: rotation rate (table 3.1), normal gravity on the ellipsoid (eq. 4-1) and its
 decrease with height (eq. 4-3).

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol, Self, TypeAlias, runtime_checkable
 
-from modelserver.history import DeferredEstimate
+from modelserver.estimation.history import DeferredEstimate
 from modelserver.messages import (
     Decision,
     Estimate,

@@ -1,4 +1,4 @@
-"""Mass, center of mass and inertia of a rigid body, and the 6x6 spatial inertia that combines them.
+"""Mass, center of mass and inertia tensor of a rigid body; spatial inertia (6x6), parallel axis theorem included.
 
 The spatial inertia maps a body's motion to its momentum, both at the body's origin and along the body's axes. Rows and
 columns are ordered x, y, z, then about x, about y, about z; the 2005 report leaves the order open. With mass m, center

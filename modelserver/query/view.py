@@ -1,8 +1,9 @@
 """PlatformView: answers queries from an immutable view of geometry, joints and estimates. Pure.
 
-The poses of all frames in the base frame at the time of the query give every pair: `X_RI = inverse(X_BR) X_BI`. For a
-frame of the vehicle it comes from the model and the joints; for a world frame it is the inverse of the vehicle's pose
-there, which localization computes for each world frame by geodesy at the vehicle's position.
+Time travel: the state history gives estimates, joints their readings at the time of the query. The poses of all frames
+in the base frame at that time give every pair: `X_RI = inverse(X_BR) X_BI`. For a frame of the vehicle it comes from
+the model and the joints; for a world frame it is the inverse of the vehicle's pose there, which localization computes
+for each world frame by geodesy at the vehicle's position.
 
 Covariances: the vehicle's is transported to a frame by the lever arm, also for large heading errors
 (`transforms.large_angle`), and the independent one of the mount and its joints is added.
@@ -27,12 +28,12 @@ from modelserver.errors import (
     TooNewError,
     TooOldError,
 )
+from modelserver.estimation.history import History, restamp
 from modelserver.estimation.interface import Localizer
 from modelserver.geometry import names
 from modelserver.geometry.kinematic_path import KinematicPath
 from modelserver.geometry.model import Model
 from modelserver.geometry.path_covariance import as_array
-from modelserver.history import History, restamp
 from modelserver.joints.history import NO_JOINTS, JointHistory, JointTrack
 from modelserver.messages import (
     NAN,

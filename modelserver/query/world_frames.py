@@ -1,4 +1,4 @@
-"""The world frames, and the vehicle's pose in each from an estimate."""
+"""The world frames, and the vehicle's pose in each: World:UTM and World:ENU (map frame of REP-105), Odom:Origin."""
 
 from __future__ import annotations
 

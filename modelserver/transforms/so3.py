@@ -241,7 +241,10 @@ def nearest_rotation(M: npt.ArrayLike) -> tuple[Array, float]:
 
 
 def left_jacobian(v: Vector3) -> Array:
-    """Return the left Jacobian J (3, 3) at a rotation vector: exp(v + dv) = exp(J dv) exp(v) to first order."""
+    """Return the left Jacobian J (3, 3) at a rotation vector: exp(v + dv) = exp(J dv) exp(v) to first order.
+
+    The right Jacobian is that of -v.
+    """
     angle = math.hypot(*v)
     K = skew(v)
     if angle < 1e-4:

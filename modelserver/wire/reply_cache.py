@@ -1,4 +1,4 @@
-"""Cache of encoded static replies: answers that do not depend on time, by the pair of frames.
+"""Cache of encoded static replies (static transforms): answers that do not depend on time, by the pair of frames.
 
 Most queries are about rigidly mounted frames, and their answers hold until the model changes. The bytes of such a reply
 differ only in request id and utime, and do not depend on the client. So the pair of names in the bytes of a request

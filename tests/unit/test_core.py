@@ -25,10 +25,10 @@ from modelserver import core
 from modelserver.core import MAX_COUNTERS, AllOutputs, CoreSettings, CoreState, Instant, step
 from modelserver.core.answers import DeferredAnswer
 from modelserver.errors import Status, UnknownBodyError, UnknownFrameError
+from modelserver.estimation.history import MIN_STEP_US
 from modelserver.estimation.raw.localizer import RawLocalizer
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.geometry import names
-from modelserver.history import MIN_STEP_US
 from modelserver.messages import (
     CHANNEL_OF,
     AbsolutePoseSample,

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 VALUES = {"errors", "version", "transforms"}
 GEOMETRY = VALUES | {"geometry"}
-POSES = VALUES | {"messages", "earth", "history"}
+POSES = VALUES | {"messages", "earth", "estimation.history"}
 CORE = GEOMETRY | POSES | {"joints", "estimation", "query"}
 FILES = {"files.kinds", "files.regular"}
 WIRE = VALUES | {"messages", "wire", "mslcm", "files.regular"}
@@ -35,7 +35,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "signing.signatures": VALUES | {"messages"},
     "signing.key_files": VALUES | {"messages", "signing.signatures", "files.regular"},
     "earth": VALUES | {"messages"},
-    "history": VALUES | {"messages"},
+    "estimation.history": VALUES | {"messages"},
     "joints": GEOMETRY | {"messages"},
     "files.kinds": set(),
     "files.regular": set(),
@@ -72,7 +72,7 @@ PURE = {
     "estimation",
     "messages",
     "signing.signatures",
-    "history",
+    "estimation.history",
     "joints",
     "query",
     "core",

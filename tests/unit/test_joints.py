@@ -11,11 +11,11 @@ import pytest
 from support_moving import BASE, DEEP, SCAN, T0, UTM, S, joints_at, rover, view
 
 from modelserver.errors import TooNewError, TooOldError
+from modelserver.estimation.history import History
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Constraint
-from modelserver.history import History
 from modelserver.joints.history import (
     MAX_CLOCK_LEAD_S,
     MAX_GAP_S,

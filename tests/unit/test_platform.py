@@ -20,8 +20,8 @@ from modelserver.errors import (
     UnknownBodyError,
     UnknownFrameError,
 )
+from modelserver.estimation.history import History
 from modelserver.geometry import names
-from modelserver.history import History
 from modelserver.messages import Invalid, Policy, PoseAnswer, Quality, TimeQuery
 from modelserver.query import HISTORY_LIMIT, PREDICTION_LIMIT_S, PlatformView
 from modelserver.transforms import Pose, so3

@@ -13,7 +13,8 @@ import numpy as np
 
 from modelserver.earth.geodesy import GeodesyError, LocalFrame, ecef_from_geodetic, geodetic_from_ecef, origin_at
 from modelserver.estimation import fix_quality as gate
-from modelserver.estimation.filter import alignment, lateness, motion, placing, updates
+from modelserver.estimation.filter import alignment, motion, placing, updates
+from modelserver.estimation.filter import latency as lateness
 from modelserver.estimation.filter.alignment import Fit, Passed, Turn, horizontal
 from modelserver.estimation.filter.measurements.aiding import AbsolutePose
 from modelserver.estimation.filter.measurements.base import Compared, Scene, wrapped

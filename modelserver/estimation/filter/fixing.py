@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 
-from modelserver.estimation.filter import fixes, lateness, motion, placing, updates
+from modelserver.estimation.filter import fixes, motion, placing, updates
+from modelserver.estimation.filter import latency as lateness
 from modelserver.estimation.filter.alignment import Passed, Turn
 from modelserver.estimation.filter.handling import begun_level, measured, scene_of, without_gps
+from modelserver.estimation.filter.heading_check import proved
 from modelserver.estimation.filter.items import NOTHING, Fused, Item, refused, took_up
 from modelserver.estimation.filter.measurements.base import wrapped
 from modelserver.estimation.filter.measurements.gps import GpsBaseline, GpsPosition, baseline_sigma
 from modelserver.estimation.filter.measurements.orientation import Yaw, yaw_told
-from modelserver.estimation.filter.proving import proved
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import FilterState
 from modelserver.messages import GpsSample, ImuSample, Mode, Phase, Verdict, YawSource

@@ -8,7 +8,7 @@ from modelserver.estimation.filter import strapdown
 from modelserver.estimation.filter.nav import ZERO, Nav
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import FilterState, Said
-from modelserver.estimation.filter.stillness import Stillness
+from modelserver.estimation.filter.stationary import Stillness
 from modelserver.estimation.filter.strapdown import Noise
 from modelserver.messages import Mode, Phase
 from modelserver.transforms import so3

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from modelserver.earth.geodesy import Geodesy, LocalFrame
 from modelserver.estimation.filter.alignment import Passed
 from modelserver.estimation.filter.nav import Nav
-from modelserver.estimation.filter.stillness import Stillness
+from modelserver.estimation.filter.stationary import Stillness
 from modelserver.estimation.filter.strapdown import Earth
 from modelserver.estimation.origin import OriginCapture
 from modelserver.messages import Mode, Origin, Phase, RestoredState, Sample, SwitchMode

@@ -1,6 +1,6 @@
 """Measurement buffer: a delayed (out-of-sequence) measurement is inserted, and what follows is fused again.
 
-A measurement that comes late is put in its place, and what follows is worked through anew, a bounded amount at a time.
+Delayed measurements: each is inserted at its instant and what follows is fused again, a bounded amount at a time.
 Whatever the order of arrival, the state in the end is that of the one order: instant, source, sequence.
 """
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from modelserver.earth.geodesy import GeodesyError, LocalFrame
 from modelserver.estimation.filter import kalman, motion
-from modelserver.estimation.filter.ageing import aged, with_biases
+from modelserver.estimation.filter.bias_inflation import aged, with_biases
 from modelserver.estimation.filter.handling import without_gps
 from modelserver.estimation.filter.items import NOTHING, Fused
 from modelserver.estimation.filter.layout import STRAPDOWN

@@ -18,9 +18,9 @@ from modelserver.core.commands import ModelLoaded
 from modelserver.estimation.filter.localizer import Deferred
 from modelserver.estimation.filter.measurements import REGISTRY, Measurement
 from modelserver.estimation.filter.world import TwistCovariance
+from modelserver.estimation.history import DeferredEstimate
 from modelserver.estimation.interface import Localizer
 from modelserver.estimation.modes import ModeLocalizer
-from modelserver.history import DeferredEstimate
 from modelserver.messages import Event, MotionCovariance
 from modelserver.server.encoding.schema import Schema, read_document, write_document
 

@@ -1,6 +1,7 @@
 """Verify signed commands: known key, valid signature, permitted channel, fresh time stamp, decodable command.
 
-Each check that fails has a reason that is counted. Until the signature is verified, the sender gets no reply.
+Each check that fails has a reason that is counted. Until the signature is verified, the sender gets no reply. A
+replay attack fails by its time stamp and counter.
 """
 
 from __future__ import annotations

@@ -11,10 +11,11 @@ import pytest
 from support_cart import ANTENNA, GEODESY, WHEELS, localizer, model, rig, some_nav
 from support_cart import IMU as IMU_FRAME
 
-from modelserver.estimation.filter import alignment, clocks, engine, inertial, lateness, placing, start
+from modelserver.estimation.filter import alignment, clocks, engine, inertial, placing, start
+from modelserver.estimation.filter import latency as lateness
 from modelserver.estimation.filter.alignment import Passed, Turn
 from modelserver.estimation.filter.clocks import Clocks, Verdict
-from modelserver.estimation.filter.lateness import Lateness
+from modelserver.estimation.filter.latency import Lateness
 from modelserver.estimation.filter.measurements.gps import LATENCY, WANDER
 from modelserver.estimation.filter.measurements.wheels import WheelSpeed, _mean, rolling, standing_wheels, turn_rate
 from modelserver.estimation.filter.nav import ZERO
@@ -22,7 +23,7 @@ from modelserver.estimation.filter.odometry import Odometry
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.state import FilterState
-from modelserver.estimation.filter.stillness import Stillness
+from modelserver.estimation.filter.stationary import Stillness
 from modelserver.estimation.filter.strapdown import STANDARD_GRAVITY, level_attitude
 from modelserver.estimation.sensor_rig import Mounts
 from modelserver.messages import (

@@ -20,10 +20,10 @@ from modelserver.estimation.filter.localizer import Deferred, FilterLocalizer
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.filter.setup import Setup
 from modelserver.estimation.filter.timeline import Timeline
+from modelserver.estimation.history import History
 from modelserver.estimation.modes import LocalizerConfig, ModeLocalizer
 from modelserver.estimation.raw.localizer import RawLocalizer
 from modelserver.estimation.raw.settings import RawSettings
-from modelserver.history import History
 from modelserver.messages import (
     Decision,
     Estimate,

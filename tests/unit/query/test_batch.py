@@ -12,7 +12,7 @@ from support_between import lookup_between
 from support_moving import BASE, DEEP, ENU, ODOM, ORIGIN, SCAN, T0, UTM, S, estimate, joints_at, rover, view
 
 from modelserver.errors import LimitError, NoPoseError, QueryError, Status, UnknownFrameError
-from modelserver.history import History
+from modelserver.estimation.history import History
 from modelserver.joints.history import NO_JOINTS, JointHistory
 from modelserver.messages import MAX_REQUEST_INSTANTS, Invalid, JointSample, PoseAnswer, Quality, TimeQuery
 from modelserver.query import PlatformView

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from support_between import lookup_between
 from support_moving import BASE, DEEP, SCAN, T0, UTM, S, estimate, vehicle, view
 
-from modelserver.history import History
+from modelserver.estimation.history import History
 from modelserver.messages import TimeQuery
 from modelserver.query import PlatformView
 from modelserver.transforms import pose_array as arrays

@@ -11,9 +11,9 @@ import pytest
 from support_moving import BASE, DEEP, ODOM, SCAN, T0, UTM, S, estimate, joints_at, positions, rover, truth, view
 
 from modelserver.errors import NoPoseError, UnknownFrameError
+from modelserver.estimation.history import History
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType, Mimic
-from modelserver.history import History
 from modelserver.joints.history import JointHistory
 from modelserver.messages import JointSample, JointsSample, Policy, Quality, SensorHeader, TimeQuery
 from modelserver.query import PlatformView

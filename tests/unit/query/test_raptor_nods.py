@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from support_moving import NOD, NOD_RATE, T0, UTM, S, estimate, vehicle
 
+from modelserver.estimation.history import History
 from modelserver.formats import load_model
-from modelserver.history import History
 from modelserver.joints.history import JointHistory
 from modelserver.messages import Estimate, JointSample, JointsSample, SensorHeader, TimeQuery
 from modelserver.query import PlatformView

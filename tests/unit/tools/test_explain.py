@@ -97,7 +97,7 @@ def test_the_table_in_the_documentation_is_what_its_command_prints(
     command, _, table = text.split("```console\n$ modelserver ")[1].split("```")[0].partition("\n")
     with pytest.raises(SystemExit):
         main(command.replace("cart.yaml", str(path)).split())
-    assert capsys.readouterr().out.partition("\n\n")[0] == table.rstrip()
+    assert capsys.readouterr().out.rstrip() == table.rstrip()
 
 
 def test_given_the_way_back_then_edges_are_passed_the_other_way_and_report_it(run: Run) -> None:

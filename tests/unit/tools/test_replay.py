@@ -21,7 +21,7 @@ from support_tuning import write_raw_mode_vehicle
 
 from modelserver import core
 from modelserver.core import CoreSettings, CoreState, Instant
-from modelserver.messages import Decision, GetBodyList, GpsSample, Invalid, PoseAnswer, RequestHeader, Verdict
+from modelserver.messages import Decision, GetBodyList, GpsSample, PoseAnswer, RequestHeader, Verdict
 from modelserver.server import playback
 from modelserver.server.vehicle import Vehicle
 from modelserver.transforms import Pose, Transformation
@@ -416,12 +416,6 @@ def test_given_times_with_comments_when_read_then_they_are_numbers(tmp_path: Pat
 )
 def test_given_wrong_options_when_replayed_then_usage(recorded_log: Path, run: Run, options: list[str]) -> None:
     assert run(recorded_log, *options)[0] == 2
-
-
-def test_given_the_page_on_recordings_then_it_gives_the_value_of_each_reason() -> None:
-    page = (HUSKY.parents[2] / "docs" / "recordings.md").read_text()
-    for flag in Invalid:
-        assert f"| {flag.value} | {flag.name} | {flag.explain().partition(':')[0]} |" in page
 
 
 # --- onto the bus -------------------------------------------------------------------------------------------

@@ -109,7 +109,7 @@ class FileAnswers:
         wait_ms: int = 0,
     ) -> Explanation:
         """Return the pose with the edges on its path."""
-        from modelserver.history import History
+        from modelserver.estimation.history import History
         from modelserver.messages import TimeQuery
         from modelserver.query import PlatformView
         from modelserver.query.explanation import explain

@@ -1,4 +1,5 @@
-"""History of estimates by time: bounded, immutable, with constant cost to append. Pure.
+"""State history by time, for queries about the past (time travel): bounded, immutable, with constant cost to append.
+Pure.
 
 Between two estimates position is linear and rotation at constant rate; where a new pose epoch begins between them the
 earlier one is held. Estimates may be deferred: they are computed when first read (`DeferredEstimate`).

@@ -8,7 +8,7 @@ import pytest
 from support_samples import ORIGIN, START
 
 from modelserver.errors import TooNewError, TooOldError
-from modelserver.history import History, interpolate, restamp
+from modelserver.estimation.history import History, interpolate, restamp
 from modelserver.messages import Estimate, Invalid, Quality
 from modelserver.transforms import Pose
 

@@ -1,0 +1,128 @@
+"""Standard terms lead to the code: one plain grep for each hits the module that does it.
+
+The terms come from the indexes of Groves (2013), PX4's EKF2, tf2 and robot_localization.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDERS = ("modelserver", "drivers/msdrivers", "tools/mstools")
+
+FILTER = "modelserver/estimation/filter"
+
+TERMS = {
+    # Groves
+    "lever arm": "modelserver/transforms/chain.py",
+    "specific force": "modelserver/estimation/raw/attitude.py",
+    "strapdown": f"{FILTER}/strapdown.py",
+    "error state": f"{FILTER}/layout.py",
+    "local level": f"{FILTER}/strapdown.py",
+    "Earth rotation": "modelserver/earth/gravity.py",
+    "Somigliana": "modelserver/earth/gravity.py",
+    "WGS 84": "modelserver/earth/geodesy.py",
+    "transverse Mercator": "modelserver/earth/geodesy.py",
+    "grid convergence": "modelserver/earth/geodesy.py",
+    "tangent plane": "modelserver/earth/geodesy.py",
+    "undulation": "modelserver/estimation/fix_quality.py",
+    "declination": "modelserver/earth/magnetism.py",
+    "World Magnetic Model": "modelserver/earth/magnetism.py",
+    "hard iron": "modelserver/estimation/calibration/ellipsoid.py",
+    "soft iron": "modelserver/estimation/calibration/ellipsoid.py",
+    "Allan deviation": "modelserver/estimation/calibration/allan.py",
+    "angle random walk": "modelserver/estimation/calibration/allan.py",
+    "bias instability": "modelserver/estimation/calibration/allan.py",
+    "Gauss-Markov": f"{FILTER}/layout.py",
+    "coarse alignment": f"{FILTER}/start.py",
+    "leveling": f"{FILTER}/start.py",
+    "heading alignment": f"{FILTER}/alignment.py",
+    "ZUPT": f"{FILTER}/measurements/constraints.py",
+    "ZARU": f"{FILTER}/measurements/constraints.py",
+    "non-holonomic": f"{FILTER}/measurements/constraints.py",
+    "stationary detection": f"{FILTER}/stationary.py",
+    "Joseph form": f"{FILTER}/kalman.py",
+    "innovation": f"{FILTER}/updates.py",
+    "NIS": f"{FILTER}/updates.py",
+    "chi-square gate": f"{FILTER}/updates.py",
+    "measurement noise": f"{FILTER}/measurements/base.py",
+    "process noise": f"{FILTER}/settings.py",
+    "dilution of precision": "modelserver/estimation/fix_quality.py",
+    "protection level": f"{FILTER}/bounds.py",
+    "integrity": f"{FILTER}/bounds.py",
+    "dead reckoning": f"{FILTER}/odometry.py",
+    "quaternion": "modelserver/transforms/so3.py",
+    "rotation vector": "modelserver/transforms/so3.py",
+    "left Jacobian": "modelserver/transforms/so3.py",
+    "adjoint": "modelserver/transforms/chain.py",
+    "quantization": "modelserver/estimation/calibration/allan.py",
+    "misalignment": "modelserver/simulation/imu.py",
+    # PX4 EKF2
+    "out-of-sequence": f"{FILTER}/timeline.py",
+    "delayed measurement": f"{FILTER}/timeline.py",
+    "latency": f"{FILTER}/latency.py",
+    "clock step": f"{FILTER}/clocks.py",
+    "dual antenna": f"{FILTER}/measurements/gps.py",
+    "position reset": f"{FILTER}/fixes.py",
+    "covariance inflation": f"{FILTER}/bias_inflation.py",
+    "warm start": f"{FILTER}/warm_start.py",
+    "sensor timeout": "modelserver/core/health.py",
+    "wheel slip": "modelserver/simulation/wheels.py",
+    # tf2
+    "time travel": "modelserver/query/view.py",
+    "lookup": "modelserver/query/path.py",
+    "state history": "modelserver/estimation/history.py",
+    "interpolation": "modelserver/query/joint_lookup.py",
+    "extrapolation": "modelserver/client/extrapolation.py",
+    "static transform": "modelserver/wire/reply_cache.py",
+    "frame tree": "modelserver/geometry/kinematic_path.py",
+    "forward kinematics": "modelserver/geometry/kinematic_path.py",
+    "slerp": "modelserver/transforms/so3.py",
+    "spanning tree": "modelserver/geometry/topology.py",
+    "loop closure": "modelserver/geometry/topology.py",
+    "inertia tensor": "modelserver/geometry/inertia.py",
+    "parallel axis": "modelserver/geometry/inertia.py",
+    "twist": "modelserver/query/motion.py",
+    # robot_localization
+    "map frame": "modelserver/query/world_frames.py",
+    "REP-105": f"{FILTER}/odometry.py",
+    "odometry": f"{FILTER}/odometry.py",
+    "skid-steer": f"{FILTER}/measurements/wheels.py",
+    "Ackermann": "modelserver/estimation/sensor_rig.py",
+    "UTM": "modelserver/earth/geodesy.py",
+    # service and drivers
+    "rate limit": "modelserver/server/requests/scheduler.py",
+    "token bucket": "modelserver/server/requests/scheduler.py",
+    "duplicate publisher": "modelserver/core/publisher_conflict.py",
+    "backoff": "drivers/msdrivers/runner.py",
+    "dead-man": "drivers/msdrivers/devices/command_arbiter.py",
+    "watchdog": "modelserver/server/supervision/systemd.py",
+    "HMAC": "modelserver/signing/signatures.py",
+    "replay attack": "modelserver/server/requests/signed_commands.py",
+    "clock drift": "drivers/msdrivers/device_clock.py",
+    "checksum": "drivers/msdrivers/protocol/framing.py",
+    "multicast": "modelserver/server/diagnostics/checks.py",
+}
+
+
+def hits(term: str) -> list[str]:
+    """Return the product files that `grep -rliF TERM` lists, without the generated ones."""
+    found = [
+        path.relative_to(ROOT).as_posix()
+        for folder in FOLDERS
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        if term.lower() in path.read_text(encoding="utf-8").lower() and path.name != "generated.py"
+    ]
+    assert found, f"no product file has {term!r}"
+    return found
+
+
+@pytest.mark.parametrize(("term", "place"), TERMS.items())
+def test_given_a_standard_term_then_a_grep_hits_its_place(term: str, place: str) -> None:
+    assert place in hits(term)
+
+
+def test_given_the_terms_then_there_are_enough() -> None:
+    assert len(TERMS) >= 60
