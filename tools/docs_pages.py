@@ -12,6 +12,7 @@ import ast
 import contextlib
 import dataclasses
 import enum
+import functools
 import importlib
 import inspect
 import io
@@ -374,6 +375,7 @@ def check_words(page: str) -> None:
         raise ValueError(f"reason words that are not in the code: {', '.join(sorted(missing))}")
 
 
+@functools.cache
 def strings_in_code() -> set[str]:
     """Return every string constant of the service and its localization."""
     found: set[str] = set()

@@ -191,6 +191,7 @@ def test_given_the_types_then_their_page_has_every_field_with_a_meaning(pages: M
     assert text.count("\n## ") == len(list((ROOT / "lcmtypes").glob("*.lcm")))
 
 
+@pytest.mark.slow
 def test_given_the_reasons_then_the_page_has_each_and_its_words_exist_in_the_code(
     pages: ModuleType,
 ) -> None:

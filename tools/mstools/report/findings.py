@@ -284,7 +284,7 @@ def check_rejected_fixes(data: ReplayData) -> Iterable[ReportFinding]:
     rejected, total = sum(reasons.values()), len(data.fixes)
     if total >= 20 and rejected > 0.2 * total:
         words = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common(3))
-        known = [REJECT_REASONS.get(reason, f"{reason}: docs/localization.md") for reason, _ in reasons.most_common(3)]
+        known = [REJECT_REASONS.get(reason, f"{reason}: docs/words.md") for reason, _ in reasons.most_common(3)]
         yield ReportFinding(
             FindingLevel.WARNING,
             f"{rejected / total:.0%} of the fixes were rejected",

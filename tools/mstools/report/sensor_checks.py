@@ -136,7 +136,7 @@ def _advice(data: ReplayData, each: _UnusedSource) -> str:
         "too_old": "Its stamps are older than localization.filter.horizon: check its clock and its latency.",
         "future": "Its clock is ahead of the others': synchronize them.",
         "sigma": "The sigma of its fixes is above localization.filter.maximum_sigma.",
-    }.get(each.reason, "docs/localization.md explains the reason.")
+    }.get(each.reason, "docs/words.md explains the reason.")
 
 
 # --- units, signs and names: comparison of sensors ----------------------------------------------------------
