@@ -65,7 +65,17 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(10_000, 50, 50)
 
 
-LONGEST = ("docs_commands", "drivers", "service", "monitoring", "systemd", "demo", "faults_data", "faults_processes", "faults_drivers")
+LONGEST = (
+    "docs_commands",
+    "drivers",
+    "service",
+    "monitoring",
+    "systemd",
+    "demo",
+    "faults_data",
+    "faults_processes",
+    "faults_drivers",
+)
 """The slowest scenario files, slowest first."""
 
 
