@@ -20,7 +20,7 @@ from support_recordings import HUSKY, LATENCY, START, write_log
 from modelserver.messages import FixType, GpsSample, ImuSample, SensorHeader
 from modelserver.wire.codec import encode
 from mstools import cli
-from mstools.report import svg
+from mstools.report import charts
 
 Run = Callable[..., tuple[int, str, str]]
 Event = tuple[int, str, bytes]
@@ -443,16 +443,15 @@ def test_given_another_command_then_nothing_of_this_is_imported() -> None:
 
 
 def test_given_axes_then_ticks_at_even_places() -> None:
-    assert svg.decade_axis("t", [0.03, 5.0]).ticks() == pytest.approx([0.01, 0.1, 1.0, 10.0])
-    assert svg.decade_axis("t", [1.0]).ticks() == pytest.approx([1.0, 10.0])
-    assert svg.Axis("x", -30.0, 30.0).ticks() == pytest.approx([-30, -20, -10, 0, 10, 20, 30])
-    assert svg.Axis("x", -30.0, 30.0).fraction(0.0) == 0.5
+    assert charts.decade_axis("t", [0.03, 5.0]).ticks() == pytest.approx([0.01, 0.1, 1.0, 10.0])
+    assert charts.decade_axis("t", [1.0]).ticks() == pytest.approx([1.0, 10.0])
+    assert charts.Axis("x", -30.0, 30.0).ticks() == pytest.approx([-30, -20, -10, 0, 10, 20, 30])
+    assert charts.Axis("x", -30.0, 30.0).fraction(0.0) == 0.5
 
 
 def test_given_names_with_markup_then_they_stay_words() -> None:
-    axis = svg.Axis("<x>", 0.0, 1.0)
-    drawing = svg.render_chart(
-        "a & b", axis, axis, [svg.PlotLine("<script>", [0.0], [1.0], svg.COLORS[0], is_dotted=True)]
-    )
+    axis = charts.Axis("<x>", 0.0, 1.0)
+    dots = charts.Series("<script>", [0.0], [1.0], shape="dots")
+    drawing = charts.render_panels("a & b", axis, [charts.Panel("<b>", axis, [dots])])
     assert ElementTree.fromstring(drawing).get("aria-label") == "a & b"
-    assert "<script>" not in svg.render_page("<script>", ["<script>"], [drawing])
+    assert "<script>" not in charts.render_page("<script>", drawing)

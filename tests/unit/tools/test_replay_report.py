@@ -13,7 +13,7 @@ from support_tuning import write_raw_mode_vehicle, write_simulated_log
 
 from modelserver.simulation import EncoderModel, WheelsModel
 from mstools import cli
-from mstools.report import panels
+from mstools.report import charts
 
 Run = Callable[..., tuple[int, str, str]]
 
@@ -149,19 +149,21 @@ def test_given_a_report_over_what_is_read_or_written_then_it_is_rejected(tmp_pat
 
 def test_given_many_points_then_a_curve_keeps_its_peaks_and_little_else() -> None:
     points = [(n / 100.0, 5.0 if n == 3333 else 0.0) for n in range(10_000)]
-    drawn = panels.decimate(points)
+    drawn = charts.decimate(points)
     assert len(drawn) <= 4 * 101
     assert (33.33, 5.0) in drawn
 
 
 def test_given_many_dots_then_a_pixel_has_one() -> None:
-    axis = panels.Axis("m", -1.0, 1.0)
-    many = panels.Dots("dots", [n / 1000.0 for n in range(100_000)], [0.5] * 100_000)
-    drawn = panels.render_panels("a", 0.0, 100.0, [panels.Panel("p", axis, [many])])
+    axis = charts.Axis("m", -1.0, 1.0)
+    many = charts.Series("dots", [n / 1000.0 for n in range(100_000)], [0.5] * 100_000, shape="dots")
+    drawn = charts.render_panels("a", charts.Axis("s", 0.0, 100.0), [charts.Panel("p", axis, [many])])
     assert len(drawn) < 30_000
 
 
 def test_given_a_name_with_marks_of_html_then_it_is_written_as_text() -> None:
-    drawn = panels.render_strip("<b>", 0.0, 1.0, [panels.StripRow("<i>", [(0.0, 1.0, '"&<')], panels.RED)])
+    drawn = charts.render_strip(
+        "<b>", charts.Axis("<s>", 0.0, 1.0), [charts.StripRow("<i>", [(0.0, 1.0, '"&<')], charts.RED)]
+    )
     assert "<b>" not in drawn
     assert "<i>" not in drawn

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import html
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from operator import attrgetter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from modelserver.estimation.calibration.allan import INSTABILITY_FLOOR, AllanCur
 from modelserver.estimation.calibration.ellipsoid import SECTORS, MagnetometerFit, project_to_level
 from modelserver.estimation.calibration.mount import MountCheck
 from modelserver.transforms.so3 import Array, Vector3
-from mstools.report import svg
+from mstools.report import charts
 from mstools.terminal.output import escape, format_count
 
 MAX_POINTS = 1500
@@ -48,18 +48,29 @@ class ImuNoise:
 
 @dataclass(frozen=True, slots=True)
 class _Quantity:
-    """A noise figure: its setting (empty for none), name, unit, and where to find it."""
+    """A noise figure: its setting (empty for none), name, unit, and the fields of `ImuNoise` and `NoiseParameters`."""
 
     setting: str
     name: str
     unit: str
-    axes: Callable[[ImuNoise], tuple[AxisNoise, ...]]
-    figure: Callable[[NoiseParameters], NoiseParameter | None]
-    limit: Callable[[NoiseParameters], float]
+    sensor: str
+    figure: str
+
+    def axes(self, noise: ImuNoise) -> tuple[AxisNoise, ...]:
+        """Return the axes of the sensor."""
+        return getattr(noise, self.sensor)  # type: ignore[no-any-return]
+
+    def of(self, figures: NoiseParameters) -> NoiseParameter | None:
+        """Return the figure of an axis."""
+        return getattr(figures, self.figure)  # type: ignore[no-any-return]
+
+    def limit(self, figures: NoiseParameters) -> float:
+        """Return the upper limit for an axis, NaN where it is open."""
+        return float(getattr(figures, f"{self.figure}_limit", math.nan))
 
     def propose(self, noise: ImuNoise) -> float:
         """Return the value of the noisiest axis, NaN where no axis has one."""
-        found = [each for axis in self.axes(noise) if (each := self.figure(axis.figures)) is not None]
+        found = [each for axis in self.axes(noise) if (each := self.of(axis.figures)) is not None]
         return max((each.value for each in found), default=math.nan)
 
     def upper_limit(self, noise: ImuNoise) -> float:
@@ -68,23 +79,14 @@ class _Quantity:
         return max(limits) if all(map(math.isfinite, limits)) else math.nan
 
 
-_gyro, _accelerometer = attrgetter("gyro"), attrgetter("accelerometer")
-_white, _instability, _walk = attrgetter("white"), attrgetter("instability"), attrgetter("random_walk")
-_instability_limit, _walk_limit = attrgetter("instability_limit"), attrgetter("random_walk_limit")
-
-
-def _no_limit(_: NoiseParameters) -> float:
-    return math.nan
-
-
 QUANTITIES = (
-    _Quantity("gyro_noise", "angle random walk", "rad/s/sqrt(Hz)", _gyro, _white, _no_limit),
-    _Quantity("", "gyro bias instability", "rad/s", _gyro, _instability, _instability_limit),
-    _Quantity("gyro_bias_walk", "gyro bias random walk", "rad/s/sqrt(s)", _gyro, _walk, _walk_limit),
-    _Quantity("accelerometer_noise", "velocity random walk", "m/s^2/sqrt(Hz)", _accelerometer, _white, _no_limit),
-    _Quantity("", "accelerometer bias instability", "m/s^2", _accelerometer, _instability, _instability_limit),
+    _Quantity("gyro_noise", "angle random walk", "rad/s/sqrt(Hz)", "gyro", "white"),
+    _Quantity("", "gyro bias instability", "rad/s", "gyro", "instability"),
+    _Quantity("gyro_bias_walk", "gyro bias random walk", "rad/s/sqrt(s)", "gyro", "random_walk"),
+    _Quantity("accelerometer_noise", "velocity random walk", "m/s^2/sqrt(Hz)", "accelerometer", "white"),
+    _Quantity("", "accelerometer bias instability", "m/s^2", "accelerometer", "instability"),
     _Quantity(
-        "accelerometer_bias_walk", "accelerometer bias random walk", "m/s^2/sqrt(s)", _accelerometer, _walk, _walk_limit
+        "accelerometer_bias_walk", "accelerometer bias random walk", "m/s^2/sqrt(s)", "accelerometer", "random_walk"
     ),
 )
 
@@ -131,7 +133,7 @@ def format_noise(log: str, noise: ImuNoise, advice: MountCheck | None) -> list[s
 
 
 def _format_figure(quantity: _Quantity, axis: AxisNoise) -> str:
-    figure = quantity.figure(axis.figures)
+    figure = quantity.of(axis.figures)
     if figure is None:
         most = quantity.limit(axis.figures)
         return f"not determined; at most {most:.3g}" if math.isfinite(most) else "not determined"
@@ -163,16 +165,10 @@ def noise_to_dict(noise: ImuNoise, advice: MountCheck | None) -> dict[str, Any]:
 
 
 def _axis_to_dict(axis: AxisNoise) -> dict[str, Any]:
-    def data(figure: NoiseParameter | None) -> dict[str, float] | None:
-        if figure is None:
-            return None
-        return {"value": figure.value, "sigma": figure.sigma, "tau": figure.tau, "clusters": figure.clusters}
-
     figures = axis.figures
+    found = {"white": figures.white, "instability": figures.instability, "walk": figures.random_walk}
     return {
-        "white": data(figures.white),
-        "instability": data(figures.instability),
-        "walk": data(figures.random_walk),
+        **{name: None if each is None else asdict(each) for name, each in found.items()},
         "instability_limit": _or_none(figures.instability_limit),
         "walk_limit": _or_none(figures.random_walk_limit),
         "missing": list(figures.missing),
@@ -204,36 +200,35 @@ def format_noise_yaml(log: str, noise: ImuNoise) -> str:
 
 def render_noise_page(log: str, noise: ImuNoise) -> str:
     """Return an HTML page with the Allan deviations."""
-    charts = [
+    drawn = [
         _render_allan_chart("Gyro", "rad/s", noise.gyro, QUANTITIES[0].propose(noise)),
         _render_allan_chart("Accelerometer", "m/s²", noise.accelerometer, QUANTITIES[3].propose(noise)),
     ]
-    return svg.render_page(f"Allan deviation: {escape(log)}", format_noise(escape(log), noise, None), charts)
+    return _render_page(f"Allan deviation: {escape(log)}", format_noise(escape(log), noise, None), drawn)
+
+
+def _render_page(title: str, lines: Sequence[str], drawn: Sequence[str]) -> str:
+    text = html.escape("\n".join(lines))
+    figures = "".join(f"<figure>{each}</figure>" for each in drawn)
+    return charts.render_page(title, f"<h1>{html.escape(title)}</h1>\n<pre>{text}</pre>\n{figures}")
 
 
 def _render_allan_chart(name: str, unit: str, axes: Sequence[AxisNoise], white: float) -> str:
-    drawn = [
-        (axis, [(t, d) for t, d in zip(each.curve.taus, each.curve.deviations, strict=True) if d > 0.0])
-        for axis, each in zip("xyz", axes, strict=True)
-    ]
-    lines = [
-        svg.PlotLine(axis, [t for t, _ in points], [d for _, d in points], color)
-        for (axis, points), color in zip(drawn, svg.COLORS, strict=False)
-        if points
-    ]
     taus = axes[0].curve.taus
+    x = charts.decade_axis("averaging time τ, s", taus)
+    lines = [
+        charts.Series(axis, each.curve.taus, each.curve.deviations, color)
+        for axis, each, color in zip("xyz", axes, charts.PALETTE, strict=False)
+    ]
+    y = charts.decade_axis(f"Allan deviation, {unit}", [value for line in lines for value in line.y])
     if math.isfinite(white):
-        ends = [taus[0], taus[-1]]
-        lines.append(
-            svg.PlotLine("noise / √τ", ends, [white / math.sqrt(t) for t in ends], svg.COLORS[3], is_dashed=True)
-        )
-    floors = [each.figures.instability for each in axes if each.figures.instability is not None]
+        ends = (taus[0], taus[-1])
+        values = [white / math.sqrt(tau) for tau in ends]
+        lines.append(charts.Series("noise / √τ", ends, values, charts.GRAY, shape="dashes"))
+    floors = [each.figures.instability.value for each in axes if each.figures.instability is not None]
     if floors:
-        level = max(each.value for each in floors) * INSTABILITY_FLOOR
-        lines.append(svg.PlotLine("0.664 B", [taus[0], taus[-1]], [level, level], "#cc79a7", is_dashed=True))
-    values = [value for line in lines for value in line.y] or [0.1, 1.0]
-    x = svg.decade_axis("averaging time τ, s", taus)
-    return svg.render_chart(name, x, svg.decade_axis(f"Allan deviation, {unit}", values), lines)
+        lines.append(charts.level("0.664 B", x, max(floors) * INSTABILITY_FLOOR, charts.PINK))
+    return charts.render_panels(name, x, [charts.Panel(name, y, lines, 360.0)])
 
 
 def format_magnetometer(log: str, found: MagnetometerFit, position: Vector3 | None, field: Vector3 | None) -> list[str]:
@@ -312,26 +307,25 @@ def render_magnetometer_page(log: str, found: MagnetometerFit, fields: Array, up
     chosen = fields[:: -(-len(fields) // MAX_POINTS)]
     before = project_to_level(chosen, up) * 1e6
     after = project_to_level(found.apply(chosen), up) * 1e6
-    angle = np.linspace(0.0, 2.0 * np.pi, 121)
-    radius = found.strength * 1e6
-    lines = [
-        svg.PlotLine("measured", before[:, 0].tolist(), before[:, 1].tolist(), svg.COLORS[1], is_dotted=True),
-        svg.PlotLine("calibrated", after[:, 0].tolist(), after[:, 1].tolist(), svg.COLORS[0], is_dotted=True),
-        svg.PlotLine(
+    circle = found.strength * 1e6 * np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 121))
+    drawn = [
+        charts.dots("measured", before.tolist(), charts.ORANGE, 3.0),
+        charts.dots("calibrated", after.tolist(), charts.BLUE, 3.0),
+        charts.Series(
             "earth's field" if found.is_strength_known else "mean radius",
-            (radius * np.cos(angle)).tolist(),
-            (radius * np.sin(angle)).tolist(),
-            svg.COLORS[3],
+            circle.real.tolist(),
+            circle.imag.tolist(),
+            charts.GRAY,
         ),
     ]
-    reach = max(max(map(abs, (*line.x, *line.y))) for line in lines) * 1.1
     plane = "the horizontal plane" if found.is_planar else "the plane of most rotation"
-    x, y = (svg.Axis(f"{name} in {plane}, µT", -reach, reach) for name in ("along", "across"))
     words = format_magnetometer(escape(log), found, None, None)[:1] if found.is_strength_known else []
     words += [f"hard iron, uT: {_format_numbers([each * 1e6 for each in found.hard_iron], 3)}"]
     words += [f"residual: {found.rms * 1e6:.3f} uT rms"]
-    chart = svg.render_chart("Field during rotation", x, y, lines, square=True)
-    return svg.render_page(f"Magnetometer: {escape(log)}", words, [chart])
+    chart = charts.render_map(
+        "Field during rotation", f"along in {plane}, µT", f"across in {plane}, µT", drawn, heights=(600, 600)
+    )
+    return _render_page(f"Magnetometer: {escape(log)}", words, [chart])
 
 
 def _format_header(log: str, how: str) -> tuple[str, ...]:

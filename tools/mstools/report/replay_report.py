@@ -7,15 +7,14 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
-from itertools import pairwise
+from itertools import chain, cycle, pairwise
 
 from modelserver.messages import Decision, Invalid, Mode, Verdict
 from modelserver.version import __version__
-from mstools.report import consistency, panels
+from mstools.report import charts, consistency
+from mstools.report.charts import Axis, Panel, Series, StripRow, decade_axis, level, value_range
 from mstools.report.findings import collect_findings
-from mstools.report.panels import Band, Curve, Dots, HorizontalLine, Panel, StripRow
-from mstools.report.replay_data import FindingLevel, ReplayData, ReportFinding, StateSample
-from mstools.report.svg import Axis, decade_axis
+from mstools.report.replay_data import ReplayData, ReportFinding, StateSample
 from mstools.terminal.output import escape, format_count
 
 HOLD_S = 1.0
@@ -41,8 +40,6 @@ COMPONENTS: dict[str, tuple[str, ...]] = {
 }
 """Names of the components of each kind of measurement; those of other kinds are numbered."""
 
-LEVEL_NAMES = {FindingLevel.ERROR: "error", FindingLevel.WARNING: "warning", FindingLevel.NOTE: "note"}
-
 
 def render_page(data: ReplayData) -> str:
     """Return the HTML page."""
@@ -59,33 +56,51 @@ def render_page(data: ReplayData) -> str:
         ("verdicts", "Verdicts", _render_verdicts(data)),
     ]
     links = " ".join(f'<a href="#{name}">{title}</a>' for name, title, _ in sections)
-    body = "\n".join(
-        f'<section id="{name}"><h2>{title}</h2>\n{content}\n</section>' for name, title, content in sections
-    )
-    name = html.escape(escape(data.vehicle))
-    log = html.escape(escape(data.log))
+    body = "\n".join(f'<section id="{name}"><h2>{title}</h2>\n{text}\n</section>' for name, title, text in sections)
     began = datetime.fromtimestamp(data.first_utime * 1e-6, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{name}: replay of {log}</title>
-<style>{STYLE}</style>
-</head>
-<body>
-<header>
+    head = f"""<header>
 <p class="kicker">Replay report</p>
-<h1>{name}</h1>
-<p>{log}, start {began}, {data.duration:.0f} s</p>
+<h1>{_escape(data.vehicle)}</h1>
+<p>{_escape(data.log)}, start {began}, {data.duration:.0f} s</p>
 {_render_key_figures(data)}
 <nav>{links}</nav>
 </header>
-{body}
-<footer>modelserver {__version__}; docs/tuning.md explains each chart</footer>
-</body>
-</html>
 """
+    foot = f"\n<footer>modelserver {__version__}; docs/tuning.md explains each chart</footer>"
+    return charts.render_page(f"{escape(data.vehicle)}: replay of {escape(data.log)}", head + body + foot)
+
+
+def format_summary(found: Sequence[ReportFinding], path: str) -> list[str]:
+    """Return the lines to print: the path of the page, and the headlines of its findings."""
+    lines = [f"report: {escape(path)}, {format_count(len(found), 'finding')}"]
+    return lines + [f"  {each.level.name.lower()}: {escape(each.title)}" for each in found]
+
+
+# --- parts of the page --------------------------------------------------------------------------------------
+
+
+def _escape(text: str) -> str:
+    return html.escape(escape(text))
+
+
+def _render_figure(chart: str, caption: str) -> str:
+    return f"<figure>{chart}<figcaption>{caption}</figcaption></figure>"
+
+
+def _render_table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Iterable[int] = ()) -> str:
+    right = frozenset(numbers)
+
+    def cells(row: Sequence[str], tag: str) -> str:
+        return "".join(
+            f"<{tag}{' class=n' if n in right else ''}>{_escape(each)}</{tag}>" for n, each in enumerate(row)
+        )
+
+    body = "\n".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
+    return f"<table><thead><tr>{cells(head, 'th')}</tr></thead>\n<tbody>{body}</tbody></table>"
+
+
+def _time_axis(data: ReplayData) -> Axis:
+    return Axis("seconds from the log's first event", 0.0, max(data.duration, 1e-3))
 
 
 # --- key figures and findings -------------------------------------------------------------------------------
@@ -113,7 +128,7 @@ def _render_key_figures(data: ReplayData) -> str:
         (f"{sigmas[len(sigmas) // 2]:.2f} m" if sigmas else "none", "median position sigma"),
     ]
     cells = "".join(f"<div><strong>{value}</strong><span>{what}</span></div>" for value, what in figures)
-    return f'<div class="figures">{cells}</div>\n<p>{html.escape(_describe_key_figures(data))}</p>'
+    return f'<div class="figures">{cells}</div>\n<p>{_escape(_describe_key_figures(data))}</p>'
 
 
 def _valid_share(data: ReplayData) -> float:
@@ -148,9 +163,8 @@ def _render_findings(found: Sequence[ReportFinding]) -> str:
     if not found:
         return '<p class="good">No findings. Compare the charts below with docs/tuning.md.</p>'
     return "\n".join(
-        f'<div class="finding {LEVEL_NAMES[each.level]}"><h3><span>{LEVEL_NAMES[each.level]}</span> '
-        f"{html.escape(escape(each.title))}</h3><p>{html.escape(escape(each.observation))}</p>"
-        f"<p>{html.escape(escape(each.advice))}</p></div>"
+        f'<div class="finding {each.level.name.lower()}"><h3><span>{each.level.name.lower()}</span> '
+        f"{_escape(each.title)}</h3><p>{_escape(each.observation)}</p><p>{_escape(each.advice)}</p></div>"
         for each in found
     )
 
@@ -158,11 +172,11 @@ def _render_findings(found: Sequence[ReportFinding]) -> str:
 # --- track --------------------------------------------------------------------------------------------------
 
 FIX_COLORS = (
-    ("monitored", "monitored", panels.SKY),
-    ("", "before heading alignment", panels.GRAY),
-    ("used", "used", panels.GREEN),
-    ("reset", "position reset", panels.AMBER),
-    ("rejected", "rejected", panels.RED),
+    ("monitored", "monitored", charts.SKY),
+    ("", "before heading alignment", charts.GRAY),
+    ("used", "used", charts.GREEN),
+    ("reset", "position reset", charts.AMBER),
+    ("rejected", "rejected", charts.RED),
 )
 
 
@@ -170,25 +184,23 @@ def _render_track(data: ReplayData) -> str:
     placed = [each for each in data.snapshots if each.position is not None]
     if not placed:
         return "<p>No pose in the world.</p>"
-    dots = []
+    drawn = []
     for verdict, words, color in FIX_COLORS:
         there = [each.position for each in data.fixes if each.verdict == verdict and each.position is not None]
         if there:
-            dots.append(Dots(f"fixes {words}", [p[0] for p in there], [p[1] for p in there], color, 4.4))
-    lines = []
-    for name, bad, color, width in (("pose", False, "#12344d", 1.1), ("pose, not valid", True, panels.ORANGE, 2.2)):
+            drawn.append(charts.dots(f"fixes {words}", there, color, 4.4))
+    for name, bad, color, width in (("pose", False, "#12344d", 1.1), ("pose, not valid", True, charts.ORANGE, 2.2)):
         x, y = _track_points(placed, bad)
         if any(map(math.isfinite, x)):
-            lines.append(Curve(name, x, y, color, width))
-    chart = panels.render_map("Track", [*dots, *lines])
-    origin = data.origin
+            drawn.append(Series(name, x, y, color, width))
     words = "Path of the antenna, and the fixes."
-    if origin is not None:
+    if data.origin is not None:
         words += (
-            f" The origin is at {origin.easting:.1f} E, {origin.northing:.1f} N in UTM zone {origin.zone}"
-            f"{'' if origin.north else ' (south)'}."
+            f" The origin is at {data.origin.easting:.1f} E, {data.origin.northing:.1f} N in UTM zone "
+            f"{data.origin.zone}{'' if data.origin.north else ' (south)'}."
         )
-    return f"<figure>{chart}<figcaption>{words}</figcaption></figure>"
+    chart = charts.render_map("Track", "east of the origin, m", "north of the origin, m", drawn)
+    return _render_figure(chart, words)
 
 
 def _track_points(placed: Sequence[StateSample], bad: bool) -> tuple[list[float], list[float]]:
@@ -219,39 +231,32 @@ def _render_validity(data: ReplayData) -> str:
     states = data.snapshots
     if not states:
         return "<p>No sample could be used.</p>"
-    rows = [StripRow("valid", _intervals(states, [not each.invalid for each in states]), panels.GREEN)]
-    rows += [
-        StripRow(
-            (flag.name or "").lower(),
-            _intervals(states, [flag in each.invalid for each in states], flag.explain()),
-            panels.RED,
-        )
-        for flag in Invalid
-        if any(flag in each.invalid for each in states)
+
+    def row(name: str, chosen: Iterable[bool], color: str, words: str = "") -> StripRow:
+        return StripRow(name, _intervals(states, list(chosen), words), color)
+
+    rows = [
+        row("valid", (not each.invalid for each in states), charts.GREEN),
+        *(
+            row(str(flag.name).lower(), (flag in each.invalid for each in states), charts.RED, flag.explain())
+            for flag in Invalid
+        ),
+        row("stationary", (each.is_stationary for each in states), charts.SKY),
+        *(
+            row(f"{name} {value.name.lower()}", (getattr(each, name) is value for each in states), color)
+            for name, color in (("phase", charts.GRAY), ("mode", charts.AMBER))
+            for value in dict.fromkeys(getattr(each, name) for each in states)
+            if value is not None
+        ),
     ]
-    rows.append(StripRow("stationary", _intervals(states, [each.is_stationary for each in states]), panels.SKY))
-    for phase in dict.fromkeys(each.phase for each in states if each.phase is not None):
-        rows.append(
-            StripRow(
-                f"phase {phase.name.lower()}", _intervals(states, [each.phase is phase for each in states]), panels.GRAY
-            )
-        )
-    for mode in dict.fromkeys(each.mode for each in states if each.mode is not None):
-        rows.append(
-            StripRow(
-                f"mode {mode.name.lower()}", _intervals(states, [each.mode is mode for each in states]), panels.AMBER
-            )
-        )
+    rows = [each for each in rows if each.intervals or each.name in ("valid", "stationary")]
     events = _events(data)
-    chart = panels.render_strip("Validity over time", 0.0, data.duration, rows, events)
-    table = _render_table(
-        ("at, s", "what happened"), [(f"{when:.1f}", words) for when, words in events[:40]], numbers=(0,)
-    )
+    chart = charts.render_strip("Validity over time", _time_axis(data), rows, events)
+    listed = [(f"{when:.1f}", words) for when, words in events[:40]]
+    table = _render_table(("at, s", "what happened"), listed, numbers=(0,)) if events else "<p>No events.</p>"
     more = f"<p>and {len(events) - 40} more</p>" if len(events) > 40 else ""
-    return (
-        f"<figure>{chart}<figcaption>Reasons for which the pose is invalid, each on its row; vertical lines are "
-        f"the events below.</figcaption></figure>\n{table if events else '<p>No events.</p>'}{more}"
-    )
+    words = "Reasons for which the pose is invalid, each on its row; vertical lines are the events below."
+    return f"{_render_figure(chart, words)}\n{table}{more}"
 
 
 def _intervals(
@@ -297,50 +302,37 @@ def _render_motion(data: ReplayData) -> str:
     heading = [(90.0 - math.degrees(each.yaw)) % 360.0 for each in states]
     # the line is interrupted where heading wraps at north
     broken = [math.nan if n and abs(value - heading[n - 1]) > 180.0 else value for n, value in enumerate(heading)]
-    speed = [each.speed for each in states]
-    turn = [math.degrees(each.yaw_rate) for each in states]
-    sigma = [each.sigma for each in states]
-    bound = [each.horizontal_protection_level for each in states]
-    yaw = [math.degrees(each.yaw_sigma) for each in states]
-    yaw_bound = [math.degrees(each.heading_protection_level) for each in states]
-    drawn = [
-        Panel("Heading", Axis("deg", 0.0, 360.0), [Curve("", t, broken)]),
-        Panel(
-            "Speed, forward",
-            Axis("m/s", *panels.value_range(speed, min_width=0.5)),
-            [HorizontalLine("", 0.0), Curve("", t, speed)],
-        ),
-        Panel(
-            "Yaw rate",
-            Axis("deg/s", *panels.value_range(turn, min_width=2.0)),
-            [HorizontalLine("", 0.0), Curve("", t, turn)],
-            90.0,
-        ),
-        _uncertainty_panel("Horizontal position", "m", t, sigma, bound),
-        _uncertainty_panel("Heading", "deg", t, yaw, yaw_bound),
-    ]
-    chart = panels.render_panels("Heading, speed and uncertainty", 0.0, data.duration, drawn, _epochs(data))
-    return (
-        f"<figure>{chart}<figcaption>Heading is clockwise from grid north. Below: one sigma, and the protection level "
-        "at the integrity risk localization.filter.risk_per_hour.</figcaption></figure>"
+    x = _time_axis(data)
+    drawn = [Panel("Heading", Axis("deg", 0.0, 360.0), [Series("", t, broken)])]
+    for title, unit, values, width, height in (
+        ("Speed, forward", "m/s", [each.speed for each in states], 0.5, 120.0),
+        ("Yaw rate", "deg/s", [math.degrees(each.yaw_rate) for each in states], 2.0, 90.0),
+    ):
+        axis = Axis(unit, *value_range(values, min_width=width))
+        drawn.append(Panel(title, axis, [level("", x, 0.0), Series("", t, values)], height))
+    for title, unit, convert, sigma, bound in (
+        ("Horizontal position", "m", float, "sigma", "horizontal_protection_level"),
+        ("Heading", "deg", math.degrees, "yaw_sigma", "heading_protection_level"),
+    ):
+        lines = [
+            Series(words, t, [convert(getattr(each, field)) for each in states], color)
+            for words, field, color in (
+                ("sigma", sigma, charts.BLUE),
+                ("protection level", bound, charts.ORANGE),
+            )
+        ]
+        axis = decade_axis(unit, [*lines[0].y, *lines[1].y])
+        drawn.append(Panel(f"{title}: uncertainty", axis, lines, 110.0))
+    chart = charts.render_panels("Heading, speed and uncertainty", x, drawn, _epochs(data))
+    return _render_figure(
+        chart,
+        "Heading is clockwise from grid north. Below: one sigma, and the protection level at the integrity risk "
+        "localization.filter.risk_per_hour.",
     )
 
 
 def _epochs(data: ReplayData) -> list[tuple[float, str]]:
     return [(when, words) for when, words in _events(data) if words.startswith("epoch")]
-
-
-def _uncertainty_panel(
-    title: str, unit: str, t: Sequence[float], sigma: Sequence[float], bound: Sequence[float]
-) -> Panel:
-    known = [value for value in (*sigma, *bound) if math.isfinite(value) and value > 0.0]
-    axis = decade_axis(unit, known) if known else Axis(unit, 0.1, 10.0, is_logarithmic=True)
-    return Panel(
-        f"{title}: uncertainty",
-        axis,
-        [Curve("sigma", t, sigma, panels.BLUE), Curve("protection level", t, bound, panels.ORANGE)],
-        110.0,
-    )
 
 
 # --- consistency and innovations ----------------------------------------------------------------------------
@@ -362,28 +354,21 @@ def _render_consistency(data: ReplayData) -> str:
         for each in found
     ]
     head = ("kind", "compared", "rejected by the gate", "mean NIS", "beyond 95 %", "errors for its sigma")
-    curves = []
-    colors = iter(panels.PALETTE * 4)
-    for each in found:
-        if each.count >= 10:
-            utimes, means = consistency.compute_running_nis(
-                (d for d in data.decisions if d.kind == each.kind), NIS_WINDOW_S
-            )
-            curves.append(Curve(each.kind, [data.to_seconds(u) for u in utimes], means, next(colors)))
+    x = _time_axis(data)
+    drawn = [level("expected", x, 1.0)]
+    for each, color in zip([each for each in found if each.count >= 10], cycle(charts.PALETTE), strict=False):
+        of_kind = (decision for decision in data.decisions if decision.kind == each.kind)
+        utimes, means = consistency.compute_running_nis(of_kind, NIS_WINDOW_S)
+        drawn.append(Series(each.kind, list(map(data.to_seconds, utimes)), means, color))
     axis = Axis("NIS / dof", 0.01, 100.0, is_logarithmic=True)
-    chart = panels.render_panels(
-        "NIS over time",
-        0.0,
-        data.duration,
-        [Panel(f"NIS, mean of {NIS_WINDOW_S:.0f} s", axis, [HorizontalLine("expected", 1.0), *curves], 220.0)],
-        _epochs(data),
+    panel = Panel(f"NIS, mean of {NIS_WINDOW_S:.0f} s", axis, drawn, 220.0)
+    figure = _render_figure(
+        charts.render_panels("NIS over time", x, [panel], _epochs(data)),
+        "NIS per degree of freedom: mean 1 and 5 % beyond the 95 % limit are consistent. Below 1 the sigma is larger "
+        "than necessary; far above 1 it is too small, or something else is wrong. Time-correlated kinds have their "
+        "noise inflated on purpose and lie well below 1.",
     )
-    return (
-        f"{_render_table(head, rows, numbers=(1, 2, 3, 4))}\n<figure>{chart}<figcaption>NIS per degree of freedom: "
-        "mean 1 and 5 % beyond the 95 % limit are consistent. Below 1 the sigma is larger than necessary; far above 1 "
-        "it is too small, or something else is wrong. Time-correlated kinds have their noise inflated on purpose and "
-        "lie well below 1.</figcaption></figure>"
-    )
+    return f"{_render_table(head, rows, numbers=(1, 2, 3, 4))}\n{figure}"
 
 
 def _render_innovations(data: ReplayData) -> str:
@@ -399,10 +384,10 @@ def _render_innovations(data: ReplayData) -> str:
     ]
     if not drawn:
         return "<p>No innovations.</p>"
-    chart = panels.render_panels("Innovations", 0.0, data.duration, drawn)
-    return (
-        f"<figure>{chart}<figcaption>Measured minus predicted, with 2 sigma: 95 % lie within, without a pattern. "
-        "Points beyond a panel are drawn at its edge.</figcaption></figure>"
+    return _render_figure(
+        charts.render_panels("Innovations", _time_axis(data), drawn),
+        "Measured minus predicted, with 2 sigma: 95 % lie within, without a pattern. Points beyond a panel are drawn "
+        "at its edge.",
     )
 
 
@@ -414,23 +399,22 @@ def _innovation_panel(data: ReplayData, kind: str, n: int, found: Sequence[Decis
     order = sorted(sigma)
     typical = order[int(0.95 * (len(order) - 1))]
     residuals = [each.residual[n] for each in found]
-    low, high = panels.value_range(residuals, 0.99)
+    low, high = value_range(residuals, 0.99)
     reach = max(min(1.15 * typical, 12.0 * max(-low, high)), -low, high, 1e-9)
     t = [data.to_seconds(each.utime) for each in found]
-    marks: list[panels.Mark] = [
-        Band("2 sigma", t, [-value for value in sigma], sigma, panels.SKY),
-        HorizontalLine("", 0.0),
+    drawn = [
+        Series("2 sigma", t, [-value for value in sigma], charts.SKY, shape="band", high=sigma),
+        level("", _time_axis(data), 0.0),
     ]
     for verdict, color in (
-        (Verdict.MONITORED, panels.AMBER),
-        (Verdict.USED, panels.BLUE),
-        (Verdict.REJECTED, panels.RED),
+        (Verdict.MONITORED, charts.AMBER),
+        (Verdict.USED, charts.BLUE),
+        (Verdict.REJECTED, charts.RED),
     ):
-        chosen = [k for k, each in enumerate(found) if each.verdict is verdict]
+        chosen = [(a, b) for a, b, each in zip(t, residuals, found, strict=True) if each.verdict is verdict]
         if chosen:
-            name_of = verdict.name.lower()
-            marks.append(Dots(name_of, [t[k] for k in chosen], [residuals[k] for k in chosen], color, 2.4))
-    return Panel(f"{kind}, {name}", Axis("", -reach, reach), marks, 56.0 if kind.startswith("zero_") else 90.0)
+            drawn.append(charts.dots(verdict.name.lower(), chosen, color, 2.4))
+    return Panel(f"{kind}, {name}", Axis("", -reach, reach), drawn, 56.0 if kind.startswith("zero_") else 90.0)
 
 
 # --- states -------------------------------------------------------------------------------------------------
@@ -464,34 +448,37 @@ def _render_states(data: ReplayData) -> str:
     core = ("position_", "velocity_", "attitude_")
     listed = {name for _, group, _, _ in KNOWN_STATES for name in group}
     own = tuple((name, (name,), "", 1.0) for name in names if name not in listed and not name.startswith(core))
-    drawn = []
-    for title, group, unit, factor in (*KNOWN_STATES, *own):
-        present = [name for name in group if name in names]
-        if present:
-            drawn.append(_state_panel(states, title, present, unit, factor))
-    chart = panels.render_panels("States", 0.0, data.duration, drawn, _epochs(data))
-    return (
-        f"<figure>{chart}<figcaption>Estimates with one sigma. A bias settles and stays; one that follows the turns of "
-        "the drive absorbs another error.</figcaption></figure>"
+    x = _time_axis(data)
+    drawn = [
+        _state_panel(x, states, title, present, unit, factor)
+        for title, group, unit, factor in (*KNOWN_STATES, *own)
+        if (present := [name for name in group if name in names])
+    ]
+    return _render_figure(
+        charts.render_panels("States", x, drawn, _epochs(data)),
+        "Estimates with one sigma. A bias settles and stays; one that follows the turns of the drive absorbs another "
+        "error.",
     )
 
 
-def _state_panel(states: Sequence[StateSample], title: str, names: Sequence[str], unit: str, factor: float) -> Panel:
-    marks: list[panels.Mark] = [HorizontalLine("", 0.0)]
-    lines: list[panels.Mark] = []
+def _state_panel(
+    x: Axis, states: Sequence[StateSample], title: str, names: Sequence[str], unit: str, factor: float
+) -> Panel:
+    bands: list[Series] = []
+    lines: list[Series] = []
     reach: list[float] = [0.0]
-    for name, color in zip(names, panels.PALETTE, strict=False):
+    for name, color in zip(names, charts.PALETTE, strict=False):
         held = [each for each in states if name in each.values]
         t = [each.t for each in held]
         value = [factor * each.values[name] for each in held]
-        sigma = [factor * each.sigmas[name] for each in held]
-        low = [v - s for v, s in zip(value, sigma, strict=True)]
-        high = [v + s for v, s in zip(value, sigma, strict=True)]
-        marks.append(Band("", t, low, high, color))
-        lines.append(Curve(name.rsplit("_", 1)[1] if len(names) > 1 else "", t, value, color))
+        low, high = (
+            [v + sign * factor * each.sigmas[name] for v, each in zip(value, held, strict=True)] for sign in (-1, 1)
+        )
+        bands.append(Series("", t, low, color, shape="band", high=high))
+        lines.append(Series(name.rsplit("_", 1)[1] if len(names) > 1 else "", t, value, color))
         settled = len(held) // 10
-        reach += [*panels.value_range(low[settled:]), *panels.value_range(high[settled:]), *panels.value_range(value)]
-    return Panel(title, Axis(unit, *panels.value_range(reach)), [*marks, *lines], 130.0)
+        reach += [*value_range(low[settled:]), *value_range(high[settled:]), *value_range(value)]
+    return Panel(title, Axis(unit, *value_range(reach)), [level("", x, 0.0), *bands, *lines], 130.0)
 
 
 # --- sensors and verdicts -----------------------------------------------------------------------------------
@@ -501,7 +488,10 @@ def _render_sensors(data: ReplayData) -> str:
     rows, table = [], []
     for sensor in data.sensors:
         gaps = sensor.find_gaps()
-        rows.append(StripRow(sensor.name, _present_intervals(sensor.times, gaps), panels.GREEN))
+        ends = [sensor.times[0], *chain.from_iterable(gaps), sensor.times[-1]]
+        rows.append(
+            StripRow(sensor.name, [(a, b, "") for a, b in zip(ends[::2], ends[1::2], strict=True)], charts.GREEN)
+        )
         longest = max((b - a for a, b in gaps), default=0.0)
         table.append(
             (
@@ -514,23 +504,13 @@ def _render_sensors(data: ReplayData) -> str:
             )
         )
     if data.frozen:
-        rows.append(StripRow("IMU frozen", [(a, b, "repeats one sample") for a, b in data.frozen], panels.RED))
+        rows.append(StripRow("IMU frozen", [(a, b, "repeats one sample") for a, b in data.frozen], charts.RED))
     if not rows:
         return "<p>No sample could be used.</p>"
-    chart = panels.render_strip("Sensors over time", 0.0, data.duration, rows)
     head = ("source", "samples", "rate, Hz", "gaps", "longest, s", "total, s")
-    return (
-        f"{_render_table(head, table, numbers=(1, 2, 3, 4, 5))}\n<figure>{chart}<figcaption>Samples of each source. A "
-        "gap exceeds three periods and 0.2 s.</figcaption></figure>"
-    )
-
-
-def _present_intervals(times: Sequence[float], gaps: Iterable[tuple[float, float]]) -> list[tuple[float, float, str]]:
-    found, begin = [], times[0]
-    for a, b in gaps:
-        found.append((begin, a, ""))
-        begin = b
-    return [*found, (begin, times[-1], "")]
+    chart = charts.render_strip("Sensors over time", _time_axis(data), rows)
+    figure = _render_figure(chart, "Samples of each source. A gap exceeds three periods and 0.2 s.")
+    return f"{_render_table(head, table, numbers=(1, 2, 3, 4, 5))}\n{figure}"
 
 
 def _render_verdicts(data: ReplayData) -> str:
@@ -552,67 +532,3 @@ def _explain_no_decisions(data: ReplayData) -> str:
     if data.missing_channels:
         return "no messages on channel " + ", ".join(channel for _, channel in data.missing_channels)
     return "leveling or heading alignment was never completed"
-
-
-def _render_table(head: Sequence[str], rows: Sequence[Sequence[str]], numbers: Iterable[int] = ()) -> str:
-    right = frozenset(numbers)
-
-    def cells(row: Sequence[str], tag: str) -> str:
-        return "".join(
-            f"<{tag}{' class=n' if n in right else ''}>{html.escape(escape(each))}</{tag}>"
-            for n, each in enumerate(row)
-        )
-
-    body = "\n".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
-    return f"<table><thead><tr>{cells(head, 'th')}</tr></thead>\n<tbody>{body}</tbody></table>"
-
-
-def format_summary(found: Sequence[ReportFinding], path: str) -> list[str]:
-    """Return the lines to print: the path of the page, and the headlines of its findings."""
-    lines = [f"report: {escape(path)}, {format_count(len(found), 'finding')}"]
-    return lines + [f"  {LEVEL_NAMES[each.level]}: {escape(each.title)}" for each in found]
-
-
-STYLE = """
-:root { --ink: #1c2430; --soft: #5b6675; --line: #dfe4ea; --paper: #ffffff; --wash: #f5f7f9; }
-* { box-sizing: border-box; }
-body { font: 15px/1.5 system-ui, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; color: var(--ink);
-  background: var(--paper); max-width: 1120px; margin: 0 auto; padding: 0 24px 40px; }
-header { padding: 28px 0 8px; border-bottom: 1px solid var(--line); }
-header p { margin: 0; color: var(--soft); }
-.kicker { text-transform: uppercase; letter-spacing: .1em; font-size: 12px; }
-h1 { margin: 2px 0; font-size: 30px; }
-h2 { margin: 38px 0 12px; font-size: 20px; }
-h3 { margin: 0 0 2px; font-size: 15px; }
-nav { margin: 14px 0 8px; display: flex; flex-wrap: wrap; gap: 4px 18px; }
-nav a { color: #0072b2; text-decoration: none; }
-nav a:hover { text-decoration: underline; }
-.figures { display: flex; flex-wrap: wrap; gap: 10px; margin: 18px 0 6px; }
-.figures div { flex: 1 1 130px; background: var(--wash); border-radius: 8px; padding: 10px 14px; }
-.figures strong { display: block; font-size: 20px; font-variant-numeric: tabular-nums; }
-.figures span { color: var(--soft); font-size: 13px; }
-.finding { border-left: 4px solid var(--tone); background: var(--wash); border-radius: 0 8px 8px 0;
-  padding: 10px 16px; margin: 8px 0; }
-.finding p { margin: 2px 0; }
-.finding p + p { color: var(--soft); }
-.finding h3 span { color: var(--tone); text-transform: uppercase; font-size: 11px; letter-spacing: .06em;
-  margin-right: 6px; }
-.error { --tone: #c22f2f; } .warning { --tone: #b36b00; } .note { --tone: #0072b2; }
-.good { border-left: 4px solid #009e73; background: var(--wash); padding: 10px 16px; }
-figure { margin: 14px 0; }
-figcaption { color: var(--soft); font-size: 13px; margin: 4px 0 0 8px; max-width: 90ch; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: 10px 0; }
-th, td { text-align: left; padding: 4px 18px 4px 4px; border-bottom: 1px solid var(--line); }
-th { font-weight: 600; color: var(--soft); font-size: 13px; }
-.n { text-align: right; }
-svg { width: 100%; height: auto; display: block; }
-svg text { font: 11.5px system-ui, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; fill: #3c4654; }
-svg .title { font-weight: 600; font-size: 13px; fill: #1c2430; }
-svg .box { fill: #fbfcfd; stroke: #c6cdd6; }
-svg .grid { stroke: #e6eaef; }
-svg .track { fill: #f0f2f5; }
-svg .band { opacity: .22; }
-svg .event { stroke: #7a4fb5; stroke-dasharray: 2 2; }
-footer { margin-top: 40px; color: var(--soft); font-size: 13px; border-top: 1px solid var(--line); padding-top: 10px; }
-@media print { body { max-width: none; } section { break-inside: avoid; } nav { display: none; } }
-"""

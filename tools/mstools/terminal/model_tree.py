@@ -14,7 +14,7 @@ from modelserver.geometry.loop_closure import compute_misclosure
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Constraint
 from modelserver.geometry.topology import Crossing, LoopClosure, Topology
-from mstools.report.svg import COLORS
+from mstools.report.charts import BLUE, ORANGE
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +126,7 @@ LETTER_WIDTH = 7.2
 LINE_LENGTH = 100
 """Letters in a line of frames."""
 
-FIXED, MOVING, LOOP = COLORS[3], COLORS[0], COLORS[1]
+FIXED, MOVING, LOOP = "#666666", BLUE, ORANGE
 
 
 def draw_svg(title: str, assemblies: Sequence[Sequence[BodyNode]], with_frames: bool = False) -> str:
