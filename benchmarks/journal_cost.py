@@ -18,7 +18,7 @@ from modelserver.messages import GpsSample, ImuSample, Sample, WheelsSample
 from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus
 from modelserver.server.journal import state as journal_state
-from modelserver.server.journal.queue import Journal, JournalQueue, NoJournal
+from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.journal.segments import Ring
 from modelserver.server.journal.writer import JournalContext, JournalWriter, pause
 from modelserver.server.loop import Hooks, Loop, LoopSettings
@@ -35,7 +35,7 @@ STATES = 40
 class LoopBench:
     """The Raptor's loop on a fake bus, fed with a drive."""
 
-    def __init__(self, vehicle: Vehicle, journal: Journal):
+    def __init__(self, vehicle: Vehicle, journal: JournalQueue):
         self.clock = FakeClock(START, 10**9)
         self.bus = FakeBus(self.clock)
         settings = LoopSettings(10_000_000, vehicle.sensor_channels())
@@ -89,7 +89,7 @@ def main() -> int:
     vehicle = load_vehicle(config)
     with tempfile.TemporaryDirectory() as folder:
         queue = JournalQueue()
-        with_it, without = LoopBench(vehicle, queue), LoopBench(vehicle, NoJournal())
+        with_it, without = LoopBench(vehicle, queue), LoopBench(vehicle, JournalQueue())
         ring = Ring(Path(folder) / "journal", 1 << 30, 16 << 20)
         write = JournalWriter(queue, ring, JournalContext({"run": "bench"}, [], config), with_it.clock)
         samples = simulate_samples(config)

@@ -3,33 +3,12 @@
 from __future__ import annotations
 
 import time
-from typing import Protocol
 
 from modelserver.core import Instant
 
 
-class Clock(Protocol):
-    """The time source of the loop."""
-
-    def monotonic_ns(self) -> int:
-        """Return nanoseconds on a clock that never steps."""
-        ...
-
-    def utime(self) -> int:
-        """Return microseconds since the Unix epoch."""
-        ...
-
-    def now(self) -> Instant:
-        """Return both times: monotonic, and microseconds since the Unix epoch."""
-        ...
-
-    def sleep(self, seconds: float) -> None:
-        """Sleep."""
-        ...
-
-
-class SystemClock:
-    """The host's clocks."""
+class Clock:
+    """The host's clocks, the time source of the loop."""
 
     def monotonic_ns(self) -> int:
         """Return nanoseconds on a clock that never steps."""
@@ -40,7 +19,7 @@ class SystemClock:
         return time.time_ns() // 1000
 
     def now(self) -> Instant:
-        """Return both times."""
+        """Return both times: monotonic, and microseconds since the Unix epoch."""
         return Instant(time.monotonic_ns(), time.time_ns() // 1000)
 
     def sleep(self, seconds: float) -> None:
@@ -48,12 +27,16 @@ class SystemClock:
         time.sleep(seconds)
 
 
-class FakeClock:
-    """A clock for tests, which moves only by `advance`, `sleep` and `step_utime`."""
+class FakeClock(Clock):
+    """A clock for replays and tests, which moves only by `set`, `advance`, `sleep` and `step_utime`."""
 
     def __init__(self, utime: int = 1_700_000_000_000_000, monotonic_ns: int = 1_000_000_000):
         self._utime_ns = utime * 1000
         self._monotonic_ns = monotonic_ns
+
+    def set(self, now: Instant) -> None:
+        """Set both clocks."""
+        self._monotonic_ns, self._utime_ns = now.monotonic_ns, now.utime * 1000
 
     def monotonic_ns(self) -> int:
         """Return nanoseconds."""

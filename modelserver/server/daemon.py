@@ -17,10 +17,10 @@ from modelserver.core import CoreState
 from modelserver.errors import quote
 from modelserver.messages import Mode, PersistOrigin, SwitchMode
 from modelserver.server.bus import LcmBus
-from modelserver.server.clock import SystemClock
+from modelserver.server.clock import Clock
 from modelserver.server.diagnostics.bus_probe import DuplicateServerMonitor, probe_bus, report_findings
 from modelserver.server.diagnostics.machine import read_gauges, read_run_delay
-from modelserver.server.journal.queue import NoJournal
+from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.journal.writer import make_writer
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.persistence.store import SUBJECT as RESTART
@@ -86,7 +86,7 @@ def _restrict_collector() -> None:
 
 def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: str, file: str) -> None:
     config = vehicle.config
-    clock = SystemClock()
+    clock = Clock()
     origins, states, warm_start = store.origin, store.state, config.warm_start
     origin = origins.load() if origins else None
     restored = states.restore(clock.now(), warm_start.max_pose_age_s, warm_start.max_age_s) if states else None
@@ -131,7 +131,7 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
             run_delay=read_run_delay,
             on_tick=supervisor.on_tick,
             verifier=verifier,
-            journal=NoJournal() if journal is None else journal[0],
+            journal=JournalQueue() if journal is None else journal[0],
         ),
     )
     report_findings(findings, loop.set_warning)

@@ -1,4 +1,4 @@
-"""A bus within one process, for tests: it delivers at once, in order, without loss."""
+"""A bus within one process, for replays and tests: it delivers at once, in order, without loss."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from modelserver.core import Instant
 from modelserver.core.publisher_conflict import CONFLICT_TIMEOUT_NS, PublisherConflictDetector, SampleId
 from modelserver.errors import quote
 from modelserver.messages import Event, HealthWarning, Rejected, RelativePoseSample, Sample, SwitchMode
-from modelserver.server.journal.queue import Journal
+from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.log import RateLimitedLog
 from modelserver.wire.codec import decode
 from modelserver.wire.fields import MAX_NAME, MAX_UTIME
@@ -111,7 +111,7 @@ class RejectionCounter:
     Channels and reasons are the server's own, so memory is bounded.
     """
 
-    def __init__(self, step: Callable[[Rejected, Instant], None], journal: Journal):
+    def __init__(self, step: Callable[[Rejected, Instant], None], journal: JournalQueue):
         self._step = step
         self._journal = journal
         self._records, self._events = RateLimiter(), RateLimiter()

@@ -58,7 +58,7 @@ from modelserver.server.ingress import (
     SensorChannel,
     peek_sample_id,
 )
-from modelserver.server.journal.queue import Journal, NoJournal
+from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.log import RateLimitedLog, escape_lines, escape_text
 from modelserver.server.requests.handler import RequestHandler
 from modelserver.server.requests.scheduler import RequestLimits
@@ -104,7 +104,7 @@ class Hooks:
     run_delay: reads the run-queue delay of the loop's thread, nanoseconds; None if unknown.
     on_tick: called after each tick without error.
     verifier: verifies signed commands. Without one they are not received, and mode commands need no signature.
-    journal: records everything that is handled and published.
+    journal: records everything that is handled and published; one that nothing begins records nothing.
     """
 
     on_origin: Callable[[PersistOrigin], None] = lambda origin: None
@@ -117,7 +117,7 @@ class Hooks:
     run_delay: Callable[[], int | None] = lambda: None
     on_tick: Callable[[CoreState], None] = lambda state: None
     verifier: CommandVerifier | None = None
-    journal: Journal = field(default_factory=NoJournal)
+    journal: JournalQueue = field(default_factory=JournalQueue)
 
 
 _NO_HOOKS = Hooks()

@@ -23,7 +23,7 @@ from modelserver.server.bus import (
     LcmBus,
     QueueLimit,
 )
-from modelserver.server.clock import Clock, FakeClock, SystemClock
+from modelserver.server.clock import Clock, FakeClock
 from modelserver.server.fake_bus import FakeBus
 from modelserver.wire.channels import CHANNELS
 
@@ -69,7 +69,7 @@ def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
         yield rig
         return
     with reserved_url() as url:
-        rig = Rig(LcmBus(url), SystemClock())
+        rig = Rig(LcmBus(url), Clock())
         rig.subscribe("LAST")
         yield rig
 

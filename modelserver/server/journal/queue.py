@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, Protocol, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from modelserver.core import CoreState, Instant
 from modelserver.messages import HealthWarning
@@ -23,57 +23,6 @@ SUBJECT: Final = "journal"
 
 ReceivedMessage: TypeAlias = tuple[str, bytes]
 """Channel and bytes of a message."""
-
-
-class Journal(Protocol):
-    """Recorder of the loop, called in processing order."""
-
-    @property
-    def wants_state(self) -> bool:
-        """Whether `begin` has to be called before the next record."""
-        ...
-
-    def begin(self, state: CoreState, now: Instant) -> None:
-        """Record the state: from here on a replay needs nothing from before."""
-        ...
-
-    def record_event(self, event: object, now: Instant, received: ReceivedMessage | None = None) -> None:
-        """Record an event before the core processes it; `received` is the message it was decoded from, if any."""
-        ...
-
-    def record_message(self, kind: RecordKind, received: ReceivedMessage, now: Instant) -> None:
-        """Record a received message that the core does not process, and what is done with it instead."""
-        ...
-
-    def record_published(self, channel: str, data: bytes) -> None:
-        """Record a message before it is published."""
-        ...
-
-    def poll_warnings(self) -> Sequence[HealthWarning]:
-        """Return the warnings about the journal since the last call, usually none."""
-        ...
-
-
-class NoJournal:
-    """Records nothing."""
-
-    wants_state = False
-
-    def begin(self, state: CoreState, now: Instant) -> None:
-        """Do nothing."""
-
-    def record_event(self, event: object, now: Instant, received: ReceivedMessage | None = None) -> None:
-        """Do nothing."""
-
-    def record_message(self, kind: RecordKind, received: ReceivedMessage, now: Instant) -> None:
-        """Do nothing."""
-
-    def record_published(self, channel: str, data: bytes) -> None:
-        """Do nothing."""
-
-    def poll_warnings(self) -> Sequence[HealthWarning]:
-        """Return no warnings."""
-        return ()
 
 
 class JournalEntry(NamedTuple):
@@ -95,26 +44,15 @@ class SegmentStart:
 
 
 class JournalQueue:
-    """Bounded queue from the loop to the writer's thread.
+    """Bounded queue from the loop to the writer's thread, in processing order. Before the first `begin` it drops all.
 
     On overflow, records are dropped and counted until the next `begin`, which the writer requests (`request_state`).
     Lock-free: each attribute is written by one thread, and a deque is thread-safe at both ends.
     """
 
-    __slots__ = (
-        "_entries",
-        "_is_started",
-        "_last",
-        "_open",
-        "_popped_bytes",
-        "_queued_bytes",
-        "_warnings",
-        "lost",
-        "wants_state",
-    )
-
     def __init__(self) -> None:
         self.wants_state = False
+        """Whether `begin` has to be called before the next record."""
         self.lost = 0
         """Records dropped since the last `begin`. Written by the loop's thread."""
         self._entries: deque[JournalEntry] = deque()
@@ -127,7 +65,7 @@ class JournalQueue:
     # --- called by the loop's thread ---
 
     def begin(self, state: CoreState, now: Instant) -> None:
-        """See `Journal`."""
+        """Record the state: from here on a replay needs nothing from before."""
         self.wants_state = False
         self._last = now
         lost, self.lost = self.lost, 0
@@ -135,40 +73,36 @@ class JournalQueue:
         self._open, self._is_started = True, 1
 
     def record_event(self, event: object, now: Instant, received: ReceivedMessage | None = None) -> None:
-        """See `Journal`."""
+        """Record an event before the core processes it; `received` is the message it was decoded from, if any."""
         self._last = now
-        if not self._open:
-            self.lost += self._is_started
-        elif received is None:
-            self._put(JournalEntry(RecordKind.EVENT, now, "", b"", event))
+        if received is None:
+            self._put(RecordKind.EVENT, now, "", b"", event)
         else:
-            self._put(JournalEntry(RecordKind.REQUEST, now, received[0], received[1], event))
+            self._put(RecordKind.REQUEST, now, received[0], received[1], event)
 
     def record_message(self, kind: RecordKind, received: ReceivedMessage, now: Instant) -> None:
-        """See `Journal`."""
+        """Record a received message that the core does not process, and what is done with it instead."""
         self._last = now
-        self._put(JournalEntry(kind, now, received[0], received[1]))
+        self._put(kind, now, *received)
 
     def record_published(self, channel: str, data: bytes) -> None:
-        """See `Journal`."""
-        self._put(JournalEntry(RecordKind.PUBLISHED, self._last, channel, data))
+        """Record a message before it is published."""
+        self._put(RecordKind.PUBLISHED, self._last, channel, data)
 
     def poll_warnings(self) -> Sequence[HealthWarning]:
-        """See `Journal`."""
-        if not self._warnings:
-            return ()
+        """Return the warnings about the journal since the last call, usually none."""
         return [self._warnings.popleft() for _ in range(len(self._warnings))]
 
-    def _put(self, entry: JournalEntry) -> None:
+    def _put(self, kind: RecordKind, now: Instant, channel: str, data: bytes, event: object = None) -> None:
         if not self._open:
             self.lost += self._is_started
             return
-        self._queued_bytes += len(entry.data)
+        self._queued_bytes += len(data)
         if len(self._entries) >= MAX_QUEUED_RECORDS or self._queued_bytes - self._popped_bytes > MAX_QUEUED_BYTES:
             self._open = False
             self.lost += 1
             return
-        self._entries.append(entry)
+        self._entries.append(JournalEntry(kind, now, channel, data, event))
 
     # --- called by the writer's thread ---
 

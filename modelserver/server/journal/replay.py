@@ -1,4 +1,4 @@
-"""Replay of a run from its journal: the same loop and core process the records, on a recording bus and a replay clock.
+"""Replay of a run from its journal: the same loop and core process the records, on a fake bus and clock.
 
 Outputs that are published are collected per record; the effects of others (a reloaded geometry, a persisted state) are
 records of their own.
@@ -6,7 +6,6 @@ records of their own.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Container, Mapping
 
 from modelserver import core
@@ -22,7 +21,8 @@ from modelserver.messages import (
     Request,
     SendReply,
 )
-from modelserver.server.bus import Handler
+from modelserver.server.clock import FakeClock
+from modelserver.server.fake_bus import FakeBus
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.journal import state as journal_state
 from modelserver.server.loop import Hooks, Loop, LoopSettings
@@ -46,54 +46,9 @@ PUBLISHING_OUTPUTS = (
 )
 
 
-class _EmptyInbox:
-    """An inbox that receives nothing."""
-
-    def subscribe(self, channel: str, handler: Handler) -> None:
-        """Do nothing."""
-
-    def drain(self, limit: int, seconds: float = math.inf) -> int:
-        """Return 0."""
-        return 0
-
-
 class _ContainsAll(Container[object]):
     def __contains__(self, thing: object) -> bool:
         return True
-
-
-class _RecordingBus:
-    """A bus that records what is published."""
-
-    def __init__(self) -> None:
-        self.sensors = self.requests = _EmptyInbox()
-        self.published: list[PublishedMessage] = []
-
-    def publish(self, channel: str, data: bytes) -> None:
-        """Record a message."""
-        self.published.append((channel, data))
-
-    def wait(self, seconds: float, requests: bool = True) -> None:
-        """Do nothing."""
-
-
-class _ReplayClock:
-    """A clock that shows the instant of the replayed record."""
-
-    def __init__(self) -> None:
-        self.instant = Instant(0, 0)
-
-    def monotonic_ns(self) -> int:
-        return self.instant.monotonic_ns
-
-    def utime(self) -> int:
-        return self.instant.utime
-
-    def now(self) -> Instant:
-        return self.instant
-
-    def sleep(self, seconds: float) -> None:
-        """Do nothing."""
 
 
 class ReplayLoop(Loop):
@@ -103,12 +58,11 @@ class ReplayLoop(Loop):
         """Continue from the state of a segment. Raises RecordingError."""
         config, known = journal_state.decode_run(state)
         self.config = config
-        self._recording_bus, self._replay_clock = _RecordingBus(), _ReplayClock()
+        self._fake_clock = FakeClock()
+        self._fake_bus = FakeBus(self._fake_clock)
         vehicle = Vehicle(config, known.model, None)
         settings = LoopSettings(period_ns=1, channel_prefix=config.lcm.channel_prefix)
-        super().__init__(
-            self._recording_bus, self._replay_clock, known, settings, Hooks(snapshot=vehicle.encode_snapshot)
-        )
+        super().__init__(self._fake_bus, self._fake_clock, known, settings, Hooks(snapshot=vehicle.encode_snapshot))
         joints = config.sensors.joints
         self._replayed_channels: Mapping[str, SensorChannel] = {
             # stays subscribed after a reload from a geometry with joints to one without
@@ -120,8 +74,9 @@ class ReplayLoop(Loop):
 
     def handle(self, record: JournalRecord) -> list[PublishedMessage]:
         """Process a record; return what is published. Raises RecordingError for an invalid record."""
-        self._recording_bus.published = []
-        now = self._replay_clock.instant = Instant(record.monotonic_ns, record.utime)
+        published = self._fake_bus.published = []
+        now = Instant(record.monotonic_ns, record.utime)
+        self._fake_clock.set(now)
         if record.kind is RecordKind.EVENT:
             self._replay_event(journal_state.decode_event(record.data), now)
         elif record.kind is RecordKind.SAMPLE:
@@ -133,7 +88,7 @@ class ReplayLoop(Loop):
             self._requests.send_deferred(int.from_bytes(record.data, "big"))
         elif record.kind not in (RecordKind.UNDECODABLE, RecordKind.DROPPED):
             self._replay_request(record, now)
-        return self._recording_bus.published
+        return published
 
     def _replay_request(self, record: JournalRecord, now: Instant) -> None:
         channel = BY_NAME.get(record.channel.removeprefix(self.config.lcm.channel_prefix))

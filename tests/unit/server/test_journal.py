@@ -16,7 +16,7 @@ from modelserver.core import Instant
 from modelserver.messages import GetBodyList, HealthWarning, Rejected, RequestHeader, Tick
 from modelserver.server.journal import queue as journal
 from modelserver.server.journal import writer as journal_writer
-from modelserver.server.journal.queue import JournalQueue, NoJournal
+from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.journal.segments import Ring, Segment
 from modelserver.server.journal.verify import verify
 from modelserver.server.journal.writer import RETRY_S, get_journal_directory, make_writer
@@ -74,7 +74,7 @@ def test_given_a_running_service_then_all_received_and_published_messages_are_in
 
 
 def test_given_no_journal_then_no_state_is_requested_and_no_warning_published(tmp_path: Path) -> None:
-    none = NoJournal()
+    none = JournalQueue()
     none.record_event(Tick(), NOW)
     none.record_message(RecordKind.UNDECODABLE, ("GPS", b""), NOW)
     none.record_published("POSE", b"")

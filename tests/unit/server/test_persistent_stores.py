@@ -22,7 +22,7 @@ from support_signing import write_test_key
 from modelserver.config.vehicle_file import VehicleConfig, load_config
 from modelserver.core import Instant
 from modelserver.earth.geodesy import make_origin
-from modelserver.server.clock import SystemClock
+from modelserver.server.clock import Clock
 from modelserver.server.journal.segments import Ring
 from modelserver.server.journal.writer import make_writer
 from modelserver.server.persistence.directory import FileLock, LockHeldError, describe_error
@@ -248,7 +248,7 @@ def test_given_a_journal_elsewhere_then_the_state_directory_is_no_matter(
     write_test_key(tmp_path)
     config = load_config(write_vehicle(tmp_path, f"{VEHICLE}journal: {{directory: {directory}}}\n"))
     store = open_stores(config, localizes=False)
-    made = make_writer(config, "", SystemClock(), store.lock)
+    made = make_writer(config, "", Clock(), store.lock)
     assert made is not None
     assert (made[1]._ring._outer_lock is store.lock) == within
     store.close()

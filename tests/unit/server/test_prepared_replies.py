@@ -12,7 +12,7 @@ from modelserver.messages import GetTransformation, RequestHeader, TransformRepl
 from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus
 from modelserver.server.ingress import SensorChannel
-from modelserver.server.journal.queue import NoJournal
+from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.wire.codec import decode, encode
 from modelserver.wire.journal import RecordKind
@@ -21,10 +21,11 @@ PERIOD_NS = 20_000_000
 FRAMES = ("Cart:Base", "Cart:Antenna", "Cart:Imu", "Cart:Mast", "Camera:Origin")
 
 
-class Noted(NoJournal):
+class Noted(JournalQueue):
     """A journal that records the kinds of messages."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.kinds: list[RecordKind] = []
 
     def record_message(self, kind: RecordKind, received: tuple[str, bytes], now: object) -> None:

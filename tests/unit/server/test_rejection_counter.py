@@ -15,7 +15,7 @@ from modelserver import core
 from modelserver.core import Instant
 from modelserver.messages import GetTransformations, Rejected
 from modelserver.server.ingress import MAX_PER_SECOND, MAX_RECORDED_BYTES, RateLimiter, RejectionCounter
-from modelserver.server.journal.queue import NoJournal
+from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.journal.verify import verify
 from modelserver.wire.codec import encode
 from modelserver.wire.journal import JournalRecord, RecordKind, read_segment
@@ -103,7 +103,7 @@ def test_given_any_messages_then_each_is_counted_once_and_few_of_a_second_singly
     steps: list[tuple[str, int]],
 ) -> None:
     events: list[tuple[Rejected, Instant]] = []
-    counter = RejectionCounter(lambda event, now: events.append((event, now)), NoJournal())
+    counter = RejectionCounter(lambda event, now: events.append((event, now)), JournalQueue())
     at = 5
     for channel, pause in steps:
         at += pause

@@ -152,7 +152,7 @@ def replay_to_bus(
 ) -> None:
     """Publish a log on the bus."""
     from modelserver.config.vehicle_file import load_config
-    from modelserver.server.clock import SystemClock
+    from modelserver.server.clock import Clock
     from modelserver.server.playback import Player
     from modelserver.wire.provider import open_lcm, resolve_url
 
@@ -160,7 +160,7 @@ def replay_to_bus(
         url = load_config(config).lcm.url
     with LogFile(log) as recording:
         bus = open_lcm(resolve_url(url))
-        player = Player(bus.publish, speed, SystemClock(), time.sleep, restamp)
+        player = Player(bus.publish, speed, Clock(), time.sleep, restamp)
         try:
             with show_progress(f"replaying {log.name}", recording.size) as show:
                 updated = 0.0
