@@ -7,18 +7,20 @@ arrows. All are plain SVG without scripts, fonts or links.
 
 from __future__ import annotations
 
+import html
 import math
 import sys
-from collections.abc import Callable, Iterable, Sequence
-from html import escape
+from collections.abc import Callable, Iterable
 from pathlib import Path
+
+from mstools.report import charts
 
 ROOT = Path(__file__).resolve().parents[1]
 IMAGES = ROOT / "docs" / "images"
 
 INK, LINE, PAPER = "#22303c", "#607d8b", "#ffffff"
 BLUE, GREEN, RED, AMBER, GRAY = "#1e6fb8", "#2e8b57", "#c0392b", "#d98200", "#9aa5ae"
-FILL = {"": "#eef2f5", BLUE: "#e3eefa", GREEN: "#e2f3e9", AMBER: "#fcf0db", RED: "#fae4e1"}
+FILL = {LINE: "#eef2f5", BLUE: "#e3eefa", GREEN: "#e2f3e9", AMBER: "#fcf0db"}
 
 
 class Drawing:
@@ -28,85 +30,53 @@ class Drawing:
         self.width, self.height, self.title = width, height, title
         self.parts: list[str] = []
 
-    def text(
-        self,
-        x: float,
-        y: float,
-        words: str,
-        size: float = 13,
-        color: str = INK,
-        anchor: str = "middle",
-        weight: str = "",
-    ) -> None:
-        """Write words at a baseline."""
-        bold = ' font-weight="600"' if weight else ""
-        self.parts.append(
-            f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" fill="{color}" text-anchor="{anchor}"{bold}>'
-            f"{escape(words)}</text>"
-        )
+    def text(self, x: float, y: float, words: str, size: float = 13, color: str = INK, anchor: str = "middle") -> None:
+        """Write words at a baseline; larger ones than 12 are bold."""
+        bold = {"font_weight": "600"} if size > 12 else {}
+        style = {"fill": color, "text_anchor": anchor} | bold
+        self.parts.append(charts.render_text(x, y, words, font_size=size, **style))
 
-    def box(self, x: float, y: float, width: float, height: float, lines: Sequence[str], color: str = "") -> None:
-        """Draw a box with a title line and further lines."""
-        self.parts.append(
-            f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" rx="6" fill="{FILL[color]}" '
-            f'stroke="{color or LINE}" stroke-width="1.3"/>'
-        )
+    def box(self, x: float, y: float, width: float, height: float, words: str, color: str = LINE) -> None:
+        """Draw a box with lines of words; the first is its title."""
+        style = {"fill": FILL[color], "stroke": color}
+        self.parts.append(charts.element("rect", x=x, y=y, width=width, height=height, rx=6, **style))
+        lines = words.splitlines()
         top = y + height / 2 - (len(lines) - 1) * 8 + 4.5
-        for number, words in enumerate(lines):
-            self.text(
-                x + width / 2, top + 16 * number, words, 13 if number == 0 else 11, weight="1" if number == 0 else ""
-            )
+        for number, line in enumerate(lines):
+            self.text(x + width / 2, top + 16 * number, line, 11 if number else 13)
 
-    def line(
-        self, points: Iterable[tuple[float, float]], color: str = LINE, width: float = 1.6, dash: str = ""
-    ) -> None:
+    def line(self, *points: tuple[float, float], color: str = LINE, width: float = 1.6, dash: str = "none") -> None:
         """Draw a polyline."""
-        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
-        dashed = f' stroke-dasharray="{dash}"' if dash else ""
-        self.parts.append(f'<polyline points="{path}" fill="none" stroke="{color}" stroke-width="{width:g}"{dashed}/>')
+        style = {"points": charts.format_points(points), "fill": "none", "stroke": color, "stroke_dasharray": dash}
+        self.parts.append(charts.element("polyline", **style, stroke_width=width))
 
-    def arrow(
-        self,
-        x1: float,
-        y1: float,
-        x2: float,
-        y2: float,
-        words: str = "",
-        color: str = LINE,
-        above: float = 6,
-        dash: str = "",
-    ) -> None:
-        """Draw an arrow with words at its middle."""
+    def arrow(self, *points: tuple[float, float], words: str = "", color: str = LINE) -> None:
+        """Draw an arrow through points with words above the middle of its ends."""
+        (x1, y1), (x2, y2) = points[-2:]
         length = math.hypot(x2 - x1, y2 - y1)
         ux, uy = (x2 - x1) / length, (y2 - y1) / length
         bx, by = x2 - 9 * ux, y2 - 9 * uy
-        self.line([(x1, y1), (bx, by)], color, dash=dash)
-        corners = ((x2, y2), (bx - 4 * uy, by + 4 * ux), (bx + 4 * uy, by - 4 * ux))
-        self.polygon(corners, color)
+        self.line(*points[:-1], (bx, by), color=color)
+        self.polygon(((x2, y2), (bx - 4 * uy, by + 4 * ux), (bx + 4 * uy, by - 4 * ux)), color)
         if words:
-            self.text((x1 + x2) / 2, (y1 + y2) / 2 - above, words, 11)
+            self.text((points[0][0] + x2) / 2, (points[0][1] + y2) / 2 - 6, words, 11)
 
     def polygon(self, points: Iterable[tuple[float, float]], fill: str, color: str = "none") -> None:
         """Draw a closed shape."""
-        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
-        self.parts.append(f'<polygon points="{path}" fill="{fill}" stroke="{color}" stroke-width="1.2"/>')
-
-    def circle(self, x: float, y: float, radius: float, fill: str, color: str) -> None:
-        """Draw a circle with an outline."""
         self.parts.append(
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" fill="{fill}" stroke="{color}" stroke-width="1.2"/>'
+            charts.element("polygon", points=charts.format_points(points), fill=fill, stroke=color, stroke_width=1.2)
         )
 
-    def dot(self, x: float, y: float, radius: float, color: str) -> None:
-        """Draw a dot."""
-        self.parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}" fill="{color}"/>')
+    def dot(self, x: float, y: float, radius: float, fill: str, color: str = "none") -> None:
+        """Draw a disk, with an outline in `color`."""
+        self.parts.append(charts.element("circle", cx=x, cy=y, r=radius, fill=fill, stroke=color))
 
     def svg(self) -> str:
         """Return the image as text."""
         return (
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width:g} {self.height:g}" '
             f'width="{self.width:g}" height="{self.height:g}" font-family="Helvetica, Arial, sans-serif" role="img">\n'
-            f"<title>{escape(self.title)}</title>\n"
+            f"<title>{html.escape(self.title)}</title>\n"
             f'<rect width="{self.width:g}" height="{self.height:g}" rx="8" fill="{PAPER}"/>\n'
             + "\n".join(self.parts)
             + "\n</svg>\n"
@@ -116,119 +86,105 @@ class Drawing:
 def data_flow() -> Drawing:
     """Draw devices, drivers, bus, service and clients."""
     d = Drawing(860, 330, "Data flow: devices, drivers, LCM bus, service, clients")
-    for row, (device, driver) in enumerate(
+    for row, (device, driver, channel) in enumerate(
         (
-            ("GPS receiver", "driver gps"),
-            ("IMU", "driver imu"),
-            ("wheels (CAN)", "driver wheels"),
-            ("joint axis", "driver axis"),
+            ("GPS receiver", "driver gps", "GPS"),
+            ("IMU", "driver imu", "IMU"),
+            ("wheels (CAN)", "driver wheels", "WHEELS"),
+            ("joint axis", "driver axis", "JOINTS"),
         )
     ):
         y = 24 + 54 * row
-        d.box(16, y, 106, 38, [device])
-        d.box(166, y, 106, 38, [driver], GREEN)
-        d.arrow(122, y + 19, 166, y + 19)
-        d.arrow(272, y + 19, 330, y + 19)
-    for x, y, words in ((301, 36, "GPS"), (301, 90, "IMU"), (301, 144, "WHEELS"), (301, 198, "JOINTS")):
-        d.text(x, y, words, 10)
-    d.box(330, 18, 60, 290, ["LCM", "UDP", "multi-", "cast"], AMBER)
-    d.box(146, 262, 126, 38, ["your program", "any sample"])
-    d.arrow(272, 281, 330, 281)
-    d.box(470, 24, 170, 200, ["modelserver run"], BLUE)
-    d.parts.pop()
-    d.text(555, 46, "modelserver run", 13, weight="1")
-    d.box(488, 58, 134, 44, ["localization", "filter or raw mode"])
-    d.box(488, 112, 134, 44, ["geometry", "frames, joints"])
-    d.box(488, 166, 134, 44, ["history", "poses, joint readings"])
-    d.arrow(390, 80, 470, 80, "samples")
-    d.arrow(470, 124, 390, 124, "POSE, health", above=6)
-    d.arrow(390, 170, 470, 170, "requests")
-    d.arrow(470, 206, 390, 206, "replies")
-    d.box(488, 256, 134, 44, ["journal, state", "on disk"])
-    d.arrow(555, 224, 555, 256)
-    for row, (name, about) in enumerate(
-        (
-            ("Platform", "a round trip per query"),
-            ("PlatformMirror", "answers locally"),
-            ("modelserver query", "status, spy, replay"),
-        )
+        d.box(16, y, 106, 38, device)
+        d.box(166, y, 106, 38, driver, GREEN)
+        d.arrow((122, y + 19), (166, y + 19))
+        d.arrow((272, y + 19), (330, y + 19))
+        d.text(301, y + 12, channel, 10)
+    d.box(330, 18, 60, 290, "LCM\nUDP\nmulti-\ncast", AMBER)
+    d.box(146, 262, 126, 38, "your program\nany sample")
+    d.arrow((272, 281), (330, 281))
+    d.box(470, 24, 170, 200, "", BLUE)
+    d.text(555, 46, "modelserver run")
+    d.box(488, 58, 134, 44, "localization\nfilter or raw mode")
+    d.box(488, 112, 134, 44, "geometry\nframes, joints")
+    d.box(488, 166, 134, 44, "history\nposes, joint readings")
+    d.arrow((390, 80), (470, 80), words="samples")
+    d.arrow((470, 124), (390, 124), words="POSE, health")
+    d.arrow((390, 170), (470, 170), words="requests")
+    d.arrow((470, 206), (390, 206), words="replies")
+    d.box(488, 256, 134, 44, "journal, state\non disk")
+    d.arrow((555, 224), (555, 256))
+    d.line((360, 308), (360, 316), (670, 316), (670, 60), color=AMBER)
+    for y, words in (
+        (60, "Platform\na round trip per query"),
+        (148, "PlatformMirror\nanswers locally"),
+        (236, "modelserver query\nstatus, spy, replay"),
     ):
-        y = 36 + 88 * row
-        d.box(696, y, 152, 48, [name, about])
-    d.line([(390, 316), (670, 316), (670, 60)], AMBER)
-    for y in (60, 148, 236):
-        d.arrow(670, y, 696, y, color=AMBER)
-    d.line([(360, 308), (360, 316), (390, 316)], AMBER)
+        d.box(696, y - 24, 152, 48, words)
+        d.arrow((670, y), (696, y), color=AMBER)
     return d
 
 
 def filter_flow() -> Drawing:
     """Draw the error-state filter: propagation, update, outputs."""
     d = Drawing(860, 330, "Error-state Kalman filter: data flow")
-    d.box(16, 30, 120, 44, ["IMU", "rates, specific force"], GREEN)
-    d.box(190, 22, 190, 60, ["propagate", "nominal state: strapdown", "P = F P F' + Q, 50 ms at most"], BLUE)
-    d.arrow(136, 52, 190, 52)
-    d.box(16, 130, 120, 44, ["fixes, wheels,", "further sources"], GREEN)
-    d.box(190, 122, 190, 60, ["measurement buffer", "ordered by instant,", "delayed ones inserted"])
-    d.arrow(136, 152, 190, 152)
-    d.box(
-        440,
-        122,
-        180,
-        60,
-        ["innovation and gate", "y = z - h(x),  S = H P H' + R", "y' S^-1 y < chi-square quantile"],
-        BLUE,
-    )
-    d.arrow(380, 152, 440, 152)
-    d.line([(380, 52), (530, 52), (530, 114)])
-    d.arrow(530, 100, 530, 122, "")
+    d.box(16, 30, 120, 44, "IMU\nrates, specific force", GREEN)
+    d.box(190, 22, 190, 60, "propagate\nnominal state: strapdown\nP = F P F' + Q, 50 ms at most", BLUE)
+    d.box(16, 130, 120, 44, "fixes, wheels,\nfurther sources", GREEN)
+    d.box(190, 122, 190, 60, "measurement buffer\nordered by instant,\ndelayed ones inserted")
+    words = "innovation and gate\ny = z - h(x),  S = H P H' + R\ny' S^-1 y < chi-square quantile"
+    d.box(440, 122, 180, 60, words, BLUE)
+    d.box(440, 232, 180, 60, "update\nJoseph form, inject error,\nreset Jacobian", BLUE)
+    d.box(680, 122, 164, 60, "decision ledger\nused, rejected, monitored\nLOCALIZATION_DECISIONS", AMBER)
+    d.box(680, 22, 164, 60, "rejected fixes\nagree with odometry?\nre-initialize position", AMBER)
+    d.box(680, 232, 164, 60, "estimate\nPOSE, POSE_ODOM, twist,\nprotection level, validity", GREEN)
+    d.box(16, 232, 120, 60, "logic\nleveling, stationary,\nheading alignment")
+    d.arrow((136, 52), (190, 52))
+    d.arrow((136, 152), (190, 152))
+    d.arrow((380, 152), (440, 152))
+    d.arrow((380, 52), (530, 52), (530, 122))
+    d.arrow((530, 182), (530, 232))
+    d.arrow((440, 262), (160, 262), (160, 102), (285, 102), (285, 82))
+    d.arrow((620, 152), (680, 152))
+    d.arrow((762, 122), (762, 82))
+    d.arrow((620, 262), (680, 262))
+    d.arrow((136, 262), (160, 262))
     d.text(455, 44, "state, covariance", 11)
-    d.box(440, 232, 180, 60, ["update", "Joseph form, inject error,", "reset Jacobian"], BLUE)
-    d.arrow(530, 182, 530, 232)
-    d.text(540, 212, "passed", 11, anchor="start")
-    d.line([(440, 262), (160, 262), (160, 102), (285, 102)])
-    d.arrow(285, 102, 285, 82)
+    d.text(558, 212, "passed", 11)
     d.text(300, 254, "corrected state", 11)
-    d.box(680, 122, 164, 60, ["decision ledger", "used, rejected, monitored", "LOCALIZATION_DECISIONS"], AMBER)
-    d.arrow(620, 152, 680, 152)
-    d.box(680, 22, 164, 60, ["rejected fixes", "agree with odometry?", "re-initialize position"], AMBER)
-    d.arrow(762, 122, 762, 82)
-    d.box(680, 232, 164, 60, ["estimate", "POSE, POSE_ODOM, twist,", "protection level, validity"], GREEN)
-    d.arrow(620, 262, 680, 262)
-    d.box(16, 232, 120, 60, ["logic", "leveling, stationary,", "heading alignment"])
-    d.arrow(136, 262, 160, 262)
     return d
 
 
 def delayed_measurement() -> Drawing:
     """Draw the time line of a delayed measurement."""
     d = Drawing(860, 250, "Time line of a delayed measurement")
-    start, scale = 90.0, 56.0
 
     def at(step: float) -> float:
-        return start + scale * step
+        return 90.0 + 56.0 * step
 
-    d.text(80, 74, "arrival", 12, anchor="end", weight="1")
-    d.text(80, 154, "instant", 12, anchor="end", weight="1")
-    for y in (70, 150):
-        d.arrow(at(0), y, at(13), y)
-    d.text(at(12.6), 172, "time", 11)
+    for y, words in ((70, "arrival"), (150, "instant")):
+        d.text(80, y + 4, words, anchor="end")
+        d.arrow((at(0), y), (at(13), y))
     for step in range(12):
         d.dot(at(step + 0.15), 70, 3.5, GREEN)
         d.dot(at(step), 150, 3.5, GREEN)
-        d.line([(at(step + 0.15), 70), (at(step), 150)], "#b8d8c4", 1)
+        d.line((at(step + 0.15), 70), (at(step), 150), color="#b8d8c4", width=1)
     d.dot(at(4), 150, 6, BLUE)
     d.dot(at(9.5), 70, 6, BLUE)
-    d.line([(at(9.5), 70), (at(4), 150)], BLUE, 1.8, "5 4")
-    d.text(at(9.5), 54, "fix arrives", 12, BLUE)
-    d.text(at(4), 176, "fix was measured", 12, BLUE)
-    d.text(at(1.2), 54, "IMU samples", 12, GREEN)
-    d.line([(at(4), 190), (at(4), 200), (at(9.5), 200), (at(9.5), 190)], AMBER)
-    d.text(at(6.75), 218, "stored states: insert the fix, process these again", 12, AMBER)
-    d.line([(at(0.5), 28), (at(9.5), 28)], LINE, 1.2, "3 3")
-    d.line([(at(0.5), 22), (at(0.5), 34)], LINE, 1.2)
-    d.line([(at(9.5), 22), (at(9.5), 34)], LINE, 1.2)
-    d.text(at(5), 20, "horizon 1 s: what was measured before is rejected (late)", 11, LINE)
+    d.line((at(9.5), 70), (at(4), 150), color=BLUE, width=1.8, dash="5 4")
+    d.line((at(4), 190), (at(4), 200), (at(9.5), 200), (at(9.5), 190), color=AMBER)
+    d.line((at(0.5), 28), (at(9.5), 28), width=1.2, dash="3 3")
+    for step in (0.5, 9.5):
+        d.line((at(step), 22), (at(step), 34), width=1.2)
+    for step, y, words, color in (
+        (12.6, 172, "time", INK),
+        (9.5, 54, "fix arrives", BLUE),
+        (4, 176, "fix was measured", BLUE),
+        (1.2, 54, "IMU samples", GREEN),
+        (6.75, 218, "stored states: insert the fix, process these again", AMBER),
+        (5, 20, "horizon 1 s: what was measured before is rejected (late)", LINE),
+    ):
+        d.text(at(step), y, words, 12, color)
     return d
 
 
@@ -243,7 +199,7 @@ def raptor_frames() -> Drawing:
     def place(x: float, z: float) -> tuple[float, float]:
         return x0 + scale * x, z0 - scale * z
 
-    outline = [
+    outline = (
         (-0.45, 0.4),
         (2.05, 0.4),
         (2.05, 0.95),
@@ -252,11 +208,11 @@ def raptor_frames() -> Drawing:
         (0.75, 1.87),
         (0.62, 1.2),
         (-0.45, 1.2),
-    ]
-    d.polygon([place(*each) for each in outline], "#f3f5f7", GRAY)
+    )
+    d.polygon((place(*each) for each in outline), "#f3f5f7", GRAY)
     for x in (0.0, 1.5):
-        d.circle(*place(x, 0.3), 0.3 * scale, "#e6eaee", GRAY)
-    d.line([(20, z0), (840, z0)], GRAY, 1)
+        d.dot(*place(x, 0.3), 0.3 * scale, "#e6eaee", GRAY)
+    d.line((20, z0), (840, z0), color=GRAY, width=1)
     reference = "Raptor:RearAxleCenter"
     labels = {
         reference: (10, 22, "start", "rolling frame: GPS course is its heading"),
@@ -275,10 +231,10 @@ def raptor_frames() -> Drawing:
         rotation = T.matrix[:3, :3]
         for axis, color, label in ((0, RED, "x"), (2, BLUE, "z")):
             ex, ez = rotation[0, axis], rotation[2, axis]
-            d.arrow(px, py, px + 42 * ex, py - 42 * ez, color=color)
+            d.arrow((px, py), (px + 42 * ex, py - 42 * ez), color=color)
             d.text(px + 50 * ex, py - 50 * ez + 4, label, 10, color)
         d.dot(px, py, 3, INK)
-        d.text(px + dx, py + dy, name, 12, anchor=anchor, weight="1")
+        d.text(px + dx, py + dy, name, 12.5, anchor=anchor)
         if words:
             d.text(px + dx, py + dy + 14, words, 11, LINE, anchor)
     return d
@@ -291,90 +247,65 @@ OUTAGE = (40.0, 70.0)
 def drive() -> Drawing:
     """Draw a simulated drive of the Raptor with GPS and IMU: track, fixes, estimate; error and protection level."""
     from modelserver.config.vehicle_file import load_config
-    from modelserver.earth.geodesy import origin_at
+    from modelserver.earth.geodesy import Geodesy, origin_at
     from modelserver.estimation.filter.localizer import FilterLocalizer
     from modelserver.estimation.filter.setup import Setup
-    from modelserver.messages import GpsSample
+    from modelserver.messages import GpsSample, ImuSample
     from modelserver.server.vehicle import load_vehicle
-    from modelserver.simulation import GpsModel, ImuModel, Simulation, Timing, Trajectory, figure_eight
+    from modelserver.simulation import GpsModel, ImuModel, Timing
+    from mstools.demo.drive import SUFFIELD, make_simulation
 
     vehicle = load_vehicle(load_config(ROOT / "config" / "raptor" / "vehicle.yaml"))
-    config = vehicle.config
-    simulation = Simulation(
-        vehicle.model,
-        config.base_frame,
-        Trajectory(figure_eight(speed=3.0, radius=15.0, stationary=4.0, laps=2)),
-        origin_at(50.27, -111.18, 700.0),
-        gps_frame=config.sensors.gps.frame,
-        imu_frame=config.sensors.imu.frame,
-        rolling_frame=config.rolling_frame,
-        gps_model=GpsModel(outages=(OUTAGE,)),
-        imu_model=ImuModel(Timing(50.0)),
-        seed=3,
-    )
+    config, geodesy = vehicle.config, Geodesy(origin_at(*SUFFIELD))
+    models = {"gps_model": GpsModel(outages=(OUTAGE,)), "imu_model": ImuModel(Timing(50.0))}
+    simulation = make_simulation(config, 10**15, 96.0, "city", seed=8, sensors=(GpsSample, ImuSample), **models)
     X_rolling_base = vehicle.model.get_transformation(config.base_frame, config.rolling_frame).pose
-    localizer = FilterLocalizer.start(Setup(vehicle.rig), origin_at(50.27, -111.18, 700.0))
+    localizer = FilterLocalizer.start(Setup(vehicle.rig), geodesy.origin)
     fixes, truth, rows = [], [], []
-    start = None
     for sample in simulation.events(96.0):
         localizer, _ = localizer.process(sample)
-        start = start or sample.header.utime
-        if isinstance(sample, GpsSample) and math.isfinite(sample.latitude_deg) and sample.header.seq % 4 == 0:
-            # meters per degree at 50.27 degrees north; the antenna is 0.45 m to the left of the base frame
-            fixes.append(((sample.longitude_deg + 111.18) * 71_293.0, (sample.latitude_deg - 50.27) * 111_234.0))
-        if sample.header.seq % 10 or isinstance(sample, GpsSample):
-            continue
-        estimate = localizer.estimate(localizer.utime)
-        true = simulation.truth(localizer.utime).enu.xyz
-        truth.append(true)
-        if estimate.enu is not None and not estimate.invalid:
-            seconds = (localizer.utime - start) * 1e-6
-            found = (estimate.enu @ X_rolling_base).xyz
-            rows.append((seconds, found, math.dist(found[:2], true[:2]), estimate.horizontal_protection_level))
-
-    d = Drawing(860, 380, "A simulated drive with 30 s without GPS")
-
-    def on_map(point: Sequence[float]) -> tuple[float, float]:
-        return 70 + 4.9 * (point[0] + 32), 194 - 4.9 * point[1]
-
-    d.text(225, 24, "Track, 3 m/s", 13, weight="1")
-    d.line([on_map(each) for each in truth], "#cfd8dc", 7)
-    for fix in fixes:
-        d.dot(*on_map(fix), 2.6, GREEN)
-    for color, inside in ((BLUE, False), (AMBER, True)):
-        part: list[tuple[float, float]] = []
-        for seconds, found, _, _ in [*rows, (math.inf, (0, 0, 0), 0, 0)]:
-            if (OUTAGE[0] <= seconds <= OUTAGE[1]) == inside and seconds < math.inf:
-                part.append(on_map(found))
-            elif part:
-                d.line(part, color, 2)
-                part = []
-    for x, color, words in (
-        (50, "#b0bec5", "truth"),
-        (110, GREEN, "fixes"),
-        (165, BLUE, "estimate"),
-        (243, AMBER, "without GPS"),
-    ):
-        d.dot(x, 366, 4, color)
-        d.text(x + 9, 370, words, 11, anchor="start")
-
-    def on_chart(seconds: float, meters: float) -> tuple[float, float]:
-        return 490 + 3.6 * seconds, 330 - 36 * meters
-
-    d.text(660, 24, "Horizontal error and protection level", 13, weight="1")
-    (x1, _), (x2, _) = on_chart(OUTAGE[0], 0), on_chart(OUTAGE[1], 0)
-    d.polygon([(x1, 42), (x2, 42), (x2, 330), (x1, 330)], "#fcf0db")
-    d.text((x1 + x2) / 2, 58, "no GPS", 11, AMBER)
-    for meters in range(0, 9, 2):
-        d.line([on_chart(0, meters), on_chart(98, meters)], "#e3e8eb", 1)
-        d.text(482, on_chart(0, meters)[1] + 4, f"{meters} m", 11, anchor="end")
-    for seconds in range(0, 100, 20):
-        d.text(on_chart(seconds, 0)[0], 348, f"{seconds} s", 11)
-    d.line([on_chart(row[0], row[3]) for row in rows], RED, 1.8)
-    d.line([on_chart(row[0], row[2]) for row in rows], BLUE, 1.8)
-    for x, color, words in ((530, RED, "protection level (10^-5 per hour)"), (735, BLUE, "true error")):
-        d.dot(x, 366, 4, color)
-        d.text(x + 9, 370, words, 11, anchor="start")
+        if isinstance(sample, GpsSample):
+            if math.isfinite(sample.latitude_deg) and sample.header.seq % 4 == 0:
+                fixes.append(geodesy.enu_from_geodetic(sample.latitude_deg, sample.longitude_deg, SUFFIELD[2]))
+        elif sample.header.seq % 10 == 0:
+            estimate, true = localizer.estimate(localizer.utime), simulation.truth(localizer.utime).enu.xyz
+            truth.append(true)
+            if estimate.enu is not None and not estimate.invalid:
+                x, y, _ = (estimate.enu @ X_rolling_base).xyz
+                seconds = localizer.utime * 1e-6 - 1e9
+                rows.append((seconds, x, y, math.dist((x, y), true[:2]), estimate.horizontal_protection_level))
+    t, x, y, error, bound = zip(*rows, strict=True)
+    hidden = [OUTAGE[0] <= each <= OUTAGE[1] for each in t]
+    track = charts.render_map(
+        "Track",
+        "east, m",
+        "north, m",
+        [
+            charts.Series("truth", [each[0] for each in truth], [each[1] for each in truth], "#cfd8dc", 8.0),
+            charts.dots("fixes", fixes, charts.GREEN, 6.0),
+            charts.Series("estimate", x, y, charts.BLUE, 2.0),
+            charts.Series(
+                "without GPS",
+                [each if inside else math.nan for each, inside in zip(x, hidden, strict=True)],
+                y,
+                charts.AMBER,
+                2.0,
+            ),
+        ],
+        heights=(300, 300),
+    )
+    top = 2.0 * math.ceil(0.5 * max(bound))
+    errors = [
+        charts.Series("without GPS", OUTAGE, (0.0, 0.0), charts.AMBER, shape="band", high=(top, top)),
+        charts.Series("protection level (10^-5 per hour)", t, bound, charts.RED, 2.0),
+        charts.Series("true error", t, error, charts.BLUE, 2.0),
+    ]
+    panel = charts.Panel("Horizontal error and protection level", charts.Axis("m", 0.0, top), errors, 150.0)
+    error_chart = charts.render_panels("Error", charts.Axis("seconds", 0.0, 98.0), [panel])
+    d = Drawing(charts.WIDTH, 592, "A simulated drive with 30 s without GPS")
+    d.parts.append(charts.element("style", charts.CHART_STYLE))
+    for y, height, chart in ((4, 366, track), (374, 216, error_chart)):
+        d.parts.append(chart.replace("<svg ", f'<svg y="{y}" width="{charts.WIDTH}" height="{height}" ', 1))
     return d
 
 
