@@ -17,7 +17,6 @@ import numpy as np
 
 from benchmarks.support import free_url, measure_interleaved, print_verdict, run_process
 from modelserver.client.remote import Platform
-from modelserver.core.answers import DeferredAnswer
 from modelserver.errors import NoServerError
 from modelserver.estimation.history import History
 from modelserver.geometry import names
@@ -35,6 +34,7 @@ from modelserver.messages import (
     SensorHeader,
 )
 from modelserver.query import PlatformView
+from modelserver.query.answers import DeferredAnswer
 from modelserver.query.steps import complete
 from modelserver.transforms.pose import Pose
 from modelserver.wire.codec import decode, encode

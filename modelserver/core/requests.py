@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-from modelserver.core.answers import DeferredAnswer, compute_replies, is_deferred, make_error_reply
 from modelserver.core.host_clock import Instant
 from modelserver.core.state import (
     AllOutputs,
@@ -31,6 +30,7 @@ from modelserver.messages import (
     SendReply,
 )
 from modelserver.messages.requests import is_answerable
+from modelserver.query.answers import DeferredAnswer, compute_replies, is_deferred, make_error_reply
 
 _TIMED: Final = (GetTransformation, GetStateVector, GetHTransform, GetMotion, GetExplanation)
 """Requests that name a time, and may wait for its data."""

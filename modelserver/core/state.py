@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, Literal, NamedTuple, TypeAlias
 
-from modelserver.core.answers import DeferredAnswer
 from modelserver.core.host_clock import HostClock, Instant
 from modelserver.errors import NotConnectedError
 from modelserver.estimation.history import History
@@ -30,6 +29,7 @@ from modelserver.messages import (
     Verdict,
 )
 from modelserver.query import PlatformView
+from modelserver.query.answers import DeferredAnswer
 
 MAX_COUNTERS: Final = 256
 """Distinct causes of rejection with a counter of their own; further ones share one."""

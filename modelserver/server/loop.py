@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 from modelserver import core
 from modelserver.core import AllOutputs, CoreState, Instant
-from modelserver.core.answers import DeferredAnswer
+from modelserver.query.answers import DeferredAnswer
 from modelserver.core.commands import ModelLoaded
 from modelserver.core.publisher_conflict import PublisherConflictDetector
 from modelserver.errors import WireError

@@ -23,7 +23,6 @@ from support_samples import (
 
 from modelserver import core
 from modelserver.core import MAX_COUNTERS, AllOutputs, CoreSettings, CoreState, Instant, step
-from modelserver.core.answers import DeferredAnswer
 from modelserver.errors import Status, UnknownBodyError, UnknownFrameError
 from modelserver.estimation.history import MIN_STEP_US
 from modelserver.estimation.raw.localizer import RawLocalizer
@@ -70,6 +69,7 @@ from modelserver.messages import (
     Verdict,
     WheelsSample,
 )
+from modelserver.query.answers import DeferredAnswer
 from modelserver.query.steps import complete
 from modelserver.wire.codec import encode
 

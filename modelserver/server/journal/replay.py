@@ -10,7 +10,7 @@ from collections.abc import Container, Mapping
 
 from modelserver import core
 from modelserver.core import AllOutputs, Instant
-from modelserver.core.answers import DeferredAnswer
+from modelserver.query.answers import DeferredAnswer
 from modelserver.errors import RecordingError, WireError
 from modelserver.messages import (
     PublishDecisions,

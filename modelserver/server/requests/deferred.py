@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-from modelserver.core.answers import COVARIANCES_IN_PART, DeferredAnswer
 from modelserver.messages import GetHistory, GetTransformations, Request
 from modelserver.query import HISTORY_LIMIT
+from modelserver.query.answers import COVARIANCES_IN_PART, DeferredAnswer
 from modelserver.query.steps import Steps, complete
 from modelserver.server.requests.scheduler import MAX_REPLY_BYTES
 from modelserver.wire.codec import encode

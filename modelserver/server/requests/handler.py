@@ -24,7 +24,6 @@ from typing import Final, Protocol
 
 from modelserver import core
 from modelserver.core import CoreState, Instant
-from modelserver.core.answers import DeferredAnswer, compute_replies, effort_of, is_deferred
 from modelserver.errors import QueryError, WireError
 from modelserver.geometry import names
 from modelserver.messages import (
@@ -42,6 +41,7 @@ from modelserver.messages import (
     TimeQuery,
 )
 from modelserver.messages.requests import is_answerable
+from modelserver.query.answers import DeferredAnswer, compute_replies, effort_of, is_deferred
 from modelserver.server.bus import Bus
 from modelserver.server.clock import Clock
 from modelserver.server.log import RateLimitedLog, escape_text

@@ -11,9 +11,9 @@ import pytest
 from support_moving import BASE, DEEP, SCAN, T0, UTM, S, view
 
 from modelserver.client.batch_reply import BatchReplyAssembler, concatenate
-from modelserver.core.answers import COVARIANCES_IN_PART, POSES_IN_PART, DeferredAnswer
 from modelserver.errors import WireError
 from modelserver.messages import GetTransformations, PoseBatchReply, RequestHeader
+from modelserver.query.answers import COVARIANCES_IN_PART, POSES_IN_PART, DeferredAnswer
 from modelserver.query.batch import lookup_batch
 from modelserver.query.steps import complete
 from modelserver.wire.codec import decode, encode

@@ -15,7 +15,6 @@ from support_moving import BASE, DEEP, ODOM, SCAN, T0, UTM, S, rover, view
 
 from modelserver.client.remote import Platform
 from modelserver.core import CoreSettings, Instant, start, step
-from modelserver.core.answers import DeferredAnswer
 from modelserver.errors import LimitError, MalformedRequestError, Status, TooNewError, UnknownFrameError, WireError
 from modelserver.messages import (
     CHANNEL_OF,
@@ -28,6 +27,7 @@ from modelserver.messages import (
     SendReply,
     TimeQuery,
 )
+from modelserver.query.answers import DeferredAnswer
 from modelserver.query.batch import lookup_batch
 from modelserver.query.explanation import explain
 from modelserver.query.motion import compute_motion

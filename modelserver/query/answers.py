@@ -60,14 +60,12 @@ class DeferredAnswer(NamedTuple):
     def work(self) -> Steps[list[Reply]]:
         """Compute the messages of the reply in steps; on a QueryError it is one error reply."""
         view, request, utime = self
-        header = ReplyHeader(request.header.request_id, utime, model_revision=view.model.revision)
         try:
-            replies: list[Reply] = yield from _DEFERRED_ANSWERS[type(request)](view, request, header)
+            return (yield from _answer_in_steps(view, request, utime))
         except QueryError as error:
             return [
                 make_error_reply(view, type(request), request.header, error.status, str(error), utime, error.nearest)
             ]
-        return replies
 
 
 def effort_of(request: Request) -> float:
@@ -86,20 +84,25 @@ def is_deferred(request: Request) -> bool:
     return type(request) in _DEFERRED_ANSWERS and effort_of(request) > DEFERRED_EFFORT
 
 
-def compute_replies(view: PlatformView, request: Request, utime: int) -> list[Reply]:
-    """Compute the messages of the reply to a request at `utime`; most types have one."""
-    if type(request) in _DEFERRED_ANSWERS:
-        return complete(DeferredAnswer(view, request, utime).work())
-    return [compute_reply(view, request, utime)]
+def compute_answer(view: PlatformView, request: Request, utime: int) -> list[Reply]:
+    """Compute the messages of the reply to a request at `utime`; most types have one. Raises QueryError."""
+    answer = _ANSWERS.get(type(request))
+    if answer is None:
+        return complete(_answer_in_steps(view, request, utime))
+    return [answer(view, request, ReplyHeader(request.header.request_id, utime, model_revision=view.model.revision))]
 
 
-def compute_reply(view: PlatformView, request: Request, utime: int) -> Reply:
-    """Compute the single message of the reply to a request at `utime`; on a QueryError it is an error reply."""
+def _answer_in_steps(view: PlatformView, request: Request, utime: int) -> Steps[list[Reply]]:
     header = ReplyHeader(request.header.request_id, utime, model_revision=view.model.revision)
+    return (yield from _DEFERRED_ANSWERS[type(request)](view, request, header))
+
+
+def compute_replies(view: PlatformView, request: Request, utime: int) -> list[Reply]:
+    """Compute the messages of the reply to a request at `utime`; on a QueryError it is one error reply."""
     try:
-        return _ANSWERS[type(request)](view, request, header)
+        return compute_answer(view, request, utime)
     except QueryError as error:
-        return make_error_reply(view, type(request), request.header, error.status, str(error), utime, error.nearest)
+        return [make_error_reply(view, type(request), request.header, error.status, str(error), utime, error.nearest)]
 
 
 def make_error_reply(
