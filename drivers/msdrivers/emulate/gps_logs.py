@@ -19,8 +19,8 @@ from msdrivers.protocol.novatel import (
     SolutionStatus,
     TimeStatus,
     Velocity,
+    encode,
 )
-from msdrivers.protocol.novatel.encode import encode
 from msdrivers.protocol.novatel.logs import Body
 
 _TYPES = {

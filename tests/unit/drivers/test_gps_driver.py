@@ -23,9 +23,9 @@ from msdrivers.protocol.novatel import (
     Position,
     PositionType,
     TimeStatus,
+    encode,
 )
-from msdrivers.protocol.novatel.binary import crc32
-from msdrivers.protocol.novatel.encode import encode
+from msdrivers.protocol.novatel.frames import crc32
 
 NMEA_UNIT = GpsUnit(
     saved=tuple(f"log com1 {name} ontime 0.25" for name in ("gpgga", "gpgsa", "gpgst", "gprmc")), is_answering=False

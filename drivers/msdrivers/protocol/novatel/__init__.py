@@ -7,6 +7,7 @@ from msdrivers.protocol.novatel.frames import (
     Prompt,
     PromptFormat,
     TextFormat,
+    encode,
 )
 from msdrivers.protocol.novatel.logs import (
     HeadingLog,
@@ -36,4 +37,5 @@ __all__ = [
     "TimeStatus",
     "UtmPosition",
     "Velocity",
+    "encode",
 ]

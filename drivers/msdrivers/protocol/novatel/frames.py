@@ -1,19 +1,73 @@
-"""Frame formats of NovAtel receivers: binary and ASCII logs with CRC, command responses and prompts without."""
+"""Frames of NovAtel receivers: binary and ASCII logs with CRC, command responses and prompts without; logs encoded.
+
+The CRC-32 has the reflected polynomial 0xEDB88320, starts from 0 and has no final inversion.
+"""
 
 from __future__ import annotations
 
+import csv
 import re
+import zlib
 from dataclasses import dataclass
+from struct import Struct
 
 from msdrivers.protocol.framing import NO_FRAME, ParsedFrame, RejectedFrame
-from msdrivers.protocol.novatel import ascii as text_logs
-from msdrivers.protocol.novatel.binary import LONG_HEADER, READERS, SHORT_HEADER, crc32
-from msdrivers.protocol.novatel.logs import MAX_ANTENNA, MESSAGE_IDS, Body, LogHeader, NovatelLog, TimeStatus
+from msdrivers.protocol.novatel.bodies import BODIES, parse_integer
+from msdrivers.protocol.novatel.logs import MAX_ANTENNA, MESSAGE_IDS, LogHeader, NovatelLog, TimeStatus
 
 MAX_LOG_BYTES = 1024
 """Bytes of a log. Longer ones (raw observations) are not read here; a broken length must not swallow good logs."""
 _MAX_NAME_BYTES = 40
 _WEEK_MS = 604_800_000
+
+_LONG_HEADER = Struct("<HBBHHxBHII4x")
+"""After sync (AA 44 12) and header length: id, type, port, body length, sequence, time status, week, ms, receiver
+status."""
+_LONG_BYTES = 4 + _LONG_HEADER.size
+_SHORT_HEADER = Struct("<HHI")
+"""After sync (AA 44 13) and body length: id, week, ms."""
+_SHORT_BYTES = 4 + _SHORT_HEADER.size
+
+_IDS = {name: ident for ident, name in MESSAGE_IDS.items()}
+_PORTS = {"COM1": 32, "COM2": 64, "COM3": 96}
+
+
+def crc32(data: bytes | bytearray) -> int:
+    """Return the checksum of a log: from its sync bytes to the end of its body, or between '#' and '*'."""
+    # zlib inverts before and after; both are undone
+    return zlib.crc32(data, 0xFFFFFFFF) ^ 0xFFFFFFFF
+
+
+def encode(log: NovatelLog) -> bytes:
+    """Encode a log with a long header, binary or ASCII by `log.header.is_binary`, as the receiver does.
+
+    Raises:
+        ValueError: a log without body, or one whose name has no number.
+    """
+    header, body = log.header, log.body
+    if body is None or header.name not in _IDS:
+        raise ValueError(f"{header.name} cannot be written")
+    layout = BODIES[header.name]
+    if header.is_binary:
+        head = _LONG_HEADER.pack(
+            _IDS[header.name],
+            header.antenna,
+            _PORTS.get(header.port) or (int(header.port) if header.port.isdecimal() else 0),
+            layout.size,
+            header.sequence,
+            header.time_status,
+            header.week,
+            header.milliseconds,
+            header.receiver_status,
+        )
+        frame = b"\xaa\x44\x12\x1c" + head + layout.pack(body)
+        return frame + crc32(frame).to_bytes(4, "little")
+    text = (
+        f"{header.label},{header.port or 'COM1'},{header.sequence},0.0,{TimeStatus(header.time_status).name},"
+        f"{header.week},{header.milliseconds / 1000.0:.3f},{header.receiver_status:08x},0000,0;"
+        f"{','.join(layout.format(body))}"
+    )
+    return f"#{text}*{crc32(text.encode('ascii')):08x}\r\n".encode("ascii")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,65 +101,46 @@ class BinaryFormat:
         available = len(buffer) - at
         if available < 4:
             return None if b"\xaa\x44".startswith(buffer[at : at + 2]) else NO_FRAME
-        if buffer[at + 1] != 0x44:
+        _, sync, sort, size = buffer[at : at + 4]
+        if sync != 0x44 or sort not in (0x12, 0x13):
             return NO_FRAME
-        if buffer[at + 2] == 0x12:
-            return self._scan_long(buffer, at, available, start)
-        if buffer[at + 2] == 0x13:
-            return self._scan_short(buffer, at, available, start)
-        return NO_FRAME
-
-    def _scan_long(
-        self, buffer: bytearray, at: int, available: int, start: int
-    ) -> ParsedFrame[NovatelLog] | RejectedFrame | None:
-        head = buffer[at + 3]
-        if head < LONG_HEADER.size:
+        layout = None
+        if sort == 0x12:
+            if size < _LONG_BYTES:
+                return RejectedFrame("novatel_header")
+            if available < _LONG_BYTES:
+                return None
+            ident, kind, port, length, sequence, status, week, ms, receiver = _LONG_HEADER.unpack_from(buffer, at + 4)
+            name = MESSAGE_IDS.get(ident) or f"id {ident}"
+            layout = BODIES.get(name)
+            if kind & 0x60 or (layout is not None and length != layout.size):
+                return RejectedFrame("novatel_header")
+            begin, end = at + size, at + size + length
+            header = LogHeader(name, week, ms, status, str(port), sequence, receiver, True, kind & MAX_ANTENNA)
+            label = header.label
+            # an answer to a binary command has the id of the command, and another body
+            if kind & 0x80:
+                layout = None
+        else:
+            if available < _SHORT_BYTES:
+                return None
+            ident, week, ms = _SHORT_HEADER.unpack_from(buffer, at + 4)
+            begin, end = at + _SHORT_BYTES, at + _SHORT_BYTES + size
+            name = MESSAGE_IDS.get(ident) or f"id {ident}"
+            header, label = LogHeader(name, week, ms, TimeStatus.UNKNOWN, "", 0, 0, True), f"{name}SB"
+        if ms >= _WEEK_MS:
             return RejectedFrame("novatel_header")
-        if available < LONG_HEADER.size:
-            return None
-        _, _, ident, kind, port, length, sequence, _, status, week, ms, receiver, _, _ = LONG_HEADER.unpack_from(
-            buffer, at
-        )
-        expected, reader = READERS.get(ident, (length, None))
-        if ms >= _WEEK_MS or kind & 0x60 or length != expected:
-            return RejectedFrame("novatel_header")
-        end = at + head + length
         if end + 4 - at > MAX_LOG_BYTES:
             return RejectedFrame("novatel_length")
         if len(buffer) < end + 4:
             return None
-        if not _has_valid_crc(buffer, at, end):
+        if crc32(buffer[at:end]) != int.from_bytes(buffer[end : end + 4], "little"):
             return RejectedFrame("novatel_checksum")
-        name = MESSAGE_IDS.get(ident) or f"id {ident}"
-        body = None
-        # an answer to a binary command has the id of the command, and another body
-        if reader is not None and not kind & 0x80:
-            body = reader(buffer[at + head : end])
-            if body is None:
-                return RejectedFrame("novatel_value")
-        header = LogHeader(name, week, ms, status, str(port), sequence, receiver, True, kind & MAX_ANTENNA)
-        return ParsedFrame(end + 4, f"novatel.{header.label}", NovatelLog(header, body, start))
-
-    def _scan_short(
-        self, buffer: bytearray, at: int, available: int, start: int
-    ) -> ParsedFrame[NovatelLog] | RejectedFrame | None:
-        end = at + SHORT_HEADER.size + buffer[at + 3]
-        if available < SHORT_HEADER.size:
-            return None
-        _, _, ident, week, ms = SHORT_HEADER.unpack_from(buffer, at)
-        if ms >= _WEEK_MS:
-            return RejectedFrame("novatel_header")
-        if len(buffer) < end + 4:
-            return None
-        if not _has_valid_crc(buffer, at, end):
-            return RejectedFrame("novatel_checksum")
-        name = MESSAGE_IDS.get(ident) or f"id {ident}"
-        header = LogHeader(name, week, ms, TimeStatus.UNKNOWN, "", 0, 0, True)
-        return ParsedFrame(end + 4, f"novatel.{name}SB", NovatelLog(header, None, start))
-
-
-def _has_valid_crc(buffer: bytearray, at: int, end: int) -> bool:
-    return crc32(bytes(buffer[at:end])) == int.from_bytes(buffer[end : end + 4], "little")
+        try:
+            body = layout.unpack(buffer[begin:end]) if layout else None
+        except ValueError:
+            return RejectedFrame("novatel_value")
+        return ParsedFrame(end + 4, f"novatel.{label}", NovatelLog(header, body, start))
 
 
 class AsciiFormat:
@@ -138,21 +173,44 @@ class AsciiFormat:
         content = bytes(buffer[at + 1 : end])
         if not self._sum.fullmatch(stated) or int(stated, 16) != crc32(content):
             return RejectedFrame("novatel_checksum")
-        long = buffer[at] == 0x23
         try:
-            header, parsed = _parse_text(content.decode("ascii"), long)
+            log = _parse_text(content.decode("ascii"), buffer[at] == 0x23, start)
         except ValueError:
             return RejectedFrame("novatel_value")
-        return ParsedFrame(end + 9, f"novatel.{header.label}", NovatelLog(header, parsed, start))
+        return ParsedFrame(end + 9, f"novatel.{log.header.label}", log)
 
 
-def _parse_text(content: str, long: bool) -> tuple[LogHeader, Body | None]:
-    head, separator, body = content.partition(";")
-    if not separator:
-        raise ValueError("no end of the header")
+_NAME = re.compile(r"(\w+)A(?:_([0-9]{1,2}))?", re.ASCII)
+
+
+def _parse_text(content: str, is_long: bool, start: int) -> NovatelLog:
+    """Parse a log between its sync and '*': ten fields of header, three of a short one, and fields of the body."""
+    head, separator, rest = content.partition(";")
     fields = head.split(",")
-    header = text_logs.parse_long_header(fields) if long else text_logs.parse_short_header(fields)
-    return header, text_logs.parse_body(header.name, text_logs.split_fields(body)) if long else None
+    if not separator or len(fields) != (10 if is_long else 3):
+        raise ValueError("no header")
+    port, sequence, status, receiver = (fields[1], *fields[2:5:2], fields[7]) if is_long else ("", "0", "", "0")
+    week, seconds = fields[5:7] if is_long else fields[1:]
+    parts = _NAME.fullmatch(fields[0])
+    milliseconds = float(seconds) * 1000.0
+    # not a number and infinities are not within it either
+    if parts is None or not 0.0 <= milliseconds < _WEEK_MS - 0.5:
+        raise ValueError(f"{fields[0]} at {seconds} s is no log of a week")
+    header = LogHeader(
+        parts[1],
+        parse_integer(week, 0xFFFF),
+        round(milliseconds),
+        TimeStatus.__members__.get(status, TimeStatus.UNKNOWN),
+        port,
+        parse_integer(sequence, 0xFFFF),
+        parse_integer(receiver, 0xFFFF_FFFF, 16),
+        False,
+        parse_integer(parts[2] or "0", MAX_ANTENNA),
+    )
+    layout = BODIES.get(header.name) if is_long else None
+    if layout is None:
+        return NovatelLog(header, None, start)
+    return NovatelLog(header, layout.parse(next(csv.reader([rest])) if '"' in rest else rest.split(",")), start)
 
 
 class TextFormat:
