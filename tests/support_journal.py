@@ -9,7 +9,7 @@ from typing import Any, Literal
 from support_samples import FORWARD, GEOMETRY, VEHICLE, drive, write_vehicle
 from support_signing import ALLOWED, KEY, envelope, write_test_key
 
-from modelserver.config.vehicle_file import load_config
+from modelserver.config.vehicle_file import LimitsConfig, load_config
 from modelserver.messages import CHANNEL_OF
 from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus
@@ -18,7 +18,6 @@ from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.journal.segments import Ring, list_segments
 from modelserver.server.journal.writer import JournalContext, JournalWriter
 from modelserver.server.loop import Hooks, Loop, LoopSettings
-from modelserver.server.requests.scheduler import RequestLimits
 from modelserver.server.vehicle import load_vehicle
 from modelserver.signing.signatures import Key
 from modelserver.wire.codec import encode
@@ -72,8 +71,7 @@ class JournalRig:
             LoopSettings(
                 20_000_000,
                 self.vehicle.sensor_channels(),
-                requests_per_pass=2,
-                limits=RequestLimits(queued=4),
+                limits=LimitsConfig(requests_per_pass=2, queued_requests=4),
                 publisher_conflict=publisher_conflict,
             ),
             Hooks(

@@ -25,7 +25,6 @@ from modelserver.server.journal.writer import make_writer
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.persistence.store import SUBJECT as RESTART
 from modelserver.server.persistence.store import PersistentStores, open_stores
-from modelserver.server.requests.scheduler import RequestLimits
 from modelserver.server.supervision.supervisor import ServiceSupervisor
 from modelserver.server.supervision.systemd import Notifier
 from modelserver.server.vehicle import Vehicle
@@ -103,13 +102,7 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
         period_ns=round(1e9 / vehicle.tick_hz()),
         sensors=vehicle.sensor_channels(),
         channel_prefix=config.lcm.channel_prefix,
-        requests_per_pass=config.limits.requests_per_pass,
-        limits=RequestLimits(
-            config.limits.queued_requests,
-            config.limits.client_hz,
-            config.limits.request_share,
-            config.limits.client_reply_bytes,
-        ),
+        limits=config.limits,
         publisher_conflict=config.sensors.publisher_conflict,
         shared_channels=frozenset({f"{config.lcm.channel_prefix}{config.sensors.joints.channel}"}),
     )

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from modelserver import core
+from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.core import AllOutputs, CoreState, Instant
 from modelserver.query.answers import DeferredAnswer
 from modelserver.core.commands import ModelLoaded
@@ -61,7 +62,6 @@ from modelserver.server.ingress import (
 from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.log import RateLimitedLog, escape_lines, escape_text
 from modelserver.server.requests.handler import RequestHandler
-from modelserver.server.requests.scheduler import RequestLimits
 from modelserver.server.requests.signed_commands import CommandVerifier
 from modelserver.server.tick_timer import TickTimer
 from modelserver.wire.codec import encode, fingerprint_of
@@ -155,8 +155,7 @@ class LoopSettings:
     period_ns: int
     sensors: Mapping[str, SensorChannel] = field(default_factory=dict)
     channel_prefix: str = ""
-    requests_per_pass: int = 16
-    limits: RequestLimits = field(default_factory=RequestLimits)
+    limits: LimitsConfig = field(default_factory=LimitsConfig)
     publisher_conflict: Literal["", "ignore", "use"] = ""
     shared_channels: frozenset[str] = frozenset()
 
@@ -189,15 +188,7 @@ class Loop:
         self._sensor_channels: set[str] = set()
         self._subscribe(settings.sensors)
         self._requests = RequestHandler(
-            self,
-            bus,
-            clock,
-            self._log,
-            prefix,
-            settings.limits,
-            settings.requests_per_pass,
-            hooks.verifier,
-            hooks.run_delay,
+            self, bus, clock, self._log, prefix, settings.limits, hooks.verifier, hooks.run_delay
         )
 
     def run(self) -> None:

@@ -23,6 +23,7 @@ from itertools import islice, product
 from typing import Final, Protocol
 
 from modelserver import core
+from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.core import CoreState, Instant
 from modelserver.errors import QueryError, WireError
 from modelserver.geometry import names
@@ -51,7 +52,6 @@ from modelserver.server.requests.scheduler import (
     ContentionDetector,
     DeferredRequest,
     QueuedRequest,
-    RequestLimits,
     RequestScheduler,
 )
 from modelserver.server.requests.signed_commands import CommandVerifier
@@ -130,8 +130,7 @@ class RequestHandler:
         clock: Clock,
         log: RateLimitedLog,
         prefix: str,
-        limits: RequestLimits,
-        per_pass: int,
+        limits: LimitsConfig,
         verifier: CommandVerifier | None = None,
         run_delay: Callable[[], int | None] = lambda: None,
     ):
@@ -141,7 +140,7 @@ class RequestHandler:
         self._log = log
         self._prefix = prefix
         self._verifier = verifier
-        self._per_pass = per_pass
+        self._per_pass = limits.requests_per_pass
         self._run_delay = run_delay
         self._scheduler = RequestScheduler(limits, clock.monotonic_ns())
         self.contention = ContentionDetector()

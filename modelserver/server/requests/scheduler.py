@@ -20,9 +20,10 @@ their own, rejections with a reply. Beyond these bounds requests are dropped and
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
+from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.errors import quote
 from modelserver.messages import Request
 
@@ -83,6 +84,9 @@ BURST_S: Final = 0.25
 RESERVE_S: Final = 0.05
 """Capacity of the bucket of request time, and how far it may be overdrawn, seconds."""
 
+MAX_CLIENTS: Final = 64
+"""Clients with a queue of their own."""
+
 CLIENT_IDLE_NS: Final = 10_000_000_000
 """A client that is silent for so long loses its queue to a new client."""
 
@@ -134,61 +138,35 @@ class DeferredRequest(NamedTuple):
     effort: float
 
 
-@dataclass(frozen=True, slots=True)
-class RequestLimits:
-    """Limits of the request work; see `modelserver.config.vehicle_file.LimitsConfig`.
-
-    Attributes
-    ----------
-    queued: waiting requests.
-    client_hz: guaranteed requests per second and client.
-    share: share of time under contention for work beyond the rates.
-    client_reply_bytes: deferred replies per client, bytes per second.
-    clients: clients with a queue of their own; further ones share one.
-    """
-
-    queued: int = 256
-    client_hz: float = 500.0
-    share: float = 0.25
-    client_reply_bytes: float = 5e6
-    clients: int = 64
-
-
+@dataclass(slots=True, eq=False)
 class ClientQueue:
     """The requests of one client, and its token buckets."""
 
-    __slots__ = (
-        "charged_ns",
-        "deferred",
-        "dropped",
-        "name",
-        "received",
-        "rejections",
-        "reply_bytes",
-        "requests",
-        "seen_ns",
-        "tokens",
-    )
-
-    def __init__(self, name: bytes, tokens: float, reply_bytes: float, now_ns: int):
-        self.name = name
-        self.requests: deque[QueuedRequest] = deque()
-        self.deferred: deque[DeferredRequest] = deque()
-        self.tokens = tokens
-        self.reply_bytes = reply_bytes
-        self.seen_ns = self.charged_ns = now_ns
-        self.received = self.dropped = self.rejections = 0
+    name: bytes
+    tokens: float
+    reply_bytes: float
+    seen_ns: int
+    charged_ns: int
+    requests: deque[QueuedRequest] = field(default_factory=deque)
+    deferred: deque[DeferredRequest] = field(default_factory=deque)
+    received: int = 0
+    dropped: int = 0
+    rejections: int = 0
 
 
 class RequestScheduler:
-    """Queues requests and returns them by priority; `report` names overloading clients once a second."""
+    """Queues requests and returns them by priority; `report` names overloading clients once a second.
 
-    def __init__(self, limits: RequestLimits, now_ns: int):
+    Beyond `max_clients`, further clients share one queue.
+    """
+
+    def __init__(self, limits: LimitsConfig, now_ns: int, max_clients: int = MAX_CLIENTS):
         self._limits = limits
+        self._max_clients = max_clients
         self._burst = max(1.0, limits.client_hz * BURST_S)
         self._burst_bytes = max(float(MAX_REPLY_BYTES), limits.client_reply_bytes)
         self._clients: dict[bytes, ClientQueue] = {}
-        self._others = ClientQueue(b"", self._burst, self._burst_bytes, now_ns)
+        self._others = ClientQueue(b"", self._burst, self._burst_bytes, now_ns, now_ns)
         self._within: deque[ClientQueue] = deque()
         self._beyond: deque[ClientQueue] = deque()
         self._deferring: deque[ClientQueue] = deque()
@@ -247,7 +225,7 @@ class RequestScheduler:
             self._refill(client, now_ns)
         elif count >= MAX_QUEUED_BEYOND_RATE and count > client.tokens and not self.may_exceed:
             return request
-        if self.queued < self._limits.queued:
+        if self.queued < self._limits.queued_requests:
             self.queued += 1
             requests.append(request)
             if not count:
@@ -332,7 +310,7 @@ class RequestScheduler:
 
     def spend(self, seconds: float, now_ns: int) -> None:
         """Account for time spent on requests, against their share of the elapsed time."""
-        earned = (now_ns - self._spare_ns) * 1e-9 * self._limits.share
+        earned = (now_ns - self._spare_ns) * 1e-9 * self._limits.request_share
         self._spare_ns = now_ns
         self._spare_s = max(-RESERVE_S, min(RESERVE_S, self._spare_s + earned - seconds))
 
@@ -369,7 +347,7 @@ class RequestScheduler:
         return self._clients.get(name) or self._others
 
     def _add_client(self, name: bytes, now_ns: int) -> ClientQueue:
-        if len(self._clients) >= self._limits.clients:
+        if len(self._clients) >= self._max_clients:
             if now_ns < self._sweep_ns:
                 return self._others
             self._sweep_ns = now_ns + SWEEP_NS
@@ -382,12 +360,12 @@ class RequestScheduler:
                 del self._clients[each]
             if not silent:
                 return self._others
-        client = self._clients[name] = ClientQueue(name, self._burst, self._burst_bytes, now_ns)
+        client = self._clients[name] = ClientQueue(name, self._burst, self._burst_bytes, now_ns, now_ns)
         return client
 
     def _describe(self, client: ClientQueue) -> str:
         if client is self._others:
-            return f"all beyond the first {self._limits.clients} clients together"
+            return f"all beyond the first {self._max_clients} clients together"
         if client.name == SIGNED_CLIENT:
             return "the channel of signed commands"
         if not client.name:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from support_samples import ME, START, ScriptedLocalizer, gps, imu, start_core
 
+from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.core import Instant
 from modelserver.errors import Status
 from modelserver.messages import (
@@ -194,7 +195,7 @@ def test_given_samples_and_requests_waiting_then_samples_are_handled_first() -> 
 
 
 def test_given_more_requests_than_the_budget_then_each_pass_answers_that_many() -> None:
-    rig = Rig(requests_per_pass=16)
+    rig = Rig(limits=LimitsConfig(requests_per_pass=16))
     for _ in range(40):
         rig.send(GetBodyList(ME))
     answered = []
@@ -205,7 +206,7 @@ def test_given_more_requests_than_the_budget_then_each_pass_answers_that_many() 
 
 
 def test_given_requests_in_order_then_they_are_answered_in_order() -> None:
-    rig = Rig(requests_per_pass=7)
+    rig = Rig(limits=LimitsConfig(requests_per_pass=7))
     for n in range(100):
         rig.send(GetBodyList(RequestHeader(n, "REPLY_TEST")))
     rig.turns(20)

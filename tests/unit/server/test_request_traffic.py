@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from support_samples import ME, START, ScriptedLocalizer, imu, start_core
 
+from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.errors import Status
 from modelserver.messages import (
     GetBodyList,
@@ -22,7 +23,6 @@ from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus, FakeInbox
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
-from modelserver.server.requests.scheduler import RequestLimits
 from modelserver.transforms import chain
 from modelserver.wire.codec import decode, encode
 
@@ -93,7 +93,7 @@ class Rig:
         self.clock = FakeClock(START, BEGIN_NS)
         self.bus = TimedBus(self.clock, answer_s)
         state = start_core(ScriptedLocalizer())
-        loop_settings = LoopSettings(10 * MS, {"IMU": SensorChannel("imu_t")}, limits=RequestLimits(**limits))
+        loop_settings = LoopSettings(10 * MS, {"IMU": SensorChannel("imu_t")}, limits=LimitsConfig(**limits))
         self.loop = Loop(self.bus, self.clock, state, loop_settings, Hooks(run_delay=run_delay))
         for n in range(90):
             self.bus.sensors.put("IMU", encode(imu(START - 1_000_000 + n * 10_000)))
@@ -178,7 +178,7 @@ def lone_client(rig: Rig, count: int) -> list[float]:
 
 def test_given_an_idle_service_then_one_client_is_never_held_back() -> None:
     # 0.2 ms a reply: all of the time goes into requests, twenty times the rate
-    took = lone_client(Rig(client_hz=250.0, share=0.05), 5000)
+    took = lone_client(Rig(client_hz=250.0, request_share=0.05), 5000)
     assert max(took) < 0.001
 
 
@@ -188,7 +188,7 @@ def test_given_a_processor_that_others_want_then_the_client_gets_the_share_of_th
 ) -> None:
     # half of the time the thread was ready to run and had no processor; a reply takes 0.2 ms
     delay = lambda: (rig.clock.monotonic_ns() - BEGIN_NS) // 2  # noqa: E731
-    rig = Rig(run_delay=delay, client_hz=hz, share=share)
+    rig = Rig(run_delay=delay, client_hz=hz, request_share=share)
     begin = rig.seconds
     count = len(lone_client(rig, 4000))
     assert count / (rig.seconds - begin) == pytest.approx(rate, rel=0.15)

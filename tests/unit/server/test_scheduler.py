@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.messages import GetBodyList, RequestHeader
 from modelserver.server.requests.handler import client_of
 from modelserver.server.requests.scheduler import (
@@ -22,7 +23,6 @@ from modelserver.server.requests.scheduler import (
     SWEEP_NS,
     DeferredRequest,
     QueuedRequest,
-    RequestLimits,
     RequestScheduler,
 )
 from modelserver.wire.fields import pack_text
@@ -50,7 +50,7 @@ def serve(scheduler: RequestScheduler, now_ns: int = 0) -> list[int]:
     return found
 
 
-def make_contended(limits: RequestLimits) -> RequestScheduler:
+def make_contended(limits: LimitsConfig) -> RequestScheduler:
     """Make a make_contended scheduler whose share of the time is used up."""
     scheduler = RequestScheduler(limits, 0)
     scheduler.spend(1.0, 0)
@@ -59,7 +59,7 @@ def make_contended(limits: RequestLimits) -> RequestScheduler:
 
 
 def test_given_several_clients_then_they_are_served_round_robin_each_in_its_order() -> None:
-    scheduler = RequestScheduler(RequestLimits(), 0)
+    scheduler = RequestScheduler(LimitsConfig(), 0)
     for number in range(5):
         send(scheduler, b"a", number)
     send(scheduler, b"b", 10)
@@ -70,7 +70,7 @@ def test_given_several_clients_then_they_are_served_round_robin_each_in_its_orde
 
 
 def test_given_full_queues_then_the_longest_gives_way_to_others() -> None:
-    scheduler = RequestScheduler(RequestLimits(queued=10), 0)
+    scheduler = RequestScheduler(LimitsConfig(queued_requests=10), 0)
     assert [send(scheduler, b"flood", n) for n in range(12)] == [True] * 10 + [False] * 2
     # the flood's are dropped for them
     assert [send(scheduler, b"polite", 100 + n) for n in range(3)] == [False] * 3
@@ -83,7 +83,7 @@ def test_given_full_queues_then_the_longest_gives_way_to_others() -> None:
 def test_given_any_requests_then_the_queues_are_bounded_and_each_is_served_or_dropped_once(
     clients: list[bytes], queued: int
 ) -> None:
-    scheduler = RequestScheduler(RequestLimits(queued=queued), 0)
+    scheduler = RequestScheduler(LimitsConfig(queued_requests=queued), 0)
     dropped = []
     for number, client in enumerate(clients):
         out = scheduler.enqueue(scheduler.client(client, 0), item(number), 0)
@@ -99,7 +99,7 @@ def test_given_any_requests_then_the_queues_are_bounded_and_each_is_served_or_dr
 
 
 def test_given_full_queues_then_each_client_that_comes_gets_its_part() -> None:
-    scheduler = RequestScheduler(RequestLimits(queued=60), 0)
+    scheduler = RequestScheduler(LimitsConfig(queued_requests=60), 0)
     for _ in range(1000):
         for client in (b"a", b"b", b"c", b"d", b"e"):
             send(scheduler, client)
@@ -108,7 +108,7 @@ def test_given_full_queues_then_each_client_that_comes_gets_its_part() -> None:
 
 
 def test_given_an_idle_service_then_no_rate_holds_a_client_back() -> None:
-    scheduler = RequestScheduler(RequestLimits(client_hz=1.0, share=0.01), 0)
+    scheduler = RequestScheduler(LimitsConfig(client_hz=1.0, request_share=0.01), 0)
     for number in range(1000):
         # far more than the rate and the share: a second for each millisecond
         scheduler.spend(1.0, number * MS)
@@ -118,7 +118,7 @@ def test_given_an_idle_service_then_no_rate_holds_a_client_back() -> None:
 
 
 def test_given_contention_then_each_client_has_its_rate() -> None:
-    scheduler = make_contended(RequestLimits(client_hz=100.0, share=0.1))
+    scheduler = make_contended(LimitsConfig(client_hz=100.0, request_share=0.1))
     got = Counter[str]()
     for step in range(10_000):
         now = step * MS
@@ -137,7 +137,7 @@ def test_given_contention_then_each_client_has_its_rate() -> None:
 
 
 def test_given_contention_then_work_beyond_the_rates_gets_its_share_of_the_time() -> None:
-    scheduler = RequestScheduler(RequestLimits(client_hz=1.0, share=0.25), 0)
+    scheduler = RequestScheduler(LimitsConfig(client_hz=1.0, request_share=0.25), 0)
     count = 0
     for step in range(10_000):
         now = step * MS
@@ -152,7 +152,7 @@ def test_given_contention_then_work_beyond_the_rates_gets_its_share_of_the_time(
 
 
 def test_given_contention_that_ends_then_what_waits_is_answered() -> None:
-    scheduler = make_contended(RequestLimits(client_hz=1.0))
+    scheduler = make_contended(LimitsConfig(client_hz=1.0))
     assert all(send(scheduler, b"a", number) for number in range(3))
     assert serve(scheduler) == [0]  # the burst of a rate of one a second
     assert not scheduler.is_ready
@@ -162,7 +162,7 @@ def test_given_contention_that_ends_then_what_waits_is_answered() -> None:
 
 
 def test_given_a_client_beyond_its_rate_then_those_within_go_first() -> None:
-    scheduler = RequestScheduler(RequestLimits(client_hz=4.0), 0)
+    scheduler = RequestScheduler(LimitsConfig(client_hz=4.0), 0)
     for number in range(6):
         send(scheduler, b"fast", number)
     assert scheduler.next(0) is not None
@@ -173,7 +173,7 @@ def test_given_a_client_beyond_its_rate_then_those_within_go_first() -> None:
 
 
 def test_given_tokens_that_have_come_then_a_waiting_client_is_within_its_rate_again() -> None:
-    scheduler = make_contended(RequestLimits(client_hz=10.0))
+    scheduler = make_contended(LimitsConfig(client_hz=10.0))
     for number in range(4):
         send(scheduler, b"a", number)
     assert serve(scheduler) == [0, 1]  # a burst of 2.5
@@ -182,7 +182,7 @@ def test_given_tokens_that_have_come_then_a_waiting_client_is_within_its_rate_ag
 
 
 def test_given_ever_new_names_then_the_earlier_clients_keep_their_queues() -> None:
-    scheduler = RequestScheduler(RequestLimits(queued=50, clients=8), 0)
+    scheduler = RequestScheduler(LimitsConfig(queued_requests=50), 0, max_clients=8)
     assert send(scheduler, b"polite", 0)
     for number in range(10_000):
         send(scheduler, str(number).encode(), -1)
@@ -195,7 +195,7 @@ def test_given_ever_new_names_then_the_earlier_clients_keep_their_queues() -> No
 
 
 def test_given_silent_clients_then_others_take_their_places() -> None:
-    scheduler = RequestScheduler(RequestLimits(clients=2), 0)
+    scheduler = RequestScheduler(LimitsConfig(), 0, max_clients=2)
     a, b = scheduler.client(b"a", 0), scheduler.client(b"b", 0)
     other = scheduler.client(b"c", 0)
     assert other not in (a, b)
@@ -206,7 +206,7 @@ def test_given_silent_clients_then_others_take_their_places() -> None:
 
 
 def test_given_dropped_requests_then_a_bounded_number_gets_a_reply_and_their_clients_are_reported() -> None:
-    scheduler = RequestScheduler(RequestLimits(queued=1), 0)
+    scheduler = RequestScheduler(LimitsConfig(queued_requests=1), 0)
     for name, count in ((b"REPLY_A", 9000), (b"REPLY_B", 20), (b"\x1b[31m\n" * 3, 10), (b"REPLY_C", 5), (b"", 1)):
         scheduler.client(name, 0)
         replies = sum(scheduler.count_dropped(name) for _ in range(count))
@@ -224,7 +224,7 @@ def test_given_dropped_requests_then_a_bounded_number_gets_a_reply_and_their_cli
 
 
 def test_given_dropped_requests_of_many_clients_then_the_replies_are_bounded_for_all_together() -> None:
-    scheduler = RequestScheduler(RequestLimits(), 0)
+    scheduler = RequestScheduler(LimitsConfig(), 0)
     replies = 0
     for number in range(60):
         name = str(number).encode()
@@ -248,7 +248,7 @@ def begin_deferred(scheduler: RequestScheduler, now_ns: int = 0) -> list[int]:
 
 
 def test_given_deferred_requests_then_clients_are_served_round_robin_and_their_queues_are_bounded() -> None:
-    scheduler = RequestScheduler(RequestLimits(), 0)
+    scheduler = RequestScheduler(LimitsConfig(), 0)
     for name in (b"a", b"b"):
         scheduler.client(name, 0)
     assert [scheduler.enqueue_deferred(make_deferred(n, b"a")) for n in range(3)] == [True] * DEFERRED_PER_CLIENT + [
@@ -265,7 +265,7 @@ def test_given_deferred_requests_then_clients_are_served_round_robin_and_their_q
 
 
 def test_given_replies_beyond_the_bytes_a_second_then_they_wait_and_others_do_not() -> None:
-    scheduler = RequestScheduler(RequestLimits(client_reply_bytes=1e6), 0)
+    scheduler = RequestScheduler(LimitsConfig(client_reply_bytes=1e6), 0)
     for name in (b"large", b"small"):
         scheduler.client(name, 0)
     sent = 0
@@ -282,14 +282,14 @@ def test_given_replies_beyond_the_bytes_a_second_then_they_wait_and_others_do_no
 
 
 def test_given_the_largest_reply_and_the_least_rate_then_it_fits() -> None:
-    scheduler = RequestScheduler(RequestLimits(client_reply_bytes=1e4), 0)
+    scheduler = RequestScheduler(LimitsConfig(client_reply_bytes=1e4), 0)
     scheduler.client(b"a", 0)
     scheduler.enqueue_deferred(make_deferred(1, b"a", MAX_REPLY_BYTES))
     assert begin_deferred(scheduler) == [1]
 
 
 def test_given_deferred_work_then_it_is_charged_before_it_begins() -> None:
-    scheduler = make_contended(RequestLimits(client_hz=100.0))
+    scheduler = make_contended(LimitsConfig(client_hz=100.0))
     scheduler.client(b"a", 0)
     scheduler.enqueue_deferred(make_deferred(1, b"a", 100, 30.0))
     assert begin_deferred(scheduler) == [1]
