@@ -2,34 +2,18 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
-import sys
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
+import docs_pages
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
 
-def _load_pages() -> ModuleType:
-    """Import tools/docs_pages.py, which lies beside this file and in no package."""
-    spec = importlib.util.spec_from_file_location("docs_pages", Path(__file__).with_name("docs_pages.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["docs_pages"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-PAGES = _load_pages()
-
-
 def on_files(files: Files, config: Any) -> Files:
     """Add the generated pages."""
-    for place, make in PAGES.PAGES.items():
+    for place, make in docs_pages.PAGES.items():
         files.append(File.generated(config, place, content=make()))
     return files
 
@@ -38,8 +22,8 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
     """Fill in the generated tables of a page."""
     try:
         if page.file.src_uri == "words.md":
-            PAGES.check_words(markdown)
-        return str(PAGES.fill(markdown))
+            docs_pages.check_words(markdown)
+        return docs_pages.fill(markdown)
     except (ValueError, AttributeError, ImportError) as error:
         raise PluginError(f"{page.file.src_uri}: {error}") from error
 

@@ -12,18 +12,18 @@ import ast
 import contextlib
 import dataclasses
 import enum
-import functools
-import importlib
 import inspect
 import io
 import os
+import pkgutil
 import re
 import textwrap
-import types
 import typing
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from unittest import mock
+
+from message_generator import Constant, Struct, read_structs
 
 ROOT = Path(__file__).resolve().parents[1]
 TYPES = ROOT / "lcmtypes"
@@ -70,14 +70,9 @@ def help_text(*command: str) -> str:
     from mstools.cli import main
 
     out = io.StringIO()
-    environment = {**os.environ}
-    os.environ.update(COLUMNS="100", TERMINAL_WIDTH="100", NO_COLOR="1")
-    try:
-        with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
-            main([*command, "--help"])
-    finally:
-        os.environ.clear()
-        os.environ.update(environment)
+    environment = mock.patch.dict(os.environ, COLUMNS="100", TERMINAL_WIDTH="100", NO_COLOR="1")
+    with environment, contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
+        main([*command, "--help"])
     return out.getvalue().strip()
 
 
@@ -90,13 +85,12 @@ def _children(text: str) -> list[str]:
 
 
 @dataclasses.dataclass(frozen=True)
-class Setting:
+class DocumentedSetting:
     """A field of a dataclass of settings as the vehicle file has it."""
 
     name: str
     default: str
     meaning: str
-    choices: tuple[str, ...]
     section: str
 
 
@@ -116,64 +110,46 @@ SUPPLEMENT = {
 """Descriptions of settings that have none in the code, by `Class.field`."""
 
 
-def find_class(dotted: str) -> type:
-    """Return the class of a dotted name, e.g. `modelserver.config.vehicle_file.LimitsConfig`."""
-    module, _, name = dotted.rpartition(".")
-    found = getattr(importlib.import_module(module), name)
-    assert isinstance(found, type)
-    return found
-
-
-def read_settings(kind: type) -> list[Setting]:
-    """Return the settings of a dataclass, base classes first, each with default, meaning and choices.
+def read_settings(kind: type) -> list[DocumentedSetting]:
+    """Return the settings of a dataclass, base classes first, each with default and meaning.
 
     The meaning is the string below a field, else what the class's docstring has after `field:`, or in the entry of the
     field in an `Attributes` section. Raises ValueError where a field has none.
     """
-    found: dict[str, Setting] = {}
-    for each in reversed(kind.__mro__):
-        if dataclasses.is_dataclass(each):
-            found |= {setting.name: setting for setting in _own_settings(each)}
-    order = [field.name for field in dataclasses.fields(kind)]
+    classes = filter(dataclasses.is_dataclass, reversed(kind.__mro__))
+    found = {setting.name: setting for each in classes for setting in _own_settings(each)}
     # a class of settings may have its fields in sections, which keep the order of the file
-    return sorted(found.values(), key=lambda setting: order.index(setting.name))
+    return [found[field.name] for field in dataclasses.fields(kind) if field.name in found]
 
 
-def _own_settings(kind: type) -> Iterator[Setting]:
+def _own_settings(kind: type) -> Iterator[DocumentedSetting]:
     source = textwrap.dedent(inspect.getsource(kind))
-    lines = source.splitlines()
-    titles = [(n, line.strip("# -")) for n, line in enumerate(lines, start=1) if line.strip().startswith("# --- ")]
+    titles = {
+        n: line.strip("# -") for n, line in enumerate(source.splitlines(), 1) if line.strip().startswith("# --- ")
+    }
     (node,) = ast.parse(source).body
     assert isinstance(node, ast.ClassDef)
-    fields = {
-        each.target.id: (each, after)
-        for each, after in zip(node.body, [*node.body[1:], None], strict=True)
-        if isinstance(each, ast.AnnAssign)
-        and isinstance(each.target, ast.Name)
-        and "ClassVar" not in ast.dump(each.annotation)
-        and each.target.id != "source"
-    }
     hints = typing.get_type_hints(kind)
+    names = [ast.unparse(each.target) for each in node.body if isinstance(each, ast.AnnAssign)]
     # not __doc__, which a dataclass without a docstring makes of its signature
-    in_docstring = _described_in(ast.get_docstring(node) or "", list(fields))
-    for name, (each, after) in fields.items():
-        words = in_docstring.get(name, "")
-        if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) and isinstance(after.value.value, str):
-            words = after.value.value
-        words = words or SUPPLEMENT.get(f"{kind.__name__}.{name}", "")
-        if not words and _is_section(hints[name]):
-            continue  # it has a table of its own
+    in_docstring = _described_in(ast.get_docstring(node) or "", names)
+    for each, after in zip(node.body, [*node.body[1:], None], strict=True):
+        if not isinstance(each, ast.AnnAssign) or "ClassVar" in ast.dump(each.annotation):
+            continue
+        name = ast.unparse(each.target)
+        words = in_docstring.get(name) or SUPPLEMENT.get(f"{kind.__name__}.{name}", "")
+        match after:
+            case ast.Expr(value=ast.Constant(value=str(below))):
+                words = below
+        is_section = any(dataclasses.is_dataclass(part) for part in (hints[name], *typing.get_args(hints[name])))
+        if name == "source" or (is_section and not words):
+            continue  # a section has a table of its own
         if not words:
             raise ValueError(f"{kind.__module__}.{kind.__qualname__}.{name} has no description")
-        above = [title for n, title in titles if n < each.lineno]
-        section = above[-1] if above else ""
+        section = next((title for n, title in reversed(titles.items()) if n < each.lineno), "")
+        meaning = "".join(f"{choices}. " for choices in _choices(hints[name])) + _sentence(words)
         # as it was written: 1e-3 and not 0.001
-        default = _default_words(each.value, source)
-        yield Setting(name, default, _sentence(words), _choices(hints[name]), section[:1].upper() + section[1:])
-
-
-def _is_section(hint: object) -> bool:
-    return any(dataclasses.is_dataclass(each) for each in (hint, *typing.get_args(hint)))
+        yield DocumentedSetting(name, _default_words(each.value, source), meaning, section[:1].upper() + section[1:])
 
 
 def _described_in(text: str, names: list[str]) -> dict[str, str]:
@@ -215,111 +191,61 @@ def _default_words(value: ast.expr | None, source: str) -> str:
     return f"`{text.lower() if text in ('True', 'False') else text.strip(chr(34))}`"
 
 
-def _choices(hint: object) -> tuple[str, ...]:
-    """Return the values that a type admits, where it lists them."""
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return next((_choices(each) for each in typing.get_args(hint) if _choices(each)), ())
-    if typing.get_origin(hint) is typing.Literal:
-        return tuple(map(str, typing.get_args(hint)))
-    if isinstance(hint, type) and issubclass(hint, enum.Enum):
-        return tuple(str(each.value) for each in hint)
-    return ()
+def _choices(hint: object) -> list[str]:
+    """Return the values that a type or a part of a union admits, where it lists them."""
+    found = [hint] if typing.get_origin(hint) is typing.Literal else [hint, *typing.get_args(hint)]
+    listed = [typing.get_args(each) for each in found if typing.get_origin(each) is typing.Literal]
+    listed += [
+        tuple(one.value for one in each) for each in found if isinstance(each, type) and issubclass(each, enum.Enum)
+    ]
+    return [", ".join(f"`{each}`" for each in values) for values in listed]
 
 
-def settings_table(kind: type, own: bool = False) -> str:
+def settings_table(dotted: str, own: str = "") -> str:
     """Return the settings of a dataclass as Markdown, a table for each section of its source; `own`: none inherited."""
+    kind = pkgutil.resolve_name(dotted)
     parts: list[str] = []
     settings = list(_own_settings(kind)) if own else read_settings(kind)
     for section in dict.fromkeys(each.section for each in settings):
-        rows = [_setting_row(each) for each in settings if each.section == section]
+        rows = [(f"`{each.name}`", each.default, each.meaning) for each in settings if each.section == section]
         parts += ([f"**{section}**\n\n"] if section else []) + [table(("setting", "default", "meaning"), rows), "\n"]
     return "".join(parts).rstrip() + "\n"
-
-
-def _setting_row(setting: Setting) -> tuple[str, str, str]:
-    choices = ", ".join(f"`{each}`" for each in setting.choices)
-    words = f"{choices}. {setting.meaning}" if choices else setting.meaning
-    return f"`{setting.name}`", setting.default, words
 
 
 # --- wire -------------------------------------------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
-class Member:
-    """A field or a constant of a wire type, with the comment above it."""
-
-    name: str
-    type: str
-    value: str
-    """Of a constant; empty for a field."""
-    comment: str
-
-
-@dataclasses.dataclass(frozen=True)
-class WireType:
-    """A struct of an .lcm file."""
-
-    name: str
-    comment: str
-    members: tuple[Member, ...]
-
-
-_CONSTANT = re.compile(r"const\s+(\w+)\s+(\w+)\s*=\s*([^;]+);")
-_FIELD = re.compile(r"([\w.]+)\s+(\w+)((?:\[\w+\])*)\s*;")
-
-
-def read_types() -> list[WireType]:
-    """Return the wire types, read from the .lcm files."""
-    return [_read_type(path) for path in sorted(TYPES.glob("*.lcm"))]
-
-
-def _read_type(path: Path) -> WireType:
-    comment: list[str] = []
-    about = ""
-    members: list[Member] = []
-    for line in map(str.strip, path.read_text(encoding="utf-8").splitlines()):
-        if line.startswith("//"):
-            comment.append(line.removeprefix("//").strip())
-            continue
-        words = " ".join(comment)
-        comment = [] if line else comment
-        if line.startswith("struct"):
-            about, members = words, []  # what stands above it is the package
-        elif found := _CONSTANT.match(line):
-            members.append(Member(found[2], found[1], found[3].strip(), words))
-        elif found := _FIELD.match(line):
-            members.append(Member(found[2], found[1] + found[3], "", words))
-    return WireType(path.stem, about, tuple(members))
-
-
 def types_page() -> str:
     """Return the page of the message types: each field with type and comment."""
-    found = read_types()
-    names = {each.name for each in found}
+    found = read_structs(TYPES)
     parts = [
         GENERATED,
         "# Message types\n\n",
-        "Package `mslcm`, from `lcmtypes/*.lcm`. Units, frames and signs stand at each field; unknown values are nan. ",
+        "Package `mslcm`, from `lcmtypes/*.lcm`. Each field has its unit, frame and sign; unknown values are nan. ",
         "[The wire protocol](../wire.md) explains how the messages are used.\n",
     ]
-    for each in found:
+    for struct in found.values():
         rows = []
-        for member in each.members:
-            base = member.type.partition("[")[0]
-            kind = f"[`{member.type}`](#{base})" if base in names else f"`{member.type}`"
-            rows.append((f"`{member.name}`" + (f" = {member.value}" if member.value else ""), kind, member.comment))
-        parts.append(f"\n## {each.name}\n\n{each.comment}\n\n" + table(("field, constant", "type", "meaning"), rows))
+        for each in struct.fields:
+            rows += [(f"`{one.name}` = {one.value}", f"`{each.type}`", one.comment) for one in each.constants]
+            kind = f"`{each.type}{''.join(f'[{size}]' for size in each.dimensions)}`"
+            rows.append((f"`{each.name}`", f"[{kind}](#{each.type})" if each.type in found else kind, each.comment))
+        head = f"\n## {struct.name}\n\n{_cell(struct.comment)}\n\n"
+        parts.append(head + table(("field, constant", "type", "meaning"), rows))
     return "".join(parts)
+
+
+def constants_of(struct: Struct) -> list[Constant]:
+    """Return the constants of a struct."""
+    return [constant for each in struct.fields for constant in each.constants]
 
 
 def constants_table(wire_type: str, first: str, last: str) -> str:
     """Return the constants of a wire type from one name to another as Markdown: value, name, meaning."""
-    (found,) = (each for each in read_types() if each.name == wire_type)
-    constants = [each for each in found.members if each.value]
+    constants = constants_of(read_structs(TYPES)[wire_type])
     names = [each.name for each in constants]
     chosen = constants[names.index(first) : names.index(last) + 1]
-    return table(("value", "name", "meaning"), ((each.value, f"`{each.name}`", each.comment) for each in chosen))
+    return table(("value", "name", "meaning"), ((str(each.value), f"`{each.name}`", each.comment) for each in chosen))
 
 
 PUBLISHERS = {
@@ -336,28 +262,11 @@ def channels_table() -> str:
     """Return the channels as Markdown."""
     from modelserver.wire.channels import CHANNELS
 
-    def use(channel: Any) -> str:
-        (found,) = (value for value in vars_of(channel) if isinstance(value, enum.Enum))
-        return PUBLISHERS[str(found.value)]
-
-    return table(
-        ("channel", "type", "publisher", "rate", "content"),
-        (
-            (
-                f"`{each.name}`",
-                f"[`{each.type_name}`](reference/types.md#{each.type_name})",
-                use(each),
-                each.rate,
-                each.about,
-            )
-            for each in CHANNELS
-        ),
-    )
-
-
-def vars_of(value: Any) -> list[Any]:
-    """Return the values of the fields of a dataclass."""
-    return [getattr(value, field.name) for field in dataclasses.fields(value)]
+    rows = []
+    for each in CHANNELS:
+        kind = f"[`{each.type_name}`](reference/types.md#{each.type_name})"
+        rows.append((f"`{each.name}`", kind, PUBLISHERS[each.use], each.rate, each.about))
+    return table(("channel", "type", "publisher", "rate", "content"), rows)
 
 
 # --- reason words -----------------------------------------------------------------------------------------------------
@@ -368,22 +277,12 @@ def check_words(page: str) -> None:
 
     Raises ValueError with the words that are not.
     """
-    words = re.findall(r"^\| ((?:`[a-z_]+`(?:, )?)+) \|", page, re.MULTILINE)
-    listed = {word for row in words for word in re.findall(r"`([a-z_]+)`", row)}
-    missing = listed - strings_in_code()
+    rows = re.findall(r"^\| ((?:`[a-z_]+`(?:, )?)+) \|", page, re.MULTILINE)
+    trees = (ast.parse(path.read_text(encoding="utf-8")) for path in sorted((ROOT / "modelserver").rglob("*.py")))
+    strings = {node.value for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+    missing = set(re.findall(r"`([a-z_]+)`", " ".join(rows))) - strings
     if missing:
         raise ValueError(f"reason words that are not in the code: {', '.join(sorted(missing))}")
-
-
-@functools.cache
-def strings_in_code() -> set[str]:
-    """Return every string constant of the service and its localization."""
-    found: set[str] = set()
-    for path in sorted((ROOT / "modelserver").rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str):
-                found.add(node.value)
-    return found
 
 
 # --- conventions ------------------------------------------------------------------------------------------------------
@@ -403,34 +302,28 @@ def conventions_list() -> str:
 # --- pages ------------------------------------------------------------------------------------------------------------
 
 
-def changelog_page() -> str:
-    """Return the change log, which stands at the root of the repository."""
-    return (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-
-
 PAGES: dict[str, Callable[[], str]] = {
     "reference/cli.md": cli_page,
     "reference/types.md": types_page,
-    "changelog.md": changelog_page,
+    "changelog.md": lambda: (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
 }
 """Whole pages, by their place in docs/."""
 
-_MARK = re.compile(r"^<!-- (settings|constants|channels|conventions)\b ?([^>]*?) ?-->$", re.MULTILINE)
+MARKS: dict[str, Callable[..., str]] = {
+    "settings": settings_table,
+    "constants": constants_table,
+    "channels": channels_table,
+    "conventions": conventions_list,
+}
+"""Tables for a mark in a page, whose further words are the arguments.
+
+`<!-- settings modelserver.config.vehicle_file.LimitsConfig -->`, with `own` for no inherited settings;
+`<!-- constants pose_transform_t NO_FIX JOINT_UNKNOWN -->`; `<!-- channels -->`; `<!-- conventions -->`.
+"""
+
+_MARK = re.compile(rf"^<!-- ({'|'.join(MARKS)})\b ?([^>]*?) ?-->$", re.MULTILINE)
 
 
 def fill(markdown: str) -> str:
-    """Return a page with each mark replaced by its table.
-
-    Marks: `<!-- settings modelserver.config.vehicle_file.LimitsConfig -->`, with `own` for no inherited settings;
-    `<!-- constants pose_transform_t NO_FIX JOINT_UNKNOWN -->`; `<!-- channels -->`; `<!-- conventions -->`.
-    """
-
-    def one(found: re.Match[str]) -> str:
-        words = found[2].split()
-        if found[1] == "settings":
-            return settings_table(find_class(words[0]), own=words[1:] == ["own"])
-        if found[1] == "constants":
-            return constants_table(*words)
-        return conventions_list() if found[1] == "conventions" else channels_table()
-
-    return _MARK.sub(one, markdown)
+    """Return a page with each mark replaced by its table."""
+    return _MARK.sub(lambda found: MARKS[found[1]](*found[2].split()), markdown)
