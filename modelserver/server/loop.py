@@ -23,7 +23,6 @@ from typing import Any, Literal
 from modelserver import core
 from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.core import AllOutputs, CoreState, Instant
-from modelserver.query.answers import DeferredAnswer
 from modelserver.core.commands import ModelLoaded
 from modelserver.core.publisher_conflict import PublisherConflictDetector
 from modelserver.errors import WireError
@@ -50,6 +49,7 @@ from modelserver.messages import (
     SwitchMode,
     Tick,
 )
+from modelserver.query.answers import DeferredAnswer
 from modelserver.server.bus import Bus
 from modelserver.server.clock import Clock
 from modelserver.server.ingress import (

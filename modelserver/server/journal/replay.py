@@ -10,7 +10,6 @@ from collections.abc import Container, Mapping
 
 from modelserver import core
 from modelserver.core import AllOutputs, Instant
-from modelserver.query.answers import DeferredAnswer
 from modelserver.errors import RecordingError, WireError
 from modelserver.messages import (
     PublishDecisions,
@@ -21,6 +20,7 @@ from modelserver.messages import (
     Request,
     SendReply,
 )
+from modelserver.query.answers import DeferredAnswer
 from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus
 from modelserver.server.ingress import SensorChannel
