@@ -278,27 +278,27 @@ class FrameMismatchError(ModelServerError, ValueError):
     """The adjacent frames of two multiplied transformations differ."""
 
 
-class ConfigError(ModelServerError):
+class ProblemsError(ModelServerError):
+    """A file breaks rules. `problems` lists every finding; the message, those of `LISTED` severities."""
+
+    LISTED: frozenset[Severity] = frozenset(Severity)
+
+    def __init__(self, problems: Iterable[Problem]):
+        self.problems = tuple(problems)
+        super().__init__("\n".join(str(each) for each in self.problems if each.severity in self.LISTED))
+
+    def __reduce__(self) -> tuple[Callable[..., ProblemsError], tuple[object, ...]]:
+        return type(self), (self.problems,)
+
+
+class ConfigError(ProblemsError):
     """A configuration file is wrong. `problems` lists every finding."""
 
-    def __init__(self, problems: Iterable[Problem]):
-        self.problems = tuple(problems)
-        super().__init__("\n".join(str(problem) for problem in self.problems))
 
-    def __reduce__(self) -> tuple[Callable[..., ConfigError], tuple[object, ...]]:
-        return type(self), (self.problems,)
-
-
-class GeometryError(ModelServerError):
+class GeometryError(ProblemsError):
     """A geometry file, or a model built in a program, breaks a rule. `problems` lists every finding."""
 
-    def __init__(self, problems: Iterable[Problem]):
-        self.problems = tuple(problems)
-        errors = [problem for problem in self.problems if problem.severity is Severity.ERROR]
-        super().__init__("\n".join(str(problem) for problem in errors))
-
-    def __reduce__(self) -> tuple[Callable[..., GeometryError], tuple[object, ...]]:
-        return type(self), (self.problems,)
+    LISTED = frozenset({Severity.ERROR})
 
 
 class WireError(ModelServerError, ValueError):
@@ -319,82 +319,63 @@ class QueryError(ModelServerError):
     """
 
     status = Status.INTERNAL
+    by_status: dict[int, type[QueryError]] = {}  # noqa: RUF012 - filled by the subclasses
 
     def __init__(self, message: str, nearest: Iterable[str] = ()):
         self.nearest = tuple(nearest)
         super().__init__(message)
 
+    def __init_subclass__(cls, status: Status = Status.INTERNAL) -> None:
+        cls.status = status
+        cls.by_status.setdefault(status, cls)
 
-class UnknownBodyError(QueryError, LookupError):
+
+class UnknownBodyError(QueryError, LookupError, status=Status.UNKNOWN_BODY):
     """The model has no body of this name."""
 
-    status = Status.UNKNOWN_BODY
 
-
-class UnknownFrameError(QueryError, LookupError):
+class UnknownFrameError(QueryError, LookupError, status=Status.UNKNOWN_FRAME):
     """The body has no frame of this name, or the name is not of the form Body:Frame."""
 
-    status = Status.UNKNOWN_FRAME
 
-
-class NotConnectedError(QueryError):
+class NotConnectedError(QueryError, status=Status.NOT_CONNECTED):
     """No chain of constraints connects the two frames."""
 
-    status = Status.NOT_CONNECTED
 
-
-class NoPoseError(QueryError):
+class NoPoseError(QueryError, status=Status.NO_POSE):
     """A world frame was queried before the vehicle's pose is known."""
 
-    status = Status.NO_POSE
 
-
-class TooOldError(QueryError):
+class TooOldError(QueryError, status=Status.TOO_OLD):
     """The queried time is before the stored history."""
 
-    status = Status.TOO_OLD
 
-
-class TooNewError(QueryError):
+class TooNewError(QueryError, status=Status.TOO_NEW):
     """The queried time is after the newest data, and the policy does not allow prediction."""
 
-    status = Status.TOO_NEW
 
-
-class MalformedRequestError(QueryError, ValueError):
+class MalformedRequestError(QueryError, ValueError, status=Status.MALFORMED):
     """The request is invalid: an unknown policy, a negative wait, a range that ends before it starts."""
 
-    status = Status.MALFORMED
 
-
-class OverloadedError(QueryError):
+class OverloadedError(QueryError, status=Status.OVERLOADED):
     """The server is overloaded and dropped the request; retry later."""
 
-    status = Status.OVERLOADED
 
-
-class LimitError(QueryError):
+class LimitError(QueryError, status=Status.LIMIT):
     """The request exceeds a limit, which the message names."""
 
-    status = Status.LIMIT
 
-
-class ForbiddenError(QueryError):
+class ForbiddenError(QueryError, status=Status.FORBIDDEN):
     """The vehicle file does not permit the command; the message names the setting."""
 
-    status = Status.FORBIDDEN
 
-
-class RejectedError(QueryError):
+class RejectedError(QueryError, status=Status.REJECTED):
     """The command was examined and rejected, e.g. an unsuitable geometry or an impossible pose; nothing has changed."""
 
-    status = Status.REJECTED
 
-
-class ServerError(QueryError):
+class ServerError(QueryError, status=Status.INTERNAL):
     """The server failed on its side; its log holds the cause."""
-
-    status = Status.INTERNAL
 
 
 class BusError(ModelServerError):
@@ -413,25 +394,6 @@ class OutOfDateError(NoServerError):
     """A mirror has not received the messages it needs, or none within its timeout."""
 
 
-_BY_STATUS: dict[int, type[QueryError]] = {
-    cls.status: cls
-    for cls in (
-        UnknownBodyError,
-        UnknownFrameError,
-        NotConnectedError,
-        NoPoseError,
-        TooOldError,
-        TooNewError,
-        MalformedRequestError,
-        OverloadedError,
-        LimitError,
-        ForbiddenError,
-        RejectedError,
-        ServerError,
-    )
-}
-
-
 def make_status_error(status: int, message: str, nearest: Iterable[str] = ()) -> QueryError:
     """Return the exception for the status of a reply."""
-    return _BY_STATUS.get(status, ServerError)(message, nearest)
+    return QueryError.by_status.get(status, ServerError)(message, nearest)

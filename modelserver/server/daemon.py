@@ -23,8 +23,8 @@ from modelserver.server.diagnostics.machine import read_gauges, read_run_delay
 from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.journal.writer import make_writer
 from modelserver.server.loop import Hooks, Loop, LoopSettings
-from modelserver.server.persistence.store import SUBJECT as RESTART
-from modelserver.server.persistence.store import PersistentStores, open_stores
+from modelserver.server.persistence.stores import SUBJECT as RESTART
+from modelserver.server.persistence.stores import PersistentStores, open_stores
 from modelserver.server.supervision.supervisor import ServiceSupervisor
 from modelserver.server.supervision.systemd import Notifier
 from modelserver.server.vehicle import Vehicle

@@ -14,7 +14,7 @@ from support_lcm import wait_until
 from modelserver.errors import ModelServerError
 from modelserver.formats import save_model
 from modelserver.messages import GpsSample, ImuSample
-from modelserver.server.persistence.state import PersistedStateError, decode_state
+from modelserver.server.persistence.stores import PersistedStateError, decode_state
 from modelserver.simulation import DrivePhase, Event
 from modelserver.wire.codec import encode
 from tests.support_filter import RIG, simulation

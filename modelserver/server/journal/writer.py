@@ -31,8 +31,13 @@ from modelserver.server.journal.chain import NEWEST_NAME, NewestMarker, read_las
 from modelserver.server.journal.queue import JournalEntry, JournalQueue, SegmentStart
 from modelserver.server.journal.segments import Ring, Segment
 from modelserver.server.log import escape_text
-from modelserver.server.persistence.directory import FileLock, describe_error
-from modelserver.server.persistence.origin import get_state_directory, to_file_name, write_atomically
+from modelserver.server.persistence.directory import (
+    FileLock,
+    describe_error,
+    get_state_directory,
+    to_file_name,
+    write_atomically,
+)
 from modelserver.signing.signatures import Key
 from modelserver.wire.journal import (
     FORMAT,

@@ -1,4 +1,4 @@
-"""The state directory: a file lock for its one writer, and descriptions of its errors with their remedies."""
+"""The state directory: where it is, its lock, atomic files, and its errors with their remedies."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import errno
 import fcntl
 import os
 import shlex
+import tempfile
 import threading
 from pathlib import Path
 from typing import Final
@@ -101,6 +102,52 @@ def _read_pid(file: int) -> int:
         digits = os.pread(file, MAX_PID_DIGITS, 0).strip()
         return int(digits) if digits.isdigit() else 0
     return 0
+
+
+def get_state_directory(named: str) -> Path | None:
+    """Return the state directory: as named, else systemd's, else the user's; None without a home directory."""
+    if named:
+        return Path(named)
+    given = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    if given:
+        return Path(given)
+    try:
+        base = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    except RuntimeError:
+        return None
+    return Path(base) / "modelserver"
+
+
+def to_file_name(vehicle: str) -> str:
+    """Return a vehicle's name with the characters that are not safe in file names replaced by _."""
+    return "".join(character if character.isalnum() or character in "-_" else "_" for character in vehicle)
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file atomically and durably: after a power cut it has the old or the new content. Raises OSError.
+
+    Creates missing directories, and blocks until the data are on the disk.
+    """
+    temporary: Path | None = None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        # temporary file, fsync, rename; then fsync the directory, or the new name may be lost
+        with tempfile.NamedTemporaryFile("wb", dir=path.parent, prefix=path.name, delete=False) as file:
+            temporary = Path(file.name)
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError:
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+        raise
+    directory = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(directory)
+    finally:
+        os.close(directory)
 
 
 _DISK_FULL: Final = (errno.ENOSPC, errno.EDQUOT)

@@ -26,7 +26,7 @@ from modelserver.messages import (
 from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus
 from modelserver.server.loop import Hooks, Loop, LoopSettings
-from modelserver.server.persistence.state import StateStore
+from modelserver.server.persistence.stores import StateStore
 from modelserver.server.vehicle import Vehicle, load_vehicle
 from modelserver.wire.codec import decode
 from tests.support_persistence import PERSISTED, SETUP

@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 from support_samples import ORIGIN
 
-from modelserver.server.persistence.origin import OriginStore, get_default_directory
+from modelserver.server.persistence.directory import get_state_directory
+from modelserver.server.persistence.stores import OriginStore
 
 GOOD = {"version": 1, **dataclasses.asdict(ORIGIN)}
 
@@ -172,7 +173,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from modelserver.earth.geodesy import make_origin
-from modelserver.server.persistence.origin import OriginStore
+from modelserver.server.persistence.stores import OriginStore
 def kill(*_): os.kill(os.getpid(), signal.SIGKILL)
 if sys.argv[2] == "sync": os.fsync = kill
 else: Path.replace = kill
@@ -207,4 +208,4 @@ def test_given_the_environment_then_the_state_directory_follows_it(
         monkeypatch.delenv(name, raising=False)
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    assert get_default_directory() == Path(expected)
+    assert get_state_directory("") == Path(expected)

@@ -26,7 +26,7 @@ from modelserver.server.clock import Clock
 from modelserver.server.journal.segments import Ring
 from modelserver.server.journal.writer import make_writer
 from modelserver.server.persistence.directory import FileLock, LockHeldError, describe_error
-from modelserver.server.persistence.store import PersistentStores, open_stores
+from modelserver.server.persistence.stores import PersistentStores, open_stores
 from tests.support_persistence import PERSISTED
 
 ORIGIN = make_origin(500_000.0, 5_500_000.0, 700.0, 12, True)
@@ -215,9 +215,9 @@ def test_given_a_user_without_a_home_then_nothing_is_persisted_and_that_is_logge
 ) -> None:
     from dataclasses import replace
 
-    from modelserver.server.persistence import store
+    from modelserver.server.persistence import stores
 
-    monkeypatch.setattr(store, "get_state_directory", lambda named: None)
+    monkeypatch.setattr(stores, "get_state_directory", lambda named: None)
     open_stores(replace(config, state_directory=""), localizes=True).close()
     assert "no home directory" in caplog.text
 

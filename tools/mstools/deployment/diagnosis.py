@@ -19,7 +19,7 @@ from modelserver.errors import KeyFileError, Problem, Severity
 from modelserver.server.diagnostics.checks import Diagnosis, DiagnosisLevel, NetworkInterface
 from modelserver.server.journal.segments import LOCK_NAME, list_segments
 from modelserver.server.journal.writer import get_journal_directory, get_max_bytes
-from modelserver.server.persistence.origin import get_state_directory
+from modelserver.server.persistence.directory import get_state_directory
 from modelserver.signing.key_files import find_group_writable_folder, read_keys
 from modelserver.version import __version__
 from mstools.deployment.files import CREDENTIAL

@@ -1,7 +1,7 @@
-"""Persisted state of localization for a warm start: file format, restore, and a writer thread.
+"""What a service persists in its state directory: the captured origin, and the state for a warm start.
 
-The file is a line with magic, version and SHA-256, then JSON; anything else is rejected with a reason. It is written
-atomically by a thread, so that the loop never waits for the disk; only the newest state waits to be written.
+The state file is a line with magic, version and SHA-256, then JSON; anything else is rejected with a reason. It is
+written atomically by a thread, so that the loop never waits for the disk; only the newest state waits to be written.
 
 The age of a state is measured by the monotonic clock if the boot id is the same. After a reboot only the time of day is
 left, which may have been set: then the pose is dropped and the biases are used.
@@ -10,27 +10,94 @@ left, which may have been set: then the pose is dropped and the biases are used.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import json
 import logging
 import math
 import os
 import threading
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from types import MappingProxyType
+from typing import Annotated, Any, Final, TypeVar, get_type_hints
 from uuid import UUID
 
+import msgspec
+
+from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.core import Instant
+from modelserver.earth.geodesy import make_origin
 from modelserver.errors import quote
 from modelserver.files.regular import read_start
-from modelserver.messages import PersistedPose, PersistedState, RestoredState
+from modelserver.messages import Origin, PersistedPose, PersistedState, RestoredState
 from modelserver.server.log import escape_text
-from modelserver.server.persistence.directory import FileLock, LockHeldError, describe_error
-from modelserver.server.persistence.origin import to_file_name, write_atomically
+from modelserver.server.persistence.directory import (
+    FileLock,
+    LockHeldError,
+    describe_error,
+    get_state_directory,
+    to_file_name,
+    write_atomically,
+)
+from modelserver.transforms.so3 import Quaternion, Vector3
 
 log = logging.getLogger(__name__)
 
 VERSION: Final = 1
+"""Version of both files."""
+
+MAX_ORIGIN_BYTES: Final = 4096
+"""Ten times the size of a valid file."""
+
+
+class OriginStore:
+    """Persists the origin of one vehicle in a file. Only the holder of the directory's `lock` writes; None: no lock."""
+
+    def __init__(self, directory: Path, vehicle: str, lock: FileLock | None = None):
+        self._lock = lock
+        self.path = directory / f"origin-{to_file_name(vehicle)}.json"
+
+    def load(self) -> Origin | None:
+        """Return the stored origin; None where there is none or the file is damaged, which is logged."""
+        try:
+            text = read_start(self.path, MAX_ORIGIN_BYTES).decode()
+        except FileNotFoundError:
+            return None
+        except (OSError, UnicodeDecodeError) as error:
+            log.warning("the stored origin in %s cannot be read (%s); a new one will be captured", self.path, error)
+            return None
+        try:
+            return _parse_origin(json.loads(text))
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+            log.warning("the stored origin in %s is damaged (%r); a new one will be captured", self.path, error)
+            return None
+
+    def save(self, origin: Origin) -> None:
+        """Store an origin. An error of the disk is logged: the next start captures a new one."""
+        content = json.dumps({"version": VERSION, **dataclasses.asdict(origin)}, indent=1)
+        try:
+            if self._lock is not None:
+                self._lock.claim()
+            write_atomically(self.path, (content + "\n").encode())
+        except OSError as error:
+            why = describe_error(error, self.path.parent, "state_directory")
+            log.warning("the origin cannot be stored in %s: %s. The next start will capture a new one", self.path, why)
+
+
+def _parse_origin(content: dict[str, Any]) -> Origin:
+    if content["version"] != VERSION:
+        raise ValueError(f"version {content['version']}; expected {VERSION}")
+    easting, northing, height = (float(content[name]) for name in ("easting", "northing", "height"))
+    zone, north, origin_id = content["zone"], content["north"], content["origin_id"]
+    if type(zone) is not int or type(north) is not bool or type(origin_id) is not int:
+        raise ValueError("zone, north or origin_id has a wrong type")
+    origin = make_origin(easting, northing, height, zone, north)
+    if not 0 < origin_id < 1 << 63:
+        raise ValueError(f"origin_id {origin_id} is out of range")
+    # the published id stays, even if this version would derive another one from the numbers
+    return dataclasses.replace(origin, origin_id=origin_id)
+
 
 MAX_BYTES: Final = 1 << 18
 """Ten times the size of a filter with 30 error states."""
@@ -42,6 +109,30 @@ MAX_NAME_LENGTH: Final = 256
 _MAGIC: Final = "modelserver-state"
 _MAX_NUMBER: Final = 1e9
 """Upper bound of the numbers, except times and counts."""
+
+_Text = Annotated[str, msgspec.Meta(max_length=MAX_NAME_LENGTH)]
+_Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
+_Number = Annotated[float, msgspec.Meta(ge=-_MAX_NUMBER, le=_MAX_NUMBER)]
+
+_FIELDS: Final[Mapping[Any, tuple[Any, str]]] = MappingProxyType(
+    {
+        str: (_Text, f"a text of at most {MAX_NAME_LENGTH} characters"),
+        int: (_Count, "a count"),
+        float: (_Number, f"a number within +-{_MAX_NUMBER:g}"),
+        Vector3: (tuple[_Number, _Number, _Number], "3 numbers"),
+        Quaternion: (tuple[_Number, _Number, _Number, _Number], "4 numbers"),
+        tuple[float, ...]: (tuple[_Number, ...], "numbers"),
+        tuple[str, ...]: (tuple[_Text, ...], f"texts of at most {MAX_NAME_LENGTH} characters"),
+        tuple[tuple[str, float], ...]: (
+            Annotated[list[Any], msgspec.Meta(max_length=MAX_WHEELS)],
+            f"at most {MAX_WHEELS} pairs",
+        ),
+        PersistedPose | None: (Any, ""),
+    }
+)
+"""What is valid for a field of each declared type, and its description."""
+
+_Row = TypeVar("_Row", PersistedState, PersistedPose)
 
 
 class PersistedStateError(ValueError):
@@ -92,112 +183,42 @@ def _reject_constant(word: str) -> float:
 
 
 def _parse_state(content: object) -> PersistedState:
-    found = _check_mapping(content, PersistedState._fields)
-    names = found["names"]
-    if not isinstance(names, list) or not 15 <= len(names) <= MAX_STATES:
+    state = _convert_fields(content, PersistedState)
+    count = len(state.names)
+    if not 15 <= count <= MAX_STATES:
         raise PersistedStateError(f"names: expected 15 to {MAX_STATES} error states")
-    if not all(isinstance(name, str) and len(name) <= MAX_NAME_LENGTH for name in names):
-        raise PersistedStateError(f"names: expected texts of at most {MAX_NAME_LENGTH} characters")
-    n = len(names)
-    covariance = _get_numbers(found, "covariance", n * n)
-    if any(covariance[k * (n + 1)] < 0.0 for k in range(n)):
+    for key, values, expected in (("covariance", state.covariance, count**2), ("extras", state.extras, count - 15)):
+        if len(values) != expected:
+            raise PersistedStateError(f"{key}: expected {expected} numbers")
+    if min(state.covariance[:: count + 1]) < 0.0:
         raise PersistedStateError("covariance: negative variance")
-    return PersistedState(
-        _get_text(found, "vehicle"),
-        _get_count(found, "utime"),
-        _get_count(found, "monotonic_ns"),
-        _get_text(found, "boot"),
-        _get_text(found, "setup"),
-        _get_count(found, "sensor_utime"),
-        tuple(names),
-        _get_vector(found, "gyro_bias"),
-        _get_vector(found, "accelerometer_bias"),
-        _get_numbers(found, "extras", n - 15),
-        covariance,
-        None if found["pose"] is None else _parse_pose(found["pose"]),
-    )
+    return state if state.pose is None else state._replace(pose=_parse_pose(state.pose))
 
 
 def _parse_pose(content: object) -> PersistedPose:
-    found = _check_mapping(content, PersistedPose._fields)
-    latitude, longitude = _get_number(found, "latitude_deg"), _get_number(found, "longitude_deg")
-    if abs(latitude) > 90.0 or abs(longitude) > 360.0:
-        raise PersistedStateError(f"latitude {latitude:g}, longitude {longitude:g}: out of range")
-    w, x, y, z = _get_numbers(found, "attitude", 4)
-    if not abs(math.hypot(w, x, y, z) - 1.0) < 1e-6:
+    pose = _convert_fields(content, PersistedPose)
+    if abs(pose.latitude_deg) > 90.0 or abs(pose.longitude_deg) > 360.0:
+        raise PersistedStateError(f"latitude {pose.latitude_deg:g}, longitude {pose.longitude_deg:g}: out of range")
+    if not abs(math.hypot(*pose.attitude) - 1.0) < 1e-6:
         raise PersistedStateError("attitude: expected a unit quaternion")
-    variance = _get_vector(found, "correlated_error_variance")
-    allowance, inflation = _get_number(found, "allowance"), _get_number(found, "gnss_noise_inflation")
-    if min(*variance, allowance) < 0.0 or inflation < 1.0:
+    if min(*pose.correlated_error_variance, pose.allowance) < 0.0 or pose.gnss_noise_inflation < 1.0:
         raise PersistedStateError("correlated_error_variance, allowance or gnss_noise_inflation: out of range")
-    wheels = found["wheels"]
-    if not isinstance(wheels, list) or len(wheels) > MAX_WHEELS:
-        raise PersistedStateError(f"wheels: expected at most {MAX_WHEELS} pairs")
-    distances = []
-    for pair in wheels:
-        if not (isinstance(pair, list) and len(pair) == 2 and isinstance(pair[0], str) and _is_number(pair[1])):
-            raise PersistedStateError("wheels: expected pairs of a name and a distance")
-        distances.append((pair[0], float(pair[1])))
-    return PersistedPose(
-        latitude,
-        longitude,
-        _get_number(found, "height"),
-        _get_vector(found, "position"),
-        (w, x, y, z),
-        _get_vector(found, "correlated_error"),
-        variance,
-        allowance,
-        inflation,
-        _get_count(found, "fix_utime"),
-        _get_count(found, "confirmed"),
-        _get_count(found, "pose_epoch"),
-        _get_text(found, "wheels_source"),
-        _get_count(found, "wheels_seq"),
-        tuple(distances),
-    )
+    pairs = tuple[tuple[str, _Number], ...]
+    return pose._replace(wheels=_convert("wheels", pose.wheels, pairs, "pairs of a name and a distance"))
 
 
-def _check_mapping(content: object, keys: tuple[str, ...]) -> dict[str, Any]:
-    if not isinstance(content, dict) or set(content) != set(keys):
+def _convert_fields(content: object, row: type[_Row]) -> _Row:
+    """Convert a mapping to a NamedTuple, each field as declared. Raises PersistedStateError."""
+    if not isinstance(content, dict) or set(content) != set(row._fields):
         raise PersistedStateError("unknown or missing keys")
-    return content
+    return row(*(_convert(key, content[key], *_FIELDS[hint]) for key, hint in get_type_hints(row).items()))
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= _MAX_NUMBER
-
-
-def _get_number(content: dict[str, Any], key: str) -> float:
-    value = content[key]
-    if not _is_number(value):
-        raise PersistedStateError(f"{key}: expected a number within +-{_MAX_NUMBER:g}")
-    return float(value)
-
-
-def _get_numbers(content: dict[str, Any], key: str, count: int) -> tuple[float, ...]:
-    values = content[key]
-    if not isinstance(values, list) or len(values) != count or not all(map(_is_number, values)):
-        raise PersistedStateError(f"{key}: expected {count} numbers")
-    return tuple(map(float, values))
-
-
-def _get_vector(content: dict[str, Any], key: str) -> tuple[float, float, float]:
-    x, y, z = _get_numbers(content, key, 3)
-    return (x, y, z)
-
-
-def _get_count(content: dict[str, Any], key: str) -> int:
-    value = content[key]
-    if type(value) is not int or not 0 <= value < 1 << 63:
-        raise PersistedStateError(f"{key}: expected a count")
-    return int(value)
-
-
-def _get_text(content: dict[str, Any], key: str) -> str:
-    value = content[key]
-    if not isinstance(value, str) or len(value) > MAX_NAME_LENGTH:
-        raise PersistedStateError(f"{key}: expected a text of at most {MAX_NAME_LENGTH} characters")
-    return value
+def _convert(key: str, value: object, kind: Any, expected: str) -> Any:
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError:
+        raise PersistedStateError(f"{key}: expected {expected}") from None
 
 
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
@@ -344,3 +365,55 @@ class StateStore:
                 log.warning("%s", warning)
             else:
                 log.info("the state is stored again in %s", self.path)
+
+
+SUBJECT: Final = "restart"
+"""Subject of the health warning while no state is stored."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class PersistentStores:
+    """Stores of a service, None for what it does not persist.
+
+    `lock` is that of the state directory. Each writer claims it again before writing, so that this service takes over
+    when its holder has ended. `warning`: why nothing can be stored, as already logged.
+    """
+
+    origin: OriginStore | None = None
+    state: StateStore | None = None
+    lock: FileLock | None = None
+    warning: str = ""
+
+    def close(self) -> None:
+        """Release the directory."""
+        if self.lock is not None:
+            self.lock.release()
+
+
+def open_stores(config: VehicleConfig, localizes: bool) -> PersistentStores:
+    """Open the stores of a vehicle's service; `localizes`: whether there is a state to persist.
+
+    A directory that is unusable or held by another service does not stop the start: it is logged, see `warning`.
+    """
+    directory = get_state_directory(config.state_directory)
+    if directory is None:
+        log.warning(
+            "there is no home directory: no state is stored for a warm start; set state_directory in the vehicle file"
+        )
+        return PersistentStores()
+    persists_origin = config.origin.persist and config.origin.initial_utm is None
+    persists_state = config.warm_start.persist and localizes
+    lock = FileLock(directory / f"lock-{to_file_name(config.vehicle)}")
+    warning = ""
+    if persists_origin or persists_state:
+        try:
+            lock.claim()
+        except LockHeldError as error:
+            warning = describe_held_lock(error, directory)
+            log.warning("%s", warning)
+    return PersistentStores(
+        OriginStore(directory, config.vehicle, lock) if persists_origin else None,
+        StateStore(directory, config.vehicle, lock=lock, warning=warning) if persists_state else None,
+        lock,
+        warning,
+    )
