@@ -23,10 +23,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks import plaza_ranges, protocols
-from benchmarks.protocols import SHIFTS, ReplayJob, ReplayScore
+from benchmarks.protocols import SHIFTS, ReplayJob, ReplayScore, data_directory, load_scorer
 from benchmarks.recordings import dresden, husky, kitti, plaza
 from benchmarks.support import ROOT
-from benchmarks.withheld import data_directory, load_scorer
 
 SKIPPED = 77
 PROTOCOLS = ("half", "outage", "p2x")

@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
+from benchmarks.protocols import data_directory
 from benchmarks.support import print_verdict
-from benchmarks.withheld import data_directory
 from modelserver import core
 from modelserver.config.vehicle_file import load_config
 from modelserver.core import Instant

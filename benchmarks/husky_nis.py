@@ -6,8 +6,8 @@ import statistics
 import tempfile
 from pathlib import Path
 
+from benchmarks.protocols import data_directory
 from benchmarks.support import ROOT
-from benchmarks.withheld import data_directory
 from modelserver.config.vehicle_file import load_config
 from modelserver.messages import Decision, Verdict
 from modelserver.server.offline import OfflineRun

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.overrides import load_with_overrides
+from benchmarks.protocols import load_with_overrides
 from benchmarks.recordings import plaza
 from benchmarks.recordings.plaza import Array, Beacons
 from benchmarks.support import ROOT

@@ -8,12 +8,15 @@
 
 An error is horizontal, in the frame of the antenna, at the fix's stamp; the estimate uses the events that arrived
 before (`modelserver.server.offline`). The common scorer is stored beside the recordings and gets an estimate at each
-withheld fix. Invalid estimates count; missing ones are reported.
+withheld fix. Invalid estimates count; missing ones are reported. `load_with_overrides` changes a vehicle file for an
+experiment.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -23,10 +26,15 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pyproj
+import yaml
 
-from benchmarks.overrides import load_with_overrides
-from benchmarks.withheld import FixTable, load_scorer, read_fixes
+from benchmarks.support import ROOT
+from modelserver.config.vehicle_file import load_config
+from modelserver.messages import GpsSample
 from modelserver.server.offline import OfflineRun
+from modelserver.server.vehicle import Vehicle, load_vehicle
+from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent, LogFile
 
 Array = npt.NDArray[np.float64]
@@ -76,6 +84,19 @@ class ReplayScore:
     max: float = float("nan")
     gaps: tuple[FixGap, ...] = ()
     rejected: Mapping[tuple[str, str], int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FixTable:
+    """Fixes of a log: stamps (microseconds), UTM easting and northing (n, 2)."""
+
+    utime: npt.NDArray[np.int64]
+    positions: Array
+
+    @property
+    def withheld(self) -> npt.NDArray[np.bool_]:
+        """Mask of the withheld fixes: every second one."""
+        return np.arange(len(self.utime)) % 2 == 1
 
 
 @dataclass(frozen=True)
@@ -200,3 +221,68 @@ def mean_gap_end(outcomes: Iterable[ReplayScore]) -> float:
     """Return the mean of the gap-end errors over all gaps of all runs, meters; nan without gaps."""
     ends = [gap.end_error for each in outcomes for gap in each.gaps]
     return float(np.mean(ends)) if ends else float("nan")
+
+
+# --- recordings and vehicle files ---------------------------------------------------------------------------
+
+
+def data_directory() -> Path:
+    return Path(os.environ.get("MODELSERVER_DATA", ROOT.parent / "shared" / "data"))
+
+
+def read_fixes(events: Iterable[LogEvent]) -> FixTable:
+    samples = [sample for event in events if (sample := _decode_fix(event)) is not None]
+    zone = int((samples[0].longitude_deg + 180) // 6) + 1
+    to_utm = pyproj.Transformer.from_crs(4326, f"+proj=utm +zone={zone} +datum=WGS84", always_xy=True)
+    east, north = to_utm.transform([s.longitude_deg for s in samples], [s.latitude_deg for s in samples])
+    return FixTable(np.array([s.header.utime for s in samples]), np.column_stack([east, north]))
+
+
+def _decode_fix(event: LogEvent) -> GpsSample | None:
+    if event.channel != "GPS":
+        return None
+    sample: GpsSample = decode("gps_t", event.data)
+    return sample
+
+
+def load_scorer(data: Path) -> Callable[..., dict[str, Any]] | None:
+    """Return the scorer beside the recordings, None where there is none."""
+    path = data.parent / "tools" / "score_trajectory.py"
+    if not path.is_file():
+        return None
+    spec = importlib.util.spec_from_file_location("score_trajectory", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    found: Callable[..., dict[str, Any]] = module.score
+    return found
+
+
+def load_with_overrides(path: Path, settings: Mapping[str, str], mode: str, directory: Path) -> Vehicle:
+    """Load a vehicle file with changed values; `directory` gets the changed file, if there is one.
+
+    A key with a dot is a path in the vehicle file (`sensors.wheels.channel`); one without is a filter setting
+    (`localization.filter.KEY`). A value is YAML; an empty one removes the key. `mode` is `localization.mode`, unless
+    empty. Raises ConfigError with the nearest known key for an unknown one.
+    """
+    if not settings and not mode:
+        return load_vehicle(load_config(path), str(path))
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    content["geometry"] = str((path.parent / content["geometry"]).resolve())
+    for key, value in settings.items():
+        _set_value(content, (key if "." in key else f"localization.filter.{key}").split("."), value)
+    if mode:
+        _set_value(content, ["localization", "mode"], mode)
+    changed = directory / path.name
+    changed.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    return load_vehicle(load_config(changed), str(changed))
+
+
+def _set_value(content: dict[str, Any], keys: list[str], value: str) -> None:
+    for key in keys[:-1]:
+        content = content.setdefault(key, {})
+    if value:
+        content[keys[-1]] = yaml.safe_load(value)
+    else:
+        content.pop(keys[-1], None)

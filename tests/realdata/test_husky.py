@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 from support_recordings import HUSKY
 
-from benchmarks import protocols, withheld
+from benchmarks import protocols
 from modelserver.config.vehicle_file import load_config
 from modelserver.server.offline import OfflineRun
 from modelserver.server.vehicle import load_vehicle
@@ -87,7 +87,7 @@ def test_given_the_recording_when_replayed_then_the_antenna_follows_its_fixes_wi
     husky_log: tuple[Path, ImportReport], antenna: npt.NDArray[np.float64]
 ) -> None:
     with LogFile(husky_log[0]) as recording:
-        fixes = withheld.read_fixes(recording)
+        fixes = protocols.read_fixes(recording)
     t = (fixes.utime - fixes.utime[0]) * 1e-6 + antenna[0, 0]
     valid = antenna[antenna[:, 4] > 0]
     scored = (t > valid[0, 0] + 1.0) & (t < valid[-1, 0])
@@ -102,11 +102,11 @@ def test_given_the_recording_when_replayed_then_the_antenna_follows_its_fixes_wi
 def test_given_withheld_fixes_when_replayed_then_the_path_between_fixes_is_propagated_better_than_by_holding(
     husky_log: tuple[Path, ImportReport], data_dir: Path
 ) -> None:
-    if withheld.load_scorer(data_dir) is None:
+    if protocols.load_scorer(data_dir) is None:
         pytest.skip(f"no scorer beside {data_dir}")
     ours = protocols.run(protocols.ReplayJob(husky_log[0], HUSKY, data_dir, "half"))
     with LogFile(husky_log[0]) as recording:
-        fixes = withheld.read_fixes(recording)
+        fixes = protocols.read_fixes(recording)
     k = np.flatnonzero(fixes.withheld & (fixes.utime - fixes.utime[0] >= protocols.SKIP_S * 1e6))
     held = np.hypot(*(fixes.positions[k] - fixes.positions[k - 1]).T)
     assert ours.missing == 0

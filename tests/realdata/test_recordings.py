@@ -16,8 +16,8 @@ from scipy.interpolate import CubicSpline
 from support_recordings import HUSKY
 
 from benchmarks import accuracy, protocols
+from benchmarks.protocols import FixTable, load_scorer, read_fixes
 from benchmarks.recordings import dresden, husky, kitti, plaza
-from benchmarks.withheld import FixTable, load_scorer, read_fixes
 from modelserver.config.vehicle_file import load_config
 from modelserver.formats import load_model
 from modelserver.messages import Direction, FixType, GpsSample, ImuSample, WheelsSample
