@@ -212,7 +212,7 @@ def test_given_an_unknown_key_at_any_level_then_line_key_and_nearest_are_named(
 @pytest.mark.parametrize(
     ("text", "key", "near", "fix"),
     [
-        # how raw mode's settings stood in the files of earlier versions
+        # raw mode's settings as the files of earlier versions have them
         ("minimum_fix_type: 1", "minimum_fix_type", "minimum_fix_type",
          "write minimum_fix_type under localization.raw or localization.filter"),
         ("jump_time: 1", "jump_time", "jump_time", "write jump_time under localization.raw"),

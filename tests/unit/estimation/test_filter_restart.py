@@ -111,7 +111,7 @@ def test_given_a_vehicle_that_was_towed_or_turned_meanwhile_then_no_wrong_pose_i
 
 @pytest.mark.parametrize("turn", [1.5708, -0.5, 3.1416])
 def test_given_a_vehicle_that_was_lifted_and_turned_on_the_spot_then_its_first_metres_put_the_heading_right(turn):
-    # what nothing can tell at rest: wheels stood, the place is the same, and so is the lean
+    # no sensor can detect it while stationary: the wheels did not turn, position and tilt are the same
     first, kept = simulate_first_run()
     sim = simulate_elsewhere(first, GAP, 0.0, turn, (DrivePhase(8.0), *DRIVES_OFF))
     localizer = FilterLocalizer.start(Setup(RIG), ORIGIN, Mode.FULL, RestoredState(kept, GAP))

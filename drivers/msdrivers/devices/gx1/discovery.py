@@ -101,7 +101,7 @@ def _stop_stream(link: Gx1Receiver, found: LineState, flush: float) -> ScriptPar
     if found.found_stream is None:
         found.found_stream = next((kind for kind in kinds if kinds.count(kind) > 1), None)
     if link.bytes_received:
-        # a stop may come amid a streamed reply: the second one is answered clearly
+        # a stop command may be sent in the middle of a streamed reply: the second one is answered clearly
         yield Send(requests.STOP)
         yield PauseStep(flush)
     yield RequestStep(requests.STOP, value=0)
