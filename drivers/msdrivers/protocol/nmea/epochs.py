@@ -12,7 +12,7 @@ The fix type of an epoch is NONE if any sentence flags the fix invalid, else tha
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from modelserver.messages import FixType
@@ -33,43 +33,51 @@ _QUALITY = {
 standard: NovAtel receivers send it for corrections by satellite (SBAS)."""
 
 _MODE = {
-    "A": FixType.FIX_3D,
-    "P": FixType.FIX_3D,
-    "D": FixType.DIFFERENTIAL,
     "R": FixType.RTK_FIXED,
     "F": FixType.RTK_FLOAT,
+    "D": FixType.DIFFERENTIAL,
+    "A": FixType.FIX_3D,
+    "P": FixType.FIX_3D,
     "E": FixType.DEAD_RECKONING,
 }
-"""The mode indicator of NMEA 2.3 and later. M (by hand), S (simulated), N (not valid) are NONE."""
+"""The mode indicator of NMEA 2.3 and later, the best first. M (by hand), S (simulated), N (not valid) are NONE."""
 
 
 def determine_fix_type(sentences: Sequence[NmeaSentence]) -> FixType:
     """Return the fix type; NONE if any sentence flags the fix invalid, or none has a position."""
-    placed = [each for each in sentences if each.has_position]
+    placed = _list_places(sentences)
     if not placed or any(_is_invalid(each) for each in sentences) or _has_no_satellites(sentences):
         return FixType.NONE
-    dimensions = [each.dimension for each in sentences if each.dimension is not None]
-    dimension = max(dimensions, default=None)
+    dimension = max((each.dimension for each in sentences if each.dimension is not None), default=None)
     if dimension == 1:
         return FixType.NONE
-    found = next(_list_fix_types(placed), FixType.FIX_3D)
+    types = (_QUALITY.get(each.quality) if each.quality is not None else _best_mode(each.mode) for each in placed)
+    found = next((each for each in types if each is not None), FixType.FIX_3D)
     has_height = any(each.height_msl == each.height_msl for each in placed)
     flat = dimension == 2 if dimension is not None else not has_height
     return FixType.FIX_2D if flat and found is FixType.FIX_3D else found
 
 
+def _list_places(sentences: Iterable[NmeaSentence]) -> list[NmeaSentence]:
+    """Return the sentences with a position, the most detailed first."""
+    return sorted((each for each in sentences if each.has_position), key=lambda each: POSITION_KINDS.index(each.kind))
+
+
 def _is_invalid(sentence: NmeaSentence) -> bool:
-    """Whether a sentence flags the fix invalid."""
+    """Return whether a sentence flags the fix invalid."""
     if sentence.kind == "GGA":
         return sentence.quality not in _QUALITY
     if sentence.kind == "GNS":
         return _best_mode(sentence.mode) is None
     if sentence.kind in ("RMC", "GLL"):
         # status V with mode E is dead reckoning, a fix of its kind
-        if sentence.mode and sentence.mode not in _MODE:
-            return True
-        return sentence.status != "A" and sentence.mode != "E"
+        return bool(sentence.mode and sentence.mode not in _MODE) or (sentence.status != "A" and sentence.mode != "E")
     return False
+
+
+def _best_mode(mode: str) -> FixType | None:
+    """Return the best of a mode indicator's letters; unused satellite systems have N."""
+    return next((found for letter, found in _MODE.items() if letter in mode), None)
 
 
 def count_satellites(sentences: Sequence[NmeaSentence]) -> int:
@@ -88,36 +96,13 @@ def _has_no_satellites(sentences: Sequence[NmeaSentence]) -> bool:
     return counts and count_satellites(sentences) == 0
 
 
-def _list_fix_types(placed: Iterable[NmeaSentence]) -> Iterator[FixType]:
-    """Yield the fix types of the sentences with a position, the most detailed first."""
-    ordered = sorted(placed, key=lambda each: ("GGA", "GNS", "RMC", "GLL").index(each.kind))
-    for each in ordered:
-        found = _QUALITY.get(each.quality) if each.quality is not None else _best_mode(each.mode)
-        if found is not None:
-            yield found
-
-
-def _best_mode(mode: str) -> FixType | None:
-    """Return the best of a mode indicator's letters; unused satellite systems have N."""
-    found = [_MODE[letter] for letter in mode if letter in _MODE]
-    return max(found, key=_RANK.index, default=None)
-
-
-_RANK = (
-    FixType.DEAD_RECKONING,
-    FixType.FIX_3D,
-    FixType.DIFFERENTIAL,
-    FixType.RTK_FLOAT,
-    FixType.RTK_FIXED,
-)
-
-
-POSITION_KINDS = frozenset({"GGA", "GNS", "RMC", "GLL"})
+POSITION_KINDS = ("GGA", "GNS", "RMC", "GLL")
+"""Sentences with a position, the most detailed first."""
 _MOTION = frozenset({"VTG", "HDT"})
 """Sentences with the receiver's motion but without a time: of another instant their content is wrong."""
 _MIN_LESSONS = 2
 """Number of cycles that determine the order of sentences."""
-_TIMED = POSITION_KINDS | {"GST"}
+_TIMED = frozenset({*POSITION_KINDS, "GST"})
 """Sentences whose time is that of the fix. ZDA's is the clock's, which in some receivers is seconds ahead."""
 _MAX_SENTENCES = 64
 """Largest number of sentences in an epoch."""
@@ -233,10 +218,7 @@ class EpochAssembler:
 
     def _get_instant(self) -> tuple[bool, int | None]:
         """Return whether the pending epoch has a timed sentence, and its time."""
-        for each in self._sentences:
-            if each.kind in _TIMED:
-                return True, each.time_of_day
-        return False, None
+        return next(((True, each.time_of_day) for each in self._sentences if each.kind in _TIMED), (False, None))
 
     def _starts_epoch(self, sentence: NmeaSentence) -> bool:
         started, instant = self._get_instant()
@@ -261,11 +243,8 @@ class EpochAssembler:
     def _is_end(self, sentence: NmeaSentence) -> bool:
         if not self._is_regular or sentence.kind != self._last:
             return False
-        if (
-            self._stable_since is None
-            or self._last_instant is None
-            or self._last_instant - self._stable_since < _MIN_STABLE_US
-        ):
+        last, since = self._last_instant, self._stable_since
+        if last is None or since is None or last - since < _MIN_STABLE_US:
             return False
         received = Counter(each.kind for each in self._sentences)
         return all(received[kind] >= number for kind, number in self._cycle.items())
@@ -308,36 +287,25 @@ def merge_sentences(sentences: list[NmeaSentence], instant: int | None, utime: i
     The more detailed sentence takes precedence: GGA and GNS before RMC before GLL for the position, RMC before VTG for
     speed and course.
     """
-    places = sorted(
-        (each for each in sentences if each.has_position),
-        key=lambda each: ("GGA", "GNS", "RMC", "GLL").index(each.kind),
-    )
-    motions = sorted(sentences, key=lambda each: each.kind != "RMC")
-    last = list(reversed(sentences))
+    places = _list_places(sentences)
 
-    def first_value(name: str, among: list[NmeaSentence]) -> float:
-        return next((value for each in among if (value := float(getattr(each, name))) == value), NAN)
+    def select(among: Iterable[NmeaSentence], *names: str) -> dict[str, float]:
+        """Return the first value of each name that is not missing."""
+        found = ((name, [getattr(each, name) for each in among]) for name in names)
+        return {name: next((value for value in values if value == value), NAN) for name, values in found}
 
-    # the height belongs to its own sentence's position
-    heights = [each for each in places if each.kind in ("GGA", "GNS")]
     return NmeaEpoch(
         start=sentences[0].start,
         kinds=tuple(each.kind for each in sentences),
         utime=utime,
         time_of_day=instant,
         fix_type=determine_fix_type(sentences),
-        latitude=first_value("latitude", places),
-        longitude=first_value("longitude", places),
-        height_msl=first_value("height_msl", heights),
-        undulation=first_value("undulation", heights),
         satellites=count_satellites(sentences),
-        hdop=first_value("hdop", last),
-        vdop=first_value("vdop", last),
-        pdop=first_value("pdop", last),
-        speed=first_value("speed", motions),
-        track=first_value("track", motions),
-        heading=first_value("heading", last),
-        sigma_latitude=first_value("sigma_latitude", last),
-        sigma_longitude=first_value("sigma_longitude", last),
-        sigma_height=first_value("sigma_height", last),
+        **select(places, "latitude", "longitude"),
+        # the height belongs to its own sentence's position
+        **select([each for each in places if each.kind in ("GGA", "GNS")], "height_msl", "undulation"),
+        **select(sorted(sentences, key=lambda each: each.kind != "RMC"), "speed", "track"),
+        **select(
+            sentences[::-1], "hdop", "vdop", "pdop", "heading", "sigma_latitude", "sigma_longitude", "sigma_height"
+        ),
     )

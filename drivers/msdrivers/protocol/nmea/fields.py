@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from datetime import date
+from math import inf
 
 from modelserver.messages.flags import NAN
 
@@ -22,12 +23,12 @@ _ANGLE = re.compile(r"(\d{1,3}?)(\d\d(?:\.\d*)?)")
 _UNIX_DAY = date(1970, 1, 1).toordinal()
 
 
-def parse_number(text: str) -> float:
-    """Return a decimal number; nan for an empty field."""
+def parse_number(text: str, least: float = -inf, most: float = inf) -> float:
+    """Return a decimal number within bounds; nan for an empty field."""
     if not text:
         return NAN
-    if not _NUMBER.fullmatch(text):
-        raise ValueError(f"'{text}' is no number")
+    if not _NUMBER.fullmatch(text) or not least <= float(text) <= most:
+        raise ValueError(f"'{text}' is no number from {least:g} to {most:g}")
     return float(text)
 
 
@@ -45,14 +46,11 @@ def parse_time_of_day(text: str) -> int | None:
     if not text:
         return None
     parts = _CLOCK.fullmatch(text)
-    if parts is None:
-        raise ValueError(f"'{text}' is no time of day")
-    hours, minutes, seconds = int(parts[1]), int(parts[2]), int(parts[3])
+    hours, minutes, seconds = (int(each) for each in parts.groups()[:3]) if parts else (24, 0, 0)
     leap = seconds == 60 and (hours, minutes) == (23, 59)
-    if hours > 23 or minutes > 59 or (seconds > 59 and not leap):
+    if parts is None or hours > 23 or minutes > 59 or (seconds > 59 and not leap):
         raise ValueError(f"'{text}' is no time of day")
-    fraction = (parts[4] or "")[:6].ljust(6, "0")
-    return (hours * 3600 + minutes * 60 + seconds) * SECOND + int(fraction)
+    return (hours * 3600 + minutes * 60 + seconds) * SECOND + int((parts[4] or "")[:6].ljust(6, "0"))
 
 
 def to_unix_days(day: int, month: int, year: int) -> int:
@@ -78,26 +76,10 @@ def parse_angle(text: str, side: str, sides: str, most: float) -> float:
     if not text and not side:
         return NAN
     parts = _ANGLE.fullmatch(text)
-    if parts is None or len(side) != 1 or side not in sides:
+    minutes = float(parts[2]) if parts else 60.0
+    if parts is None or len(side) != 1 or side not in sides or minutes >= 60.0:
         raise ValueError(f"'{text},{side}' is no angle")
-    minutes = float(parts[2])
     degrees = int(parts[1]) + minutes / 60.0
-    if minutes >= 60.0 or degrees > most:
-        raise ValueError(f"'{text},{side}' is no angle")
+    if degrees > most:
+        raise ValueError(f"'{text},{side}' is over {most:g} degrees")
     return degrees if side == sides[0] else -degrees
-
-
-def parse_direction(text: str) -> float:
-    """Return a direction, degrees clockwise from north, 0 to 360; nan for an empty field."""
-    value = parse_number(text)
-    if value < 0.0 or value > 360.0:
-        raise ValueError(f"'{text}' is no direction")
-    return value
-
-
-def parse_nonnegative(text: str) -> float:
-    """Return a number that cannot be negative; nan for an empty field."""
-    value = parse_number(text)
-    if value < 0.0:
-        raise ValueError(f"'{text}' is negative")
-    return value

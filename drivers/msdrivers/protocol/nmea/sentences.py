@@ -1,13 +1,16 @@
 """Parse one NMEA 0183 sentence: frame and content.
 
-pynmea2 checks the checksum and names the fields; `fields` parses their text.
+pynmea2 computes the checksum and names the fields; `fields` parses their text.
 """
 
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import pynmea2
 
@@ -86,10 +89,10 @@ class SentenceFormat:
         text = buffer[at : end + 3].decode("latin-1")
         if not self._sum.fullmatch(text, end + 1 - at):
             return RejectedFrame("nmea_checksum")
-        if int(text[-2:], 16) != pynmea2.NMEASentence.checksum(text[1:-3]):
-            return RejectedFrame("nmea_checksum")
         try:
             sentence = parse_sentence(text, start)
+        except pynmea2.ChecksumError:
+            return RejectedFrame("nmea_checksum")
         except ValueError:
             return RejectedFrame("nmea_field")
         return ParsedFrame(
@@ -103,188 +106,76 @@ def parse_sentence(text: str, start: int = 0) -> NmeaSentence | None:
     Raises:
         ValueError: a field is not what it should be, or the checksum is wrong.
     """
-    reader = _READERS.get(text[3:6])
-    if reader is None or text[6:7] != "," or not text[1:3].isalnum() or text[1] == "P":
+    if int(text[-2:], 16) != pynmea2.NMEASentence.checksum(text[1:-3]):
+        raise pynmea2.ChecksumError("wrong checksum", text)
+    talker, kind = text[1:3], text[3:6]
+    if kind not in KINDS or text[6] != "," or not talker.isalnum() or talker[0] == "P":
         return None
-    return reader(_Fields(pynmea2.NMEASentence.parse(text, check=True)), start)
-
-
-VALID_MODES = frozenset("APDRFE")
-"""Letters of the mode indicator for measured data: M is manual input, S simulated, N not valid."""
-
-
-def _is_valid_mode(mode: str) -> bool:
-    """Whether speed and course are measured by the mode indicator; before NMEA 2.3 there was none."""
-    return not mode or mode in VALID_MODES
-
-
-class _Fields:
-    """A sentence's fields by pynmea2's names, as they were written; an absent field is empty."""
-
-    def __init__(self, sentence: pynmea2.TalkerSentence) -> None:
-        self.talker: str = sentence.talker
-        self._data: list[str] = sentence.data
-        self._index: dict[str, int] = type(sentence).name_to_idx
-
-    def __getitem__(self, name: str) -> str:
-        index = self._index[name]
-        return self._data[index] if index < len(self._data) else ""
-
-    def parse_position(self, valid: bool) -> tuple[float, float]:
-        """Latitude and longitude, degrees. Where there is no fix, receivers fill in what cannot be: nothing raw."""
+    raw = defaultdict(str, zip(getattr(pynmea2, kind).name_to_idx, text[7:-3].split(","), strict=False))
+    known = [(text, *_FIELDS[name]) for name, text in raw.items() if name in _FIELDS]
+    values: dict[str, Any] = {name: parse(text) for text, name, parse in known}
+    status, mode = values.get("status", "A"), values.get("mode", "")
+    if "lat" in raw:
         try:
-            return (
-                fields.parse_angle(self["lat"], self["lat_dir"], "NS", 90.0),
-                fields.parse_angle(self["lon"], self["lon_dir"], "EW", 180.0),
-            )
+            values["latitude"] = fields.parse_angle(raw["lat"], raw["lat_dir"], "NS", 90.0)
+            values["longitude"] = fields.parse_angle(raw["lon"], raw["lon_dir"], "EW", 180.0)
         except ValueError:
-            if valid:
+            # where there is no fix, receivers fill in what cannot be
+            if status != "V" and values.get("quality") != 0 and (kind != "GNS" or mode.strip("N")):
                 raise
-            return NAN, NAN
+            values["latitude"] = values["longitude"] = NAN
+    if kind == "VTG":
+        kmh = _parse_nonnegative(raw["spd_over_grnd_kmph"]) * fields.KMH
+        values["speed"] = speed if (speed := values.get("speed", NAN)) == speed else kmh
+    elif kind == "GSA":
+        values["listed"] = sum(name.startswith("sv_id") and text != "" for name, text in raw.items())
+    elif kind == "ZDA":
+        day = fields.parse_integer(raw["day"], 1, 31)
+        month = fields.parse_integer(raw["month"], 1, 12)
+        year = fields.parse_integer(raw["year"], 1980, 9999)
+        values["day"] = fields.to_unix_days(day, month, year) if day and month and year else None
+    if not ((status == "A" and (not mode or mode in MODES)) or mode == "E"):
+        values |= {"speed": NAN, "track": NAN}
+    return NmeaSentence(talker, kind, start, **values)
 
 
-def _parse_gga(raw: _Fields, start: int) -> NmeaSentence:
-    latitude, longitude = raw.parse_position(valid=raw["gps_qual"] != "0")
-    return NmeaSentence(
-        raw.talker,
-        "GGA",
-        start,
-        time_of_day=fields.parse_time_of_day(raw["timestamp"]),
-        latitude=latitude,
-        longitude=longitude,
-        quality=fields.parse_integer(raw["gps_qual"], most=9),
-        satellites=fields.parse_integer(raw["num_sats"], most=999),
-        hdop=fields.parse_nonnegative(raw["horizontal_dil"]),
-        height_msl=fields.parse_number(raw["altitude"]),
-        undulation=fields.parse_number(raw["geo_sep"]),
-    )
-
-
-def _parse_gns(raw: _Fields, start: int) -> NmeaSentence:
-    latitude, longitude = raw.parse_position(valid=raw["mode_indicator"].strip("N") != "")
-    return NmeaSentence(
-        raw.talker,
-        "GNS",
-        start,
-        time_of_day=fields.parse_time_of_day(raw["timestamp"]),
-        latitude=latitude,
-        longitude=longitude,
-        mode=raw["mode_indicator"],
-        satellites=fields.parse_integer(raw["num_sats"], most=999),
-        hdop=fields.parse_nonnegative(raw["hdop"]),
-        height_msl=fields.parse_number(raw["altitude"]),
-        undulation=fields.parse_number(raw["geo_sep"]),
-    )
-
-
-def _parse_rmc(raw: _Fields, start: int) -> NmeaSentence:
-    latitude, longitude = raw.parse_position(valid=raw["status"] != "V")
-    speed, track = (
-        fields.parse_nonnegative(raw["spd_over_grnd"]) * fields.KNOT,
-        fields.parse_direction(raw["true_course"]),
-    )
-    moves = (raw["status"] == "A" and _is_valid_mode(raw["mode_indicator"])) or raw["mode_indicator"] == "E"
-    return NmeaSentence(
-        raw.talker,
-        "RMC",
-        start,
-        time_of_day=fields.parse_time_of_day(raw["timestamp"]),
-        day=fields.parse_date(raw["datestamp"]),
-        status=raw["status"],
-        mode=raw["mode_indicator"],
-        latitude=latitude,
-        longitude=longitude,
-        speed=speed if moves else NAN,
-        track=track if moves else NAN,
-    )
-
-
-def _parse_gll(raw: _Fields, start: int) -> NmeaSentence:
-    latitude, longitude = raw.parse_position(valid=raw["status"] != "V")
-    return NmeaSentence(
-        raw.talker,
-        "GLL",
-        start,
-        time_of_day=fields.parse_time_of_day(raw["timestamp"]),
-        status=raw["status"],
-        mode=raw["faa_mode"],
-        latitude=latitude,
-        longitude=longitude,
-    )
-
-
-def _parse_vtg(raw: _Fields, start: int) -> NmeaSentence:
-    knots = fields.parse_nonnegative(raw["spd_over_grnd_kts"]) * fields.KNOT
-    kmh = fields.parse_nonnegative(raw["spd_over_grnd_kmph"]) * fields.KMH
-    speed, track = knots if knots == knots else kmh, fields.parse_direction(raw["true_track"])
-    moves = _is_valid_mode(raw["faa_mode"])
-    return NmeaSentence(
-        raw.talker,
-        "VTG",
-        start,
-        track=track if moves else NAN,
-        speed=speed if moves else NAN,
-        mode=raw["faa_mode"],
-    )
-
-
-def _parse_gsa(raw: _Fields, start: int) -> NmeaSentence:
-    return NmeaSentence(
-        raw.talker,
-        "GSA",
-        start,
-        dimension=fields.parse_integer(raw["mode_fix_type"], 1, 3),
-        listed=sum(bool(raw[name]) for name in _LISTED),
-        pdop=fields.parse_nonnegative(raw["pdop"]),
-        hdop=fields.parse_nonnegative(raw["hdop"]),
-        vdop=fields.parse_nonnegative(raw["vdop"]),
-    )
-
-
-_LISTED = tuple(f"sv_id{number:02d}" for number in range(1, 13))
-"""Fields of GSA with the satellites in use."""
-
-
-def _parse_gst(raw: _Fields, start: int) -> NmeaSentence:
-    return NmeaSentence(
-        raw.talker,
-        "GST",
-        start,
-        time_of_day=fields.parse_time_of_day(raw["timestamp"]),
-        sigma_latitude=fields.parse_nonnegative(raw["std_dev_latitude"]),
-        sigma_longitude=fields.parse_nonnegative(raw["std_dev_longitude"]),
-        sigma_height=fields.parse_nonnegative(raw["std_dev_altitude"]),
-    )
-
-
-def _parse_hdt(raw: _Fields, start: int) -> NmeaSentence:
-    return NmeaSentence(raw.talker, "HDT", start, heading=fields.parse_direction(raw["heading"]))
-
-
-def _parse_zda(raw: _Fields, start: int) -> NmeaSentence:
-    day = fields.parse_integer(raw["day"], 1, 31)
-    month = fields.parse_integer(raw["month"], 1, 12)
-    year = fields.parse_integer(raw["year"], 1980, 9999)
-    known = None if day is None or month is None or year is None else fields.to_unix_days(day, month, year)
-    return NmeaSentence(
-        raw.talker,
-        "ZDA",
-        start,
-        time_of_day=fields.parse_time_of_day(raw["timestamp"]),
-        day=known,
-    )
-
-
-_READERS: dict[str, Callable[[_Fields, int], NmeaSentence]] = {
-    "GGA": _parse_gga,
-    "GNS": _parse_gns,
-    "RMC": _parse_rmc,
-    "GLL": _parse_gll,
-    "VTG": _parse_vtg,
-    "GSA": _parse_gsa,
-    "GST": _parse_gst,
-    "HDT": _parse_hdt,
-    "ZDA": _parse_zda,
-}
-KINDS = frozenset(_READERS)
+KINDS = frozenset({"GGA", "GNS", "RMC", "GLL", "VTG", "GSA", "GST", "HDT", "ZDA"})
 """The sentences that are read."""
+
+MODES = frozenset("APDRFE")
+"""Letters of the mode indicator, which NMEA 2.3 added, for measured data. M is manual input, S simulated, N invalid."""
+
+
+_parse_nonnegative = partial(fields.parse_number, least=0.0)
+_parse_direction = partial(fields.parse_number, least=0.0, most=360.0)
+
+
+def _parse_knots(text: str) -> float:
+    return _parse_nonnegative(text) * fields.KNOT
+
+
+_FIELDS: dict[str, tuple[str, Callable[[str], object]]] = {
+    "timestamp": ("time_of_day", fields.parse_time_of_day),
+    "datestamp": ("day", fields.parse_date),
+    "status": ("status", str),
+    "mode_indicator": ("mode", str),
+    "faa_mode": ("mode", str),
+    "gps_qual": ("quality", partial(fields.parse_integer, most=9)),
+    "num_sats": ("satellites", partial(fields.parse_integer, most=999)),
+    "mode_fix_type": ("dimension", partial(fields.parse_integer, least=1, most=3)),
+    "horizontal_dil": ("hdop", _parse_nonnegative),
+    "hdop": ("hdop", _parse_nonnegative),
+    "vdop": ("vdop", _parse_nonnegative),
+    "pdop": ("pdop", _parse_nonnegative),
+    "altitude": ("height_msl", fields.parse_number),
+    "geo_sep": ("undulation", fields.parse_number),
+    "spd_over_grnd": ("speed", _parse_knots),
+    "spd_over_grnd_kts": ("speed", _parse_knots),
+    "true_course": ("track", _parse_direction),
+    "true_track": ("track", _parse_direction),
+    "heading": ("heading", _parse_direction),
+    "std_dev_latitude": ("sigma_latitude", _parse_nonnegative),
+    "std_dev_longitude": ("sigma_longitude", _parse_nonnegative),
+    "std_dev_altitude": ("sigma_height", _parse_nonnegative),
+}
+"""pynmea2's name of a field -> the name here, and how its text is parsed."""
