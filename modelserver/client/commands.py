@@ -8,33 +8,18 @@ import time
 from collections.abc import Callable
 
 from modelserver.messages import (
-    Acknowledgement,
     Envelope,
-    PoseAnswer,
     ReloadModel,
-    ReloadReply,
-    RequestHeader,
     SetHTransform,
     SetStateVector,
 )
 from modelserver.signing.key_files import KEY_FILE_VARIABLE, read_keys
 from modelserver.signing.signatures import Key, sign
-from modelserver.transforms.transformation import Transformation
 from modelserver.wire.channels import SIGNED
 from modelserver.wire.codec import encode
 
-REPLY_TYPES = {ReloadReply: "reload_model_reply_t", Acknowledgement: "acknowledgement_t"}
-
 COMMANDS = (ReloadModel, SetStateVector, SetHTransform)
 """Requests that are not retried: a lost reply does not mean that the command was not executed."""
-
-
-def make_set_pose_request(
-    header: RequestHeader, transformation: Transformation, as_vector: bool
-) -> SetStateVector | SetHTransform:
-    """Return the request to set the vehicle's pose to a transformation."""
-    pose = PoseAnswer(transformation)
-    return SetStateVector(header, pose) if as_vector else SetHTransform(header, pose)
 
 
 MAX_SENDER_LENGTH = 64

@@ -1,35 +1,51 @@
-"""The queries that `Platform` (asks the server) and `PlatformMirror` (answers from a local replica) share."""
+"""The queries that clients have in common: their signatures and documentation.
+
+A client defines only how a request is answered: `Platform` sends it to the server, a `LocalPlatform` such as
+`PlatformMirror` computes the answer from a replica.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol
+from types import TracebackType
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.messages import Explanation, MotionAnswer, Policy, PoseAnswer, PoseBatch
+from modelserver.client.batch_reply import check_batch
+from modelserver.errors import WireError
+from modelserver.messages import (
+    Explanation,
+    ExplanationReply,
+    GetBodyFrameList,
+    GetBodyList,
+    GetExplanation,
+    GetHistory,
+    GetHTransform,
+    GetMotion,
+    GetStateVector,
+    HistoryReply,
+    MotionAnswer,
+    MotionReply,
+    NameListReply,
+    Policy,
+    PoseAnswer,
+    PoseBatch,
+    RequestHeader,
+    StateVectorReply,
+    TimeQuery,
+    TransformReply,
+)
 from modelserver.transforms.transformation import Transformation
 
+R = TypeVar("R")
+A = TypeVar("A")
 
-class PlatformClient(Protocol):
-    """Annotate a parameter with this where `Platform` or `PlatformMirror` will do.
 
-    Times are microseconds since the Unix epoch, 0 for the latest. All methods raise NoServerError if the server does
-    not answer, and a QueryError with the reason if there is no answer.
-    """
-
-    def get_transformation(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> Transformation:
-        """Return the pose of `frame_of_interest` in `frame_of_reference`."""
-        ...
+class FrameClient(ABC):
+    """The queries that a geometry file can answer too."""
 
     def get_pose(
         self,
@@ -41,43 +57,15 @@ class PlatformClient(Protocol):
         wait_ms: int = 0,
     ) -> PoseAnswer:
         """Return the transformation with its origin, protection levels and quality flags."""
-        ...
+        return self._query_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms)
 
     def get_body_list(self) -> list[str]:
-        """Return the names of the bodies, root first."""
-        ...
+        """Return the names of the bodies, root first. Raises NoServerError."""
+        return list(self._query(GetBodyList(self._header()), NameListReply).names)
 
     def get_body_frame_list(self, body: str) -> list[str]:
-        """Return the names of a body's frames."""
-        ...
-
-    def get_state_vector(
-        self, *, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
-    ) -> Transformation:
-        """Return the vehicle's pose in World:UTM, through its 7-vector."""
-        ...
-
-    def get_h_transform(
-        self, *, inverse: bool = False, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
-    ) -> Transformation:
-        """Return the vehicle's pose in World:UTM, with `inverse` the pose of World:UTM in the vehicle."""
-        ...
-
-    def get_history(self, start_utime: int, end_utime: int, rate_hz: float) -> list[Transformation]:
-        """Return the vehicle's poses in World:UTM at a fixed rate; times outside the history are left out."""
-        ...
-
-    def get_transformations(
-        self,
-        pairs: Sequence[tuple[str, str]],
-        at: Sequence[int] | npt.NDArray[np.int64],
-        *,
-        fixed_frame: str = "",
-        reference_at: int = 0,
-        covariance: bool = True,
-    ) -> list[PoseBatch]:
-        """Return for each pair (frame of interest, frame of reference) its poses at all times `at`."""
-        ...
+        """Return the names of a body's frames. Raises NoServerError, UnknownBodyError."""
+        return list(self._query(GetBodyFrameList(self._header(), body), NameListReply).names)
 
     def get_motion(
         self,
@@ -89,8 +77,15 @@ class PlatformClient(Protocol):
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> MotionAnswer:
-        """Return velocity and acceleration of `frame_of_interest` in `frame_of_reference`."""
-        ...
+        """Return velocity and acceleration, linear and angular, of `frame_of_interest` in `frame_of_reference`.
+
+        Vectors are along the axes of `expressed_in`, by default the frame of reference. `PlatformMirror` estimates the
+        vehicle's velocity from its poses in Odom: its sigma is larger than the server's, and its acceleration is
+        unknown (nan). Raises as `get_transformation`.
+        """
+        time = TimeQuery(at, policy, wait_ms)
+        request = GetMotion(self._header(), frame_of_interest, frame_of_reference, expressed_in, time)
+        return require_answer(self._query(request, MotionReply).answer)
 
     def explain(
         self,
@@ -101,17 +96,150 @@ class PlatformClient(Protocol):
         policy: Policy = Policy.INTERPOLATED,
         wait_ms: int = 0,
     ) -> Explanation:
-        """Return the pose with the provenance and variance share of each edge on its path."""
-        ...
+        """Return the pose with the provenance and variance share of each edge on its path.
+
+        Raises as `get_transformation`.
+        """
+        time = TimeQuery(at, policy, wait_ms)
+        request = GetExplanation(self._header(), frame_of_interest, frame_of_reference, time)
+        return require_answer(self._query(request, ExplanationReply).answer)
+
+    def _header(self) -> RequestHeader:
+        return RequestHeader(0, "")
+
+    @abstractmethod
+    def _query_pose(self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int) -> PoseAnswer:
+        """Answer `get_pose`."""
+
+    @abstractmethod
+    def _query(self, request: Any, reply_type: type[R]) -> R:
+        """Return the reply to a request."""
+
+
+class PlatformClient(FrameClient):
+    """Annotate a parameter with this where `Platform` or `PlatformMirror` will do.
+
+    Times are microseconds since the Unix epoch, 0 for the latest. All methods raise NoServerError if the server does
+    not answer (`PlatformMirror`: OutOfDateError where its replica is incomplete or too old), and a QueryError with the
+    reason if there is no answer.
+    """
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
     def close(self) -> None:
-        """Leave the bus."""
-        ...
+        """Leave the bus. Further queries raise ValueError."""
+
+    def get_transformation(
+        self,
+        frame_of_interest: str,
+        frame_of_reference: str,
+        *,
+        at: int = 0,
+        policy: Policy = Policy.INTERPOLATED,
+        wait_ms: int = 0,
+    ) -> Transformation:
+        """Return the pose of `frame_of_interest` in `frame_of_reference`.
+
+        Parameters
+        ----------
+        frame_of_interest, frame_of_reference
+            Body:Frame.
+        at
+            Time in microseconds since the Unix epoch, 0 for the latest common one.
+        policy
+            What is accepted at that time: interpolated, latest, held (the last value before it) or predicted data.
+        wait_ms
+            How long to wait for data that cover it.
+
+        Raises
+        ------
+        NoServerError
+            No reply was received; OutOfDateError where a replica is incomplete or too old.
+        QueryError
+            The reason in the reply.
+        """
+        return self._query_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms).transformation
+
+    def get_state_vector(
+        self, *, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
+    ) -> Transformation:
+        """Return the vehicle's pose in World:UTM, through its 7-vector. Raises as `get_transformation`."""
+        request = GetStateVector(self._header(), TimeQuery(at, policy, wait_ms))
+        return require_answer(self._query(request, StateVectorReply).answer).transformation
+
+    def get_h_transform(
+        self, *, inverse: bool = False, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
+    ) -> Transformation:
+        """Return the vehicle's pose in World:UTM, with `inverse` the pose of World:UTM in the vehicle.
+
+        Raises as `get_transformation`.
+        """
+        request = GetHTransform(self._header(), inverse, TimeQuery(at, policy, wait_ms))
+        return require_answer(self._query(request, TransformReply).answer).transformation
+
+    def get_history(self, start_utime: int, end_utime: int, rate_hz: float) -> list[Transformation]:
+        """Return the vehicle's poses in World:UTM at a fixed rate; times outside the history are left out.
+
+        Raises NoServerError, NoPoseError, LimitError (more than 1,000 poses), MalformedRequestError.
+        """
+        request = GetHistory(self._header(), start_utime, end_utime, rate_hz)
+        return [answer.transformation for answer in self._query(request, HistoryReply).answers]
+
+    def get_transformations(
+        self,
+        pairs: Sequence[tuple[str, str]],
+        at: Sequence[int] | npt.NDArray[np.int64],
+        *,
+        fixed_frame: str = "",
+        reference_at: int = 0,
+        covariance: bool = True,
+    ) -> list[PoseBatch]:
+        """Return for each pair (frame of interest, frame of reference) its poses at all times `at`.
+
+        A time without data has a status with the reason, and a pose of nan.
+
+        Parameters
+        ----------
+        pairs
+            Frames of interest and reference.
+        at
+            (n,) times, microseconds since the Unix epoch.
+        fixed_frame
+            If given, the frame of reference is taken at `reference_at` instead of at each time, through this frame,
+            which is assumed stationary between the times: Odom:Origin for short ones (tf2's "advanced" lookup).
+        reference_at
+            Time of the frame of reference with `fixed_frame`, 0 for the latest.
+        covariance
+            Whether to compute covariances.
+
+        Raises
+        ------
+        NoServerError, QueryError
+            As `get_transformation`; MalformedRequestError also for too many pairs, non-integer times, and with
+            `fixed_frame` and a `reference_at` of 0 for more times than one request to the server holds.
+        """
+        return self._query_batch(*check_batch(pairs, at), fixed_frame, reference_at, covariance)
+
+    @abstractmethod
+    def _query_batch(
+        self,
+        pairs: tuple[tuple[str, str], ...],
+        utimes: npt.NDArray[np.int64],
+        fixed_frame: str,
+        reference_at: int,
+        covariance: bool,
+    ) -> list[PoseBatch]:
+        """Answer `get_transformations`, with checked pairs and times."""
 
 
-if TYPE_CHECKING:
-    from modelserver.client.mirror import PlatformMirror
-    from modelserver.client.remote import Platform
-
-    def _check_protocol(remote: Platform, mirror: PlatformMirror) -> tuple[PlatformClient, PlatformClient]:
-        return remote, mirror
+def require_answer(answer: A | None) -> A:
+    """Return the answer of a reply whose status is OK. Raises WireError for none."""
+    if answer is None:
+        raise WireError("malformed", "the reply has status OK and no answer")
+    return answer

@@ -3,39 +3,44 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.client.batch_reply import check_batch, concatenate
+from modelserver.client.batch_reply import concatenate
+from modelserver.client.interface import PlatformClient, R
 from modelserver.client.mirror_state import NEVER, MirrorState
 from modelserver.errors import MalformedRequestError, NoPoseError, OutOfDateError, WireError
 from modelserver.geometry import names
 from modelserver.geometry.model import CACHE_SIZE
 from modelserver.messages import (
     MAX_REQUEST_INSTANTS,
-    Explanation,
-    MotionAnswer,
+    GetExplanation,
+    GetHistory,
+    GetHTransform,
+    GetMotion,
+    GetStateVector,
     Policy,
     PoseAnswer,
     PoseBatch,
     TimeQuery,
 )
 from modelserver.query import WORLD_FRAMES, PlatformView
+from modelserver.query.answers import compute_answer
 from modelserver.query.batch import lookup_batch
-from modelserver.query.explanation import explain
-from modelserver.query.motion import compute_motion
-from modelserver.transforms.transformation import Transformation
 from modelserver.wire.fields import MAX_UTIME, check_not_negative, check_utime, read_enum
+
+IN_HISTORY: Final = TimeQuery(1)
+"""A time that no newer pose needs to be waited for."""
 
 MAX_WAIT_MS: Final = (1 << 31) - 1
 """Range of the wire's field, so that a query that `Platform` cannot send is rejected here too."""
 
 
-class LocalPlatform(ABC):
+class LocalPlatform(PlatformClient):
     """The queries of `Platform`, answered from a `MirrorState`, which subclasses provide.
 
     `limit`: largest age of the state, seconds. `where`: place of the state for messages.
@@ -54,35 +59,8 @@ class LocalPlatform(ABC):
 
     # --- queries
 
-    def get_transformation(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> Transformation:
-        """Return the pose of `frame_of_interest` in `frame_of_reference`; see `Platform.get_transformation`.
-
-        Raises OutOfDateError where the state is incomplete or too old, and the QueryErrors of `Platform`.
-        """
-        return self._compute_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms).transformation
-
-    def get_pose(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> PoseAnswer:
-        """Return the transformation with its origin, protection levels and quality flags."""
-        return self._compute_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms)
-
-    def _compute_pose(self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int) -> PoseAnswer:
-        time = _make_time_query(at, policy, wait_ms)
+    def _query_pose(self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int) -> PoseAnswer:
+        time = _check_time(TimeQuery(at, policy, wait_ms))
         state, view, now = self._wait_until_ready(time, interest, reference)
         answer = view.transformation(interest, reference, time, now)
         if _is_static(view, interest, reference) and len(state.static_transforms) < CACHE_SIZE:
@@ -91,128 +69,47 @@ class LocalPlatform(ABC):
             state.static_transforms[interest, reference] = answer.transformation
         return answer
 
-    def get_body_list(self) -> list[str]:
-        """Return the names of the bodies, root first. Raises OutOfDateError."""
-        return self._get_view().model.get_body_list()
-
-    def get_body_frame_list(self, body: str) -> list[str]:
-        """Return the names of a body's frames. Raises OutOfDateError, UnknownBodyError."""
-        return self._get_view().model.get_body_frame_list(body)
-
-    def get_state_vector(
-        self, *, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
-    ) -> Transformation:
-        """Return the vehicle's pose in World:UTM. Raises as `get_transformation`."""
-        return self.get_h_transform(at=at, policy=policy, wait_ms=wait_ms)
-
-    def get_h_transform(
-        self, *, inverse: bool = False, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
-    ) -> Transformation:
-        """Return the vehicle's pose in World:UTM, with `inverse` the pose of World:UTM in the vehicle.
-
-        Raises as `get_transformation`.
-        """
-        time = _make_time_query(at, policy, wait_ms)
-        _, view, now = self._wait_until_ready(time, names.WORLD_UTM, "")
-        ends = (view.base_frame, names.WORLD_UTM)
-        interest, reference = reversed(ends) if inverse else ends
-        return view.transformation(interest, reference, time, now).transformation
-
-    def get_history(self, start_utime: int, end_utime: int, rate_hz: float) -> list[Transformation]:
-        """Return the vehicle's poses in World:UTM at a fixed rate; times outside the history are left out.
-
-        Raises OutOfDateError, NoPoseError, LimitError (more than 1,000 poses), MalformedRequestError.
-        """
-        _check_utimes(start_utime, end_utime)
-        view = self._get_history_view(names.WORLD_UTM)[0]
-        return [answer.transformation for answer in view.vehicle_history(start_utime, end_utime, rate_hz)]
-
-    def get_transformations(
-        self,
-        pairs: Sequence[tuple[str, str]],
-        at: Sequence[int] | npt.NDArray[np.int64],
-        *,
-        fixed_frame: str = "",
-        reference_at: int = 0,
-        covariance: bool = True,
-    ) -> list[PoseBatch]:
-        """Return for each pair its poses at all times `at`; see `Platform.get_transformations`.
-
-        Raises OutOfDateError and the QueryErrors of `Platform`; MalformedRequestError for too many pairs.
-        """
-        wanted, utimes = check_batch(pairs, at)
-        _check_utimes(reference_at, *((int(utimes.min()), int(utimes.max())) if len(utimes) else ()))
-        ends = [frame for pair in wanted for frame in pair]
-        if fixed_frame and not reference_at:
-            _, view, now = self._wait_until_ready(TimeQuery(), fixed_frame, *ends)
+    def _query(self, request: Any, reply_type: type[R]) -> R:
+        time = IN_HISTORY
+        ends: tuple[str, ...] = (names.WORLD_UTM, "")
+        if isinstance(request, GetHistory):
+            _check_utimes(request.start_utime, request.end_utime)
+        elif isinstance(request, (GetStateVector, GetHTransform, GetMotion, GetExplanation)):
+            time = _check_time(request.time)
+            request = request._replace(time=time)
+            if isinstance(request, (GetMotion, GetExplanation)):
+                ends = (request.frame_of_interest, request.frame_of_reference)
         else:
-            view, now = self._get_history_view(fixed_frame, *ends)
-        starts = range(0, max(len(utimes), 1), MAX_REQUEST_INSTANTS)
+            ends = ()
+        _, view, now = self._wait_until_ready(time, *ends)
+        (reply,) = compute_answer(view, request, now)
+        assert isinstance(reply, reply_type)
+        return reply
+
+    def _query_batch(
+        self,
+        pairs: tuple[tuple[str, str], ...],
+        utimes: npt.NDArray[np.int64],
+        fixed_frame: str,
+        reference_at: int,
+        covariance: bool,
+    ) -> list[PoseBatch]:
+        _check_utimes(reference_at, *((int(utimes.min()), int(utimes.max())) if len(utimes) else ()))
+        time = TimeQuery() if fixed_frame and not reference_at else IN_HISTORY
+        _, view, now = self._wait_until_ready(time, fixed_frame, *(frame for pair in pairs for frame in pair))
+        chunks = np.split(utimes, range(MAX_REQUEST_INSTANTS, len(utimes), MAX_REQUEST_INSTANTS))
         return [
             concatenate(
-                [
-                    lookup_batch(
-                        view,
-                        interest,
-                        reference,
-                        utimes[start : start + MAX_REQUEST_INSTANTS],
-                        reference_at,
-                        fixed_frame,
-                        covariance,
-                        now,
-                    )
-                    for start in starts
-                ]
+                [lookup_batch(view, *pair, chunk, reference_at, fixed_frame, covariance, now) for chunk in chunks]
             )
-            for interest, reference in wanted
+            for pair in pairs
         ]
-
-    def get_motion(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        expressed_in: str = "",
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> MotionAnswer:
-        """Return velocity and acceleration of `frame_of_interest` in `frame_of_reference`; see `Platform.get_motion`.
-
-        The vehicle's velocity is estimated from its poses in Odom: its sigma is larger than the server's, and its
-        acceleration is unknown (nan). Raises as `get_transformation`.
-        """
-        time = _make_time_query(at, policy, wait_ms)
-        _, view, now = self._wait_until_ready(time, frame_of_interest, frame_of_reference)
-        return compute_motion(view, frame_of_interest, frame_of_reference, expressed_in, time, now)
-
-    def explain(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> Explanation:
-        """Return the pose with the provenance of each edge on its path. Raises as `get_transformation`."""
-        time = _make_time_query(at, policy, wait_ms)
-        _, view, now = self._wait_until_ready(time, frame_of_interest, frame_of_reference)
-        return explain(view, frame_of_interest, frame_of_reference, time, now)
 
     # --- state
 
     def is_fresh(self, state: MirrorState, now: int) -> bool:
         """Return whether the geometry is complete, in force and not too old."""
         return state.view is not None and not state.other_revision and state.get_ages(now).geometry <= self.limit
-
-    def _get_view(self) -> PlatformView:
-        return self._get_history_view()[0]
-
-    def _get_history_view(self, *ends: str) -> tuple[PlatformView, int]:
-        """Return the view for queries of times in the history, and the server's time. Raises as `_wait_until_ready`."""
-        _, view, now = self._wait_until_ready(TimeQuery(1), *ends)
-        return view, now
 
     def _wait_until_ready(self, time: TimeQuery, *ends: str) -> tuple[MirrorState, PlatformView, int]:
         """Return the state, its view and the server's time, after waiting up to the query's wait_ms for new data.
@@ -288,8 +185,9 @@ def _is_static(view: PlatformView, interest: str, reference: str) -> bool:
     return not view.model.get_kinematic_path(interest, reference).joints
 
 
-def _make_time_query(at: int, policy: Policy, wait_ms: int) -> TimeQuery:
-    """Return the time query. Raises MalformedRequestError for one that the server would reject."""
+def _check_time(time: TimeQuery) -> TimeQuery:
+    """Return a time. Raises MalformedRequestError for one that the server would reject."""
+    at, policy, wait_ms = time
     try:
         if isinstance(at, float):
             raise MalformedRequestError(f"at must be integer microseconds since 1970, got {at!r}; write int(...)")

@@ -7,12 +7,11 @@ import threading
 import time
 import weakref
 from collections.abc import Callable
-from types import TracebackType
 from typing import Final, Self
 
 import lcm
 
-from modelserver.client.local import LocalPlatform
+from modelserver.client.local import IN_HISTORY, LocalPlatform
 from modelserver.client.mirror_state import Ages, MirrorReceiver, MirrorState
 from modelserver.errors import OutOfDateError
 from modelserver.messages import Policy, PoseAnswer
@@ -86,14 +85,6 @@ class PlatformMirror(LocalPlatform):
         )
         self._thread.start()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def close(self) -> None:
         """Leave the bus. Further queries raise ValueError."""
         self._stop.set()
@@ -119,7 +110,7 @@ class PlatformMirror(LocalPlatform):
         try:
             return self._static_transforms[frame_of_interest, frame_of_reference]
         except KeyError:
-            return self._compute_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms).transformation
+            return self._query_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms).transformation
 
     def get_pose(
         self,
@@ -134,7 +125,7 @@ class PlatformMirror(LocalPlatform):
         try:
             return self._static_answers[frame_of_interest, frame_of_reference]
         except KeyError:
-            return self._compute_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms)
+            return self._query_pose(frame_of_interest, frame_of_reference, at, policy, wait_ms)
 
     @property
     def age(self) -> Ages:
@@ -155,7 +146,7 @@ class PlatformMirror(LocalPlatform):
             return self.is_fresh(known, now) and (not pose or known.get_ages(now).pose <= self.limit)
 
         if not self.wait_for(is_ready, timeout):
-            self._get_view()
+            self._wait_until_ready(IN_HISTORY)
             raise OutOfDateError(
                 f"no POSE with its POSE_ODOM was received {self.where} within {timeout:g} s, only the geometry. Do the "
                 "sensors publish? For a vehicle file without sensors call wait(pose=False)"

@@ -15,38 +15,25 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
-from types import TracebackType
-from typing import Any, Final, Self, TypeVar
+from collections.abc import Callable
+from typing import Any, Final
 
 import lcm
 import numpy as np
 import numpy.typing as npt
 
 from modelserver.client import commands
-from modelserver.client.batch_reply import BatchReplyAssembler, check_batch, concatenate
+from modelserver.client.batch_reply import BatchReplyAssembler, concatenate
 from modelserver.client.commands import Signer, load_signer
-from modelserver.errors import MalformedRequestError, NoServerError, Status, WireError, make_status_error
+from modelserver.client.interface import PlatformClient, R, require_answer
+from modelserver.errors import MalformedRequestError, NoServerError, Status, make_status_error
 from modelserver.messages import (
     CHANNEL_OF,
     MAX_CHANNEL_LENGTH,
     MAX_REQUEST_INSTANTS,
     Acknowledgement,
-    Explanation,
-    ExplanationReply,
-    GetBodyFrameList,
-    GetBodyList,
-    GetExplanation,
-    GetHistory,
-    GetHTransform,
-    GetMotion,
-    GetStateVector,
     GetTransformation,
     GetTransformations,
-    HistoryReply,
-    MotionAnswer,
-    MotionReply,
-    NameListReply,
     Policy,
     PoseAnswer,
     PoseBatch,
@@ -55,41 +42,16 @@ from modelserver.messages import (
     ReloadReply,
     ReplyHeader,
     RequestHeader,
-    StateVectorReply,
+    SetHTransform,
+    SetStateVector,
     TimeQuery,
     TransformReply,
 )
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire.channels import REPLY_PREFIX, to_subscription_pattern
-from modelserver.wire.codec import decode, encode
+from modelserver.wire.codec import decode, encode, get_type_name
 from modelserver.wire.provider import handle_message, open_lcm, resolve_url
 from modelserver.wire.queries import pack_get_transformation, read_answer
-
-R = TypeVar(
-    "R",
-    TransformReply,
-    NameListReply,
-    StateVectorReply,
-    HistoryReply,
-    PoseBatchReply,
-    MotionReply,
-    ExplanationReply,
-    ReloadReply,
-    Acknowledgement,
-)
-
-A = TypeVar("A")
-
-_REPLY_TYPES = {
-    TransformReply: "get_transformation_reply_t",
-    NameListReply: "name_list_reply_t",
-    StateVectorReply: "get_state_vector_reply_t",
-    HistoryReply: "get_history_reply_t",
-    PoseBatchReply: "get_transformations_reply_t",
-    MotionReply: "get_motion_reply_t",
-    ExplanationReply: "get_explanation_reply_t",
-    **commands.REPLY_TYPES,
-}
 
 REPLY_QUEUE_CAPACITY: Final = 64
 """Queued replies; further ones are lost."""
@@ -105,7 +67,7 @@ _REQUEST_ID: Final = slice(8, 16)
 """Bytes of the request's id in every request and reply: the first field after the fingerprint."""
 
 
-class Platform:
+class Platform(PlatformClient):
     """Query the running server.
 
         with modelserver.Platform() as platform:
@@ -168,192 +130,46 @@ class Platform:
         # between two requests only replies to programs of the same name arrive
         subscription.set_queue_capacity(REPLY_QUEUE_CAPACITY)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def close(self) -> None:
         """Leave the bus. Further queries raise ValueError."""
         with self._lock:
             self._lcm = None
 
-    def get_transformation(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> Transformation:
-        """Return the pose of `frame_of_interest` in `frame_of_reference`.
-
-        Parameters
-        ----------
-        frame_of_interest, frame_of_reference
-            Body:Frame.
-        at
-            Time in microseconds since the Unix epoch, 0 for the latest common one.
-        policy
-            What is accepted at that time: interpolated, latest, held (the last value before it) or predicted data.
-        wait_ms
-            How long the server may wait for data that cover it.
-
-        Raises
-        ------
-        NoServerError
-            No reply was received.
-        QueryError
-            The reason in the reply.
-        """
-        return self.get_pose(
-            frame_of_interest, frame_of_reference, at=at, policy=policy, wait_ms=wait_ms
-        ).transformation
-
-    def get_pose(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> PoseAnswer:
-        """Return the transformation with its origin, protection levels and quality flags."""
-        # packed without `_request`: the hot path
-        names = (self.reply_channel, frame_of_interest, frame_of_reference)
+    def _query_pose(self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int) -> PoseAnswer:
+        # packed without `_query`: the hot path
         try:
-            request = pack_get_transformation(self._ids.getrandbits(63), *names, at, policy, wait_ms)
+            request = pack_get_transformation(
+                self._ids.getrandbits(63), self.reply_channel, interest, reference, at, policy, wait_ms
+            )
         except _ENCODE_ERRORS as error:
             raise _to_malformed_request(error, at) from error
         reply = self._exchange(self._channels[GetTransformation], request, self.timeout + wait_ms * 1e-3)
-        return decode_pose_reply(reply, frame_of_interest, frame_of_reference)
+        return decode_pose_reply(reply, interest, reference)
 
-    def get_body_list(self) -> list[str]:
-        """Return the names of the bodies, root first. Raises NoServerError."""
-        return list(self._request(GetBodyList(self._header()), NameListReply).names)
-
-    def get_body_frame_list(self, body: str) -> list[str]:
-        """Return the names of a body's frames. Raises NoServerError, UnknownBodyError."""
-        return list(self._request(GetBodyFrameList(self._header(), body), NameListReply).names)
-
-    def get_state_vector(
-        self, *, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
-    ) -> Transformation:
-        """Return the vehicle's pose in World:UTM, through its 7-vector. Raises as `get_transformation`."""
-        request = GetStateVector(self._header(), TimeQuery(at, policy, wait_ms))
-        return _require_answer(self._request(request, StateVectorReply, wait_ms).answer).transformation
-
-    def get_h_transform(
-        self, *, inverse: bool = False, at: int = 0, policy: Policy = Policy.INTERPOLATED, wait_ms: int = 0
-    ) -> Transformation:
-        """Return the vehicle's pose in World:UTM, with `inverse` the pose of World:UTM in the vehicle.
-
-        Raises as `get_transformation`.
-        """
-        request = GetHTransform(self._header(), inverse, TimeQuery(at, policy, wait_ms))
-        return _require_answer(self._request(request, TransformReply, wait_ms).answer).transformation
-
-    def get_history(self, start_utime: int, end_utime: int, rate_hz: float) -> list[Transformation]:
-        """Return the vehicle's poses in World:UTM at a fixed rate; times outside the history are left out.
-
-        Raises NoServerError, NoPoseError, LimitError (more than 1,000 poses), MalformedRequestError.
-        """
-        request = GetHistory(self._header(), start_utime, end_utime, rate_hz)
-        return [answer.transformation for answer in self._request(request, HistoryReply).answers]
-
-    def get_transformations(
+    def _query_batch(
         self,
-        pairs: Sequence[tuple[str, str]],
-        at: Sequence[int] | npt.NDArray[np.int64],
-        *,
-        fixed_frame: str = "",
-        reference_at: int = 0,
-        covariance: bool = True,
+        pairs: tuple[tuple[str, str], ...],
+        utimes: npt.NDArray[np.int64],
+        fixed_frame: str,
+        reference_at: int,
+        covariance: bool,
     ) -> list[PoseBatch]:
-        """Return for each pair (frame of interest, frame of reference) its poses at all times `at`.
-
-        A time without data has a status with the reason, and a pose of nan.
-
-        Parameters
-        ----------
-        pairs
-            Frames of interest and reference.
-        at
-            (n,) times, microseconds since the Unix epoch.
-        fixed_frame
-            If given, the frame of reference is taken at `reference_at` instead of at each time, through this frame,
-            which is assumed stationary between the times: Odom:Origin for short ones (tf2's "advanced" lookup).
-        reference_at
-            Time of the frame of reference with `fixed_frame`, 0 for the latest.
-        covariance
-            Whether to compute covariances.
-
-        Raises
-        ------
-        NoServerError, QueryError
-            As `get_transformation`; MalformedRequestError also for too many pairs, non-integer times, and with
-            `fixed_frame` and a `reference_at` of 0 for more times than one request holds.
-        """
-        wanted, utimes = check_batch(pairs, at)
-        most = MAX_REQUEST_INSTANTS // len(wanted)
+        most = MAX_REQUEST_INSTANTS // len(pairs)
         if fixed_frame and not reference_at and len(utimes) > most:
             raise MalformedRequestError(
-                f"{len(utimes)} times of {len(wanted)} pairs need several requests of {most}, whose latest times "
+                f"{len(utimes)} times of {len(pairs)} pairs need several requests of {most}, whose latest times "
                 "differ; give reference_at, or fewer times"
             )
         batches = []
-        for start in range(0, max(len(utimes), 1), most):
-            chunk = utimes[start : start + most]
+        for chunk in np.split(utimes, range(most, len(utimes), most)):
             parts = BatchReplyAssembler(lambda data: _decode_reply(data, PoseBatchReply))
-            self._request(
-                GetTransformations(
-                    self._header(), wanted, tuple(chunk.tolist()), fixed_frame, reference_at, covariance
-                ),
+            self._query(
+                GetTransformations(self._header(), pairs, tuple(chunk.tolist()), fixed_frame, reference_at, covariance),
                 PoseBatchReply,
                 is_complete=parts.add,
             )
-            batches.append(parts.join(wanted, chunk))
-        return [concatenate([batch[number] for batch in batches]) for number in range(len(wanted))]
-
-    def get_motion(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        expressed_in: str = "",
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> MotionAnswer:
-        """Return velocity and acceleration, linear and angular, of `frame_of_interest` in `frame_of_reference`.
-
-        Vectors are along the axes of `expressed_in`, by default the frame of reference. Raises as `get_transformation`.
-        """
-        time = TimeQuery(at, policy, wait_ms)
-        request = GetMotion(self._header(), frame_of_interest, frame_of_reference, expressed_in, time)
-        return _require_answer(self._request(request, MotionReply, wait_ms).answer)
-
-    def explain(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> Explanation:
-        """Return the pose with the provenance and variance share of each edge on its path.
-
-        Raises as `get_transformation`.
-        """
-        time = TimeQuery(at, policy, wait_ms)
-        request = GetExplanation(self._header(), frame_of_interest, frame_of_reference, time)
-        return _require_answer(self._request(request, ExplanationReply, wait_ms).answer)
+            batches.append(parts.join(pairs, chunk))
+        return [concatenate([batch[number] for batch in batches]) for number in range(len(pairs))]
 
     def reload_model(self, *, dry_run: bool = False) -> ReloadReply:
         """Reload the server's geometry file; return its revision and the changes, one per line.
@@ -362,7 +178,7 @@ class Platform:
         does not permit it; KeyFileError; RejectedError if the file is wrong or does not fit the vehicle: the geometry
         in force stays.
         """
-        return self._request(ReloadModel(self._header(), dry_run), ReloadReply)
+        return self._query(ReloadModel(self._header(), dry_run), ReloadReply)
 
     def set_state_vector(self, pose: Transformation) -> Acknowledgement:
         """Set the pose of the vehicle, the base frame in World:UTM, through a 7-vector.
@@ -373,25 +189,24 @@ class Platform:
         reply where `utime` is 0. Sent once: after NoServerError it may still have been accepted. Raises ForbiddenError,
         KeyFileError, RejectedError.
         """
-        return self._request(commands.make_set_pose_request(self._header(), pose, as_vector=True), Acknowledgement)
+        return self._query(SetStateVector(self._header(), PoseAnswer(pose)), Acknowledgement)
 
     def set_h_transform(self, pose: Transformation) -> Acknowledgement:
         """Set the pose as `set_state_vector`, through a homogeneous transform."""
-        return self._request(commands.make_set_pose_request(self._header(), pose, as_vector=False), Acknowledgement)
+        return self._query(SetHTransform(self._header(), PoseAnswer(pose)), Acknowledgement)
 
     def _header(self) -> RequestHeader:
         return RequestHeader(self._ids.getrandbits(63), self.reply_channel)
 
-    def _request(
-        self, request: Any, reply_kind: type[R], wait_ms: int = 0, is_complete: Callable[[bytes], bool] | None = None
-    ) -> R:
+    def _query(self, request: Any, reply_type: type[R], is_complete: Callable[[bytes], bool] | None = None) -> R:
         """Return the reply to a request, for a batch its last part. Raises NoServerError, QueryError, WireError."""
+        time: TimeQuery = getattr(request, "time", TimeQuery())
         try:
             data = encode(request)
         except _ENCODE_ERRORS as error:
-            raise _to_malformed_request(error, getattr(getattr(request, "time", None), "at", 0)) from error
+            raise _to_malformed_request(error, time.at) from error
         channel = self._channels[type(request)]
-        timeout, tries = self.timeout + wait_ms * 1e-3, 1 + self.retries
+        timeout, tries = self.timeout + time.wait_ms * 1e-3, 1 + self.retries
         request_id = data[_REQUEST_ID]
         if isinstance(request, commands.COMMANDS):
             timeout, tries = timeout * tries, 1
@@ -399,7 +214,7 @@ class Platform:
             # without a key it is sent unsigned: the server's reply explains how to sign
             if self._signer is not None:
                 channel, data = self._signer.channel, self._signer.seal(CHANNEL_OF[type(request)], data)
-        return _decode_reply(self._exchange(channel, data, timeout, is_complete, tries, request_id), reply_kind)
+        return _decode_reply(self._exchange(channel, data, timeout, is_complete, tries, request_id), reply_type)
 
     def _exchange(
         self,
@@ -450,12 +265,13 @@ def _to_malformed_request(error: Exception, at: object) -> MalformedRequestError
     return MalformedRequestError(f"the request cannot be encoded: {error}")
 
 
-def _decode_reply(data: bytes, kind: type[R]) -> R:
+def _decode_reply(data: bytes, reply_type: type[R]) -> R:
     """Decode a reply. Raises the QueryError in it, WireError."""
-    reply: R = decode(_REPLY_TYPES[kind], data)
+    reply: Any = decode(get_type_name(reply_type), data)
     header: ReplyHeader = reply.header
     if header.status is not Status.OK:
         raise make_status_error(header.status, header.message, header.nearest)
+    assert isinstance(reply, reply_type)
     return reply
 
 
@@ -465,13 +281,7 @@ def decode_pose_reply(data: bytes, frame_of_interest: str, frame_of_reference: s
         answer = read_answer(data, frame_of_interest, frame_of_reference)
     except struct.error:
         answer = None  # truncated: `decode` raises the error
-    return answer or _require_answer(_decode_reply(data, TransformReply).answer)
-
-
-def _require_answer(answer: A | None) -> A:
-    if answer is None:
-        raise WireError("malformed", "the reply has status OK and no answer")
-    return answer
+    return answer or require_answer(_decode_reply(data, TransformReply).answer)
 
 
 def _discard_unread(bus: lcm.LCM) -> None:

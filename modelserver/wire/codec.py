@@ -19,6 +19,11 @@ def get_type_names() -> tuple[str, ...]:
     return tuple(_BY_TYPE_NAME)
 
 
+def get_type_name(value_type: type) -> str:
+    """Return the name of the wire type that a class of values is encoded as; see `encode`."""
+    return _BY_VALUE[value_type].type_name
+
+
 def fingerprint_of(type_name: str) -> bytes:
     """Return the eight bytes that a message of a wire type begins with."""
     return _BY_TYPE_NAME[type_name].fingerprint

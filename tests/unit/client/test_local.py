@@ -19,7 +19,7 @@ from modelserver.client.remote import Platform
 from modelserver.messages import MAX_REQUEST_INSTANTS, Policy
 
 NOW = T0 + 2 * S + 5_000
-QUESTIONS = [*sorted(name for name in vars(PlatformClient) if name.startswith("get_")), "explain", "close"]
+QUESTIONS = [*sorted(name for name in dir(PlatformClient) if name.startswith("get_")), "explain", "close"]
 
 
 @pytest.fixture(scope="module")

@@ -5,19 +5,21 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any
 
 import typer
 
+from modelserver.client.interface import FrameClient, R
 from modelserver.errors import ModelServerError, UnknownFrameError, find_nearest_names, quote
 from modelserver.geometry import names
-from modelserver.messages import NO_FLAGS, Explanation, MotionAnswer, Policy, PoseAnswer, Quality
+from modelserver.messages import NO_FLAGS, ExplanationReply, GetExplanation, GetMotion, Policy, PoseAnswer, Quality
 from mstools.terminal.options import parse_variables
 from mstools.terminal.output import print_problem
 
 if TYPE_CHECKING:
     import lcm
 
+    from modelserver.geometry.model import Model
     from mstools.recordings.log_platform import LogPlatform
 
 
@@ -43,109 +45,62 @@ def handle_until(bus: lcm.LCM, seconds: float, is_done: Callable[[], bool]) -> b
     return True
 
 
-class AnswerSource(Protocol):
-    """Source of poses and names: a file, or the daemon."""
-
-    def get_pose(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> PoseAnswer:
-        """Return the pose of one frame in another."""
-        ...
-
-    def get_body_list(self) -> list[str]:
-        """Return the names of the bodies."""
-        ...
-
-    def get_body_frame_list(self, body: str) -> list[str]:
-        """Return the names of a body's frames."""
-        ...
-
-
-class FileAnswers:
-    """Poses of a geometry file. Raises GeometryError, OSError."""
+class FileAnswers(FrameClient):
+    """Poses of a geometry file, with joints at their defaults; times are ignored. Raises GeometryError, OSError."""
 
     def __init__(self, path: Path, settings: list[str] | None):
-        from modelserver.formats import load_model
+        self._model = load_given_model(path, settings)
 
-        self._model = load_model(path, variables=parse_variables(settings))
-        for problem in self._model.problems:
-            print_problem(problem, err=True)
-        self.get_body_list = self._model.get_body_list
-        self.get_body_frame_list = self._model.get_body_frame_list
-
-    def get_pose(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> PoseAnswer:
-        """Return the pose of one frame in another, with joints at their defaults; the time is ignored."""
-        asked = {frame.partition(":")[0] for frame in (frame_of_interest, frame_of_reference)}
+    def _query_pose(self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int) -> PoseAnswer:
+        asked = {frame.partition(":")[0] for frame in (interest, reference)}
         if not asked.isdisjoint(names.RESERVED_BODIES):
-            _check_world_frames(frame_of_interest, frame_of_reference)
+            _check_world_frames(interest, reference)
             raise ModelServerError("a geometry file has no pose of the vehicle in the world; query the daemon")
-        rests = bool(self._model.get_kinematic_path(frame_of_interest, frame_of_reference).joints)
+        rests = bool(self._model.get_kinematic_path(interest, reference).joints)
         return PoseAnswer(
-            self._model.get_transformation(frame_of_interest, frame_of_reference),
-            quality=Quality.JOINT_DEFAULT if rests else NO_FLAGS,
+            self._model.get_transformation(interest, reference), quality=Quality.JOINT_DEFAULT if rests else NO_FLAGS
         )
 
-    def explain(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> Explanation:
-        """Return the pose with the edges on its path."""
+    def _query(self, request: Any, reply_type: type[R]) -> R:
         from modelserver.estimation.history import History
-        from modelserver.messages import TimeQuery
         from modelserver.query import PlatformView
-        from modelserver.query.explanation import explain
+        from modelserver.query.answers import compute_answer
 
-        answer = self.get_pose(frame_of_interest, frame_of_reference)
-        view = PlatformView(self._model, frame_of_reference, None, History(0.0))
-        found = explain(view, frame_of_interest, frame_of_reference, TimeQuery(), 0)
-        # stale sensors do not invalidate the geometry of a file
-        return found._replace(answer=answer._replace(quality=found.answer.quality))
+        if isinstance(request, GetMotion):
+            raise ModelServerError("a geometry file has no motion; query the daemon")
+        answer = (
+            self._query_pose(*request[1:3], 0, Policy.INTERPOLATED, 0) if isinstance(request, GetExplanation) else None
+        )
+        root = self._model.root
+        view = PlatformView(self._model, names.join(root.name, root.frames[0].name), None, History(0.0))
+        (reply,) = compute_answer(view, request, 0)
+        if isinstance(reply, ExplanationReply) and reply.answer is not None and answer is not None:
+            # a joint at its default does not invalidate the geometry of a file
+            answer = answer._replace(quality=reply.answer.answer.quality)
+            reply = ExplanationReply(reply.header, reply.answer._replace(answer=answer))
+        assert isinstance(reply, reply_type)
+        return reply
 
-    def get_motion(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        expressed_in: str = "",
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> MotionAnswer:
-        """Raise ModelServerError: a file has no motion."""
-        raise ModelServerError("a geometry file has no motion; query the daemon")
+
+def load_given_model(path: Path, settings: list[str] | None) -> Model:
+    """Load the geometry file of the options, and print its problems. Raises GeometryError, OSError."""
+    from modelserver.formats import load_model
+
+    model = load_model(path, variables=parse_variables(settings))
+    for problem in model.problems:
+        print_problem(problem, err=True)
+    return model
 
 
 def open_log_answers(log: Path, model: Path | None, settings: list[str] | None, prefix: str) -> LogPlatform:
     """Open a log as a source of poses, with `model` for its geometry. Raises RecordingError, GeometryError, OSError."""
     from modelserver.client.mirror_state import HISTORY_S
-    from modelserver.formats import load_model
     from modelserver.formats.snapshot import ModelSnapshot
     from mstools.recordings.log_platform import LogPlatform
 
     if model is None:
         return LogPlatform(log, prefix)
-    given = load_model(model, variables=parse_variables(settings))
-    for problem in given.problems:
-        print_problem(problem, err=True)
+    given = load_given_model(model, settings)
     root = f"{given.root.name}:{given.root.frames[0].name}"
     source = LogPlatform(log, prefix, ModelSnapshot("", given, root, root, HISTORY_S, f"{prefix}JOINTS"))
     if source.revision not in ("", given.revision):
@@ -158,7 +113,7 @@ def open_log_answers(log: Path, model: Path | None, settings: list[str] | None, 
 
 def open_answer_source(
     model: Path | None, settings: list[str] | None, url: str, prefix: str, timeout: float
-) -> AnswerSource:
+) -> FrameClient:
     """Open the source that the options select."""
     if model is not None:
         return FileAnswers(model, settings)

@@ -7,57 +7,20 @@ import math
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from modelserver.errors import ModelServerError
-from modelserver.messages import EdgeReport, Explanation, Invalid, MotionAnswer, Policy, PoseAnswer, Quality, TimeQuery
+from modelserver.client.interface import FrameClient
+from modelserver.messages import EdgeReport, Explanation, Invalid, MotionAnswer, Policy, PoseAnswer, Quality
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
-from mstools.commands.pose_source import AnswerSource, open_answer_source, open_log_answers
+from mstools.commands.pose_source import open_answer_source, open_log_answers
 from mstools.terminal.options import JsonOption, ModelOption, PrefixOption, TimeoutOption, UrlOption, Variables
 from mstools.terminal.output import escape, format_table, replace_unencodable
 
 _EDGE_HEADER = ("kind", "name", "passed", "provenance", "age", "source", "coordinates", "position", "rotation")
-
-
-@runtime_checkable
-class ExplanationSource(Protocol):
-    """A source of explanations and motions."""
-
-    def explain(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> Explanation:
-        """Return the pose with the edges on its path."""
-        ...
-
-    def get_motion(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        expressed_in: str = "",
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> MotionAnswer:
-        """Return velocity and acceleration of one frame in another."""
-        ...
-
-
-def require_explanations(source: object) -> ExplanationSource:
-    """Return the source. Raises ModelServerError if it has poses only."""
-    if not isinstance(source, ExplanationSource):
-        raise ModelServerError("this source has poses only; query the daemon for --explain and --motion")
-    return source
 
 
 # --- explanation
@@ -265,7 +228,7 @@ def command(
         raise typer.BadParameter(f"{policy!r} is not one of {', '.join(POLICIES)}", param_hint="--policy")
     if inverse:
         frame_of_interest, frame_of_reference = frame_of_reference, frame_of_interest
-    source: AnswerSource
+    source: FrameClient
     utime = None
     if log is not None:
         recorded = source = open_log_answers(log, model, settings, prefix)
@@ -275,43 +238,17 @@ def command(
     utime = _parse_time(at) if utime is None else utime
     if log is None:
         _check_unit(utime)
-    if explain or motion:
-        when = TimeQuery(utime, POLICIES[policy], wait_ms)
-        ends = (frame_of_interest, frame_of_reference)
-        found = _query_explanation(source, *ends, when) if explain else _query_motion(source, *ends, expressed_in, when)
-        typer.echo(json.dumps(found.data, indent=2) if as_json else f"{found.text}\n\n{describe(found.answer, matrix)}")
-        return
-    answer = source.get_pose(
-        frame_of_interest,
-        frame_of_reference,
-        at=utime,
-        policy=POLICIES[policy],
-        wait_ms=wait_ms,
-    )
-    typer.echo(json.dumps(as_dict(answer), indent=2) if as_json else describe(answer, matrix))
-
-
-class _DetailedAnswer(NamedTuple):
-    """An answer with its explanation or motion, as text and as JSON data."""
-
-    answer: PoseAnswer
-    text: str
-    data: dict[str, Any]
-
-
-def _query_explanation(source: object, interest: str, reference: str, time: TimeQuery) -> _DetailedAnswer:
-    found = require_explanations(source).explain(
-        interest, reference, at=time.at, policy=time.policy, wait_ms=time.wait_ms
-    )
-    data = as_dict(found.answer) | {"edges": edges_as_data(found)}
-    return _DetailedAnswer(found.answer, describe_edges(found), data)
-
-
-def _query_motion(source: object, interest: str, reference: str, axes: str, time: TimeQuery) -> _DetailedAnswer:
-    found = require_explanations(source).get_motion(
-        interest, reference, expressed_in=axes, at=time.at, policy=time.policy, wait_ms=time.wait_ms
-    )
-    return _DetailedAnswer(found.pose, describe_motion(found), as_dict(found.pose) | motion_as_data(found))
+    ends, when = (frame_of_interest, frame_of_reference), POLICIES[policy]
+    text, data = "", dict[str, Any]()
+    if explain:
+        found = source.explain(*ends, at=utime, policy=when, wait_ms=wait_ms)
+        answer, text, data = found.answer, f"{describe_edges(found)}\n\n", {"edges": edges_as_data(found)}
+    elif motion:
+        moving = source.get_motion(*ends, expressed_in=expressed_in, at=utime, policy=when, wait_ms=wait_ms)
+        answer, text, data = moving.pose, f"{describe_motion(moving)}\n\n", motion_as_data(moving)
+    else:
+        answer = source.get_pose(*ends, at=utime, policy=when, wait_ms=wait_ms)
+    typer.echo(json.dumps(as_dict(answer) | data, indent=2) if as_json else text + describe(answer, matrix))
 
 
 _SECONDS_RANGE = (1_000_000_000, 10_000_000_000)

@@ -14,7 +14,8 @@ from modelserver.client.local import LocalPlatform
 from modelserver.client.mirror_state import HISTORY_S, MirrorReceiver, MirrorState
 from modelserver.errors import QueryError, RecordingError, WireError
 from modelserver.formats.snapshot import ModelSnapshot, decode_snapshot
-from modelserver.messages import Explanation, MotionAnswer, Policy, PoseAnswer, SnapshotPart
+from modelserver.messages import Policy, PoseAnswer, SnapshotPart, TimeQuery
+from modelserver.query import PlatformView
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogEvent, LogFile
 from modelserver.wire.snapshot import SnapshotAssembler
@@ -93,47 +94,10 @@ class LogPlatform(LocalPlatform):
         except (ValueError, OverflowError):
             return None
 
-    def get_pose(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> PoseAnswer:
-        """Return the pose of one frame in another; `at` 0 is the latest in the log, with LATEST that as of `at`."""
-        self.read_for(at, policy, (frame_of_interest, frame_of_reference))
-        return super().get_pose(frame_of_interest, frame_of_reference, at=at, policy=policy)
-
-    def get_motion(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        expressed_in: str = "",
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> MotionAnswer:
-        """Return the motion of one frame in another; as `get_pose`."""
-        self.read_for(at, policy, (frame_of_interest, frame_of_reference))
-        return super().get_motion(
-            frame_of_interest, frame_of_reference, expressed_in=expressed_in, at=at, policy=policy
-        )
-
-    def explain(
-        self,
-        frame_of_interest: str,
-        frame_of_reference: str,
-        *,
-        at: int = 0,
-        policy: Policy = Policy.INTERPOLATED,
-        wait_ms: int = 0,
-    ) -> Explanation:
-        """Return the pose of one frame in another with its provenance; as `get_pose`."""
-        self.read_for(at, policy, (frame_of_interest, frame_of_reference))
-        return super().explain(frame_of_interest, frame_of_reference, at=at, policy=policy)
+    def _wait_until_ready(self, time: TimeQuery, *ends: str) -> tuple[MirrorState, PlatformView, int]:
+        """Read what a query needs; at time 0 it is the latest in the log, with LATEST that as of the time."""
+        self.read_for(time.at, time.policy, ends)
+        return super()._wait_until_ready(time._replace(wait_ms=0), *ends)
 
     def read_for(self, at: int, policy: Policy, ends: Sequence[str]) -> None:
         """Read the messages that a query at a time needs. Raises RecordingError for a time outside the log."""
