@@ -31,7 +31,6 @@ from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
 from msdrivers.settings import read_drivers
 from mstools.cli import main
 from mstools.commands import doctor
-from mstools.deployment import diagnosis
 from mstools.deployment.diagnosis import diagnose_connections, diagnose_vehicle, diagnose_vehicle_file
 
 LO = NetworkInterface("lo", loopback=True)
@@ -159,7 +158,7 @@ def test_given_a_vehicle_file_that_may_not_be_read_then_it_is_a_finding(
     def raise_permission_error(file: Path) -> None:
         raise PermissionError(13, "Permission denied", str(file))
 
-    monkeypatch.setattr(diagnosis, "load_config", raise_permission_error)
+    monkeypatch.setattr("modelserver.config.vehicle_file.load_config", raise_permission_error)
     code, out, _ = run("-c", path)
     assert code == 3
     assert f"{path} cannot be read: Permission denied" in out

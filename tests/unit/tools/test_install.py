@@ -15,7 +15,6 @@ from modelserver.errors import ConfigError, ModelServerError
 from modelserver.signing.key_files import generate_key, write_key
 from mstools.cli import main
 from mstools.commands import install
-from mstools.deployment import installation
 from mstools.deployment import steps as install_steps
 from mstools.deployment.files import (
     SerialDriver,
@@ -190,7 +189,7 @@ def test_given_a_user_without_rights_then_the_command_with_sudo_is_reported(
     for command in ("install", "uninstall"):
         with pytest.raises(SystemExit):
             main([command])
-        assert f"needs root: sudo {installation.get_command_path()} {command}" in capsys.readouterr().err
+        assert f"needs root: sudo {install_steps.get_command_path()} {command}" in capsys.readouterr().err
 
 
 def test_given_a_command_that_fails_then_it_is_reported_which_and_what_it_reported(
@@ -220,12 +219,12 @@ def test_given_a_path_then_it_is_known_what_hides_it(path: str, why: str) -> Non
 
 def test_given_an_installation_that_the_units_do_not_see_then_it_is_rejected_with_the_way_out() -> None:
     with pytest.raises(ModelServerError, match=r"its Python is /root/x, which .*ProtectHome=yes.*/opt/modelserver"):
-        check_visible([("/usr/bin/x", "a"), ("/root/x", "its Python")], installation.INSTALL_HINT)
+        check_visible([("/usr/bin/x", "a"), ("/root/x", "its Python")], install_steps.INSTALL_HINT)
 
 
 def test_given_several_paths_that_the_units_do_not_see_then_one_error_names_all_and_what_works() -> None:
     with pytest.raises(ConfigError) as caught:
-        check_visible([("/root/x", "its Python"), ("/tmp/y", "its package")], installation.INSTALL_HINT)
+        check_visible([("/root/x", "its Python"), ("/tmp/y", "its package")], install_steps.INSTALL_HINT)
     (problem,) = caught.value.problems
     assert problem.message == (
         "its Python is /root/x, its package is /tmp/y, which the hardened units cannot access "
@@ -239,7 +238,7 @@ def test_given_several_paths_that_the_units_do_not_see_then_one_error_names_all_
 def test_given_the_documentation_then_it_names_the_same_way_as_the_advice(page: str) -> None:
     text = (Path(__file__).parents[3] / page).read_text(encoding="utf-8")
     way = "sudo /usr/bin/python3 -m venv --clear /opt/modelserver"
-    assert way in installation.INSTALL_HINT
+    assert way in install_steps.INSTALL_HINT
     assert way in text
     assert "-m venv" not in text.replace(way, "").replace("python3 -m venv .venv", "")
 
@@ -251,12 +250,12 @@ def test_given_an_installation_then_everything_that_is_wrong_with_it_is_reported
     python.parent.mkdir()
     python.write_text("")
     python.parent.chmod(0o700)
-    monkeypatch.setattr(installation.sys, "executable", str(python))
-    monkeypatch.setattr(installation.sys, "base_prefix", "/home/me/python")
-    monkeypatch.setattr(installation.install_files, "HIDDEN_FOLDERS", {"/home": "ProtectHome"})
-    monkeypatch.setattr(installation, "files", lambda name: tmp_path)
+    monkeypatch.setattr(install_steps.sys, "executable", str(python))
+    monkeypatch.setattr(install_steps.sys, "base_prefix", "/home/me/python")
+    monkeypatch.setattr(install_steps.install_files, "HIDDEN_FOLDERS", {"/home": "ProtectHome"})
+    monkeypatch.setattr(install_steps, "files", lambda name: tmp_path)
     with pytest.raises(ConfigError) as caught:
-        installation.check_installation()
+        install_steps.check_installation()
     output = "\n".join(problem.message for problem in caught.value.problems)
     assert "its Python's library is /home/me/python, which the hardened units cannot access" in output
     assert f"there is no {tmp_path}/bin/modelserver" in output
@@ -331,9 +330,9 @@ def test_given_an_installation_that_others_may_not_read_then_it_is_known_what_is
     for part in (tmp_path, *tmp_path.parents):
         if "/pytest-of-" in str(part):  # the tests' own
             part.chmod(0o755)
-    assert installation.find_unreadable_part(str(folder / "bin")) == ""
+    assert install_steps.find_unreadable_part(str(folder / "bin")) == ""
     folder.chmod(0o700)
-    assert installation.find_unreadable_part(str(folder / "bin")) == str(folder)
+    assert install_steps.find_unreadable_part(str(folder / "bin")) == str(folder)
 
 
 @pytest.mark.parametrize(

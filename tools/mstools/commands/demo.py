@@ -17,7 +17,7 @@ from modelserver.transforms.pose import Pose
 from modelserver.wire.provider import handle_message, open_lcm, resolve_url
 from mstools.demo.connections import DemoConnections, make_connections
 from mstools.demo.processes import MODELSERVER, ChildProcesses, DemoError
-from mstools.deployment.installation import get_examples_folder
+from mstools.deployment.steps import get_examples_folder
 
 SEED = 20050901
 LEAD_SECONDS = 1.5

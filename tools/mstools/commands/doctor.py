@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
+import platform
 import shlex
+from collections import Counter
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -51,9 +55,7 @@ def command(
         check_exists(config)
     findings = diagnose(config, url, prefix)
     typer.echo(json.dumps(as_data(findings), indent=2) if as_json else describe(findings))
-    code = get_exit_code(findings)
-    if code:
-        raise typer.Exit(code)
+    raise typer.Exit(get_exit_code(findings))
 
 
 def check_exists(config: Path) -> None:
@@ -73,42 +75,37 @@ def check_exists(config: Path) -> None:
 
 def diagnose(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...]:
     """Return all findings. Takes two seconds, most of it waiting for replies."""
-    from modelserver.config.vehicle_file import NOT_A_VEHICLE_FILE
+    from modelserver.config.vehicle_file import NOT_A_VEHICLE_FILE, load_config
+    from modelserver.server.diagnostics import checks
     from modelserver.server.diagnostics.bus_probe import discover_servers, probe_delivery
-    from modelserver.server.diagnostics.checks import (
-        Diagnosis,
-        DiagnosisLevel,
-        evaluate_bus,
-        evaluate_clock,
-        evaluate_servers,
-    )
+    from modelserver.server.diagnostics.checks import ERROR, OK, Diagnosis
     from modelserver.server.diagnostics.machine import HostClockMonitor, read_bus_facts
     from modelserver.version import __version__
     from modelserver.wire.channels import REPLY_PREFIX
     from modelserver.wire.provider import resolve_url
     from modelserver.wire.urls import find_url_problem
-    from mstools.deployment.diagnosis import diagnose_vehicle, diagnose_versions, read_vehicle
+    from mstools.deployment.diagnosis import diagnose_vehicle
 
     vehicle: VehicleConfig | None = None
-    found: list[Diagnosis] = [diagnose_versions()]
+    versions = f"modelserver {__version__}, lcm {version('lcm')}, Python {platform.python_version()}"
+    found = [Diagnosis(OK, "versions", versions)]
     reply_prefix = REPLY_PREFIX
     if config is not None:
+        subject = "vehicle file"
         try:
-            vehicle = read_vehicle(config)
+            vehicle = load_config(config)
         except OSError as error:
             seen = f"{escape(str(config))} cannot be read: {error.strerror}"
             # namei shows which folder has no permission, if it is not the file
             command = f"{'sudo chmod a+r' if os.path.exists(config) else 'sudo namei -l'} {shlex.quote(str(config))}"
-            found.append(
-                Diagnosis(DiagnosisLevel.ERROR, "vehicle file", seen, "the service does not start without it", command)
-            )
+            found.append(Diagnosis(ERROR, subject, seen, "the service does not start without it", command))
         except ConfigError as error:
             first = error.problems[0]
             seen, why = f"{escape(str(config))} is wrong: {escape(first.message)}", "the service does not start with it"
             command = f"modelserver check {shlex.quote(str(config))}"
             if first.message.endswith(NOT_A_VEHICLE_FILE):
                 why, command = escape(f"{why}; {first.fix}"), ""  # check may find it to be a valid geometry file
-            found.append(Diagnosis(DiagnosisLevel.ERROR, "vehicle file", seen, why, command))
+            found.append(Diagnosis(ERROR, subject, seen, why, command))
     if vehicle is not None:
         url, prefix = url or vehicle.lcm.url, prefix or vehicle.lcm.channel_prefix
         reply_prefix = vehicle.lcm.reply_prefix
@@ -116,18 +113,19 @@ def diagnose(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...
     watch = HostClockMonitor()
     wrong, leaves = find_url_problem(provider), False
     if wrong:
-        found.append(Diagnosis(DiagnosisLevel.ERROR, "bus", f"{provider}: {wrong}", "LCM cannot be joined there"))
+        found.append(Diagnosis(ERROR, "bus", f"{provider}: {wrong}", "LCM cannot be joined there"))
     else:
         facts = read_bus_facts(provider, probe_delivery)
-        found.append(Diagnosis(DiagnosisLevel.OK, "bus", escape(provider)))
-        found += evaluate_bus(facts)
+        found.append(Diagnosis(OK, "bus", escape(provider)))
+        found += checks.evaluate_bus(facts)
         if facts.address is None or facts.delivered:
             try:
-                found += evaluate_servers(discover_servers(provider, prefix, reply_prefix), prefix, __version__)
+                servers = discover_servers(provider, prefix, reply_prefix)
+                found += checks.evaluate_servers(servers, prefix, __version__)
             except BusError as error:
-                found.append(Diagnosis(DiagnosisLevel.ERROR, "bus", str(error), "no message can be received or sent"))
+                found.append(Diagnosis(ERROR, "bus", str(error), "no message can be received or sent"))
         leaves = facts.address is not None and facts.address.ttl > 0
-    found += evaluate_clock(watch.read_facts(), leaves)
+    found += checks.evaluate_clock(watch.read_facts(), leaves)
     if config is not None and vehicle is not None:
         found += diagnose_vehicle(vehicle, config)
     return tuple(found)
@@ -135,9 +133,9 @@ def diagnose(config: Path | None, url: str, prefix: str) -> tuple[Diagnosis, ...
 
 def get_exit_code(findings: Sequence[Diagnosis]) -> int:
     """Return the exit code of findings."""
-    from modelserver.server.diagnostics.checks import DiagnosisLevel, get_worst_level
+    from modelserver.server.diagnostics.checks import get_worst_level
 
-    return {DiagnosisLevel.WARNING: EXIT_WARNINGS, DiagnosisLevel.ERROR: EXIT_ERRORS}.get(get_worst_level(findings), 0)
+    return (0, 0, EXIT_WARNINGS, EXIT_ERRORS)[get_worst_level(findings)]
 
 
 def describe(findings: Sequence[Diagnosis]) -> str:
@@ -146,12 +144,10 @@ def describe(findings: Sequence[Diagnosis]) -> str:
     lines = []
     for each in findings:
         lines.append(f"{LEVEL_NAMES[each.level]:<8} {escape(each.subject):<{width}}  {escape(each.observed)}")
-        if each.why:
-            lines.append(f"{'':<8} {'':<{width}}  {escape(each.why)}")
-        if each.command:
-            lines.append(f"{'':<8} {'':<{width}}  $ {escape(each.command)}")
-    number = [sum(each.level == level for each in findings) for level in range(len(LEVEL_NAMES))]
-    totals = [format_count(number[level], LEVEL_NAMES[level]) for level in (3, 2, 1) if number[level]]
+        below = (each.why, f"$ {each.command}" if each.command else "")
+        lines += [f"{'':<8} {'':<{width}}  {escape(text)}" for text in below if text]
+    count = Counter(each.level for each in findings)
+    totals = [format_count(count[level], LEVEL_NAMES[level]) for level in sorted(count, reverse=True) if level]
     return "\n".join([*lines, ", ".join(totals) or "no problem found"])
 
 
@@ -159,14 +155,5 @@ def as_data(findings: Sequence[Diagnosis]) -> dict[str, object]:
     """Return findings as JSON data."""
     return {
         "exit_code": get_exit_code(findings),
-        "findings": [
-            {
-                "level": LEVEL_NAMES[each.level],
-                "subject": each.subject,
-                "observed": each.observed,
-                "why": each.why,
-                "command": each.command,
-            }
-            for each in findings
-        ],
+        "findings": [dataclasses.asdict(each) | {"level": LEVEL_NAMES[each.level]} for each in findings],
     }

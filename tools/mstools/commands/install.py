@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,28 +15,14 @@ from modelserver.errors import ConfigError, Severity, quote
 from modelserver.files.regular import read_regular
 from modelserver.formats.registry import MAX_BYTES as LARGEST_FILE
 from mstools.deployment import files as install_files
-from mstools.deployment.installation import check_installation, get_command_path, get_examples_folder
-from mstools.deployment.plan import (
-    CONFIGURATION,
-    LOOPBACK,
-    RULES,
-    SERVICE,
-    STATE,
-    SYSCTL,
-    UNITS,
-    VEHICLE,
-    Plan,
-    SystemFacts,
-    WriteFile,
-    digest,
-    path_in_root,
-    plan_install,
-)
+from mstools.deployment import plan as planning
+from mstools.deployment.plan import Plan, WriteFile, path_in_root
 from mstools.deployment.steps import (
+    check_installation,
     check_root_user,
     execute_plan,
-    find_installed_vehicle,
-    print_plan,
+    get_command_path,
+    get_examples_folder,
     read_facts,
     read_manifest,
 )
@@ -45,8 +31,6 @@ from mstools.terminal.problems import ProblemCollector
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
     from msdrivers.settings import DriverSettings
-
-DROP_INS = (install_files.REALTIME, install_files.CREDENTIAL)
 
 RootOption = Annotated[
     Path, typer.Option("--root", metavar="DIR", help="Root of another system, e.g. an image; nothing is started.")
@@ -84,16 +68,7 @@ def command(
     root = root.resolve()
     if not dry_run:
         check_root_user(root, f"{get_command_path()} install ...")
-    show_or_apply(make_plan(vehicle, drivers, parse_serial(serial), start, root), root, dry_run)
-
-
-def show_or_apply(plan: Plan, root: Path, dry_run: bool) -> None:
-    """Print a plan, or execute it."""
-    if dry_run:
-        print_plan(plan, root)
-        typer.echo("nothing was done")
-    else:
-        execute_plan(plan, root)
+    execute_plan(make_plan(vehicle, drivers, parse_serial(serial), start, root), root, dry_run)
 
 
 def make_plan(vehicle: Path | None, drivers: str, serial: Mapping[str, str], start: bool, root: Path) -> Plan:
@@ -101,89 +76,83 @@ def make_plan(vehicle: Path | None, drivers: str, serial: Mapping[str, str], sta
 
     Raises ConfigError with all problems; ModelServerError, OSError.
     """
+    from modelserver.config.vehicle_file import load_partly
+
     gathered = ProblemCollector()
     with gathered.collect("this installation"):
         check_installation()
-    found = find_installed_vehicle(root)
-    if vehicle is None and found is None:
-        there = path_in_root(str(root), CONFIGURATION)
+    found = path_in_root(root, planning.VEHICLE)
+    is_installed = found.is_file()
+    if vehicle is None and not is_installed:
+        there = path_in_root(root, planning.CONFIGURATION)
         why = f"there is no vehicle file in {there} yet, and none is given"
         gathered.add("--vehicle", why, f"--vehicle FILE; examples are in {get_examples_folder()}")
-    given = None if vehicle is None else _load_vehicle(vehicle, gathered)
+    made: CheckedVehicle | None = None
     copied: list[WriteFile] = []
-    if given is not None:
+    if vehicle is not None:
         with gathered.collect(str(vehicle)):
-            copied = install_files.list_configuration(sources_of(given), {key_of(given)})
-    made = given
+            made = CheckedVehicle.load(vehicle)
+            copied = install_files.list_configuration(made.read_files(), {made.key_file})
     # the vehicle file in force: an edited one is not replaced
-    if found is not None and (vehicle is None or (given is not None and not _is_unmodified(found, vehicle, root))):
-        made = _load_vehicle(found, gathered)
+    if is_installed and (vehicle is None or (made is not None and not _is_unmodified(found, vehicle, root))):
+        made = None
         with gathered.collect(str(found)):
-            _check_geometry(made, root)
-    known = made.config.drivers if made is not None else _read_driver_names(vehicle or found)
+            made = CheckedVehicle.load(found)
+            geometry = Path(made.config.geometry).resolve()
+            inside = Path("/") / geometry.relative_to(root) if geometry.is_relative_to(root) else geometry
+            fix = f"copy it to {planning.CONFIGURATION}"
+            install_files.check_visible([(str(inside), "the geometry")], fix, str(found))
+    known: Iterable[str] | None = None
+    if made is not None:
+        known = made.config.drivers
+    elif vehicle is not None or is_installed:
+        # a wrong vehicle file may name its drivers all the same
+        with suppress(ConfigError, OSError):
+            config = load_partly(vehicle or found)[0]
+            known = None if config is None else config.drivers
     names = tuple(known or ())
     if known is not None:
         with gathered.collect("--drivers"):
             names = install_files.check_drivers(drivers, known)
     if made is not None:
         with gathered.collect("commands.key_file"):
-            install_files.render_credential_drop_in(get_installed_key(made))
+            install_files.render_credential_drop_in(made.installed_key)
         with gathered.collect("--serial"):
             install_files.check_serial(serial, made.serial_of(names))
     gathered.raise_any()
     assert made is not None
-    facts = read_facts([*(each.path for each in copied), RULES, SYSCTL, *_list_unit_paths(), *DROP_INS], root)
-    return _build_plan(copied, made, names, serial, start, facts)
-
-
-def _load_vehicle(vehicle: Path, gathered: ProblemCollector) -> CheckedVehicle | None:
-    made: list[CheckedVehicle] = []
-    with gathered.collect(str(vehicle)):
-        made.append(CheckedVehicle.load(vehicle))
-    return made[0] if made else None
-
-
-def _read_driver_names(vehicle: Path | None) -> Iterable[str] | None:
-    """Return the drivers of a wrong vehicle file; None if they cannot be read."""
-    from modelserver.config.vehicle_file import load_partly
-
-    with contextlib.suppress(ConfigError, OSError):
-        config = None if vehicle is None else load_partly(vehicle)[0]
-        return None if config is None else config.drivers
-    return None
-
-
-def _check_geometry(made: CheckedVehicle | None, root: Path) -> None:
-    if made is not None:
-        geometry = Path(made.config.geometry).resolve()
-        inside = Path("/") / geometry.relative_to(root) if geometry.is_relative_to(root) else geometry
-        install_files.check_visible([(str(inside), "the geometry")], f"copy it to {CONFIGURATION}", str(made.path))
+    return _build_plan(copied, made, names, serial, start, root)
 
 
 def _build_plan(
-    copied: Iterable[WriteFile],
+    copied: list[WriteFile],
     made: CheckedVehicle,
     names: tuple[str, ...],
     serial: Mapping[str, str],
     start: bool,
-    facts: SystemFacts,
+    root: Path,
 ) -> Plan:
     from modelserver.wire.channels import DEFAULT_URL
     from modelserver.wire.provider import RECEIVE_BUFFER_BYTES
 
+    templates = read_templates()
+    units = (f"{planning.UNITS}/{name}" for name in templates)
+    drop_ins = (install_files.REALTIME, install_files.CREDENTIAL)
+    paths = [*(each.path for each in copied), planning.RULES, planning.SYSCTL, *units, *drop_ins]
+    facts = read_facts(paths, root)
     url = made.config.lcm.url or DEFAULT_URL
-    group = install_files.loopback_group(url)
     ip = facts.programs.get("ip", "/usr/sbin/ip")
     rules, notes = install_files.render_udev_rules(made.serial_of(names), serial, facts)
     writes = [
         *copied,
-        *install_files.render_units(read_templates(), get_command_path(), url, ip, bool(names), made.hosts_of(names)),
+        *install_files.render_units(templates, get_command_path(), url, ip, bool(names), made.hosts_of(names)),
         *install_files.render_realtime_drop_in(facts),
-        *install_files.render_credential_drop_in(get_installed_key(made)),
+        *install_files.render_credential_drop_in(made.installed_key),
         *rules,
         *install_files.render_sysctl(RECEIVE_BUFFER_BYTES, facts),
     ]
-    units = (*((LOOPBACK,) if group else ()), SERVICE, *(f"modelserver-driver@{name}.service" for name in names))
+    started = [planning.LOOPBACK] if install_files.loopback_group(url) else []
+    started += [planning.SERVICE, *(f"modelserver-driver@{name}.service" for name in names)]
     if set(install_files.NETWORK) & set(install_files.bus_addresses(url)):
         notes.append(
             "the units may use this machine's and private addresses only (IPAddressAllow); if the vehicle's network "
@@ -194,36 +163,49 @@ def _build_plan(
     if made.config.journal.directory:
         notes.append(
             "the vehicle file sets journal.directory, which the unit can write only inside "
-            f"{STATE[0]}; without it (megabytes only) the journal is written there"
+            f"{planning.STATE[0]}; without it (megabytes only) the journal is written there"
         )
     if facts.is_live and os.geteuid() != 0:
         notes.append("run as root, this also checks for real-time scheduling and adds the drop-in for it")
     if not facts.is_live and facts.root == "/":
         notes.append("systemd does not run this system: the units are enabled, and nothing is started")
-    return plan_install(writes, units, facts, start=start, notes=notes)
+    return planning.plan_install(writes, started, facts, start=start, notes=notes)
 
 
 @dataclass(frozen=True, slots=True)
 class CheckedVehicle:
-    """A vehicle file without errors, and its valid drivers."""
+    """A vehicle file without errors, its content and its valid drivers."""
 
     path: Path
+    content: Mapping[str, Any]
     config: VehicleConfig
     drivers: Mapping[str, DriverSettings]
 
     @classmethod
     def load(cls, vehicle: Path) -> CheckedVehicle:
         """Load and check a vehicle file. Raises ConfigError, GeometryError, OSError."""
+        import yaml
+
         from modelserver.config.vehicle_file import load_config
         from msdrivers.settings import SourceMap, read_drivers
         from mstools.commands.check import check_vehicle
 
         _, problems = check_vehicle(str(vehicle))
-        errors = [problem for problem in problems if problem.severity is Severity.ERROR]
-        if errors:
+        if errors := [problem for problem in problems if problem.severity is Severity.ERROR]:
             raise ConfigError(errors)
         config = load_config(vehicle)
-        return cls(vehicle, config, read_drivers(config.drivers, SourceMap(str(vehicle)))[0])
+        drivers = read_drivers(config.drivers, SourceMap(str(vehicle)))[0]
+        return cls(vehicle, yaml.safe_load(vehicle.read_bytes()), config, drivers)
+
+    @property
+    def key_file(self) -> str:
+        """The key file as written in the vehicle file; empty for none."""
+        return str((self.content.get("commands") or {}).get("key_file") or "")
+
+    @property
+    def installed_key(self) -> str:
+        """The path of the installed key file; empty for none."""
+        return os.path.normpath(os.path.join(planning.CONFIGURATION, self.key_file)) if self.key_file else ""
 
     def hosts_of(self, names: Iterable[str]) -> list[str]:
         """Return the hosts of the named drivers' network devices."""
@@ -243,56 +225,33 @@ class CheckedVehicle:
         ports = ((name, getattr(self.drivers[name].line, "port", "")) for name in names)
         return [install_files.SerialDriver(name, port) for name, port in ports if port]
 
+    def read_files(self) -> dict[str, bytes]:
+        """Return the vehicle's files by path relative to the vehicle file, which itself is vehicle.yaml.
 
-def sources_of(made: CheckedVehicle) -> dict[str, bytes]:
-    """Return a vehicle's files by path relative to the vehicle file, which itself is vehicle.yaml.
-
-    Raises ConfigError for files outside the folder of the vehicle file and for unreadable ones; OSError.
-    """
-    import yaml
-
-    vehicle = made.path
-    text = vehicle.read_bytes()
-    raw = yaml.safe_load(text)
-    named = [str(raw["geometry"])]
-    named += [dbc for each in made.drivers.values() if (dbc := getattr(each.device_settings, "dbc", ""))]
-    # systemd passes a key file outside the folder as a credential
-    named += [key] if (key := key_of(made)) and not Path(key).is_absolute() else []
-    found = {"vehicle.yaml": text}
-    folder = vehicle.resolve().parent
-    gathered = ProblemCollector()
-    for name in dict.fromkeys(named):
-        path = Path(name)
-        if path.is_absolute():
-            with gathered.collect(str(vehicle)):
-                seen = [(str(path), "a file that it names")]
-                install_files.check_visible(seen, "put it beside the vehicle file", str(vehicle))
-            continue
-        whole = os.path.normpath(folder / path)
-        relative = os.path.relpath(whole, folder)
-        if Path(whole).parent != folder and folder not in Path(whole).parents:
-            gathered.add(str(vehicle), f"it names {quote(name)}, outside its folder", "put it beside the vehicle file")
-        elif relative in found or relative == "installed.json":
-            gathered.add(str(vehicle), f"it names {quote(name)}, a reserved name", "rename the file")
-        else:
-            with gathered.collect(whole):
-                found[relative] = read_regular(whole, LARGEST_FILE)
-    gathered.raise_any()
-    return found
-
-
-def key_of(made: CheckedVehicle) -> str:
-    """Return the key file as written in the vehicle file; empty for none."""
-    import yaml
-
-    commands = yaml.safe_load(made.path.read_bytes()).get("commands") or {}
-    return str(commands.get("key_file") or "")
-
-
-def get_installed_key(made: CheckedVehicle) -> str:
-    """Return the path of the installed key file; empty for none."""
-    key = key_of(made)
-    return os.path.normpath(os.path.join(CONFIGURATION, key)) if key else ""
+        Raises ConfigError for files outside the folder of the vehicle file and for unreadable ones; OSError.
+        """
+        named = [str(self.content["geometry"])]
+        named += [dbc for each in self.drivers.values() if (dbc := getattr(each.device_settings, "dbc", ""))]
+        # systemd passes a key file outside the folder as a credential
+        named += [self.key_file] if self.key_file and not Path(self.key_file).is_absolute() else []
+        found = {"vehicle.yaml": self.path.read_bytes()}
+        subject, folder, fix = str(self.path), self.path.resolve().parent, "put it beside the vehicle file"
+        gathered = ProblemCollector()
+        for name in dict.fromkeys(named):
+            whole = Path(os.path.normpath(folder / name))
+            relative = os.path.relpath(whole, folder)
+            if Path(name).is_absolute():
+                with gathered.collect(subject):
+                    install_files.check_visible([(name, "a file that it names")], fix, subject)
+            elif folder not in whole.parents:
+                gathered.add(subject, f"it names {quote(name)}, outside its folder", fix)
+            elif relative in found or relative == "installed.json":
+                gathered.add(subject, f"it names {quote(name)}, a reserved name", "rename the file")
+            else:
+                with gathered.collect(str(whole)):
+                    found[relative] = read_regular(whole, LARGEST_FILE)
+        gathered.raise_any()
+        return found
 
 
 def parse_serial(given: Iterable[str] | None) -> dict[str, str]:
@@ -314,9 +273,5 @@ def read_templates() -> dict[str, str]:
 
 def _is_unmodified(found: Path, vehicle: Path, root: Path) -> bool:
     """Return whether the installed vehicle file equals an earlier installation's, or the given one."""
-    there = digest(found.read_bytes())
-    return there in read_manifest(root).files.get(VEHICLE, ()) or there == digest(vehicle.read_bytes())
-
-
-def _list_unit_paths() -> list[str]:
-    return [f"{UNITS}/{name}" for name in read_templates()]
+    there = planning.digest(found.read_bytes())
+    return there in (*read_manifest(root).files.get(planning.VEHICLE, ()), planning.digest(vehicle.read_bytes()))

@@ -7,10 +7,9 @@ from typing import Annotated
 
 import typer
 
-from mstools.commands.install import DryRunOption, RootOption, show_or_apply
-from mstools.deployment.installation import get_command_path
+from mstools.commands.install import DryRunOption, RootOption
 from mstools.deployment.plan import plan_uninstall
-from mstools.deployment.steps import check_root_user, read_facts
+from mstools.deployment.steps import check_root_user, execute_plan, get_command_path, read_facts
 
 
 def command(
@@ -29,4 +28,4 @@ def command(
     root = root.resolve()
     if not dry_run:
         check_root_user(root, f"{get_command_path()} uninstall{' --purge' if purge else ''}")
-    show_or_apply(plan_uninstall(read_facts((), root), purge=purge), root, dry_run)
+    execute_plan(plan_uninstall(read_facts((), root), purge=purge), root, dry_run)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from ipaddress import ip_address
-from typing import Final, NoReturn
+from typing import Final
 from urllib.parse import parse_qs, urlsplit
 
 from modelserver.errors import ConfigError, Location, ModelServerError, Problem, Severity, find_nearest_names, quote
@@ -22,6 +22,7 @@ from mstools.deployment.plan import (
     SystemFacts,
     WriteFile,
 )
+from mstools.terminal.problems import ProblemCollector
 
 BY_ID: Final = "/dev/serial/by-id/"
 DEVICE_FOLDER: Final = "/dev/modelserver/"
@@ -40,6 +41,9 @@ HIDDEN_FOLDERS: Final = {
 
 INSTANCE_NAME: Final = re.compile(r"[A-Za-z0-9_.:][A-Za-z0-9_.:-]*")
 """A driver name that equals its unit instance, without systemd's escapes."""
+
+_UNIT_PATH: Final = re.compile(r"/[A-Za-z0-9/._+@-]+")
+"""A path that means itself in a unit."""
 
 _DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9#+.:=@_-]+")
 """Characters that udev allows in device names."""
@@ -63,18 +67,16 @@ def check_visible(paths: Iterable[tuple[str, str]], fix: str, subject: str = "th
 
     `subject` is the location in the error, `fix` the remedy.
     """
-    unseen = [(path, what, find_hiding_setting(path)) for path, what in paths if find_hiding_setting(path)]
-    if unseen:
-        which = ", ".join(f"{what} is {path}" for path, what, _ in unseen)
-        why = " and ".join(f"{setting}=yes" for setting in dict.fromkeys(setting for *_, setting in unseen))
-        _raise_problem(f"{which}, which the hardened units cannot access ({why})", subject, fix)
+    if unseen := {f"{what} is {path}": setting for path, what in paths if (setting := find_hiding_setting(path))}:
+        why = " and ".join(f"{setting}=yes" for setting in dict.fromkeys(unseen.values()))
+        raise _error(f"{', '.join(unseen)}, which the hardened units cannot access ({why})", subject, fix)
 
 
 def check_program(program: str) -> None:
     """Raise ConfigError for a command path that cannot be written in a unit."""
-    if not re.fullmatch(r"/[A-Za-z0-9/._+@-]+", program):
+    if not _UNIT_PATH.fullmatch(program):
         fix = "install to a folder whose path has only letters, digits and ._+@-"
-        _raise_problem(f"{program!r} cannot be written in a unit", "this installation", fix)
+        raise _error(f"{program!r} cannot be written in a unit", "this installation", fix)
 
 
 def check_drivers(wanted: str, known: Iterable[str]) -> tuple[str, ...]:
@@ -88,33 +90,28 @@ def check_drivers(wanted: str, known: Iterable[str]) -> tuple[str, ...]:
         names = known
     elif names == ("none",):
         names = ()
-    problems = []
+    gathered = ProblemCollector()
     for name in names:
         if name in ("all", "none") and name not in known:
             others = ",".join(each for each in names if each not in ("all", "none"))
             why = f"{name} is combined with other names in {quote(wanted, 80)}, and means "
             why += "every driver" if name == "all" else "no driver at all"
             fix = f"--drivers {name}, or only the names" + (f": --drivers {others}" if others else "")
-            problems.append(_problem(why, "--drivers", fix))
+            gathered.add("--drivers", why, fix)
         elif name not in known:
             near = find_nearest_names(name, known)
             offer = f"did you mean {near[0]}?" if near else f"it has: {', '.join(known) or 'none'}"
-            problems.append(_problem(f"the vehicle file has no driver {quote(name, 40)}; {offer}", "--drivers"))
+            gathered.add("--drivers", f"the vehicle file has no driver {quote(name, 40)}; {offer}")
         elif not INSTANCE_NAME.fullmatch(name):
             why = f"driver {quote(name, 40)} cannot be a unit name"
             fix = "rename it in the vehicle file with only letters, digits, _ . : and -"
-            problems.append(_problem(why, "--drivers", fix))
-    if problems:
-        raise ConfigError(problems)
+            gathered.add("--drivers", why, fix)
+    gathered.raise_any()
     return names
 
 
-def _raise_problem(why: str, subject: str, fix: str = "") -> NoReturn:
-    raise ConfigError([_problem(why, subject, fix)])
-
-
-def _problem(why: str, subject: str, fix: str = "") -> Problem:
-    return Problem(Severity.ERROR, why, Location(subject), fix)
+def _error(why: str, subject: str, fix: str) -> ConfigError:
+    return ConfigError([Problem(Severity.ERROR, why, Location(subject), fix)])
 
 
 def loopback_group(url: str) -> str:
@@ -147,20 +144,19 @@ def bus_addresses(url: str) -> tuple[str, ...]:
 
 def host_addresses(hosts: Iterable[str]) -> tuple[str, ...]:
     """Return the addresses of hosts, in their order; `any` for a name, which may resolve differently later."""
-    found = []
-    for host in hosts:
-        if host == LOCAL:
-            continue
-        try:
-            found.append(str(ip_address(host)))
-        except ValueError:
-            found.append(ANYWHERE)
-    return tuple(found)
+    return tuple(_parse_address(host) for host in hosts if host != LOCAL)
 
 
-def format_address_list(addresses: Iterable[str]) -> str:
+def _parse_address(host: str) -> str:
+    try:
+        return str(ip_address(host))
+    except ValueError:
+        return ANYWHERE
+
+
+def _join_addresses(addresses: Iterable[str]) -> str:
     """Return addresses for a unit: each once, or `any` alone."""
-    found = tuple(dict.fromkeys(addresses))
+    found = dict.fromkeys(addresses)
     return ANYWHERE if ANYWHERE in found else " ".join(found)
 
 
@@ -178,21 +174,14 @@ def render_units(
     """
     check_program(program)
     group, bus = loopback_group(url), bus_addresses(url)
-    places = {
-        "@MODELSERVER@": program,
-        "@GROUP@": group,
-        "@IP@": ip,
-        "@ADDRESSES@": format_address_list(bus),
-        "@DEVICES@": format_address_list((*bus, *host_addresses(hosts))),
-    }
+    places = {"MODELSERVER": program, "GROUP": group, "IP": ip, "ADDRESSES": _join_addresses(bus)}
+    places["DEVICES"] = _join_addresses((*bus, *host_addresses(hosts)))
     wanted = {SERVICE: "the service"}
     wanted |= {DRIVER: "one driver, by its name"} if drivers else {}
     wanted |= {LOOPBACK: "multicast on the loopback interface"} if group else {}
     writes = []
     for name, what in wanted.items():
-        text = templates[name]
-        for place, value in places.items():
-            text = text.replace(place, value)
+        text = re.sub("@([A-Z]+)@", lambda place: places[place[1]], templates[name])
         summary = "\n".join(line for line in text.splitlines() if line.startswith("ExecStart="))
         writes.append(WriteFile(f"{UNITS}/{name}", text.encode(), what, summary))
     return writes
@@ -205,11 +194,10 @@ def list_configuration(sources: Mapping[str, bytes], secret: Container[str] = ()
     """
     writes = []
     for path, content in sources.items():
-        what = "the vehicle file" if path == "vehicle.yaml" else "of the vehicle"
+        what, mode = "the vehicle file" if path == "vehicle.yaml" else "of the vehicle", 0o644
         if path in secret:
-            writes.append(WriteFile(f"{CONFIGURATION}/{path}", content, "the key of signed commands", mode=0o600))
-        else:
-            writes.append(WriteFile(f"{CONFIGURATION}/{path}", content, what))
+            what, mode = "the key of signed commands", 0o600
+        writes.append(WriteFile(f"{CONFIGURATION}/{path}", content, what, mode=mode))
     return writes
 
 
@@ -243,7 +231,7 @@ def render_credential_drop_in(key_file: str) -> list[WriteFile]:
     """
     if not key_file:
         return []
-    if not re.fullmatch(r"/[A-Za-z0-9/._+@-]+", key_file):
+    if not _UNIT_PATH.fullmatch(key_file):
         raise ModelServerError(
             f"the key file {quote(key_file)} cannot be written in a unit: use only letters, digits and ._+@-; rename it"
         )
@@ -288,21 +276,20 @@ def render_udev_rules(
 def check_serial(given: Mapping[str, str], drivers: Iterable[SerialDriver]) -> None:
     """Raise ConfigError for invalid devices of --serial. `given` are names by driver."""
     known = [each.name for each in drivers]
-    problems = []
+    gathered = ProblemCollector()
     for name, device in given.items():
         if name not in known:
             near = find_nearest_names(name, known)
             offer = f"did you mean {near[0]}?" if near else f"there are: {', '.join(known) or 'none'}"
-            why = f"{quote(name, 40)} is not a driver on a serial port; {offer}"
-            problems.append(_problem(why, "--serial"))
-        if not _DEVICE_NAME.fullmatch(device.removeprefix(BY_ID)):
-            problems.append(_problem(_describe_bad_device(device.removeprefix(BY_ID)), "--serial"))
-    if problems:
-        raise ConfigError(problems)
+            gathered.add("--serial", f"{quote(name, 40)} is not a driver on a serial port; {offer}")
+        with gathered.collect("--serial"):
+            _check_device(device.removeprefix(BY_ID))
+    gathered.raise_any()
 
 
-def _describe_bad_device(device: str) -> str:
-    return f"{quote(device)} is not a name below {BY_ID}: only letters, digits and #+-.:=@_"
+def _check_device(device: str) -> None:
+    if not _DEVICE_NAME.fullmatch(device):
+        raise ModelServerError(f"{quote(device)} is not a name below {BY_ID}: only letters, digits and #+-.:=@_")
 
 
 def _id_of(port: str, facts: SystemFacts) -> str:
@@ -313,8 +300,7 @@ def _id_of(port: str, facts: SystemFacts) -> str:
 
 
 def _render_rule(name: str, device: str) -> str:
-    if not _DEVICE_NAME.fullmatch(device):
-        raise ModelServerError(_describe_bad_device(device))
+    _check_device(device)
     # systemd's own rules make the link by id, from vendor, product and serial number
     match = f'SUBSYSTEM=="tty", SYMLINK=="{BY_ID.removeprefix("/dev/")}{device}"'
     # ModemManager would send data to it otherwise, from which some devices do not recover

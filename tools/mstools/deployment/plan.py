@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 from modelserver.errors import ModelServerError
@@ -102,12 +104,8 @@ class Manifest:
 
     def encode(self) -> bytes:
         """Return the content of the manifest file."""
-        content = {
-            "version": MANIFEST_VERSION,
-            "files": dict(sorted(self.files.items())),
-            "units": self.units,
-            "folders": self.folders,
-        }
+        files = dict(sorted(self.files.items()))
+        content = {"version": MANIFEST_VERSION, "files": files, "units": self.units, "folders": self.folders}
         return (json.dumps(content, indent=1) + "\n").encode()
 
     @classmethod
@@ -117,8 +115,14 @@ class Manifest:
             content = json.loads(raw)
             if content["version"] != MANIFEST_VERSION:
                 raise ValueError(f"its version is {content['version']!r}, not {MANIFEST_VERSION}")
-            files = {_parse_path(path): tuple(map(_parse_hash, hashes)) for path, hashes in content["files"].items()}
-            return cls(files, tuple(map(_parse_unit, content["units"])), tuple(map(_parse_folder, content["folders"])))
+            return cls(
+                {
+                    _parse("file", path): tuple(_parse("hash", each) for each in hashes)
+                    for path, hashes in content["files"].items()
+                },
+                tuple(_parse("unit", each) for each in content["units"]),
+                tuple(_parse("folder", each) for each in content["folders"]),
+            )
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ModelServerError(
                 f"{file}: the record of the installation is damaged ({error}); remove it: the installed files then "
@@ -155,9 +159,9 @@ class SystemFacts:
     root: str = "/"
 
 
-def path_in_root(root: str, path: str) -> str:
+def path_in_root(root: str | Path, path: str) -> Path:
     """Return the location of an absolute path of a system with the given root."""
-    return path if root == "/" else f"{root.rstrip('/')}{path}"
+    return Path(root, path.lstrip("/"))
 
 
 def digest(content: bytes) -> str:
@@ -189,9 +193,8 @@ def plan_install(
             changed.add(write.path)
             steps.append(write)
         else:
-            steps.append(
-                KeepFile(write.path, f"edited, or not installed by modelserver; not written: {write.description}")
-            )
+            why = f"edited, or not installed by modelserver; not written: {write.description}"
+            steps.append(KeepFile(write.path, why))
     for path in sorted(set(owned) - {write.path for write in writes}):
         there = facts.files.get(path)
         if path.startswith(f"{CONFIGURATION}/") or (there is not None and there not in owned[path]):
@@ -208,7 +211,7 @@ def plan_install(
     steps.insert(0, WriteFile(MANIFEST, manifest.encode(), "the record for `modelserver uninstall`"))
     steps += _plan_reloads(facts, changed)
     if obsolete:
-        steps.append(_systemctl(facts, "units that are no longer needed", "disable", *_now(facts), *obsolete))
+        steps.append(_systemctl(facts, "units that are no longer needed", "disable", *obsolete))
     steps.append(_systemctl(facts, "start at boot", "enable", *units))
     if start and facts.is_live:
         steps.append(_systemctl(facts, "start now, with the new files", "restart", *units))
@@ -225,12 +228,11 @@ def plan_uninstall(facts: SystemFacts, *, purge: bool) -> Plan:
         raise ModelServerError(f"nothing to uninstall: {path_in_root(facts.root, MANIFEST)} has no installation")
     steps: list[Step] = []
     if manifest.units:
-        stop = _systemctl(facts, "stop, and do not start again", "disable", *_now(facts), *manifest.units)
-        steps.append(RunProgram(stop.arguments, stop.description, may_fail=True))
+        stop = _systemctl(facts, "stop, and do not start again", "disable", *manifest.units)
+        steps.append(replace(stop, may_fail=True))
     removed = set()
     for path, hashes in sorted(manifest.files.items()):
-        there = facts.files.get(path)
-        if there is None:
+        if (there := facts.files.get(path)) is None:
             continue
         if there in hashes or purge:
             removed.add(path)
@@ -241,8 +243,7 @@ def plan_uninstall(facts: SystemFacts, *, purge: bool) -> Plan:
     if purge:
         steps += [RemovePath(path, "the service's state", is_recursive=True) for path in STATE]
     # nested folders first
-    for folder in sorted(manifest.folders, reverse=True):
-        steps.append(RemovePath(folder, "the folder, if it is empty"))
+    steps += [RemovePath(folder, "the folder, if it is empty") for folder in sorted(manifest.folders, reverse=True)]
     steps += _plan_reloads(facts, removed)
     notes = []
     if SYSCTL in removed:
@@ -257,15 +258,18 @@ def _plan_reloads(facts: SystemFacts, changed: Iterable[str]) -> list[Step]:
     if not facts.is_live:
         return []
     changed = set(changed)
-    steps: list[Step] = []
-    if RULES in changed and "udevadm" in facts.programs:
-        udevadm = facts.programs["udevadm"]
-        steps.append(RunProgram((udevadm, "control", "--reload"), "apply the rules for serial ports", may_fail=True))
-        trigger = (udevadm, "trigger", "--subsystem-match=tty", "--action=change")
-        steps.append(RunProgram(trigger, "apply them to connected devices", may_fail=True))
-    if SYSCTL in changed and "sysctl" in facts.programs and SYSCTL not in facts.files:
-        load = (facts.programs["sysctl"], "--quiet", "--load", SYSCTL)
-        steps.append(RunProgram(load, "apply the limit", may_fail=True))
+    commands: list[tuple[tuple[str, ...], str]] = []
+    if RULES in changed:
+        trigger = ("udevadm", "trigger", "--subsystem-match=tty", "--action=change")
+        commands += [(("udevadm", "control", "--reload"), "apply the rules for serial ports")]
+        commands += [(trigger, "apply them to connected devices")]
+    if SYSCTL in changed and SYSCTL not in facts.files:
+        commands += [(("sysctl", "--quiet", "--load", SYSCTL), "apply the limit")]
+    steps: list[Step] = [
+        RunProgram((facts.programs[program], *rest), what, may_fail=True)
+        for (program, *rest), what in commands
+        if program in facts.programs
+    ]
     if any(path.startswith(f"{UNITS}/") for path in changed):
         steps.append(_systemctl(facts, "systemd reloads the units", "daemon-reload"))
     return steps
@@ -277,38 +281,23 @@ def parent_folders(path: str) -> list[str]:
     return ["/".join(parts[:n]) for n in range(2, len(parts) + 1)]
 
 
-def _systemctl(facts: SystemFacts, what: str, *arguments: str) -> RunProgram:
-    program = facts.programs.get("systemctl", "systemctl")
-    return RunProgram((program, *(() if facts.root == "/" else (f"--root={facts.root}",)), *arguments), what)
+def _systemctl(facts: SystemFacts, what: str, verb: str, *units: str) -> RunProgram:
+    root = () if facts.root == "/" else (f"--root={facts.root}",)
+    now = ("--now",) if verb == "disable" and facts.is_live else ()
+    return RunProgram((facts.programs.get("systemctl", "systemctl"), *root, verb, *now, *units), what)
 
 
-def _now(facts: SystemFacts) -> tuple[str, ...]:
-    return ("--now",) if facts.is_live else ()
+_OWN: Final = {
+    "file": rf"{re.escape(RULES)}|{re.escape(SYSCTL)}|{CONFIGURATION}/.*|{UNITS}/modelserver.*",
+    "unit": "modelserver[^/]*",
+    "folder": "/etc(/.*)?",
+    "hash": ".*",
+}
+"""What a manifest may name; it decides what is removed. A folder is removed only where it is empty."""
 
 
-def _parse_path(path: Any) -> str:
-    """Return a path of the manifest, which decides what is removed: one below a folder of the installation."""
-    below = (f"{CONFIGURATION}/", f"{UNITS}/modelserver")
-    is_own = isinstance(path, str) and (path in (RULES, SYSCTL) or path.startswith(below))
-    if not is_own or not {"..", "."}.isdisjoint(path.split("/")):
-        raise ValueError(f"{path!r} is no file of this installation")
-    return str(path)
-
-
-def _parse_unit(name: Any) -> str:
-    if not isinstance(name, str) or not name.startswith("modelserver") or "/" in name:
-        raise ValueError(f"{name!r} is no unit of this installation")
-    return name
-
-
-def _parse_folder(path: Any) -> str:
-    # removed only where it is empty
-    if not isinstance(path, str) or not (path == "/etc" or path.startswith("/etc/")) or ".." in path.split("/"):
-        raise ValueError(f"{path!r} is no folder of this installation")
-    return path
-
-
-def _parse_hash(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"{value!r} is no hash")
-    return value
+def _parse(kind: str, value: Any) -> str:
+    is_own = isinstance(value, str) and re.fullmatch(_OWN[kind], value, re.DOTALL)
+    if not is_own or not {"..", "."}.isdisjoint(value.split("/")):
+        raise ValueError(f"{value!r} is no {kind} of this installation")
+    return str(value)
