@@ -31,8 +31,7 @@ from msdrivers.endpoint import (
     Send,
 )
 from msdrivers.health import HealthReporter
-from msdrivers.links import EndOfRecordingError, Link, LinkError
-from msdrivers.links.guard import GuardedLink
+from msdrivers.links import EndOfRecordingError, GuardedLink, Link, LinkError
 from msdrivers.raw_log import TimeSource
 
 STABLE_NS = 5_000_000_000

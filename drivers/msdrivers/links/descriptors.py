@@ -1,4 +1,4 @@
-"""Non-blocking I/O on the file descriptor of a byte link."""
+"""Byte links on a file descriptor: non-blocking I/O."""
 
 from __future__ import annotations
 
@@ -16,41 +16,52 @@ WRITE_TIMEOUT_MS = 1000
 """Write timeout, milliseconds."""
 
 
-def wait_readable(file: int, timeout: float) -> bool:
-    """Wait at most `timeout` seconds; return whether there is data to read or an error to report."""
-    poll = select.poll()
-    poll.register(file, select.POLLIN)
-    return bool(poll.poll(max(0.0, timeout) * 1e3))
+class DescriptorLink:
+    """Base of the links whose bytes go through a file descriptor."""
 
+    description: str
 
-def read_available(file: int, what: str) -> Sequence[bytes]:
-    """Return what can be read without waiting. Raises LinkError, beginning with `what`, where the line is lost."""
-    try:
-        data = os.read(file, READ_BYTES)
-    except BlockingIOError:
-        return ()
-    except OSError as error:
-        raise make_lost_error(what, error) from None
-    if not data:
-        raise LinkError(what, "the other end is gone: unplugged, switched off or closed", "waiting for its return")
-    return (data,)
+    def fileno(self) -> int:
+        """Return the descriptor. Raises LinkError if the line is not open."""
+        raise NotImplementedError
 
+    def poll(self, timeout: float) -> Sequence[bytes]:
+        """Return received bytes; wait at most `timeout` seconds. Raises LinkError if the line is lost."""
+        file = self.fileno()
+        return self.read_available(file) if _wait(file, select.POLLIN, max(0.0, timeout) * 1e3) else ()
 
-def write_all(file: int, data: bytes, what: str) -> None:
-    """Write all of `data`. Raises LinkError, beginning with `what`, where the line is lost or does not take it."""
-    rest = memoryview(data)
-    while rest:
+    def send(self, unit: bytes) -> None:
+        """Send all bytes. Raises LinkError if the line is lost or does not take them."""
+        file, rest = self.fileno(), memoryview(unit)
+        while rest:
+            try:
+                rest = rest[os.write(file, rest) :]
+            except BlockingIOError:
+                if not _wait(file, select.POLLOUT, WRITE_TIMEOUT_MS):
+                    why, fix = f"{len(rest)} bytes are not taken", "look at the cable and at flow control"
+                    raise LinkError(self.description, why, fix) from None
+            except OSError as error:
+                raise make_lost_error(self.description, error) from None
+
+    def read_available(self, file: int) -> Sequence[bytes]:
+        """Return what can be read without waiting. Raises LinkError if the line is lost."""
         try:
-            rest = rest[os.write(file, rest) :]
+            data = os.read(file, READ_BYTES)
         except BlockingIOError:
-            poll = select.poll()
-            poll.register(file, select.POLLOUT)
-            if not poll.poll(WRITE_TIMEOUT_MS):
-                raise LinkError(
-                    what, f"{len(rest)} bytes are not taken", "look at the cable and at flow control"
-                ) from None
+            return ()
         except OSError as error:
-            raise make_lost_error(what, error) from None
+            raise make_lost_error(self.description, error) from None
+        if not data:
+            why = "the other end is gone: unplugged, switched off or closed"
+            raise LinkError(self.description, why, "waiting for its return")
+        return (data,)
+
+
+def _wait(file: int, event: int, timeout_ms: float) -> bool:
+    """Return whether an event, or an error to report, came in time."""
+    poll = select.poll()
+    poll.register(file, event)
+    return bool(poll.poll(timeout_ms))
 
 
 def make_lost_error(what: str, error: OSError) -> LinkError:

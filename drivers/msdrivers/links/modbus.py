@@ -24,7 +24,7 @@ from pymodbus.pdu.register_message import (
     WriteMultipleRegistersResponse,
 )
 
-from msdrivers.links import Link, LinkError
+from msdrivers.links import Link, LinkError, LinkWrapper
 from msdrivers.links.tcp import TcpLink, TcpServerLink
 from msdrivers.protocol.modbus.registers import (
     FailureKind,
@@ -91,14 +91,13 @@ class _TcpFramer:
         return self._framer.buildFrame(message)
 
 
-class ModbusLink:
+class ModbusLink(LinkWrapper[bytes]):
     """The driver's end: requests are sent, replies and failures come. Several requests may be under way."""
-
-    baud = 0
 
     def __init__(self, link: Link[bytes], unit_id: int, clock_ns: Callable[[], int] = time.monotonic_ns):
         """`unit_id` is the number of the device behind the server."""
-        self._link, self._unit_id, self._clock_ns = link, unit_id, clock_ns
+        super().__init__(link)
+        self._unit_id, self._clock_ns = unit_id, clock_ns
         self._framer = _TcpFramer(is_server=False)
         self._pending: dict[int, tuple[ModbusRequest, int]] = {}
 
@@ -111,11 +110,7 @@ class ModbusLink:
         """Connect. Raises LinkError."""
         self._framer.clear()
         self._pending.clear()
-        self._link.open(baud)
-
-    def close(self) -> None:
-        """Disconnect."""
-        self._link.close()
+        super().open(baud)
 
     def send(self, unit: ModbusUnit) -> None:
         """Send a request. Raises LinkError."""
@@ -164,13 +159,13 @@ class ModbusLink:
         return ModbusFailure(FailureKind.LINE, "a reply that does not fit its request", transaction=request.transaction)
 
 
-class ModbusServerLink:
+class ModbusServerLink(LinkWrapper[bytes]):
     """The emulator's end: requests come, replies and exceptions are sent."""
 
-    baud = 0
+    _link: TcpServerLink
 
     def __init__(self, link: TcpServerLink):
-        self._link = link
+        super().__init__(link)
         self._framer = _TcpFramer(is_server=True)
         self._pending: dict[int, tuple[int, int]] = {}
         self._clients_seen = 0
@@ -179,14 +174,6 @@ class ModbusServerLink:
     def description(self) -> str:
         """The address to call."""
         return f"modbus {self._link.description.removeprefix('tcp ')}"
-
-    def open(self, baud: int | None = None) -> None:
-        """Listen. Raises LinkError."""
-        self._link.open(baud)
-
-    def close(self) -> None:
-        """Stop listening."""
-        self._link.close()
 
     def poll(self, timeout: float) -> Sequence[ModbusUnit]:
         """Return received requests; unsupported ones are answered with an exception. Raises LinkError."""
@@ -233,12 +220,10 @@ class ModbusServerLink:
 
 def _convert_request(message: ModbusPDU | None, number: int) -> ModbusRequest | None:
     """Return the request in a message, None for what is not served here."""
-    if isinstance(message, ReadHoldingRegistersRequest):
+    if isinstance(message, ReadHoldingRegistersRequest | ReadInputRegistersRequest):
         # the class of input registers is made from that of holding ones
         table = RegisterTable.INPUT if isinstance(message, ReadInputRegistersRequest) else RegisterTable.HOLDING
         return ReadRegisters(message.address, message.count, table, number)
-    if isinstance(message, ReadInputRegistersRequest):
-        return ReadRegisters(message.address, message.count, RegisterTable.INPUT, number)
     if isinstance(message, WriteMultipleRegistersRequest) and len(message.registers) == message.count:
         return WriteRegisters(message.address, tuple(message.registers), number)
     return None

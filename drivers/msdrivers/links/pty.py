@@ -10,14 +10,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from msdrivers.links import LinkError
-from msdrivers.links.descriptors import read_available, wait_readable
+from msdrivers.links.descriptors import DescriptorLink
 from msdrivers.links.serial_port import find_emulators
 
 WRONG_BAUD_TABLE = bytes(byte ^ 0x5A for byte in range(256))
 """Translation of bytes between different baud rates."""
 
 
-class PtyLink:
+class PtyLink(DescriptorLink):
     """A pseudo-terminal. `description` is the path that a driver opens.
 
     With another rate than `baud` set by the driver, data is garbled in both directions as on a real line; 0: any rate.
@@ -66,20 +66,20 @@ class PtyLink:
         self._path = ""
         self._emulator_fd = self._driver_fd = -1
 
-    def poll(self, timeout: float) -> Sequence[bytes]:
-        """Return what the driver sent. Raises LinkError."""
+    def fileno(self) -> int:
+        """Return the emulator's end. Raises LinkError if it is not open."""
         if self._emulator_fd < 0:
             raise LinkError(self.description, "the line is not open")
-        if not wait_readable(self._emulator_fd, timeout):
-            return ()
-        return [self._apply_baud(data) for data in read_available(self._emulator_fd, self.description)]
+        return self._emulator_fd
+
+    def poll(self, timeout: float) -> Sequence[bytes]:
+        """Return what the driver sent. Raises LinkError."""
+        return tuple(self._apply_baud(data) for data in super().poll(timeout))
 
     def send(self, unit: bytes) -> None:
         """Send bytes; they are lost when the terminal's buffer is full, as on a real line."""
-        if self._emulator_fd < 0:
-            raise LinkError(self.description, "the line is not open")
         with contextlib.suppress(BlockingIOError):
-            os.write(self._emulator_fd, self._apply_baud(unit))
+            os.write(self.fileno(), self._apply_baud(unit))
 
     def _apply_baud(self, data: bytes) -> bytes:
         return data if not self.baud or self._get_driver_baud() in (self.baud, 0) else data.translate(WRONG_BAUD_TABLE)

@@ -10,7 +10,7 @@ import grp
 import os
 import termios
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +19,7 @@ from serial.tools import list_ports
 
 from modelserver.errors import find_nearest_names
 from msdrivers.links import LinkError
-from msdrivers.links.descriptors import make_lost_error, read_available, wait_readable
+from msdrivers.links.descriptors import DescriptorLink
 
 MAX_COMMAND_LENGTH = 60
 """Characters of a process's command line that are shown."""
@@ -153,7 +153,7 @@ DRAIN_ATTEMPTS, DRAIN_INTERVAL_S = 50, 0.01
 """Number and interval, seconds, of the checks whether the output is drained."""
 
 
-class SerialLink:
+class SerialLink(DescriptorLink):
     """A serial port, 8 data bits, no parity, 1 stop bit, for this process alone."""
 
     def __init__(self, port: str, baud: int):
@@ -165,7 +165,7 @@ class SerialLink:
         """Open the port. Raises LinkError that names the process which holds it."""
         self.baud = baud or self.baud
         try:
-            self._serial = serial.Serial(self.description, self.baud, timeout=0, write_timeout=1.0, exclusive=True)
+            self._serial = serial.Serial(self.description, self.baud, timeout=0, exclusive=True)
         # pyserial passes on termios.error, which is no OSError
         except (OSError, ValueError, termios.error) as error:
             raise self._explain_error(error) from None
@@ -184,25 +184,11 @@ class SerialLink:
         with contextlib.suppress(OSError, termios.error):
             port.close()
 
-    def poll(self, timeout: float) -> Sequence[bytes]:
-        """Return received bytes. Raises LinkError if the port is lost."""
-        file = self._require_port().fileno()
-        return read_available(file, self.description) if wait_readable(file, timeout) else ()
-
-    def send(self, unit: bytes) -> None:
-        """Send bytes. Raises LinkError."""
-        try:
-            self._require_port().write(unit)
-        except serial.SerialTimeoutException:
-            why, fix = f"{len(unit)} bytes are not taken", "look at the cable and at flow control"
-            raise LinkError(self.description, why, fix) from None
-        except OSError as error:
-            raise make_lost_error(self.description, error) from None
-
-    def _require_port(self) -> serial.Serial:
+    def fileno(self) -> int:
+        """Return the port's descriptor. Raises LinkError if it is not open."""
         if self._serial is None:
             raise LinkError(self.description, "the port is not open")
-        return self._serial
+        return self._serial.fileno()
 
     def _explain_error(self, error: Exception) -> LinkError:
         path = self.description

@@ -9,13 +9,13 @@ import socket
 from collections.abc import Sequence
 
 from msdrivers.links import LinkError
-from msdrivers.links.descriptors import make_lost_error, read_available, wait_readable, write_all
+from msdrivers.links.descriptors import DescriptorLink, make_lost_error
 
 CONNECT_TIMEOUT_S = 1.0
 """Connect timeout."""
 
 
-class TcpLink:
+class TcpLink(DescriptorLink):
     """A connection to a device server: a receiver with a network port, or a serial port on the network."""
 
     baud = 0
@@ -50,45 +50,44 @@ class TcpLink:
         if connection is not None:
             connection.close()
 
-    def poll(self, timeout: float) -> Sequence[bytes]:
-        """Return received bytes. Raises LinkError if the server has disconnected."""
-        file = self._get_file_descriptor()
-        return read_available(file, self.description) if wait_readable(file, timeout) else ()
-
-    def send(self, unit: bytes) -> None:
-        """Send bytes. Raises LinkError."""
-        write_all(self._get_file_descriptor(), unit, self.description)
-
-    def _get_file_descriptor(self) -> int:
+    def fileno(self) -> int:
+        """Return the connection's descriptor. Raises LinkError if it is not open."""
         if self._socket is None:
             raise LinkError(self.description, "the line is not open")
         return self._socket.fileno()
 
 
-class TcpServerLink:
+class TcpServerLink(DescriptorLink):
     """A server for one client at a time, the latest. Bytes sent without a client are lost."""
 
     baud = 0
 
     def __init__(self, port: int, host: str = "127.0.0.1"):
         """Listen on `port`; 0 takes a free one when the link is opened."""
-        self._host, self._port = host, port
+        self._address = (host, port)
+        self.description = f"tcp {host}:{port}"
         self._server: socket.socket | None = None
         self._client: socket.socket | None = None
         self.clients_accepted = 0
         """Number of clients so far."""
 
-    @property
-    def description(self) -> str:
-        """Address of the server."""
-        return f"tcp {self._host}:{self._port}"
-
     def open(self, baud: int | None = None) -> None:
         """Listen. Raises LinkError if the port is in use."""
         if self._server is not None:
             return
-        self._server = open_server_socket(self._host, self._port)
-        self._port = self._server.getsockname()[1]
+        host, port = self._address
+        try:
+            self._server = socket.create_server(self._address, backlog=1)
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                what = f"port {port} is in use"
+                raise LinkError(what, "another program listens on it", "end it, or take another port") from None
+            if error.errno == errno.EACCES:
+                what = f"port {port} may not be used"
+                raise LinkError(what, "ports below 1024 are the system's", "take another port") from None
+            raise make_lost_error(self.description, error) from None
+        self._address = (host, self._server.getsockname()[1])
+        self.description = f"tcp {host}:{self._address[1]}"
 
     def close(self) -> None:
         """Disconnect and stop listening."""
@@ -101,16 +100,22 @@ class TcpServerLink:
         """Return bytes from the client. A disconnect is no error: another client may connect."""
         if self._server is None:
             raise LinkError(self.description, "the line is not open")
-        caller = self._client
-        ready = wait_ready([self._server] if caller is None else [self._server, caller], timeout)
+        known = [each for each in (self._server, self._client) if each is not None]
+        ready, _, _ = select.select(known, (), (), max(0.0, timeout))
         data: Sequence[bytes] = ()
-        if caller in ready and caller is not None:
+        if self._client is not None and self._client in ready:
             try:
-                data = read_available(caller.fileno(), self.description)
+                data = self.read_available(self._client.fileno())
             except LinkError:
                 self.disconnect_client()
         if self._server in ready:
-            self._accept_client()
+            with contextlib.suppress(OSError):
+                caller, _ = self._server.accept()
+                self.disconnect_client()
+                caller.setblocking(False)
+                caller.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._client = caller
+                self.clients_accepted += 1
         return data
 
     def send(self, unit: bytes) -> None:
@@ -124,38 +129,8 @@ class TcpServerLink:
         except OSError:
             self.disconnect_client()
 
-    def _accept_client(self) -> None:
-        assert self._server is not None
-        with contextlib.suppress(OSError):
-            caller, _ = self._server.accept()
-            self.disconnect_client()
-            caller.setblocking(False)
-            caller.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._client = caller
-            self.clients_accepted += 1
-
     def disconnect_client(self) -> None:
         """Disconnect the client."""
         if self._client is not None:
             self._client.close()
             self._client = None
-
-
-def open_server_socket(host: str, port: int) -> socket.socket:
-    """Open a listening socket. Raises LinkError."""
-    try:
-        return socket.create_server((host, port), backlog=1)
-    except OSError as error:
-        if error.errno == errno.EADDRINUSE:
-            what = f"port {port} is in use"
-            raise LinkError(what, "another program listens on it", "end it, or take another port") from None
-        if error.errno == errno.EACCES:
-            what = f"port {port} may not be used"
-            raise LinkError(what, "ports below 1024 are the system's", "take another port") from None
-        raise make_lost_error(f"tcp {host}:{port}", error) from None
-
-
-def wait_ready(sockets: Sequence[socket.socket], timeout: float) -> list[socket.socket]:
-    """Return the readable `sockets`; wait at most `timeout` seconds."""
-    ready, _, _ = select.select(sockets, (), (), max(0.0, timeout))
-    return ready
