@@ -17,96 +17,56 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Final, get_args
 
-from modelserver.core.commands import OPERATOR, SET_COVARIANCE, ModelLoaded, apply_model, deny_unsigned, execute_command
+from modelserver import messages
+from modelserver.core import commands, requests, samples
 from modelserver.core.host_clock import Instant
-from modelserver.core.persistence import START, get_state_to_persist, report_start
-from modelserver.core.requests import (
-    handle_denied,
-    handle_request,
-    reply_internal_error,
-    reply_malformed,
-    reply_overloaded,
-)
-from modelserver.core.samples import COMMAND_FUTURE_LIMIT_S, SAMPLE_FUTURE_LIMIT_S, process_sample, switch_mode
+from modelserver.core.requests import reply_error, reply_internal_error, reply_overloaded
 from modelserver.core.state import (
     DEGRADED,
-    MAX_COUNTERS,
     RUNNING,
     STARTING,
     AllOutputs,
     CoreSettings,
     CoreState,
     ExpectedSensor,
-    Outputs,
-    SourceTraffic,
-    StepResult,
-    WaitingRequest,
-    check_rigid,
     handle_rejected,
     handle_warning,
     start,
 )
-from modelserver.core.ticks import MAX_TICK_LATENCIES, handle_tick
-from modelserver.messages import (
-    Denied,
-    Event,
-    HealthWarning,
-    Rejected,
-    ReloadModel,
-    Request,
-    Sample,
-    SetHTransform,
-    SetStateVector,
-    SignedCommand,
-    SwitchMode,
-    Tick,
-)
+from modelserver.core.ticks import get_state_to_persist, handle_tick
 
 
-def step(state: CoreState, event: Event | ModelLoaded, now: Instant) -> tuple[CoreState, AllOutputs]:
+def step(state: CoreState, event: messages.Event | commands.ModelLoaded, now: Instant) -> tuple[CoreState, AllOutputs]:
     """Return the state after an event, and the outputs to send."""
     return _HANDLERS[type(event)](state, event, now)
 
 
 _HANDLERS: Final[Mapping[type, Callable[[CoreState, Any, Instant], tuple[CoreState, AllOutputs]]]] = {
-    **dict.fromkeys(get_args(Sample), process_sample),
-    **dict.fromkeys(get_args(Request), handle_request),
-    **dict.fromkeys((ReloadModel, SetStateVector, SetHTransform), deny_unsigned),
-    SignedCommand: execute_command,
-    SwitchMode: switch_mode,
-    ModelLoaded: apply_model,
-    Tick: handle_tick,
-    Rejected: handle_rejected,
-    HealthWarning: handle_warning,
-    Denied: handle_denied,
+    **dict.fromkeys(get_args(messages.Sample), samples.process_sample),
+    **dict.fromkeys(get_args(messages.Request), requests.handle_request),
+    **dict.fromkeys(commands.COMMANDS, commands.deny_unsigned),
+    messages.SignedCommand: commands.execute_command,
+    messages.SwitchMode: samples.switch_mode,
+    commands.ModelLoaded: commands.apply_model,
+    messages.Tick: handle_tick,
+    messages.Rejected: handle_rejected,
+    messages.HealthWarning: handle_warning,
+    messages.Denied: requests.handle_denied,
 }
 
 __all__ = [
-    "COMMAND_FUTURE_LIMIT_S",
     "DEGRADED",
-    "MAX_COUNTERS",
-    "MAX_TICK_LATENCIES",
-    "OPERATOR",
     "RUNNING",
-    "SAMPLE_FUTURE_LIMIT_S",
-    "SET_COVARIANCE",
-    "START",
     "STARTING",
     "AllOutputs",
     "CoreSettings",
     "CoreState",
     "ExpectedSensor",
     "Instant",
-    "Outputs",
-    "SourceTraffic",
-    "StepResult",
-    "WaitingRequest",
-    "check_rigid",
     "get_state_to_persist",
+    "reply_error",
     "reply_internal_error",
-    "reply_malformed",
     "reply_overloaded",
-    "report_start",
     "start",
     "step",
 ]

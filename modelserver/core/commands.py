@@ -36,7 +36,6 @@ from modelserver.messages import (
     ReloadModel,
     ReloadReply,
     ReplyHeader,
-    Request,
     SendReply,
     SensorHeader,
     SetHTransform,
@@ -62,6 +61,9 @@ class ModelLoaded:
     why: str = ""
 
 
+COMMANDS: Final = (ReloadModel, SetStateVector, SetHTransform)
+"""Requests that must be signed."""
+
 SET_COVARIANCE: Final = tuple(np.diag([1.0] * 3 + [math.radians(5.0) ** 2] * 3).ravel().tolist())
 """Default covariance of a pose that is set: 1 m and 5 degrees."""
 
@@ -74,15 +76,13 @@ UNSIGNED_MESSAGE: Final = (
 )
 
 
-def deny_unsigned(state: CoreState, request: ReloadModel | SetStateVector | SetHTransform, now: Instant) -> StepResult:
+def deny_unsigned(state: CoreState, command: ReloadModel | SetStateVector | SetHTransform, now: Instant) -> StepResult:
     """Deny a command without signature."""
-    if not is_answerable(request.header, state.settings.reply_prefix):
-        return count_rejection(state, CHANNEL_OF[type(request)], "reply_channel"), ()
-    reload = isinstance(request, ReloadModel)
-    if not (state.settings.may_reload if reload else state.settings.may_set_pose):
-        return _deny(state, request, "commands.reload" if reload else "commands.set_pose", now)
-    state = count_rejection(state, CHANNEL_OF[type(request)], "unsigned")
-    return state, reply_error(state, type(request), request.header, Status.FORBIDDEN, UNSIGNED_MESSAGE, now)
+    forbidden = _forbid(state, command, now)
+    if forbidden is not None:
+        return forbidden
+    state = count_rejection(state, CHANNEL_OF[type(command)], "unsigned")
+    return state, reply_error(state, type(command), command.header, Status.FORBIDDEN, UNSIGNED_MESSAGE, now)
 
 
 def execute_command(state: CoreState, signed: SignedCommand, now: Instant) -> StepResult:
@@ -90,12 +90,28 @@ def execute_command(state: CoreState, signed: SignedCommand, now: Instant) -> St
     command = signed.command
     if isinstance(command, SwitchMode):
         return switch_mode(state, command, now)
-    reload = isinstance(command, ReloadModel)
-    if not is_answerable(command.header, state.settings.reply_prefix):
-        return count_rejection(state, CHANNEL_OF[type(command)], "reply_channel"), ()
-    if not (state.settings.may_reload if reload else state.settings.may_set_pose):
-        return _deny(state, command, "commands.reload" if reload else "commands.set_pose", now)
+    forbidden = _forbid(state, command, now)
+    if forbidden is not None:
+        return forbidden
     return (state, (LoadModel(command),)) if isinstance(command, ReloadModel) else _set_pose(state, command, now)
+
+
+def _forbid(state: CoreState, command: ReloadModel | SetStateVector | SetHTransform, now: Instant) -> StepResult | None:
+    """Reject a command whose reply channel, or which itself, is not permitted; None if it is."""
+    channel, settings = CHANNEL_OF[type(command)], state.settings
+    if not is_answerable(command.header, settings.reply_prefix):
+        return count_rejection(state, channel, "reply_channel"), ()
+    name, is_permitted = "set_pose", settings.may_set_pose
+    if isinstance(command, ReloadModel):
+        name, is_permitted = "reload", settings.may_reload
+    if is_permitted:
+        return None
+    state = count_rejection(state, channel, "forbidden")
+    why = (
+        f"the vehicle file does not permit it; write commands: {{{name}: true}} and beside it a key_file, whose key "
+        "clients sign with"
+    )
+    return state, reply_error(state, type(command), command.header, Status.FORBIDDEN, why, now)
 
 
 def apply_model(state: CoreState, loaded: ModelLoaded, now: Instant) -> StepResult:
@@ -186,13 +202,3 @@ def _has_other_origin(pose: PoseAnswer, origin: Origin) -> bool:
     """Return whether a pose names another origin; without a name it means the server's."""
     named = pose.transformation.origin_id
     return (pose.origin is not None and pose.origin != origin) or (named != 0 and named != origin.origin_id)
-
-
-def _deny(state: CoreState, request: Request, key: str, now: Instant) -> StepResult:
-    state = count_rejection(state, CHANNEL_OF[type(request)], "forbidden")
-    section, _, name = key.partition(".")
-    why = (
-        f"the vehicle file does not permit it; write {section}: {{{name}: true}} and beside it a key_file, whose key "
-        "clients sign with"
-    )
-    return state, reply_error(state, type(request), request.header, Status.FORBIDDEN, why, now)

@@ -10,7 +10,6 @@ Sensor timeout: a source is silent after `get_silence_limit` of its usual interv
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 from modelserver.core.host_clock import Instant
 from modelserver.core.state import (
@@ -116,7 +115,7 @@ def _update_rates(state: CoreState, now: Instant) -> CoreState:
 
     def start_period(each: SourceTraffic) -> SourceTraffic:
         rate = (each.count - each.reported) / elapsed if elapsed > 0 else 0.0
-        return replace(each, reported=each.count, rate=rate, delay=NAN, reported_delay=each.delay)
+        return each._replace(reported=each.count, rate=rate, delay=NAN, reported_delay=each.delay)
 
     return state._replace(traffic={name: start_period(traffic) for name, traffic in state.traffic.items()})
 

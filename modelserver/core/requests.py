@@ -57,8 +57,6 @@ def handle_request(state: CoreState, request: Request, now: Instant) -> tuple[Co
 
 def _must_wait(state: CoreState, request: TimedRequest) -> bool:
     """Return whether the data that a request asks for are yet to come, and it may wait for them."""
-    if not request.time.wait_ms:
-        return False
     ends = (names.WORLD_UTM, state.view.base_frame)
     if isinstance(request, (GetTransformation, GetMotion, GetExplanation)):
         ends = (request.frame_of_interest, request.frame_of_reference)
@@ -102,14 +100,10 @@ def handle_denied(state: CoreState, command: Denied, now: Instant) -> StepResult
     if command.request_type is None or command.header is None:
         return state, ()
     if command.is_malformed:
-        return state, reply_malformed(state, command.request_type, command.header, command.message, now)
-    why = f"the command is denied: {command.message}"
-    return state, reply_error(state, command.request_type, command.header, Status.FORBIDDEN, why, now)
-
-
-def reply_malformed(state: CoreState, kind: type[Request], header: RequestHeader, why: str, now: Instant) -> Outputs:
-    """Reply to a request of which only the header can be decoded."""
-    return reply_error(state, kind, header, Status.MALFORMED, why, now)
+        status, why = Status.MALFORMED, command.message
+    else:
+        status, why = Status.FORBIDDEN, f"the command is denied: {command.message}"
+    return state, reply_error(state, command.request_type, command.header, status, why, now)
 
 
 def reply_error(

@@ -7,17 +7,19 @@ from dataclasses import replace
 from typing import Final
 
 from modelserver.core.host_clock import Instant
-from modelserver.core.persistence import WARM_START, report_start
 from modelserver.core.requests import answer_waiting
 from modelserver.core.state import (
     DEGRADED,
     RUNNING,
+    START,
+    START_REPORT_NS,
     STARTING,
     CoreState,
     StepResult,
     count_decision,
     count_message,
     count_rejection,
+    handle_warning,
     mark_received,
 )
 from modelserver.estimation.interface import Localizer
@@ -25,6 +27,7 @@ from modelserver.geometry import names
 from modelserver.messages import (
     VALID,
     Decision,
+    HealthWarning,
     Invalid,
     JointsSample,
     Output,
@@ -32,6 +35,7 @@ from modelserver.messages import (
     PublishDecisions,
     PublishPose,
     Rejected,
+    ReportStart,
     Sample,
     SwitchMode,
     Verdict,
@@ -44,6 +48,9 @@ COMMAND_FUTURE_LIMIT_S: Final = 1.0
 SAMPLE_FUTURE_LIMIT_S: Final = 0.25
 """The same for a sample: synchronized clocks differ by less, and a fix that is fused a quarter of a second late is off
 by what the vehicle travels in that time."""
+
+WARM_START: Final = "warm_start"
+"""Kind of the decisions on the persisted state of an earlier run."""
 
 
 def process_sample(state: CoreState, sample: Sample, now: Instant) -> StepResult:
@@ -147,6 +154,13 @@ def update_localizer(state: CoreState, before: Localizer, sample: Sample | Switc
             state, replies = answer_waiting(state, now)
             outputs.extend(replies)
     return state, tuple(outputs)
+
+
+def report_start(state: CoreState, decision: Decision, now: Instant) -> StepResult:
+    """Report what became of the persisted state of an earlier run."""
+    if now.monotonic_ns - state.started_ns <= START_REPORT_NS:
+        state, _ = handle_warning(state, HealthWarning(START, decision.reason), now)
+    return state, (ReportStart(decision.reason),)
 
 
 def publish_pose(state: CoreState, utime: int) -> tuple[CoreState, PublishPose]:

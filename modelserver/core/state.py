@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, Literal, NamedTuple, TypeAlias
 
@@ -35,6 +35,12 @@ MAX_COUNTERS: Final = 256
 """Distinct causes of rejection with a counter of their own; further ones share one."""
 
 STARTING, RUNNING, DEGRADED = 0, 1, 2
+
+START: Final = "start"
+"""Subject of the warning on how the server started."""
+
+START_REPORT_NS: Final = 600_000_000_000
+"""How long the health report shows how the server started: ten minutes."""
 
 SILENT_INTERVALS: Final = 5.0
 MIN_SILENCE_S: Final = 1.0
@@ -102,8 +108,7 @@ class ExpectedSensor(NamedTuple):
     source: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class SourceTraffic:
+class SourceTraffic(NamedTuple):
     """Statistics of the messages of one source.
 
     Attributes
@@ -116,7 +121,7 @@ class SourceTraffic:
     dropped, reason: measurements dropped in a row since the last used one, and the last reason.
     """
 
-    count: int = 0
+    count: int = 0  # type: ignore[assignment]  # hides tuple.count
     last_received_ns: int = 0
     reported: int = 0
     interval: float = 0.0
@@ -274,19 +279,7 @@ def count_message(state: CoreState, source: str, host_utime: int, now: Instant) 
     if host_utime:
         latest = (now.utime - host_utime) * 1e-6
         delay = delay if delay >= latest else latest  # also if it is nan
-    updated = SourceTraffic(
-        known.count + 1,
-        now.monotonic_ns,
-        known.reported,
-        interval,
-        delay,
-        known.rate,
-        known.reported_delay,
-        known.measured,
-        known.used,
-        known.dropped,
-        known.reason,
-    )
+    updated = known._replace(count=known.count + 1, last_received_ns=now.monotonic_ns, interval=interval, delay=delay)
     return state._replace(traffic={**state.traffic, source: updated})
 
 
@@ -297,8 +290,7 @@ def count_decision(state: CoreState, decision: Decision) -> CoreState:
     if known is None or decision.kind in UNCOUNTED_KINDS:
         return state
     is_rejected = decision.verdict is Verdict.REJECTED
-    updated = replace(
-        known,
+    updated = known._replace(
         measured=known.measured + 1,
         used=known.used + (decision.verdict in (Verdict.USED, Verdict.RESET)),
         dropped=known.dropped + 1 if is_rejected else 0,

@@ -6,11 +6,19 @@ from typing import Final
 
 from modelserver.core import health
 from modelserver.core.host_clock import Instant
-from modelserver.core.persistence import persist_if_due
 from modelserver.core.requests import answer_waiting
 from modelserver.core.samples import check_host_clock, publish_pose
-from modelserver.core.state import CoreState, StepResult
-from modelserver.messages import Output, PublishNavigation, PublishSnapshot, Tick
+from modelserver.core.state import START, START_REPORT_NS, CoreState, StepResult, handle_warning
+from modelserver.estimation.interface import PersistentLocalizer
+from modelserver.messages import (
+    HealthWarning,
+    Output,
+    PersistedState,
+    PersistState,
+    PublishNavigation,
+    PublishSnapshot,
+    Tick,
+)
 
 MAX_TICK_LATENCIES: Final = 512
 """Tick latencies that are retained for the percentiles of a health report."""
@@ -45,11 +53,25 @@ def handle_tick(state: CoreState, tick: Tick, now: Instant) -> StepResult:
         state = state._replace(snapshot_due_ns=now.monotonic_ns + settings.snapshot_period_ns)
         outputs.append(PublishSnapshot(now.utime))
     if settings.persist_period_ns:
-        state, to_persist = persist_if_due(state, now)
-        outputs.extend(to_persist)
+        if START in state.warnings and now.monotonic_ns - state.started_ns > START_REPORT_NS:
+            state, _ = handle_warning(state, HealthWarning(START), now)
+        if now.monotonic_ns >= state.persist_due_ns:
+            state = state._replace(persist_due_ns=now.monotonic_ns + settings.persist_period_ns)
+            to_persist = get_state_to_persist(state, now)
+            if to_persist is not None:
+                outputs.append(PersistState(to_persist))
     return state, tuple(outputs)
 
 
 def _is_due(every: int, before: int, after: int) -> bool:
     """Return whether ticks `before` to `after` (counted from 0, without the last) hold a multiple of `every`."""
     return (after - 1) // every > (before - 1) // every
+
+
+def get_state_to_persist(state: CoreState, now: Instant) -> PersistedState | None:
+    """Return the state for the next run; None if it is no better than what was persisted before."""
+    localizer: object = state.localizer
+    found = localizer.get_state_to_persist() if isinstance(localizer, PersistentLocalizer) else None
+    if found is None:
+        return None
+    return found._replace(vehicle=state.settings.vehicle, utime=now.utime, monotonic_ns=now.monotonic_ns)

@@ -16,6 +16,7 @@ from modelserver import core
 from modelserver.config.vehicle_file import KEY_HINT, VehicleConfig, WheelsConfig, add_lines
 from modelserver.core import CoreSettings, CoreState, ExpectedSensor, Instant
 from modelserver.core.commands import ModelLoaded
+from modelserver.core.state import START
 from modelserver.earth.geodesy import GeodesyError, make_origin
 from modelserver.errors import (
     ConfigError,
@@ -127,7 +128,7 @@ class Vehicle:
             sensors=self.expected_sensors(),
         )
         state = core.start(settings, self.model, localizer, now)
-        return state._replace(warnings={core.START: start_report}) if start_report else state
+        return state._replace(warnings={START: start_report}) if start_report else state
 
     def make_localizer_setup(self) -> LocalizerConfig | None:
         """Make the configuration of the localizers; None without a localization sensor."""

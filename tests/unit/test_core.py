@@ -22,7 +22,8 @@ from support_samples import (
 )
 
 from modelserver import core
-from modelserver.core import MAX_COUNTERS, AllOutputs, CoreSettings, CoreState, Instant, step
+from modelserver.core import AllOutputs, CoreSettings, CoreState, Instant, step
+from modelserver.core.state import MAX_COUNTERS
 from modelserver.errors import Status, UnknownBodyError, UnknownFrameError
 from modelserver.estimation.history import MIN_STEP_US
 from modelserver.estimation.raw.localizer import RawLocalizer
@@ -177,7 +178,7 @@ def test_given_each_request_when_dropped_or_failed_then_the_reply_has_the_type_o
     for outputs, status in (
         (core.reply_overloaded(state, request_, instant_at(START)), Status.OVERLOADED),
         (core.reply_internal_error(state, request_, instant_at(START)), Status.INTERNAL),
-        (core.reply_malformed(state, type(request_), ME, "why", instant_at(START)), Status.MALFORMED),
+        (core.reply_error(state, type(request_), ME, Status.MALFORMED, "why", instant_at(START)), Status.MALFORMED),
     ):
         (output,) = outputs
         assert isinstance(output, SendReply)
@@ -257,7 +258,7 @@ def test_given_a_reply_channel_outside_the_rules_then_it_is_counted_and_there_is
         assert run.rejected == {(CHANNEL_OF[type(request)], "reply_channel"): 1}
         assert core.reply_overloaded(run.state, odd, instant_at(START)) == ()
         assert core.reply_internal_error(run.state, odd, instant_at(START)) == ()
-        assert core.reply_malformed(run.state, type(odd), odd.header, "", instant_at(START)) == ()
+        assert core.reply_error(run.state, type(odd), odd.header, Status.MALFORMED, "", instant_at(START)) == ()
 
 
 @pytest.mark.parametrize("channel", ["REPLY_A", "REPLY_a_9", "REPLY_" + "A" * 57])

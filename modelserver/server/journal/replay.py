@@ -10,7 +10,7 @@ from collections.abc import Container, Mapping
 
 from modelserver import core
 from modelserver.core import AllOutputs, Instant
-from modelserver.errors import RecordingError, WireError
+from modelserver.errors import RecordingError, Status, WireError
 from modelserver.messages import (
     PublishDecisions,
     PublishHealth,
@@ -101,7 +101,7 @@ class ReplayLoop(Loop):
             if record.kind is RecordKind.MALFORMED and header is not None:
                 kind = get_request_type(channel.type_name)
                 assert kind is not None
-                self.send(core.reply_malformed(self.state, kind, header, str(error), now))
+                self.send(core.reply_error(self.state, kind, header, Status.MALFORMED, str(error), now))
                 return
             raise RecordingError(f"a request on {record.channel} cannot be decoded: {error}") from error
         if record.kind is RecordKind.REQUEST:

@@ -25,7 +25,7 @@ from typing import Final, Protocol
 from modelserver import core
 from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.core import CoreState, Instant
-from modelserver.errors import QueryError, WireError
+from modelserver.errors import QueryError, Status, WireError
 from modelserver.geometry import names
 from modelserver.messages import (
     CHANNEL_OF,
@@ -384,7 +384,7 @@ class RequestHandler:
             if header is not None and kind is not None:
                 now = self._clock.now()
                 context.record(RecordKind.MALFORMED, channel, data, now)
-                context.send(core.reply_malformed(context.state, kind, header, str(error), now))
+                context.send(core.reply_error(context.state, kind, header, Status.MALFORMED, str(error), now))
             return
         effort = effort_of(request)
         if is_deferred(request):

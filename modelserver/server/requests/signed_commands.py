@@ -9,16 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from modelserver.core import Instant
+from modelserver.core import Instant, commands
 from modelserver.errors import WireError
 from modelserver.messages import (
     CHANNEL_OF,
     Denied,
     Envelope,
-    ReloadModel,
     Request,
-    SetHTransform,
-    SetStateVector,
     SignedCommand,
 )
 from modelserver.signing.signatures import Freshness, Key, check_freshness, has_valid_signature
@@ -26,10 +23,8 @@ from modelserver.wire.channels import BY_NAME, SIGNED
 from modelserver.wire.codec import decode
 from modelserver.wire.queries import read_request_header
 
-COMMANDS: Final[Mapping[str, type[Request]]] = {
-    CHANNEL_OF[kind]: kind for kind in (ReloadModel, SetStateVector, SetHTransform)
-}
-"""Channels of requests that must be signed."""
+COMMANDS: Final[Mapping[str, type[Request]]] = {CHANNEL_OF[kind]: kind for kind in commands.COMMANDS}
+"""Request types that must be signed, by channel."""
 
 MODE_TYPE: Final = "localization_mode_t"
 

@@ -11,6 +11,7 @@ from support_samples import GEOMETRY, START, VEHICLE, ScriptedLocalizer, instant
 
 from modelserver import core
 from modelserver.config.vehicle_file import load_config
+from modelserver.core.samples import report_start
 from modelserver.estimation.filter.persistence import ago, judged, named
 from modelserver.estimation.modes import ModeLocalizer
 from modelserver.messages import (
@@ -153,7 +154,7 @@ def test_given_nothing_to_persist_then_there_is_no_output(localizer) -> None:
 def test_given_a_report_on_the_start_then_it_is_shown_for_ten_minutes_and_cleared() -> None:
     state = start_core(PersistentScriptedLocalizer(newest=START), persist_period_ns=EVERY_S * 10**9)
     word = Decision(START, "filter", 0, "warm_start", Verdict.RESET, "warm start: all of it")
-    state, outputs = core.report_start(state, word, instant_at(START))
+    state, outputs = report_start(state, word, instant_at(START))
     assert outputs == (ReportStart("warm start: all of it"),)
     assert state.warnings == {"start": "warm start: all of it"}
     state, _ = core.step(state, Tick(), instant_at(START + 599_000_000))
@@ -161,7 +162,7 @@ def test_given_a_report_on_the_start_then_it_is_shown_for_ten_minutes_and_cleare
     state, _ = core.step(state, Tick(), instant_at(START + 601_000_000))
     assert state.warnings == {}
     # a later one is only logged
-    state, outputs = core.report_start(state, word, instant_at(START + 700_000_000))
+    state, outputs = report_start(state, word, instant_at(START + 700_000_000))
     assert (len(outputs), state.warnings) == (1, {})
 
 
