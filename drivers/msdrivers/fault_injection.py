@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Generic, TypeVar
 
 from modelserver.errors import find_nearest_names, quote
-from msdrivers.emulate import InjectedFault as InjectedFault
+from msdrivers.emulate.faults import FaultQueue
+from msdrivers.emulate.faults import InjectedFault as InjectedFault
 from msdrivers.endpoint import Endpoint, EndpointPhase, EndpointStatus, HostTime, Output, Send
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.modbus.registers import Registers
@@ -58,31 +58,26 @@ class FaultInjector(Generic[U]):
     def __init__(self, make: Callable[[], Endpoint[U]], faults: Sequence[InjectedFault]):
         self._make = make
         self._inner = make()
-        self._faults = sorted(faults, key=lambda fault: fault.at, reverse=True)
-        self._started_ns: int | None = None
-        self._silent_until_ns = 0
+        self._faults = FaultQueue[U](faults, corrupt_unit)
         self._is_restarting = False
         self._clock_jump_ns = 0
-        self._pending: Counter[str] = Counter()
-        self._counts: Counter[str] = Counter()
 
     def on_open(self, now: HostTime) -> Sequence[Output[U]]:
         """Power on."""
-        if self._started_ns is None:
-            self._started_ns = now.monotonic_ns
+        self._faults.start(now.monotonic_ns)
         return self._filter_outputs(self._inner.on_open(self._to_device_time(now)), now)
 
     def on_receive(self, unit: U, now: HostTime) -> Sequence[Output[U]]:
         """Pass on a received unit unless the device is silent."""
         struck = self._apply_due_faults(now)
-        if now.monotonic_ns < self._silent_until_ns:
+        if self._faults.is_silent(now.monotonic_ns):
             return struck
         return [*struck, *self._filter_outputs(self._inner.on_receive(unit, self._to_device_time(now)), now)]
 
     def on_timer(self, now: HostTime) -> Sequence[Output[U]]:
         """Apply due faults; fire the device's timer."""
-        outputs = list(self._apply_due_faults(now))
-        if self._is_restarting and now.monotonic_ns >= self._silent_until_ns:
+        outputs = self._apply_due_faults(now)
+        if self._is_restarting and not self._faults.is_silent(now.monotonic_ns):
             self._is_restarting = False
             self._inner = self._make()
             outputs += self._filter_outputs(self._inner.on_open(self._to_device_time(now)), now)
@@ -93,13 +88,10 @@ class FaultInjector(Generic[U]):
 
     def get_deadline(self) -> int | None:
         """Return when the device, or a fault, is due."""
-        due = None if self._is_restarting else self._inner.get_deadline()
-        dues = [due - self._clock_jump_ns] if due is not None else []
-        if self._is_restarting:
-            dues.append(self._silent_until_ns)
-        if self._faults and self._started_ns is not None:
-            dues.append(self._started_ns + round(self._faults[-1].at * 1e9))
-        return min(dues, default=None)
+        inner = self._inner.get_deadline()
+        device = None if inner is None else inner - self._clock_jump_ns
+        dues = (self._faults.silent_until_ns if self._is_restarting else device, self._faults.get_deadline())
+        return min((due for due in dues if due is not None), default=None)
 
     def on_close(self, now: HostTime) -> Sequence[Output[U]]:
         """Close the device."""
@@ -108,43 +100,26 @@ class FaultInjector(Generic[U]):
     @property
     def counts(self) -> Mapping[str, int]:
         """The device's counters, and the units that faults took or damaged."""
-        return {**self._inner.counts, **self._counts}
+        return {**self._inner.counts, **self._faults.counts}
 
     def _to_device_time(self, now: HostTime) -> HostTime:
         return HostTime(now.monotonic_ns + self._clock_jump_ns, now.utime + self._clock_jump_ns // 1000)
 
     def _apply_due_faults(self, now: HostTime) -> list[Output[U]]:
         outputs: list[Output[U]] = []
-        since = 0 if self._started_ns is None else now.monotonic_ns - self._started_ns
-        while self._faults and round(self._faults[-1].at * 1e9) <= since:
-            fault = self._faults.pop()
-            amount_ns = round(fault.amount * 1e9)
-            if fault.kind in ("stall", "restart"):
-                self._silent_until_ns = now.monotonic_ns + amount_ns
-                self._is_restarting = self._is_restarting or fault.kind == "restart"
-            elif fault.kind == "jump":
-                self._clock_jump_ns += amount_ns
-            else:
-                self._pending[fault.kind] += round(fault.amount)
+        for fault, _ in self._faults.pop_due(now.monotonic_ns):
+            self._is_restarting = self._is_restarting or fault.kind == "restart"
+            if fault.kind == "jump":
+                self._clock_jump_ns += round(fault.amount * 1e9)
             outputs.append(EndpointStatus(EndpointPhase.STREAMING, f"fault: {fault.kind}, {fault.amount:g}"))
         return outputs
 
     def _filter_outputs(self, outputs: Sequence[Output[U]], now: HostTime) -> list[Output[U]]:
         passed: list[Output[U]] = []
         for output in outputs:
-            if not isinstance(output, Send):
-                passed.append(output)
-            elif now.monotonic_ns < self._silent_until_ns:
-                self._counts["fault.silenced"] += 1
-            elif self._pending["drop"] > 0:
-                self._pending["drop"] -= 1
-                self._counts["fault.dropped"] += 1
-            elif self._pending["corrupt"] > 0:
-                self._pending["corrupt"] -= 1
-                self._counts["fault.corrupted"] += 1
-                passed.append(Send(corrupt_unit(output.unit)))
-            else:
-                passed.append(output)
+            passed += (
+                self._faults.filter_units((output.unit,), now.monotonic_ns) if isinstance(output, Send) else [output]
+            )
         return passed
 
 

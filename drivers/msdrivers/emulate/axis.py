@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from msdrivers.emulate import InjectedFault
-from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Send
+from msdrivers.emulate.faults import FaultQueue, InjectedFault
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output
 from msdrivers.protocol.modbus.axis_map import AxisRegisters
 from msdrivers.protocol.modbus.registers import (
     MAX_READ,
@@ -59,10 +59,10 @@ class AxisEmulator:
     def __init__(self, registers: AxisRegisters, unit: AxisUnit | None = None, faults: Iterable[InjectedFault] = ()):
         self.unit = unit or AxisUnit()
         self._registers = registers
-        self._faults = deque(sorted(faults, key=lambda fault: fault.at))
+        self._faults = FaultQueue[ModbusUnit](
+            faults, lambda unit: replace(unit, values=unit.values[:-1]) if isinstance(unit, Registers) else unit
+        )
         self._started_ns: int | None = None
-        self._drop = self._corrupt = 0
-        self._silent_until_ns = 0
         self._exceptions: deque[int] = deque()
         self.counts: Counter[str] = Counter()
         self._switch_on(0)
@@ -71,24 +71,20 @@ class AxisEmulator:
         """Power on at the first opening; later the axis has continued."""
         if self._started_ns is None:
             self._started_ns = self._updated_ns = now.monotonic_ns
+            self._faults.start(now.monotonic_ns)
         return [EndpointStatus(EndpointPhase.STREAMING, "axis emulated")]
 
     def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
         """Answer a request."""
-        self._apply_due_faults(now.monotonic_ns)
-        if now.monotonic_ns < self._silent_until_ns or not isinstance(unit, ReadRegisters | WriteRegisters):
-            return []
-        if self._drop:
-            self._drop -= 1
+        for fault, due in self._faults.pop_due(now.monotonic_ns):
+            self._apply_fault(fault, due)
+        if self._faults.is_silent(now.monotonic_ns) or not isinstance(unit, ReadRegisters | WriteRegisters):
             return []
         self._advance(now.monotonic_ns)
         code = self._exceptions.popleft() if self._exceptions else 0
         reply = self._make_exception(unit, code) if code else self._answer(unit)
         self.counts["exceptions" if isinstance(reply, ModbusFailure) else "replies"] += 1
-        if self._corrupt and isinstance(reply, Registers):
-            self._corrupt -= 1
-            reply = Registers(reply.address, reply.values[:-1], reply.transaction)
-        return [Send(reply)]
+        return [*self._faults.filter_units((reply,), now.monotonic_ns)]
 
     def on_timer(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Do nothing: it only answers."""
@@ -122,25 +118,14 @@ class AxisEmulator:
         self._measured_deg = self._angle
         self._measured_rate = 0.0
 
-    def _apply_due_faults(self, at_ns: int) -> None:
-        """Apply the faults that are due."""
-        started = self._started_ns or 0
-        while self._faults and started + round(self._faults[0].at * 1e9) <= at_ns:
-            fault = self._faults.popleft()
-            due = started + round(fault.at * 1e9)
-            if fault.kind == "drop":
-                self._drop += round(fault.amount)
-            elif fault.kind == "corrupt":
-                self._corrupt += round(fault.amount)
-            elif fault.kind == "exception":
-                self._exceptions.append(round(fault.amount))
-            elif fault.kind == "jump":
-                self._advance(due)
-                self._angle += fault.amount
-            else:
-                self._silent_until_ns = due + round(fault.amount * 1e9)
-                if fault.kind == "restart":
-                    self._switch_on(self._silent_until_ns)
+    def _apply_fault(self, fault: InjectedFault, at_ns: int) -> None:
+        if fault.kind == "exception":
+            self._exceptions.append(round(fault.amount))
+        elif fault.kind == "jump":
+            self._advance(at_ns)
+            self._angle += fault.amount
+        elif fault.kind == "restart":
+            self._switch_on(self._faults.silent_until_ns)
 
     def _advance(self, at_ns: int) -> None:
         """Turn on to an instant, and measure at the last instant of its own before."""

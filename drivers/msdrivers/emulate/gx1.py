@@ -14,7 +14,7 @@ from typing import NamedTuple
 from modelserver.messages import ImuSample, OrientationReference
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
-from msdrivers.emulate import InjectedFault
+from msdrivers.emulate.faults import FaultQueue, InjectedFault
 from msdrivers.emulate.gx1_unit import GAINS, Eeprom, Gx1Unit, UnitClock
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Send
 from msdrivers.protocol.gx1 import MEASUREMENTS, CommandByte, EepromAddress, Gains, Gx1Packet, Gx1Request, RequestParser
@@ -122,16 +122,16 @@ class Gx1Emulator:
         self._samples = SampleInterpolator(samples)
         self._requests = RequestParser()
         self._outbox: deque[tuple[int, bytes]] = deque()
-        self._faults = deque(sorted(self.unit.faults, key=lambda fault: fault.at))
+        self._faults = FaultQueue[bytes](
+            self.unit.faults, lambda raw: raw[:-3] + bytes((raw[-3] ^ 0x10,)) + raw[-2:], silencing=("stall",)
+        )
         self._opened_ns: int | None = None
-        self._stalled_until_ns = 0
         self._clock = UnitClock.make(self.eeprom, self.unit, 0, 0)
         self._tick = 0
         self._gains = GAINS
         self._bias: Vector3 = (0.0, 0.0, 0.0)
         self._capture: tuple[int, list[Vector3]] | None = None
         self._extremes: tuple[list[int], list[int]] = ([MAX_WORD] * 3, [MIN_WORD] * 3)
-        self._pending = Counter[str]()
         self._utime_offset_us = 0
         self.counts: Counter[str] = Counter()
 
@@ -139,6 +139,7 @@ class Gx1Emulator:
         """Switch on at the first time; later the device has run on."""
         if self._opened_ns is None:
             self._opened_ns = now.monotonic_ns
+            self._faults.start(now.monotonic_ns)
             self._switch_on(now.monotonic_ns, self.unit.tick_offset)
         return [
             EndpointStatus(
@@ -150,7 +151,7 @@ class Gx1Emulator:
     def on_receive(self, unit: bytes, now: HostTime) -> list[Output[bytes]]:
         """Process received bytes."""
         outputs = self.on_timer(now)
-        if now.monotonic_ns < max(self._clock.started_ns, self._stalled_until_ns):
+        if now.monotonic_ns < max(self._clock.started_ns, self._faults.silent_until_ns):
             return outputs
         for request in self._requests.feed(unit):
             self.counts[f"request.{CommandByte(request.command).name.lower()}"] += 1
@@ -162,8 +163,8 @@ class Gx1Emulator:
         if self._opened_ns is None:
             return []
         self._utime_offset_us = now.utime - now.monotonic_ns // 1000
-        while self._faults and self._opened_ns + round(self._faults[0].at * 1e9) <= now.monotonic_ns:
-            self.apply_fault(self._faults.popleft(), now)
+        for fault, _ in self._faults.pop_due(now.monotonic_ns):
+            self.apply_fault(fault, now)
         self._run_cycles(now.monotonic_ns)
         return self._pop_sent(now.monotonic_ns)
 
@@ -173,9 +174,9 @@ class Gx1Emulator:
             return None
         instants = [self._clock.instant_of(self._tick)]
         if self._outbox:
-            instants.append(max(self._outbox[0][0], self._stalled_until_ns))
-        if self._faults:
-            instants.append(self._opened_ns + round(self._faults[0].at * 1e9))
+            instants.append(max(self._outbox[0][0], self._faults.silent_until_ns))
+        if (fault_ns := self._faults.get_deadline()) is not None:
+            instants.append(fault_ns)
         return min(instants)
 
     def on_close(self, now: HostTime) -> list[Output[bytes]]:
@@ -183,16 +184,12 @@ class Gx1Emulator:
         return []
 
     def apply_fault(self, fault: InjectedFault, now: HostTime) -> None:
-        """Apply a fault."""
-        if fault.kind == "stall":
-            self._stalled_until_ns = now.monotonic_ns + round(fault.amount * 1e9)
-        elif fault.kind == "jump":
+        """Apply a fault that is the device's own."""
+        if fault.kind == "jump":
             self._clock = replace(self._clock, offset=self._clock.offset + round(fault.amount))
         elif fault.kind == "restart":
             self._switch_on(now.monotonic_ns + round(self.unit.boot_time * 1e9), 0)
             self.streamed, self._bias = 0, (0.0, 0.0, 0.0)
-        else:
-            self._pending[fault.kind] += round(fault.amount)
 
     def _switch_on(self, at_ns: int, ticks: int) -> None:
         self._clock = UnitClock.make(self.eeprom, self.unit, at_ns, ticks)
@@ -332,21 +329,15 @@ class Gx1Emulator:
             if command in (CommandByte.CONTINUOUS, CommandByte.FIRMWARE, CommandByte.SERIAL)
             else self._clock.ticks_at(at_ns)
         )
-        raw = Gx1Packet(command, words, ticks).to_bytes()
-        if self._pending["drop"] > 0:
-            self._pending["drop"] -= 1
-            return
-        if self._pending["corrupt"] > 0:
-            self._pending["corrupt"] -= 1
-            raw = raw[:-3] + bytes((raw[-3] ^ 0x10,)) + raw[-2:]
         send_ns = at_ns + round(self.unit.delay * 1e9)
         if self._outbox:
             send_ns = max(send_ns, self._outbox[-1][0])
-        self._outbox.append((send_ns, raw))
+        for sent in self._faults.filter_units((Gx1Packet(command, words, ticks).to_bytes(),), at_ns):
+            self._outbox.append((send_ns, sent.unit))
 
     def _pop_sent(self, now_ns: int) -> list[Output[bytes]]:
         outputs: list[Output[bytes]] = []
-        if now_ns < self._stalled_until_ns:
+        if self._faults.is_silent(now_ns):
             # replies during a stall are lost
             self._outbox.clear()
         while self._outbox and self._outbox[0][0] <= now_ns:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from modelserver.transforms.so3 import Vector3
-from msdrivers.emulate import InjectedFault
+from msdrivers.emulate.faults import InjectedFault
 from msdrivers.protocol.gx1 import EepromAddress, Gains
 from msdrivers.protocol.gx1.scaling import tick_from_timer_words
 

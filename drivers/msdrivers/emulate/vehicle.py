@@ -10,9 +10,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from modelserver.messages import VehicleMode, VehicleStatusSample
-from msdrivers.emulate import InjectedFault
-from msdrivers.emulate.can_faults import CanEmulator
-from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output
+from msdrivers.emulate.faults import CanEmulator, InjectedFault
+from msdrivers.endpoint import HostTime, Output
 from msdrivers.protocol.can.database import CanDatabase, FrameError
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.can.mapping import CommandMap, StatusMap
@@ -53,7 +52,7 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         faults: Iterable[InjectedFault] = (),
     ):
         """Bind the signals. Raises ConfigError as `bind_status` and `bind_command` do."""
-        super().__init__(samples, faults)
+        super().__init__("vehicle controller emulated", samples, faults)
         self.unit = unit or VehicleUnit()
         self.mode = self.unit.mode
         """Driving mode; set it to press the emergency stop."""
@@ -73,56 +72,33 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
 
     def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
         """Start at the first opening; later the vehicle has continued."""
-        if self._start(now):
+        if self._started is None:
             self._updated_ns = self._status_ns = now.monotonic_ns
-        return [EndpointStatus(EndpointPhase.STREAMING, "vehicle controller emulated"), *self.on_timer(now)]
+        return super().on_open(now)
 
     def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
         """Process a command."""
         outputs = self.on_timer(now)
         command = self._command
-        if command is None or unit.is_error or unit.key != command.forward_speed.key:
-            return outputs
-        if self._faults.is_silent(now.monotonic_ns):
+        is_command = command is not None and not unit.is_error and unit.key == command.forward_speed.key
+        if command is None or not is_command or self._faults.is_silent(now.monotonic_ns):
             return outputs
         try:
-            raw = self._database.decode(unit)
+            self._on_command(command, self._database.decode(unit), now.monotonic_ns)
         except FrameError as error:
             self.counts[f"rejected.{error.reason}"] += 1
-            return outputs
-        self._on_command(command, raw, now.monotonic_ns)
-        return outputs
-
-    def on_timer(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Advance the simulation, and send the status when it is due."""
-        outputs: list[Output[CanFrame]] = []
-        while (due := self.get_deadline()) is not None and due <= now.monotonic_ns:
-            faults, sample, errors = self._pop_due(due)
-            outputs += errors
-            for fault in faults:
-                if fault.kind == "restart":
-                    self.rejected, self._commanded_ns, self._alive = 0, None, None
-            if sample is not None:
-                self._apply_sample(sample)
-            if self._status_ns <= due:
-                self._advance(due)
-                self._status_ns += round(self.unit.status_period * 1e9)
-                outputs += self._faults.filter_frames(self._make_frames(), due)
         return outputs
 
     def get_deadline(self) -> int | None:
         """Return when the next status, sample or fault is due, monotonic nanoseconds."""
         if self._started is None:
             return None
-        deadlines = (self._status_ns, self._get_sample_ns(), self._faults.get_deadline())
-        return min(each for each in deadlines if each is not None)
+        other = super().get_deadline()
+        return self._status_ns if other is None else min(self._status_ns, other)
 
-    def _apply_sample(self, sample: VehicleStatusSample) -> None:
-        self.mode = sample.mode
-        if math.isfinite(sample.forward_speed):
-            self.speed = sample.forward_speed
-        if math.isfinite(sample.steering_angle):
-            self.steering = sample.steering_angle
+    def _on_fault(self, fault: InjectedFault) -> None:
+        if fault.kind == "restart":
+            self.rejected, self._commanded_ns, self._alive = 0, None, None
 
     def _on_command(self, command: BoundCommand, raw: dict[str, float], at_ns: int) -> None:
         self._advance(at_ns)
@@ -167,7 +143,15 @@ class VehicleEmulator(CanEmulator[VehicleStatusSample]):
         step = unit.steering_rate * seconds
         self.steering += min(max(steering - self.steering, -step), step)
 
-    def _make_frames(self) -> list[CanFrame]:
+    def _make_frames(self, sample: VehicleStatusSample | None, at_ns: int) -> list[CanFrame]:
+        if sample is not None:
+            self.mode = sample.mode
+            self.speed = sample.forward_speed if math.isfinite(sample.forward_speed) else self.speed
+            self.steering = sample.steering_angle if math.isfinite(sample.steering_angle) else self.steering
+        if self._status_ns > at_ns:
+            return []
+        self._advance(at_ns)
+        self._status_ns += round(self.unit.status_period * 1e9)
         status = self._status
         if status is None:
             return []

@@ -6,9 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 
 from modelserver.messages import Direction, WheelSample, WheelsSample
-from msdrivers.emulate import InjectedFault
-from msdrivers.emulate.can_faults import CanEmulator
-from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output
+from msdrivers.emulate.faults import CanEmulator, InjectedFault
 from msdrivers.protocol.can.database import BoundSignal, CanDatabase
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.can.mapping import WheelMap
@@ -27,7 +25,7 @@ class WheelsEmulator(CanEmulator[WheelsSample]):
         first_count: int = 0,
     ):
         """`first_count` is the counters' value at travel 0. Raises ConfigError as `bind_wheels` does."""
-        super().__init__(samples, faults)
+        super().__init__(f"{len(wheels)} wheels emulated", samples, faults)
         self._database = database
         self._wheels = bind_wheels(wheels, database, "wheels")
         self._raw: dict[str, dict[str, float]] = {}
@@ -38,45 +36,21 @@ class WheelsEmulator(CanEmulator[WheelsSample]):
         self._counted = dict.fromkeys((wheel.name for wheel in self._wheels), 0)
         self._rolled = dict.fromkeys((wheel.name for wheel in self._wheels), 0)
 
-    def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Start at the first opening; later the wheels have continued."""
-        self._start(now)
-        return [EndpointStatus(EndpointPhase.STREAMING, f"{len(self._wheels)} wheels emulated"), *self.on_timer(now)]
+    def _on_fault(self, fault: InjectedFault) -> None:
+        for name in self._offset:
+            if fault.kind == "jump":
+                self._offset[name] += round(fault.amount)
+            elif fault.kind == "restart":
+                self._offset[name] = -self._counted[name]
 
-    def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
-        """Ignore received frames."""
-        return []
-
-    def on_timer(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Send the samples that are due."""
-        outputs: list[Output[CanFrame]] = []
-        while True:
-            due = self.get_deadline()
-            if due is None or due > now.monotonic_ns:
-                return outputs
-            faults, sample, errors = self._pop_due(due)
-            outputs += errors
-            for fault in faults:
-                for name in self._offset:
-                    if fault.kind == "jump":
-                        self._offset[name] += round(fault.amount)
-                    elif fault.kind == "restart":
-                        self._offset[name] = -self._counted[name]
-            if sample is not None:
-                frames = self._make_frames(sample)
-                self.counts["frames"] += len(frames)
-                outputs += self._faults.filter_frames(frames, due)
-
-    def get_deadline(self) -> int | None:
-        """Return when the next sample or fault is due, monotonic nanoseconds."""
-        deadlines = (self._get_sample_ns(), self._faults.get_deadline())
-        return min((each for each in deadlines if each is not None), default=None)
-
-    def _make_frames(self, sample: WheelsSample) -> list[CanFrame]:
+    def _make_frames(self, sample: WheelsSample | None, at_ns: int) -> list[CanFrame]:
+        if sample is None:
+            return []
         wheels = {wheel.name: wheel for wheel in sample.wheels}
         for wheel in self._wheels:
             if wheel.name in wheels:
                 self._set_wheel(wheel, wheels[wheel.name])
+        self.counts["frames"] += len(self._raw)
         return [self._database.encode(message, raw) for message, raw in self._raw.items()]
 
     def _set_wheel(self, wheel: BoundWheel, sample: WheelSample) -> None:
@@ -110,4 +84,4 @@ class WheelsEmulator(CanEmulator[WheelsSample]):
         self._raw[signal.message][signal.name] = raw
 
     def _set_physical(self, signal: BoundSignal, value: float) -> None:
-        self._set_raw(signal, signal.to_bits(value))
+        self._raw[signal.message][signal.name] = signal.to_bits(value)
