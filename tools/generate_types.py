@@ -64,12 +64,6 @@ def read_lock(text: str) -> dict[str, str]:
 def generate_modules(types: Path, fingerprints: Mapping[str, str]) -> dict[str, str]:
     """Return the formatted text of each generated Python module by its path in the repository."""
     texts = message_generator.generate(types, fingerprints)
-    messages = "modelserver/messages"
-    texts[f"{messages}/__init__.py"] = message_generator.index_of(
-        ROOT / messages,
-        message_generator.ABOUT_MESSAGES,
-        {Path(path).name: text for path, text in texts.items() if path.startswith(messages)},
-    )
     return {path: format_python(text, path) for path, text in texts.items()}
 
 

@@ -29,7 +29,6 @@ those of nested messages included.
 
 from __future__ import annotations
 
-import ast
 import re
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -757,47 +756,12 @@ def _values_module(values: _Values, body: str) -> str:
     )
 
 
-ABOUT_MESSAGES: Final = """Values of the messages: samples, requests, replies, reports; inputs and outputs of the core.
-
-Units, frames and signs are those of the wire types in `lcmtypes/`, which declare most of them. A number that is not
-known is nan, a vector or matrix None. What is exchanged with every query is a NamedTuple, which costs a third of a
-dataclass; the rest are frozen dataclasses. This module and `generated` are written by `make types`.
-"""
-
 HAND_VALUES: Final = {
     "Invalid": "modelserver.messages.flags",
     "Quality": "modelserver.messages.flags",
     "Status": "modelserver.errors",
 }
 """Where the values are that no .lcm file declares."""
-
-
-def index_of(package: Path, about: str, fresh: Mapping[str, str]) -> str:
-    """Return the `__init__.py` of a package that exports each public definition of its modules.
-
-    `fresh` has the text of modules that are not written yet, by file name.
-    """
-    lines, exported = [], []
-    texts = {path.name: path.read_text(encoding="utf-8") for path in package.glob("[a-z]*.py")} | dict(fresh)
-    for name in sorted(texts.keys() - {"__init__.py"}):
-        names = sorted(_public_names(ast.parse(texts[name])))
-        if names:
-            lines.append(f"from {'.'.join(package.parts[-2:])}.{name.removesuffix('.py')} import {', '.join(names)}")
-            exported += names
-    listed = ", ".join(f'"{name}"' for name in sorted(exported))
-    return f'"""{about}"""\n\n' + "\n".join(lines) + f"\n\n__all__ = [{listed}]\n"
-
-
-def _public_names(tree: ast.Module) -> Iterator[str]:
-    for node in tree.body:
-        if isinstance(node, (ast.ClassDef, ast.FunctionDef)):
-            names = [node.name]
-        elif isinstance(node, (ast.Assign, ast.AnnAssign)):
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            names = [target.id for target in targets if isinstance(target, ast.Name)]
-        else:
-            continue
-        yield from (name for name in names if not name.startswith("_"))
 
 
 def _hand_imports(names: Iterable[str]) -> str:

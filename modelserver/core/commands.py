@@ -43,8 +43,8 @@ from modelserver.messages import (
     SignedCommand,
     SwitchMode,
     Verdict,
+    is_answerable,
 )
-from modelserver.messages.requests import is_answerable
 from modelserver.transforms.covariance import find_problem
 
 

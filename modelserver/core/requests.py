@@ -28,8 +28,8 @@ from modelserver.messages import (
     Request,
     RequestHeader,
     SendReply,
+    is_answerable,
 )
-from modelserver.messages.requests import is_answerable
 from modelserver.query.answers import DeferredAnswer, compute_replies, is_deferred, make_error_reply
 
 _TIMED: Final = (GetTransformation, GetStateVector, GetHTransform, GetMotion, GetExplanation)

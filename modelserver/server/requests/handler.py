@@ -40,8 +40,8 @@ from modelserver.messages import (
     SignedCommand,
     SwitchMode,
     TimeQuery,
+    is_answerable,
 )
-from modelserver.messages.requests import is_answerable
 from modelserver.query.answers import DeferredAnswer, compute_replies, effort_of, is_deferred
 from modelserver.server.bus import Bus
 from modelserver.server.clock import Clock

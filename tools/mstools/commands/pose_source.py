@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +15,6 @@ from mstools.terminal.options import parse_variables
 from mstools.terminal.output import print_problem
 
 if TYPE_CHECKING:
-    import lcm
-
     from modelserver.geometry.model import Model
     from mstools.recordings.log_platform import LogPlatform
 
@@ -30,19 +26,6 @@ def _check_world_frames(*frames: str) -> None:
         if frame.partition(":")[0] in names.RESERVED_BODIES and frame not in known:
             text = f"{quote(frame, 80)} is an unknown frame; known: {', '.join(known)}"
             raise UnknownFrameError(text, find_nearest_names(frame, known, 1))
-
-
-def handle_until(bus: lcm.LCM, seconds: float, is_done: Callable[[], bool]) -> bool:
-    """Handle messages of the bus for up to `seconds` until `is_done`; return whether it is."""
-    from modelserver.wire.provider import handle_message
-
-    deadline = time.monotonic() + seconds
-    while not is_done():
-        left = deadline - time.monotonic()
-        if left <= 0.0:
-            return False
-        handle_message(bus, int(left * 1e3) + 1)
-    return True
 
 
 class FileAnswers(FrameClient):
