@@ -23,17 +23,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from modelserver.errors import Location, Severity, Suggestion, quote, suggest_name
-from modelserver.formats.reading import (
-    MAX_POSITION,
-    MAX_SUGGESTIONS,
-    ORIGIN,
-    check_position,
-    find_cycles,
-    label,
-    parse_numbers,
-    repair_quaternion,
-    suggest_known_key,
-)
+from modelserver.formats import reading
+from modelserver.formats.reading import ORIGIN, ElementReader, SyntaxProblemError, label, suggest_known_key
 from modelserver.geometry import names
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import FIXED, Joint, JointType
@@ -83,29 +74,16 @@ def is_bot_param(content: bytes) -> bool:
     return _BEGIN.match(content) is not None and _FRAMES_BLOCK.search(content) is not None
 
 
-class _ParamSyntaxError(Exception):
-    def __init__(self, message: str, line: int, fix: str):
-        super().__init__(message)
-        self.line = line
-        self.fix = fix
-
-
 def parse_param_file(content: bytes, builder: ModelBuilder, file: str) -> ParamBlock | None:
     """Parse a file into one block; None, with an error in `builder`, for a syntax error."""
     try:
-        text = content.decode("utf-8-sig")
+        return _ParamParser(content.decode("utf-8-sig")).parse()
     except UnicodeDecodeError as error:
-        builder.add_error(
-            f"the file is not UTF-8 text: byte {content[error.start]:#04x} in this line",
-            Location(file, content.count(b"\n", 0, error.start) + 1),
-            "save it as UTF-8",
-        )
-        return None
-    try:
-        return _ParamParser(text).parse()
-    except _ParamSyntaxError as error:
+        message = f"the file is not UTF-8 text: byte {content[error.start]:#04x} in this line"
+        builder.add_error(message, Location(file, content.count(b"\n", 0, error.start) + 1), "save it as UTF-8")
+    except SyntaxProblemError as error:
         builder.add_error(str(error), Location(file, error.line), error.fix)
-        return None
+    return None
 
 
 class _ParamParser:
@@ -129,7 +107,7 @@ class _ParamParser:
                 if wrong == '"'
                 else "remove it, or put the text in quotes"
             )
-            raise _ParamSyntaxError(f"unexpected {quote(wrong)}", self.line, fix)
+            raise SyntaxProblemError(f"unexpected {quote(wrong)}", self.line, fix)
         self.line += self.text.count("\n", start, match.end())
         self.at = match.end()
         return kind, match[kind]
@@ -138,75 +116,62 @@ class _ParamParser:
         root = ParamBlock(self.line)
         open_blocks = [root]
         while True:
-            kind, text = self.next_token()
+            token = kind, text = self.next_token()
             if kind == "end":
                 if len(open_blocks) > 1:
-                    raise _ParamSyntaxError("a block is not closed", open_blocks[-1].line, "close it with }")
+                    raise SyntaxProblemError("a block is not closed", open_blocks[-1].line, "close it with }")
                 return root
-            if (kind, text) == ("mark", "}"):
+            if token == ("mark", "}"):
                 if len(open_blocks) == 1:
-                    raise _ParamSyntaxError("a } closes nothing", self.line, "remove it, or look for a missing {")
+                    raise SyntaxProblemError("a } closes nothing", self.line, "remove it, or look for a missing {")
                 open_blocks.pop()
                 continue
+            line, fix = self.line, "write name = value; or name { ... }"
             if kind != "word":
-                raise _ParamSyntaxError(
-                    f"expected a name, got {quote(text)}", self.line, "write name = value; or name { ... }"
-                )
-            line = self.line
+                raise SyntaxProblemError(f"expected a name, got {quote(text)}", line, fix)
             mark = self.next_token()
             if mark == ("mark", "{"):
                 if len(open_blocks) > MAX_DEPTH:
-                    raise _ParamSyntaxError(
-                        f"the file nests deeper than {MAX_DEPTH} levels",
-                        line,
-                        "look for blocks that are not closed",
-                    )
+                    message = f"the file nests deeper than {MAX_DEPTH} levels"
+                    raise SyntaxProblemError(message, line, "look for blocks that are not closed")
                 block = ParamBlock(line)
                 open_blocks[-1].entries.append((text, block))
                 open_blocks.append(block)
             elif mark == ("mark", "="):
                 open_blocks[-1].entries.append((text, self.parse_value(text, line)))
             else:
-                raise _ParamSyntaxError(
-                    f"expected = or {{ after {quote(text)}, got {quote(mark[1])}",
-                    line,
-                    "write name = value; or name { ... }",
-                )
+                raise SyntaxProblemError(f"expected = or {{ after {quote(text)}, got {quote(mark[1])}", line, fix)
 
     def parse_value(self, name: str, line: int) -> ParamValue:
         """Parse the right side of an assignment, including its semicolon."""
-        kind, text = self.next_token()
-        if kind == "cast":
-            kind, text = self.next_token()
-        if kind in ("word", "text"):
-            value = ParamValue([text], line)
-        elif (kind, text) == ("mark", "["):
+        token = self.next_token()
+        if token[0] == "cast":
+            token = self.next_token()
+        if token[0] in ("word", "text"):
+            value = ParamValue([token[1]], line)
+        elif token == ("mark", "["):
             value = ParamValue(self.parse_list(name), line)
         else:
-            raise _ParamSyntaxError(f"{name} has no value", line, f"write {name} = value; or {name} = [value, value];")
+            raise SyntaxProblemError(f"{name} has no value", line, f"write {name} = value; or {name} = [value, value];")
         if self.next_token() != ("mark", ";"):
-            raise _ParamSyntaxError(
-                f"a ; is missing after the value of {quote(name)}", line, "end the assignment with ;"
-            )
+            message = f"a ; is missing after the value of {quote(name)}"
+            raise SyntaxProblemError(message, line, "end the assignment with ;")
         return value
 
     def parse_list(self, name: str) -> list[str]:
         line = self.line
         items: list[str] = []
         while True:
-            kind, text = self.next_token()
-            if kind in ("word", "text"):
-                items.append(text)
-                kind, text = self.next_token()
-                if (kind, text) == ("mark", ","):
+            token = self.next_token()
+            if token[0] in ("word", "text"):
+                items.append(token[1])
+                token = self.next_token()
+                if token == ("mark", ","):
                     continue
-            if (kind, text) == ("mark", "]"):
+            if token == ("mark", "]"):
                 return items
-            raise _ParamSyntaxError(
-                f"the list of {quote(name)} is not well-formed: got {quote(text)}",
-                line,
-                f"write {name} = [value, value];",
-            )
+            message = f"the list of {quote(name)} is not well-formed: got {quote(token[1])}"
+            raise SyntaxProblemError(message, line, f"write {name} = [value, value];")
 
 
 _FRAME_KEYS = ("relative_to", "history", "update_channel", "pose_update_channel", "initial_transform")
@@ -215,186 +180,53 @@ _UNITS = {"quat": "w, x, y, z", "rpy": "degrees", "rodrigues": "radians", "angle
 _CHANNEL_KEYS = ("update_channel", "pose_update_channel")
 
 
-def load(content: bytes, builder: ModelBuilder, file: str) -> ModelBuilder:
+def load(content: bytes, builder: ModelBuilder, file: str) -> None:
     """Add the frames of a parameter file, and their problems, to `builder`."""
     root = parse_param_file(content, builder, file)
     if root is not None:
         _BotFramesReader(builder, file).read(root)
-    return builder
 
 
-@dataclass(slots=True)
-class _BotFrame:
-    name: str
-    parent: str
-    pose: Pose
-    is_driven: bool
-    source: Location
-    parent_source: Location
+class _BlockReader(ElementReader):
+    """Reads the entries of a block; duplicates are errors, unknown names warnings."""
 
-
-class _BotFramesReader:
-    def __init__(self, builder: ModelBuilder, file: str):
-        self.builder = builder
-        self.file = file
-        self.frames: dict[str, _BotFrame] = {}
-        self.has_errors = False
-
-    def locate(self, line: int, place: str) -> Location:
-        return Location(self.file, line, place)
-
-    def error(self, message: str, source: Location, fix: str, nearest: tuple[str, ...] = ()) -> None:
-        self.builder.add_error(message, source, fix, nearest)
-        self.has_errors = True
-
-    def read(self, root: ParamBlock) -> None:
-        for name, value in root.values():
-            if name == "INCLUDE":
-                files = ", ".join(value.texts[:5])
-                self.builder.add_warning(
-                    f"INCLUDE is not followed: {quote(files)}",
-                    self.locate(value.line, name),
-                    "paste the included file's coordinate_frames into this one",
-                )
-        blocks = [block for name, block in root.blocks() if name == "coordinate_frames"]
-        others = [name for name, _ in root.blocks() if name != "coordinate_frames"]
-        if others:
-            self.builder.add_problem(
-                Severity.NOTE,
-                f"{len(others)} other block{'' if len(others) == 1 else 's'} ignored: {', '.join(others[:5])}",
-                self.locate(root.line, ""),
-            )
-        if not blocks:
-            self.error(
-                "there is no block coordinate_frames", self.locate(1, ""), "see docs/geometry-files.md for an example"
-            )
-            return
-        top = self.read_root(blocks)
-        if top is None:
-            return
-        for block in blocks:
-            for name, entry in block.blocks():
-                self.read_frame(name, entry, top)
-        if not self.has_errors and self.check_parents(top):
-            self.add_to_model(top, blocks[0])
-
-    def read_root(self, blocks: list[ParamBlock]) -> str | None:
-        """Return the name of the root frame."""
-        named = [value for block in blocks for name, value in block.values() if name == "root_frame"]
-        for block in blocks:
-            for name, value in block.values():
-                if near := suggest_known_key(name, ("root_frame",)) if name != "root_frame" else ():
-                    place = self.locate(value.line, "coordinate_frames")
-                    self.builder.add_warning(f"unknown name {quote(name)}; ignored", place, f"write {near[0]}", near)
-        if not named or not named[0].texts:
-            self.error(
-                "root_frame is missing", self.locate(blocks[0].line, "coordinate_frames"), 'add root_frame = "local";'
-            )
-            return None
-        if len(named) > 1:
-            self.error(
-                f"root_frame is given twice (first on line {named[0].line})",
-                self.locate(named[1].line, "coordinate_frames"),
-                "remove one of the two",
-            )
-            return None
-        top = named[0].texts[0]
-        return top if self.is_valid_name(top, self.locate(named[0].line, "root_frame")) else None
-
-    def is_valid_name(self, name: str, source: Location) -> bool:
-        fault = names.find_problem(name)
-        if name in names.RESERVED_BODIES:
-            fault = "this name is reserved for the server's world frames"
-        if fault:
-            self.error(f"frame {quote(name)}: {fault}", source, "rename it, here and in relative_to")
-        return not fault
-
-    def read_frame(self, name: str, block: ParamBlock, top: str) -> None:
-        """Read one frame."""
-        place = f"frame {label(name)}"
-        source = self.locate(block.line, place)
-        if not block.entries and name == top:
-            return
-        if not self.is_valid_name(name, source):
-            return
-        if name == top:
-            self.error(
-                f"{place} is the root frame and has no parent",
-                source,
-                "leave its block empty, or name another root_frame",
-            )
-            return
-        if name in self.frames:
-            first = self.frames[name].source.line
-            self.error(f"{place} is defined twice (first on line {first})", source, "rename one of the two")
-            return
-        fields = self.read_fields(block, _FRAME_KEYS, place)
-        parent, transform = fields.get("relative_to"), fields.get("initial_transform")
-        if not isinstance(parent, ParamValue) or len(parent.texts) != 1 or not parent.texts[0]:
-            self.error("relative_to is missing", source, f'add relative_to = "{top}"; or its parent frame')
-            return
-        if not isinstance(transform, ParamBlock):
-            fix = "add initial_transform { translation = [0, 0, 0]; rpy = [0, 0, 0]; }"
-            self.error("initial_transform is missing", source, fix)
-            return
-        pose = self.read_transform(transform, f"{place}, initial_transform")
-        channels = [fields[key] for key in _CHANNEL_KEYS if key in fields]
-        driven = any(isinstance(each, ParamValue) and any(each.texts) for each in channels)
-        if pose is not None:
-            self.frames[name] = _BotFrame(
-                name, parent.texts[0], pose, driven, source, self.locate(parent.line, f"{place}, relative_to")
-            )
-
-    def read_fields(self, block: ParamBlock, known: tuple[str, ...], place: str) -> dict[str, ParamValue | ParamBlock]:
-        """Return the entries of a block by name; duplicates are errors, unknown ones warnings."""
-        found: dict[str, ParamValue | ParamBlock] = {}
+    def __init__(self, builder: ModelBuilder, file: str, block: ParamBlock, place: str, known: tuple[str, ...]):
+        super().__init__(builder, file, block.line, place)
+        self.fields: dict[str, ParamValue | ParamBlock] = {}
         for name, entry in block.entries:
-            if name in found:
-                first = found[name].line
-                self.error(
-                    f"{name} is given twice (first on line {first})",
-                    self.locate(entry.line, place),
-                    "remove one of the two",
-                )
+            if name in self.fields:
+                message = f"{name} is given twice (first on line {self.fields[name].line})"
+                self.error(message, "remove one of the two", entry.line)
             elif name in known:
-                found[name] = entry
+                self.fields[name] = entry
             else:
                 near = suggest_known_key(name, known)
-                self.builder.add_warning(
-                    f"unknown name {quote(name)}; ignored",
-                    self.locate(entry.line, place),
-                    f"write {near[0]}" if near else f"known here: {', '.join(known)}",
-                    near,
-                )
-        return found
+                fix = f"write {near[0]}" if near else f"known here: {', '.join(known)}"
+                self.warning(f"unknown name {quote(name)}; ignored", fix, entry.line, near)
 
-    def read_transform(self, block: ParamBlock, place: str) -> Pose | None:
-        fields = self.read_fields(block, ("translation", *_ROTATIONS), place)
-        source = self.locate(block.line, place)
-        turns = [key for key in _ROTATIONS if key in fields]
+    def read_transform(self) -> Pose | None:
+        turns = [key for key in _ROTATIONS if key in self.fields]
         if len(turns) != 1:
             what = f"is given twice, as {turns[0]} and as {turns[1]}" if turns else "is missing"
-            self.error(f"the rotation {what}", source, f"write one of {', '.join(_ROTATIONS)}")
+            self.error(f"the rotation {what}", f"write one of {', '.join(_ROTATIONS)}")
             return None
-        if "translation" not in fields:
-            self.error("translation is missing", source, "add translation = [x, y, z]; in meters")
+        (key,) = turns
+        if "translation" not in self.fields:
+            self.error("translation is missing", "add translation = [x, y, z]; in meters")
             return None
-        position = self.read_numbers(fields["translation"], "translation", 3, "meters", place)
-        values = self.read_numbers(fields[turns[0]], turns[0], _ROTATIONS[turns[0]], _UNITS[turns[0]], place)
-        if position is None or values is None or not check_position(position, self.builder, source):
-            self.has_errors = True
+        position = self.read_numbers("translation", 3, "meters")
+        values = self.read_numbers(key, _ROTATIONS[key], _UNITS[key])
+        if position is None or values is None or not self.check_position(position):
             return None
-        turned = self.read_rotation(turns[0], values, self.locate(fields[turns[0]].line, place))
-        if turned is None:
-            self.has_errors = True
-            return None
-        return Pose(position, turned)
+        turned = self.read_rotation(key, values)
+        return None if turned is None else Pose(position, turned)
 
-    def read_rotation(self, key: str, values: list[float], source: Location) -> Quaternion | None:
+    def read_rotation(self, key: str, values: list[float]) -> Quaternion | None:
+        line = self.fields[key].line
         if key == "quat":
-            return repair_quaternion(values, self.builder, source)
-        if max(map(abs, values)) > MAX_POSITION:
-            self.error(f"{key} is out of reach", source, "look for a slip in the exponent")
+            return self.repair_quaternion(values, line)
+        if max(map(abs, values)) > reading.MAX_POSITION:
+            self.error(f"{key} is out of reach", "look for a slip in the exponent", line)
             return None
         if key == "rpy":
             roll, pitch, yaw = map(math.radians, values)
@@ -407,61 +239,155 @@ class _BotFramesReader:
         scale = angle / length if length > 0.0 else 0.0
         return so3.exponential((x * scale, y * scale, z * scale))
 
-    def read_numbers(
-        self, entry: ParamValue | ParamBlock, key: str, count: int, unit: str, place: str
-    ) -> list[float] | None:
-        source = self.locate(entry.line, place)
-        fix = f"write {key} = [{', '.join(['number'] * count)}]; ({unit})"
-        if isinstance(entry, ParamBlock):
-            self.error(f"{key} is a block, not a list of {count} numbers", source, fix)
-            return None
+    def read_numbers(self, key: str, count: int, unit: str) -> list[float] | None:
+        entry = self.fields[key]
         try:
-            return parse_numbers(entry.texts, count, key)
+            if isinstance(entry, ParamBlock):
+                raise ValueError(f"{key} is a block, not a list of {count} numbers")
+            return reading.parse_numbers(entry.texts, count, key)
         except ValueError as error:
-            self.error(str(error), source, fix)
+            self.error(str(error), f"write {key} = [{', '.join(['number'] * count)}]; ({unit})", entry.line)
             return None
+
+
+@dataclass(slots=True)
+class _BotFrame:
+    name: str
+    parent: str
+    pose: Pose
+    is_driven: bool
+    source: Location
+    parent_source: Location
+
+
+class _BotFramesReader(ElementReader):
+    def __init__(self, builder: ModelBuilder, file: str):
+        super().__init__(builder, file)
+        self.frames: dict[str, _BotFrame] = {}
+
+    @property
+    def has_errors(self) -> bool:
+        return any(problem.severity is Severity.ERROR for problem in self.builder.problems)
+
+    def enter(self, line: int, place: str) -> ElementReader:
+        return ElementReader(self.builder, self.file, line, place)
+
+    def read(self, root: ParamBlock) -> None:
+        for name, value in root.values():
+            if name == "INCLUDE":
+                message = f"INCLUDE is not followed: {quote(', '.join(value.texts[:5]))}"
+                fix = "paste the included file's coordinate_frames into this one"
+                self.enter(value.line, name).warning(message, fix)
+        blocks = [block for name, block in root.blocks() if name == "coordinate_frames"]
+        others = [name for name, _ in root.blocks() if name != "coordinate_frames"]
+        if others:
+            plural = "" if len(others) == 1 else "s"
+            self.note(f"{len(others)} other block{plural} ignored: {', '.join(others[:5])}", at=root.line)
+        if not blocks:
+            self.error("there is no block coordinate_frames", "see docs/geometry-files.md for an example", 1)
+            return
+        top = self.read_root(blocks)
+        if top is None:
+            return
+        for block in blocks:
+            for name, entry in block.blocks():
+                self.read_frame(name, entry, top)
+        if not self.has_errors and self.check_parents(top):
+            self.add_to_model(top, blocks[0])
+
+    def read_root(self, blocks: list[ParamBlock]) -> str | None:
+        """Return the name of the root frame."""
+        at = self.enter(blocks[0].line, "coordinate_frames")
+        named = []
+        for name, value in (entry for block in blocks for entry in block.values()):
+            if name == "root_frame":
+                named.append(value)
+            elif near := suggest_known_key(name, ("root_frame",)):
+                at.warning(f"unknown name {quote(name)}; ignored", f"write {near[0]}", value.line, near)
+        if not named or not named[0].texts:
+            at.error("root_frame is missing", 'add root_frame = "local";')
+            return None
+        if len(named) > 1:
+            message = f"root_frame is given twice (first on line {named[0].line})"
+            at.error(message, "remove one of the two", named[1].line)
+            return None
+        top = named[0].texts[0]
+        return top if self.is_valid_name(top, self.enter(named[0].line, "root_frame")) else None
+
+    def is_valid_name(self, name: str, at: ElementReader) -> bool:
+        fault = names.find_problem(name)
+        if name in names.RESERVED_BODIES:
+            fault = "this name is reserved for the server's world frames"
+        if fault:
+            at.error(f"frame {quote(name)}: {fault}", "rename it, here and in relative_to")
+        return not fault
+
+    def read_frame(self, name: str, block: ParamBlock, top: str) -> None:
+        """Read one frame."""
+        place = f"frame {label(name)}"
+        at = self.enter(block.line, place)
+        if (name == top and not block.entries) or not self.is_valid_name(name, at):
+            return
+        if name == top:
+            fix = "leave its block empty, or name another root_frame"
+            at.error(f"{place} is the root frame and has no parent", fix)
+            return
+        if name in self.frames:
+            message = f"{place} is defined twice (first on line {self.frames[name].source.line})"
+            at.error(message, "rename one of the two")
+            return
+        fields = _BlockReader(self.builder, self.file, block, place, _FRAME_KEYS).fields
+        parent, transform = fields.get("relative_to"), fields.get("initial_transform")
+        if not isinstance(parent, ParamValue) or len(parent.texts) != 1 or not parent.texts[0]:
+            at.error("relative_to is missing", f'add relative_to = "{top}"; or its parent frame')
+            return
+        if not isinstance(transform, ParamBlock):
+            fix = "add initial_transform { translation = [0, 0, 0]; rpy = [0, 0, 0]; }"
+            at.error("initial_transform is missing", fix)
+            return
+        keys, inside = ("translation", *_ROTATIONS), f"{place}, initial_transform"
+        pose = _BlockReader(self.builder, self.file, transform, inside, keys).read_transform()
+        channels = [fields[key] for key in _CHANNEL_KEYS if key in fields]
+        driven = any(isinstance(each, ParamValue) and any(each.texts) for each in channels)
+        if pose is not None:
+            parent_source = Location(self.file, parent.line, f"{place}, relative_to")
+            self.frames[name] = _BotFrame(name, parent.texts[0], pose, driven, at.locate(), parent_source)
 
     def check_parents(self, top: str) -> bool:
         """Report missing parents and cycles; return whether there are none."""
-        suggested = 0
-        for frame in self.frames.values():
-            if frame.parent != top and frame.parent not in self.frames:
-                suggested += 1
-                near = suggest_name(frame.parent, (top, *self.frames)) if suggested <= MAX_SUGGESTIONS else Suggestion()
-                self.error(
-                    f"relative_to names frame {quote(frame.parent)}, which does not exist",
-                    frame.parent_source,
-                    f"write {near[0]}" if near else "name the root frame, or a frame of this file",
-                    near,
-                )
-        if self.has_errors:
+        missing = [each for each in self.frames.values() if each.parent != top and each.parent not in self.frames]
+        for number, frame in enumerate(missing):
+            near = Suggestion()
+            if number < reading.MAX_SUGGESTIONS:
+                near = suggest_name(frame.parent, (top, *self.frames))
+            message = f"relative_to names frame {quote(frame.parent)}, which does not exist"
+            fix = f"write {near[0]}" if near else "name the root frame, or a frame of this file"
+            self.builder.add_error(message, frame.parent_source, fix, near)
+        if missing:
             return False
-        for cycle in find_cycles(self.frames, lambda name: self.frames[name].parent if name in self.frames else None):
-            self.error(
-                f"frames form a cycle: {' in '.join(map(label, cycle))}",
-                self.frames[cycle[-1]].parent_source,
-                f"one of them must be relative to the root frame {label(top)}, or to one that is",
-            )
+        for cycle in reading.find_cycles(
+            self.frames, lambda name: self.frames[name].parent if name in self.frames else None
+        ):
+            message = f"frames form a cycle: {' in '.join(map(label, cycle))}"
+            fix = f"one of them must be relative to the root frame {label(top)}, or to one that is"
+            self.builder.add_error(message, self.frames[cycle[-1]].parent_source, fix)
         return not self.has_errors
 
     def add_to_model(self, top: str, block: ParamBlock) -> None:
         """Add the frames as bodies, root first, and their constraints."""
-        bodies = {top: self.builder.add_body(top, source=self.locate(block.line, f"frame {label(top)}"))}
-        for frame in self.frames.values():
-            bodies[frame.name] = self.builder.add_body(frame.name, source=frame.source)
-        for body in bodies.values():
-            body.add_frame(ORIGIN, source=body.source)
-        for frame in self.frames.values():
-            mount = frame.name if frame.name != ORIGIN else f"{ORIGIN}_"
+        sources = {top: Location(self.file, block.line, f"frame {label(top)}")}
+        sources |= {name: frame.source for name, frame in self.frames.items()}
+        bodies = {
+            name: self.builder.add_body(name, source=source).add_frame(ORIGIN, source=source)
+            for name, source in sources.items()
+        }
+        for name, frame in self.frames.items():
+            mount = name if name != ORIGIN else f"{ORIGIN}_"
             bodies[frame.parent].add_frame(mount, source=frame.source)
-            self.builder.add_constraint(
-                frame.name,
-                names.join(frame.parent, mount),
-                names.join(frame.name, ORIGIN),
-                Pose.identity() if frame.is_driven else frame.pose,
-                joint=_make_floating_joint(frame.pose) if frame.is_driven else FIXED,
-                source=frame.source,
-            )
+            pose = Pose.identity() if frame.is_driven else frame.pose
+            joint = _make_floating_joint(frame.pose) if frame.is_driven else FIXED
+            ends = (names.join(frame.parent, mount), names.join(name, ORIGIN))
+            self.builder.add_constraint(name, *ends, pose, joint=joint, source=frame.source)
 
 
 def _make_floating_joint(rest: Pose) -> Joint:

@@ -21,17 +21,18 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from modelserver.errors import Location, Severity, Suggestion, find_suggestion, quote, suggest_name
 from modelserver.formats.frame_paths import ANY, ROOT, Ancestry, FramePath, parse_path
-from modelserver.formats.reading import MAX_SUGGESTIONS, ORIGIN, check_position, find_cycles, label, parse_number
-from modelserver.formats.xml_document import NamedParameters, get_line
+from modelserver.formats.reading import MAX_SUGGESTIONS, ORIGIN, ElementReader, find_cycles, label, parse_number
+from modelserver.formats.xml_document import NamedParameters, get_line, get_name
 from modelserver.geometry import names
 from modelserver.geometry.builder import ModelBuilder
-from modelserver.geometry.draft import BodyBuilder
+from modelserver.geometry.review import BodyBuilder
 from modelserver.transforms.pose import Pose
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def find_instances(root: Element) -> Iterator[Element]:
             yield element
 
 
-def load(root: Element, builder: ModelBuilder, file: str, variables: Mapping[str, str]) -> ModelBuilder:
+def load(root: Element, builder: ModelBuilder, file: str, variables: Mapping[str, str]) -> None:
     """Add the frames below `root`, grouped into bodies, and their problems to `builder`.
 
     `$NAME` and `${NAME}` are replaced from `variables`, else from the environment.
@@ -62,7 +63,6 @@ def load(root: Element, builder: ModelBuilder, file: str, variables: Mapping[str
     reader.report_variables()
     if reader.find_parents():
         reader.add_bodies()
-    return builder
 
 
 _EXTERNAL_FRAME = re.compile(r"Earth|UtmGrid\d{1,2}[A-Z]|\$\{?SITE_FRAME\}?")
@@ -79,31 +79,27 @@ class _FrameInstance:
     path: FramePath
 
 
-class _FrameTreeReader:
+class _FrameTreeReader(ElementReader):
     def __init__(self, builder: ModelBuilder, file: str, variables: Mapping[str, str]):
-        self.builder = builder
-        self.file = file
+        super().__init__(builder, file)
         self.variables = variables
         self.frames: dict[str, _FrameInstance] = {}
         """By name; a second frame of a name, with another parent, by parent and name."""
         self.parents: dict[str, str] = {}
         """Key of the parent of each frame, empty for a root."""
-        self.undefined: dict[str, list[Location]] = {}
+        self.undefined: defaultdict[str, list[Location]] = defaultdict(list)
 
     def read_frame(self, element: Element) -> None:
         """Read one instance; a second one of the same name and parent is ignored with a warning."""
-        own = (element.get("name") or "").strip()
+        own = get_name(element)
         parts = NamedParameters(element, _PARAMETERS, self.builder, self.file, f"frame {label(own)}")
         name = self.expand(own, parts.locate())
         stated = self.expand(parts.read_text("Name") or "", parts.locate("Name"))
         if not name:
             name = stated
         elif stated and stated != name:
-            self.builder.add_warning(
-                f"the instance is named {label(name)}, its parameter Name {label(stated)}; {label(name)} is used",
-                parts.locate("Name"),
-                "make the two alike, or remove the parameter Name",
-            )
+            message = f"the instance is named {label(name)}, its parameter Name {label(stated)}; {label(name)} is used"
+            parts.warning(message, "make the two alike, or remove the parameter Name", "Name")
         parent = self.expand(parts.read_text("Parent") or "", parts.locate("Parent"))
         pose = self.read_pose(parts)
         path = parse_path(parent)
@@ -123,45 +119,39 @@ class _FrameTreeReader:
         """Report a second frame of a name in the same parent."""
         moved, turned = first.pose.distance(second.pose)
         lines = f"on line {first.source.line} and on line {second.source.line}"
-        self.builder.add_warning(
+        message = (
             f"frame {label(first.name)} is defined twice: {lines}; "
-            f"the two are {moved:.6g} m and {math.degrees(turned):.6g} deg apart; the first is used",
-            second.source,
-            "rename one of the two, or remove the wrong one",
+            f"the two are {moved:.6g} m and {math.degrees(turned):.6g} deg apart; the first is used"
         )
+        self.builder.add_warning(message, second.source, "rename one of the two, or remove the wrong one")
 
     def read_pose(self, parts: NamedParameters) -> Pose | None:
         """Read the pose from X to Yaw; None, with an error, if one is not a number."""
         values: list[float] = []
         for key in (*_POSITION, *_ROTATION):
-            if key not in parts.elements:
-                values.append(0.0)
-                continue
-            text = parts.read_text(key)
+            text = parts.read_text(key) if key in parts.elements else "0"
             if text is None:
                 continue
-            unit = "meters" if key in _POSITION else "degrees"
             filled, missing = self.substitute(text)
             if missing:
-                self.builder.add_error(
-                    f"{key} takes its number from ${missing[0]}, which is not defined",
-                    parts.locate(key),
-                    f"give it: --set {missing[0]}=NUMBER, or export {missing[0]}",
-                    tuple(suggest_name(missing[0], self.variables)),
+                message = f"{key} takes its number from ${missing[0]}, which is not defined"
+                near, fix = (
+                    suggest_name(missing[0], self.variables),
+                    f"--set {missing[0]}=NUMBER, or export {missing[0]}",
                 )
+                parts.error(message, f"give it: {fix}", key, tuple(near))
                 continue
             try:
                 values.append(parse_number(filled.strip()))
             except ValueError as error:
-                self.builder.add_error(f"{key}: {error}", parts.locate(key), f"write one number, in {unit}")
-        if len(values) != 6 or not check_position(values[:3], self.builder, parts.locate()):
+                unit = "meters" if key in _POSITION else "degrees"
+                parts.error(f"{key}: {error}", f"write one number, in {unit}", key)
+        if len(values) != 6 or not parts.check_position(values[:3]):
             return None
         return Pose.from_rpy(values[:3], *(math.radians(value) for value in values[3:]))
 
     def substitute(self, text: str) -> tuple[str, list[str]]:
         """Replace the variables in a text; return it, and the names of those that are not defined."""
-        if "$" not in text:
-            return text, []
         missing: list[str] = []
 
         def replace_variable(match: re.Match[str]) -> str:
@@ -178,7 +168,7 @@ class _FrameTreeReader:
         """Replace the variables in a name; undefined ones stay, and are recorded."""
         filled, missing = self.substitute(text)
         for name in missing:
-            self.undefined.setdefault(name, []).append(source)
+            self.undefined[name].append(source)
         return filled.strip()
 
     def report_variables(self) -> None:
@@ -194,20 +184,18 @@ class _FrameTreeReader:
 
     def report_other_types(self, root: Element) -> None:
         """Report instances of other types, which are not read."""
-        passed: dict[str, list[int]] = {}
+        passed: defaultdict[str, list[int]] = defaultdict(list)
         for element in root.iter("{*}instance"):
             kind = (element.get("type") or "").strip()
             if not kind.endswith("FrameRpyParameters"):
-                passed.setdefault(kind, []).append(get_line(element))
+                passed[kind].append(get_line(element))
         for kind, lines in passed.items():
             # a type with "frame" in its name is probably meant as one
-            severity = Severity.WARNING if "frame" in kind.casefold() else Severity.NOTE
-            self.builder.add_problem(
-                severity,
-                f"{len(lines)} instance{'' if len(lines) == 1 else 's'} of type {label(kind)} ignored",
-                Location(self.file, lines[0]),
-                "frames have type rapid::FrameRpyParameters" if severity is Severity.WARNING else "",
-            )
+            message = f"{len(lines)} instance{'' if len(lines) == 1 else 's'} of type {label(kind)} ignored"
+            if "frame" in kind.casefold():
+                self.warning(message, "frames have type rapid::FrameRpyParameters", lines[0])
+            else:
+                self.note(message, at=lines[0])
 
     def find_parents(self) -> bool:
         """Find the parent of each frame; report missing parents and cycles. Return whether there are none."""
@@ -217,9 +205,9 @@ class _FrameTreeReader:
                 # a name may hold slashes
                 frame.path = FramePath((frame.parent,), False)
         self.add_external_roots()
-        keys: dict[str, list[str]] = {}
+        keys: defaultdict[str, list[str]] = defaultdict(list)
         for key, frame in self.frames.items():
-            keys.setdefault(frame.name, []).append(key)
+            keys[frame.name].append(key)
         ancestry = Ancestry({key: frame.name for key, frame in self.frames.items()}, self.parents)
         several: list[str] = []
         for key, frame in self.frames.items():
@@ -242,9 +230,7 @@ class _FrameTreeReader:
         if not ancestry.is_exhausted:
             self.report_missing(missing, keys, ancestry)
         else:
-            self.builder.add_error(
-                "the paths of parents are too many and too deep", Location(self.file), "write plain names"
-            )
+            self.error("the paths of parents are too many and too deep", "write plain names")
         return is_tree and not missing and not ancestry.is_exhausted
 
     def add_external_roots(self) -> None:
@@ -389,11 +375,8 @@ class _FrameTreeReader:
                 continue
             if frame.name == ORIGIN:
                 where = label(bodies[parent].name)
-                self.builder.add_error(
-                    f"a frame in {where} is named {ORIGIN}, which is the name of the frame of {where} itself",
-                    frame.source,
-                    "rename it",
-                )
+                message = f"a frame in {where} is named {ORIGIN}, which is the name of the frame of {where} itself"
+                self.builder.add_error(message, frame.source, "rename it")
                 continue
             bodies[parent].add_frame(frame.name, frame.pose, source=frame.source)
             if key in bodies:

@@ -14,7 +14,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from modelserver.errors import Location, Suggestion, quote, suggest_key
+from modelserver.errors import Location, Severity, Suggestion, quote, suggest_key
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion
@@ -76,86 +76,107 @@ def parse_numbers(texts: Sequence[str], count: int, key: str) -> list[float]:
     return values
 
 
-def check_position(position: Sequence[float], builder: ModelBuilder, source: Location) -> bool:
-    """Return whether each coordinate is at most `MAX_POSITION`; otherwise report an error."""
-    if all(abs(value) <= MAX_POSITION for value in position):
-        return True
-    far = max(position, key=abs)
-    builder.add_error(
-        f"the position {far:g} m is out of reach; the limit is {MAX_POSITION:g} m",
-        source,
-        "positions are in meters; look for a slip in the exponent",
-    )
-    return False
+class SyntaxProblemError(Exception):
+    """A file cannot be parsed; with the line, and the fix."""
+
+    def __init__(self, message: str, line: int, fix: str):
+        super().__init__(message)
+        self.line = line
+        self.fix = fix
 
 
-def repair_rotation(
-    rows: Sequence[Sequence[float]], builder: ModelBuilder, source: Location, where: str
-) -> Quaternion | None:
-    """Return the rotation nearest to three rows of three numbers; None, with an error, if they are not a rotation.
+class ElementReader:
+    """Reads one element of a file, and reports its problems; `place` names it there, e.g. `body Raptor`."""
 
-    `where` names the rows for the fix, e.g. `Row1 to Row3`.
-    """
-    (a, b, c), (d, e, f), (g, h, i) = rows
-    if (a, b, c, d, e, f, g, h, i) == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0):
-        return so3.IDENTITY
-    products = (
-        a * a + d * d + g * g - 1.0,
-        b * b + e * e + h * h - 1.0,
-        c * c + f * f + i * i - 1.0,
-        a * b + d * e + g * h,
-        a * c + d * f + g * i,
-        b * c + e * f + h * i,
-    )
-    # a product that overflowed to nan must fail this test
-    if not all(abs(value) <= MAX_DEVIATION for value in products):
-        worst = max((abs(value) for value in products), key=lambda value: math.inf if math.isnan(value) else value)
-        builder.add_error(
-            f"this is not a rotation: |R'R - I| is {worst:.3g}, more than {MAX_DEVIATION:g}",
-            source,
-            f"look for a wrong digit or sign in {where}: each row and column has length 1, at right angles",
-        )
-        return None
-    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:
-        builder.add_error(
-            "this is a reflection, not a rotation (determinant -1): one axis points the wrong way",
-            source,
-            f"turn the sign of one row or column in {where}; axes are right-handed",
-        )
-        return None
-    deviation = max(abs(value) for value in products)
-    if deviation < 1e-14:
-        return so3.from_matrix(rows)
-    matrix, deviation = so3.nearest_rotation(rows)
-    if deviation > ROUNDING_DEVIATION:
-        moved = float(np.abs(matrix - np.asarray(rows)).max())
-        builder.add_warning(
-            f"this is not quite a rotation: |R'R - I| is {deviation:.2g}, more than {ROUNDING_DEVIATION:g}; "
-            f"replaced by the nearest one, entries changed by up to {moved:.2g}",
-            source,
-            f"write {where} with more digits, or look for a slip in one of them",
-        )
-    return so3.from_matrix(matrix)
+    def __init__(self, builder: ModelBuilder, file: str, line: int = 0, place: str = ""):
+        self.builder = builder
+        self.file = file
+        self.line = line
+        self.place = place
 
+    def line_of(self, key: str) -> int:
+        """Return the line of a named value; 0 if it is absent."""
+        return 0
 
-def repair_quaternion(wxyz: Sequence[float], builder: ModelBuilder, source: Location) -> Quaternion | None:
-    """Return four numbers, w first, as a unit quaternion; None, with an error, if their length is not about 1."""
-    w, x, y, z = wxyz
-    deviation = abs(w * w + x * x + y * y + z * z - 1.0)
-    if not deviation <= MAX_DEVIATION:
-        builder.add_error(
-            f"the quaternion has length {math.hypot(w, x, y, z):.4g}, not 1",
-            source,
-            "write w, x, y, z of a unit quaternion, w first",
+    def locate(self, at: int | str = 0) -> Location:
+        """Return the location of a line, or of a named value; by default of the element's first line."""
+        return Location(self.file, (self.line_of(at) if isinstance(at, str) else at) or self.line, self.place)
+
+    def error(self, message: str, fix: str, at: int | str = 0, nearest: tuple[str, ...] = ()) -> None:
+        """Report an error at a line or a named value, by default at the element's first line."""
+        self.builder.add_error(message, self.locate(at), fix, nearest)
+
+    def warning(self, message: str, fix: str, at: int | str = 0, nearest: tuple[str, ...] = ()) -> None:
+        """Report a warning, as `error`."""
+        self.builder.add_warning(message, self.locate(at), fix, nearest)
+
+    def note(self, message: str, fix: str = "", at: int | str = 0) -> None:
+        """Report a note, as `error`."""
+        self.builder.add_problem(Severity.NOTE, message, self.locate(at), fix)
+
+    def check_position(self, position: Sequence[float], line: int = 0) -> bool:
+        """Return whether each coordinate is at most `MAX_POSITION`; otherwise report an error."""
+        if all(abs(value) <= MAX_POSITION for value in position):
+            return True
+        message = f"the position {max(position, key=abs):g} m is out of reach; the limit is {MAX_POSITION:g} m"
+        self.error(message, "positions are in meters; look for a slip in the exponent", line)
+        return False
+
+    def repair_rotation(self, rows: Sequence[Sequence[float]], where: str, line: int = 0) -> Quaternion | None:
+        """Return the rotation nearest to three rows of three numbers; None, with an error, if they are not a rotation.
+
+        `where` names the rows for the fix, e.g. `Row1 to Row3`.
+        """
+        (a, b, c), (d, e, f), (g, h, i) = rows
+        if (a, b, c, d, e, f, g, h, i) == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0):
+            return so3.IDENTITY
+        products = (
+            a * a + d * d + g * g - 1.0,
+            b * b + e * e + h * h - 1.0,
+            c * c + f * f + i * i - 1.0,
+            a * b + d * e + g * h,
+            a * c + d * f + g * i,
+            b * c + e * f + h * i,
         )
-        return None
-    if deviation > ROUNDING_DEVIATION:
-        builder.add_warning(
-            f"the quaternion has length {math.hypot(w, x, y, z):.6g}, not 1; normalized",
-            source,
-            "write it with more digits, or look for a slip in one of them",
-        )
-    return so3.normalize((w, x, y, z))
+        # a product that overflowed to nan must fail this test
+        if not all(abs(value) <= MAX_DEVIATION for value in products):
+            worst = max((abs(value) for value in products), key=lambda value: math.inf if math.isnan(value) else value)
+            message = f"this is not a rotation: |R'R - I| is {worst:.3g}, more than {MAX_DEVIATION:g}"
+            fix = f"look for a wrong digit or sign in {where}: each row and column has length 1, at right angles"
+            self.error(message, fix, line)
+            return None
+        if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0:
+            fix = f"turn the sign of one row or column in {where}; axes are right-handed"
+            self.error(
+                "this is a reflection, not a rotation (determinant -1): one axis points the wrong way", fix, line
+            )
+            return None
+        deviation = max(abs(value) for value in products)
+        if deviation < 1e-14:
+            return so3.from_matrix(rows)
+        matrix, deviation = so3.nearest_rotation(rows)
+        if deviation > ROUNDING_DEVIATION:
+            moved = float(np.abs(matrix - np.asarray(rows)).max())
+            self.warning(
+                f"this is not quite a rotation: |R'R - I| is {deviation:.2g}, more than {ROUNDING_DEVIATION:g}; "
+                f"replaced by the nearest one, entries changed by up to {moved:.2g}",
+                f"write {where} with more digits, or look for a slip in one of them",
+                line,
+            )
+        return so3.from_matrix(matrix)
+
+    def repair_quaternion(self, wxyz: Sequence[float], line: int = 0) -> Quaternion | None:
+        """Return four numbers, w first, as a unit quaternion; None, with an error, if their length is not about 1."""
+        w, x, y, z = wxyz
+        length, deviation = math.hypot(w, x, y, z), abs(w * w + x * x + y * y + z * z - 1.0)
+        if not deviation <= MAX_DEVIATION:
+            fix = "write w, x, y, z of a unit quaternion, w first"
+            self.error(f"the quaternion has length {length:.4g}, not 1", fix, line)
+            return None
+        if deviation > ROUNDING_DEVIATION:
+            fix = "write it with more digits, or look for a slip in one of them"
+            self.warning(f"the quaternion has length {length:.6g}, not 1; normalized", fix, line)
+        return so3.normalize((w, x, y, z))
 
 
 def label(name: str) -> str:

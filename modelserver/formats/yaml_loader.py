@@ -17,14 +17,13 @@ visuals:
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from modelserver.errors import Severity, Suggestion, quote, suggest_name
-from modelserver.formats import yaml_nodes
+from modelserver.errors import Location, Severity, Suggestion, quote, suggest_name
 from modelserver.formats.reading import label
 from modelserver.formats.yaml_joint import read_joint
-from modelserver.formats.yaml_nodes import NodeKind, NodeReader, YamlNode
-from modelserver.formats.yaml_pose import POSE_KEYS, SigmaDefaults, read_pose, read_sigma, read_sigma_parts
+from modelserver.formats.yaml_nodes import NodeKind, YamlMapping, YamlNode, parse_yaml
+from modelserver.formats.yaml_pose import POSE_KEYS, SigmaDefaults, read_pose, read_sigma
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import FIXED
 from modelserver.geometry.parts import BodyFrame, Sigma
@@ -35,79 +34,73 @@ _SHAPE_KINDS = tuple(str(kind) for kind in ShapeKind)
 _SHAPE_KEYS = (*_SHAPE_KINDS, "scale", *POSE_KEYS, "name", "material")
 
 
-def read_shapes(reader: NodeReader, node: YamlNode | None, place: str) -> tuple[Shape, ...]:
+def read_shapes(owner: YamlMapping, key: str) -> tuple[Shape, ...]:
     """Read a list of shapes; wrong ones are reported and left out."""
+    node, place = owner.fields.get(key), f"{owner.place}, {key}"
     if node is None:
         return ()
     if node.kind is not NodeKind.LIST:
-        reader.error(
-            f"expected a list of shapes, got {node.kind.value}", node, place, "begin each shape with - box: ..."
-        )
+        message = f"expected a list of shapes, got {node.kind.value}"
+        owner.builder.add_error(message, Location(owner.file, node.line, place), "begin each shape with - box: ...")
         return ()
-    found = [_read_shape(reader, item, f"{place} {number}") for number, item in enumerate(node.items, 1)]
+    found = [_read_shape(owner.enter(item, f"{place} {n}", _SHAPE_KEYS)) for n, item in enumerate(node.items, 1)]
     return tuple(shape for shape in found if shape is not None)
 
 
-def _read_shape(reader: NodeReader, node: YamlNode, place: str) -> Shape | None:
-    fields = reader.read_fields(node, place, _SHAPE_KEYS)
-    kinds = [key for key in _SHAPE_KINDS if key in fields]
+def _read_shape(at: YamlMapping) -> Shape | None:
+    kinds = [key for key in _SHAPE_KINDS if key in at.fields]
     if len(kinds) != 1:
         what = "both " + " and ".join(kinds) if kinds else "no shape"
-        reader.error(f"expected one shape, got {what}", node, place, f"write one of {', '.join(_SHAPE_KINDS)}")
+        at.error(f"expected one shape, got {what}", f"write one of {', '.join(_SHAPE_KINDS)}")
         return None
     kind = ShapeKind(kinds[0])
-    file = ""
-    if kind is ShapeKind.MESH:
-        file = reader.read_text(fields["mesh"], place, "mesh")
-        size = (
-            [1.0, 1.0, 1.0]
-            if "scale" not in fields
-            else reader.read_numbers(fields["scale"], 3, place, "scale", "factors")
-        )
-    else:
-        if "scale" in fields:
-            reader.error(f"a {kind} has no scale; only a mesh has", fields["scale"], place, "write its size in meters")
-        size = _read_size(reader, kind, fields[kinds[0]], place)
-    pose = read_pose(reader, fields, place)
-    material = _read_material(reader, fields["material"], f"{place}, material") if "material" in fields else None
+    size: list[float] | None = [1.0, 1.0, 1.0]
+    if kind is not ShapeKind.MESH:
+        if "scale" in at.fields:
+            at.error(f"a {kind} has no scale; only a mesh has", "write its size in meters", "scale")
+        size = _read_size(at, kind)
+    elif "scale" in at.fields:
+        size = at.read_numbers(at.fields["scale"], 3, "scale", "factors")
+    file = at.read_text("mesh") if kind is ShapeKind.MESH else ""
+    pose = read_pose(at)
+    material = _read_material(at) if "material" in at.fields else None
     if size is None:
         return None
-    name = reader.read_text(fields.get("name"), place, "name")
     try:
-        return Shape(kind, tuple(size), pose or Pose.identity(), file, name, material)
+        return Shape(kind, tuple(size), pose or Pose.identity(), file, at.read_text("name"), material)
     except ValueError as error:
-        reader.error(str(error), fields[kinds[0]], place, "see docs/geometry-files.md")
+        at.error(str(error), "see docs/geometry-files.md", kinds[0])
         return None
 
 
-def _read_size(reader: NodeReader, kind: ShapeKind, node: YamlNode, place: str) -> list[float] | None:
+def _read_size(shape: YamlMapping, kind: ShapeKind) -> list[float] | None:
+    node = shape.fields[str(kind)]
     if kind is ShapeKind.BOX:
-        return reader.read_numbers(node, 3, place, "box", "meters")
+        return shape.read_numbers(node, 3, "box", "meters")
     wanted = DIMENSIONS[kind]
     fix = f"write {kind}: {{{', '.join(f'{what}: number' for what in wanted)}}}, in meters"
-    inside = reader.read_fields(node, f"{place}, {kind}", wanted)
+    at = shape.enter(node, f"{shape.place}, {kind}", wanted)
     values = []
     for what in wanted:
-        if what not in inside:
-            reader.error(f"{what} is missing", node, f"{place}, {kind}", fix)
-        elif (value := reader.read_number(inside[what], place, what, fix)) is not None:
+        if what not in at.fields:
+            at.error(f"{what} is missing", fix)
+        elif (value := at.read_number(at.fields[what], what, fix)) is not None:
             values.append(value)
     return values if len(values) == len(wanted) else None
 
 
-def _read_material(reader: NodeReader, node: YamlNode, place: str) -> Material | None:
-    fields = reader.read_fields(node, place, ("name", "color", "texture"))
+def _read_material(shape: YamlMapping) -> Material | None:
+    at = shape.enter(shape.fields["material"], f"{shape.place}, material", ("name", "color", "texture"))
     color = None
-    if "color" in fields:
-        values = reader.read_numbers(fields["color"], 4, place, "color", "red, green, blue and opacity from 0 to 1")
+    if "color" in at.fields:
+        values = at.read_numbers(at.fields["color"], 4, "color", "red, green, blue and opacity from 0 to 1")
         if values is None:
             return None
         color = (values[0], values[1], values[2], values[3])
     try:
-        name = reader.read_text(fields.get("name"), place, "name")
-        return Material(name, color, reader.read_text(fields.get("texture"), place, "texture"))
+        return Material(at.read_text("name"), color, at.read_text("texture"))
     except ValueError as error:
-        reader.error(str(error), node, place, "write material: {name: ..., color: [red, green, blue, opacity]}")
+        at.error(str(error), "write material: {name: ..., color: [red, green, blue, opacity]}")
         return None
 
 
@@ -128,144 +121,125 @@ _Inertia = tuple[tuple[float, ...], ...]
 _FrameNode = tuple[BodyFrame, YamlNode]
 
 
-def load(content: bytes, builder: ModelBuilder, file: str) -> ModelBuilder:
+def load(content: bytes, builder: ModelBuilder, file: str) -> None:
     """Add the model in a YAML file, and its problems, to `builder`."""
-    root = yaml_nodes.parse_yaml(content, builder, file)
-    if root is not None:
-        _GeometryReader(NodeReader(builder, file)).read(root)
-    return builder
+    root = parse_yaml(content, builder, file)
+    if root is None:
+        return
+    if root.kind is NodeKind.MAPPING:
+        _GeometryReader(YamlMapping(builder, file, root, "", _TOP_KEYS)).read()
+        return
+    builder.add_error(
+        f"the file is not a geometry: its top level is {root.kind.value}, not a mapping",
+        Location(file, root.line),
+        "begin with bodies:, as in docs/geometry-files.md",
+    )
 
 
 @dataclass(slots=True)
-class _BodyTemplate:
+class _BodyParts:
+    """What a template and a body have in common."""
+
     description: str
     inertia: _Inertia | None
     frames: list[_FrameNode]
-    node: YamlNode
     visuals: tuple[Shape, ...]
     collisions: tuple[Shape, ...]
-    is_used: bool = field(default=False)
+    line: int
+    is_used: bool = False
 
 
 class _GeometryReader:
-    def __init__(self, reader: NodeReader):
-        self.reader = reader
-        self.builder = reader.builder
+    def __init__(self, top: YamlMapping):
+        self.top = top
+        self.builder = top.builder
         self.defaults = SigmaDefaults()
-        self.templates: dict[str, _BodyTemplate] = {}
+        self.templates: dict[str, _BodyParts] = {}
         self.frame_count = 0
         self.template_uses: Counter[str] = Counter()
         """Number of bodies that name a template."""
 
-    def read(self, root: YamlNode) -> None:
-        reader = self.reader
-        if root.kind is not NodeKind.MAPPING:
-            reader.error(
-                f"the file is not a geometry: its top level is {root.kind.value}, not a mapping",
-                root,
-                "",
-                "begin with bodies:, as in docs/geometry-files.md",
-            )
-            return
-        fields = reader.read_fields(root, "", _TOP_KEYS)
+    def read(self) -> None:
+        top, builder, fields = self.top, self.builder, self.top.fields
+        version, fix = top.read_text(FORMAT_KEY), f"{FORMAT_KEY}: {FORMAT_VERSION}"
         if FORMAT_KEY not in fields:
-            self.builder.add_problem(
-                Severity.NOTE,
-                "the file does not state its format",
-                reader.locate(root, ""),
-                f"add a first line, {FORMAT_KEY}: {FORMAT_VERSION}",
-            )
-        elif (version := reader.read_text(fields[FORMAT_KEY], "", FORMAT_KEY)) != FORMAT_VERSION:
-            reader.error(
-                f"{FORMAT_KEY}: {quote(version)} is not supported",
-                fields[FORMAT_KEY],
-                "",
-                f"write {FORMAT_KEY}: {FORMAT_VERSION}",
-            )
-        self.builder.name = reader.read_text(fields.get("name"), "", "name")
-        self.builder.description = reader.read_text(fields.get("description"), "", "description")
+            top.note("the file does not state its format", f"add a first line, {fix}")
+        elif version != FORMAT_VERSION:
+            top.error(f"{FORMAT_KEY}: {quote(version)} is not supported", f"write {fix}", FORMAT_KEY)
+        builder.name, builder.description = top.read_text("name"), top.read_text("description")
         if "defaults" in fields:
-            inside = reader.read_fields(fields["defaults"], "defaults", ("sigma",))
-            if "sigma" in inside:
-                self.defaults = read_sigma_parts(reader, inside["sigma"], "defaults") or SigmaDefaults()
+            defaults = top.enter(fields["defaults"], "defaults", ("sigma",))
+            if "sigma" in defaults.fields:
+                self.defaults = read_sigma(defaults) or SigmaDefaults()
         if "templates" in fields:
-            self.read_templates(fields["templates"])
+            self.read_templates(top.enter(fields["templates"], "templates"))
         if "bodies" in fields:
             bodies = [value for _, value in fields["bodies"].pairs]
             self.template_uses.update(
                 v.text.strip() for body in bodies for k, v in body.pairs if k.text.strip() == "template"
             )
-            for name, key, value in reader.read_pairs(fields["bodies"], "bodies"):
+            for name, key, value in top.enter(fields["bodies"], "bodies").pairs:
                 self.read_body(name, key, value)
-        elif not any(problem.severity is Severity.ERROR for problem in self.builder.problems):
-            reader.error("there are no bodies", root, "", "add bodies:, with a name and frames: for each")
+        elif not any(problem.severity is Severity.ERROR for problem in builder.problems):
+            top.error("there are no bodies", "add bodies:, with a name and frames: for each")
         if "constraints" in fields:
-            for name, key, value in reader.read_pairs(fields["constraints"], "constraints"):
+            for name, key, value in top.enter(fields["constraints"], "constraints").pairs:
                 self.read_constraint(name, key, value)
         for name, template in self.templates.items():
             if not template.is_used:
-                self.builder.add_problem(
-                    Severity.NOTE,
-                    f"no body uses template {label(name)}",
-                    reader.locate(template.node, "templates"),
-                )
+                source = Location(top.file, template.line, "templates")
+                builder.add_problem(Severity.NOTE, f"no body uses template {label(name)}", source)
 
-    def read_templates(self, node: YamlNode) -> None:
-        for name, key, value in self.reader.read_pairs(node, "templates"):
+    def read_templates(self, templates: YamlMapping) -> None:
+        for name, key, value in templates.pairs:
             place = f"template {label(name)}"
             if name in self.templates:
-                first = self.templates[name].node.line
-                self.reader.error(
-                    f"{place} is defined twice (first on line {first})", key, place, "rename one of the two"
-                )
+                message = f"{place} is defined twice (first on line {self.templates[name].line})"
+                self.builder.add_error(message, Location(templates.file, key.line, place), "rename one of the two")
                 continue
-            fields = self.reader.read_fields(value, place, _TEMPLATE_KEYS)
-            self.templates[name] = _BodyTemplate(
-                self.reader.read_text(fields.get("description"), place, "description"),
-                self.read_inertia(fields.get("inertia"), place),
-                self.read_frames(fields.get("frames"), place),
-                key,
-                read_shapes(self.reader, fields.get("visuals"), f"{place}, visuals"),
-                read_shapes(self.reader, fields.get("collisions"), f"{place}, collisions"),
-            )
+            self.templates[name] = self.read_parts(templates.enter(value, place, _TEMPLATE_KEYS), key)
+
+    def read_parts(self, at: YamlMapping, key: YamlNode) -> _BodyParts:
+        inertia = at.read_rows("inertia", (6,), 6) if "inertia" in at.fields else None
+        frames = at.enter(at.fields["frames"], f"{at.place}, frames").pairs if "frames" in at.fields else []
+        return _BodyParts(
+            at.read_text("description"),
+            None if inertia is None else tuple(map(tuple, inertia)),
+            [
+                (self.read_frame(name, at.enter(value, f"{at.place}, frame {label(name)}", _FRAME_KEYS)), frame_key)
+                for name, frame_key, value in frames
+            ],
+            read_shapes(at, "visuals"),
+            read_shapes(at, "collisions"),
+            key.line,
+        )
 
     def read_body(self, name: str, key: YamlNode, value: YamlNode) -> None:
-        place = f"body {label(name)}"
-        fields = self.reader.read_fields(value, place, _BODY_KEYS)
-        template = self.find_template(fields.get("template"), place)
-        description = self.reader.read_text(fields.get("description"), place, "description")
-        inertia = self.read_inertia(fields.get("inertia"), place)
-        frames = self.read_frames(fields.get("frames"), place)
-        visuals = read_shapes(self.reader, fields.get("visuals"), f"{place}, visuals")
-        collisions = read_shapes(self.reader, fields.get("collisions"), f"{place}, collisions")
-        pose = None
-        if "transform" in fields:
-            inside = f"{place}, transform"
-            pose = read_pose(self.reader, self.reader.read_fields(fields["transform"], inside, POSE_KEYS), inside)
+        at = self.top.enter(value, f"body {label(name)}", _BODY_KEYS)
+        template = self.find_template(at)
+        parts = self.read_parts(at, key)
+        frames, pose = parts.frames, None
+        if "transform" in at.fields:
+            pose = read_pose(at.enter(at.fields["transform"], f"{at.place}, transform", POSE_KEYS))
         if template is not None:
-            description = description or template.description
-            inertia = inertia or template.inertia
-            visuals, collisions = visuals or template.visuals, collisions or template.collisions
             frames = _override(template.frames, frames)
         self.frame_count += len(frames)
+        source = at.locate(key.line)
         if self.frame_count > MAX_FRAMES >= self.frame_count - len(frames):
-            self.reader.error(
-                f"the file, with its templates expanded, has more than {MAX_FRAMES} frames",
-                key,
-                place,
-                "split it into several models",
-            )
+            message = f"the file, with its templates expanded, has more than {MAX_FRAMES} frames"
+            self.builder.add_error(message, source, "split it into several models")
         if self.frame_count > MAX_FRAMES:
             return
-        body = self.builder.add_body(name, description, pose, inertia, self.reader.locate(key, place))
-        body.visuals, body.collisions = visuals, collisions
+        base = template or parts
+        inertia = parts.inertia or base.inertia
+        body = self.builder.add_body(name, parts.description or base.description, pose, inertia, source)
+        body.visuals, body.collisions = parts.visuals or base.visuals, parts.collisions or base.collisions
         for frame, node in frames:
-            body.frames.append((frame, self.reader.locate(node, f"{place}, frame {label(frame.name)}")))
+            place = f"{at.place}, frame {label(frame.name)}"
+            body.frames.append((frame, Location(at.file, node.line, place)))
 
-    def find_template(self, node: YamlNode | None, place: str) -> _BodyTemplate | None:
-        if node is None:
-            return None
-        name = self.reader.read_text(node, place, "template")
+    def find_template(self, body: YamlMapping) -> _BodyParts | None:
+        name = body.read_text("template")
         template = self.templates.get(name)
         if template is not None:
             template.is_used = True
@@ -274,86 +248,52 @@ class _GeometryReader:
             if near and self.template_uses[name] > 1 and not self.template_uses[near[0]]:
                 near = Suggestion()
             known = ", ".join(list(self.templates)[:8]) or "none"
-            self.reader.error(
-                f"there is no template {quote(name)}",
-                node,
-                place,
-                f"write {near[0]}" if near else f"templates are: {known}",
-                near,
-            )
+            fix = f"write {near[0]}" if near else f"templates are: {known}"
+            body.error(f"there is no template {quote(name)}", fix, "template", near)
         return template
 
-    def read_frames(self, node: YamlNode | None, place: str) -> list[_FrameNode]:
-        if node is None:
-            return []
-        return [
-            (self.read_frame(name, value, f"{place}, frame {label(name)}"), key)
-            for name, key, value in self.reader.read_pairs(node, f"{place}, frames")
-        ]
+    def read_frame(self, name: str, at: YamlMapping) -> BodyFrame:
+        return BodyFrame(name, read_pose(at) or Pose.identity(), at.read_text("description"), self.read_sigma(at))
 
-    def read_frame(self, name: str, node: YamlNode, place: str) -> BodyFrame:
-        fields = self.reader.read_fields(node, place, _FRAME_KEYS)
-        return BodyFrame(
-            name,
-            read_pose(self.reader, fields, place) or Pose.identity(),
-            self.reader.read_text(fields.get("description"), place, "description"),
-            self.read_sigma(fields, place),
-        )
-
-    def read_sigma(self, fields: dict[str, YamlNode], place: str) -> Sigma | None:
+    def read_sigma(self, at: YamlMapping) -> Sigma | None:
         """Return the sigma of a frame or constraint.
 
         The defaults apply if it states a pose: a frame without one, like Origin, is there by definition, not by survey.
         """
-        if "sigma" in fields:
-            return read_sigma(self.reader, fields["sigma"], place, self.defaults)
-        position, rotation = self.defaults.position, self.defaults.rotation
-        if (position is None and rotation is None) or not any(key in fields for key in POSE_KEYS):
+        if "sigma" in at.fields:
+            stated = read_sigma(at)
+            return None if stated is None else self.defaults.complete(stated)
+        if self.defaults == SigmaDefaults() or not any(key in at.fields for key in POSE_KEYS):
             return None
-        none = (0.0, 0.0, 0.0)
-        return Sigma(position or none, rotation or none)
-
-    def read_inertia(self, node: YamlNode | None, place: str) -> _Inertia | None:
-        if node is None:
-            return None
-        rows = self.reader.read_rows(node, (6,), 6, place, "inertia")
-        return None if rows is None else tuple(tuple(row) for row in rows)
+        return self.defaults.complete()
 
     def read_constraint(self, name: str, key: YamlNode, value: YamlNode) -> None:
-        place = f"constraint {label(name)}"
-        fields = self.reader.read_fields(value, place, _CONSTRAINT_KEYS)
-        pose = read_pose(self.reader, fields, place)
-        sigma = self.read_sigma(fields, place)
-        description = self.reader.read_text(fields.get("description"), place, "description")
-        joint = read_joint(self.reader, fields["joint"], place) if "joint" in fields else FIXED
+        at = self.top.enter(value, f"constraint {label(name)}", _CONSTRAINT_KEYS)
+        pose = read_pose(at)
+        sigma = self.read_sigma(at)
+        description = at.read_text("description")
+        joint = read_joint(at) if "joint" in at.fields else FIXED
         if joint is None:
             self.builder.unreadable_joints.add(name)
             joint = FIXED
-        from_, to = (self.read_end(end, fields, key, place) for end in ("from", "to"))
+        from_, to = (self.read_end(at, end, key) for end in ("from", "to"))
+        source = at.locate(key.line)
         if from_ and to:
-            self.builder.add_constraint(
-                name, from_, to, pose, description, sigma, joint, self.reader.locate(key, place)
-            )
+            self.builder.add_constraint(name, from_, to, pose, description, sigma, joint, source)
         elif from_ or to:
-            self.builder.unresolved_ends.append(
-                (name, "From" if from_ else "To", from_ or to, self.reader.locate(key, place))
-            )
+            self.builder.unresolved_ends.append((name, "From" if from_ else "To", from_ or to, source))
 
-    def read_end(self, end: str, fields: dict[str, YamlNode], key: YamlNode, place: str) -> str:
+    def read_end(self, at: YamlMapping, end: str, key: YamlNode) -> str:
         """Return the frame that a constraint names; empty, with an error, if it names none."""
-        node = fields.get(end)
+        node = at.fields.get(end)
         if node is None:
-            self.reader.error(f"{end} is missing", key, place, f"add {end}: Body:Frame")
+            at.error(f"{end} is missing", f"add {end}: Body:Frame", key.line)
             return ""
         if node.kind is NodeKind.MAPPING and len(node.pairs) == 1:
-            self.reader.error(
-                f"{end} is a mapping: there is a space after the colon",
-                node,
-                place,
-                f"write {end}: Body:Frame, without a space",
-            )
+            message = f"{end} is a mapping: there is a space after the colon"
+            at.error(message, f"write {end}: Body:Frame, without a space", node.line)
             return ""
-        return ":".join(part.strip() for part in self.reader.read_text(node, place, end).split(":"))
+        return ":".join(part.strip() for part in at.read_text(end).split(":"))
 
 
 def _override(base: list[_FrameNode], own: list[_FrameNode]) -> list[_FrameNode]:

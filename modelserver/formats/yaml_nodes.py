@@ -4,8 +4,6 @@ PyYAML's composer is recursive in C, so a few kilobytes of brackets would end th
 is built from them with bounded depth and bounded size. The size counts the nodes of each alias again, so an alias bomb
 is rejected at the alias that exceeds it. Tags are rejected: the key decides what a scalar means, so a frame may be
 named `on`, `12` or `null`.
-
-Each method of `NodeReader` returns a value, or None with a problem at the line of the node.
 """
 
 from __future__ import annotations
@@ -18,7 +16,7 @@ from typing import Any
 import yaml
 
 from modelserver.errors import Location, quote
-from modelserver.formats.reading import parse_number, suggest_known_key
+from modelserver.formats.reading import ElementReader, SyntaxProblemError, parse_number, suggest_known_key
 from modelserver.geometry.builder import ModelBuilder
 
 MAX_DEPTH = 20
@@ -66,40 +64,26 @@ _NO_ITEMS: list[YamlNode] = []
 _NO_PAIRS: list[tuple[YamlNode, YamlNode]] = []
 
 
-class _RejectedYamlError(Exception):
-    def __init__(self, message: str, line: int, fix: str):
-        super().__init__(message)
-        self.line = line
-        self.fix = fix
-
-
 def parse_yaml(content: bytes, builder: ModelBuilder, file: str) -> YamlNode | None:
     """Parse the one document in `content`; None, with an error in `builder`, if it is not YAML."""
+    text = ""
     try:
         text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = content.count(b"\n", 0, error.start) + 1
-        builder.add_error(
-            f"the file is not UTF-8 text: byte {content[error.start]:#04x} in this line",
-            Location(file, line),
-            "save it as UTF-8; a binary file is not a geometry file",
-        )
-        return None
-    try:
         return _NodeBuilder().build(text)
-    except _RejectedYamlError as error:
-        builder.add_error(str(error), Location(file, error.line), error.fix)
+    except UnicodeDecodeError as error:
+        message = f"the file is not UTF-8 text: byte {content[error.start]:#04x} in this line"
+        fix, line = "save it as UTF-8; a binary file is not a geometry file", content.count(b"\n", 0, error.start) + 1
+    except SyntaxProblemError as error:
+        message, fix, line = str(error), error.fix, error.line
     except yaml.MarkedYAMLError as error:
-        _report_syntax(error, text, builder, file)
+        message, fix, line = _explain_syntax(error, text)
     except yaml.reader.ReaderError as error:
         place = error.position if isinstance(error.position, int) else 0
-        builder.add_error(
-            f"the file holds a character that YAML forbids: {_format_character(error.character)}",
-            Location(file, text.count("\n", 0, place) + 1),
-            "remove it; a binary file is not a geometry file",
-        )
+        message = f"the file holds a character that YAML forbids: {_format_character(error.character)}"
+        fix, line = "remove it; a binary file is not a geometry file", text.count("\n", 0, place) + 1
     except yaml.YAMLError as error:
-        builder.add_error(f"the YAML cannot be read: {error}", Location(file), "write it as in docs/geometry-files.md")
+        message, fix, line = f"the YAML cannot be read: {error}", "write it as in docs/geometry-files.md", 0
+    builder.add_error(message, Location(file, line), fix)
     return None
 
 
@@ -108,24 +92,16 @@ def _format_character(value: object) -> str:
     return f"#x{code:04x}" if isinstance(code, int) else repr(value)
 
 
-def _report_syntax(error: yaml.MarkedYAMLError, text: str, builder: ModelBuilder, file: str) -> None:
+def _explain_syntax(error: yaml.MarkedYAMLError, text: str) -> tuple[str, str, int]:
+    """Return message, fix and line of a syntax error."""
     mark = error.problem_mark or error.context_mark
     number = mark.line + 1 if mark is not None else 0
     lines = text.split("\n")
-    indent = re.match(r"[ ]*(\t)?", lines[number - 1]) if 0 < number <= len(lines) else None
-    if indent is not None and indent[1]:
-        builder.add_error(
-            "the line is indented with a tab, which YAML forbids",
-            Location(file, number),
-            "write spaces instead of tabs",
-        )
-        return
+    if 0 < number <= len(lines) and re.match(r"[ ]*\t", lines[number - 1]):
+        return "the line is indented with a tab, which YAML forbids", "write spaces instead of tabs", number
     context = f" {error.context}" if error.context else ""
-    builder.add_error(
-        f"the YAML is not well-formed: {error.problem or 'unreadable'}{context}",
-        Location(file, number),
-        "look at this line and the one before: a missing colon, bracket or quote, or a wrong indentation",
-    )
+    fix = "look at this line and the one before: a missing colon, bracket or quote, or a wrong indentation"
+    return f"the YAML is not well-formed: {error.problem or 'unreadable'}{context}", fix, number
 
 
 class _NodeBuilder:
@@ -152,7 +128,7 @@ class _NodeBuilder:
                 line = event.start_mark.line + 1
                 self.reject_tag(event.tag, line)
                 if len(open_nodes) >= MAX_DEPTH:
-                    raise _RejectedYamlError(
+                    raise SyntaxProblemError(
                         f"the file nests deeper than {MAX_DEPTH} levels",
                         line,
                         "no geometry needs that; look for brackets that are not closed",
@@ -168,7 +144,7 @@ class _NodeBuilder:
             elif kind is yaml.AliasEvent:
                 node = self.resolve_alias(event.anchor, event.start_mark.line + 1)
             elif kind is yaml.DocumentStartEvent and root is not None:
-                raise _RejectedYamlError(
+                raise SyntaxProblemError(
                     "a second document begins here", event.start_mark.line + 1, "keep one model in a file; remove ---"
                 )
             else:
@@ -190,7 +166,7 @@ class _NodeBuilder:
     def add_size(self, size: int, line: int) -> None:
         self.total += size
         if self.total > MAX_NODES:
-            raise _RejectedYamlError(
+            raise SyntaxProblemError(
                 f"the file, with its aliases expanded, holds more than {MAX_NODES} values",
                 line,
                 "split it, or use a template instead of aliases within aliases",
@@ -199,7 +175,7 @@ class _NodeBuilder:
     def resolve_alias(self, anchor: str, line: int) -> YamlNode:
         node = self.anchors.get(anchor)
         if node is None:
-            raise _RejectedYamlError(
+            raise SyntaxProblemError(
                 f"alias *{anchor} has no complete anchor &{anchor} before it",
                 line,
                 "write the anchor first; a value cannot hold itself",
@@ -210,135 +186,115 @@ class _NodeBuilder:
     @staticmethod
     def reject_tag(tag: str | None, line: int) -> None:
         if tag not in (None, "!"):
-            raise _RejectedYamlError(f"the tag {tag} has no meaning here", line, "remove it")
+            raise SyntaxProblemError(f"the tag {tag} has no meaning here", line, "remove it")
 
 
-class NodeReader:
-    """Reads nodes of one file into plain values; `place` names the element for problems, e.g. `body Raptor`."""
+class YamlMapping(ElementReader):
+    """A mapping: its `pairs` (key text, key, value) in order, and the values of the `known` keys in `fields`.
 
-    def __init__(self, builder: ModelBuilder, file: str):
-        self.builder = builder
-        self.file = file
+    Null values are left out of the fields; unknown and duplicate keys are errors. The value of a misspelled key is at
+    the key that is meant: it is examined, and not missing.
+    """
 
-    def locate(self, node: YamlNode, place: str) -> Location:
-        """Return the place of a node."""
-        return Location(self.file, node.line, place)
-
-    def error(self, message: str, node: YamlNode, place: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
-        """Report an error at a node."""
-        self.builder.add_error(message, Location(self.file, node.line, place), fix, nearest)
-
-    def read_fields(self, node: YamlNode, place: str, known: tuple[str, ...]) -> dict[str, YamlNode]:
-        """Return the values of a mapping by key, without null values; unknown and duplicate keys are errors.
-
-        The value of a misspelled key is returned under the key that is meant: it is examined, and not missing.
-        """
-        found: dict[str, YamlNode] = {}
-        first: dict[str, int] = {}
-        pairs = self.read_pairs(node, place)
-        given = {name for name, _, _ in pairs}
-        for name, key, value in pairs:
-            if name not in known:
-                # a key that is present already is not what was meant
-                near = suggest_known_key(name, tuple(each for each in known if each not in given))
-                self.error(
-                    f"unknown key {quote(name)}",
-                    key,
-                    place,
-                    f"write {near[0]}" if near else f"keys here are {', '.join(known)}",
-                    near,
-                )
-                if near and not value.is_null:
-                    found.setdefault(near[0], value)
-            elif name in first:
-                self.error(f"{name} is given twice (first on line {first[name]})", key, place, "remove one of the two")
-            else:
-                first[name] = key.line
-                if not value.is_null:
-                    found[name] = value
-        return found
-
-    def read_pairs(self, node: YamlNode, place: str) -> list[tuple[str, YamlNode, YamlNode]]:
-        """Return key text, key and value of each pair of a mapping, in order."""
-        if node.is_null:
-            return []
-        if node.kind is not NodeKind.MAPPING:
-            what = node.kind.value
-            self.error(f"expected a mapping (key: value), got {what}", node, place, "write key: value, one per line")
-            return []
-        pairs = []
+    def __init__(self, builder: ModelBuilder, file: str, node: YamlNode, place: str, known: tuple[str, ...] = ()):
+        super().__init__(builder, file, node.line, place)
+        self.node = node
+        self.pairs: list[tuple[str, YamlNode, YamlNode]] = []
+        self.fields: dict[str, YamlNode] = {}
+        if not node.is_null and node.kind is not NodeKind.MAPPING:
+            self.error(f"expected a mapping (key: value), got {node.kind.value}", "write key: value, one per line")
         for key, value in node.pairs:
             if key.kind is not NodeKind.SCALAR:
-                self.error(f"a key is a name, got {key.kind.value}", key, place, "write name: value")
+                self.error(f"a key is a name, got {key.kind.value}", "write name: value", key.line)
             elif key.text == "<<" and key.is_plain:
-                self.error("merge keys (<<) are not supported", key, place, "use templates; see docs/geometry-files.md")
+                fix = "use templates; see docs/geometry-files.md"
+                self.error("merge keys (<<) are not supported", fix, key.line)
             else:
-                pairs.append((key.text.strip(), key, value))
-        return pairs
+                self.pairs.append((key.text.strip(), key, value))
+        if known:
+            self._select(known)
 
-    def read_text(self, node: YamlNode | None, place: str, key: str) -> str:
-        """Return the trimmed text of a scalar, empty if it is absent or wrong."""
+    def _select(self, known: tuple[str, ...]) -> None:
+        first: dict[str, int] = {}
+        given = {name for name, _, _ in self.pairs}
+        for name, key, value in self.pairs:
+            if name in first:
+                message = f"{name} is given twice (first on line {first[name]})"
+                self.error(message, "remove one of the two", key.line)
+                continue
+            if name in known:
+                first[name] = key.line
+            else:
+                # a key that is present already is not what was meant
+                near = suggest_known_key(name, tuple(each for each in known if each not in given))
+                fix = f"write {near[0]}" if near else f"keys here are {', '.join(known)}"
+                self.error(f"unknown key {quote(name)}", fix, key.line, near)
+                if not near or near[0] in self.fields:
+                    continue
+                name = near[0]
+            if not value.is_null:
+                self.fields[name] = value
+
+    def enter(self, node: YamlNode, place: str, known: tuple[str, ...] = ()) -> YamlMapping:
+        """Return another mapping of the file."""
+        return YamlMapping(self.builder, self.file, node, place, known)
+
+    def line_of(self, key: str) -> int:
+        """Return the line of the value of a key; 0 if it is absent."""
+        return self.fields[key].line if key in self.fields else 0
+
+    def read_text(self, key: str) -> str:
+        """Return the trimmed text of a scalar, empty if it is absent or, with an error, no scalar."""
+        node = self.fields.get(key)
         if node is None:
             return ""
-        if node.kind is not NodeKind.SCALAR:
-            self.error(
-                f"{key} is a text, got {node.kind.value}", node, place, f"write {key}: some text, in quotes if need be"
-            )
-            return ""
-        return node.text.strip()
+        if node.kind is NodeKind.SCALAR:
+            return node.text.strip()
+        fix = f"write {key}: some text, in quotes if need be"
+        self.error(f"{key} is a text, got {node.kind.value}", fix, node.line)
+        return ""
 
-    def read_numbers(self, node: YamlNode, count: int, place: str, key: str, unit: str) -> list[float] | None:
-        """Read a list of `count` numbers."""
+    def read_numbers(self, node: YamlNode, count: int, key: str, unit: str = "") -> list[float] | None:
+        """Read a list of `count` numbers; None, with an error, if it is wrong."""
         fix = f"write {key}: [{', '.join(['number'] * count)}]" + (f", in {unit}" if unit else "")
         if node.kind is not NodeKind.LIST:
             got = quote(node.text, 40) if node.kind is NodeKind.SCALAR else node.kind.value
-            self.error(f"{key} is a list of {count} numbers, got {got}", node, place, fix)
+            self.error(f"{key} is a list of {count} numbers, got {got}", fix, node.line)
             return None
-        values = []
-        wrong = False
-        for item in node.items:
-            value = self.read_number(item, place, key, fix)
-            if value is None:
-                wrong = True
-            else:
-                values.append(value)
-        if wrong:
+        read = [self.read_number(item, key, fix) for item in node.items]
+        values = [value for value in read if value is not None]
+        if len(values) < len(read):
             return None
         if len(values) != count:
             plural = "" if len(values) == 1 else "s"
-            self.error(f"{key} has {len(values)} number{plural}, not {count}", node, place, fix)
+            self.error(f"{key} has {len(values)} number{plural}, not {count}", fix, node.line)
             return None
         return values
 
-    def read_number(self, node: YamlNode, place: str, key: str, fix: str) -> float | None:
-        """Read one number."""
+    def read_number(self, node: YamlNode, key: str, fix: str) -> float | None:
+        """Read one number; None, with an error, if it is wrong."""
         if node.kind is not NodeKind.SCALAR:
-            self.error(f"{key}: expected a number, got {node.kind.value}", node, place, fix)
+            self.error(f"{key}: expected a number, got {node.kind.value}", fix, node.line)
             return None
         try:
             if not node.is_plain:
                 raise ValueError(f"{quote(node.text, 40)} is a text in quotes, not a number")
             return parse_number(node.text)
         except ValueError as error:
-            self.error(f"{key}: {error}", node, place, fix)
+            self.error(f"{key}: {error}", fix, node.line)
             return None
 
-    def read_rows(
-        self, node: YamlNode, shapes: tuple[int, ...], width: int, place: str, key: str
-    ) -> list[list[float]] | None:
+    def read_rows(self, key: str, shapes: tuple[int, ...], width: int) -> list[list[float]] | None:
         """Read rows of `width` numbers; their count is one of `shapes`."""
-        wanted = " or ".join(str(shape) for shape in shapes)
-        fix = f"write {key}: [[...], ...] with {wanted} rows of {width} numbers"
-        if node.kind is not NodeKind.LIST:
-            self.error(f"{key} is a list of rows, got {node.kind.value}", node, place, fix)
+        node = self.fields[key]
+        wanted = " or ".join(map(str, shapes))
+        if node.kind is not NodeKind.LIST or len(node.items) not in shapes:
+            what = f"has {len(node.items)} rows, not {wanted}"
+            if node.kind is not NodeKind.LIST:
+                what = f"is a list of rows, got {node.kind.value}"
+            fix = f"write {key}: [[...], ...] with {wanted} rows of {width} numbers"
+            self.error(f"{key} {what}", fix, node.line)
             return None
-        if len(node.items) not in shapes:
-            self.error(f"{key} has {len(node.items)} rows, not {wanted}", node, place, fix)
-            return None
-        rows = [
-            self.read_numbers(item, width, place, f"{key} row {number}", "")
-            for number, item in enumerate(node.items, 1)
-        ]
-        if any(row is None for row in rows):
-            return None
-        return [row for row in rows if row is not None]
+        rows = [self.read_numbers(item, width, f"{key} row {number}") for number, item in enumerate(node.items, 1)]
+        read = [row for row in rows if row is not None]
+        return read if len(read) == len(rows) else None

@@ -15,11 +15,10 @@ A file reader fills one and adds the problems that it met; a program may do the 
 from __future__ import annotations
 
 from modelserver.errors import GeometryError, Location, NotConnectedError, Problem, Severity, quote
-from modelserver.geometry.draft import NO_LOCATION, BodyBuilder, ModelDraft
 from modelserver.geometry.joint import FIXED, Joint
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
-from modelserver.geometry.review import ModelReview
+from modelserver.geometry.review import NO_LOCATION, BodyBuilder, ModelDraft, ModelReview
 from modelserver.geometry.topology import full_name
 from modelserver.transforms.pose import Pose
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Collection, Iterable, Sequence
 
-from modelserver.errors import Location, quote, suggest_name
-from modelserver.geometry.joint import Joint, coordinate_names
+from modelserver.errors import Location, Severity, quote, suggest_name
+from modelserver.geometry.joint import coordinate_names
 from modelserver.geometry.mimic import apply_mimic_defaults, find_mimic_chain, resolve_mimics
 from modelserver.geometry.names import MAX_LISTED, format_first_location, format_names
 from modelserver.geometry.parts import Constraint
@@ -24,40 +23,35 @@ MAX_ANGLE = 2.0 * math.tau
 """Radians; an angle beyond two turns is probably one in degrees."""
 
 
-class JointProblem(NamedTuple):
-    """A problem of a joint: message, location and fix."""
-
-    message: str
-    source: Location
-    fix: str
-    nearest: tuple[str, ...] = ()
-
-
 class JointRules:
     """Checks the joints of constraints that are well formed otherwise.
 
+    `report` and `add_problem` are those of the `ModelReview`.
     `known` are the names of all constraints of the file: a follower of a rejected joint is not reported again.
-    `unclear` are those whose joint could not be read. `constraints` are those left when the invalid ones are dropped,
-    with the defaults of mimic joints applied. With `repair` the followers of a dropped joint are dropped as well, and
-    reported.
+    `unclear` are those whose joint could not be read. With `repair` the followers of a dropped joint are dropped as
+    well, and reported.
     """
 
     def __init__(
         self,
-        placed: Sequence[LocatedConstraint],
+        report: Callable[..., None],
+        add_problem: Callable[..., None],
         known: Iterable[str],
-        unclear: Collection[str] = (),
-        repair: bool = False,
+        unclear: Collection[str],
+        repair: bool,
     ):
-        self.problems: list[JointProblem] = []
-        self.warnings: list[JointProblem] = []
+        self._report = report
+        self._add_problem = add_problem
         self._known = set(known)
         self._unclear = unclear
         self._repair = repair
+
+    def apply(self, placed: Sequence[LocatedConstraint]) -> tuple[LocatedConstraint, ...]:
+        """Return the constraints without those whose joints are invalid, with the defaults of mimic joints applied."""
         valid = self._drop_duplicate_coordinates(placed)
         while rejected := self._find_invalid_mimics(valid):
             valid = [each for each in valid if each[0].name not in rejected]
-        self.constraints = self._apply_defaults(valid)
+        return self._apply_defaults(valid)
 
     def _drop_duplicate_coordinates(self, placed: Sequence[LocatedConstraint]) -> list[LocatedConstraint]:
         valid: list[LocatedConstraint] = []
@@ -67,13 +61,11 @@ class JointRules:
             clash = next((name for name in mine if name in taken), None)
             if clash is not None:
                 other, place = taken[clash]
-                self.problems.append(
-                    JointProblem(
-                        f"constraint {quote(constraint.name)}: a coordinate of its joint is called {quote(clash)}, as "
-                        f"is one of constraint {other.name}{format_first_location(place)}",
-                        source,
-                        "rename one of the two constraints",
-                    )
+                self._report(
+                    f"constraint {quote(constraint.name)}: a coordinate of its joint is called {quote(clash)}, as is "
+                    f"one of constraint {other.name}{format_first_location(place)}",
+                    source,
+                    "rename one of the two constraints",
                 )
                 continue
             taken.update((name, (constraint, source)) for name in mine)
@@ -150,8 +142,8 @@ class JointRules:
             message = f"constraint {quote(constraint.name)}: its joint follows {constraint.joint.mimic.joint}"
             self._report(f"{message}, which was removed", source, "fix that one")
 
-    def _report(self, message: str, source: Location, fix: str, nearest: tuple[str, ...] = ()) -> None:
-        self.problems.append(JointProblem(message, source, fix, nearest))
+    def _warn(self, constraint: Constraint, message: str, source: Location, fix: str) -> None:
+        self._add_problem(Severity.WARNING, f"constraint {quote(constraint.name)}: {message}", source, fix)
 
     def _apply_defaults(self, placed: Sequence[LocatedConstraint]) -> tuple[LocatedConstraint, ...]:
         placed = self._drop_out_of_range(placed)
@@ -161,31 +153,19 @@ class JointRules:
             joint, mimic = each.joint, each.joint.mimic
             if mimic is None:
                 continue
-            label = f"constraint {quote(each.name)}"
+            unused = f"is not used, because it follows {mimic.joint}"
             if stated.joint.default not in ((), joint.default):
-                self.warnings.append(
-                    JointProblem(
-                        f"{label}: the default of its joint is not used, because it follows {mimic.joint}",
-                        source,
-                        f"remove it, or state the default of {mimic.joint}",
-                    )
-                )
+                fix = f"remove it, or state the default of {mimic.joint}"
+                self._warn(each, f"the default of its joint {unused}", source, fix)
             if stated.joint.sigma:
-                self.warnings.append(
-                    JointProblem(
-                        f"{label}: the sigma of its joint is not used, because it follows {mimic.joint}",
-                        source,
-                        f"remove it, or state the sigma of {mimic.joint}: their errors are common",
-                    )
-                )
+                fix = f"remove it, or state the sigma of {mimic.joint}: their errors are common"
+                self._warn(each, f"the sigma of its joint {unused}", source, fix)
             if joint.is_out_of_limits(joint.default):
-                self.warnings.append(
-                    JointProblem(
-                        f"{label}: at the default of {mimic.joint}, its joint is at "
-                        f"{_format_default(joint)}, out of its limits",
-                        source,
-                        "fix the multiplier or offset of mimic, the limits, or the default of the joint it follows",
-                    )
+                (value,) = joint.default
+                at = f"{math.degrees(value):.4g} deg" if joint.angle_flags[0] else f"{value:.4g} m"
+                fix = "fix the multiplier or offset of mimic, the limits, or the default of the joint it follows"
+                self._warn(
+                    each, f"at the default of {mimic.joint}, its joint is at {at}, out of its limits", source, fix
                 )
         return tuple((each, source) for (_, source), each in zip(placed, applied, strict=True))
 
@@ -201,14 +181,9 @@ class JointRules:
                 ]
                 if turns:
                     what = "default" if key == "default" else f"{key} limit"
-                    self.warnings.append(
-                        JointProblem(
-                            f"constraint {quote(constraint.name)}: the {what} of its joint is {turns[0]:.6g} rad, "
-                            f"{abs(turns[0]) / math.tau:.3g} turns",
-                            source,
-                            "where that is degrees, name them so (limits_deg, default_deg); a winch may turn that far",
-                        )
-                    )
+                    size = f"{turns[0]:.6g} rad, {abs(turns[0]) / math.tau:.3g} turns"
+                    fix = "where that is degrees, name them so (limits_deg, default_deg); a winch may turn that far"
+                    self._warn(constraint, f"the {what} of its joint is {size}", source, fix)
                     break
 
     def _drop_out_of_range(self, placed: Sequence[LocatedConstraint]) -> list[LocatedConstraint]:
@@ -230,8 +205,3 @@ class JointRules:
                     continue
             valid.append((constraint, source))
         return valid
-
-
-def _format_default(joint: Joint) -> str:
-    (value,) = joint.default
-    return f"{math.degrees(value):.4g} deg" if joint.angle_flags[0] else f"{value:.4g} m"

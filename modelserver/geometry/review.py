@@ -1,24 +1,74 @@
-"""The rules of a model (report 4.5): checks what a builder collected, and drops what is invalid."""
+"""The rules of a model (report 4.5): checks the unchecked model of a `ModelBuilder`, and drops what is invalid."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field, replace
+from typing import Final
 
 from modelserver.errors import Location, Problem, Severity, Suggestion, quote
 from modelserver.geometry import loop_closure as loops
 from modelserver.geometry import names
-from modelserver.geometry.draft import NO_LOCATION, BodyBuilder, ModelDraft
 from modelserver.geometry.joint_rules import JointRules, LocatedConstraint
-from modelserver.geometry.loop_closure import MAX_SIGMAS, LoopMisclosure
 from modelserver.geometry.names import MAX_LISTED, format_first_location, format_names
-from modelserver.geometry.parts import Body, BodyFrame, Constraint, suggest_frame
+from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma, suggest_frame
+from modelserver.geometry.shape import Shape
 from modelserver.geometry.topology import Topology
+from modelserver.transforms.pose import Pose
 
 MAX_LOOP_SIGMAS = 3.0
 """A loop misclosure of more standard deviations is a warning: one in 370 correct surveys exceeds it."""
 
 MAX_SUGGESTIONS = 100
 """Constraint ends for which the nearest names are searched, which is slow."""
+
+
+NO_LOCATION: Final = Location()
+
+
+@dataclass(slots=True)
+class BodyBuilder:
+    """Collects one body; created by `ModelBuilder.add_body`."""
+
+    name: str
+    source: Location = NO_LOCATION
+    description: str = ""
+    pose: Pose | None = None
+    inertia: tuple[tuple[float, ...], ...] | None = None
+    frames: list[tuple[BodyFrame, Location]] = field(default_factory=list)
+    visuals: tuple[Shape, ...] = ()
+    collisions: tuple[Shape, ...] = ()
+
+    def add_frame(
+        self,
+        name: str,
+        pose: Pose | None = None,
+        description: str = "",
+        sigma: Sigma | None = None,
+        source: Location = NO_LOCATION,
+    ) -> BodyBuilder:
+        """Add a frame at `pose` in body coordinates; return this body."""
+        self.frames.append((BodyFrame(name, pose or Pose.identity(), description, sigma, self.name), source))
+        return self
+
+
+@dataclass(slots=True, eq=False)
+class ModelDraft:
+    """A model before it is checked.
+
+    strict: apply the 2005 rule that a frame has one constraint at most. problems: those met while reading.
+    unreadable_joints: constraints whose joint could not be read; they are added as fixed. unresolved_ends: constraint,
+    end (From or To) and frame of constraints with one end missing; the other end is checked too.
+    """
+
+    name: str = ""
+    description: str = ""
+    strict: bool = False
+    problems: list[Problem] = field(default_factory=list)
+    unreadable_joints: set[str] = field(default_factory=set)
+    unresolved_ends: list[tuple[str, str, str, Location]] = field(default_factory=list)
+    bodies: list[BodyBuilder] = field(default_factory=list)
+    constraints: list[tuple[Constraint, Location]] = field(default_factory=list)
 
 
 class ModelReview:
@@ -33,83 +83,76 @@ class ModelReview:
 
     def report(self, message: str, source: Location, fix: str, nearest: tuple[str, ...] = ()) -> None:
         """Report something invalid: an error, or with repair the warning that it was removed."""
-        if self.repair:
-            self.problems.append(Problem(Severity.WARNING, f"{message}; removed", source, fix, nearest))
-        else:
-            self.problems.append(Problem(Severity.ERROR, message, source, fix, nearest))
+        severity, removed = (Severity.WARNING, "; removed") if self.repair else (Severity.ERROR, "")
+        self.problems.append(Problem(severity, message + removed, source, fix, nearest))
 
     def add_problem(self, severity: Severity, message: str, source: Location, fix: str = "") -> None:
         """Report a problem that leaves the model usable."""
         self.problems.append(Problem(severity, message, source, fix))
 
+    @property
+    def has_errors(self) -> bool:
+        """Whether there is any error so far."""
+        return any(problem.severity is Severity.ERROR for problem in self.problems)
+
+    def _is_new_name(
+        self, label: str, name: str, source: Location, seen: dict[str, Location], example: str, fix: str = ""
+    ) -> bool:
+        """Return whether a name is valid and not among those `seen`, to which it is added; otherwise report it."""
+        if fault := names.find_problem(name):
+            self.report(f"{label}: {fault}", source, f"give it a plain name, e.g. {example}")
+        elif name in seen:
+            twice = f"{label} is defined twice{format_first_location(seen[name])}"
+            self.report(twice, source, fix or "rename one of the two")
+        else:
+            seen[name] = source
+            return True
+        return False
+
     def check_bodies(self) -> dict[str, Body]:
         """Return the bodies by name, each with its well-formed frames."""
         valid: dict[str, Body] = {}
+        fix = "rename one; to duplicate a device, give the copy a name of its own"
         for draft in self.draft.bodies:
             label = f"body {quote(draft.name)}"
-            if fault := names.find_problem(draft.name):
-                self.report(f"{label}: {fault}", draft.source, "give it a plain name, e.g. FrontCamera")
-                continue
             if draft.name in names.RESERVED_BODIES:
                 self.report(f"{label}: this name is reserved for the server's world frames", draft.source, "rename it")
                 continue
-            if draft.name in valid:
-                first = self.locations[draft.name]
-                self.report(
-                    f"{label} is defined twice{format_first_location(first)}",
-                    draft.source,
-                    "rename one; to duplicate a device, give the copy a name of its own",
-                )
+            if not self._is_new_name(label, draft.name, draft.source, self.locations, "FrontCamera", fix):
                 continue
-            self.locations[draft.name] = draft.source
             frames = self._check_frames(draft)
             if not frames:
                 self.report(
-                    f"{label} has no frame; a body needs at least one",
-                    draft.source,
-                    "add a frame, e.g. Origin",
+                    f"{label} has no frame; a body needs at least one", draft.source, "add a frame, e.g. Origin"
                 )
                 if self.repair:
                     continue
-            shapes = (draft.visuals, draft.collisions)
+            body = Body(draft.name, frames, draft.description, draft.pose, None, draft.visuals, draft.collisions)
             try:
-                valid[draft.name] = Body(draft.name, frames, draft.description, draft.pose, draft.inertia, *shapes)
+                body = replace(body, inertia=draft.inertia)
             except ValueError as error:
                 self.report(f"{label}: {error}", draft.source, "write 6 rows of 6 numbers, or leave it out")
-                valid[draft.name] = Body(draft.name, frames, draft.description, draft.pose, None, *shapes)
-        if not valid and not any(problem.severity is Severity.ERROR for problem in self.problems):
+            valid[draft.name] = body
+        if not valid and not self.has_errors:
             # not after an error: it is the cause
-            self.add_problem(
-                Severity.ERROR,
-                "there is no body",
-                NO_LOCATION,
-                "a model has two bodies or more, each with a frame",
-            )
+            fix = "a model has two bodies or more, each with a frame"
+            self.add_problem(Severity.ERROR, "there is no body", NO_LOCATION, fix)
         elif len(valid) == 1:
             (only,) = valid
-            self.add_problem(
-                Severity.NOTE,
-                f"there is one body, {only}; most models join two or more",
-                self.locations[only],
-                "add the bodies mounted on it, or leave it if the vehicle is one rigid body",
-            )
+            message = f"there is one body, {only}; most models join two or more"
+            fix = "add the bodies mounted on it, or leave it if the vehicle is one rigid body"
+            self.add_problem(Severity.NOTE, message, self.locations[only], fix)
         return valid
 
     def _check_frames(self, draft: BodyBuilder) -> tuple[BodyFrame, ...]:
-        valid: dict[str, tuple[BodyFrame, Location]] = {}
-        for frame, source in draft.frames:
-            label = f"frame {quote(frame.name)} of body {quote(draft.name)}"
-            if fault := names.find_problem(frame.name):
-                self.report(f"{label}: {fault}", source, "give it a plain name, e.g. ImagePlane")
-            elif frame.name in valid:
-                self.report(
-                    f"{label} is defined twice{format_first_location(valid[frame.name][1])}",
-                    source,
-                    "rename one of the two",
-                )
-            else:
-                valid[frame.name] = (frame, source)
-        return tuple(frame for frame, _ in valid.values())
+        seen: dict[str, Location] = {}
+        return tuple(
+            frame
+            for frame, source in draft.frames
+            if self._is_new_name(
+                f"frame {quote(frame.name)} of body {quote(draft.name)}", frame.name, source, seen, "ImagePlane"
+            )
+        )
 
     def check_constraints(self, bodies: dict[str, Body]) -> tuple[LocatedConstraint, ...]:
         """Return the well-formed constraints: both ends exist and differ; in strict mode, one for each frame."""
@@ -118,28 +161,16 @@ class ModelReview:
         by_frame: dict[str, tuple[str, Location]] = {}
         for constraint, source in self.draft.constraints:
             label = f"constraint {quote(constraint.name)}"
-            if fault := names.find_problem(constraint.name):
-                self.report(f"{label}: {fault}", source, "give it a plain name, e.g. DigiclopsFixed")
+            if not self._is_new_name(label, constraint.name, source, by_name, "DigiclopsFixed"):
                 continue
-            if constraint.name in by_name:
-                self.report(
-                    f"{label} is defined twice{format_first_location(by_name[constraint.name])}",
-                    source,
-                    "rename one of the two",
-                )
-                continue
-            by_name[constraint.name] = source
             ends = (("From", constraint.from_), ("To", constraint.to))
             # a list, so that both ends are checked
-            exist = [self._check_end(label, sense, end, bodies, source) for sense, end in ends]
+            exist = [self._check_end(label, *end, bodies, source) for end in ends]
             if not all(exist):
                 continue
             if constraint.from_ == constraint.to:
-                self.report(
-                    f"{label}: From equals To ({constraint.from_})",
-                    source,
-                    "a constraint joins two different frames; name the partner in To",
-                )
+                fix = "a constraint joins two different frames; name the partner in To"
+                self.report(f"{label}: From equals To ({constraint.from_})", source, fix)
                 continue
             if names.split(constraint.from_)[0] == names.split(constraint.to)[0]:
                 self.report(
@@ -150,55 +181,39 @@ class ModelReview:
                 continue
             taken = [(end, *by_frame[end]) for _, end in ends if self.draft.strict and end in by_frame]
             for end, other, place in taken:
-                self.report(
-                    f"{label}: frame {end} already has constraint {other}{format_first_location(place)}; "
-                    "a frame has one at most",
-                    source,
-                    f"add a frame of its own to body {names.split(end)[0]} for this constraint, or leave strict out",
-                )
-            if taken:
-                continue
-            for _, end in ends:
-                by_frame[end] = (constraint.name, source)
-            valid.append((constraint, source))
+                first = f"frame {end} already has constraint {other}{format_first_location(place)}"
+                own = f"add a frame of its own to body {names.split(end)[0]} for this constraint, or leave strict out"
+                self.report(f"{label}: {first}; a frame has one at most", source, own)
+            if not taken:
+                by_frame |= {end: (constraint.name, source) for _, end in ends}
+                valid.append((constraint, source))
         for name, sense, end, source in self.draft.unresolved_ends:
             self._check_end(f"constraint {quote(name)}", sense, end, bodies, source)
         return tuple(valid)
 
     def _check_end(self, label: str, sense: str, end: str, bodies: dict[str, Body], source: Location) -> bool:
+        fix = "write it as Body:Frame, with the names in the file"
         try:
             body, frame = names.split(end)
         except ValueError:
-            near = self._suggest_end(end, bodies)
-            self.report(f"{label}: {sense} {quote(end)} is not of the form Body:Frame", source, _suggest(near), near)
-            return False
-        if body not in bodies:
-            near = self._suggest_end(end, bodies)
-            self.report(
-                f"{label}: {sense} names body {quote(body)}, which does not exist", source, _suggest(near), near
-            )
-            return False
-        if not bodies[body].has_frame(frame):
-            known = [each.name for each in bodies[body].frames[: MAX_LISTED + 1]]
-            near = self._suggest_end(end, bodies)
-            self.report(
-                f"{label}: {sense} names frame {quote(frame)}, which body {body} does not have",
-                source,
-                _suggest(near) if near else f"body {body} has: {format_names(known)}",
-                near,
-            )
-            return False
-        return True
+            problem = f"{quote(end)} is not of the form Body:Frame"
+        else:
+            if body not in bodies:
+                problem = f"names body {quote(body)}, which does not exist"
+            elif not bodies[body].has_frame(frame):
+                problem = f"names frame {quote(frame)}, which body {body} does not have"
+                known = [each.name for each in bodies[body].frames[: MAX_LISTED + 1]]
+                fix = f"body {body} has: {format_names(known)}"
+            else:
+                return True
+        near = self._suggest_end(end, bodies)
+        self.report(f"{label}: {sense} {problem}", source, f"write {near[0]}" if near else fix, near)
+        return False
 
     def check_joints(self, placed: tuple[LocatedConstraint, ...]) -> tuple[LocatedConstraint, ...]:
         """Return the constraints whose joints are valid, with the defaults of mimic joints applied."""
         known = [constraint.name for constraint, _ in self.draft.constraints]
-        rules = JointRules(placed, known, self.draft.unreadable_joints, self.repair)
-        for fault in rules.problems:
-            self.report(fault.message, fault.source, fault.fix, fault.nearest)
-        for warning in rules.warnings:
-            self.add_problem(Severity.WARNING, warning.message, warning.source, warning.fix)
-        return rules.constraints
+        return JointRules(self.report, self.add_problem, known, self.draft.unreadable_joints, self.repair).apply(placed)
 
     def _suggest_end(self, end: str, bodies: dict[str, Body]) -> Suggestion:
         """Return a suggestion for an end of a constraint that does not exist.
@@ -220,7 +235,7 @@ class ModelReview:
     ) -> tuple[dict[str, Body], tuple[Constraint, ...]]:
         """Report orphans and loops; return what is left: with repair, only what is traceable to the root."""
         constraints = tuple(constraint for constraint, _ in placed)
-        if any(problem.severity is Severity.ERROR for problem in self.problems) or not bodies:
+        if self.has_errors or not bodies:
             # orphans are a consequence of invalid constraints
             return bodies, constraints
         topology = Topology(tuple(bodies.values()), constraints)
@@ -228,13 +243,10 @@ class ModelReview:
         root, *orphaned = topology.assemblies
         for assembly in orphaned:
             for body in assembly:
-                self.add_problem(
-                    Severity.WARNING,
-                    f"body {body} is an orphan: no constraints lead to the root body {root[0]}"
-                    + ("; removed" if self.repair else "; it answers only inside its own assembly"),
-                    self.locations[body],
-                    f"add a constraint that joins it to {root[0]} or to what is mounted there",
-                )
+                end = "removed" if self.repair else "it answers only inside its own assembly"
+                message = f"body {body} is an orphan: no constraints lead to the root body {root[0]}; {end}"
+                fix = f"add a constraint that joins it to {root[0]} or to what is mounted there"
+                self.add_problem(Severity.WARNING, message, self.locations[body], fix)
         for closing in topology.find_loop_closures():
             found = loops.compute_misclosure(closing.path, lambda name: _frame_of(bodies, name))
             bad = not found.is_exact and (found.sigmas is None or found.sigmas > MAX_LOOP_SIGMAS)
@@ -257,30 +269,23 @@ def _frame_of(bodies: dict[str, Body], name: str) -> BodyFrame:
     return bodies[body].frame(frame)
 
 
-def _describe_misclosure(found: LoopMisclosure) -> str:
+def _describe_misclosure(found: loops.LoopMisclosure) -> str:
     """Return the misclosure of a loop as text."""
     if found.is_exact:
         return "it closes exactly" + (", with joints at their defaults" if found.joints else "")
-    text = (
-        f"its misclosure{', with joints at their defaults,' if found.joints else ''} is "
-        f"{found.meters * 1e3:.3g} mm and "
-        f"{math.degrees(found.radians):.3g} deg"
-    )
+    joints = ", with joints at their defaults," if found.joints else ""
+    text = f"its misclosure{joints} is {found.meters * 1e3:.3g} mm and {math.degrees(found.radians):.3g} deg"
     if found.sigmas is None:
         return f"{text}, and no sigma is stated for {format_names(found.missing_sigmas)}"
     if math.isinf(found.sigmas):
         return f"{text}, in a direction that the surveys state as exact"
-    more = "more than " if found.sigmas >= MAX_SIGMAS else ""
+    more = "more than " if found.sigmas >= loops.MAX_SIGMAS else ""
     return f"{text}, {more}{found.sigmas:.1f} sigma of the surveys"
 
 
-def _suggest_fix(found: LoopMisclosure) -> str:
+def _suggest_fix(found: loops.LoopMisclosure) -> str:
     if found.sigmas is None:
         missing = format_names(found.missing_sigmas)
         return f"state sigma: of {missing}, remove one constraint of the loop, or fix the survey"
     rest = " or the default of a joint" if found.joints else ""
     return f"remove one constraint of the loop, or fix the survey of its frames{rest}"
-
-
-def _suggest(near: tuple[str, ...]) -> str:
-    return f"write {near[0]}" if near else "write it as Body:Frame, with the names in the file"
