@@ -11,8 +11,8 @@ import pytest
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.messages import VALID, Decision, Invalid, Phase, Verdict
 from mstools.report import consistency
-from mstools.report.findings import FindingLevel, collect_findings, estimate_fix_latency
-from mstools.report.replay_data import FixRecord, ReplayData, SourceTimes, StateSample, WheelComparison
+from mstools.report.findings import collect_findings, estimate_fix_latency
+from mstools.report.replay_data import FindingLevel, FixRecord, ReplayData, SourceTimes, StateSample, WheelComparison
 
 START = 1_700_000_000_000_000
 

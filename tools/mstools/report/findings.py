@@ -14,13 +14,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
+from itertools import groupby
 
 import numpy as np
 
 from modelserver.messages import Decision, Invalid, Verdict
 from modelserver.transforms.so3 import Array
 from mstools.report import consistency
-from mstools.report.replay_data import FindingLevel, ReplayData, ReportFinding, StateSample, WheelComparison
+from mstools.report.replay_data import ReplayData, ReportFinding, StateSample, error, note, warning
 from mstools.report.sensor_checks import SENSOR_CHECKS
 from mstools.terminal.output import format_count
 
@@ -50,48 +51,26 @@ def collect_findings(data: ReplayData) -> list[ReportFinding]:
 
 def check_wheels(data: ReplayData) -> Iterable[ReportFinding]:
     """Find wheels with reversed sign, and wheels without pulses."""
-    for name, turns in sorted(_group_by_wheel(data.wheels).items()):
+    by_name = sorted(data.wheels, key=lambda each: each.name)
+    for name, turns in groupby(by_name, lambda each: each.name):
         moving = [each for each in turns if abs(each.expected) > MOVING_SPEED]
         if len(moving) < MIN_WHEEL_SAMPLES:
             continue
-        against = [each for each in moving if abs(each.measured + each.expected) < 0.3 * abs(each.expected)]
-        if len(against) > 0.5 * len(moving):
-            yield ReportFinding(
-                FindingLevel.ERROR,
+        against = sum(abs(each.measured + each.expected) < 0.3 * abs(each.expected) for each in moving)
+        runs = [list(run) for is_silent, run in groupby(moving, lambda each: abs(each.measured) < 0.02) if is_silent]
+        silent, longest = sum(map(len, runs)), max((run[-1].t - run[0].t for run in runs), default=0.0)
+        if against > 0.5 * len(moving):
+            yield error(
                 f"Wheel {name} counts backward",
-                f"In {len(against)} of {len(moving)} samples in motion it measured the negative of the expected speed.",
+                f"In {against} of {len(moving)} samples in motion it measured the negative of the expected speed.",
                 "Reverse the sign of this wheel in its driver, or swap its encoder's two channels.",
             )
-            continue
-        silent = [each for each in moving if abs(each.measured) < 0.02]
-        longest = _longest_run(silent, moving)
-        if len(silent) > 0.5 * len(moving) or longest > 5.0:
-            yield ReportFinding(
-                FindingLevel.ERROR,
+        elif silent > 0.5 * len(moving) or longest > 5.0:
+            yield error(
                 f"Wheel {name} is stationary while the vehicle drives",
-                f"It measured no motion in {len(silent)} of {len(moving)} samples, for up to {longest:.0f} s.",
+                f"It measured no motion in {silent} of {len(moving)} samples, for up to {longest:.0f} s.",
                 "Check its encoder, cable and plug; leave a wheel without encoder out of sensors.wheels.frames.",
             )
-
-
-def _group_by_wheel(turns: Iterable[WheelComparison]) -> dict[str, list[WheelComparison]]:
-    wheels: dict[str, list[WheelComparison]] = {}
-    for each in turns:
-        wheels.setdefault(each.name, []).append(each)
-    return wheels
-
-
-def _longest_run(marked: list[WheelComparison], among: list[WheelComparison]) -> float:
-    """Return the longest time over which all of `among` are marked, seconds."""
-    chosen = set(map(id, marked))
-    longest, since = 0.0, math.nan
-    for each in among:
-        if id(each) not in chosen:
-            since = math.nan
-        else:
-            since = each.t if math.isnan(since) else since
-            longest = max(longest, each.t - since)
-    return longest
 
 
 def check_direction(data: ReplayData) -> Iterable[ReportFinding]:
@@ -99,8 +78,7 @@ def check_direction(data: ReplayData) -> Iterable[ReportFinding]:
     moving = [each for each in data.snapshots if abs(each.speed) > MOVING_SPEED]
     backward = sum(each.speed < 0.0 for each in moving)
     if len(moving) >= 2 * MIN_WHEEL_SAMPLES and backward > 0.8 * len(moving):
-        yield ReportFinding(
-            FindingLevel.WARNING,
+        yield warning(
             "The vehicle drives backward nearly all the time",
             f"Forward speed is negative in {backward / len(moving):.0%} of the time in motion.",
             "If it drove forward: all wheels count backward, or the IMU mount is rotated by 180 degrees.",
@@ -114,16 +92,14 @@ def check_wheel_scale(data: ReplayData) -> Iterable[ReportFinding]:
     scale, sigma = _get_state(last, "wheel_scale")
     if math.isfinite(scale) and abs(scale) > max(2.0 * settings.wheel_scale_sigma, 3.0 * sigma):
         word = "too long" if scale > 0.0 else "too short"
-        yield ReportFinding(
-            FindingLevel.WARNING,
+        yield warning(
             f"The distance by the wheels is {abs(scale):.1%} {word}",
             f"wheel_scale ended at {scale:+.3f} +- {sigma:.3f}; its prior sigma is {settings.wheel_scale_sigma:.3f}.",
             f"Multiply the wheel radius in the driver by {1.0 / (1.0 + scale):.3f}.",
         )
     yaw, sigma = _get_state(last, "wheel_yaw")
     if math.isfinite(yaw) and abs(yaw) > max(3.0 * settings.wheel_yaw_sigma, 3.0 * sigma):
-        yield ReportFinding(
-            FindingLevel.WARNING,
+        yield warning(
             f"The wheels roll {abs(math.degrees(yaw)):.1f} degrees to the {'left' if yaw > 0.0 else 'right'}",
             f"wheel_yaw ended at {math.degrees(yaw):+.2f} +- {math.degrees(sigma):.2f} degrees from the geometry's x.",
             "Survey the yaw of the rolling frame and of the IMU: gravity and wheels cannot distinguish the two.",
@@ -138,8 +114,7 @@ def check_frozen_imu(data: ReplayData) -> Iterable[ReportFinding]:
     if data.frozen:
         total = sum(b - a for a, b in data.frozen)
         begin = data.frozen[0][0]
-        yield ReportFinding(
-            FindingLevel.ERROR,
+        yield error(
             "The IMU froze",
             f"It repeated one sample {format_count(len(data.frozen), 'time')}, {total:.1f} s in all, first at "
             f"{begin:.0f} s.",
@@ -158,8 +133,7 @@ def check_biases(data: ReplayData) -> Iterable[ReportFinding]:
         for axis in "xyz":
             value, sigma = _get_state(last, f"{kind}_{axis}")
             if math.isfinite(value) and abs(value) > 3.0 * limit and abs(value) > 3.0 * sigma:
-                yield ReportFinding(
-                    FindingLevel.WARNING,
+                yield warning(
                     f"{kind.replace('_', ' ').capitalize()} about {axis} is far outside its data sheet"
                     if kind == "gyro_bias"
                     else f"Accelerometer bias along {axis} is far outside its data sheet",
@@ -203,10 +177,9 @@ def check_stated_sigma(data: ReplayData) -> Iterable[ReportFinding]:
         )
         if each.mean > 2.5:
             advice = ADVICE.get(each.kind, GENERAL_ADVICE)
-            yield ReportFinding(FindingLevel.WARNING, f"{each.kind}: errors larger than its sigma", seen, advice)
+            yield warning(f"{each.kind}: errors larger than its sigma", seen, advice)
         elif each.mean < 0.15 and each.kind not in constraints:
-            yield ReportFinding(
-                FindingLevel.NOTE,
+            yield note(
                 f"{each.kind}: errors smaller than its sigma",
                 seen,
                 "Nothing is wrong; a smaller sigma would give it more weight. modelserver tune measures the gain.",
@@ -221,8 +194,7 @@ def check_latency(data: ReplayData) -> Iterable[ReportFinding]:
     seconds, sigma = found
     if abs(seconds) > max(0.1, 4.0 * sigma):
         where = "behind" if seconds > 0.0 else "ahead of"
-        yield ReportFinding(
-            FindingLevel.WARNING,
+        yield warning(
             f"Fixes lie {abs(seconds):.2f} s {where} the vehicle",
             f"Their residuals along the path are proportional to the speed: {seconds:+.2f} +- {sigma:.2f} s.",
             f"If the receiver's stamps have this latency, set sensors.gps.latency: {seconds:.2f}; NIS should fall."
@@ -246,8 +218,8 @@ def estimate_fix_latency(data: ReplayData) -> tuple[float, float] | None:
     for series in (off, v):
         series -= _smooth(t, series)
     part = np.minimum((np.arange(len(t)) * LATENCY_BLOCKS) // len(t), LATENCY_BLOCKS - 1)
-    cross = np.array([-float((off[part == n] * v[part == n]).sum()) for n in range(LATENCY_BLOCKS)])
-    square = np.array([float((v[part == n] ** 2).sum()) for n in range(LATENCY_BLOCKS)])
+    cross = np.bincount(part, -(off * v).sum(axis=1))
+    square = np.bincount(part, (v * v).sum(axis=1))
     total = float(square.sum())
     if total < 0.05 * len(t):  # too little change: 0.2 m/s rms
         return None
@@ -285,8 +257,7 @@ def check_rejected_fixes(data: ReplayData) -> Iterable[ReportFinding]:
     if total >= 20 and rejected > 0.2 * total:
         words = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common(3))
         known = [REJECT_REASONS.get(reason, f"{reason}: docs/words.md") for reason, _ in reasons.most_common(3)]
-        yield ReportFinding(
-            FindingLevel.WARNING,
+        yield warning(
             f"{rejected / total:.0%} of the fixes were rejected",
             f"Of {format_count(total, 'fix', 'fixes')} as positions: {words}.",
             f"{'; '.join(known)}.",
@@ -309,8 +280,7 @@ def check_stamps(data: ReplayData) -> Iterable[ReportFinding]:
                 by_source[source] += count
         for source, count in sorted(by_source.items()):
             if count >= 5:
-                yield ReportFinding(
-                    FindingLevel.WARNING,
+                yield warning(
                     f"{source}: {format_count(count, 'sample')} {reason}",
                     "They were not used.",
                     advice,
@@ -323,8 +293,7 @@ def check_gaps(data: ReplayData) -> Iterable[ReportFinding]:
         found = [(a, b) for a, b in sensor.find_gaps() if b - a > max(1.0, 5.0 * sensor.period)]
         if found:
             longest = max(b - a for a, b in found)
-            yield ReportFinding(
-                FindingLevel.NOTE,
+            yield note(
                 f"{sensor.name}: {format_count(len(found), 'gap')}, the longest {longest:.1f} s",
                 f"Its period is {sensor.period:.3g} s; the first gap begins at {found[0][0]:.0f} s.",
                 "See the position's sigma in the gap; check the device's link if it was not intended.",
@@ -337,8 +306,7 @@ def check_validity(data: ReplayData, has_cause: bool = False) -> Iterable[Report
     `has_cause`: other findings explain it; then the reasons given with poses are not repeated.
     """
     if not data.snapshots:
-        yield ReportFinding(
-            FindingLevel.ERROR,
+        yield error(
             "There was never a state",
             "Probably a consequence of the findings above."
             if has_cause
@@ -349,8 +317,7 @@ def check_validity(data: ReplayData, has_cause: bool = False) -> Iterable[Report
     first = next((n for n, each in enumerate(data.snapshots) if not each.invalid), None)
     if first is None:
         words = data.snapshots[-1].invalid.explain()
-        yield ReportFinding(
-            FindingLevel.ERROR,
+        yield error(
             "The pose was never valid",
             "Probably a consequence of the findings above." if has_cause else f"At the end: {words}.",
             "Fix those first."
@@ -364,8 +331,7 @@ def check_validity(data: ReplayData, has_cause: bool = False) -> Iterable[Report
     if len(bad) > 0.05 * len(after):
         reasons = Counter(flag for each in bad for flag in Invalid if flag in each.invalid)
         words = "; ".join(flag.explain() for flag, _ in reasons.most_common(2))
-        yield ReportFinding(
-            FindingLevel.WARNING,
+        yield warning(
             f"The pose was not valid in {len(bad) / len(after):.0%} of the time after it first was",
             f"Mostly: {words}.",
             "See the strip of reasons below.",
@@ -384,8 +350,7 @@ def check_divergence(data: ReplayData) -> Iterable[ReportFinding]:
         if found:
             first = found[0]
             times = "" if len(found) == 1 else f", first of {len(found)} times"
-            yield ReportFinding(
-                FindingLevel.WARNING,
+            yield warning(
                 title,
                 f"At {data.to_seconds(first.utime):.0f} s{times}: {first.reason}.",
                 "See the innovations before it: which kind failed first?",

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +25,6 @@ from modelserver.messages import (
     ImuSample,
     Invalid,
     Mode,
-    NavigationState,
     Origin,
     Phase,
     SensorHeader,
@@ -165,6 +167,27 @@ class ReplayData:
         return (utime - self.first_utime) * 1e-6
 
 
+class FindingLevel(IntEnum):
+    """Severity of a finding, worst first."""
+
+    ERROR = 0
+    WARNING = 1
+    NOTE = 2
+
+
+@dataclass(frozen=True, slots=True)
+class ReportFinding:
+    """One finding: a headline, the observation, and what to do."""
+
+    level: FindingLevel
+    title: str
+    observation: str
+    advice: str
+
+
+error, warning, note = (partial(ReportFinding, level) for level in FindingLevel)
+
+
 class ReplayCollector:
     """Collects `ReplayData`: pass `on_sample` and `on_decision` to the offline run, then call `finish`."""
 
@@ -280,27 +303,34 @@ class ReplayCollector:
         estimate = localizer.estimate(utime)
         if estimate.origin is not None:
             self._origin = estimate.origin
-        place, yaw, sigma, yaw_sigma = None, math.nan, math.nan, math.nan
+        known: dict[str, Any] = {}
         if estimate.utm is not None:
-            place = (estimate.utm @ self._X_rolling_antenna).xyz
-            yaw = _yaw(estimate.utm)
+            known |= {"position": (estimate.utm @ self._X_rolling_antenna).xyz, "yaw": float(estimate.utm.rpy[2])}
             if estimate.covariance is not None:
                 P = np.array(estimate.covariance).reshape(6, 6)
-                sigma = math.sqrt(max(float(np.linalg.eigvalsh(P[:2, :2])[-1]), 0.0))
-                yaw_sigma = math.sqrt(max(float(P[5, 5]), 0.0))
-        known = StateSample(
+                known["sigma"] = math.sqrt(max(float(np.linalg.eigvalsh(P[:2, :2])[-1]), 0.0))
+                known["yaw_sigma"] = math.sqrt(max(float(P[5, 5]), 0.0))
+        state = localizer.navigation(utime)
+        if state is not None:
+            variances = np.diagonal(np.array(state.covariance).reshape(len(state.names), -1))
+            known |= {
+                "speed": state.linear_velocity[0],
+                "lateral_speed": state.linear_velocity[1],
+                "yaw_rate": state.angular_velocity[2],
+                "is_stationary": state.stationary,
+                "mode": state.mode,
+                "phase": state.phase,
+                "values": dict(zip(state.names, state.values, strict=True)),
+                "sigmas": dict(zip(state.names, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True)),
+            }
+        return StateSample(
             t=0.0,
             invalid=estimate.invalid,
             epoch=estimate.pose_epoch,
-            position=place,
-            yaw=yaw,
-            sigma=sigma,
-            yaw_sigma=yaw_sigma,
             horizontal_protection_level=estimate.horizontal_protection_level,
             heading_protection_level=estimate.heading_protection_level,
+            **known,
         )
-        state = localizer.navigation(utime)
-        return known if state is None else _add_state(known, state)
 
     def _add_wheels(self, sample: WheelsSample) -> None:
         before = self._previous_wheels.get(sample.header.source)
@@ -309,8 +339,8 @@ class ReplayCollector:
         dt = (sample.header.utime - before.header.utime) * 1e-6 if before is not None else 0.0
         for wheel in sample.wheels:
             self._wheel_names[wheel.name] = None
-            way = wheel.travel - earlier.get(wheel.name, math.nan)
-            speed = way / dt if 0.0 < dt < 1.0 and math.isfinite(way) else wheel.speed
+            distance = wheel.travel - earlier.get(wheel.name, math.nan)
+            speed = distance / dt if 0.0 < dt < 1.0 and math.isfinite(distance) else wheel.speed
             if math.isfinite(speed) and math.isfinite(wheel.steering):
                 middle = sample.header.utime - round(0.5e6 * min(dt, 1.0))
                 self._wheel_speeds.append((middle, wheel.name, speed, wheel.steering))
@@ -319,13 +349,8 @@ class ReplayCollector:
         if sample.specific_force is not None and all(map(math.isfinite, sample.specific_force)):
             self._forces += sample.specific_force
             self._force_count += 1
-        before = self._imu
-        same = (
-            before is not None
-            and before.specific_force == sample.specific_force
-            and before.angular_velocity == sample.angular_velocity
-        )
-        if not same:
+        measured = (sample.specific_force, sample.angular_velocity)
+        if self._imu is None or measured != (self._imu.specific_force, self._imu.angular_velocity):
             self._close_frozen()
             self._same_since = sample.header.utime
         self._imu = sample
@@ -353,69 +378,46 @@ class ReplayCollector:
         for sample in self._fixes:
             header = sample.header
             fix = gate.evaluate_fix(sample, settings)
-            place = None
-            if geodesy is not None and not isinstance(fix, str):
-                height = 0.0 if math.isnan(fix.height) else fix.height
-                try:
-                    utm = geodesy.utm_from_geodetic(fix.latitude_deg, fix.longitude_deg, height)
-                    place = geodesy.to_relative_utm(utm)
-                except GeodesyError:
-                    place = None
             decision = decided.get((header.source, header.utime, header.seq))
             t = (header.utime - first_utime) * 1e-6
-            off = velocity = None
-            if decision is not None and decision.dof == 2 and not isinstance(fix, str):
-                before = _latest(snapshots, times, t)
-                if before is not None and math.isfinite(before.speed):
-                    east = shares(fix.east_variance, sample.fix_type, settings)[1]
-                    north = shares(fix.north_variance, sample.fix_type, settings)[1]
-                    a, b = (before.values.get(name, 0.0) for name in WANDER[:2])
-                    off = (decision.residual[0] + east * a, decision.residual[1] + north * b)
-                    velocity = _velocity(before)
-            sigma = math.nan if isinstance(fix, str) else fix.sigma
             verdict, reason = ("", "") if decision is None else (decision.verdict.name.lower(), decision.reason)
-            # without decisions, as in raw mode, the gate's own
-            if not decided and isinstance(fix, str):
-                verdict, reason = "rejected", fix
-            found.append(FixRecord(t, place, sigma, verdict, reason, off, velocity))
+            if isinstance(fix, str):
+                # without decisions, as in raw mode, the gate's own
+                words = (verdict, reason) if decided else ("rejected", fix)
+                found.append(FixRecord(t, None, math.nan, *words))
+                continue
+            place = residual = velocity = None
+            if geodesy is not None:
+                height = 0.0 if math.isnan(fix.height) else fix.height
+                with suppress(GeodesyError):
+                    utm = geodesy.utm_from_geodetic(fix.latitude_deg, fix.longitude_deg, height)
+                    place = geodesy.to_relative_utm(utm)
+            before = _latest(snapshots, times, t) if decision is not None and decision.dof == 2 else None
+            if decision is not None and before is not None and math.isfinite(before.speed):
+                east = shares(fix.east_variance, sample.fix_type, settings)[1]
+                north = shares(fix.north_variance, sample.fix_type, settings)[1]
+                a, b = (before.values.get(name, 0.0) for name in WANDER[:2])
+                residual = (decision.residual[0] + east * a, decision.residual[1] + north * b)
+                velocity = _velocity(before)
+            found.append(FixRecord(t, place, fix.sigma, verdict, reason, residual, velocity))
         return tuple(found)
 
     def _compare_wheels(self, first_utime: int, snapshots: tuple[StateSample, ...]) -> tuple[WheelComparison, ...]:
         known = [each for each in snapshots if math.isfinite(each.speed)]
         if not known or not self._wheel_speeds:
             return ()
+        utimes, names, measured, steering = zip(*self._wheel_speeds, strict=True)
         times = [each.t for each in known]
-        speeds, turns = [each.speed for each in known], [each.yaw_rate for each in known]
+        at = (np.array(utimes) - first_utime) * 1e-6
+        v, w = (np.interp(at, times, [getattr(each, name) for each in known]) for name in ("speed", "yaw_rate"))
         contacts = {name: self._rig.pose(frame).xyz for name, frame in self._rig.wheel_frames.items()}
-        at = (np.array([utime for utime, _, _, _ in self._wheel_speeds]) - first_utime) * 1e-6
-        found = []
-        for t, v, w, (_, name, measured, steering) in zip(
-            at.tolist(),
-            np.interp(at, times, speeds).tolist(),
-            np.interp(at, times, turns).tolist(),
-            self._wheel_speeds,
-            strict=True,
-        ):
-            if name in contacts and times[0] <= t <= times[-1]:
-                x, y, _ = contacts[name]
-                expected = math.cos(steering) * (v - w * y) + math.sin(steering) * w * x
-                found.append(WheelComparison(t, name, measured, expected))
-        return tuple(found)
-
-
-def _add_state(snapshot: StateSample, state: NavigationState) -> StateSample:
-    variances = np.diagonal(np.array(state.covariance).reshape(len(state.names), -1))
-    return replace(
-        snapshot,
-        speed=state.linear_velocity[0],
-        lateral_speed=state.linear_velocity[1],
-        yaw_rate=state.angular_velocity[2],
-        is_stationary=state.stationary,
-        mode=state.mode,
-        phase=state.phase,
-        values=dict(zip(state.names, state.values, strict=True)),
-        sigmas=dict(zip(state.names, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True)),
-    )
+        x, y, _ = np.array([contacts.get(name, (math.nan,) * 3) for name in names]).T
+        expected = np.cos(steering) * (v - w * y) + np.sin(steering) * w * x
+        return tuple(
+            WheelComparison(*each)
+            for each in zip(at.tolist(), names, measured, expected.tolist(), strict=True)
+            if each[1] in contacts and times[0] <= each[0] <= times[-1]
+        )
 
 
 def _velocity(snapshot: StateSample) -> tuple[float, float]:
@@ -427,29 +429,3 @@ def _latest(snapshots: tuple[StateSample, ...], times: Array, t: float) -> State
     """Return the newest snapshot at or before `t` that is not older than a second."""
     index = int(np.searchsorted(times, t, side="right")) - 1
     return snapshots[index] if index >= 0 and t - times[index] < 1.0 else None
-
-
-def _yaw(pose: Pose) -> float:
-    x, y, _ = so3.rotate(pose.wxyz, (1.0, 0.0, 0.0))
-    return math.atan2(y, x)
-
-
-__all__ = ["FixRecord", "ReplayCollector", "ReplayData", "SourceTimes", "StateSample", "WheelComparison"]
-
-
-class FindingLevel(IntEnum):
-    """Severity of a finding, worst first."""
-
-    ERROR = 0
-    WARNING = 1
-    NOTE = 2
-
-
-@dataclass(frozen=True, slots=True)
-class ReportFinding:
-    """One finding: a headline, the observation, and what to do."""
-
-    level: FindingLevel
-    title: str
-    observation: str
-    advice: str

@@ -9,11 +9,10 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 from modelserver.messages import Mode, Verdict
-from mstools.report.replay_data import FindingLevel, ReplayData, ReportFinding
-from mstools.report.sensor_motion import TurnRateComparison, compare_turn_rates
+from mstools.report.replay_data import ReplayData, ReportFinding, error
+from mstools.report.sensor_motion import compare_turn_rates
 from mstools.terminal.output import format_count
 
 UNUSED_SHARE = 0.05
@@ -44,130 +43,88 @@ def check_missing(data: ReplayData) -> Iterable[ReportFinding]:
         if key in MODES_WITHOUT:
             mode = MODES_WITHOUT[key][0].name.lower()
             remedy = f"Correct the channel; a vehicle without it: localization.mode: {mode}, or no sensors.{key}."
-        yield ReportFinding(
-            FindingLevel.ERROR,
+        yield error(
             f"No messages on channel {channel} (sensors.{key})",
             f"The log has {', '.join(data.channels)}." if data.channels else "The log is empty.",
             remedy,
         )
 
 
-@dataclass(frozen=True, slots=True)
-class _UnusedSource:
-    """A source whose samples are rejected: how many, and the most frequent reason."""
-
-    key: str
-    source: str
-    count: int
-    reason: str
-
-
-def _find_unused(data: ReplayData) -> Iterable[_UnusedSource]:
-    used: dict[str, set[tuple[int, int]]] = {}
-    refused: dict[str, dict[tuple[int, int], str]] = {}
-    for each in data.decisions:
-        stamp = (each.utime, each.seq)
-        if each.verdict is Verdict.REJECTED:
-            refused.setdefault(each.source, {}).setdefault(stamp, each.reason or "rejected")
-        else:
-            used.setdefault(each.source, set()).add(stamp)
-    for source, key in sorted(data.sensor_keys.items()):
-        reasons = refused.get(source, {})
-        good = len(used.get(source, ()))
-        if key == "imu":  # accepted IMU samples have no decisions
-            good = data.count_samples(source) - len(reasons)
-        if len(reasons) >= MIN_SAMPLES and good <= UNUSED_SHARE * (good + len(reasons)):
-            ((reason, _),) = Counter(reasons.values()).most_common(1)
-            yield _UnusedSource(key, source, len(reasons), reason)
+RANGE_ADVICE = {
+    "wheels": "Check the units in the driver: speed in m/s and travel in m; mm are too large by 1000.",
+    "gps": "Check the units in the driver: latitude and longitude in degrees, height in meters.",
+    "imu": "Check the units in the driver: rates in rad/s, specific force in m/s2.",
+}
+REASON_ADVICE = {
+    "range": "Check the units in the driver: meters, seconds and radians.",
+    "nan": "The driver sends non-finite numbers: check its input.",
+    "no_fix": "The receiver reports no fix: check its antenna, and localization.filter.minimum_fix_type.",
+    "too_old": "Its stamps are older than localization.filter.horizon: check its clock and its latency.",
+    "future": "Its clock is ahead of the others': synchronize them.",
+    "sigma": "The sigma of its fixes is above localization.filter.maximum_sigma.",
+}
+"""What to do about samples that are rejected for a reason, and about the range of each sensor."""
 
 
 def check_unused(data: ReplayData) -> Iterable[ReportFinding]:
     """Find sensors whose samples are nearly all rejected."""
-    for each in _find_unused(data):
-        if each.reason == "gate":
+    used: dict[str, set[tuple[int, int]]] = {}
+    rejected: dict[str, dict[tuple[int, int], str]] = {}
+    for each in data.decisions:
+        stamp = (each.utime, each.seq)
+        if each.verdict is Verdict.REJECTED:
+            rejected.setdefault(each.source, {}).setdefault(stamp, each.reason or "rejected")
+        else:
+            used.setdefault(each.source, set()).add(stamp)
+    for source, key in sorted(data.sensor_keys.items()):
+        reasons = rejected.get(source, {})
+        # accepted IMU samples have no decisions
+        good = data.count_samples(source) - len(reasons) if key == "imu" else len(used.get(source, ()))
+        if len(reasons) < MIN_SAMPLES or good > UNUSED_SHARE * (good + len(reasons)):
+            continue
+        ((reason, _),) = Counter(reasons.values()).most_common(1)
+        if reason == "gate":
             continue  # fixes disagree with the motion; other checks find which of them is wrong
-        yield ReportFinding(
-            FindingLevel.ERROR,
-            f"No sample of sensors.{each.key} is used: {each.reason}",
-            f"Of {format_count(each.count, 'sample')} of {each.source} with a decision, nearly all were "
-            f"rejected. {_describe(data, each)}".strip(),
-            _advice(data, each),
+        observation = (
+            f"Of {format_count(len(reasons), 'sample')} of {source} with a decision, nearly all were rejected."
         )
-
-
-def _has_wrong_names(data: ReplayData, each: _UnusedSource) -> bool:
-    return (
-        each.key == "wheels"
-        and each.reason in ("names", "nan")
-        and bool(data.wheel_names)
-        and not set(data.wheel_names) & set(data.sensor_motion.lateral_offsets)
-    )
-
-
-def _describe(data: ReplayData, each: _UnusedSource) -> str:
-    if _has_wrong_names(data, each):
-        return (
-            f"The log's wheels are {', '.join(data.wheel_names)}; sensors.wheels.frames has "
-            f"{', '.join(data.sensor_motion.lateral_offsets)}."
-        )
-    if each.key == "wheels" and each.reason == "range":
-        fastest = max(
-            (abs(v) for wheel in data.sensor_motion.wheels.values() for v in wheel.values()), default=math.nan
-        )
-        return (
-            f"The fastest second is {fastest:.0f} m/s; localization.filter.maximum_speed is "
-            f"{data.settings.maximum_speed:.0f}."
-        )
-    return ""
-
-
-def _advice(data: ReplayData, each: _UnusedSource) -> str:
-    if _has_wrong_names(data, each):
-        return "Use the log's names in sensors.wheels.frames, or the vehicle file's names in the driver."
-    if each.reason == "range":
-        return {
-            "wheels": "Check the units in the driver: speed in m/s and travel in m; mm are too large by 1000.",
-            "gps": "Check the units in the driver: latitude and longitude in degrees, height in meters.",
-            "imu": "Check the units in the driver: rates in rad/s, specific force in m/s2.",
-        }.get(each.key, "Check the units in the driver: meters, seconds and radians.")
-    return {
-        "nan": "The driver sends non-finite numbers: check its input.",
-        "no_fix": "The receiver reports no fix: check its antenna, and localization.filter.minimum_fix_type.",
-        "too_old": "Its stamps are older than localization.filter.horizon: check its clock and its latency.",
-        "future": "Its clock is ahead of the others': synchronize them.",
-        "sigma": "The sigma of its fixes is above localization.filter.maximum_sigma.",
-    }.get(each.reason, "docs/words.md explains the reason.")
+        advice = REASON_ADVICE.get(reason, "docs/words.md explains the reason.")
+        known = data.sensor_motion.lateral_offsets
+        if key == "wheels" and reason in ("names", "nan") and data.wheel_names and not known.keys() & data.wheel_names:
+            observation += (
+                f" The log's wheels are {', '.join(data.wheel_names)}; sensors.wheels.frames has {', '.join(known)}."
+            )
+            advice = "Use the log's names in sensors.wheels.frames, or the vehicle file's names in the driver."
+        elif reason == "range":
+            advice = RANGE_ADVICE.get(key, advice)
+            if key == "wheels":
+                speeds = [abs(v) for wheel in data.sensor_motion.wheels.values() for v in wheel.values()]
+                observation += (
+                    f" The fastest second is {max(speeds, default=math.nan):.0f} m/s; "
+                    f"localization.filter.maximum_speed is {data.settings.maximum_speed:.0f}."
+                )
+        yield error(f"No sample of sensors.{key} is used: {reason}", observation, advice)
 
 
 # --- units, signs and names: comparison of sensors ----------------------------------------------------------
 
 
 def check_gyro_unit(data: ReplayData) -> Iterable[ReportFinding]:
-    """Find a gyro in degrees per second: its rate is 57 times that of wheels or fixes."""
-    found = _compare_gyro(data)
-    if found is None:
-        return
-    compared, what = found
-    # wheels that skid through a turn measure up to twice its rate
-    if abs(compared.correlation) > 0.5 and 0.4 * DEGREES_PER_RADIAN < compared.ratio < 1.6 * DEGREES_PER_RADIAN:
-        yield ReportFinding(
-            FindingLevel.ERROR,
-            "The gyro is in degrees per second",
-            f"Its rate is {compared.ratio:.0f} times that of the {what}; a radian is 57.3 degrees.",
-            "angular_velocity must be in rad/s: check the unit in its driver.",
-        )
-
-
-def _compare_gyro(data: ReplayData) -> tuple[TurnRateComparison, str] | None:
-    """Return the gyro's turn rate compared with the wheels', else with the fixes'; None without enough turns."""
-    raw = data.sensor_motion
-    for compared, what in (
-        (compare_turn_rates(raw.gyro, raw.wheel_turn_rate), "wheels"),
-        (raw.compare_with_course(raw.gyro), "fixes"),
-    ):
-        if compared is not None and abs(compared.correlation) > 0.5:
-            return compared, what
-    return None
+    """Find a gyro in degrees per second: its rate is 57 times that of wheels, without them that of fixes."""
+    motion = data.sensor_motion
+    pairs = (
+        (compare_turn_rates(motion.gyro, motion.wheel_turn_rate), "wheels"),
+        (motion.compare_with_course(motion.gyro), "fixes"),
+    )
+    known = [(found.ratio, what) for found, what in pairs if found is not None and abs(found.correlation) > 0.5]
+    for ratio, what in known[:1]:
+        # wheels that skid through a turn measure up to twice its rate
+        if 0.4 * DEGREES_PER_RADIAN < ratio < 1.6 * DEGREES_PER_RADIAN:
+            yield error(
+                "The gyro is in degrees per second",
+                f"Its rate is {ratio:.0f} times that of the {what}; a radian is 57.3 degrees.",
+                "angular_velocity must be in rad/s: check the unit in its driver.",
+            )
 
 
 def check_wheel_signs(data: ReplayData) -> Iterable[ReportFinding]:
@@ -175,14 +132,13 @@ def check_wheel_signs(data: ReplayData) -> Iterable[ReportFinding]:
     raw = data.sensor_motion
     by_gyro = bool(raw.gyro)
     reference, what = (raw.gyro, "gyro") if by_gyro else (raw.course_turn_rate(), "fixes' course")
-    if _is_gyro_in_degrees(data):
+    if any(check_gyro_unit(data)):
         reference = {second: math.radians(rate) for second, rate in raw.gyro.items()}
     against, straight = raw.count_opposed(reference)
     if straight >= 5 and against > 0.8 * straight:
         backward = raw.backward_wheels()
         names = ", ".join(backward)
-        yield ReportFinding(
-            FindingLevel.ERROR,
+        yield error(
             f"Wheel {names} counts backward" if backward else "The wheels of one side count backward",
             f"In {against} of {straight} s of straight driving by the {what} the sides rolled against each other.",
             "Reverse the sign of this wheel in its driver, or swap its encoder's two channels.",
@@ -193,24 +149,18 @@ def check_wheel_signs(data: ReplayData) -> Iterable[ReportFinding]:
     if compared is None or compared.correlation > -0.6:
         return
     if by_gyro and course is not None and course.correlation > 0.6:
-        yield ReportFinding(
-            FindingLevel.ERROR,
+        yield error(
             "The gyro's rate has the opposite sign of wheels and fixes",
             f"Its correlation with the wheels' turn rate is {compared.correlation:.2f}).",
             "Check the IMU mount in the geometry, and the signs in its driver.",
         )
         return
-    yield ReportFinding(
-        FindingLevel.ERROR,
+    yield error(
         "Left and right wheels are swapped",
         f"The correlation of the wheels' turn rate with the {what} is {compared.correlation:.2f}).",
         "Swap the names in sensors.wheels.frames, or the frames' positions in the geometry; where all wheels count "
         "backward, reverse their signs.",
     )
-
-
-def _is_gyro_in_degrees(data: ReplayData) -> bool:
-    return any(True for _ in check_gyro_unit(data))
 
 
 def check_distances(data: ReplayData) -> Iterable[ReportFinding]:
@@ -227,8 +177,7 @@ def check_distances(data: ReplayData) -> Iterable[ReportFinding]:
         advice = "1000 is mm per m: the wheels' driver must give travel in m and speed in m/s."
     else:
         advice = "Check the units in both drivers (m and m/s; degrees), and the wheel radius."
-    yield ReportFinding(
-        FindingLevel.ERROR,
+    yield error(
         f"Fixes moved {found.fixes:.1f} m while the wheels rolled {found.wheels:.0f} m",
         f"The distance by the wheels is {ratio:.3g} times that of the fixes.",
         advice,
@@ -243,23 +192,20 @@ def check_gravity(data: ReplayData) -> Iterable[ReportFinding]:
     angle = math.atan2(math.hypot(x, y), z)
     size = math.sqrt(x * x + y * y + z * z)
     if angle > 0.3 and size > 0.5:
-        yield ReportFinding(
-            FindingLevel.ERROR,
+        yield error(
             "The IMU mount differs from the geometry",
             f"The mean specific force is {math.degrees(angle):.0f} degrees from the vehicle's up axis "
             f"({x:+.1f}, {y:+.1f}, {z:+.1f} m/s2 along x, y, z).",
             "Run modelserver calibrate imu LOG -c VEHICLE: it finds the mount that fits.",
         )
     if 0.9 < size < 1.1:
-        yield ReportFinding(
-            FindingLevel.ERROR,
+        yield error(
             "Specific force is in g, not in m/s2",
             f"Its mean is {size:.2f}, and gravity is 9.81 m/s2.",
             "specific_force must be in m/s2: check the unit in its driver.",
         )
     elif not 9.0 < size < 10.6:
-        yield ReportFinding(
-            FindingLevel.ERROR,
+        yield error(
             f"The mean specific force is {size:.2f} m/s2",
             "In any drive its mean is close to 9.8 m/s2.",
             "Check the unit of acceleration in the driver, and whether gravity is subtracted there.",

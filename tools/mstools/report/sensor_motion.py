@@ -9,6 +9,7 @@ Limits: without turns or straight driving there is nothing to compare, and the c
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -119,12 +120,8 @@ class SensorMotion:
 
     def backward_wheels(self) -> list[str]:
         """Return the wheels that roll backward on average."""
-        found = []
-        for name, speeds in self.wheels.items():
-            moving = [each for each in speeds.values() if abs(each) > 0.3]
-            if moving and sum(moving) < 0.0:
-                found.append(name)
-        return sorted(found)
+        moving = {name: [each for each in speeds.values() if abs(each) > 0.3] for name, speeds in self.wheels.items()}
+        return sorted(name for name, speeds in moving.items() if sum(speeds) < 0.0)
 
     def compare_distances(self) -> DistanceComparison:
         """Return the distances by wheels and by fixes, over sections of `DISTANCE_STEP_M` by the wheels."""
@@ -159,11 +156,11 @@ class SensorMotion:
 
     def _mean_speed(self) -> dict[int, float]:
         """Return the mean magnitude of the wheels' speeds."""
-        seconds: dict[int, list[float]] = {}
+        means = _SecondMeans()
         for speeds in self.wheels.values():
             for second, value in speeds.items():
-                seconds.setdefault(second, []).append(abs(value))
-        return {second: sum(values) / len(values) for second, values in sorted(seconds.items())}
+                means.add(second, abs(value))
+        return means.finish()
 
     def _wheel_names(self, sign: float) -> list[str]:
         return [name for name, left in self.lateral_offsets.items() if left * sign > 0.05 and name in self.wheels]
@@ -199,12 +196,26 @@ def _compare(first: Sequence[float], second: Sequence[float], least: float) -> T
     )
 
 
+class _SecondMeans:
+    """Means of the values of each second."""
+
+    def __init__(self) -> None:
+        self._sums: defaultdict[int, tuple[float, int]] = defaultdict(lambda: (0.0, 0))
+
+    def add(self, second: int, value: float) -> None:
+        total, count = self._sums[second]
+        self._sums[second] = (total + value, count + 1)
+
+    def finish(self) -> dict[int, float]:
+        return {second: total / count for second, (total, count) in sorted(self._sums.items())}
+
+
 class SensorMotionCollector:
     """Accumulates the sensor data of a `SensorMotion`. `q_base_imu` rotates the IMU's axes to the vehicle's."""
 
     def __init__(self, q_base_imu: Quaternion | None):
         self._q_base_imu = q_base_imu
-        self._rates: dict[int, tuple[float, int]] = {}
+        self._rates = _SecondMeans()
         self._positions: list[tuple[float, float, float]] = []
 
     def on_imu(self, sample: ImuSample) -> None:
@@ -212,10 +223,7 @@ class SensorMotionCollector:
         rate = sample.angular_velocity
         if self._q_base_imu is None or rate is None or not all(map(math.isfinite, rate)):
             return
-        up = so3.rotate(self._q_base_imu, rate)[2]
-        second = sample.header.utime // 1_000_000
-        total, count = self._rates.get(second, (0.0, 0))
-        self._rates[second] = (total + up, count + 1)
+        self._rates.add(sample.header.utime // 1_000_000, so3.rotate(self._q_base_imu, rate)[2])
 
     def on_fix(self, sample: GpsSample) -> None:
         """Add the position of a fix."""
@@ -225,21 +233,12 @@ class SensorMotionCollector:
 
     def finish(self, turns: Iterable[tuple[int, str, float, float]], sides: Mapping[str, float]) -> SensorMotion:
         """Return the result. `turns` are utime, wheel, speed and steering; steered samples are left out."""
-        sums: dict[str, dict[int, tuple[float, int]]] = {}
+        wheels: defaultdict[str, _SecondMeans] = defaultdict(_SecondMeans)
         for utime, name, speed, steering in turns:
             if name in sides and abs(steering) < 0.02:
-                wheel = sums.setdefault(name, {})
-                total, count = wheel.get(utime // 1_000_000, (0.0, 0))
-                wheel[utime // 1_000_000] = (total + speed, count + 1)
-        return SensorMotion(
-            gyro={second: total / count for second, (total, count) in self._rates.items()},
-            wheels={
-                name: {second: total / count for second, (total, count) in wheel.items()}
-                for name, wheel in sums.items()
-            },
-            lateral_offsets=dict(sides),
-            fixes=self._fixes(),
-        )
+                wheels[name].add(utime // 1_000_000, speed)
+        speeds = {name: means.finish() for name, means in wheels.items()}
+        return SensorMotion(self._rates.finish(), speeds, dict(sides), self._fixes())
 
     def _fixes(self) -> tuple[tuple[float, float, float], ...]:
         if not self._positions:
