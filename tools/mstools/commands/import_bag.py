@@ -18,14 +18,13 @@ from modelserver.errors import RecordingError, find_nearest_names, quote
 from modelserver.messages import MAX_CHANNEL_LENGTH, SensorHeader
 from modelserver.wire import codec
 from mstools.recordings.bag_messages import (
+    CONVERTERS,
     DEFAULT_OPTIONS,
     ROS_TYPES,
     Altitude,
     BagOptions,
-    Converter,
     ImuOrientation,
     TopicKind,
-    make_converter,
 )
 from mstools.recordings.bag_reader import Bag, Topic, open_bag
 from mstools.terminal.options import JsonOption
@@ -202,7 +201,7 @@ def _write(
     prefix: str,
 ) -> float:
     """Write the messages of the chosen topics; return the seconds between the first and the last."""
-    converters: dict[str, Converter] = {name: make_converter(kind, options) for name, kind in chosen.items()}
+    converters = {name: CONVERTERS[kind](options) for name, kind in chosen.items()}
     unstamped = dict.fromkeys(chosen, 0)
     total = sum(each.count for each in bag.topics if each.name in chosen)
     for name, kind in chosen.items():
@@ -212,16 +211,16 @@ def _write(
     out = lcm.EventLog(str(path), "w", overwrite=True)
     try:
         with show_progress(f"importing {path.name.strip('.')}", total) as show:
-            for received in bag.messages(set(chosen)):
-                report = reports[received.topic]
-                arrived = received.received_ns // 1000
-                stamp = received.message.header.stamp
+            for name, received_ns, message in bag.messages(set(chosen)):
+                report = reports[name]
+                arrived = received_ns // 1000
+                stamp = message.header.stamp
                 utime = int(stamp.sec) * 1_000_000 + int(stamp.nanosec) // 1000
                 if utime <= 0:
                     utime = arrived
-                    unstamped[received.topic] += 1
-                header = SensorHeader(utime, chosen[received.topic].value, report.written, arrived)
-                sample = converters[received.topic].convert(header, received.message)
+                    unstamped[name] += 1
+                header = SensorHeader(utime, chosen[name].value, report.written, arrived)
+                sample = converters[name].convert(header, message)
                 out.write_event(arrived, report.channel, codec.encode(sample))
                 report.written += 1
                 first, last = first or arrived, arrived

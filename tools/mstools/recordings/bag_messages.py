@@ -7,10 +7,12 @@ message leaves open (height reference, orientation reference, track width) is a 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Protocol
+from itertools import chain, repeat
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +32,7 @@ from modelserver.messages import (
     YawSource,
 )
 from modelserver.transforms import so3
-from modelserver.transforms.so3 import Array, Matrix3
+from modelserver.transforms.so3 import Array, Matrix3, Quaternion
 
 STATIONARY_SPEED = 1e-3
 """Speed in m/s below which a wheel is stationary: averaging controllers leave residues of 1e-15."""
@@ -81,29 +83,19 @@ class BagOptions:
 DEFAULT_OPTIONS = BagOptions()
 
 
-class Converter(Protocol):
+class Converter(ABC):
     """Converts the messages of one topic to samples, in their order."""
 
+    def __init__(self, options: BagOptions):
+        self._options = options
+
+    @abstractmethod
     def convert(self, header: SensorHeader, message: Any) -> Sample:
         """Return the sample of a message."""
-        ...
 
     def notes(self) -> list[str]:
         """Return notes on the converted messages for the user, one line each."""
-        ...
-
-
-def make_converter(kind: TopicKind, options: BagOptions) -> Converter:
-    """Return a new converter."""
-    match kind:
-        case TopicKind.GPS:
-            return GpsConverter(options.altitude, options.undulation)
-        case TopicKind.IMU:
-            return ImuConverter(options.imu_orientation)
-        case TopicKind.WHEELS:
-            return WheelsConverter(options.track_width)
-        case TopicKind.JOINTS:
-            return JointsConverter()
+        return []
 
 
 # --- fixes --------------------------------------------------------------------------------------------------
@@ -117,16 +109,14 @@ _FIX_TYPES = {
 }
 
 
-@dataclass(slots=True)
-class GpsConverter:
+class GpsConverter(Converter):
     """NavSatFix. The altitude is ellipsoidal or MSL by option; the other height needs the undulation."""
 
-    altitude: Altitude
-    undulation: float = NAN
-    _unknown_covariances: int = 0
+    _unknown_covariances = 0
 
     def convert(self, header: SensorHeader, message: Any) -> GpsSample:
         """Return the fix of a NavSatFix."""
+        is_msl, undulation = self._options.altitude is Altitude.MSL, self._options.undulation
         latitude, longitude, height = float(message.latitude), float(message.longitude), float(message.altitude)
         fix_type = _FIX_TYPES.get(int(message.status.status), FixType.NONE)
         if not (math.isfinite(latitude) and math.isfinite(longitude)):
@@ -135,15 +125,14 @@ class GpsConverter:
             fix_type = FixType.FIX_2D
         covariance = None if int(message.position_covariance_type) == 0 else _covariance(message.position_covariance)
         self._unknown_covariances += covariance is None
-        msl = height if self.altitude is Altitude.MSL else NAN
         return GpsSample(
             header,
             fix_type,
             latitude,
             longitude,
-            height_ellipsoidal=msl + self.undulation if self.altitude is Altitude.MSL else height,
-            height_msl=msl,
-            undulation=self.undulation,
+            height_ellipsoidal=height + undulation if is_msl else height,
+            height_msl=height if is_msl else NAN,
+            undulation=undulation,
             position_covariance=covariance,
         )
 
@@ -152,7 +141,7 @@ class GpsConverter:
         lines = []
         if self._unknown_covariances:
             lines.append(f"{self._unknown_covariances} fixes have no covariance")
-        if self.altitude is Altitude.MSL and not math.isfinite(self.undulation):
+        if self._options.altitude is Altitude.MSL and not math.isfinite(self._options.undulation):
             lines.append("ellipsoidal heights are unknown: give --undulation with --altitude msl")
         return lines
 
@@ -160,28 +149,26 @@ class GpsConverter:
 # --- inertial -----------------------------------------------------------------------------------------------
 
 
-@dataclass(slots=True)
-class ImuConverter:
+class ImuConverter(Converter):
     """Imu. A first covariance element of -1 marks a missing value (the message's definition)."""
 
-    orientation: ImuOrientation
-    _count: int = 0
-    _force: float = 0.0
-    _rotated: Array = field(default_factory=lambda: np.zeros(3))
-    _oriented: int = 0
+    _count = 0
+    _force = 0.0
+    _up = 0.0
+    _oriented = 0
 
     def convert(self, header: SensorHeader, message: Any) -> ImuSample:
         """Return the sample of an Imu."""
         rate = _vector(message.angular_velocity, message.angular_velocity_covariance)
         force = _vector(message.linear_acceleration, message.linear_acceleration_covariance)
-        quaternion = self._quaternion(message)
+        quaternion = _unit_quaternion(message)
         if force is not None:
             self._count += 1
             self._force += math.hypot(*force)
             if quaternion is not None:
                 self._oriented += 1
-                self._rotated += so3.rotate(quaternion, force)
-        reference = OrientationReference[self.orientation.name]
+                self._up += so3.rotate(quaternion, force)[2]
+        reference = OrientationReference[self._options.imu_orientation.name]
         wanted = quaternion is not None and reference is not OrientationReference.NONE
         return ImuSample(
             header,
@@ -196,33 +183,22 @@ class ImuConverter:
             orientation_covariance=_covariance(message.orientation_covariance) if wanted else None,
         )
 
-    @staticmethod
-    def _quaternion(message: Any) -> tuple[float, float, float, float] | None:
-        if float(message.orientation_covariance[0]) == -1.0:
-            return None
-        q = message.orientation
-        values = (float(q.w), float(q.x), float(q.y), float(q.z))
-        length = math.hypot(*values)
-        if not math.isfinite(length) or abs(length - 1.0) > 0.05:
-            return None  # drivers without orientation send zeros
-        w, x, y, z = (value / length for value in values)
-        return (w, x, y, z)
-
     def notes(self) -> list[str]:
         """Return notes for the user."""
         lines = []
         if self._count and not 8.5 < (mean := self._force / self._count) < 11.5:
             lines.append(f"the mean specific force is {mean:.2f} m/s2, not 9.81: wrong unit, or gravity removed?")
         if self._oriented:
-            up = self._rotated[2] / self._oriented
+            up = self._up / self._oriented
             likely = "enu" if up > 8.0 else "ned" if up < -8.0 else ""
-            if self.orientation is ImuOrientation.NONE:
+            stated = self._options.imu_orientation
+            if stated is ImuOrientation.NONE:
                 hint = f"; by gravity it is {likely}" if likely else ""
                 lines.append(f"the IMU's own orientation is dropped (--imu-orientation){hint}")
-            elif likely != self.orientation.value:
+            elif likely != stated:
                 lines.append(
                     f"the IMU's orientation gives {up:+.1f} m/s2 of gravity's reaction along z: this does not look "
-                    f"like {self.orientation.value}"
+                    f"like {stated}"
                 )
         return lines
 
@@ -230,7 +206,7 @@ class ImuConverter:
 # --- wheels -------------------------------------------------------------------------------------------------
 
 
-class WheelsConverter:
+class WheelsConverter(Converter):
     """Odometry, as two virtual wheels `left` and `right` at half the track width to either side of the base.
 
     Speed: that of two points of the base by the published twist, v -+ w track/2. Travel: from the steps of the
@@ -238,13 +214,10 @@ class WheelsConverter:
     not the pose. The encoder counts of a skidding wheel are not in the message.
     """
 
-    def __init__(self, track_width: float):
-        self._half = track_width / 2
-        self._previous: tuple[int, Array, Array] | None
-        self._previous = None
-        self._travel = [0.0, 0.0]
-        self._jumps = 0
-        self._sideways = 0.0
+    _previous: tuple[int, Array, Array] | None = None
+    _travel = (0.0, 0.0)
+    _jumps = 0
+    _sideways = 0.0
 
     def convert(self, header: SensorHeader, message: Any) -> WheelsSample:
         """Return the sample of an Odometry."""
@@ -253,28 +226,21 @@ class WheelsConverter:
         self._sideways = max(self._sideways, abs(float(twist.linear.y)))
         distance, angle = self._step(header.utime, message.pose.pose, speed, turn)
         covariance = np.asarray(message.twist.covariance, float).reshape(6, 6)
+        arms = (-self._options.track_width / 2, self._options.track_width / 2)
+        self._travel = (self._travel[0] + distance + arms[0] * angle, self._travel[1] + distance + arms[1] * angle)
         wheels = []
-        for n, (name, arm) in enumerate((("left", -self._half), ("right", self._half))):
-            self._travel[n] += distance + arm * angle
+        for name, arm, travel in zip(("left", "right"), arms, self._travel, strict=True):
             rolled = speed + arm * turn
             spread = covariance[0, 0] + 2 * arm * covariance[0, 5] + arm * arm * covariance[5, 5]
             known = covariance[0, 0] > 0 and covariance[5, 5] > 0 and spread > 0
-            wheels.append(
-                WheelSample(
-                    name,
-                    travel=self._travel[n],
-                    speed=rolled,
-                    speed_sigma=math.sqrt(spread) if known else NAN,
-                    direction=_direction(rolled),
-                )
-            )
+            sigma, direction = math.sqrt(spread) if known else NAN, _direction(rolled)
+            wheels.append(WheelSample(name, travel=travel, speed=rolled, speed_sigma=sigma, direction=direction))
         return WheelsSample(header, tuple(wheels))
 
     def _step(self, utime: int, pose: Any, speed: float, turn: float) -> tuple[float, float]:
         """Return the forward distance, meters, and the turn, radians, since the previous message."""
         position = np.array([pose.position.x, pose.position.y, pose.position.z], float)
-        q = pose.orientation
-        forward = np.array(so3.rotate((float(q.w), float(q.x), float(q.y), float(q.z)), (1.0, 0.0, 0.0)))
+        forward = np.array(so3.rotate(_quaternion(pose.orientation), (1.0, 0.0, 0.0)))
         good = bool(np.isfinite(position).all()) and 0.9 < float(np.linalg.norm(forward)) < 1.1
         before, self._previous = self._previous, (utime, position, forward) if good else None
         if before is None:
@@ -313,27 +279,23 @@ def _direction(speed: float) -> Direction:
 # --- joints -------------------------------------------------------------------------------------------------
 
 
-class JointsConverter:
+class JointsConverter(Converter):
     """JointState: names, positions and rates; efforts are dropped."""
 
     def convert(self, header: SensorHeader, message: Any) -> JointsSample:
         """Return the sample of a JointState."""
-        positions, rates = list(message.position), list(message.velocity)
-        return JointsSample(
-            header,
-            tuple(
-                JointSample(
-                    str(name),
-                    float(positions[n]) if n < len(positions) else NAN,
-                    rate=float(rates[n]) if n < len(rates) else NAN,
-                )
-                for n, name in enumerate(message.name)
-            ),
-        )
+        # each of the other arrays may be empty
+        columns = (message.name, chain(message.position, repeat(NAN)), chain(message.velocity, repeat(NAN)))
+        rows = zip(*columns, strict=False)
+        return JointsSample(header, tuple(JointSample(str(n), float(p), rate=float(v)) for n, p, v in rows))
 
-    def notes(self) -> list[str]:
-        """Return notes for the user."""
-        return []
+
+CONVERTERS: dict[TopicKind, type[Converter]] = {
+    TopicKind.GPS: GpsConverter,
+    TopicKind.IMU: ImuConverter,
+    TopicKind.WHEELS: WheelsConverter,
+    TopicKind.JOINTS: JointsConverter,
+}
 
 
 # --- parts --------------------------------------------------------------------------------------------------
@@ -341,8 +303,8 @@ class JointsConverter:
 
 def _covariance(values: Sequence[float]) -> Matrix3 | None:
     """Return nine numbers, or None for an unknown covariance: first element -1, all zero, or not finite."""
-    a, b, c, d, e, f, g, h, i = (float(value) for value in values)
-    if not all(map(math.isfinite, (a, b, c, d, e, f, g, h, i))) or not (a > 0 and e > 0 and i > 0):
+    a, b, c, d, e, f, g, h, i = found = tuple(float(value) for value in values)
+    if not all(map(math.isfinite, found)) or not (a > 0 and e > 0 and i > 0):
         return None
     return (a, b, c, d, e, f, g, h, i)
 
@@ -351,3 +313,17 @@ def _vector(vector: Any, covariance: Sequence[float]) -> tuple[float, float, flo
     if float(covariance[0]) == -1.0:
         return None
     return (float(vector.x), float(vector.y), float(vector.z))
+
+
+def _quaternion(q: Any) -> Quaternion:
+    return (float(q.w), float(q.x), float(q.y), float(q.z))
+
+
+def _unit_quaternion(message: Any) -> Quaternion | None:
+    values = _quaternion(message.orientation)
+    length = math.hypot(*values)
+    # drivers without orientation send zeros
+    if float(message.orientation_covariance[0]) == -1.0 or not abs(length - 1.0) <= 0.05:
+        return None
+    w, x, y, z = (value / length for value in values)
+    return (w, x, y, z)

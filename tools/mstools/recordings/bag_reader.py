@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,29 +23,19 @@ class Topic:
     count: int
 
 
-@dataclass(frozen=True, slots=True)
-class BagMessage:
-    """One message of a bag, with its topic and receive time in nanoseconds."""
-
-    topic: str
-    received_ns: int
-    message: Any
-
-
 class Bag:
     """An open bag."""
 
     def __init__(self, path: Path, reader: Any):
         self._path = path
         self._reader = reader
-        counts: dict[tuple[str, str], int] = {}
-        for connection in reader.connections:
-            key = (connection.topic, connection.msgtype)
-            counts[key] = counts.get(key, 0) + connection.msgcount
-        self.topics = tuple(Topic(name, type_name, count) for (name, type_name), count in sorted(counts.items()))
+        counts: Counter[tuple[str, str]] = Counter()
+        for each in reader.connections:
+            counts[each.topic, each.msgtype] += each.msgcount
+        self.topics = tuple(Topic(*names, count) for names, count in sorted(counts.items()))
 
-    def messages(self, topics: set[str]) -> Iterator[BagMessage]:
-        """Yield the messages of some topics in the order received. Raises RecordingError."""
+    def messages(self, topics: set[str]) -> Iterator[tuple[str, int, Any]]:
+        """Yield topic, receive time (ns) and message of some topics in the order received. Raises RecordingError."""
         connections = [each for each in self._reader.connections if each.topic in topics]
         stream = iter(self._reader.messages(connections=connections)) if connections else iter(())
         count = 0
@@ -56,7 +47,7 @@ class Bag:
                     return
                 message = self._reader.deserialize(raw, connection.msgtype)
             count += 1
-            yield BagMessage(connection.topic, received_ns, message)
+            yield connection.topic, received_ns, message
 
 
 @contextmanager

@@ -22,6 +22,9 @@ HOLD_S = 1.0
 
 NIS_WINDOW_S = 20.0
 
+BREAK = (math.nan, math.nan)
+"""Point that interrupts a line."""
+
 COMPONENTS: dict[str, tuple[str, ...]] = {
     "gps_position": ("east, m", "north, m"),
     "gps_height": ("up, m",),
@@ -190,9 +193,9 @@ def _render_track(data: ReplayData) -> str:
         if there:
             drawn.append(charts.dots(f"fixes {words}", there, color, 4.4))
     for name, bad, color, width in (("pose", False, "#12344d", 1.1), ("pose, not valid", True, charts.ORANGE, 2.2)):
-        x, y = _track_points(placed, bad)
-        if any(map(math.isfinite, x)):
-            drawn.append(Series(name, x, y, color, width))
+        points = _track_points(placed, bad)
+        if any(math.isfinite(each[0]) for each in points):
+            drawn.append(Series(name, [each[0] for each in points], [each[1] for each in points], color, width))
     words = "Path of the antenna, and the fixes."
     if data.origin is not None:
         words += (
@@ -203,25 +206,21 @@ def _render_track(data: ReplayData) -> str:
     return _render_figure(chart, words)
 
 
-def _track_points(placed: Sequence[StateSample], bad: bool) -> tuple[list[float], list[float]]:
+def _track_points(placed: Sequence[StateSample], bad: bool) -> list[tuple[float, ...]]:
     """Return the track of the valid, or invalid (`bad`), states; nan interrupts it at gaps and new epochs."""
-    x: list[float] = []
-    y: list[float] = []
+    points: list[tuple[float, ...]] = [BREAK]
     for a, b in pairwise(placed):
         assert a.position is not None
         assert b.position is not None
         if bool(b.invalid) != bad:
             continue
         if b.t - a.t > HOLD_S or a.epoch != b.epoch:
-            x.append(math.nan)
-            y.append(math.nan)
+            points.append(BREAK)
             continue
-        if not x or (x[-1], y[-1]) != a.position[:2]:
-            x += [math.nan, a.position[0]]
-            y += [math.nan, a.position[1]]
-        x.append(b.position[0])
-        y.append(b.position[1])
-    return x, y
+        if points[-1] != a.position:
+            points += [BREAK, a.position]
+        points.append(b.position)
+    return points
 
 
 # --- validity and events ------------------------------------------------------------------------------------
