@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from modelserver import core
-from modelserver.config.vehicle_file import KEY_HINT, VehicleConfig, WheelsConfig, add_lines
+from modelserver.config.vehicle_file import KEY_HINT, VehicleConfig, add_lines
 from modelserver.core import CoreSettings, CoreState, ExpectedSensor, Instant
 from modelserver.core.commands import ModelLoaded
 from modelserver.core.state import START
@@ -50,10 +50,11 @@ from modelserver.messages import (
     WheelsSample,
 )
 from modelserver.server.ingress import SensorChannel
-from modelserver.server.requests.signed_commands import CommandVerifier
+from modelserver.server.requests.signed_commands import MODE_TYPE, CommandVerifier
 from modelserver.signing.key_files import read_keys
 from modelserver.signing.signatures import Key
 from modelserver.wire.channels import CHANNELS, ChannelUse
+from modelserver.wire.codec import get_type_name
 
 if TYPE_CHECKING:
     from modelserver.estimation.modes import LocalizerConfig
@@ -151,8 +152,7 @@ class Vehicle:
         try:
             return read_keys(path) if path else ()
         except KeyFileError as error:
-            problem = Problem(Severity.ERROR, str(error), Location(file, element="commands.key_file"))
-            raise ConfigError(add_lines([problem], file)) from None
+            raise ConfigError(add_lines([_make_problem(file, "commands.key_file", str(error))], file)) from None
 
     def make_command_verifier(self, started_ns: int, file: str = "") -> CommandVerifier:
         """Make the verifier of signed commands. Raises ConfigError if the key file is invalid."""
@@ -226,43 +226,39 @@ class Vehicle:
         """
         has_joints = bool((model or self.model).joints)
         channels = {
-            each.channel: SensorChannel(each.type_name, each.latency_us)
+            each.channel: SensorChannel(get_type_name(each.sample), each.latency_us)
             for each in _list_sensors(self.config)
             if has_joints or each.sample is not JointsSample
         }
         if self.config.localization.mode_channel:
             name = f"{self.config.lcm.channel_prefix}{self.config.localization.mode_channel}"
-            channels[name] = SensorChannel("localization_mode_t")
+            channels[name] = SensorChannel(MODE_TYPE)
         return channels
 
 
 class _ConfiguredSensor(NamedTuple):
-    """A sensor of the vehicle file: its key below `sensors`, its channel with prefix, its types, its source name."""
+    """A sensor of the vehicle file: its key below `sensors`, its channel with prefix, its samples, its source name."""
 
     key: str
     channel: str
     latency_us: int
     sample: type[Sample]
-    type_name: str
     source: str = ""
 
 
 def _list_sensors(config: VehicleConfig) -> list[_ConfiguredSensor]:
     prefix, sensors = config.lcm.channel_prefix, config.sensors
-    listed: list[tuple[str, Any, type[Sample], str, str]] = [
-        ("gps", sensors.gps, GpsSample, "gps_t", ""),
-        ("imu", sensors.imu, ImuSample, "imu_t", ""),
-        ("wheels", sensors.wheels, WheelsSample, "wheels_t", ""),
-        ("wheels.steering", sensors.steering, VehicleStatusSample, "vehicle_status_t", ""),
-        ("joints", sensors.joints, JointsSample, "joints_t", ""),
-        *(
-            (f"aiding.{name}", each, AIDING_SAMPLES[each.type], f"{each.type}_t", name)
-            for name, each in sensors.aiding.items()
-        ),
+    listed: list[tuple[str, Any, type[Sample], str]] = [
+        ("gps", sensors.gps, GpsSample, ""),
+        ("imu", sensors.imu, ImuSample, ""),
+        ("wheels", sensors.wheels, WheelsSample, ""),
+        ("wheels.steering", sensors.steering, VehicleStatusSample, ""),
+        ("joints", sensors.joints, JointsSample, ""),
+        *((f"aiding.{name}", each, AIDING_SAMPLES[each.type], name) for name, each in sensors.aiding.items()),
     ]
     return [
-        _ConfiguredSensor(key, f"{prefix}{each.channel}", round(each.latency * 1e6), sample, type_name, source)
-        for key, each, sample, type_name, source in listed
+        _ConfiguredSensor(key, f"{prefix}{each.channel}", round(each.latency * 1e6), sample, source)
+        for key, each, sample, source in listed
         if each is not None
     ]
 
@@ -312,22 +308,26 @@ def examine_vehicle(
             geometry = examine_file(config.geometry, config.variables, strict=strict)
         except OSError as error:
             why = f"the geometry file {config.geometry} cannot be read: {error.strerror}"
-            problems.append(Problem(Severity.ERROR, why, Location(file, element="geometry")))
+            problems.append(_make_problem(file, "geometry", why))
     if geometry.partial_model is not None:
         problems += _find_frame_problems(config, geometry.partial_model, file, is_whole=geometry.model is not None)
     gps, imu = config.sensors.gps, config.sensors.imu
     if config.localization.mode == "raw" and (gps is None or imu is None):
         why = "raw mode needs a GPS and an IMU, and the section sensors does not have both"
-        problems.append(Problem(Severity.ERROR, why, Location(file, element="localization.mode"), "write mode: full"))
+        problems.append(_make_problem(file, "localization.mode", why, "write mode: full"))
     problems += _find_channel_problems(config, file)
     if config.localization.mode_channel and not config.commands.key_file:
         why = f"mode commands must be signed: {KEY_HINT}"
-        problems.append(Problem(Severity.ERROR, why, Location(file, element="localization.mode_channel")))
+        problems.append(_make_problem(file, "localization.mode_channel", why))
     try:
         get_configured_origin(config)
     except GeodesyError as error:
-        problems.append(Problem(Severity.ERROR, str(error), Location(file, element="origin.initial_utm")))
+        problems.append(_make_problem(file, "origin.initial_utm", str(error)))
     return geometry, tuple(add_lines(problems, file))
+
+
+def _make_problem(file: str, key: str, why: str, fix: str = "", near: tuple[str, ...] = ()) -> Problem:
+    return Problem(Severity.ERROR, why, Location(file, element=key), fix, near)
 
 
 def _find_frame_problems(config: VehicleConfig, model: Model, file: str, is_whole: bool) -> list[Problem]:
@@ -338,6 +338,7 @@ def _find_frame_problems(config: VehicleConfig, model: Model, file: str, is_whol
     named += [("sensors.gps.second_frame", gps.second_frame)] if gps is not None else []
     if config.sensors.wheels is not None:
         named += [(f"sensors.wheels.frames.{name}", frame) for name, frame in config.sensors.wheels.frames.items()]
+    see = f"see: modelserver bodies --model {config.geometry}"
     problems: list[Problem] = []
     unknown: set[str] = set()
     for key, frame in named:
@@ -348,8 +349,8 @@ def _find_frame_problems(config: VehicleConfig, model: Model, file: str, is_whol
         except QueryError as error:
             unknown.add(frame)
             near = Suggestion.of(frame, suggest_frame(frame, {body.name: body for body in model.bodies}))
-            fix = f"write {near[0]}" if near else f"see: modelserver bodies --model {config.geometry}"
-            problems.append(Problem(Severity.ERROR, str(error), Location(file, element=key), fix, near))
+            fix = f"write {near[0]}" if near else see
+            problems.append(_make_problem(file, key, str(error), fix, near))
     if not is_whole or not config.base_frame or config.base_frame in unknown:
         return problems
     body = config.rolling_frame or config.base_frame
@@ -360,13 +361,12 @@ def _find_frame_problems(config: VehicleConfig, model: Model, file: str, is_whol
             model.get_transformation(frame, config.base_frame)
             joints = () if body in unknown else model.get_kinematic_path(frame, body).joints
         except QueryError as error:
-            fix = f"see: modelserver bodies --model {config.geometry}"
-            problems.append(Problem(Severity.ERROR, str(error), Location(file, element=key), fix))
+            problems.append(_make_problem(file, key, str(error), see))
             continue
         if joints:
             why = f"joint {joints[0].name} moves {frame} relative to the vehicle; localization needs a rigid mount"
             fix = "name a frame that is fixed to the vehicle, or make the constraint fixed"
-            problems.append(Problem(Severity.ERROR, why, Location(file, element=key), fix))
+            problems.append(_make_problem(file, key, why, fix))
     return problems
 
 
@@ -375,6 +375,7 @@ def _make_rig(config: VehicleConfig, model: Model) -> SensorRig | None:
     gps, imu, wheels = config.sensors.gps, config.sensors.imu, config.sensors.wheels
     if gps is None and imu is None and wheels is None:
         return None
+    steering = config.sensors.steering
     return SensorRig(
         model,
         config.rolling_frame or config.base_frame,
@@ -384,16 +385,11 @@ def _make_rig(config: VehicleConfig, model: Model) -> SensorRig | None:
         wheels.frames if wheels is not None else {},
         wheels.kinematics if wheels is not None else "differential",
         config.localization.magnetometer,
-        _make_steering_signal(wheels),
+        SteeringSignal(steering.wheels, steering.geometry, steering.sigma, steering.limit, steering.max_age)
+        if steering is not None
+        else None,
         wheels is not None,
     )
-
-
-def _make_steering_signal(wheels: WheelsConfig | None) -> SteeringSignal | None:
-    if wheels is None or wheels.steering is None:
-        return None
-    steering = wheels.steering
-    return SteeringSignal(steering.wheels, steering.geometry, steering.sigma, steering.limit, steering.max_age)
 
 
 def _find_channel_problems(config: VehicleConfig, file: str) -> list[Problem]:
@@ -402,38 +398,21 @@ def _find_channel_problems(config: VehicleConfig, file: str) -> list[Problem]:
     used = {f"sensors.{each.key}.channel": each.channel for each in _list_sensors(config)}
     own = {f"{prefix}{channel.name}" for channel in CHANNELS}
     not_for_sensors = {f"{prefix}{channel.name}" for channel in CHANNELS if channel.use is not ChannelUse.SENSOR}
+    why, fix = "is a channel of the server itself, not of a sensor", "give the sensor another channel"
     problems = [
-        Problem(
-            Severity.ERROR,
-            f"{channel} is a channel of the server itself, not of a sensor",
-            Location(file, element=key),
-            "give the sensor another channel",
-        )
-        for key, channel in used.items()
-        if channel in not_for_sensors
+        _make_problem(file, key, f"{channel} {why}", fix) for key, channel in used.items() if channel in not_for_sensors
     ]
     if config.localization.mode_channel:
         channel = f"{prefix}{config.localization.mode_channel}"
         if channel in used.values() or (channel in own and channel != f"{prefix}{MODE_CHANNEL}"):
-            problems.append(
-                Problem(
-                    Severity.ERROR,
-                    f"{channel} has another use, so it cannot be the channel of mode commands",
-                    Location(file, element="localization.mode_channel"),
-                    f"write {MODE_CHANNEL}",
-                )
-            )
+            why = f"{channel} has another use, so it cannot be the channel of mode commands"
+            problems.append(_make_problem(file, "localization.mode_channel", why, f"write {MODE_CHANNEL}"))
         used["localization.mode_channel"] = channel
     clashing = sorted(name for name in own | set(used.values()) if name.startswith(reply_prefix))
     if clashing:
-        problems.append(
-            Problem(
-                Severity.ERROR,
-                f"with the reply prefix {reply_prefix} a request could make the server reply on {clashing[0]}",
-                Location(file, element="lcm.reply_prefix"),
-                "choose a prefix that no other channel has, e.g. REPLY_",
-            )
-        )
+        why = f"with the reply prefix {reply_prefix} a request could make the server reply on {clashing[0]}"
+        fix = "choose a prefix that no other channel has, e.g. REPLY_"
+        problems.append(_make_problem(file, "lcm.reply_prefix", why, fix))
     return problems
 
 

@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import Final
 
 from modelserver.errors import BusError
 from modelserver.messages import Gauges
@@ -161,41 +161,23 @@ def _read_int(path: Path) -> int | None:
         return None
 
 
-class _Timeval(ctypes.Structure):
-    _fields_: ClassVar = [("seconds", ctypes.c_long), ("fraction", ctypes.c_long)]
-
-
-class _Timex(ctypes.Structure):
-    """struct timex of adjtimex(2), as far as it is read."""
-
-    _fields_: ClassVar = [
-        ("modes", ctypes.c_uint),
-        ("offset", ctypes.c_long),
-        ("freq", ctypes.c_long),
-        ("maxerror", ctypes.c_long),
-        ("esterror", ctypes.c_long),
-        ("status", ctypes.c_int),
-        ("constant", ctypes.c_long),
-        ("precision", ctypes.c_long),
-        ("tolerance", ctypes.c_long),
-        ("time", _Timeval),
-        ("tick", ctypes.c_long),
-        ("room", ctypes.c_byte * 256),
-    ]
+_TIMEX: Final = struct.Struct("@I4li")
+"""Start of struct timex (adjtimex(2)): modes, offset, freq, maxerror, esterror, status."""
 
 
 def read_kernel_clock() -> tuple[bool | None, float | None]:
     """Read whether the kernel considers the time of day synchronized, and its bound of the error, s."""
-    timex = _Timex()
+    timex = ctypes.create_string_buffer(512)  # more than its size on any machine; modes 0: read only
     try:
-        result = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(timex))
+        result = ctypes.CDLL(None, use_errno=True).adjtimex(timex)
     except (OSError, AttributeError):
         return None, None
     if result < 0:
         return None, None
-    if result == _TIME_ERROR or timex.status & _STA_UNSYNC:
+    _, _, _, max_error_us, _, status = _TIMEX.unpack_from(timex)
+    if result == _TIME_ERROR or status & _STA_UNSYNC:
         return False, None
-    return True, timex.maxerror * 1e-6
+    return True, max_error_us * 1e-6
 
 
 def find_time_service() -> str:
