@@ -12,12 +12,11 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 
-from modelserver.formats.miro_writer import escape
 from modelserver.formats.reading import ORIGIN
 from modelserver.formats.writing import (
     SavedModel,
+    format_element,
     format_names,
-    format_number,
     list_inertia_features,
     list_joint_and_shape_features,
     list_text_and_sigma_features,
@@ -49,8 +48,7 @@ class _FrameTreeWriter:
         self.crossings: dict[str, Crossing] = {}
         topology = Topology(model.bodies, model.constraints)
         for assembly in topology.assemblies:
-            for _, crossing in topology.traverse_breadth_first(assembly[0]):
-                self.crossings[names.split(crossing.far_frame)[0]] = crossing
+            self.crossings |= {each.far_body: each for _, each in topology.traverse_breadth_first(assembly[0])}
         self.used = {crossing.constraint.name for crossing in self.crossings.values()}
         self.aligned = {body: self._find_aligned_mount(body, crossing) for body, crossing in self.crossings.items()}
         """For each mounted body the frame that its instance represents too, empty for none."""
@@ -116,7 +114,7 @@ class _FrameTreeWriter:
         renamed += [f"body {name} as {own}" for name, own in self.bodies.items() if own != name]
         if renamed:
             yield f"frame names that are not unique in the whole model; written {format_names(renamed)}"
-        parents = {names.split(crossing.near_frame)[0] for crossing in self.crossings.values()}
+        parents = {crossing.near_body for crossing in self.crossings.values()}
         bare = [
             body.name
             for body in self.model.bodies
@@ -152,11 +150,9 @@ def _make_unique(name: str, taken: set[str]) -> str:
 
 
 def _format_instance(name: str, parent: str, pose: Pose) -> Iterator[str]:
-    yield f'    <instance type="rapid::FrameRpyParameters" name="{escape(name)}">'
-    yield f'      <parameter value="{escape(parent)}" name="Parent"/>'
-    roll, pitch, yaw = to_rpy_degrees(pose.wxyz) or (math.degrees(angle) for angle in so3.to_rpy(pose.wxyz))
-    for key, value in zip(("X", "Y", "Z"), pose.xyz, strict=True):
-        yield f'      <parameter value="{format_number(value)}" name="{key}"/>'
-    for key, value in (("Roll", roll), ("Pitch", pitch), ("Yaw", yaw)):
-        yield f'      <parameter value="{format_number(value)}" name="{key}"/>'
-    yield "    </instance>"
+    angles = to_rpy_degrees(pose.wxyz) or tuple(map(math.degrees, so3.to_rpy(pose.wxyz)))
+    values = zip(("X", "Y", "Z", "Roll", "Pitch", "Yaw"), (*pose.xyz, *angles), strict=True)
+    inside = [*format_element("parameter", value=parent, name="Parent")]
+    inside += [line for key, value in values for line in format_element("parameter", value=value, name=key)]
+    lines = format_element("instance", inside, type="rapid::FrameRpyParameters", name=name)
+    return (f"    {line}" for line in lines)

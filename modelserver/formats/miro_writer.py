@@ -6,27 +6,23 @@ from collections.abc import Iterator
 
 from modelserver.formats.writing import (
     SavedModel,
+    format_element,
     format_names,
-    format_number,
     list_inertia_features,
     list_joint_and_shape_features,
 )
 from modelserver.geometry.model import Model
-from modelserver.geometry.parts import Body, BodyFrame, Constraint
+from modelserver.geometry.parts import Body, Constraint
 from modelserver.transforms.pose import Pose
-
-_ESCAPES = {ord("&"): "&amp;", ord("<"): "&lt;", ord(">"): "&gt;", ord('"'): "&quot;"}
 
 
 def save(model: Model) -> SavedModel:
     """Return the text of `model`, and its features that this format does not support."""
+    bodies = [line for body in model.bodies for line in _format_body(body)]
+    constraints = [line for each in model.constraints for line in _format_constraint(each)]
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<config>", ' <section name="Geometry">']
-    lines += ['  <parameter name="BodyList">', *_indent(_format_bodies(model.bodies), 4), "  </parameter>"]
-    lines += [
-        '  <parameter name="ConstraintList">',
-        *_indent(_format_constraints(model.constraints), 4),
-        "  </parameter>",
-    ]
+    for name, inside in (("BodyList", bodies), ("ConstraintList", constraints)):
+        lines += [f'  <parameter name="{name}">', *(f"    {line}" for line in inside), "  </parameter>"]
     lines += [" </section>", "</config>"]
     return SavedModel("\n".join(lines) + "\n", tuple(_list_unsupported(model)))
 
@@ -56,57 +52,33 @@ def _fold_description(text: str) -> str:
     return " ".join("".join(each if each.isprintable() else " " for each in text).split())
 
 
-def _format_bodies(bodies: tuple[Body, ...]) -> Iterator[str]:
-    for body in bodies:
-        yield "<parameter> <!-- Body -->"
-        yield _format_parameter("BodyName", body.name, 2)
-        if body.description:
-            yield _format_parameter("Description", _fold_description(body.description), 2)
-        if body.pose is not None:
-            yield from _indent(_format_transform(body.pose), 2)
-        yield '  <parameter name="Frames">'
-        for frame in body:
-            yield from _indent(_format_frame(frame), 4)
-        yield "  </parameter>"
-        yield "</parameter>"
+def _format_body(body: Body) -> Iterator[str]:
+    lines = _format_head("BodyName", body.name, body.description)
+    if body.pose is not None:
+        lines += _format_transform(body.pose)
+    lines.append('<parameter name="Frames">')
+    for frame in body:
+        inside = [*_format_head("FrameName", frame.name, frame.description), *_format_transform(frame.pose)]
+        lines += [f"  {line}" for line in format_element("parameter", inside, "BodyFrame")]
+    lines.append("</parameter>")
+    return format_element("parameter", lines, "Body")
 
 
-def _format_frame(frame: BodyFrame) -> Iterator[str]:
-    yield "<parameter> <!-- BodyFrame -->"
-    yield _format_parameter("FrameName", frame.name, 2)
-    if frame.description:
-        yield _format_parameter("Description", _fold_description(frame.description), 2)
-    yield from _indent(_format_transform(frame.pose), 2)
-    yield "</parameter>"
+def _format_constraint(each: Constraint) -> Iterator[str]:
+    lines = _format_head("ConstraintName", each.name, each.description)
+    for key, end in (("From", each.from_), ("To", each.to)):
+        lines += format_element("parameter", name=key, value=end)
+    return format_element("parameter", [*lines, *_format_transform(each.default_pose)], "Constraint")
 
 
-def _format_constraints(constraints: tuple[Constraint, ...]) -> Iterator[str]:
-    for each in constraints:
-        yield "<parameter> <!-- Constraint -->"
-        yield _format_parameter("ConstraintName", each.name, 2)
-        if each.description:
-            yield _format_parameter("Description", _fold_description(each.description), 2)
-        yield _format_parameter("From", each.from_, 2)
-        yield _format_parameter("To", each.to, 2)
-        yield from _indent(_format_transform(each.default_pose), 2)
-        yield "</parameter>"
+def _format_head(key: str, name: str, description: str) -> list[str]:
+    lines = [*format_element("parameter", name=key, value=name)]
+    if description:
+        lines += format_element("parameter", name="Description", value=_fold_description(description))
+    return lines
 
 
 def _format_transform(pose: Pose) -> Iterator[str]:
-    yield '<parameter name="HTransform">'
-    for number, row in enumerate(pose.matrix_rows()[:3], 1):
-        yield _format_parameter(f"Row{number}", " ".join(map(format_number, row)), 2)
-    yield "</parameter>"
-
-
-def _format_parameter(name: str, value: str, indent: int) -> str:
-    return f'{" " * indent}<parameter name="{name}" value="{escape(value)}"/>'
-
-
-def escape(value: str) -> str:
-    """Escape a text for an XML attribute."""
-    return value.translate(_ESCAPES)
-
-
-def _indent(lines: Iterator[str], columns: int) -> Iterator[str]:
-    return (" " * columns + line for line in lines)
+    rows = enumerate(pose.matrix_rows()[:3], 1)
+    inside = [line for n, row in rows for line in format_element("parameter", name=f"Row{n}", value=row)]
+    return format_element("parameter", inside, name="HTransform")

@@ -15,84 +15,46 @@ import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from modelserver.formats.miro_writer import escape
 from modelserver.formats.reading import ORIGIN
 from modelserver.formats.urdf_loader import UNLIMITED
-from modelserver.formats.writing import SavedModel, format_names, format_number, list_text_and_sigma_features
+from modelserver.formats.writing import SavedModel, format_element, format_names, list_text_and_sigma_features
 from modelserver.geometry import names
 from modelserver.geometry.inertia import Rows, from_spatial_inertia
-from modelserver.geometry.joint import FIXED, Joint, JointType
+from modelserver.geometry.joint import FIXED, TYPES_WITH_AXIS, Joint, JointType
 from modelserver.geometry.model import Model
-from modelserver.geometry.shape import Material, Shape, ShapeKind
+from modelserver.geometry.shape import DIMENSIONS, Material, Shape, ShapeKind
 from modelserver.geometry.topology import Crossing, Topology
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 
 
-class MaterialTable:
-    """The materials of a model, defined once for the robot; of several with one name the first."""
-
-    def __init__(self, model: Model):
-        self.defined: dict[str, Material] = {}
-        for body in model.bodies:
-            for shape in (*body.visuals, *body.collisions):
-                if shape.material is not None and _has_content(shape.material):
-                    self.defined.setdefault(shape.material.name, shape.material)
-
-    def format_definitions(self) -> Iterator[str]:
-        """Yield the definitions."""
-        for material in self.defined.values():
-            yield from _format_material(material, named_only=False)
-
-    def format_use(self, material: Material) -> Iterator[str]:
-        """Yield a material in a visual: its name alone if it is the defined one."""
-        known = self.defined.get(material.name)
-        yield from _format_material(material, named_only=known == material or not _has_content(material))
+def _format_material(material: Material, is_name_only: bool = False) -> Iterator[str]:
+    inside: list[str] = []
+    if material.color is not None and not is_name_only:
+        inside += format_element("color", rgba=material.color)
+    if material.texture and not is_name_only:
+        inside += format_element("texture", filename=material.texture)
+    return format_element("material", inside, name=material.name)
 
 
-def _has_content(material: Material) -> bool:
-    return material.color is not None or bool(material.texture)
-
-
-def _format_material(material: Material, named_only: bool) -> Iterator[str]:
-    head = f'<material name="{escape(material.name)}"'
-    if named_only:
-        yield f"{head}/>"
-        return
-    yield f"{head}>"
-    if material.color is not None:
-        rgba = " ".join(map(format_number, material.color))
-        yield f'  <color rgba="{rgba}"/>'
-    if material.texture:
-        yield f'  <texture filename="{escape(material.texture)}"/>'
-    yield "</material>"
-
-
-def format_shape(key: str, shape: Shape, materials: MaterialTable) -> Iterator[str]:
-    """Yield a visual or a collision."""
-    yield f'<{key} name="{escape(shape.name)}">' if shape.name else f"<{key}>"
-    if shape.pose != Pose.identity():
-        yield f"  {format_origin(shape.pose)}"
-    yield "  <geometry>"
-    size = [format_number(value) for value in shape.size]
-    together = " ".join(size)
-    match shape.kind:
-        case ShapeKind.BOX:
-            yield f'    <box size="{together}"/>'
-        case ShapeKind.CYLINDER:
-            yield f'    <cylinder radius="{size[0]}" length="{size[1]}"/>'
-        case ShapeKind.SPHERE:
-            yield f'    <sphere radius="{size[0]}"/>'
-        case ShapeKind.MESH:
-            scale = "" if shape.size == (1.0, 1.0, 1.0) else f' scale="{together}"'
-            yield f'    <mesh filename="{escape(shape.file)}"{scale}/>'
-    yield "  </geometry>"
+def _format_shape(key: str, shape: Shape, materials: dict[str, Material]) -> Iterator[str]:
+    """Return a visual or a collision; a material defined for the robot is named only."""
+    if shape.kind is ShapeKind.BOX:
+        form = format_element("box", size=shape.size)
+    elif shape.kind is not ShapeKind.MESH:
+        form = format_element(str(shape.kind), **dict(zip(DIMENSIONS[shape.kind], shape.size, strict=True)))
+    elif shape.size == (1.0, 1.0, 1.0):
+        form = format_element("mesh", filename=shape.file)
+    else:
+        form = format_element("mesh", filename=shape.file, scale=shape.size)
+    inside = [*_format_origin(shape.pose)] if shape.pose != Pose.identity() else []
+    inside += format_element("geometry", form)
     if shape.material is not None:
-        yield from (f"  {line}" for line in materials.format_use(shape.material))
-    yield f"</{key}>"
+        inside += _format_material(shape.material, materials.get(shape.material.name) == shape.material)
+    return format_element(key, inside, **({"name": shape.name} if shape.name else {}))
 
 
-def format_inertial(inertia: Rows | None) -> Iterator[str]:
+def _format_inertial(inertia: Rows | None) -> Iterator[str]:
     """Yield the inertial of a body, along the axes of its link; nothing if it is not that of a rigid body."""
     found = None if inertia is None else from_spatial_inertia(inertia)
     if found is None:
@@ -100,13 +62,10 @@ def format_inertial(inertia: Rows | None) -> Iterator[str]:
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = found.about_center
     greatest = max(abs(value) for row in inertia or () for value in row)
     x, y, z = (_round_off(value, max(map(abs, found.center))) for value in found.center)
-    yield "<inertial>"
-    yield f"  {format_origin(Pose((x, y, z)))}"
-    yield f'  <mass value="{format_number(found.mass)}"/>'
     moments = {"ixx": xx, "ixy": xy, "ixz": xz, "iyy": yy, "iyz": yz, "izz": zz}
-    attributes = " ".join(f'{key}="{format_number(_round_off(value, greatest))}"' for key, value in moments.items())
-    yield f"  <inertia {attributes}/>"
-    yield "</inertial>"
+    inside = [*_format_origin(Pose((x, y, z))), *format_element("mass", value=found.mass)]
+    inside += format_element("inertia", **{key: _round_off(value, greatest) for key, value in moments.items()})
+    yield from format_element("inertial", inside)
 
 
 def _round_off(value: float, scale: float) -> float:
@@ -115,11 +74,9 @@ def _round_off(value: float, scale: float) -> float:
     return rounded if abs(rounded - value) <= 4e-15 * scale else value
 
 
-def format_origin(pose: Pose) -> str:
+def _format_origin(pose: Pose) -> Iterator[str]:
     """Return the <origin> of a pose; its angles, in radians, read back to 1e-11 everywhere."""
-    angles = [format_number(_round_off(angle, 1.0) + 0.0) for angle in so3.to_rpy(pose.wxyz)]
-    xyz, rpy = " ".join(map(format_number, pose.xyz)), " ".join(angles)
-    return f'<origin xyz="{xyz}" rpy="{rpy}"/>'
+    return format_element("origin", xyz=pose.xyz, rpy=[_round_off(each, 1.0) + 0.0 for each in so3.to_rpy(pose.wxyz)])
 
 
 UNSPECIFIED_EFFORT = 1e9
@@ -129,23 +86,23 @@ UNSPECIFIED_EFFORT = 1e9
 def save(model: Model) -> SavedModel:
     """Return the text of `model`, and its features that this format does not support."""
     writer = _UrdfWriter(model)
-    materials = MaterialTable(model)
-    robot = "".join(each if each.isprintable() else " " for each in model.name).strip()
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>', f'<robot name="{escape(robot)}">']
-    lines += [f"  {line}" for line in materials.format_definitions()]
+    materials: dict[str, Material] = {}
+    for shape in (shape for body in model.bodies for shape in (*body.visuals, *body.collisions)):
+        if shape.material is not None and (shape.material.color is not None or shape.material.texture):
+            # of several with one name the first is defined for the robot
+            materials.setdefault(shape.material.name, shape.material)
+    inside = [line for material in materials.values() for line in _format_material(material)]
     for name, body in writer.links.items():
-        if not body:
-            lines.append(f'  <link name="{escape(name)}"/>')
-            continue
-        found = model.body(body)
-        inside = [*format_inertial(found.inertia)]
-        for key, shapes in (("visual", found.visuals), ("collision", found.collisions)):
-            inside += [line for shape in shapes for line in format_shape(key, shape, materials)]
-        head = f'<link name="{escape(name)}"'
-        lines += [f"  {head}>", *(f"    {line}" for line in inside), "  </link>"] if inside else [f"  {head}/>"]
-    for joint in writer.joints:
-        lines += [f"  {line}" for line in _format_joint(joint)]
-    lines.append("</robot>")
+        parts: list[str] = []
+        if body:
+            found = model.body(body)
+            parts += _format_inertial(found.inertia)
+            for key, shapes in (("visual", found.visuals), ("collision", found.collisions)):
+                parts += [line for shape in shapes for line in _format_shape(key, shape, materials)]
+        inside += format_element("link", parts, name=name)
+    inside += [line for joint in writer.joints for line in _format_joint(joint)]
+    robot = "".join(each if each.isprintable() else " " for each in model.name).strip()
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', *format_element("robot", inside, name=robot)]
     unsupported = [*writer.list_unsupported()]
     if robot != model.name:
         unsupported.append("control characters in the model's name")
@@ -173,9 +130,7 @@ class _UrdfWriter:
         self.model = model
         topology = Topology(model.bodies, model.constraints)
         root, *_ = topology.assemblies
-        self.crossings: dict[str, Crossing] = {}
-        for _, crossing in topology.traverse_breadth_first(root[0]):
-            self.crossings[names.split(crossing.far_frame)[0]] = crossing
+        self.crossings = {each.far_body: each for _, each in topology.traverse_breadth_first(root[0])}
         self.bodies = [body for body in model.bodies if body.name in set(root)]
         self.links: dict[str, str] = {body.name: body.name for body in self.bodies}
         """Links to write, each with the body that it represents, empty for none."""
@@ -206,7 +161,7 @@ class _UrdfWriter:
         mounts = {
             crossing.near_frame: crossing.constraint.name
             for crossing in self.crossings.values()
-            if names.split(crossing.near_frame)[0] == body
+            if crossing.near_body == body
         }
         between = self.find_intermediate_frame(body)
         for frame in self.model.body(body):
@@ -231,7 +186,7 @@ class _UrdfWriter:
     def add_joint(self, body: str, crossing: Crossing) -> None:
         """Add the joint on which a body is mounted."""
         each = crossing.constraint
-        parent = names.split(crossing.near_frame)[0]
+        parent = crossing.near_body
         mount = self.model.frame(crossing.near_frame).pose
         back = self.model.frame(crossing.far_frame).pose.inverse()
         if not each.joint.is_movable or not _is_movable_in_urdf(crossing):
@@ -317,28 +272,23 @@ def _remove_mimic(joint: Joint) -> Joint:
 
 def _format_joint(written: _WrittenJoint) -> Iterator[str]:
     joint = written.joint
-    bounds = (joint.lower or (-math.inf,), joint.upper or (math.inf,))
-    bounded = joint.count == 1 and (bounds[0][0] > -UNLIMITED or bounds[1][0] < UNLIMITED)
+    low = max(joint.lower[0] if joint.lower else -math.inf, -UNLIMITED)
+    high = min(joint.upper[0] if joint.upper else math.inf, UNLIMITED)
+    bounded = joint.count == 1 and (low > -UNLIMITED or high < UNLIMITED)
     kind = "continuous" if joint.type is JointType.REVOLUTE and not bounded else str(joint.type)
-    yield f'<joint name="{escape(written.name)}" type="{kind}">'
-    yield f"  {format_origin(written.pose)}"
-    yield f'  <parent link="{escape(written.parent)}"/>'
-    yield f'  <child link="{escape(written.child)}"/>'
-    if joint.type in (JointType.REVOLUTE, JointType.PRISMATIC, JointType.PLANAR):
+    inside = [*_format_origin(written.pose)]
+    for key, link in (("parent", written.parent), ("child", written.child)):
+        inside += format_element(key, link=link)
+    if joint.type in TYPES_WITH_AXIS:
         sign = -1.0 if written.is_reversed else 1.0
-        axis = " ".join(format_number(sign * value + 0.0) for value in joint.axis)
-        yield f'  <axis xyz="{axis}"/>'
+        inside += format_element("axis", xyz=[sign * value + 0.0 for value in joint.axis])
     if joint.count == 1:
         rate = min(joint.rate_limit[0], UNLIMITED) if joint.rate_limit else UNLIMITED
-        rest = f'effort="{format_number(UNSPECIFIED_EFFORT)}" velocity="{format_number(rate)}"'
         if kind != "continuous":
-            low, high = max(bounds[0][0], -UNLIMITED), min(bounds[1][0], UNLIMITED)
-            yield f'  <limit lower="{format_number(low)}" upper="{format_number(high)}" {rest}/>'
+            inside += format_element("limit", lower=low, upper=high, effort=UNSPECIFIED_EFFORT, velocity=rate)
         elif rate < UNLIMITED:
-            yield f"  <limit {rest}/>"
+            inside += format_element("limit", effort=UNSPECIFIED_EFFORT, velocity=rate)
         if joint.mimic is not None:
-            yield (
-                f'  <mimic joint="{escape(joint.mimic.joint)}" multiplier="{format_number(joint.mimic.multiplier)}" '
-                f'offset="{format_number(joint.mimic.offset)}"/>'
-            )
-    yield "</joint>"
+            factors = {"multiplier": joint.mimic.multiplier, "offset": joint.mimic.offset}
+            inside += format_element("mimic", joint=joint.mimic.joint, **factors)
+    return format_element("joint", inside, name=written.name, type=kind)

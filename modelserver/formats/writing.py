@@ -1,9 +1,10 @@
-"""Shared by the writers of geometry files: their result, numbers, and features that a format does not support."""
+"""Shared by the writers of geometry files: result, numbers, XML elements, features that a format does not support."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from xml.sax import saxutils
 
 from modelserver.geometry.model import Model
 
@@ -20,6 +21,29 @@ def format_number(value: float) -> str:
     """Return the shortest text that reads back as the same float, without a trailing `.0`."""
     text = repr(value)
     return text[:-2] if text.endswith(".0") else text
+
+
+def escape(value: str) -> str:
+    """Escape a text for an XML attribute."""
+    return saxutils.escape(value, {'"': "&quot;"})
+
+
+def format_element(
+    tag: str, inside: Iterable[str] = (), comment: str = "", /, **attributes: str | float | Sequence[float]
+) -> Iterator[str]:
+    """Yield the lines of an XML element with the lines `inside`; a comment is written behind the start tag."""
+    head = f"<{tag}"
+    for key, value in attributes.items():
+        if not isinstance(value, str):
+            value = " ".join(map(format_number, [value] if isinstance(value, float) else value))
+        head += f' {key}="{escape(value)}"'
+    lines = [f"  {line}" for line in inside]
+    if not lines:
+        yield f"{head}/>"
+        return
+    yield f"{head}>" + (f" <!-- {comment} -->" if comment else "")
+    yield from lines
+    yield f"</{tag}>"
 
 
 def format_names(names: list[str], limit: int = 5) -> str:

@@ -289,7 +289,7 @@ class FrameTree:
             root = assembly[0]
             self._add_frames(bodies[root], FrameNode(number, root, Pose.identity()))
             for _, crossing in topology.traverse_breadth_first(root):
-                body = bodies[names.split(crossing.far_frame)[0]]
+                body = bodies[crossing.far_body]
                 self._add_frames(body, self._cross(crossing, body), crossing.far_frame)
 
     def _add_frames(self, body: Body, entered: FrameNode, by: str = "") -> None:

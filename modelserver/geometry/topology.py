@@ -56,6 +56,16 @@ class Crossing:
         return self.constraint.to if self.forward else self.constraint.from_
 
     @property
+    def near_body(self) -> str:
+        """The body that the path leaves."""
+        return self.near_frame.partition(":")[0]
+
+    @property
+    def far_body(self) -> str:
+        """The body that the path enters."""
+        return self.far_frame.partition(":")[0]
+
+    @property
     def pose(self) -> Pose:
         """The pose of the far frame in the near one, with a movable joint at its default position."""
         X_FT = self.constraint.default_pose
@@ -99,7 +109,7 @@ class Topology:
             if start not in seen:
                 assembly = (
                     start,
-                    *(names.split(crossing.far_frame)[0] for _, crossing in self.traverse_breadth_first(start)),
+                    *(crossing.far_body for _, crossing in self.traverse_breadth_first(start)),
                 )
                 seen.update(assembly)
                 assemblies.append(assembly)
@@ -112,7 +122,7 @@ class Topology:
         while queue:
             body = queue.popleft()
             for crossing in self._by_body[body]:
-                entered = names.split(crossing.far_frame)[0]
+                entered = crossing.far_body
                 if entered not in seen:
                     seen.add(entered)
                     queue.append(entered)
@@ -130,7 +140,7 @@ class Topology:
             reached: dict[str, tuple[str, Crossing]] = {}
             used = set()
             for body, crossing in self.traverse_breadth_first(start):
-                entered = names.split(crossing.far_frame)[0]
+                entered = crossing.far_body
                 reached[entered] = (body, crossing)
                 used.add(crossing.constraint.name)
             for body in assembly:
@@ -139,7 +149,7 @@ class Topology:
                     if name in used:
                         continue
                     used.add(name)
-                    entered = names.split(crossing.far_frame)[0]
+                    entered = crossing.far_body
                     back = self._tree_path(reached, entered, body)
                     closures.append(LoopClosure(name, _find_loop_bodies(reached, body, entered), (crossing, *back)))
         return tuple(closures)
@@ -167,7 +177,7 @@ class Topology:
             return ()
         predecessors: dict[str, tuple[str, Crossing]] = {}
         for previous, crossing in self.traverse_breadth_first(body):
-            entered = names.split(crossing.far_frame)[0]
+            entered = crossing.far_body
             predecessors[entered] = (previous, crossing)
             if entered == target:
                 return _backtrack(predecessors, body, target)
@@ -209,7 +219,7 @@ class Topology:
             if crossing.far_frame == target:
                 return tuple(path)
             on_path.add(name)
-            stack.append(self._iterate_crossings(names.split(crossing.far_frame)[0]))
+            stack.append(self._iterate_crossings(crossing.far_body))
         return None
 
     def _iterate_crossings(self, body: str) -> Iterator[tuple[str, Crossing | None]]:
