@@ -4,8 +4,8 @@
       gps: {device: novatel, port: /dev/ttyUSB0, baud: 38400}
 
 `device` is the kind. The other keys follow from the dataclasses of the kind's lines and settings, which alone define
-names, types and limits. `SectionReader` validates a section with pydantic and collects every problem with its line and
-fix: an invalid value is removed and the rest validated again, until only valid values are left.
+names, types and limits. `SectionReader` validates a section as `modelserver.config.reader` does a file, and collects
+every problem with its line and fix.
 """
 
 from __future__ import annotations
@@ -15,11 +15,9 @@ import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeAlias, get_args, get_type_hints
+from typing import Any, get_args
 
-from pydantic import ValidationError
-
-from modelserver.config.reader import find_renamed_key, get_adapter
+from modelserver.config.reader import Path_, SettingsReader, find_renamed_key, get_value, list_known_keys
 from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_key, suggest_name
 from msdrivers.line_settings import LineSettings, TcpSettings, get_line_key
 from msdrivers.registry import KINDS, DeviceKind
@@ -39,16 +37,11 @@ _EXPECTED = {
 }
 
 
-class ProblemText(NamedTuple):
-    """Message of a problem, its fix, and the nearest known names."""
+def describe_error(detail: Any, keys: Sequence[str]) -> tuple[str, str, tuple[str, ...]]:
+    """Describe one of pydantic's errors: message, fix, nearest known names.
 
-    message: str
-    fix: str = ""
-    nearest: tuple[str, ...] = ()
-
-
-def describe_error(detail: Any, keys: Sequence[str]) -> ProblemText:
-    """Describe one of pydantic's errors; `keys` are those of the section that is expected there."""
+    `keys` are those of the section that is expected there.
+    """
     kind, got = detail["type"], detail.get("input")
     *path, last = detail["loc"]
     name = f"{path[-1]}, number {last + 1} in it," if isinstance(last, int) else str(last)
@@ -56,11 +49,11 @@ def describe_error(detail: Any, keys: Sequence[str]) -> ProblemText:
     if kind in _CHOICE_ERRORS:
         expected = detail["ctx"]["expected"]
         near = suggest_name(str(got), re.findall(r"'([^']*)'", expected))
-        return ProblemText(f"{name} is {expected}{actual}", f"write {near[0]}" if near else "", near)
+        return f"{name} is {expected}{actual}", f"write {near[0]}" if near else "", near
     if kind not in _EXPECTED:
         message = str(detail["msg"])
-        return ProblemText(f"{name}: {message[:1].lower()}{message[1:]}{actual}")
-    return ProblemText(f"{name} is {_EXPECTED[kind]}{actual}", _suggest_fix(kind, got, keys))
+        return f"{name}: {message[:1].lower()}{message[1:]}{actual}", "", ()
+    return f"{name} is {_EXPECTED[kind]}{actual}", _suggest_fix(kind, got, keys), ()
 
 
 def _suggest_fix(kind: str, got: Any, keys: Sequence[str]) -> str:
@@ -86,50 +79,34 @@ def format_value(value: str | float) -> str:
     return str(value).lower() if isinstance(value, bool) else f"{value}"
 
 
-KeyPath: TypeAlias = tuple[str | int, ...]
-"""Path of a value in a section."""
-
-
 def list_keys(*kinds: type) -> list[str]:
     """Return the names of the fields of dataclasses."""
     return list(dict.fromkeys(each.name for kind in kinds for each in dataclasses.fields(kind)))
 
 
-def _list_known_keys(kind: Any, path: tuple[str | int, ...]) -> list[str]:
-    """Return the keys known at a place below settings of `kind`: in a section, a mapping or a list of sections."""
-    for step in path:
-        if dataclasses.is_dataclass(kind):
-            kind = get_type_hints(kind).get(str(step))
-        else:
-            # a mapping or a list: what it holds is its last argument, or the first of tuple[X, ...]
-            kind = next((each for each in reversed(get_args(kind)) if each is not Ellipsis), None)
-        if type(None) in get_args(kind):
-            kind = next(each for each in get_args(kind) if each is not type(None))
-    return list_keys(kind) if dataclasses.is_dataclass(kind) and isinstance(kind, type) else []
-
-
-class SectionReader:
+class SectionReader(SettingsReader):
     """Reads one driver's section and collects its problems."""
 
     def __init__(self, name: str, section: Mapping[str, Any], locate: Callable[..., Location]):
         """`locate` returns the location of a key path in the vehicle file."""
-        self.name, self.section, self._locate = name, section, locate
-        self.problems: list[Problem] = []
+        super().__init__(name, _CommonKeys)
+        self.section, self._locate_key = section, locate
         self._has_line = True
+
+    def locate(self, at: Path_) -> Location:
+        """Return the location of a key path of the section."""
+        return self._locate_key("drivers", self.name, *at)
 
     def read_kind(self, kinds: Mapping[str, DeviceKind]) -> DeviceKind:
         """Return the kind of device that the section names. Raises ConfigError."""
         given = self.section.get("device")
         known = f"kinds: {', '.join(kinds)}"
         if given is None:
-            words = ProblemText("device is missing", f"add a line: device: ... ({known})")
-            raise ConfigError([self._make_problem(words, "device")])
+            raise ConfigError([self._make_problem("device", "device is missing", f"add a line: device: ... ({known})")])
         if not isinstance(given, str) or given not in kinds:
             near = suggest_name(str(given), kinds)
             fix = f"write {near[0]}" if near else known
-            raise ConfigError(
-                [self._make_problem(ProblemText(f"unknown device {quote(str(given))}", fix, near), "device")]
-            )
+            raise ConfigError([self._make_problem("device", f"unknown device {quote(str(given))}", fix, near)])
         return kinds[given]
 
     def read_line_type(self, kind: DeviceKind, more: list[str]) -> type[LineSettings]:
@@ -148,10 +125,9 @@ class SectionReader:
             return firsts[given[0]]
         wanted = " or ".join(firsts)
         if given:
-            self.report(given[-1], ProblemText(f"both {' and '.join(given)} are given", f"keep one of {wanted}"))
+            self.report(given[-1], f"both {' and '.join(given)} are given", f"keep one of {wanted}")
         elif not any(key in self.section for key in _list_other_lines(kind)):
-            fix = f"add a line: {next(iter(firsts))}: ..."
-            self.problems.append(self._make_problem(ProblemText(f"no line is named: {wanted} is missing", fix)))
+            self.add_problem((), f"no line is named: {wanted} is missing", f"add a line: {next(iter(firsts))}: ...")
         self._has_line = False
         return next(iter(firsts.values()))
 
@@ -163,13 +139,12 @@ class SectionReader:
         others = _list_other_lines(kind)
         for key in [each for each in self.section if each not in known]:
             if key in others:
-                what = f"{on}, not on {others[key]}"
                 fix = "take it out" if self._has_line else f"write {firsts[0]}: ... in its place"
-                self.report(key, ProblemText(what, fix))
+                self.report(key, f"{on}, not on {others[key]}", fix)
             elif key in list_keys(*get_args(LineSettings)):
                 owner = next(get_line_key(each) for each in get_args(LineSettings) if key in list_keys(each))
                 there = f"and {on}" if owner not in firsts else f"and the line here is {get_line_key(line)}"
-                self.report(key, ProblemText(f"{key} goes with {owner}, {there}", "take it out"))
+                self.report(key, f"{key} goes with {owner}, {there}", "take it out")
             else:
                 self._report_misspelled(key, known)
 
@@ -177,7 +152,7 @@ class SectionReader:
         """Return the key that one of the section misspells; one that is given already is not what was meant."""
         return self._suggest_at((key,), [each for each in known if each not in self.section])
 
-    def _suggest_at(self, path: KeyPath, known: list[str]) -> Suggestion:
+    def _suggest_at(self, path: Path_, known: list[str]) -> Suggestion:
         """Return the key that an unknown one at a path had become, or misspells."""
         renamed = find_renamed_key(".".join(map(str, ("drivers", self.name, *path))))
         return Suggestion.of(str(path[-1]), renamed) if renamed in known else suggest_key(str(path[-1]), known)
@@ -186,67 +161,53 @@ class SectionReader:
         """Report an unknown key; its value is that of the key that is meant, which is not missing then."""
         near = self._suggest_key(key, known)
         fix = f"write {near[0]}" if near else f"known here: {', '.join(dict.fromkeys(known))}"
-        self.report(key, ProblemText(f"unknown key {quote(key)}", fix, near))
+        self.report(key, f"unknown key {quote(key)}", fix, near)
         if near:
             self.section = {near[0] if name == key else name: value for name, value in self.section.items()}
 
-    def report(self, key: str, words: ProblemText) -> None:
+    def report(self, key: str, message: str, fix: str = "", nearest: tuple[str, ...] = ()) -> None:
         """Report a problem of a key."""
-        self.problems.append(self._make_problem(words, key))
+        self.problems.append(self._make_problem(key, message, fix, nearest))
+
+    def _make_problem(self, key: str, message: str, fix: str, nearest: tuple[str, ...] = ()) -> Problem:
+        return Problem(Severity.ERROR, message, self.locate((key,)), fix, nearest)
 
     def read_values(self, kind: type, given: Mapping[str, Any] | None = None) -> Any:
         """Return the instance of `kind` that the section makes, None where something is wrong with it.
 
-        What is `given` goes before the section; what `kind` does not have is left out. A section's own rules are looked
-        at once all in it can be read, and end at the first: so what is wrong is left out, and the rest read again.
+        What is `given` goes before the section; what `kind` does not have is left out.
         """
+        self.schema, known = kind, len(self.problems)
         merged = json.loads(json.dumps({**self.section, **(given or {})}, default=str))
-        values = {key: value for key, value in merged.items() if key in list_keys(kind)}
-        gone: set[KeyPath] = set()
-        while True:
-            try:
-                # by way of JSON: strict there means that "4" is no number, while a list still makes a tuple
-                found: Any = get_adapter(kind).validate_json(json.dumps(values), strict=True)
-                return None if gone else found
-            except ValidationError as error:
-                wrong = [self._explain_error(kind, detail) for detail in error.errors()]
-            # a key that is misspelled is not missing
-            meant = {each for path, words in wrong for each in _suggested_paths(path, words)}
-            for path, words in wrong:
-                # what misses a part that was left out is no mistake
-                if words is not None and path not in meant and not any(each[: len(path)] == path for each in gone):
-                    self.problems.append(self._make_problem(words, *path))
-            # try to remove each, also after one failed
-            dropped = [_drop_at_path(values, path, gone) for path, _ in wrong]
-            if not all(dropped):
-                return None
+        found = self.validate({key: value for key, value in merged.items() if key in list_keys(kind)}, {})
+        return found if len(self.problems) == known else None
 
-    def _explain_error(self, kind: type, detail: Any) -> tuple[KeyPath, ProblemText | None]:
-        """Return the key path of a pydantic error and its text; None if it is reported otherwise."""
-        path = tuple(detail["loc"])
-        last = str(path[-1]) if path else ""
+    def explain(self, detail: Any) -> list[tuple[Path_, Problem]]:
+        """Turn one of pydantic's errors into a problem with its path; a missing line is reported otherwise."""
+        at: Path_ = tuple(detail["loc"])
+        last = str(at[-1]) if at else ""
+        fix, near = "", tuple[str, ...]()
         if detail["type"] == "missing":
-            words = ProblemText(f"{last} is missing", f"add a line: {last}: ...")
-            return path, words if self._has_line or last not in list_keys(*get_args(LineSettings)) else None
-        if detail["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-            known = _list_known_keys(kind, path[:-1])
-            around = _get_at_path(self.section, path[:-1])
-            given = around if isinstance(around, dict) else {}
-            near = self._suggest_at(path, [each for each in known if each not in given])
-            return path, ProblemText(
-                f"unknown key {quote(last)}", f"write {near[0]}" if near else f"known here: {', '.join(known)}", near
+            if not self._has_line and last in list_keys(*get_args(LineSettings)):
+                return []
+            message, fix = f"{last} is missing", f"add a line: {last}: ..."
+        elif detail["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+            known = list_known_keys(self.schema, at[:-1])
+            given = get_value(self.section, at[:-1])
+            near = self._suggest_at(at, [each for each in known if not isinstance(given, dict) or each not in given])
+            message, fix = (
+                f"unknown key {quote(last)}",
+                f"write {near[0]}" if near else f"known here: {', '.join(known)}",
             )
-        if detail["type"] != "value_error":
-            return path, describe_error(detail, _list_known_keys(kind, path))
-        # found by the section as a whole; the message begins with the key that it is about
-        message = str(detail["msg"]).removeprefix("Value error, ")
-        key = message.partition(" ")[0].rstrip(":")
-        path = (*path, key) if key in _list_known_keys(kind, path) else path
-        return path, ProblemText(message[:1].lower() + message[1:])
-
-    def _make_problem(self, words: ProblemText, *path: str | int) -> Problem:
-        source = self._locate("drivers", self.name, *path)
-        return Problem(Severity.ERROR, words.message, source, words.fix, words.nearest)
+        elif detail["type"] == "value_error":
+            # found by the section as a whole; the message begins with the key that it is about
+            message = str(detail["msg"]).removeprefix("Value error, ")
+            key = message.partition(" ")[0].rstrip(":")
+            at = (*at, key) if key in list_known_keys(self.schema, at) else at
+            message = message[:1].lower() + message[1:]
+        else:
+            message, fix, near = describe_error(detail, list_known_keys(self.schema, at))
+        return [(at, Problem(Severity.ERROR, message, self.locate(at), fix, near))]
 
 
 def _list_other_lines(kind: DeviceKind) -> dict[str, str]:
@@ -254,33 +215,6 @@ def _list_other_lines(kind: DeviceKind) -> dict[str, str]:
     own = {get_line_key(each) for each in kind.lines}
     every = {get_line_key(each): each.description for each in get_args(LineSettings)}
     return {key: about for key, about in every.items() if key not in own}
-
-
-def _suggested_paths(path: KeyPath, words: ProblemText | None) -> tuple[KeyPath, ...]:
-    """Return the path of the key that is meant by one that is misspelled; none where that is not what is wrong."""
-    if words is None or not isinstance(words.nearest, Suggestion) or path[-1:] != (words.nearest.replaced,):
-        return ()
-    return tuple((*path[:-1], each) for each in words.nearest)
-
-
-def _get_at_path(values: Any, path: KeyPath) -> Any:
-    for step in path:
-        values = values.get(step) if isinstance(values, dict) else None
-    return values
-
-
-def _drop_at_path(values: Any, path: KeyPath, gone: set[KeyPath]) -> bool:
-    """Remove the value at a path, or the nearest one around it (a whole list); return whether there was one."""
-    path = path[: next((n for n, step in enumerate(path) if isinstance(step, int)), len(path))]
-    while path:
-        around = _get_at_path(values, path[:-1])
-        if isinstance(around, dict) and path[-1] in around:
-            del around[path[-1]]
-            gone.add(path)
-            return True
-        gone.add(path)
-        path = path[:-1]
-    return False
 
 
 SOURCE_FIELD = "source"
@@ -383,7 +317,7 @@ def read_driver(
     given: dict[str, Any] = {SOURCE_FIELD: name, **kind.presets}
     baud = getattr(line_values, "baud", 0)
     if "bauds" in section and "baud" in section:
-        reader.report("baud", ProblemText("both baud and bauds are given", "keep one of baud or bauds"))
+        reader.report("baud", "both baud and bauds are given", "keep one of baud or bauds")
     elif baud and BAUDS_FIELD in station_keys:
         given[BAUDS_FIELD] = [baud]
     if line is TcpSettings and BAUDS_FIELD in station_keys:

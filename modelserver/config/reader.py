@@ -16,7 +16,7 @@ import re
 from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from functools import cache
-from typing import Any, Final, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Final, TypeVar, get_args, get_type_hints
 
 import yaml
 from pydantic import TypeAdapter, ValidationError
@@ -113,31 +113,10 @@ def read_partly(
         The file is not a YAML mapping.
     """
     reader, values = _compose(raw, name, schema)
-    problems = list(reader.problems)
     if any(at[-1:] == ("?",) for at in reader.lines):
-        return None, tuple(problems)  # with keys that are no names the rest is not what was meant
-    dropped: set[Path_] = set()
-    found: S | None = None
-    adapter = get_adapter(schema)
-    for _ in range(MAX_ROUNDS):
-        try:
-            # strict JSON: "4" is not a number, while a mapping still makes a section
-            found = adapter.validate_json(json.dumps(values, default=str), strict=True)
-            break
-        except ValidationError as error:
-            explained = [each for detail in error.errors() for each in reader.explain(detail)]
-        renamed = [
-            at for at, problem in explained if problem.replaced and reader.rename(values, at, problem.nearest[0])
-        ]
-        meant = {(*at[:-1], problem.nearest[0]) for at, problem in explained if at in renamed}
-        new = [(at, problem) for at, problem in explained if at not in dropped and at not in meant]
-        problems += [problem for _, problem in new]
-        removed = [at in renamed or _remove(values, at, dropped) for at, _ in new]
-        filled = [key for key, value in (blanks or {}).items() if values.setdefault(key, value) is value]
-        removed = [True] if filled else removed
-        if not removed or not all(removed):
-            break
-    return found, tuple(sorted(problems, key=lambda each: each.line))
+        return None, tuple(reader.problems)  # with keys that are no names the rest is not what was meant
+    found: S | None = reader.validate(values, blanks or {})
+    return found, tuple(sorted(reader.problems, key=lambda each: each.line))
 
 
 _ADAPTERS: dict[type, TypeAdapter[Any]] = {}
@@ -155,18 +134,17 @@ def _remove(values: Any, at: Path_, dropped: set[Path_]) -> bool:
     """Remove the value at a path, or the nearest section around it; return whether there was any."""
     steps = at[: next((n for n, step in enumerate(at) if isinstance(step, int)), len(at))]
     while steps:
-        if steps in dropped:
-            return True
-        inside = _get_value(values, steps[:-1])
+        dropped.add(steps)
+        inside = get_value(values, steps[:-1])
         if isinstance(inside, dict) and steps[-1] in inside:
             del inside[steps[-1]]
-            dropped.add(steps)
             return True
         steps = steps[:-1]
     return False
 
 
-def _get_value(values: Any, at: Path_) -> Any:
+def get_value(values: Any, at: Path_) -> Any:
+    """Return the value at a path; None if there is none."""
     for step in at:
         values = values.get(step) if isinstance(values, dict) else None
     return values
@@ -177,7 +155,7 @@ def read_lines(raw: bytes, name: str, schema: type) -> dict[Path_, int]:
     return _compose(raw, name, schema)[0].lines
 
 
-def _compose(raw: bytes, name: str, schema: type) -> tuple[_SettingsReader, Any]:
+def _compose(raw: bytes, name: str, schema: type) -> tuple[SettingsReader, Any]:
     """Return the plain values of a file, and the reader that has their lines."""
     if len(raw) > MAX_BYTES:
         raise _make_error(name, 0, f"the file is larger than {MAX_BYTES >> 20} MiB", "is this the vehicle file?")
@@ -204,12 +182,12 @@ def _compose(raw: bytes, name: str, schema: type) -> tuple[_SettingsReader, Any]
         ]
         what = "the file is empty" if node is None else "the file is not a mapping (key: value, one per line)"
         raise _make_error(name, 1, what, f"start with: {', '.join(required)}")
-    reader = _SettingsReader(name, schema)
+    reader = SettingsReader(name, schema)
     return reader, reader.read_value(node, ())
 
 
-class _SettingsReader:
-    """Turns YAML nodes into plain values, records the line of each, and explains pydantic's errors."""
+class SettingsReader:
+    """Turns YAML nodes into plain values, records the line of each, validates them, and explains pydantic's errors."""
 
     def __init__(self, name: str, schema: type):
         self.name = name
@@ -217,7 +195,30 @@ class _SettingsReader:
         self.lines: dict[Path_, int] = {}
         self.problems: list[Problem] = []
 
+    def validate(self, values: Any, blanks: Mapping[str, str]) -> Any:
+        """Return the instance that the values make, None where too little is valid; record every problem."""
+        dropped: set[Path_] = set()
+        for _ in range(MAX_ROUNDS):
+            try:
+                # strict JSON: "4" is not a number, while a mapping still makes a section
+                return get_adapter(self.schema).validate_json(json.dumps(values, default=str), strict=True)
+            except ValidationError as error:
+                explained = [each for detail in error.errors() for each in self.explain(detail)]
+            renamed = [
+                at for at, problem in explained if problem.replaced and self.rename(values, at, problem.nearest[0])
+            ]
+            meant = {(*at[:-1], problem.nearest[0]) for at, problem in explained if at in renamed}
+            wrong = [(at, problem) for at, problem in explained if at not in meant]
+            # what misses a value that was removed is no mistake
+            self.problems += [problem for at, problem in wrong if not any(each[: len(at)] == at for each in dropped)]
+            removed = [at in renamed or _remove(values, at, dropped) for at, _ in wrong]
+            filled = [key for key, value in blanks.items() if values.setdefault(key, value) is value]
+            if not filled and not (removed and all(removed)):
+                break
+        return None
+
     def read_value(self, node: yaml.Node, at: Path_) -> Any:
+        """Return the plain value of a node; record its lines and duplicate keys."""
         self.lines.setdefault(at, node.start_mark.line + 1)
         if isinstance(node, yaml.SequenceNode):
             return [self.read_value(each, (*at, index)) for index, each in enumerate(node.value)]
@@ -243,11 +244,12 @@ class _SettingsReader:
         return values
 
     def add_problem(self, at: Path_, message: str, fix: str) -> None:
+        """Record a problem at a path."""
         self.problems.append(Problem(Severity.ERROR, message, self.locate(at), fix))
 
     def rename(self, values: Any, at: Path_, meant: str) -> bool:
         """Move the value under a misspelled key to the key that is meant; return whether there is such a key."""
-        known, around = _list_known_keys(self.schema, at[:-1]), _get_value(values, at[:-1])
+        known, around = list_known_keys(self.schema, at[:-1]), get_value(values, at[:-1])
         if meant not in known or at[-1] in known or not isinstance(around, dict) or meant in around:
             return False
         around[meant] = around.pop(at[-1])
@@ -256,6 +258,7 @@ class _SettingsReader:
         return True
 
     def locate(self, at: Path_) -> Location:
+        """Return the location of a path, or of the nearest section around it."""
         line = next((self.lines[at[:n]] for n in range(len(at), -1, -1) if at[:n] in self.lines), 0)
         return Location(self.name, line, ".".join(map(str, at)))
 
@@ -290,7 +293,7 @@ class _SettingsReader:
 
     def _suggest_keys(self, key: str, at: Path_) -> tuple[tuple[str, ...], str]:
         """Return the known keys nearest to an unknown one at a path, and the fix."""
-        known = _list_known_keys(self.schema, at)
+        known = list_known_keys(self.schema, at)
         present = {each for each in known if (*at, each) in self.lines}
         renamed = find_renamed_key(".".join(map(str, (*at, key))))
         if renamed and renamed in present:
@@ -299,7 +302,7 @@ class _SettingsReader:
             return Suggestion.of(key, renamed), f"write {renamed}, its new name"
         below: dict[str, list[str]] = {}
         for section in known:
-            for each in _list_known_keys(self.schema, (*at, section)):
+            for each in list_known_keys(self.schema, (*at, section)):
                 below.setdefault(each, []).append(".".join(map(str, (*at, section))))
         # a key that is present already is not what was meant
         near = Suggestion() if key in below else suggest_key(key, [each for each in known if each not in present])
@@ -343,17 +346,16 @@ def _read_scalar(node: yaml.Node) -> Any:
         return str(node.value)
 
 
-def _list_known_keys(schema: type, at: Path_) -> list[str]:
-    """Return the keys of the schema at a path."""
-    kind: Any = schema
+def list_known_keys(schema: Any, at: Path_) -> list[str]:
+    """Return the keys known at a path below a schema: in a section, in a mapping or a list of sections."""
+    kind = schema
     for step in at:
-        if get_origin(kind) is dict:
-            kind = get_args(kind)[1]
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            kind = _get_type_hints(kind).get(str(step))
         else:
-            is_section = isinstance(kind, type) and dataclasses.is_dataclass(kind)
-            kind = _get_type_hints(kind).get(str(step)) if is_section else None
-        section = (each for each in (kind, *get_args(kind)) if dataclasses.is_dataclass(each))
-        kind = kind if get_origin(kind) is dict else next(section, None)
+            kind = next((each for each in reversed(get_args(kind)) if each is not Ellipsis), None)
+        if type(None) in get_args(kind):
+            kind = next(each for each in get_args(kind) if each is not type(None))
     return [each.name for each in dataclasses.fields(kind)] if dataclasses.is_dataclass(kind) else []
 
 

@@ -279,7 +279,7 @@ def test_given_the_renamed_keys_then_each_new_name_is_a_key() -> None:
     for path, new in reader.RENAMED_KEYS.items():
         if not path.startswith("drivers"):
             text = path.replace("*", "raw").rpartition(".")[0]
-            assert new in reader._list_known_keys(VehicleConfig, tuple(filter(None, text.split("."))))
+            assert new in reader.list_known_keys(VehicleConfig, tuple(filter(None, text.split("."))))
 
 
 def test_given_an_unknown_key_like_one_that_is_given_already_then_that_is_not_proposed() -> None:
