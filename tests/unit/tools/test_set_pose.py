@@ -133,9 +133,9 @@ def test_given_messages_of_another_type_then_they_are_passed_over() -> None:
             ("V1_POSE", encode(PoseAnswer(Transformation("Cart:Base", "World:UTM", Pose())))),
         ):
             bus.publish(channel, data)
-        assert listener.wait(30.0, lambda: listener.pose is not None)
-    assert listener.get_decision(5) == USED
-    assert listener.get_decision(6) is None
+        assert listener.listen(30.0, lambda: listener.pose is not None)
+    assert listener.decisions.get(5) == USED
+    assert listener.decisions.get(6) is None
 
 
 # --- the report ----------------------------------------------------------------------------------------------------

@@ -7,14 +7,15 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from modelserver.errors import NoServerError, QueryError
 from modelserver.messages import DriverHealth, DriverPhase, Health, Invalid, PoseAnswer
 from modelserver.transforms.pose import Pose
-from modelserver.wire.provider import handle_message, open_lcm, resolve_url
+from modelserver.wire.provider import open_lcm, resolve_url
+from mstools.commands.listener import DaemonListener
 from mstools.demo.connections import DemoConnections, make_connections
 from mstools.demo.processes import MODELSERVER, ChildProcesses, DemoError
 from mstools.deployment.steps import get_examples_folder
@@ -103,31 +104,29 @@ def run_demo(lines: DemoConnections, seconds: float, children: ChildProcesses) -
         typer.echo("\n4. POSE from GPS, IMU and wheels, beside the simulated truth")
         typer.echo("   time      easting     northing       up     yaw   error            protection level state")
         valid: list[PoseAnswer] = []
-        received = 0
-        next_row = 0.0
-        alive = ""
+        received, next_row, alive = 0, 0.0, ""
         for pose in iter_poses(listener, start_utime, seconds, children):
             received += 1
             since = (pose.transformation.utime - start_utime) * 1e-6
             if pose.transformation.is_valid:
                 valid.append(pose)
             if since >= next_row:
-                typer.echo(
-                    format_row(pose, since, run.truth(pose.transformation.utime).utm, run.geodesy.origin.initial_utm)
-                )
+                truth = run.truth(pose.transformation.utime).utm
+                typer.echo(format_row(pose, since, truth, run.geodesy.origin.initial_utm))
                 next_row = math.floor(since) + 1.0
-            if not alive and since >= SETTLING_SECONDS and not list_missing_devices(listener.health, lines):
-                alive = ", ".join(f"{name} {listener.health[name].rate_hz:.1f} Hz" for name in lines.devices)
+            if not alive and since >= SETTLING_SECONDS and not list_missing_devices(listener.drivers, lines):
+                alive = ", ".join(f"{name} {listener.drivers[name].rate_hz:.1f} Hz" for name in lines.devices)
                 typer.echo(f"   all {len(lines.devices)} devices are streaming: {alive}")
         if not alive:
-            raise DemoError(f"not all devices are streaming: {'; '.join(list_missing_devices(listener.health, lines))}")
+            raise DemoError(
+                f"not all devices are streaming: {'; '.join(list_missing_devices(listener.drivers, lines))}"
+            )
         if not valid:
             raise DemoError(
                 f"the pose never became valid in {seconds:g} s: {received} poses were received on POSE. "
                 "Run it again with --verbose; a busy machine may need --seconds 20"
             )
-        typer.echo(f"   {received} poses in {seconds:g} s, {len(valid)} of them valid")
-        for text in format_usage(listener.service):
+        for text in (f"{received} poses in {seconds:g} s, {len(valid)} of them valid", *format_usage(listener.service)):
             typer.echo(f"   {text}")
 
         typer.echo("\n5. The camera in the world a second ago, from the history")
@@ -165,33 +164,27 @@ def format_usage(service: Health | None) -> list[str]:
     return [f"{name}: {used} of {measured} measurements used" for name, used, measured in counts] + warnings
 
 
-class PoseListener:
-    """Receive the poses, and the health reports of server and drivers."""
+class PoseListener(DaemonListener):
+    """Receive the poses, and the last health reports of the server and, by name, of the drivers."""
 
     def __init__(self, url: str, prefix: str):
-        from modelserver.wire.channels import to_subscription_pattern
-        from modelserver.wire.codec import decode
-
         self.poses: list[PoseAnswer] = []
-        self.health: dict[str, DriverHealth] = {}
-        """The last report of each driver by name."""
+        self.drivers: dict[str, DriverHealth] = {}
         self.service: Health | None = None
-        """The last report of the server."""
-        self.bus = open_lcm(resolve_url(url))
+        handlers: dict[str, Callable[[Any], object]] = {
+            "POSE": self.poses.append,
+            "DRIVER_HEALTH": self._on_driver,
+            "MODELSERVER_HEALTH": self._on_health,
+        }
+        super().__init__(open_lcm(resolve_url(url)), prefix, handlers)
+        for each in self.subscriptions:
+            each.set_queue_capacity(0)
 
-        def report(_: str, data: bytes) -> None:
-            health: DriverHealth = decode("driver_health_t", data)
-            self.health[health.source] = health
+    def _on_driver(self, health: DriverHealth) -> None:
+        self.drivers[health.source] = health
 
-        def service(_: str, data: bytes) -> None:
-            self.service = decode("health_t", data)
-
-        for channel, handler in (
-            ("POSE", lambda _, data: self.poses.append(decode("pose_transform_t", data))),
-            ("DRIVER_HEALTH", report),
-            ("MODELSERVER_HEALTH", service),
-        ):
-            self.bus.subscribe(to_subscription_pattern(f"{prefix}{channel}"), handler).set_queue_capacity(0)
+    def _on_health(self, health: Health) -> None:
+        self.service = health
 
 
 def wait_for_answer(ask: Callable[[], list[str]], children: ChildProcesses) -> list[str]:
@@ -210,20 +203,22 @@ def wait_for_answer(ask: Callable[[], list[str]], children: ChildProcesses) -> l
 
 def wait_for_drivers(listener: PoseListener, lines: DemoConnections, children: ChildProcesses) -> None:
     """Wait for a health report of every driver. Raises DemoError if one fails or takes too long."""
-    deadline = time.monotonic() + START_TIMEOUT_S
-    while missing := [name for name in lines.devices if name not in listener.health]:
-        handle_message(listener.bus, 100)
+
+    def has_all() -> bool:
         children.check()
-        if time.monotonic() > deadline:
-            raise DemoError(f"no report within {START_TIMEOUT_S:g} s of driver {', '.join(missing)}; see --verbose")
+        return lines.devices.keys() <= listener.drivers.keys()
+
+    if not listener.listen(START_TIMEOUT_S, has_all):
+        missing = ", ".join(name for name in lines.devices if name not in listener.drivers)
+        raise DemoError(f"no report within {START_TIMEOUT_S:g} s of driver {missing}; see --verbose")
 
 
-def list_missing_devices(health: dict[str, DriverHealth], lines: DemoConnections) -> list[str]:
+def list_missing_devices(drivers: dict[str, DriverHealth], lines: DemoConnections) -> list[str]:
     """List the devices that do not stream, with their status."""
     return [
-        f"{name} is {health[name].phase.name.lower()} ({health[name].text})"
+        f"{name} is {drivers[name].phase.name.lower()} ({drivers[name].text})"
         for name in lines.devices
-        if health[name].phase is not DriverPhase.STREAMING or not health[name].rate_hz
+        if drivers[name].phase is not DriverPhase.STREAMING or not drivers[name].rate_hz
     ]
 
 
@@ -232,8 +227,8 @@ def iter_poses(
 ) -> Iterator[PoseAnswer]:
     """Yield the published poses of the drive."""
     end = time.monotonic() + start_utime * 1e-6 - time.time() + seconds
-    while time.monotonic() < end:
-        handle_message(listener.bus, 100)
+    while (left := end - time.monotonic()) > 0.0:
+        listener.listen(left, lambda: bool(listener.poses))
         yield from (pose for pose in listener.poses if pose.transformation.utime >= start_utime)
         listener.poses.clear()
         children.check()
@@ -242,19 +237,19 @@ def iter_poses(
 def format_row(pose: PoseAnswer, since: float, truth: Pose, truth_origin: tuple[float, float, float]) -> str:
     """Format a row of the table: a pose, its error, and its protection levels."""
     found = pose.transformation
-    if pose.origin is None or not math.isfinite(pose.horizontal_protection_level):
-        return f"{since:7.2f} s  {'-':>11} {'-':>12} {'-':>8} {'-':>7}   {'':16} {'':16} {format_validity(pose)}"
+    state = format_validity(pose)
+    position, heading = pose.horizontal_protection_level, pose.heading_protection_level
+    if pose.origin is None or not math.isfinite(position):
+        return f"{since:7.2f} s  {'-':>11} {'-':>12} {'-':>8} {'-':>7}   {'':16} {'':16} {state}"
     place = [a + b for a, b in zip(found.pose.xyz, pose.origin.initial_utm, strict=True)]
     real = [a + b for a, b in zip(truth.xyz, truth_origin, strict=True)]
     yaw = float(found.rpy[2])
     turned = math.degrees(math.remainder(yaw - float(truth.rpy[2]), math.tau))
     off = f"{math.hypot(place[0] - real[0], place[1] - real[1]):.2f} m {turned:+6.1f} deg"
-    bound = "-"
-    if math.isfinite(pose.horizontal_protection_level) and math.isfinite(pose.heading_protection_level):
-        bound = f"{pose.horizontal_protection_level:.2f} m {math.degrees(pose.heading_protection_level):6.1f} deg"
+    bound = f"{position:.2f} m {math.degrees(heading):6.1f} deg" if math.isfinite(heading) else "-"
     return (
         f"{since:7.2f} s {place[0]:12.2f} {place[1]:12.2f} {place[2]:8.2f} {round(math.degrees(yaw), 1) + 0.0:7.1f}   "
-        f"{off:16} {bound:16} {format_validity(pose)}"
+        f"{off:16} {bound:16} {state}"
     )
 
 

@@ -6,26 +6,17 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from modelserver.errors import (
-    ConfigError,
-    Location,
-    ModelServerError,
-    NoServerError,
-    Problem,
-    Severity,
-    find_nearest_names,
-    quote,
-)
+from modelserver.errors import ConfigError, Location, ModelServerError, NoServerError, Problem, Severity
 from modelserver.messages import Health, Mode, NavigationState, PublishDecisions, SensorHeader, SwitchMode
 from modelserver.signing.key_files import KEY_FILE_VARIABLE
 from modelserver.wire.channels import SIGNED
 from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.commands.pose_source import handle_until
-from mstools.terminal.options import KeyOption, UrlOption
+from mstools.commands.listener import DaemonListener
+from mstools.terminal.options import KeyOption, UrlOption, choose_name
 
 if TYPE_CHECKING:
     import lcm
@@ -101,16 +92,13 @@ def command(
         typer.echo(f"{sent}; not confirmed: LOCALIZATION_STATE is silent, as in raw mode and before the first samples")
 
 
-class ModeListener:
+class ModeListener(DaemonListener):
     """Receive the mode of a daemon: `mode` from its state, `decided_mode` from its decisions since `since`.
 
-    `has_received`: any message. `rejection`: why a command was rejected, from the health report.
+    `rejection`: why a command was rejected, from the health report.
     """
 
     def __init__(self, bus: lcm.LCM, prefix: str, mode_channel: str):
-        from modelserver.wire.channels import to_subscription_pattern
-
-        self.has_received = False
         self.mode: Mode | None = None
         self.decided_mode: Mode | None = None
         self.rejection = ""
@@ -118,68 +106,49 @@ class ModeListener:
         # rejected commands that the daemon had counted before
         self._sources = (f"{prefix}{mode_channel}", f"{prefix}{SIGNED}")
         self._counts: dict[tuple[str, str], int] = {}
-        self._bus = bus
         self._state_time = 0.0
-        handlers = {
+        handlers: dict[str, Callable[[Any], object]] = {
             "LOCALIZATION_STATE": self._on_state,
             "LOCALIZATION_DECISIONS": self._on_decisions,
             "MODELSERVER_HEALTH": self._on_health,
-            "POSE": self._on_pose,
+            "POSE": lambda _: None,
         }
-        for name, handler in handlers.items():
-            bus.subscribe(to_subscription_pattern(f"{prefix}{name}"), handler)
+        super().__init__(bus, prefix, handlers)
 
     def reset(self, since: int) -> None:
         """Drop what was received; decisions count from `since` on."""
         self.mode = self.decided_mode = None
         self.has_received, self.since = False, since
 
-    def listen(self, seconds: float, until: Callable[[], bool]) -> bool:
-        """Listen for up to `seconds` until a condition holds; return whether it does."""
-        return handle_until(self._bus, seconds, until)
-
     def is_silent(self, state_hz: float) -> bool:
         """Return whether the last three states are missing: raw mode publishes none."""
         return time.monotonic() - self._state_time > min(3.0 / state_hz, 0.5 * TIMEOUT_S)
 
-    def _on_state(self, _: str, data: bytes) -> None:
-        from modelserver.wire.codec import decode
+    def _on_state(self, state: NavigationState) -> None:
+        self.mode, self._state_time = state.mode, time.monotonic()
 
-        state: NavigationState = decode("navigation_state_t", data)
-        self.has_received, self.mode, self._state_time = True, state.mode, time.monotonic()
-
-    def _on_decisions(self, _: str, data: bytes) -> None:
-        from modelserver.wire.codec import decode
-
-        published: PublishDecisions = decode("decisions_t", data)
-        self.has_received = True
+    def _on_decisions(self, published: PublishDecisions) -> None:
         for each in published.decisions:
             name = each.reason.removeprefix("mode ").upper()
             if each.kind == "mode" and published.utime >= self.since > 0 and name in Mode.__members__:
                 self.decided_mode = Mode[name]
 
-    def _on_health(self, _: str, data: bytes) -> None:
-        from modelserver.wire.codec import decode
-
-        health: Health = decode("health_t", data)
-        self.has_received = True
-        self.rejection = next(
-            (why for source, why, _ in health.rejected if source == f"command:{OPERATOR}"), self.rejection
-        )
-        counts = {(name, why): count for name, why, count in health.rejected if name in self._sources}
-        # without an earlier report, earlier rejections count too: they are the likeliest cause
-        before, self._counts = self._counts, counts
+    def _on_health(self, health: Health) -> None:
+        before = self._counts
+        self._counts = {(name, why): count for name, why, count in health.rejected if name in self._sources}
+        for source, why, _ in health.rejected:
+            if source == f"command:{OPERATOR}":
+                self.rejection = why
+                break
         if self.since:
-            for (name, why), count in counts.items():
+            # without an earlier report, earlier rejections count too: they are the likeliest cause
+            for (name, why), count in self._counts.items():
                 if count > before.get((name, why), 0):
                     self.rejection = f"{why}: {_REASONS.get(why, 'see its log')}"
             ahead = (health.utime - time.time_ns() // 1000) * 1e-6
             if self.rejection.startswith("stale") and abs(ahead) > 1.0:
                 side = "ahead of" if ahead > 0 else "behind"
                 self.rejection += f"; the daemon's clock is {abs(ahead):.1f} s {side} this one"
-
-    def _on_pose(self, _: str, data: bytes) -> None:
-        self.has_received = True
 
 
 _REASONS = {
@@ -193,9 +162,5 @@ _REASONS = {
 
 def parse_mode(text: str) -> Mode:
     """Return the mode of that name. Raises typer.BadParameter, a usage error, with the nearest name."""
-    name = text.strip().replace("-", "_").upper()
-    if name in Mode.__members__:
-        return Mode[name]
-    near = find_nearest_names(name, MODES)
-    hint = f"did you mean {near[0]}?" if near else f"modes: {', '.join(MODES)}"
-    raise typer.BadParameter(f"{quote(text, 40)} is an unknown mode; {hint}", param_hint="MODE")
+    name = text.strip().replace("-", "_").lower()
+    return Mode[(name if name in MODES else choose_name(text, MODES, "mode", "MODE")).upper()]

@@ -17,8 +17,16 @@ from modelserver.messages import EdgeReport, Explanation, Invalid, MotionAnswer,
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from mstools.commands.pose_source import open_answer_source, open_log_answers
-from mstools.terminal.options import JsonOption, ModelOption, PrefixOption, TimeoutOption, UrlOption, Variables
-from mstools.terminal.output import escape, format_table, replace_unencodable
+from mstools.terminal.options import (
+    JsonOption,
+    ModelOption,
+    PrefixOption,
+    TimeoutOption,
+    UrlOption,
+    Variables,
+    choose_name,
+)
+from mstools.terminal.output import escape, format_table, replace_unencodable, to_json
 
 _EDGE_HEADER = ("kind", "name", "passed", "provenance", "age", "source", "coordinates", "position", "rotation")
 
@@ -97,23 +105,25 @@ def format_coordinates(edge: EdgeReport) -> list[str]:
 def edges_as_data(explanation: Explanation) -> list[dict[str, Any]]:
     """Return the edges as JSON data, in radians; unknown values are null."""
     return [
-        {
-            "kind": edge.kind,
-            "name": edge.name,
-            "from": edge.ends[0],
-            "to": edge.ends[1],
-            "forward": edge.forward,
-            "position": list(edge.pose.xyz),
-            "quaternion": list(edge.pose.wxyz),
-            "provenance": edge.provenance,
-            "stamp": edge.stamp or None,
-            "age": _finite_or_none(edge.age),
-            "source": edge.source or None,
-            "coordinates": list(edge.coordinates),
-            "position_share": _finite_or_none(edge.position_share),
-            "rotation_share": _finite_or_none(edge.rotation_share),
-            "warning": edge.warning or None,
-        }
+        to_json(
+            {
+                "kind": edge.kind,
+                "name": edge.name,
+                "from": edge.ends[0],
+                "to": edge.ends[1],
+                "forward": edge.forward,
+                "position": edge.pose.xyz,
+                "quaternion": edge.pose.wxyz,
+                "provenance": edge.provenance,
+                "stamp": edge.stamp or None,
+                "age": edge.age,
+                "source": edge.source or None,
+                "coordinates": edge.coordinates,
+                "position_share": edge.position_share,
+                "rotation_share": edge.rotation_share,
+                "warning": edge.warning or None,
+            }
+        )
         for edge in explanation.edges
     ]
 
@@ -124,7 +134,7 @@ def edges_as_data(explanation: Explanation) -> list[dict[str, Any]]:
 def describe_motion(motion: MotionAnswer) -> str:
     """Format a motion in meters, degrees and seconds, along the axes of `expressed_in`."""
     transformation = motion.pose.transformation
-    sigmas = _get_sigmas(motion)
+    sigmas = () if motion.covariance is None else tuple(math.sqrt(max(motion.covariance[7 * n], 0.0)) for n in range(6))
     rows = [
         ("velocity", motion.velocity, 1.0, "m/s", sigmas[:3]),
         ("turn rate", motion.angular_velocity, math.degrees(1.0), "deg/s", sigmas[3:]),
@@ -145,20 +155,10 @@ def describe_motion(motion: MotionAnswer) -> str:
 
 def motion_as_data(motion: MotionAnswer) -> dict[str, Any]:
     """Return a motion as JSON data in SI units; unknown values are null."""
-    return {
-        "expressed_in": motion.expressed_in,
-        "velocity": [_finite_or_none(value) for value in motion.velocity],
-        "angular_velocity": [_finite_or_none(value) for value in motion.angular_velocity],
-        "acceleration": [_finite_or_none(value) for value in motion.acceleration],
-        "angular_acceleration": [_finite_or_none(value) for value in motion.angular_acceleration],
-        "motion_covariance": None if motion.covariance is None else np.array(motion.covariance).reshape(6, 6).tolist(),
-    }
-
-
-def _get_sigmas(motion: MotionAnswer) -> tuple[float, ...]:
-    if motion.covariance is None:
-        return ()
-    return tuple(math.sqrt(max(motion.covariance[7 * n], 0.0)) for n in range(6))
+    names = ("expressed_in", "velocity", "angular_velocity", "acceleration", "angular_acceleration")
+    data = {name: to_json(getattr(motion, name)) for name in names}
+    covariance = None if motion.covariance is None else np.array(motion.covariance).reshape(6, 6).tolist()
+    return data | {"motion_covariance": covariance}
 
 
 def _format_vector(values: Iterable[float], scale: float, unit: str) -> str:
@@ -220,25 +220,27 @@ def command(
     Example:
       modelserver query Digiclops:ImagePlane FrontNoddingSICK:Origin --model config/raptor/geometry.xml
     """
+    when = POLICIES[choose_name(policy, POLICIES, "policy", "--policy")]
     if expressed_in and not motion:
         raise typer.BadParameter("needs --motion, whose axes it sets", param_hint="--expressed-in")
     if explain and motion:
         raise typer.BadParameter("--explain and --motion exclude each other; run one after the other")
-    if policy not in POLICIES:
-        raise typer.BadParameter(f"{policy!r} is not one of {', '.join(POLICIES)}", param_hint="--policy")
     if inverse:
         frame_of_interest, frame_of_reference = frame_of_reference, frame_of_interest
     source: FrameClient
-    utime = None
     if log is not None:
         recorded = source = open_log_answers(log, model, settings, prefix)
         utime = recorded.parse_time(at)
+        utime = _parse_time(at) if utime is None else utime
     else:
         source = open_answer_source(model, settings, url, prefix, timeout)
-    utime = _parse_time(at) if utime is None else utime
-    if log is None:
-        _check_unit(utime)
-    ends, when = (frame_of_interest, frame_of_reference), POLICIES[policy]
+        utime = _parse_time(at)
+        # our time in seconds; as microseconds it would be the first three hours of 1970
+        if 1_000_000_000 < utime < 10_000_000_000:
+            raise typer.BadParameter(
+                f"{utime} looks like seconds since 1970; times are microseconds: {utime}000000", param_hint="--at"
+            )
+    ends = (frame_of_interest, frame_of_reference)
     text, data = "", dict[str, Any]()
     if explain:
         found = source.explain(*ends, at=utime, policy=when, wait_ms=wait_ms)
@@ -249,17 +251,6 @@ def command(
     else:
         answer = source.get_pose(*ends, at=utime, policy=when, wait_ms=wait_ms)
     typer.echo(json.dumps(as_dict(answer) | data, indent=2) if as_json else text + describe(answer, matrix))
-
-
-_SECONDS_RANGE = (1_000_000_000, 10_000_000_000)
-"""Seconds since 1970 of our time; as microseconds they are the first three hours of 1970."""
-
-
-def _check_unit(utime: int) -> None:
-    if _SECONDS_RANGE[0] < utime < _SECONDS_RANGE[1]:
-        raise typer.BadParameter(
-            f"{utime} looks like seconds since 1970; times are microseconds: {utime}000000", param_hint="--at"
-        )
 
 
 def _parse_time(text: str) -> int:
@@ -341,11 +332,7 @@ def as_dict(answer: PoseAnswer) -> dict[str, Any]:
         "utm_zone": None if origin is None else f"{origin.zone}{'N' if origin.north else 'S'}",
         "origin_id": f"{transformation.origin_id:016x}" if transformation.origin_id else None,
         "pose_epoch": transformation.pose_epoch,
-        "horizontal_protection_level": _finite_or_none(answer.horizontal_protection_level),
-        "heading_protection_level": _finite_or_none(answer.heading_protection_level),
+        "horizontal_protection_level": to_json(answer.horizontal_protection_level),
+        "heading_protection_level": to_json(answer.heading_protection_level),
         "model_revision": transformation.model_revision,
     }
-
-
-def _finite_or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None

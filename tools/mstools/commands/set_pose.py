@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
-from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
 
-from modelserver.errors import ForbiddenError, ModelServerError, NoServerError, RejectedError, WireError
+from modelserver.errors import ForbiddenError, ModelServerError, NoServerError, RejectedError
 from modelserver.geometry import names
 from modelserver.messages import Decision, Invalid, PoseAnswer, PublishDecisions, Verdict
 from modelserver.transforms import so3
@@ -19,9 +17,9 @@ from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Quaternion, Vector3
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire.provider import open_lcm, resolve_url
-from mstools.commands.pose_source import handle_until
+from mstools.commands.listener import DaemonListener
 from mstools.terminal.options import JsonOption, KeyOption, PrefixOption, TimeoutOption, UrlOption
-from mstools.terminal.output import escape
+from mstools.terminal.output import escape, to_json
 
 if TYPE_CHECKING:
     import lcm
@@ -61,11 +59,11 @@ class PoseTarget(NamedTuple):
 
 def command(
     utm: Annotated[
-        tuple[float, float, float] | None,
+        Triple | None,
         typer.Option("--utm", metavar="E N H", help="Position: grid easting, northing, ellipsoidal height, meters."),
     ] = None,
     xyz: Annotated[
-        tuple[float, float, float] | None,
+        Triple | None,
         typer.Option("--xyz", metavar="X Y Z", help="Position: meters from the origin of World:UTM (initial_utm)."),
     ] = None,
     latlon: Annotated[
@@ -85,11 +83,11 @@ def command(
         typer.Option("--heading", metavar="DEG", help="Degrees clockwise from true north; roll and pitch stay."),
     ] = None,
     rpy: Annotated[
-        tuple[float, float, float] | None,
+        Triple | None,
         typer.Option("--rpy", metavar="R P Y", help="Roll, pitch and yaw, degrees, yaw from grid east."),
     ] = None,
     quaternion: Annotated[
-        tuple[float, float, float, float] | None,
+        Quaternion | None,
         typer.Option("--quaternion", metavar="S X Y Z", help="Orientation in World:UTM, scalar first."),
     ] = None,
     sigma: Annotated[
@@ -117,14 +115,18 @@ def command(
       modelserver set-pose --latlon 50.27 -111.1 --heading 90 --sigma 0.05 --sigma-deg 1
       modelserver set-pose --utm 350283.1 5570712.6 700 --yaw 12.5 --key /etc/modelserver/commands.key
     """
-    target = parse_target(utm, xyz, latlon, height, yaw, heading, rpy, quaternion)
+    target = parse_target(
+        {"--utm": utm, "--xyz": xyz, "--latlon": latlon},
+        {"--yaw": yaw, "--heading": heading, "--rpy": rpy, "--quaternion": quaternion},
+        height,
+    )
     covariance = to_covariance(sigma, sigma_deg)
     from modelserver.client.remote import Platform
     from modelserver.earth.geodesy import Geodesy
 
     bus = open_lcm(resolve_url(url))
     listener = SetPoseListener(bus, prefix)
-    if not listener.wait(timeout, lambda: listener.pose is not None):
+    if not listener.listen(timeout, lambda: listener.pose is not None):
         raise NoServerError(
             f"no {prefix}POSE within {timeout:g} s on {resolve_url(url)}, so the base frame and the origin are not "
             "known: is the daemon running, on this bus (--url) and with this prefix (--prefix)?"
@@ -145,10 +147,10 @@ def command(
             accepted = platform.set_state_vector(request)
         except (ForbiddenError, RejectedError) as error:
             raise ModelServerError(f"the pose was not set: {error}") from None
-    listener.wait(CONFIRM_S, lambda: listener.get_decision(accepted.header.utime) is not None)
-    decision = listener.get_decision(accepted.header.utime)
+    listener.listen(CONFIRM_S, lambda: accepted.header.utime in listener.decisions)
+    decision = listener.decisions.get(accepted.header.utime)
     listener.pose = None
-    listener.wait(timeout, lambda: listener.pose is not None)
+    listener.listen(timeout, lambda: listener.pose is not None)
     result = SetPoseResult(request, geodesy, (sigma, sigma_deg), decision, listener.has_decisions, listener.pose)
     typer.echo(json.dumps(as_data(result), indent=2) if as_json else describe(result))
     if decision is not None and decision.verdict is Verdict.REJECTED:
@@ -169,41 +171,27 @@ class SetPoseResult(NamedTuple):
     after: PoseAnswer | None
 
 
-def parse_target(
-    utm: Triple | None,
-    xyz: Triple | None,
-    latlon: tuple[float, float] | None,
-    height: float | None,
-    yaw: float | None,
-    heading: float | None,
-    rpy: Triple | None,
-    quaternion: Quaternion | None,
-) -> PoseTarget:
+def parse_target(positions: dict[str, Any], orientations: dict[str, Any], height: float | None) -> PoseTarget:
     """Return the pose that the options state. Raises typer.BadParameter where they state none, two or no numbers."""
-    positions = {"--utm": utm, "--xyz": xyz, "--latlon": latlon}
-    orientations = {"--yaw": yaw, "--heading": heading, "--rpy": rpy, "--quaternion": quaternion}
     for what, options in (("position", positions), ("orientation", orientations)):
         given = [name for name, value in options.items() if value is not None]
         if len(given) != 1:
             got = f"got {' and '.join(given)}" if given else "got none"
             raise typer.BadParameter(f"give one {what}, {', '.join(options)}; {got}")
+    latlon, quaternion = positions["--latlon"], orientations["--quaternion"]
     if height is not None and latlon is None:
         raise typer.BadParameter("it goes with --latlon; --utm and --xyz have a height", param_hint="--height")
-    numbers = {"--height": height, **positions, **orientations}
-    for name, value in numbers.items():
+    for name, value in {"--height": height, **positions, **orientations}.items():
         if value is not None and not np.isfinite(value).all():
             raise typer.BadParameter("expected finite numbers", param_hint=name)
     if quaternion is not None and not any(quaternion):
         raise typer.BadParameter("a quaternion of zeros has no direction", param_hint="--quaternion")
-    return PoseTarget(
-        utm,
-        xyz,
-        None if latlon is None else (*latlon, height),
-        None if yaw is None else math.radians(yaw),
-        None if heading is None else math.radians(heading),
-        None if rpy is None else (math.radians(rpy[0]), math.radians(rpy[1]), math.radians(rpy[2])),
-        quaternion,
+    yaw, heading, rpy = (
+        None if value is None else np.radians(value).tolist()
+        for value in (orientations[name] for name in ("--yaw", "--heading", "--rpy"))
     )
+    geodetic = None if latlon is None else (*latlon, height)
+    return PoseTarget(positions["--utm"], positions["--xyz"], geodetic, yaw, heading, rpy, quaternion)
 
 
 def to_covariance(sigma: float, sigma_deg: float) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -256,53 +244,26 @@ def _resolve_orientation(target: PoseTarget, geodesy: Geodesy, position: Vector3
     return so3.from_rpy(roll, pitch, yaw)
 
 
-class SetPoseListener:
-    """Receive the daemon's latest `pose`, and its decisions on poses that were set."""
+class SetPoseListener(DaemonListener):
+    """Receive the daemon's latest `pose`, and its decisions on poses that were set, by the time of these."""
 
     def __init__(self, bus: lcm.LCM, prefix: str):
-        from modelserver.wire.channels import to_subscription_pattern
-
         self.pose: PoseAnswer | None = None
         self.has_decisions = False
-        self._decisions: dict[int, Decision] = {}
-        self._bus = bus
-        bus.subscribe(to_subscription_pattern(f"{prefix}POSE"), self._on_pose)
-        bus.subscribe(to_subscription_pattern(f"{prefix}LOCALIZATION_DECISIONS"), self._on_decisions)
+        self.decisions: dict[int, Decision] = {}
+        super().__init__(bus, prefix, {"POSE": self._on_pose, "LOCALIZATION_DECISIONS": self._on_decisions})
 
-    def get_decision(self, utime: int) -> Decision | None:
-        """Return the decision on the pose that was set at a time, None if there is none yet."""
-        return self._decisions.get(utime)
+    def _on_pose(self, pose: PoseAnswer) -> None:
+        self.pose = pose
 
-    def wait(self, seconds: float, until: Callable[[], bool]) -> bool:
-        """Handle messages for up to `seconds` until a condition holds; return whether it does."""
-        return handle_until(self._bus, seconds, until)
-
-    def _on_pose(self, _: str, data: bytes) -> None:
-        from modelserver.wire.codec import decode
-
-        # a message of another type is from another program or version: the next one may be valid
-        with suppress(WireError):
-            self.pose = decode("pose_transform_t", data)
-
-    def _on_decisions(self, _: str, data: bytes) -> None:
-        from modelserver.wire.codec import decode
-
-        try:
-            published: PublishDecisions = decode("decisions_t", data)
-        except WireError:
-            return
+    def _on_decisions(self, published: PublishDecisions) -> None:
         self.has_decisions = True
         for each in published.decisions:
             if each.source == OPERATOR and each.kind == "absolute_pose":
-                self._decisions[each.utime] = each
+                self.decisions[each.utime] = each
 
 
-_VERDICTS = {
-    Verdict.USED: "used",
-    Verdict.REJECTED: "rejected",
-    Verdict.MONITORED: "monitored",
-    Verdict.RESET: "set",
-}
+_VERDICTS = {verdict: verdict.name.lower() for verdict in Verdict} | {Verdict.RESET: "set"}
 
 
 def describe(result: SetPoseResult) -> str:
@@ -350,18 +311,16 @@ def as_data(result: SetPoseResult) -> dict[str, Any]:
         "initial_utm": list(origin.initial_utm),
         "utm_zone": origin.zone,
         "utm_north": origin.north,
-        "decision": None
-        if decision is None
-        else {
+        "decision": decision
+        and {
             "utime": decision.utime,
             "verdict": _VERDICTS[decision.verdict],
             "reason": decision.reason,
-            "statistic": decision.statistic if math.isfinite(decision.statistic) else None,
-            "limit": decision.limit if math.isfinite(decision.limit) else None,
+            "statistic": to_json(decision.statistic),
+            "limit": to_json(decision.limit),
         },
-        "pose_after": None
-        if after is None
-        else {
+        "pose_after": after
+        and {
             "utime": after.transformation.utime,
             "state_vector": after.transformation.state_vector.tolist(),
             "valid": after.transformation.is_valid,

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import json
-import select
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from modelserver.errors import NoServerError, WireError, find_nearest_names, quote
+from modelserver.errors import NoServerError, find_nearest_names, quote
 from modelserver.messages import DriverHealth, Health
-from modelserver.wire.provider import handle_message, open_lcm, resolve_url
+from modelserver.wire.provider import open_lcm, resolve_url
+from mstools.commands.listener import DaemonListener, handle_until
 from mstools.terminal.health_text import as_data, format_line, format_report, is_healthy
 from mstools.terminal.interrupts import Interrupts
 from mstools.terminal.options import JsonOption, PrefixOption, UrlOption
@@ -40,9 +39,6 @@ MAX_SHOWN_NAMES = 6
 
 SILENT_S = 5.0
 """Time without a report until a warning, seconds."""
-
-POLL_S = 0.2
-"""Period of checks for a signal, seconds."""
 
 HEALTH = "MODELSERVER_HEALTH"
 
@@ -98,50 +94,26 @@ def command(
         raise typer.Exit(EXIT_UNHEALTHY)
 
 
-class HealthListener:
+class HealthListener(DaemonListener):
     """Receive the health reports of one daemon and its drivers; `reports` counts the daemon's."""
 
     def __init__(self, bus: lcm.LCM, prefix: str):
-        from modelserver.wire.channels import to_subscription_pattern
-        from modelserver.wire.codec import decode
-
         self.health: Health | None = None
         self.reports = 0
         self.drivers: dict[str, DriverHealth] = {}
-        self._bus = bus
+        super().__init__(bus, prefix, {HEALTH: self._on_health, "DRIVER_HEALTH": self._on_driver})
 
-        def health(_: str, data: bytes) -> None:
-            try:
-                self.health = decode("health_t", data)
-            except WireError:
-                return  # unknown, or of another version: see `format_no_report`
-            self.reports += 1
+    def _on_health(self, health: Health) -> None:
+        self.health = health
+        self.reports += 1
 
-        def driver(_: str, data: bytes) -> None:
-            try:
-                found: DriverHealth = decode("driver_health_t", data)
-            except WireError:
-                return
-            if found.source in self.drivers or len(self.drivers) < MAX_NAMES:
-                self.drivers[found.source] = found
-
-        bus.subscribe(to_subscription_pattern(f"{prefix}{HEALTH}"), health)
-        bus.subscribe(to_subscription_pattern(f"{prefix}DRIVER_HEALTH"), driver)
+    def _on_driver(self, health: DriverHealth) -> None:
+        if health.source in self.drivers or len(self.drivers) < MAX_NAMES:
+            self.drivers[health.source] = health
 
     def has_drivers(self, drivers: tuple[str, ...]) -> bool:
         """Return whether all these drivers have reported; False for none, as others may exist."""
         return bool(drivers) and all(name in self.drivers for name in drivers)
-
-    def listen(self, seconds: float, until: Callable[[], bool]) -> bool:
-        """Listen for up to `seconds` until a condition holds; return whether it does."""
-        deadline = time.monotonic() + seconds
-        while not until():
-            left = deadline - time.monotonic()
-            if left <= 0.0:
-                return False
-            if select.select((self._bus.fileno(),), (), (), min(left, POLL_S))[0]:
-                handle_message(self._bus)
-        return True
 
 
 def probe_channels(bus: lcm.LCM, seconds: float = PROBE_S) -> dict[str, bool]:
@@ -155,9 +127,7 @@ def probe_channels(bus: lcm.LCM, seconds: float = PROBE_S) -> dict[str, bool]:
             found[channel] = type_name_of(data) == "health_t"
 
     bus.subscribe(".*", handle)
-    deadline = time.monotonic() + seconds
-    while (left := deadline - time.monotonic()) > 0.0:
-        handle_message(bus, int(left * 1e3) + 1)
+    handle_until(bus, seconds, lambda: False)
     return found
 
 

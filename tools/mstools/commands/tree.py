@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from modelserver.errors import NoServerError
 from modelserver.geometry.model import Model
-from modelserver.wire.provider import handle_message, open_lcm, resolve_url
 from mstools.terminal.model_tree import BodyNode, build_nodes, describe_crossing
 from mstools.terminal.options import PrefixOption, UrlOption, Variables, parse_variables
 from mstools.terminal.output import (
@@ -93,36 +91,26 @@ def load_geometry(file: str, variables: dict[str, str]) -> Model:
 
 def receive_geometry(url: str, prefix: str, seconds: float) -> ModelSnapshot:
     """Return the geometry that a daemon publishes. Raises NoServerError after a timeout."""
-    from modelserver.errors import WireError
     from modelserver.formats.snapshot import decode_snapshot
-    from modelserver.wire.channels import to_subscription_pattern
-    from modelserver.wire.codec import decode
+    from modelserver.wire.provider import open_lcm, resolve_url
     from modelserver.wire.snapshot import SnapshotAssembler
+    from mstools.commands.listener import DaemonListener
 
     provider = resolve_url(url)
-    bus, assembler, whole = open_lcm(provider), SnapshotAssembler(), []
+    assembler, whole = SnapshotAssembler(), []
 
-    def take(_: str, data: bytes) -> None:
-        try:
-            content = assembler.add(decode("model_snapshot_t", data))
-            if content is not None:
-                whole.append(decode_snapshot(content))
-        except WireError:
-            # unknown, or of another version: the next may be valid
-            pass
+    def add(chunk: Any) -> None:
+        if (content := assembler.add(chunk)) is not None:
+            whole.append(decode_snapshot(content))
 
-    channel = f"{prefix}MODEL_SNAPSHOT"
-    bus.subscribe(to_subscription_pattern(channel), take).set_queue_capacity(0)
-    deadline = time.monotonic() + seconds
-    while not whole:
-        left = deadline - time.monotonic()
-        if left <= 0.0:
-            raise NoServerError(
-                f"no geometry received on {channel} at {provider} within {seconds:g} s. Is the daemon running "
-                "(modelserver run -c vehicle.yaml), on this bus ($LCM_DEFAULT_URL) and with this --prefix? Its period "
-                "is publish.snapshot_s in the vehicle file: use a longer --wait"
-            )
-        handle_message(bus, int(left * 1e3) + 1)
+    listener = DaemonListener(open_lcm(provider), prefix, {"MODEL_SNAPSHOT": add})
+    listener.subscriptions[0].set_queue_capacity(0)
+    if not listener.listen(seconds, lambda: bool(whole)):
+        raise NoServerError(
+            f"no geometry received on {prefix}MODEL_SNAPSHOT at {provider} within {seconds:g} s. Is the daemon running "
+            "(modelserver run -c vehicle.yaml), on this bus ($LCM_DEFAULT_URL) and with this --prefix? Its period is "
+            "publish.snapshot_s in the vehicle file: use a longer --wait"
+        )
     return whole[0]
 
 

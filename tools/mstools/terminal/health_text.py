@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
-from enum import IntEnum, IntFlag
 from typing import Any, Final
 
 from modelserver.core import DEGRADED, RUNNING, STARTING
@@ -19,7 +17,7 @@ from modelserver.messages import (
     LocalizationHealth,
     Phase,
 )
-from mstools.terminal.output import escape, format_count, format_table
+from mstools.terminal.output import escape, format_count, format_table, to_json
 
 STATE_NAMES: Final = {STARTING: "STARTING", RUNNING: "RUNNING", DEGRADED: "DEGRADED"}
 
@@ -226,36 +224,16 @@ def _format_source(each: ChannelHealth) -> str:
 
 def as_data(health: Health, drivers: Iterable[DriverHealth] = ()) -> dict[str, Any]:
     """Return a report as JSON data: enumerations by name, null for unknown values."""
-    data: dict[str, Any] = {
-        each.name: to_json_value(getattr(health, each.name))
-        for each in dataclasses.fields(health)
-        if each.name not in ("channels", "rejected", "warnings", "localization", "state")
-    }
+    data: dict[str, Any] = to_json(health)
     data["state"] = STATE_NAMES.get(health.state, health.state)
     data["healthy"] = is_healthy(health)
     data["invalid_text"] = health.invalid_reasons.explain()
-    data["localization"] = fields_of(health.localization) | {"current": is_current(health)}
-    data["channels"] = [fields_of(each) for each in health.channels]
+    data["localization"]["current"] = is_current(health)
     data["rejected"] = [{"channel": a, "reason": b, "count": c} for a, b, c in health.rejected]
     data["warnings"] = dict(health.warnings)
-    data["drivers"] = [
-        fields_of(each) | {"counters": dict(each.counters)} for each in sorted(drivers, key=lambda each: each.source)
-    ]
+    drivers = sorted(drivers, key=lambda each: each.source)
+    data["drivers"] = [to_json(each) | {"counters": dict(each.counters)} for each in drivers]
     return data
-
-
-def fields_of(value: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass as JSON values."""
-    return {each.name: to_json_value(getattr(value, each.name)) for each in dataclasses.fields(value)}
-
-
-def to_json_value(value: Any) -> Any:
-    """Return a value for JSON: null for nan, the name of an enumeration, the number of flags."""
-    if isinstance(value, IntFlag):
-        return int(value)
-    if isinstance(value, IntEnum):
-        return value.name
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def format_number(value: float, digits: int) -> str:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
 import typer
 
-from modelserver.errors import quote
+from modelserver.errors import find_nearest_names, quote
 
 Variables: TypeAlias = Annotated[
     list[str] | None,
@@ -39,6 +39,15 @@ TimeoutOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
 
 _ASSIGNMENT = re.compile(r"(\w+)=(.*)", re.ASCII | re.DOTALL)
+
+
+def choose_name(text: str, known: Collection[str], what: str, option: str) -> str:
+    """Return a known name. Raises typer.BadParameter, a usage error of `option`, with the nearest one for another."""
+    if text in known:
+        return text
+    near = find_nearest_names(text, known)
+    hint = f"did you mean {near[0]}?" if near else f"{what}s: {', '.join(known)}"
+    raise typer.BadParameter(f"{quote(text, 40)} is an unknown {what}; {hint}", param_hint=option)
 
 
 def parse_variables(given: Iterable[str] | None) -> dict[str, str]:

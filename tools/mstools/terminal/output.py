@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import math
 import os
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from typing import TextIO
+from enum import IntEnum
+from typing import Any, TextIO
 
 import typer
 
@@ -46,6 +49,24 @@ def describe_size(model: Model) -> str:
             format_count(len(model.constraints), "constraint"),
         )
     )
+
+
+def to_json(value: Any) -> Any:
+    """Return a value for JSON: an enumeration by name, flags as their number, null for a non-finite number.
+
+    Named tuples and dataclasses are objects.
+    """
+    if dataclasses.is_dataclass(value):
+        return {each.name: to_json(getattr(value, each.name)) for each in dataclasses.fields(value)}
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
+    if isinstance(value, dict):
+        return {key: to_json(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_json(each) for each in value]
+    if isinstance(value, IntEnum):
+        return value.name
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def check_writable(path: str) -> None:
