@@ -23,8 +23,7 @@ from modelserver.core import CoreSettings, CoreState, Instant
 from modelserver.formats import load_model
 from modelserver.messages import JointSample, JointsSample, SensorHeader
 from modelserver.wire import queries
-from modelserver.wire.codec import decode, encode
-from modelserver.wire.queries import pack_get_transformation
+from modelserver.wire.codec import decode, encode, pack_get_transformation
 
 START_UTIME: Final = 1_700_000_000_000_000
 STEP_US, SAMPLES = 20_000, 100

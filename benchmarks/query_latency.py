@@ -28,9 +28,8 @@ from modelserver import core
 from modelserver.client.remote import Platform
 from modelserver.messages import CHANNEL_OF, GetTransformation
 from modelserver.wire.channels import to_subscription_pattern
-from modelserver.wire.codec import decode, encode
+from modelserver.wire.codec import decode, encode, pack_get_transformation
 from modelserver.wire.provider import resolve_url
-from modelserver.wire.queries import pack_get_transformation
 
 INTEREST, REFERENCE = "Digiclops:ImagePlane", "Raptor:CG"
 ROUNDS, CALLS = 40, 100

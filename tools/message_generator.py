@@ -17,7 +17,7 @@ begin with `@`, what Python needs beyond that:
              @check NAME [ARGUMENTS]   `wire.fields.check_NAME(value, field, ...)` on reading
              @check_all NAME           the same for an array as a whole
              @max NUMBER               of a count: more entries are malformed, and cannot be sent
-             @limit NUMBER             of a count: more entries are malformed
+             @limit NUMBER             of a count: more entries are malformed; a number may be MAX_... of `wire.fields`
              @least NUMBER             of a count: fewer entries are malformed
              @property NAME            of a count: a property of the value has it
              @rows NAME [CLASS]        of a count: arrays of this length are columns; the value has a tuple of rows
@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, TypeVar
@@ -99,7 +99,6 @@ class Struct:
     comment: str
     options: Mapping[str, str]
     fields: tuple[Field, ...]
-    module: str = ""
 
     @property
     def base(self) -> str:
@@ -136,7 +135,6 @@ class Struct:
         return [each for each in self.fields if count.name in each.dimensions]
 
 
-_STRUCT = re.compile(r"struct\s+(\w+)\s*\{(.*)\}", re.DOTALL)
 _CONSTANT = re.compile(r"const\s+\w+\s+(\w+)\s*=\s*(-?\d+);")
 _FIELD = re.compile(r"(\w+)\s+(\w+)((?:\[\w+\])*);")
 _OPTION = re.compile(r"@(\w+)([^@]*)")
@@ -200,7 +198,6 @@ class _Values:
         self._structs = structs
         self._written: set[str] = set()
         self.names: list[str] = []
-        self.hand: set[str] = set()
 
     def write(self) -> str:
         """Return the body of the module."""
@@ -218,13 +215,13 @@ class _Values:
             if each.type in self._structs and self._structs[each.type].value:
                 parts += self._write_struct(self._structs[each.type])
             parts += self._write_enumeration(each)
-        if struct.value and not struct.options.get("codec", "").endswith(" value"):
+        if struct.value and not struct.codec.endswith(" value"):
             parts.append(self._write_class(struct))
         return parts
 
     def _write_enumeration(self, each: Field) -> list[str]:
         name, _, prefix = each.options.get("enum", "").partition(" ")
-        if not each.constants or not name or name in self.names or name in HAND_VALUES:
+        if not each.constants or not name or name in self.names or name == "Status":
             return []
         self.names.append(name)
         lines = [f"class {name}(IntEnum):", _docstring(_first_sentence(each.comment), "    "), ""]
@@ -325,19 +322,9 @@ class _Values:
 
     def _scalar(self, each: Field) -> str:
         if "enum" in each.options or "flags" in each.options:
-            name = (each.options.get("enum") or each.options["flags"]).partition(" ")[0]
-            if name in HAND_VALUES or not any(
-                other.constants and other.options.get("enum", "").partition(" ")[0] == name
-                for struct in self._structs.values()
-                for other in struct.fields
-            ):
-                self.hand.add(name)
-            return name
+            return (each.options.get("enum") or each.options["flags"]).partition(" ")[0]
         if each.type in self._structs:
-            nested = self._structs[each.type]
-            if nested.codec.endswith(" value") or not nested.value:
-                self.hand.add(nested.value)
-            return nested.value
+            return self._structs[each.type].value
         return {"boolean": "bool", "string": "str", "double": "float", "float": "float"}.get(each.type, "int")
 
 
@@ -366,12 +353,9 @@ class _Atoms:
 class _Codecs:
     """Writes the module of the codec."""
 
-    def __init__(self, structs: Mapping[str, Struct], values: _Values) -> None:
-        self._structs = structs
-        self._values = values
+    def __init__(self, structs: Mapping[str, Struct]) -> None:
+        self.structs = structs
         self._formats: dict[str, str] = {}
-        self.hand: dict[str, set[str]] = {}
-        self.value_names: set[str] = set()
 
     def struct_of(self, code: str) -> str:
         """Return the name of the struct.Struct of a format."""
@@ -381,11 +365,6 @@ class _Codecs:
         """Return the definitions of the formats that were used."""
         return "\n".join(f'{name} = struct.Struct(">{code}")' for code, name in self._formats.items())
 
-    def _hand(self, struct: Struct, function: str) -> str:
-        module = struct.codec.partition(" ")[0]
-        self.hand.setdefault(module, set()).add(function)
-        return function
-
     # writing
 
     def write_packer(self, struct: Struct) -> str:
@@ -393,7 +372,6 @@ class _Codecs:
         atoms = _Atoms()
         limits: list[str] = []
         self._collect(struct, "value", atoms, limits)
-        self.value_names.add(struct.value)
         lines = [
             f"def pack_{struct.base}(value: {struct.value}) -> bytes:",
             f'    """Return the bytes of a {struct.name} without the fingerprint."""',
@@ -434,7 +412,7 @@ class _Codecs:
             expression = (
                 f"[each.{each.value_name} for each in {table}]" if row else f"[each[{number}] for each in {table}]"
             )
-        if each.type in self._structs:
+        if each.type in self.structs:
             self._collect_nested(each, expression, atoms, limits)
         elif each.type == "string":
             atoms.bytes(f"*map(pack_text, {expression})" if each.dimensions else f"pack_text({expression})")
@@ -460,15 +438,12 @@ class _Codecs:
             atoms.numbers(CODES[each.type], expression)
 
     def _collect_nested(self, each: Field, expression: str, atoms: _Atoms, limits: list[str]) -> None:
-        nested = self._structs[each.type]
+        nested = self.structs[each.type]
         packer = f"pack_{nested.base}"
-        if nested.codec:
-            self._hand(nested, packer)
         if each.dimensions:
             atoms.bytes(f"*map({packer}, {expression})")
         elif "if_ok" in each.options:
-            absent = self._hand(nested, f"NO_{nested.base.upper()}")
-            atoms.bytes(f"{absent} if {expression} is None else {packer}({expression})")
+            atoms.bytes(f"NO_{nested.base.upper()} if {expression} is None else {packer}({expression})")
         elif nested.codec:
             atoms.bytes(f"{packer}({expression})")
         else:
@@ -481,7 +456,6 @@ class _Codecs:
         reader = _Reader(self)
         result = reader.read_struct(struct, "")
         reader.flush()
-        self.value_names.add(struct.value)
         if "verify" in struct.options:
             result = f"verify_{struct.base}({result})"
         lines = [
@@ -567,18 +541,14 @@ class _Reader:
                 assert count is not None
                 row = count.options["rows"].partition(" ")[2]
                 columns = ", ".join(tables[argument[1:]])
-                if row:
-                    self._codecs.value_names.add(row)
                 made.append(f"tuple(map({row}, {columns}))" if row else f"tuple(zip({columns}, strict=True))")
             else:
                 made.append(argument)
-        self._codecs.value_names.add(struct.value)
         return f"{struct.value}({', '.join(made)})"
 
     def _read_field(self, struct: Struct, each: Field, name: str, prefix: str, status: str) -> str:
-        structs = self._codecs._structs
-        if each.type in structs:
-            return self._read_nested(structs[each.type], each, name, prefix, status)
+        if each.type in self._codecs.structs:
+            return self._read_nested(self._codecs.structs[each.type], each, name, prefix, status)
         if each.type == "string":
             if each.dimensions:
                 position = self._settle()
@@ -597,7 +567,6 @@ class _Reader:
             self.lines.append(f'{name}, at = read_numbers("{CODES[each.type]}", data, {position}, {total})')
             if "enum" in each.options:
                 enumeration = each.options["enum"].partition(" ")[0]
-                self._codecs.value_names.add(enumeration)
                 return f'[read_enum({enumeration}, each, "{each.name}") for each in {name}]'
             if "empty_nan" in each.options:
                 return f"() if {name} and {name}[0] != {name}[0] else {name}"
@@ -629,10 +598,8 @@ class _Reader:
     def _scalar(self, each: Field, name: str) -> str:
         if "enum" in each.options:
             enumeration = each.options["enum"].partition(" ")[0]
-            self._codecs.value_names.add(enumeration)
             return f'read_enum({enumeration}, {name}, "{each.name}")'
         if "flags" in each.options:
-            self._codecs.value_names.add(each.options["flags"])
             return f"{each.options['flags']}({name})"
         if each.type == "boolean":
             return f"bool({name})"
@@ -652,20 +619,16 @@ class _Reader:
 
     def _read_nested(self, nested: Struct, each: Field, name: str, prefix: str, status: str) -> str:
         unpacker = f"unpack_{nested.base}"
-        if nested.codec:
-            self._codecs._hand(nested, unpacker)
         if each.dimensions:
             position = self._settle()
             self.lines.append(f"{name}, at = read_each({unpacker}, data, {position}, {prefix}{each.dimensions[0]})")
             return name
         if "if_ok" in each.options:
             position = self._settle()
-            check = self._codecs._hand(nested, f"skip_{nested.base}")
-            self._codecs.value_names.add("Status")
             self.lines.append(f"if {status} is Status.OK:")
             self.lines.append(f"    {name}, at = {unpacker}(data, {position})")
             self.lines.append("else:")
-            self.lines.append(f"    {name}, at = None, {check}(data, {position})")
+            self.lines.append(f"    {name}, at = None, skip_{nested.base}(data, {position})")
             return name
         if nested.codec:
             position = self._settle()
@@ -717,93 +680,71 @@ def generate(folder: Path, fingerprints: Mapping[str, str]) -> dict[str, str]:
     """
     structs = read_structs(folder)
     values = _Values(structs)
-    body = values.write()
-    codecs = _Codecs(structs, values)
-    functions: list[str] = []
-    table: list[str] = []
-    for struct in structs.values():
-        if not struct.value:
-            continue
-        module = struct.codec.partition(" ")[0]
-        if module:
-            codecs.hand.setdefault(module, set()).update((f"pack_{struct.base}", f"unpack_{struct.base}"))
-            codecs.value_names.add(struct.value)
-        else:
-            functions += [codecs.write_packer(struct), codecs.write_unpacker(struct)]
-        if "part" in struct.options:
-            continue
-        table.append(
-            f'    Codec("{struct.name}", FINGERPRINTS["{struct.name}"], {struct.value}, '
-            f"pack_{struct.base}, unpack_{struct.base}),"
-        )
     return {
-        "modelserver/messages/generated.py": _values_module(values, body),
-        "modelserver/wire/fingerprints.py": _fingerprint_module(fingerprints),
-        "modelserver/wire/generated.py": _codec_module(codecs, functions, table, structs),
+        "modelserver/messages/generated.py": _values_module(values.write()),
+        "modelserver/wire/generated.py": _codec_module(structs, {*values.names, *HAND_VALUES}, fingerprints),
     }
 
 
-def _values_module(values: _Values, body: str) -> str:
-    hand = _hand_imports(values.hand)
+def _values_module(body: str) -> str:
+    # the formatter removes the imports that are not used
     return (
         '"""Values of the messages. Generated from lcmtypes/*.lcm by `make types`; do not edit."""\n\n'
         "from __future__ import annotations\n\n"
         "from dataclasses import dataclass\nfrom enum import IntEnum\nfrom typing import NamedTuple\n\n"
-        f"{hand}"
-        "from modelserver.messages.flags import NAN, NO_FLAGS, VALID\n"
+        "from modelserver.errors import Status\n"
+        "from modelserver.messages.answers import PoseAnswer\n"
+        "from modelserver.messages.flags import NAN, NO_FLAGS, VALID, Invalid, Quality\n"
         "from modelserver.transforms.so3 import Matrix3, Quaternion, Vector3\n\n"
         f"\n{body}\n"
     )
 
 
-HAND_VALUES: Final = {
-    "Invalid": "modelserver.messages.flags",
-    "Quality": "modelserver.messages.flags",
-    "Status": "modelserver.errors",
-}
-"""Where the values are that no .lcm file declares."""
+HAND_VALUES: Final = ("Invalid", "Quality")
+"""Flags that no .lcm file declares."""
+
+_WORD: Final = re.compile(r"\b[A-Za-z]\w+\b")
+_HELPER: Final = re.compile(r"(check|verify|read|pack)_[a-z_0-9]+|NAN\d+|MAX_[A-Z_]+|Codec")
 
 
-def _hand_imports(names: Iterable[str]) -> str:
-    return "".join(
-        f"from {HAND_VALUES.get(name, 'modelserver.messages.answers')} import {name}\n"
-        for name in sorted(names)
-        if name
-    )
-
-
-_CHECKS: Final = re.compile(r"\b((?:check|verify|read|pack)_[a-z_0-9]+|NAN\d+)\b")
-
-
-def _fingerprint_module(fingerprints: Mapping[str, str]) -> str:
-    lines = [f'    "{name}": bytes.fromhex("{number}"),' for name, number in sorted(fingerprints.items())]
-    return (
-        '"""Fingerprints of the wire types, as lcm-gen computes them. Written by `make types`; do not edit."""\n\n'
-        "from __future__ import annotations\n\nfrom collections.abc import Mapping\nfrom typing import Final\n\n"
-        "FINGERPRINTS: Final[Mapping[str, bytes]] = {\n" + "\n".join(lines) + "\n}\n"
-    )
-
-
-def _codec_module(
-    codecs: _Codecs, functions: Sequence[str], table: Sequence[str], structs: Mapping[str, Struct]
-) -> str:
-    text = "\n\n\n".join(functions)
-    own = {f"{verb}_{each.base}" for verb in ("pack", "unpack") for each in structs.values()}
-    by_hand = {name for names in codecs.hand.values() for name in names}
-    helpers = sorted(set(_CHECKS.findall(text)) - own - by_hand | {"Codec"})
+def _codec_module(structs: Mapping[str, Struct], names: set[str], fingerprints: Mapping[str, str]) -> str:
+    codecs = _Codecs(structs)
+    functions: list[str] = []
+    table: list[str] = []
+    of_module: dict[str, set[str]] = {}
+    for each in structs.values():
+        if not each.value:
+            continue
+        names.add(each.value)
+        if each.codec:
+            by_hand = {f"{verb}_{each.base}" for verb in ("pack", "unpack", "skip")} | {f"NO_{each.base.upper()}"}
+            of_module.setdefault(each.codec.partition(" ")[0], set()).update(by_hand)
+        else:
+            functions += [codecs.write_packer(each), codecs.write_unpacker(each)]
+        if "part" not in each.options:
+            row = (
+                f'"{each.name}"',
+                f'FINGERPRINTS["{each.name}"]',
+                each.value,
+                f"pack_{each.base}",
+                f"unpack_{each.base}",
+            )
+            table.append(f"    Codec({', '.join(row)}),")
+    body = "\n\n\n".join([*functions, "\n".join(["CODECS = (", *table, ")"])])
+    used = set(_WORD.findall(body))
+    here = {f"{verb}_{each.base}" for verb in ("pack", "unpack") for each in structs.values()}
+    of_module["fields"] = {word for word in used if _HELPER.fullmatch(word)} - here
     imports = "".join(
-        f"from modelserver.wire.{module} import {', '.join(sorted(names))}\n"
-        for module, names in sorted(codecs.hand.items())
+        f"from modelserver.wire.{module} import {', '.join(sorted(wanted & used))}\n"
+        for module, wanted in sorted(of_module.items())
     )
-    names = sorted(name for name in codecs.value_names if name and name != "Status")
-    status = "from modelserver.errors import Status\n" if "Status" in codecs.value_names else ""
+    numbers = "\n".join(f'    "{name}": bytes.fromhex("{fingerprints[name]}"),' for name in sorted(fingerprints))
     return (
         '"""Codec of the messages. Generated from lcmtypes/*.lcm by `make types`; do not edit."""\n\n'
         "from __future__ import annotations\n\n"
-        f"import struct\n\n{status}"
-        f"from modelserver.messages import {', '.join(names)}\n"
-        f"{imports}from modelserver.wire.fields import {', '.join(helpers)}\n\n"
-        f"from modelserver.wire.fingerprints import FINGERPRINTS\n\n{codecs.formats()}\n\n\n{text}\n\n\nCODECS = (\n"
-        + "\n".join(table)
-        + "\n)\n"
+        "import struct\nfrom collections.abc import Mapping\nfrom typing import Final\n\n"
+        "from modelserver.errors import Status\n"
+        f"from modelserver.messages import {', '.join(sorted(names & used))}\n"
+        f"{imports}\nFINGERPRINTS: Final[Mapping[str, bytes]] = {{\n{numbers}\n}}\n"
+        f'"""Of the wire types, as lcm-gen computes them."""\n\n{codecs.formats()}\n\n\n{body}\n'
     )

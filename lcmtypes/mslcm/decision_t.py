@@ -74,7 +74,7 @@ class decision_t(object):
         self.num = 0
         """
         Degrees of freedom, 0 to 64: the size of the residual; 0 = rejected before the comparison.
-        @max 64 @property dof
+        @limit MAX_STATES @property dof
         LCM Type: int32_t
         """
 

@@ -32,7 +32,7 @@ class decisions_t(object):
         self.count = 0
         """
         Number of decisions, 0 to 1,024.
-        @max 1024
+        @max MAX_DECISIONS
         LCM Type: int32_t
         """
 

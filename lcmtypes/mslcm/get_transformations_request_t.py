@@ -32,7 +32,7 @@ class get_transformations_request_t(object):
         self.num_pairs = 0
         """
         Number of pairs, 1 to 64.
-        @rows pairs @limit 64 @least 1
+        @rows pairs @limit MAX_PAIRS @least 1
         LCM Type: int32_t
         """
 
@@ -53,7 +53,7 @@ class get_transformations_request_t(object):
         self.num_instants = 0
         """
         Number of instants; times num_pairs it is 2,000 at most, more is rejected.
-        @max 100_000
+        @limit MAX_MESSAGE_INSTANTS
         LCM Type: int32_t
         """
 

@@ -31,7 +31,7 @@ class joints_t(object):
         self.num_joints = 0
         """
         Number of joints, 0 to 1,024.
-        @rows joints JointSample @max 1024
+        @rows joints JointSample @limit 1024
         LCM Type: int32_t
         """
 

@@ -11,7 +11,7 @@ class reply_header_t(object):
     """
     How a request ended. First member of every reply.
     @value ReplyHeader tuple
-    @codec queries
+    @codec poses
     @part
     """
 

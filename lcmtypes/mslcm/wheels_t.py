@@ -42,7 +42,7 @@ class wheels_t(object):
         self.num_wheels = 0
         """
         Number of wheels, 0 to 1,024.
-        @rows wheels WheelSample @max 1024
+        @rows wheels WheelSample @limit 1024
         LCM Type: int32_t
         """
 

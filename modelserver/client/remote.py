@@ -49,9 +49,8 @@ from modelserver.messages import (
 )
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire.channels import REPLY_PREFIX, to_subscription_pattern
-from modelserver.wire.codec import decode, encode, get_type_name
+from modelserver.wire.codec import decode, encode, get_type_name, pack_get_transformation, read_answer
 from modelserver.wire.provider import handle_message, open_lcm, resolve_url
-from modelserver.wire.queries import pack_get_transformation, read_answer
 
 REPLY_QUEUE_CAPACITY: Final = 64
 """Queued replies; further ones are lost."""

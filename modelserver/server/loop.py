@@ -65,8 +65,8 @@ from modelserver.server.requests.handler import RequestHandler
 from modelserver.server.requests.signed_commands import CommandVerifier
 from modelserver.server.tick_timer import TickTimer
 from modelserver.wire.codec import encode, fingerprint_of
+from modelserver.wire.fields import MAX_DECISIONS
 from modelserver.wire.journal import RecordKind
-from modelserver.wire.navigation import MAX_DECISIONS
 from modelserver.wire.snapshot import split_snapshot
 
 log = logging.getLogger(__name__)

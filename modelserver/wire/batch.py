@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -11,11 +10,8 @@ import numpy.typing as npt
 from modelserver.errors import Status, WireError
 from modelserver.messages import Origin, PoseBatch, PoseBatchReply
 from modelserver.wire import fields
-from modelserver.wire.fields import LENGTH
-from modelserver.wire.queries import pack_reply_header, unpack_reply_header
-
-MAX_MESSAGE_INSTANTS: Final = 100_000
-"""In a message; the server takes far fewer."""
+from modelserver.wire.fields import LENGTH, MAX_MESSAGE_INSTANTS
+from modelserver.wire.poses import pack_reply_header, unpack_reply_header
 
 _INT = struct.Struct(">i")
 _PLACE = struct.Struct(">iiii3dbbqi")

@@ -5,37 +5,23 @@ from __future__ import annotations
 import struct
 from typing import Final
 
-import mslcm
 from modelserver.errors import WireError
 from modelserver.wire.channels import CHANNELS, SIGNED, ChannelUse
-from modelserver.wire.codec import get_type_names
 from modelserver.wire.fields import read_text
+from modelserver.wire.generated import CODECS, FINGERPRINTS
 from modelserver.wire.journal import MAGIC
-from mslcm.relative_pose_t import relative_pose_t
 
 _INPUTS: Final = frozenset(
-    getattr(mslcm, channel.type_name)._get_packed_fingerprint()
+    FINGERPRINTS[channel.type_name]
     for channel in CHANNELS
     # signed commands are no inputs for playback: signatures protect against replayed commands
     if channel.use in (ChannelUse.SENSOR, ChannelUse.COMMAND) and channel.name != SIGNED
 )
-_SERVICE: Final = frozenset(getattr(mslcm, name)._get_packed_fingerprint() for name in get_type_names()) - _INPUTS | {
-    MAGIC
-}
-
-
-def _is_stamped(type_name: str) -> bool:
-    return isinstance(getattr(getattr(mslcm, type_name)(), "header", None), mslcm.sensor_header_t)
-
-
+_SERVICE: Final = frozenset(codec.fingerprint for codec in CODECS) - _INPUTS | {MAGIC}
 _STAMPED: Final = frozenset(
-    getattr(mslcm, channel.type_name)._get_packed_fingerprint()
-    for channel in CHANNELS
-    if _is_stamped(channel.type_name)
+    codec.fingerprint for codec in CODECS if codec.value.__annotations__.get("header") == "SensorHeader"
 )
-
-
-_TYPES: Final = {getattr(mslcm, name)._get_packed_fingerprint(): name for name in dir(mslcm) if name.endswith("_t")}
+_TYPES: Final = {fingerprint: name for name, fingerprint in FINGERPRINTS.items()}
 
 
 def type_name_of(data: bytes) -> str:
@@ -60,7 +46,7 @@ _SINCE = struct.Struct(">q")
 _SOURCE_AT: Final = 48
 """Offset of the source, the last field of the sensor header."""
 
-_RELATIVE: Final[bytes] = relative_pose_t._get_packed_fingerprint()
+_RELATIVE: Final = FINGERPRINTS["relative_pose_t"]
 
 
 def restamp(data: bytes, shift: int) -> bytes:

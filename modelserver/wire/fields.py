@@ -34,6 +34,15 @@ MAX_FRAME_NAME = 401
 MAX_PAIRS: Final = 64
 """Pairs of frames in one GetTransformations."""
 
+MAX_MESSAGE_INSTANTS: Final = 100_000
+"""Instants of a batch in one message; the server takes far fewer."""
+
+MAX_DECISIONS: Final = 1024
+"""Decisions in one message; more go out in several."""
+
+MAX_STATES: Final = 64
+"""Error states of the filter, and numbers of one measurement."""
+
 MAX_SNAPSHOT_PARTS: Final = 100_000
 
 MAX_DISTANCE = 1e12

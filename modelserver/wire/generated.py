@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
+from typing import Final
 
 from modelserver.errors import Status
 from modelserver.messages import (
@@ -67,6 +69,10 @@ from modelserver.messages import (
 )
 from modelserver.wire.batch import pack_get_transformations_reply, unpack_get_transformations_reply
 from modelserver.wire.fields import (
+    MAX_DECISIONS,
+    MAX_MESSAGE_INSTANTS,
+    MAX_PAIRS,
+    MAX_STATES,
     NAN3,
     NAN4,
     NAN9,
@@ -101,7 +107,6 @@ from modelserver.wire.fields import (
     verify_model_snapshot,
     verify_relative_pose,
 )
-from modelserver.wire.fingerprints import FINGERPRINTS
 from modelserver.wire.motion import (
     pack_get_explanation_reply,
     pack_get_motion_reply,
@@ -114,12 +119,65 @@ from modelserver.wire.poses import (
     NO_POSE_VECTOR,
     pack_pose_transform,
     pack_pose_vector,
+    pack_reply_header,
     skip_pose_transform,
     skip_pose_vector,
     unpack_pose_transform,
     unpack_pose_vector,
+    unpack_reply_header,
 )
-from modelserver.wire.queries import pack_reply_header, unpack_reply_header
+
+FINGERPRINTS: Final[Mapping[str, bytes]] = {
+    "absolute_pose_t": bytes.fromhex("305f281754526b71"),
+    "acknowledgement_t": bytes.fromhex("56db4119c8a4967a"),
+    "channel_health_t": bytes.fromhex("ed447313ec93b898"),
+    "decision_t": bytes.fromhex("44de773b00abcc98"),
+    "decisions_t": bytes.fromhex("21bd524309243fd5"),
+    "driver_health_t": bytes.fromhex("0c62286d0ae44df8"),
+    "get_body_frame_list_request_t": bytes.fromhex("2497e2c3fc56ff7f"),
+    "get_body_list_request_t": bytes.fromhex("02ff54e76e2dd188"),
+    "get_explanation_reply_t": bytes.fromhex("78784d12aacdab49"),
+    "get_explanation_request_t": bytes.fromhex("349d6de2b7954177"),
+    "get_h_transform_request_t": bytes.fromhex("7e7a9479fd1d6d9b"),
+    "get_history_reply_t": bytes.fromhex("179fc49727116ccf"),
+    "get_history_request_t": bytes.fromhex("6e2a16f04ed99393"),
+    "get_motion_reply_t": bytes.fromhex("3743f00523352e6f"),
+    "get_motion_request_t": bytes.fromhex("cfb4f4d1e8b42938"),
+    "get_state_vector_reply_t": bytes.fromhex("790a52685036e932"),
+    "get_state_vector_request_t": bytes.fromhex("7a15c48e4bece939"),
+    "get_transformation_reply_t": bytes.fromhex("a5d7be367c7e79cf"),
+    "get_transformation_request_t": bytes.fromhex("70bdf317a3d8605e"),
+    "get_transformations_reply_t": bytes.fromhex("5c17dce904d61a93"),
+    "get_transformations_request_t": bytes.fromhex("d71f006e179d5a75"),
+    "gps_t": bytes.fromhex("661a4b5c1827f64c"),
+    "health_t": bytes.fromhex("eadb90c8ecd748c9"),
+    "imu_t": bytes.fromhex("a488946aa26727f7"),
+    "joints_t": bytes.fromhex("2f8bc69e04097f3d"),
+    "localization_health_t": bytes.fromhex("4e4d0e20a3e01caf"),
+    "localization_mode_t": bytes.fromhex("5862804cd0a8b608"),
+    "model_snapshot_t": bytes.fromhex("0ed3b5078061bb8f"),
+    "name_list_reply_t": bytes.fromhex("c14f1581c7c4db7b"),
+    "navigation_state_t": bytes.fromhex("d8c235934651b218"),
+    "path_edge_t": bytes.fromhex("3b32c8e843fbfdb3"),
+    "pose_transform_t": bytes.fromhex("896679c831751920"),
+    "pose_vector_t": bytes.fromhex("366fff4a06cdd1e9"),
+    "range_t": bytes.fromhex("39acec7e5e030304"),
+    "rejected_count_t": bytes.fromhex("cc9becbf2c78c790"),
+    "relative_pose_t": bytes.fromhex("d75db953643bc60a"),
+    "reload_model_reply_t": bytes.fromhex("5e9feb331c508f32"),
+    "reload_model_request_t": bytes.fromhex("5c5ab9383ef5362c"),
+    "reply_header_t": bytes.fromhex("25053b2b5b842c4d"),
+    "request_header_t": bytes.fromhex("fb1745122e48c9d4"),
+    "sensor_header_t": bytes.fromhex("c35bf2781d281ef1"),
+    "set_h_transform_request_t": bytes.fromhex("cb1b5b324b0eb2ae"),
+    "set_state_vector_request_t": bytes.fromhex("252e6635f5c02440"),
+    "signed_t": bytes.fromhex("9e853d013a985096"),
+    "time_query_t": bytes.fromhex("e0e3ae7a2bde3465"),
+    "vehicle_command_t": bytes.fromhex("c0060a5442733d61"),
+    "vehicle_status_t": bytes.fromhex("68dabe3bdb8f1c77"),
+    "wheels_t": bytes.fromhex("ebe9d01835d4ee64"),
+}
+"""Of the wire types, as lcm-gen computes them."""
 
 _S0 = struct.Struct(">qdqqq")
 _S1 = struct.Struct(">3d4d36d")
@@ -223,7 +281,6 @@ def unpack_channel_health(data: bytes, at: int) -> tuple[ChannelHealth, int]:
 
 def pack_decision(value: Decision) -> bytes:
     """Return the bytes of a decision_t without the fingerprint."""
-    check_outgoing(len(value.residual), 64, "num")
     return b"%b%b%b%b%b%b%b%b%b%b%b" % (
         _S3.pack(value.utime),
         pack_text(value.source),
@@ -248,7 +305,7 @@ def unpack_decision(data: bytes, at: int) -> tuple[Decision, int]:
     (verdict,) = _S4.unpack_from(data, at)
     reason, at = read_text(data, at + 1)
     (num,) = _S5.unpack_from(data, at)
-    check_count(num, "num", 64)
+    check_count(num, "num", MAX_STATES)
     residual, at = read_numbers("d", data, at + 4, num)
     innovation_covariance, at = read_numbers("d", data, at, num * num)
     noise, at = read_numbers("d", data, at, num * num)
@@ -270,14 +327,14 @@ def unpack_decision(data: bytes, at: int) -> tuple[Decision, int]:
 
 def pack_decisions(value: PublishDecisions) -> bytes:
     """Return the bytes of a decisions_t without the fingerprint."""
-    check_outgoing(len(value.decisions), 1024, "count")
+    check_outgoing(len(value.decisions), MAX_DECISIONS, "count")
     return b"".join((_S7.pack(value.utime, len(value.decisions)), *map(pack_decision, value.decisions)))
 
 
 def unpack_decisions(data: bytes, at: int) -> tuple[PublishDecisions, int]:
     """Return the decisions_t that begins at `at`, and its end. Raises WireError, struct.error."""
     utime, count = _S7.unpack_from(data, at)
-    check_count(count, "count", 1024)
+    check_count(count, "count", MAX_DECISIONS)
     decisions, at = read_each(unpack_decision, data, at + 12, count)
     return PublishDecisions(check_utime(utime, "utime"), decisions), at
 
@@ -588,7 +645,6 @@ def unpack_get_transformation_request(data: bytes, at: int) -> tuple[GetTransfor
 
 def pack_get_transformations_request(value: GetTransformations) -> bytes:
     """Return the bytes of a get_transformations_request_t without the fingerprint."""
-    check_outgoing(len(value.at), 100_000, "num_instants")
     return b"".join(
         (
             _S3.pack(value.header.request_id),
@@ -609,11 +665,11 @@ def unpack_get_transformations_request(data: bytes, at: int) -> tuple[GetTransfo
     (header_request_id,) = _S3.unpack_from(data, at)
     header_reply_channel, at = read_text(data, at + 8)
     (num_pairs,) = _S5.unpack_from(data, at)
-    check_count(num_pairs, "num_pairs", 64, 1)
+    check_count(num_pairs, "num_pairs", MAX_PAIRS, 1)
     frames_of_interest, at = read_texts(data, at + 4, num_pairs)
     frames_of_reference, at = read_texts(data, at, num_pairs)
     (num_instants,) = _S5.unpack_from(data, at)
-    check_count(num_instants, "num_instants", 100_000)
+    check_count(num_instants, "num_instants", MAX_MESSAGE_INSTANTS)
     at_, at = read_numbers("q", data, at + 4, num_instants)
     fixed_frame, at = read_text(data, at)
     reference_at, with_covariance = _S12.unpack_from(data, at)
@@ -1039,7 +1095,6 @@ def unpack_imu(data: bytes, at: int) -> tuple[ImuSample, int]:
 
 def pack_joints(value: JointsSample) -> bytes:
     """Return the bytes of a joints_t without the fingerprint."""
-    check_outgoing(len(value.joints), 1024, "num_joints")
     return b"".join(
         (
             _S0.pack(
@@ -1523,7 +1578,6 @@ def unpack_vehicle_status(data: bytes, at: int) -> tuple[VehicleStatusSample, in
 
 def pack_wheels(value: WheelsSample) -> bytes:
     """Return the bytes of a wheels_t without the fingerprint."""
-    check_outgoing(len(value.wheels), 1024, "num_wheels")
     return b"".join(
         (
             _S0.pack(

@@ -17,7 +17,7 @@ from modelserver.messages import (
 from modelserver.transforms.pose import Pose
 from modelserver.wire import fields, poses
 from modelserver.wire.fields import LENGTH, pack_text, read_text
-from modelserver.wire.queries import pack_reply_header, unpack_reply_header
+from modelserver.wire.poses import pack_reply_header, unpack_reply_header
 
 EDGE_KINDS: Final = ("frame", "constraint", "joint", "vehicle")
 PROVENANCES: Final = ("fixed", "measured", "interpolated", "held", "predicted", "default")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from typing import Final
 
 from modelserver.errors import WireError
 from modelserver.messages import Invalid, Mode, NavigationState, Phase
 from modelserver.transforms.pose import Pose
 from modelserver.wire.fields import (
     LENGTH,
+    MAX_STATES,
     NAN36,
     check_count,
     check_name,
@@ -22,13 +22,6 @@ from modelserver.wire.fields import (
     read_numbers,
     read_texts,
 )
-
-MAX_DECISIONS: Final = 1024
-"""Decisions in one message; more go out in several."""
-
-MAX_STATES: Final = 64
-"""Error states of the filter, and numbers of one measurement."""
-
 
 _HEAD = struct.Struct(">qbbbiiddd3d4d3d3d36di")
 

@@ -1,4 +1,7 @@
-"""Poses between Python and wire: pose_transform_t and pose_vector_t, whose values are transformations."""
+"""What the hot path of a query exchanges, between Python and wire: poses and the header of replies.
+
+The values of pose_transform_t and pose_vector_t are transformations.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +9,26 @@ import struct
 from functools import partial
 from typing import Any, Final
 
-from modelserver.errors import WireError
-from modelserver.messages import NO_FLAGS, Origin, PoseAnswer, Quality
+from modelserver.errors import Status, WireError
+from modelserver.messages import NO_FLAGS, Origin, PoseAnswer, Quality, ReplyHeader
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire import fields
-from modelserver.wire.fields import MAX_DISTANCE, ROTATION_TOLERANCE, pack_text, read_text
+from modelserver.wire.fields import (
+    COUNT,
+    LENGTH,
+    MAX_DISTANCE,
+    ROTATION_TOLERANCE,
+    check_count,
+    pack_text,
+    read_enum,
+    read_text,
+    read_texts,
+)
 
-_UTIME = struct.Struct(">q")
+_REPLY_HEAD = struct.Struct(">qqh")
+UTIME = struct.Struct(">q")
 _MATRIX = struct.Struct(">16d")
 _STATE_VECTOR = struct.Struct(">7d")
 _NUMBERS = struct.Struct(">36d")
@@ -23,6 +37,9 @@ _REST = struct.Struct(">3dbbqibiiddd")
 # all of these in one: of the covariance only the first number, nan where there is none
 _TRANSFORM = struct.Struct(">16dd280x3dbbqibiiddd")
 _VECTOR = struct.Struct(">7dd280x3dbbqibiiddd")
+PLAIN: Final = pack_text("") + LENGTH.pack(0)
+"""The part of a reply's header that is the same in each reply with an answer: no message, no nearest names."""
+
 _NAN_COVARIANCE: Final = _NUMBERS.pack(*fields.NAN36)
 
 _POSE_HEAD: Final = bytes(8) + 2 * pack_text("")
@@ -106,7 +123,7 @@ def _pack_pose(pose: bytes, answer: PoseAnswer) -> bytes:
     invalid = transformation.invalid_reasons
     easting, northing, height = fields.NAN3 if origin is None else origin.initial_utm
     return b"%b%b%b%b%b%b%b" % (
-        _UTIME.pack(transformation.utime),
+        UTIME.pack(transformation.utime),
         pack_text(transformation.frame_of_interest),
         pack_text(transformation.frame_of_reference),
         pose,
@@ -132,7 +149,7 @@ def _pack_pose(pose: bytes, answer: PoseAnswer) -> bytes:
 
 def _read_pose_head(data: bytes, at: int) -> tuple[int, str, str, int]:
     """Return time and names that a pose begins with, and where they end."""
-    (utime,) = _UTIME.unpack_from(data, at)
+    (utime,) = UTIME.unpack_from(data, at)
     interest, at = read_text(data, at + 8)
     reference, at = read_text(data, at)
     return utime, interest, reference, at
@@ -162,3 +179,32 @@ def _make_answer(
 
 def _unpack_covariance(data: bytes, at: int) -> tuple[float, ...]:
     return _NUMBERS.unpack_from(data, at)
+
+
+def pack_reply_header(header: ReplyHeader) -> bytes:
+    """Return the bytes of a reply_header_t without its fingerprint."""
+    if not header.message and not header.nearest:
+        head = _REPLY_HEAD.pack(header.request_id, header.utime, header.status)
+        return b"%b%b%b" % (head, PLAIN, pack_text(header.model_revision))
+    return b"%b%b%b%b%b" % (
+        _REPLY_HEAD.pack(header.request_id, header.utime, header.status),
+        pack_text(header.message),
+        LENGTH.pack(len(header.nearest)),
+        b"".join(map(pack_text, header.nearest)),
+        pack_text(header.model_revision),
+    )
+
+
+def unpack_reply_header(data: bytes, at: int) -> tuple[ReplyHeader, int]:
+    """Return the reply_header_t that begins at `at`, and its end. Raises WireError, struct.error."""
+    request_id, utime, status = _REPLY_HEAD.unpack_from(data, at)
+    at += _REPLY_HEAD.size
+    if status == 0 and data[at : at + len(PLAIN)] == PLAIN:
+        revision, at = read_text(data, at + len(PLAIN))
+        return ReplyHeader(request_id, utime, model_revision=revision), at
+    message, at = read_text(data, at)
+    (count,) = COUNT.unpack_from(data, at)
+    check_count(count, "num_nearest")
+    nearest, at = read_texts(data, at + COUNT.size, count)
+    revision, at = read_text(data, at)
+    return ReplyHeader(request_id, utime, read_enum(Status, status, "status"), message, nearest, revision), at

@@ -14,10 +14,9 @@ from typing import Final
 from modelserver.errors import Status
 from modelserver.messages import Policy, Reply, TransformReply
 from modelserver.wire.fields import MAX_UTIME
-from mslcm.get_transformation_reply_t import get_transformation_reply_t
-from mslcm.get_transformation_request_t import get_transformation_request_t
+from modelserver.wire.generated import FINGERPRINTS
 
-CACHED_TYPE: Final = get_transformation_request_t.__name__
+CACHED_TYPE: Final = "get_transformation_request_t"
 """The only type of request whose replies are cached."""
 
 MAX_ENTRIES: Final = 16_384
@@ -26,8 +25,8 @@ MAX_ENTRIES: Final = 16_384
 MAX_PAIR_BYTES: Final = 512
 """Bytes of both names; longer ones are not cached."""
 
-_REQUEST: Final[bytes] = get_transformation_request_t._get_packed_fingerprint()
-_REPLY: Final[bytes] = get_transformation_reply_t._get_packed_fingerprint()
+_REQUEST: Final = FINGERPRINTS[CACHED_TYPE]
+_REPLY: Final = FINGERPRINTS["get_transformation_reply_t"]
 _CHANNEL: Final = 20
 """Offset of the reply channel in a request: behind fingerprint, id and the channel's length."""
 _TIME = struct.Struct(">qbi")

@@ -29,9 +29,8 @@ from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.requests.handler import get_request_type
 from modelserver.server.vehicle import Vehicle
 from modelserver.wire.channels import BY_NAME
-from modelserver.wire.codec import decode
+from modelserver.wire.codec import decode, read_request_header
 from modelserver.wire.journal import JournalRecord, RecordKind
-from modelserver.wire.queries import read_request_header
 
 PublishedMessage = tuple[str, bytes]
 

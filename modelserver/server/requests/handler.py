@@ -56,9 +56,8 @@ from modelserver.server.requests.scheduler import (
 )
 from modelserver.server.requests.signed_commands import CommandVerifier
 from modelserver.wire.channels import BY_NAME, REQUESTS, SIGNED
-from modelserver.wire.codec import decode, encode
+from modelserver.wire.codec import decode, encode, read_request_header
 from modelserver.wire.journal import RecordKind
-from modelserver.wire.queries import read_request_header
 from modelserver.wire.reply_cache import CACHED_TYPE, MAX_ENTRIES, StaticReplyCache
 
 log = logging.getLogger(__name__)

@@ -20,8 +20,7 @@ from modelserver.messages import (
 )
 from modelserver.signing.signatures import Freshness, Key, check_freshness, has_valid_signature
 from modelserver.wire.channels import BY_NAME, SIGNED
-from modelserver.wire.codec import decode
-from modelserver.wire.queries import read_request_header
+from modelserver.wire.codec import decode, read_request_header
 
 COMMANDS: Final[Mapping[str, type[Request]]] = {CHANNEL_OF[kind]: kind for kind in commands.COMMANDS}
 """Request types that must be signed, by channel."""

@@ -11,8 +11,7 @@ import pytest
 from modelserver.errors import Status, WireError
 from modelserver.messages import Invalid, Origin, PoseAnswer, Quality, ReplyHeader, TransformReply
 from modelserver.transforms import Pose, Transformation
-from modelserver.wire.codec import decode, encode
-from modelserver.wire.queries import read_answer
+from modelserver.wire.codec import decode, encode, read_answer
 
 KIND = "get_transformation_reply_t"
 INTEREST, REFERENCE = "Camera:Lens", "Base:Ö"
@@ -55,8 +54,8 @@ def test_given_one_that_holds_for_good_then_it_is_read_once_whatever_its_id_and_
 
 
 def test_given_a_full_cache_then_the_oldest_answer_is_evicted_and_read_again(monkeypatch):
-    monkeypatch.setattr("modelserver.wire.queries._MAX_CACHED_ANSWERS", 2)
-    monkeypatch.setattr("modelserver.wire.queries._ANSWER_CACHE", OrderedDict())
+    monkeypatch.setattr("modelserver.wire.codec._MAX_CACHED_ANSWERS", 2)
+    monkeypatch.setattr("modelserver.wire.codec._ANSWER_CACHE", OrderedDict())
     cached = [reply(answers()[0], f"bounded {number}") for number in range(3)]
     first, second, _ = (read_answer(data, INTEREST, REFERENCE) for data in cached)
     assert read_answer(cached[1], INTEREST, REFERENCE) is second
