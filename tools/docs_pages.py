@@ -2,7 +2,7 @@
 """Generate the reference of the documentation site from the code: CLI, settings, channels, types, reason words.
 
 `tools/docs_hook.py` calls this when mkdocs builds the site (`make docs`). Nothing here is written to the repository.
-A fact stands once, at its definition: the help text of a command, the docstring of a setting, the comment of a wire
+A fact is written once, at its definition: the help text of a command, the docstring of a setting, the comment of a wire
 field. What has none raises ValueError, which fails the build.
 """
 
@@ -137,10 +137,11 @@ def _own_settings(kind: type) -> Iterator[DocumentedSetting]:
         if not isinstance(each, ast.AnnAssign) or "ClassVar" in ast.dump(each.annotation):
             continue
         name = ast.unparse(each.target)
-        words = in_docstring.get(name) or SUPPLEMENT.get(f"{kind.__name__}.{name}", "")
         match after:
             case ast.Expr(value=ast.Constant(value=str(below))):
                 words = below
+            case _:
+                words = in_docstring.get(name) or SUPPLEMENT.get(f"{kind.__name__}.{name}", "")
         is_section = any(dataclasses.is_dataclass(part) for part in (hints[name], *typing.get_args(hints[name])))
         if name == "source" or (is_section and not words):
             continue  # a section has a table of its own

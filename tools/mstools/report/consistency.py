@@ -10,6 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
 
 from modelserver.estimation.filter.kalman import gate_limit
 from modelserver.messages import Decision, Verdict
@@ -42,42 +45,25 @@ def has_nis(decision: Decision) -> bool:
 
 def compute_consistency(decisions: Iterable[Decision]) -> list[Consistency]:
     """Return the consistency of each kind of measurement, by name."""
-    kinds: dict[str, list[Decision]] = {}
-    for each in decisions:
-        if has_nis(each):
-            kinds.setdefault(each.kind, []).append(each)
-    return [_summarize(kind, found) for kind, found in sorted(kinds.items())]
+    known = sorted(filter(has_nis, decisions), key=lambda each: each.kind)
+    return [_summarize(kind, list(found)) for kind, found in groupby(known, lambda each: each.kind)]
 
 
 def _summarize(kind: str, found: list[Decision]) -> Consistency:
     numbers = sum(each.dof for each in found)
+    rejected = sum(each.verdict is Verdict.REJECTED for each in found)
     beyond = sum(each.statistic > gate_limit(each.dof, 0.05) for each in found)
     return Consistency(
-        kind,
-        len(found),
-        numbers,
-        sum(each.verdict is Verdict.REJECTED for each in found),
-        sum(each.statistic for each in found) / numbers,
-        beyond / len(found),
+        kind, len(found), numbers, rejected, sum(each.statistic for each in found) / numbers, beyond / len(found)
     )
 
 
 def compute_running_nis(decisions: Iterable[Decision], window_s: float) -> tuple[list[int], list[float]]:
     """Return utimes and the mean NIS per degree of freedom in the `window_s` before each."""
-    utimes: list[int] = []
-    means: list[float] = []
-    window: list[Decision] = []
-    first = 0
-    total = 0.0
-    numbers = 0
-    for each in sorted(filter(has_nis, decisions), key=lambda decision: decision.utime):
-        window.append(each)
-        total += each.statistic
-        numbers += each.dof
-        while window[first].utime < each.utime - window_s * 1e6:
-            total -= window[first].statistic
-            numbers -= window[first].dof
-            first += 1
-        utimes.append(each.utime)
-        means.append(max(total, 0.0) / numbers)
-    return utimes, means
+    known = sorted(filter(has_nis, decisions), key=lambda decision: decision.utime)
+    utimes = np.array([each.utime for each in known], dtype=np.int64)
+    first = np.searchsorted(utimes, utimes - round(window_s * 1e6))
+    totals = np.cumsum([0.0, *(each.statistic for each in known)])
+    numbers = np.cumsum([0, *(each.dof for each in known)])
+    means = np.maximum(totals[1:] - totals[first], 0.0) / (numbers[1:] - numbers[first])
+    return utimes.tolist(), means.tolist()

@@ -17,8 +17,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 
@@ -148,26 +150,21 @@ def read_fixes(log: Path, config: Path) -> UsableFixes:
     channel = gps_channel(vehicle)
     codec = vehicle.sensor_channels()[channel]
     settings = vehicle.config.localization.filter
-    samples, numbers, count = [], [], 0
+    found: list[tuple[GpsSample, int]] = []
+    number = -1
     with LogFile(log) as recording:
-        for event in recording:
-            if event.channel != channel:
-                continue
-            count += 1
-            try:
+        for number, event in enumerate(event for event in recording if event.channel == channel):
+            with suppress(ValueError):
                 sample = codec.decode(event.data)
-            except ValueError:
-                continue
-            if isinstance(sample, GpsSample) and not isinstance(gate.evaluate_fix(sample, settings), str):
-                samples.append(sample)
-                numbers.append(count - 1)
-    if len(samples) < 20:
+                if isinstance(sample, GpsSample) and not isinstance(gate.evaluate_fix(sample, settings), str):
+                    found.append((sample, number))
+    if len(found) < 20:
         raise RecordingError(
-            f"{log}: {len(samples)} of {count} messages on {channel} are good fixes; at least 20 are needed to "
+            f"{log}: {len(found)} of {number + 1} messages on {channel} are good fixes; at least 20 are needed to "
             "withhold some of them; record a drive of a few minutes"
         )
-    order = sorted(range(len(samples)), key=lambda n: samples[n].header.utime)
-    return UsableFixes(tuple(samples[n] for n in order), tuple(numbers[n] for n in order))
+    samples, numbers = zip(*sorted(found, key=lambda each: each[0].header.utime), strict=True)
+    return UsableFixes(samples, numbers)
 
 
 def evaluate(job: EvaluationJob) -> EvaluationResult:
@@ -186,20 +183,17 @@ def evaluate(job: EvaluationJob) -> EvaluationResult:
         events = _drop_withheld(recording, gps_channel(vehicle), {known.numbers[n] for n in withheld})
         replay = OfflineRun(vehicle, events, gps.frame, on_decision=decisions.append)
         scored = [known.samples[n] for n in withheld]
-        errors, densities, marks = [], [], []
+        rows: list[tuple[GpsSample, float, float]] = []
         for sample, row in zip(scored, replay.rows([s.header.utime for s in scored]), strict=True):
-            if job.part == "half" and sample.header.utime < skip:
-                continue
-            errors.append(_error(row, sample, replay.localizer))
-            densities.append(_log_density(replay.localizer, sample))
-            marks.append(sample)
-    good = [error for error in errors if math.isfinite(error)]
+            if job.part == "outage" or sample.header.utime >= skip:
+                rows.append((sample, _error(row, sample, replay.localizer), _log_density(replay.localizer, sample)))
+    good = [error for _, error, _ in rows if math.isfinite(error)]
     return EvaluationResult(
-        len(errors),
-        len(errors) - len(good),
-        sum(densities) / len(densities) if densities else math.nan,
+        len(rows),
+        len(rows) - len(good),
+        sum(density for _, _, density in rows) / len(rows) if rows else math.nan,
         math.sqrt(sum(error * error for error in good) / len(good)) if good else math.inf,
-        _gap_ends(known, marks, errors) if job.part == "outage" else (),
+        _gap_ends(known, rows) if job.part == "outage" else (),
         tuple(compute_consistency(decisions)),
     )
 
@@ -214,14 +208,9 @@ def apply_settings(vehicle: Vehicle, settings: Mapping[str, float]) -> Vehicle:
 
 
 def _drop_withheld(events: Iterable[LogEvent], channel: str, withheld: set[int]) -> Iterator[LogEvent]:
-    """Yield the events without the withheld fixes, which are identified by their index on the channel."""
-    number = -1
-    for event in events:
-        if event.channel == channel:
-            number += 1
-            if number in withheld:
-                continue
-        yield event
+    """Return the events without the withheld fixes, which are identified by their index on the channel."""
+    number = count()
+    return (event for event in events if event.channel != channel or next(number) not in withheld)
 
 
 def _error(row: TrackRow, sample: GpsSample, localizer: Localizer | None) -> float:
@@ -274,29 +263,13 @@ def _normal_log_density(residual: Array, S: Array) -> float:
     return -0.5 * (kalman.statistic(residual, S) + float(size) + len(residual) * math.log(2.0 * math.pi))
 
 
-def _gap_ends(known: UsableFixes, marks: list[GpsSample], errors: list[float]) -> tuple[float, ...]:
+def _gap_ends(known: UsableFixes, rows: Iterable[tuple[GpsSample, float, float]]) -> tuple[float, ...]:
     """Return the mean error over the last 2 s of each gap; a gap without an estimate at its end is left out."""
-    ends = []
-    for number, start in enumerate(GAP_STARTS):
-        end = known.begin + round(1e6 * (start * known.seconds + known.gap))
-        last = [
-            error
-            for sample, error in zip(marks, errors, strict=True)
-            if known.gap_of(sample) == number and sample.header.utime > end - 2_000_000 and math.isfinite(error)
-        ]
-        if last:
-            ends.append(sum(last) / len(last))
-    return tuple(ends)
-
-
-__all__ = [
-    "EvaluationJob",
-    "EvaluationResult",
-    "UsableFixes",
-    "apply_settings",
-    "evaluate",
-    "load",
-    "mixture_log_density",
-    "read_fixes",
-    "stated_sigma",
-]
+    ends: dict[int, list[float]] = {}
+    for sample, error, _ in rows:
+        gap = known.gap_of(sample)
+        if gap is not None and math.isfinite(error):
+            end = known.begin + round(1e6 * (GAP_STARTS[gap] * known.seconds + known.gap))
+            if sample.header.utime > end - 2_000_000:
+                ends.setdefault(gap, []).append(error)
+    return tuple(sum(errors) / len(errors) for _, errors in sorted(ends.items()))
