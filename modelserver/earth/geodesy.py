@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import math
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 from pyproj import Proj, Transformer
@@ -163,26 +163,23 @@ def origin_at(latitude_deg: float, longitude_deg: float, height: float) -> Origi
     return make_origin(round(easting, 4), round(northing, 4), round(height, 4), zone, north)
 
 
+@dataclass(frozen=True, slots=True)
 class Geodesy:
     """World coordinates around one origin: its pinned UTM zone and its tangent plane (World:ENU).
 
     The zone stays that of the origin where the vehicle crosses into the next: PROJ's series hold far beyond a zone's
-    border. Immutable; two of one origin are equal. Scalar calls cost microseconds. Raises GeodesyError for an invalid
-    origin.
+    border. Scalar calls cost microseconds. Raises GeodesyError for an invalid origin.
     """
 
-    __slots__ = ("origin", "tangent")
-
     origin: Origin
-    tangent: LocalFrame
+    tangent: LocalFrame = field(init=False, repr=False, compare=False)
+    """The tangent plane at the origin."""
 
-    def __init__(self, origin: Origin):
-        """Create the geodesy of an origin; `tangent` is the plane at it."""
-        checked = make_origin(
-            origin.easting, origin.northing, origin.height, origin.zone, origin.north
-        )  # the caller's origin_id stays: it may have been persisted by another version
+    def __post_init__(self) -> None:
+        origin = self.origin
+        # the caller's origin_id stays: it may have been persisted by another version
+        checked = make_origin(origin.easting, origin.northing, origin.height, origin.zone, origin.north)
         longitude, latitude = _utm(origin.zone, origin.north)(checked.easting, checked.northing, inverse=True)
-        object.__setattr__(self, "origin", origin)
         object.__setattr__(self, "tangent", LocalFrame.at(latitude, longitude, origin.height))
 
     def utm_from_geodetic(self, latitude_deg: float, longitude_deg: float, height: float) -> Vector3:
@@ -273,21 +270,6 @@ class Geodesy:
                 f"longitude {longitude_deg:.6f} deg lies {abs(away):.1f} deg from the middle of the pinned UTM "
                 f"zone {self.origin.zone}, which reaches {MAX_ZONE_OFFSET:g} deg: set a new origin"
             )
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Geodesy) and self.origin == other.origin
-
-    def __hash__(self) -> int:
-        return hash(self.origin)
-
-    def __setattr__(self, name: str, value: object) -> None:
-        raise AttributeError("a Geodesy is immutable; make a new one")
-
-    def __reduce__(self) -> tuple[type[Geodesy], tuple[Origin]]:
-        return (Geodesy, (self.origin,))
-
-    def __repr__(self) -> str:
-        return f"Geodesy({self.origin!r})"
 
 
 def rotation_about_up(angle: float) -> Quaternion:

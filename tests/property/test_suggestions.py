@@ -19,8 +19,7 @@ from support_formats import YAML, miro, tree, tree_frame
 from modelserver.config.reader import read_lines, read_partly
 from modelserver.config.vehicle_file import VehicleConfig
 from modelserver.errors import ConfigError, Problem, Severity
-from modelserver.formats import parse_model
-from modelserver.formats.registry import parse_content
+from modelserver.formats import parse_content, parse_model
 from msdrivers.settings import SourceMap, read_drivers
 
 pytestmark = pytest.mark.slow

@@ -9,8 +9,7 @@ from support_formats import YAML, miro, miro_body, miro_constraint, miro_frame, 
 from support_urdf import BOT_FRAMES, URDF
 
 from modelserver.errors import GeometryError
-from modelserver.formats import FORMATS, check_file, format_of_path, load_model, save_model
-from modelserver.formats.registry import MAX_BYTES
+from modelserver.formats import FORMATS, MAX_BYTES, check_file, format_of_path, load_model, save_model
 
 TREE = tree(tree_frame("Rover"), tree_frame("Mast", "Rover"), tree_frame("Camera", "Mast"))
 

@@ -66,9 +66,9 @@ def test_broken_xml_is_a_problem_not_a_traceback(content):
 
 
 def test_a_file_named_xml_is_read_as_xml_whatever_it_begins_with():
-    from modelserver.formats import registry
+    from modelserver.formats import parse_content
 
-    (problem,) = registry.parse_content(b"bodies:\n", "cart.xml").problems
+    (problem,) = parse_content(b"bodies:\n", "cart.xml").problems
     assert "not well-formed" in problem.message
 
 

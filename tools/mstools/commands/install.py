@@ -13,7 +13,7 @@ import typer
 
 from modelserver.errors import ConfigError, Severity, quote
 from modelserver.files.regular import read_regular
-from modelserver.formats.registry import MAX_BYTES as LARGEST_FILE
+from modelserver.formats import MAX_BYTES as LARGEST_FILE
 from mstools.deployment import files as install_files
 from mstools.deployment import plan as planning
 from mstools.deployment.plan import Plan, WriteFile, path_in_root
