@@ -18,7 +18,7 @@ from msdrivers.line_settings import CanSettings, ModbusSettings, SerialSettings,
 from msdrivers.links import Link
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.modbus.registers import ModbusUnit
-from msdrivers.raw_log import BytesCodec, UnitCodec
+from msdrivers.raw_log import BYTES_CODEC, UnitCodec
 from msdrivers.registry import EmulatorInputs
 from msdrivers.settings import BAUDS_FIELD, DriverSettings
 
@@ -27,53 +27,46 @@ _CAN_HEADER = struct.Struct(">IB")
 _EXTENDED_FLAG, _ERROR_FLAG = 1, 2
 
 
-class CanFrameCodec:
-    """A CAN frame: its identifier, 4 bytes, most significant first; flags, 1 byte (1 extended, 2 error); its data."""
-
-    name = "can"
-
-    def pack(self, unit: CanFrame) -> bytes:
-        """Return the bytes of a frame."""
-        flags = _EXTENDED_FLAG * unit.is_extended + _ERROR_FLAG * unit.is_error
-        return _CAN_HEADER.pack(unit.arbitration_id, flags) + unit.data
-
-    def unpack(self, data: bytes) -> CanFrame:
-        """Return the frame of bytes. Raises ValueError for fewer than a frame has."""
-        if len(data) < _CAN_HEADER.size:
-            raise ValueError(f"{len(data)} bytes are no CAN frame")
-        identifier, flags = _CAN_HEADER.unpack_from(data)
-        return CanFrame(identifier, data[_CAN_HEADER.size :], bool(flags & _EXTENDED_FLAG), bool(flags & _ERROR_FLAG))
+def _pack_frame(frame: CanFrame) -> bytes:
+    flags = _EXTENDED_FLAG * frame.is_extended + _ERROR_FLAG * frame.is_error
+    return _CAN_HEADER.pack(frame.arbitration_id, flags) + frame.data
 
 
-class ModbusCodec:
-    """A Modbus request, reply or failure, as JSON: its kind and its fields."""
+def _unpack_frame(data: bytes) -> CanFrame:
+    if len(data) < _CAN_HEADER.size:
+        raise ValueError(f"{len(data)} bytes are no CAN frame")
+    identifier, flags = _CAN_HEADER.unpack_from(data)
+    return CanFrame(identifier, data[_CAN_HEADER.size :], bool(flags & _EXTENDED_FLAG), bool(flags & _ERROR_FLAG))
 
-    name = "modbus"
 
-    def pack(self, unit: ModbusUnit) -> bytes:
-        """Return the bytes of a unit."""
-        fields = {each.name: getattr(unit, each.name) for each in dataclasses.fields(unit)}
-        return json.dumps([type(unit).__name__, fields], default=lambda each: each.value).encode()
+def _pack_modbus(unit: ModbusUnit) -> bytes:
+    fields = {each.name: getattr(unit, each.name) for each in dataclasses.fields(unit)}
+    return json.dumps([type(unit).__name__, fields], default=lambda each: each.value).encode()
 
-    def unpack(self, data: bytes) -> ModbusUnit:
-        """Return the unit of bytes. Raises ValueError for bytes that are none."""
-        try:
-            name, fields = json.loads(data)
-            kind = _MODBUS_TYPES[name]
-            unit: ModbusUnit = get_adapter(kind).validate_python(fields)
-        except (TypeError, KeyError) as error:
-            raise ValueError(f"no Modbus unit: {error}") from None
-        return unit
+
+def _unpack_modbus(data: bytes) -> ModbusUnit:
+    try:
+        name, fields = json.loads(data)
+        unit: ModbusUnit = get_adapter(_MODBUS_TYPES[name]).validate_python(fields)
+    except (TypeError, KeyError) as error:
+        raise ValueError(f"no Modbus unit: {error}") from None
+    return unit
 
 
 _MODBUS_TYPES: Mapping[str, Any] = {kind.__name__: kind for kind in get_args(ModbusUnit)}
+
+CAN_CODEC = UnitCodec("can", _pack_frame, _unpack_frame)
+"""The identifier, 4 bytes, most significant first; flags, 1 byte (1 extended, 2 error); the data."""
+
+MODBUS_CODEC = UnitCodec("modbus", _pack_modbus, _unpack_modbus)
+"""JSON of the unit's kind and fields."""
 
 
 def make_codec(settings: DriverSettings) -> UnitCodec[Any]:
     """Return how the units of a driver's line are recorded."""
     if isinstance(settings.line, CanSettings):
-        return CanFrameCodec()
-    return ModbusCodec() if isinstance(settings.line, ModbusSettings) else BytesCodec()
+        return CAN_CODEC
+    return MODBUS_CODEC if isinstance(settings.line, ModbusSettings) else BYTES_CODEC
 
 
 def make_link(settings: DriverSettings) -> Link[Any]:

@@ -37,32 +37,15 @@ MAX_LINE = 1 << 20
 """Characters; longer lines are damage."""
 
 
-class UnitCodec(Protocol[U]):
-    """Codec of a kind of unit."""
+class UnitCodec(NamedTuple, Generic[U]):
+    """How a kind of unit is recorded. `unpack` raises ValueError for bytes that are no unit."""
 
     name: str
-
-    def pack(self, unit: U) -> bytes:
-        """Return the bytes of a unit."""
-        ...
-
-    def unpack(self, data: bytes) -> U:
-        """Return the unit of bytes. Raises ValueError for bytes that are none."""
-        ...
+    pack: Callable[[U], bytes]
+    unpack: Callable[[bytes], U]
 
 
-class BytesCodec:
-    """Bytes as they are."""
-
-    name = "bytes"
-
-    def pack(self, unit: bytes) -> bytes:
-        """Return them."""
-        return unit
-
-    def unpack(self, data: bytes) -> bytes:
-        """Return them."""
-        return data
+BYTES_CODEC: UnitCodec[bytes] = UnitCodec("bytes", bytes, bytes)
 
 
 class RecordDirection(StrEnum):
@@ -258,30 +241,30 @@ class RecordingLink(LinkWrapper[U]):
         """Open the line. Raises LinkError."""
         self._link.open(baud)
         self._is_open = True
-        self._record_event(f"open {self.description} {self.baud}")
+        self._record(RecordDirection.EVENT, f"open {self.description} {self.baud}".encode())
 
     def close(self) -> None:
         """Close the line."""
         self._link.close()
         # one that cannot be opened is closed each time that it was tried
         if self._is_open:
-            self._record_event("close")
+            self._record(RecordDirection.EVENT, b"close")
         self._is_open = False
 
     def poll(self, timeout: float) -> Sequence[U]:
         """Return received units. Raises LinkError."""
         units = self._link.poll(timeout)
         for unit in units:
-            self._writer.record(RecordDirection.RECEIVED, self._time_source.now(), self._codec.pack(unit))
+            self._record(RecordDirection.RECEIVED, self._codec.pack(unit))
         return units
 
     def send(self, unit: U) -> None:
         """Send a unit. Raises LinkError."""
         self._link.send(unit)
-        self._writer.record(RecordDirection.SENT, self._time_source.now(), self._codec.pack(unit))
+        self._record(RecordDirection.SENT, self._codec.pack(unit))
 
-    def _record_event(self, text: str) -> None:
-        self._writer.record(RecordDirection.EVENT, self._time_source.now(), text.encode())
+    def _record(self, way: RecordDirection, data: bytes) -> None:
+        self._writer.record(way, self._time_source.now(), data)
 
 
 class ReplayLink(Generic[U]):

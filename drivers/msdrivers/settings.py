@@ -118,7 +118,7 @@ class SectionReader(SettingsReader):
         if not any(key in self.section for key in firsts):
             known = [*list_keys(*kind.lines), *more]
             for key in [each for each in self.section if each not in known]:
-                if not firsts.keys().isdisjoint(self._suggest_key(key, known)):
+                if not firsts.keys().isdisjoint(self._suggest((key,), known)):
                     self._report_misspelled(key, known)
         given = [key for key in firsts if key in self.section]
         if len(given) == 1:
@@ -148,18 +148,16 @@ class SectionReader(SettingsReader):
             else:
                 self._report_misspelled(key, known)
 
-    def _suggest_key(self, key: str, known: list[str]) -> Suggestion:
-        """Return the key that one of the section misspells; one that is given already is not what was meant."""
-        return self._suggest_at((key,), [each for each in known if each not in self.section])
-
-    def _suggest_at(self, path: Path_, known: list[str]) -> Suggestion:
-        """Return the key that an unknown one at a path had become, or misspells."""
+    def _suggest(self, path: Path_, known: list[str]) -> Suggestion:
+        """Return the key that an unknown one at a path had become, or misspells; none that is given already."""
+        given = get_value(self.section, path[:-1])
+        known = [each for each in known if not isinstance(given, dict) or each not in given]
         renamed = find_renamed_key(".".join(map(str, ("drivers", self.name, *path))))
         return Suggestion.of(str(path[-1]), renamed) if renamed in known else suggest_key(str(path[-1]), known)
 
     def _report_misspelled(self, key: str, known: list[str]) -> None:
         """Report an unknown key; its value is that of the key that is meant, which is not missing then."""
-        near = self._suggest_key(key, known)
+        near = self._suggest((key,), known)
         fix = f"write {near[0]}" if near else f"known here: {', '.join(dict.fromkeys(known))}"
         self.report(key, f"unknown key {quote(key)}", fix, near)
         if near:
@@ -193,12 +191,9 @@ class SectionReader(SettingsReader):
             message, fix = f"{last} is missing", f"add a line: {last}: ..."
         elif detail["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
             known = list_known_keys(self.schema, at[:-1])
-            given = get_value(self.section, at[:-1])
-            near = self._suggest_at(at, [each for each in known if not isinstance(given, dict) or each not in given])
-            message, fix = (
-                f"unknown key {quote(last)}",
-                f"write {near[0]}" if near else f"known here: {', '.join(known)}",
-            )
+            near = self._suggest(at, known)
+            fix = f"write {near[0]}" if near else f"known here: {', '.join(known)}"
+            message = f"unknown key {quote(last)}"
         elif detail["type"] == "value_error":
             # found by the section as a whole; the message begins with the key that it is about
             message = str(detail["msg"]).removeprefix("Value error, ")
@@ -279,7 +274,7 @@ def read_drivers(
 ) -> tuple[dict[str, DriverSettings], tuple[Problem, ...]]:
     """Return the settings of every driver of which nothing is wrong, by its name; and every problem of the others."""
     source_map = source_map or SourceMap()
-    problems = [make_empty_section_problem(name, source_map) for name in find_empty_sections(sections, source_map)]
+    problems = [*find_empty_sections(sections, source_map).values()]
     found = {}
     for name, section in sections.items():
         try:
@@ -289,16 +284,14 @@ def read_drivers(
     return found, tuple(problems)
 
 
-def find_empty_sections(sections: Mapping[str, object], place: SourceMap) -> list[str]:
-    """Return the names of drivers whose section is empty, which the parser leaves out."""
-    named = [path[1] for path in place.lines if len(path) == 2 and path[0] == "drivers"]
-    return [str(name) for name in named if name not in sections]
-
-
-def make_empty_section_problem(name: str, place: SourceMap) -> Problem:
-    """Return the problem of a driver that has a name and nothing else."""
-    message, fix = f"drivers.{name} is empty: device is missing", "add a line: device: ..., or take the name out"
-    return Problem(Severity.ERROR, message, place.locate("drivers", name), fix)
+def find_empty_sections(sections: Mapping[str, object], place: SourceMap) -> dict[str | int, Problem]:
+    """Return the problems of drivers whose section is empty, which the parser leaves out, by name."""
+    fix = "add a line: device: ..., or take the name out"
+    return {
+        path[1]: Problem(Severity.ERROR, f"{path[0]}.{path[1]} is empty: device is missing", place.locate(*path), fix)
+        for path in place.lines
+        if len(path) == 2 and path[0] == "drivers" and path[1] not in sections
+    }
 
 
 def read_driver(

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 
 from modelserver.errors import RecordingError
 from msdrivers.endpoint import HostTime
-from msdrivers.factory import CanFrameCodec, ModbusCodec
+from msdrivers.factory import CAN_CODEC, MODBUS_CODEC
 from msdrivers.links import EndOfRecordingError, LinkError
 from msdrivers.links.fake import FakeLink, FakeTimeSource
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.modbus.registers import FailureKind, ModbusFailure, ReadRegisters, Registers, RegisterTable
 from msdrivers.raw_log import (
-    BytesCodec,
+    BYTES_CODEC,
     RawReader,
     RawWriter,
     RecordDirection,
@@ -36,7 +36,7 @@ def make_recording(limit: int = 1 << 20) -> tuple[str, RawWriter]:
     writer = RawWriter(stream, limit, "x")
     writer.begin("bytes", "gps", "novatel")
     units = [(start + 0.5, b"one"), (start + 0.75, b"two"), (start + 3.0, b"\x00\xff")]
-    link = RecordingLink(FakeLink(time, units), BytesCodec(), writer, time)
+    link = RecordingLink(FakeLink(time, units), BYTES_CODEC, writer, time)
     link.open(38400)
     link.send(b"log")
     while time.monotonic_ns * 1e-9 < start + 4.0:
@@ -66,7 +66,7 @@ def test_given_a_line_when_recorded_then_all_of_it_stands_there_with_times() -> 
 def test_given_a_recording_when_played_then_units_come_as_long_after_each_other_and_then_it_ends() -> None:
     text, _ = make_recording()
     time = FakeTimeSource(monotonic_ns=77_000_000_000)
-    link = ReplayLink(RawReader(io.StringIO(text), "x"), BytesCodec().unpack, time)
+    link = ReplayLink(RawReader(io.StringIO(text), "x"), BYTES_CODEC.unpack, time)
     link.open()
     received = []
     while len(received) < 3:
@@ -109,7 +109,7 @@ def test_given_a_limit_then_the_recording_is_no_larger_and_whole() -> None:
 def played_out(lines: list[str]) -> Exception:
     """Return how the playing of a recording with these lines ends."""
     text = "".join(["# modelserver raw 1 can wheels wheels\n", *lines])
-    link = ReplayLink(RawReader(io.StringIO(text), "w.raw"), CanFrameCodec().unpack, FakeTimeSource())
+    link = ReplayLink(RawReader(io.StringIO(text), "w.raw"), CAN_CODEC.unpack, FakeTimeSource())
     try:
         while True:
             link.poll(10.0)
@@ -153,7 +153,7 @@ def test_given_a_full_disk_then_the_recording_ends_it_is_reported_once_and_the_l
     writer = RawWriter(FullDisk(2), 1 << 20, "gps.raw")
     writer.begin("bytes", "gps", "novatel")
     time = FakeTimeSource()
-    link = RecordingLink(FakeLink(time, [(1.5, b"one"), (1.6, b"two")]), BytesCodec(), writer, time)
+    link = RecordingLink(FakeLink(time, [(1.5, b"one"), (1.6, b"two")]), BYTES_CODEC, writer, time)
     link.open()
     assert [*link.poll(1.0), *link.poll(1.0)] == [b"one", b"two"]
     link.send(b"log")
@@ -218,7 +218,7 @@ def test_given_a_line_that_cannot_be_opened_then_nothing_is_recorded() -> None:
     stream, time = io.StringIO(), FakeTimeSource()
     link = FakeLink[bytes](time)
     link.outages = [(0.0, 1e9)]
-    recorded_link = RecordingLink(link, BytesCodec(), RawWriter(stream, 1 << 20), time)
+    recorded_link = RecordingLink(link, BYTES_CODEC, RawWriter(stream, 1 << 20), time)
     for _ in range(3):
         with pytest.raises(LinkError):
             recorded_link.open()
@@ -246,7 +246,7 @@ def test_given_another_file_then_it_is_no_recording(text: str, tmp_path: Path) -
     [CanFrame(0x123, b"\x01\x02"), CanFrame(0x1FFFFFFF, b"", is_extended=True), CanFrame(0x40, is_error=True)],
 )
 def test_given_a_can_frame_then_its_form_keeps_all_of_it(frame: CanFrame) -> None:
-    assert CanFrameCodec().unpack(CanFrameCodec().pack(frame)) == frame
+    assert CAN_CODEC.unpack(CAN_CODEC.pack(frame)) == frame
 
 
 @pytest.mark.parametrize(
@@ -258,12 +258,12 @@ def test_given_a_can_frame_then_its_form_keeps_all_of_it(frame: CanFrame) -> Non
     ],
 )
 def test_given_a_modbus_unit_then_its_form_keeps_all_of_it(unit: ReadRegisters | Registers | ModbusFailure) -> None:
-    assert ModbusCodec().unpack(ModbusCodec().pack(unit)) == unit
+    assert MODBUS_CODEC.unpack(MODBUS_CODEC.pack(unit)) == unit
 
 
 @given(st.binary(max_size=40))
 def test_given_any_bytes_then_a_form_rejects_or_takes_them(data: bytes) -> None:
-    for form in (CanFrameCodec(), ModbusCodec()):
+    for form in (CAN_CODEC, MODBUS_CODEC):
         try:
             form.unpack(data)
         except ValueError:

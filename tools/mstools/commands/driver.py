@@ -206,14 +206,14 @@ def load_driver(
     """
     from modelserver.config.vehicle_file import load_config, read_config_lines
     from msdrivers.registry import KINDS
-    from msdrivers.settings import SourceMap, find_empty_sections, make_empty_section_problem, read_driver
+    from msdrivers.settings import SourceMap, find_empty_sections, read_driver
 
     vehicle = load_config(config)
     place = SourceMap(str(config), read_config_lines(config))
     if name in vehicle.drivers:
         return vehicle, read_driver(name, vehicle.drivers[name], place, kinds or KINDS)
-    if name in find_empty_sections(vehicle.drivers, place):
-        raise ConfigError([make_empty_section_problem(name, place)])
+    if problem := find_empty_sections(vehicle.drivers, place).get(name):
+        raise ConfigError([problem])
     if not vehicle.drivers:
         raise ModelServerError(f"{config} has no section drivers; see docs/vehicle-file.md")
     known = f"{config} has: {', '.join(vehicle.drivers)}"
