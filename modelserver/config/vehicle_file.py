@@ -23,8 +23,6 @@ from modelserver.files.kinds import FileKind, detect_file_kind, format_conversio
 from modelserver.files.regular import NotRegularFileError, read_start
 from modelserver.messages import Mode
 
-_STRICT: ConfigDict = {"extra": "forbid", "allow_inf_nan": False}
-
 MAX_CHANNEL = 39
 """Characters of a sensor's channel: LCM allows 63, and a prefix has up to 24."""
 
@@ -35,39 +33,33 @@ MAX_LATENCY = 5.0
 """Seconds: the localization retains the past for no longer."""
 
 
-def _check_ranges(section: object, *ranges: tuple[str, float, float]) -> list[str]:
-    """Return a problem for each setting of a section that is out of its range."""
-    return [
-        f"{name} is between {low:g} and {high:g}, got {getattr(section, name):g}"
-        for name, low, high in ranges
-        if not low <= getattr(section, name) <= high
-    ]
+def _check(section: object, *problems: str, channel: str = "", **ranges: tuple[float, float]) -> None:
+    """Raise ValueError, with a line for each of the `problems`, if there are any.
 
-
-def _check_channel(channel: str, key: str = "channel") -> list[str]:
-    if 0 < len(channel) <= MAX_CHANNEL and channel.isascii() and channel.isprintable() and " " not in channel:
-        return []
-    return [f"{key} has 1 to {MAX_CHANNEL} printable ASCII characters, no spaces, got {quote(channel)}"]
-
-
-def _check_latency(latency: float) -> list[str]:
-    if 0.0 <= latency <= MAX_LATENCY:
-        return []
-    hint = f": {latency:g} ms is {latency * 1e-3:g}" if latency > MAX_LATENCY else ""
-    return [f"latency is between 0 and {MAX_LATENCY:g} seconds, got {latency:g}{hint}"]
-
-
-def _raise_problems(problems: Iterable[str]) -> None:
-    """Raise ValueError with all problems, one per line, if there are any."""
-    if text := "\n".join(problems):
-        raise ValueError(text)
+    Further problems are the settings out of their `ranges`, the `latency`, and the `channel` if that is a key.
+    """
+    found = list(problems)
+    if channel:
+        name = getattr(section, channel)
+        if not (0 < len(name) <= MAX_CHANNEL and name.isascii() and name.isprintable() and " " not in name):
+            found.append(f"{channel} has 1 to {MAX_CHANNEL} printable ASCII characters, no spaces, got {quote(name)}")
+    latency = getattr(section, "latency", 0.0)
+    if not 0.0 <= latency <= MAX_LATENCY:
+        hint = f": {latency:g} ms is {latency * 1e-3:g}" if latency > MAX_LATENCY else ""
+        found.append(f"latency is between 0 and {MAX_LATENCY:g} seconds, got {latency:g}{hint}")
+    for key, (low, high) in ranges.items():
+        value = getattr(section, key)
+        if not low <= value <= high:
+            digits = "" if isinstance(value, int) else "g"
+            found.append(f"{key} is between {low:{digits}} and {high:{digits}}, got {value:{digits}}")
+    if found:
+        raise ValueError("\n".join(found))
 
 
 @dataclass(frozen=True, slots=True)
 class LcmConfig:
     """The message bus."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     url: str = ""
     """LCM provider. ttl=0 limits traffic to this machine; empty: $LCM_DEFAULT_URL, else loopback."""
     channel_prefix: str = ""
@@ -83,14 +75,13 @@ class LcmConfig:
         ]
         if not self.reply_prefix:
             problems.append("reply_prefix must not be empty: with it no request can make the server publish on POSE")
-        _raise_problems(problems)
+        _check(self, *problems)
 
 
 @dataclass(frozen=True, slots=True)
 class PublishConfig:
     """What the service publishes, and when."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     mode: Literal["timer", "event"] = "timer"
     """`timer` publishes POSE at `rate_hz`; `event` at every accepted sample of the IMU or the GPS."""
     rate_hz: float = 50.0
@@ -105,15 +96,13 @@ class PublishConfig:
     """Seconds between publications of the whole geometry, for mirrors and logs that start later."""
 
     def __post_init__(self) -> None:
-        ranges = (("rate_hz", 0.1, 1000.0), ("health_hz", 0.01, 100.0), ("state_hz", 0.0, 50.0))
-        _raise_problems(_check_ranges(self, *ranges, ("snapshot_s", 0.5, 3600.0)))
+        _check(self, rate_hz=(0.1, 1000.0), health_hz=(0.01, 100.0), state_hz=(0.0, 50.0), snapshot_s=(0.5, 3600.0))
 
 
 @dataclass(frozen=True, slots=True)
 class SensorConfig:
     """A sensor: its channel, and the frame of the geometry at which it is mounted."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     channel: str
     """Channel of its samples."""
     frame: str
@@ -122,14 +111,13 @@ class SensorConfig:
     """Seconds by which its stamps are later than the measurement; subtracted from each stamp."""
 
     def __post_init__(self) -> None:
-        _raise_problems(_check_channel(self.channel) + _check_latency(self.latency))
+        _check(self, channel="channel")
 
 
 @dataclass(frozen=True, slots=True)
 class GpsConfig(SensorConfig):
     """The GNSS receiver."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     second_frame: str = ""
     """Frame of the other antenna of a dual-antenna receiver."""
 
@@ -138,7 +126,6 @@ class GpsConfig(SensorConfig):
 class SteeringConfig:
     """Source of the angle of steered wheels that do not measure it themselves."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     wheels: tuple[str, ...]
     """Names of the wheels in `frames` that steer by the controller's steering_angle."""
     channel: str = "VEHICLE_STATUS"
@@ -156,18 +143,15 @@ class SteeringConfig:
     """Seconds by which the stamps are later than the measurement; subtracted from each stamp."""
 
     def __post_init__(self) -> None:
-        problems = _check_channel(self.channel) + _check_latency(self.latency)
-        if not self.wheels:
-            problems.append("wheels names the wheels that steer, e.g. [front_left, front_right]; got none")
-        ranges = (("sigma", 1e-4, 0.5), ("limit", 0.05, 1.5), ("max_age", 0.01, 10.0))
-        _raise_problems(problems + _check_ranges(self, *ranges))
+        none = ["wheels names the wheels that steer, e.g. [front_left, front_right]; got none"]
+        problems = [] if self.wheels else none
+        _check(self, *problems, channel="channel", sigma=(1e-4, 0.5), limit=(0.05, 1.5), max_age=(0.01, 10.0))
 
 
 @dataclass(frozen=True, slots=True)
 class WheelsConfig:
     """The wheel odometry."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     channel: str = "WHEELS"
     """Channel of its samples."""
     frames: dict[str, str] = field(default_factory=dict)
@@ -182,14 +166,13 @@ class WheelsConfig:
     """Seconds by which the stamps are later than the measurement; subtracted from each stamp."""
 
     def __post_init__(self) -> None:
-        _raise_problems(_check_channel(self.channel) + _check_latency(self.latency))
+        _check(self, channel="channel")
 
 
 @dataclass(frozen=True, slots=True)
 class AidingConfig:
     """A further source of measurements. Its messages name their frames."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     channel: str
     """Channel of its messages."""
     type: Literal["absolute_pose", "relative_pose", "range"]
@@ -198,28 +181,26 @@ class AidingConfig:
     """Seconds by which its stamps are later than the measurement; subtracted from each stamp."""
 
     def __post_init__(self) -> None:
-        _raise_problems(_check_channel(self.channel) + _check_latency(self.latency))
+        _check(self, channel="channel")
 
 
 @dataclass(frozen=True, slots=True)
 class JointsConfig:
     """The joint positions, received if the geometry has joints that move."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     channel: str = "JOINTS"
     """Channel on which the drivers publish them."""
     latency: float = 0.0
     """Seconds by which the stamps are later than the measurement; subtracted from each stamp."""
 
     def __post_init__(self) -> None:
-        _raise_problems(_check_channel(self.channel) + _check_latency(self.latency))
+        _check(self, channel="channel")
 
 
 @dataclass(frozen=True, slots=True)
 class SensorsConfig:
     """The sensors. Their mounting poses are in the geometry file alone."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     gps: GpsConfig | None = None
     imu: SensorConfig | None = None
     wheels: WheelsConfig | None = None
@@ -249,7 +230,6 @@ class SensorsConfig:
 class OriginConfig:
     """The origin of World:UTM. Without a configured one it is captured from the first good fixes."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     initial_utm: tuple[float, float, float] | None = None
     """Grid easting, grid northing, height above the ellipsoid, meters: a datum that several runs share."""
     zone: int | None = None
@@ -271,7 +251,6 @@ class OriginConfig:
 class LocalizationConfig:
     """How the pose is estimated."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     mode: Literal["full", "raw", "no_imu", "no_wheels", "no_gps", "dead_reckoning"] = "full"
     """The sources that are used from the start, see `modelserver.messages.Mode`."""
     mode_channel: str = ""
@@ -281,8 +260,7 @@ class LocalizationConfig:
     magnetometer: MagnetometerCalibration = field(default_factory=MagnetometerCalibration)
 
     def __post_init__(self) -> None:
-        if self.mode_channel:
-            _raise_problems(_check_channel(self.mode_channel, "mode_channel"))
+        _check(self, channel="mode_channel" if self.mode_channel else "")
 
     @property
     def initial_mode(self) -> Mode:
@@ -294,7 +272,6 @@ class LocalizationConfig:
 class LimitsConfig:
     """Memory and processing time for requests, bounded so that no client can starve the pose."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     history_s: float = 60.0
     """Seconds of poses stored for queries about the past, at most 600."""
     waiting_requests: int = 64
@@ -313,20 +290,21 @@ class LimitsConfig:
     """Bytes per second of long replies (many transformations, history) to each client."""
 
     def __post_init__(self) -> None:
-        problems = _check_ranges(self, ("client_hz", 1.0, 100_000.0), ("request_share", 0.0, 1.0))
+        problems = []
         if not 1e4 <= self.client_reply_bytes <= 1e9:
             problems.append(f"client_reply_bytes is between 10000 and 1e9, got {self.client_reply_bytes:g}")
         if not 0.0 < self.history_s <= 600.0:
             problems.append(f"history_s is above 0 and at most 600, got {self.history_s:g}")
-        for name, low, high in (
-            ("waiting_requests", 0, 4096),
-            ("wait_ms", 0, 60_000),
-            ("queued_requests", 1, 65536),
-            ("requests_per_pass", 1, 1024),
-        ):
-            if not low <= getattr(self, name) <= high:
-                problems.append(f"{name} is between {low} and {high}, got {getattr(self, name)}")
-        _raise_problems(problems)
+        _check(
+            self,
+            *problems,
+            client_hz=(1.0, 100_000.0),
+            request_share=(0.0, 1.0),
+            waiting_requests=(0, 4096),
+            wait_ms=(0, 60_000),
+            queued_requests=(1, 65536),
+            requests_per_pass=(1, 1024),
+        )
 
 
 KEY_HINT = (
@@ -339,7 +317,6 @@ KEY_HINT = (
 class CommandsConfig:
     """Commands from the bus that change the state of the service. None is allowed by default."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     reload: bool = False
     """Whether the geometry file may be reloaded."""
     set_pose: bool = False
@@ -350,18 +327,14 @@ class CommandsConfig:
     """Greatest age of a signed message, seconds, by the vehicle's clock."""
 
     def __post_init__(self) -> None:
-        problems = _check_ranges(self, ("window_s", 0.1, 300.0))
-        if not self.key_file:
-            enabled = [name for name in ("reload", "set_pose") if getattr(self, name)]
-            problems += [f"{name} needs a key_file beside it: {KEY_HINT}" for name in enabled]
-        _raise_problems(problems)
+        enabled = [name for name in ("reload", "set_pose") if getattr(self, name) and not self.key_file]
+        _check(self, *(f"{name} needs a key_file beside it: {KEY_HINT}" for name in enabled), window_s=(0.1, 300.0))
 
 
 @dataclass(frozen=True, slots=True)
 class WarmStartConfig:
     """The state of the localization that is persisted in `state_directory`, and when the next start restores it."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     persist: bool = True
     """Whether the state of the localization is persisted."""
     period_s: float = 5.0
@@ -373,15 +346,13 @@ class WarmStartConfig:
     never."""
 
     def __post_init__(self) -> None:
-        ranges = (("period_s", 0.5, 600.0), ("max_age_s", 0.0, 31536000.0), ("max_pose_age_s", 0.0, 600.0))
-        _raise_problems(_check_ranges(self, *ranges))
+        _check(self, period_s=(0.5, 600.0), max_age_s=(0.0, 31536000.0), max_pose_age_s=(0.0, 600.0))
 
 
 @dataclass(frozen=True, slots=True)
 class JournalConfig:
     """The journal: everything that is received and sent, on disk; see docs/journal.md."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
     directory: str = ""
     """Its directory, relative to this file; empty: `journal-` and the vehicle's name in the state directory."""
     megabytes: int | None = None
@@ -395,14 +366,15 @@ class JournalConfig:
             problems.append(f"megabytes is 0 for no journal, or 32 to 1000000, got {self.megabytes}")
         if not 0.2 <= self.sync_s <= 60.0:
             problems.append(f"sync_s is between 0.2 and 60 seconds, got {self.sync_s:g}")
-        _raise_problems(problems)
+        _check(self, *problems)
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleConfig:
     """A vehicle: its geometry, its sensors, and the settings of its service."""
 
-    __pydantic_config__: ClassVar[ConfigDict] = _STRICT
+    __pydantic_config__: ClassVar[ConfigDict] = {"extra": "forbid", "allow_inf_nan": False}
+    # of all sections too: pydantic passes it on
     vehicle: str
     """Name of the vehicle."""
     geometry: str
@@ -501,11 +473,12 @@ NOT_A_VEHICLE_FILE = "not a vehicle file"
 
 _START_HINT = "start with: vehicle, geometry, base_frame; docs/vehicle-file.md has an example"
 _MODEL_HINT = "query, bodies and frames take it with --model"
+_GEOMETRY_HINT = f"give the vehicle file, which names it (geometry: {{name}}); {_MODEL_HINT}"
 _FIXES: dict[FileKind, str] = {
     FileKind.EMPTY: _START_HINT,
     FileKind.COMMENTS: _START_HINT,
-    FileKind.GEOMETRY: f"give the vehicle file, which names it (geometry: {{name}}); {_MODEL_HINT}",
-    FileKind.URDF: f"give the vehicle file, which names it (geometry: {{name}}); {_MODEL_HINT}",
+    FileKind.GEOMETRY: _GEOMETRY_HINT,
+    FileKind.URDF: _GEOMETRY_HINT,
     FileKind.MIRO_PROCESS: "convert it to a vehicle file: {command}",
     FileKind.XML: f"give the vehicle file, which is YAML; if this is a geometry file, {_MODEL_HINT}",
     FileKind.LOG: "give the vehicle file; a log is played by modelserver replay",
