@@ -31,6 +31,7 @@ from modelserver.messages import (
 from modelserver.query import WORLD_FRAMES, PlatformView
 from modelserver.query.answers import compute_answer
 from modelserver.query.batch import lookup_batch
+from modelserver.query.steps import complete
 from modelserver.wire.fields import MAX_UTIME, check_not_negative, check_utime, read_enum
 
 IN_HISTORY: Final = TimeQuery(1)
@@ -100,7 +101,10 @@ class LocalPlatform(PlatformClient):
         chunks = np.split(utimes, range(MAX_REQUEST_INSTANTS, len(utimes), MAX_REQUEST_INSTANTS))
         return [
             concatenate(
-                [lookup_batch(view, *pair, chunk, reference_at, fixed_frame, covariance, now) for chunk in chunks]
+                [
+                    complete(lookup_batch(view, *pair, chunk, reference_at, fixed_frame, covariance, now))
+                    for chunk in chunks
+                ]
             )
             for pair in pairs
         ]

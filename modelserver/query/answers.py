@@ -44,7 +44,7 @@ from modelserver.messages import (
     TransformReply,
 )
 from modelserver.query import HISTORY_LIMIT, PlatformView
-from modelserver.query.batch import lookup_batch_in_steps
+from modelserver.query.batch import lookup_batch
 from modelserver.query.explanation import explain
 from modelserver.query.motion import compute_motion
 from modelserver.query.steps import Steps, complete
@@ -135,7 +135,7 @@ def _get_state_vector(view: PlatformView, request: GetStateVector, header: Reply
 
 def _get_history(view: PlatformView, request: GetHistory, header: ReplyHeader) -> Steps[list[Reply]]:
     span = (request.start_utime, request.end_utime, request.rate_hz)
-    return [HistoryReply(header, (yield from view.vehicle_history_in_steps(*span)))]
+    return [HistoryReply(header, (yield from view.vehicle_history(*span)))]
 
 
 def _get_body_list(view: PlatformView, request: GetBodyList, header: ReplyHeader) -> Reply:
@@ -158,7 +158,7 @@ def _get_transformations(view: PlatformView, request: GetTransformations, header
     utimes = np.array(request.at, dtype=np.int64)
     parts: list[tuple[int, int, PoseBatch]] = []
     for number, (interest, reference) in enumerate(request.pairs):
-        poses = yield from lookup_batch_in_steps(
+        poses = yield from lookup_batch(
             view,
             interest,
             reference,

@@ -31,7 +31,7 @@ from modelserver.query.batch_links import (
     odom_drift_factors,
 )
 from modelserver.query.path import PathState, lookup_path
-from modelserver.query.steps import Steps, complete
+from modelserver.query.steps import Steps
 from modelserver.query.view import PlatformView
 from modelserver.query.world_frames import WORLD_FRAMES, check_not_reserved
 from modelserver.transforms import chain
@@ -41,20 +41,6 @@ from modelserver.transforms.so3 import Array
 
 
 def lookup_batch(
-    view: PlatformView,
-    interest: str,
-    reference: str,
-    utimes: Times,
-    reference_at: int = 0,
-    fixed: str = "",
-    with_covariance: bool = True,
-    now: int = 0,
-) -> PoseBatch:
-    """Return the result of `lookup_batch_in_steps` at once."""
-    return complete(lookup_batch_in_steps(view, interest, reference, utimes, reference_at, fixed, with_covariance, now))
-
-
-def lookup_batch_in_steps(
     view: PlatformView,
     interest: str,
     reference: str,

@@ -48,7 +48,7 @@ from modelserver.messages import (
     TimeQuery,
 )
 from modelserver.query.joint_lookup import NO_READINGS, JointReadings, find_tracks, lookup_joints
-from modelserver.query.steps import Steps, complete
+from modelserver.query.steps import Steps
 from modelserver.query.world_frames import (
     WORLD_FRAMES,
     check_not_reserved,
@@ -201,14 +201,8 @@ class PlatformView:
         """Return the base frame's pose in World:UTM; as `transformation`."""
         return self.transformation(self.base_frame, names.WORLD_UTM, time, now)
 
-    def vehicle_history(self, start_utime: int, end_utime: int, rate_hz: float) -> tuple[PoseAnswer, ...]:
-        """Return the result of `vehicle_history_in_steps` at once."""
-        return complete(self.vehicle_history_in_steps(start_utime, end_utime, rate_hz))
-
-    def vehicle_history_in_steps(
-        self, start_utime: int, end_utime: int, rate_hz: float
-    ) -> Steps[tuple[PoseAnswer, ...]]:
-        """Return the base frame's poses in World:UTM at a constant rate; times outside the history are omitted.
+    def vehicle_history(self, start_utime: int, end_utime: int, rate_hz: float) -> Steps[tuple[PoseAnswer, ...]]:
+        """Return in steps the base frame's poses in World:UTM at a constant rate, without times outside the history.
 
         Raises MalformedRequestError for a range that ends before it starts or a rate that is not positive, LimitError
         for too many poses, NoPoseError.

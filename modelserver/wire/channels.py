@@ -40,145 +40,73 @@ class Channel:
     about: str
 
 
+def _channels(use: ChannelUse, *rows: tuple[str, str, str, str]) -> tuple[Channel, ...]:
+    """Return channels of one purpose, from name, message type, rate and description."""
+    return tuple(Channel(name, type_name, use, rate, about) for name, type_name, rate, about in rows)
+
+
+def _request(name: str, question: str, reply: str) -> tuple[str, str, str, str]:
+    return (name, f"{question}_request_t", "on demand", f"answered by {reply}")
+
+
+REQUESTS = _channels(
+    ChannelUse.REQUEST,
+    _request("PLATFORM_GET_TRANSFORMATION", "get_transformation", "get_transformation_reply_t"),
+    _request("PLATFORM_GET_BODY_LIST", "get_body_list", "name_list_reply_t"),
+    _request("PLATFORM_GET_BODY_FRAME_LIST", "get_body_frame_list", "name_list_reply_t"),
+    _request("POSE_GET_STATE_VECTOR", "get_state_vector", "get_state_vector_reply_t"),
+    _request("POSE_GET_H_TRANSFORM", "get_h_transform", "get_transformation_reply_t"),
+    _request("POSE_GET_HISTORY", "get_history", "get_history_reply_t"),
+    _request("PLATFORM_GET_TRANSFORMATIONS", "get_transformations", "get_transformations_reply_t, in parts"),
+    _request("PLATFORM_GET_MOTION", "get_motion", "get_motion_reply_t"),
+    _request("PLATFORM_GET_EXPLANATION", "get_explanation", "get_explanation_reply_t"),
+    _request("PLATFORM_RELOAD_MODEL", "reload_model", "reload_model_reply_t; where allowed"),
+    _request("POSE_SET_STATE_VECTOR", "set_state_vector", "acknowledgement_t; where allowed"),
+    _request("POSE_SET_H_TRANSFORM", "set_h_transform", "acknowledgement_t; where allowed"),
+)
+
 CHANNELS = (
-    Channel("GPS", "gps_t", ChannelUse.SENSOR, "1-20 Hz", "fixes of the satellite receiver"),
-    Channel("IMU", "imu_t", ChannelUse.SENSOR, "30-200 Hz", "rates, specific force, field, own orientation"),
-    Channel("WHEELS", "wheels_t", ChannelUse.SENSOR, "10-100 Hz", "travel, speed and direction of each wheel"),
-    Channel("JOINTS", "joints_t", ChannelUse.SENSOR, "50 Hz and more", "positions and rates of joints"),
-    Channel(
-        "ABSOLUTE_POSE",
-        "absolute_pose_t",
+    *_channels(
         ChannelUse.SENSOR,
-        "as they come",
-        "poses in the world by other means than GPS",
+        ("GPS", "gps_t", "1-20 Hz", "fixes of the satellite receiver"),
+        ("IMU", "imu_t", "30-200 Hz", "rates, specific force, field, own orientation"),
+        ("WHEELS", "wheels_t", "10-100 Hz", "travel, speed and direction of each wheel"),
+        ("JOINTS", "joints_t", "50 Hz and more", "positions and rates of joints"),
+        ("ABSOLUTE_POSE", "absolute_pose_t", "as they come", "poses in the world by other means than GPS"),
+        ("RELATIVE_POSE", "relative_pose_t", "as they come", "motion between two instants, e.g. by visual odometry"),
+        ("RANGE", "range_t", "as they come", "distances to beacons at known positions"),
+        ("VEHICLE_STATUS", "vehicle_status_t", "1-20 Hz", "status of the vehicle controller"),
     ),
-    Channel(
-        "RELATIVE_POSE",
-        "relative_pose_t",
-        ChannelUse.SENSOR,
-        "as they come",
-        "motion between two instants, e.g. by visual odometry",
-    ),
-    Channel("RANGE", "range_t", ChannelUse.SENSOR, "as they come", "distances to beacons at known positions"),
-    Channel("VEHICLE_STATUS", "vehicle_status_t", ChannelUse.SENSOR, "1-20 Hz", "status of the vehicle controller"),
-    Channel(
-        "VEHICLE_COMMAND",
-        "vehicle_command_t",
+    *_channels(
         ChannelUse.COMMAND,
-        "10 Hz and more",
-        "commands to the vehicle controller",
+        ("VEHICLE_COMMAND", "vehicle_command_t", "10 Hz and more", "commands to the vehicle controller"),
+        ("LOCALIZATION_MODE", "localization_mode_t", "on demand", "which sources localization uses"),
+        (SIGNED, "signed_t", "on demand", "signed commands"),
     ),
-    Channel(
-        "LOCALIZATION_MODE", "localization_mode_t", ChannelUse.COMMAND, "on demand", "which sources localization uses"
-    ),
-    Channel("MODELSERVER_SIGNED", "signed_t", ChannelUse.COMMAND, "on demand", "signed commands"),
-    Channel("POSE", "pose_transform_t", ChannelUse.BROADCAST, "timer or event", "base frame in World:UTM"),
-    Channel("POSE_VECTOR", "pose_vector_t", ChannelUse.BROADCAST, "with POSE", "the same as a 7-vector"),
-    Channel(
-        "POSE_ODOM", "pose_transform_t", ChannelUse.BROADCAST, "with POSE", "base frame in Odom:Origin, never jumps"
-    ),
-    Channel(
-        "LOCALIZATION_DECISIONS",
-        "decisions_t",
+    *_channels(
         ChannelUse.BROADCAST,
-        "on sensor events",
-        "innovation tests: which measurements were used, and why",
+        ("POSE", "pose_transform_t", "timer or event", "base frame in World:UTM"),
+        ("POSE_VECTOR", "pose_vector_t", "with POSE", "the same as a 7-vector"),
+        ("POSE_ODOM", "pose_transform_t", "with POSE", "base frame in Odom:Origin, never jumps"),
+        (
+            "LOCALIZATION_DECISIONS",
+            "decisions_t",
+            "on sensor events",
+            "innovation tests: which measurements were used, and why",
+        ),
+        ("LOCALIZATION_STATE", "navigation_state_t", "timer, 5 Hz", "the filter's state"),
+        ("MODEL_SNAPSHOT", "model_snapshot_t", "at start, on change, every 5 s", "the geometry"),
+        ("JOINTS_HELD", "joints_t", "with MODEL_SNAPSHOT", "the newest reading of each joint"),
+        ("MODELSERVER_HEALTH", "health_t", "1 Hz, on change", "state, traffic, rejected input"),
     ),
-    Channel("LOCALIZATION_STATE", "navigation_state_t", ChannelUse.BROADCAST, "timer, 5 Hz", "the filter's state"),
-    Channel(
-        "MODEL_SNAPSHOT", "model_snapshot_t", ChannelUse.BROADCAST, "at start, on change, every 5 s", "the geometry"
-    ),
-    Channel("JOINTS_HELD", "joints_t", ChannelUse.BROADCAST, "with MODEL_SNAPSHOT", "the newest reading of each joint"),
-    Channel(
-        "MODELSERVER_HEALTH", "health_t", ChannelUse.BROADCAST, "1 Hz, on change", "state, traffic, rejected input"
-    ),
-    Channel(
-        "DRIVER_HEALTH",
-        "driver_health_t",
+    *_channels(
         ChannelUse.REPORT,
-        "1 Hz, on change",
-        "health of each driver: phase, rate, clock",
+        ("DRIVER_HEALTH", "driver_health_t", "1 Hz, on change", "health of each driver: phase, rate, clock"),
     ),
-    Channel(
-        "PLATFORM_GET_TRANSFORMATION",
-        "get_transformation_request_t",
-        ChannelUse.REQUEST,
-        "on demand",
-        "answered by get_transformation_reply_t",
-    ),
-    Channel(
-        "PLATFORM_GET_BODY_LIST",
-        "get_body_list_request_t",
-        ChannelUse.REQUEST,
-        "on demand",
-        "answered by name_list_reply_t",
-    ),
-    Channel(
-        "PLATFORM_GET_BODY_FRAME_LIST",
-        "get_body_frame_list_request_t",
-        ChannelUse.REQUEST,
-        "on demand",
-        "answered by name_list_reply_t",
-    ),
-    Channel(
-        "POSE_GET_STATE_VECTOR",
-        "get_state_vector_request_t",
-        ChannelUse.REQUEST,
-        "on demand",
-        "answered by get_state_vector_reply_t",
-    ),
-    Channel(
-        "POSE_GET_H_TRANSFORM",
-        "get_h_transform_request_t",
-        ChannelUse.REQUEST,
-        "on demand",
-        "answered by get_transformation_reply_t",
-    ),
-    Channel(
-        "POSE_GET_HISTORY", "get_history_request_t", ChannelUse.REQUEST, "on demand", "answered by get_history_reply_t"
-    ),
-    Channel(
-        "PLATFORM_GET_TRANSFORMATIONS",
-        "get_transformations_request_t",
-        ChannelUse.REQUEST,
-        "on demand",
-        "answered by get_transformations_reply_t, in parts",
-    ),
-    Channel(
-        "PLATFORM_GET_MOTION", "get_motion_request_t", ChannelUse.REQUEST, "on demand", "answered by get_motion_reply_t"
-    ),
-    Channel(
-        "PLATFORM_GET_EXPLANATION",
-        "get_explanation_request_t",
-        ChannelUse.REQUEST,
-        "on demand",
-        "answered by get_explanation_reply_t",
-    ),
-    Channel(
-        "PLATFORM_RELOAD_MODEL",
-        "reload_model_request_t",
-        ChannelUse.REQUEST,
-        "on demand",
-        "answered by reload_model_reply_t; where allowed",
-    ),
-    Channel(
-        "POSE_SET_STATE_VECTOR",
-        "set_state_vector_request_t",
-        ChannelUse.REQUEST,
-        "on demand",
-        "answered by acknowledgement_t; where allowed",
-    ),
-    Channel(
-        "POSE_SET_H_TRANSFORM",
-        "set_h_transform_request_t",
-        ChannelUse.REQUEST,
-        "on demand",
-        "answered by acknowledgement_t; where allowed",
-    ),
+    *REQUESTS,
 )
 
 BY_NAME = {channel.name: channel for channel in CHANNELS}
-REQUESTS = tuple(channel for channel in CHANNELS if channel.use is ChannelUse.REQUEST)
 
 
 def to_subscription_pattern(channel: str) -> str:

@@ -32,6 +32,7 @@ from modelserver.messages import NAN, Invalid, JointSample, JointsSample, Policy
 from modelserver.query import PlatformView
 from modelserver.query.batch import lookup_batch
 from modelserver.query.motion import compute_motion
+from modelserver.query.steps import complete
 
 
 def at(seconds: float) -> int:
@@ -366,7 +367,7 @@ def test_given_a_rotation_vector_that_wraps_then_it_takes_the_shorter_arc(kind: 
     for seconds, degrees in ((0.0, 179.0), (0.025, 179.5), (0.05, 180.0), (0.075, 180.5), (0.1, 181.0)):
         found = yaw(platform, TimeQuery(at(seconds)))
         assert math.remainder(found - degrees, 360.0) == pytest.approx(0.0, abs=1e-9)
-        column = lookup_batch(platform, "Head:Root", "Rover:Mast", np.array([at(seconds)])).vectors[0]
+        column = complete(lookup_batch(platform, "Head:Root", "Rover:Mast", np.array([at(seconds)]))).vectors[0]
         assert 2.0 * abs(math.degrees(math.atan2(column[6], column[3]))) == pytest.approx(
             degrees if column[3] * column[6] > 0 or degrees <= 180 else 360 - degrees, abs=1e-9
         )
@@ -394,7 +395,7 @@ def test_given_a_ball_whose_coordinates_have_different_times_then_each_is_interp
     platform = replace(platform, joints=update(platform.joints, 0.2, JointSample("J.rx", 0.0))[0])
     platform = replace(platform, joints=update(platform.joints, 0.2, JointSample("J.ry", 0.0))[0])
     assert yaw(platform, TimeQuery(at(0.05))) == pytest.approx(12.5)
-    column = lookup_batch(platform, "Head:Root", "Rover:Mast", np.array([at(0.05)])).vectors[0]
+    column = complete(lookup_batch(platform, "Head:Root", "Rover:Mast", np.array([at(0.05)]))).vectors[0]
     assert math.degrees(2.0 * math.atan2(column[6], column[3])) == pytest.approx(12.5)
 
 

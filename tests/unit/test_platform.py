@@ -24,6 +24,7 @@ from modelserver.estimation.history import History
 from modelserver.geometry import names
 from modelserver.messages import Invalid, Policy, PoseAnswer, Quality, TimeQuery
 from modelserver.query import HISTORY_LIMIT, PREDICTION_LIMIT_S, PlatformView
+from modelserver.query.steps import complete
 from modelserver.transforms import Pose, so3
 
 S = 1_000_000
@@ -238,7 +239,7 @@ def test_given_no_sensors_then_world_frames_report_that_the_vehicle_file_names_n
         with pytest.raises(NoPoseError, match="names no GPS and IMU"):
             ask(platform, interest, reference)
     with pytest.raises(NoPoseError, match="names no GPS and IMU"):
-        platform.vehicle_history(START, START + S, 1.0)
+        complete(platform.vehicle_history(START, START + S, 1.0))
 
 
 def test_given_no_sample_yet_then_there_is_no_pose_and_the_reasons_are_reported() -> None:
@@ -247,7 +248,7 @@ def test_given_no_sample_yet_then_there_is_no_pose_and_the_reasons_are_reported(
         with pytest.raises(NoPoseError, match="no usable GPS fix yet; no inertial sample yet"):
             ask(platform, CAMERA, UTM, time)
     with pytest.raises(NoPoseError, match="no usable GPS fix yet"):
-        platform.vehicle_history(START, START + S, 1.0)
+        complete(platform.vehicle_history(START, START + S, 1.0))
 
 
 def test_given_no_origin_yet_then_odom_answers_and_the_world_does_not() -> None:
@@ -385,44 +386,44 @@ def test_given_times_then_coverage_is_reported() -> None:
 
 
 def test_given_a_range_and_a_rate_then_the_times_are_even_and_only_held_ones_come() -> None:
-    answers = view(10).vehicle_history(START + 8 * S, START + 12 * S, 4.0)
+    answers = complete(view(10).vehicle_history(START + 8 * S, START + 12 * S, 4.0))
     assert [(each.transformation.utime - START) / S for each in answers] == [8 + n / 4 for n in range(9)]
     assert all(each.transformation.frame_of_reference == UTM for each in answers)
     assert all(each.transformation.frame_of_interest == BASE for each in answers)
 
 
 def test_given_a_range_of_one_instant_then_one_pose_comes() -> None:
-    assert len(view(10).vehicle_history(START + S, START + S, 50.0)) == 1
+    assert len(complete(view(10).vehicle_history(START + S, START + S, 50.0))) == 1
 
 
 def test_given_a_rate_that_divides_no_microsecond_then_the_times_do_not_drift() -> None:
-    answers = view(10).vehicle_history(START, START + 9 * S, 30.0)
+    answers = complete(view(10).vehicle_history(START, START + 9 * S, 30.0))
     assert len(answers) == 271
     assert answers[-1].transformation.utime == START + 9 * S
     assert answers[200].transformation.utime == START + round(200e6 / 30)
 
 
 def test_given_a_range_outside_what_is_held_then_nothing_comes() -> None:
-    assert view(10).vehicle_history(1, 1000, 1.0) == ()
+    assert complete(view(10).vehicle_history(1, 1000, 1.0)) == ()
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf"), 1e6, -float("inf")])
 def test_given_a_rate_that_cannot_be_then_the_request_is_malformed(rate: float) -> None:
     with pytest.raises(MalformedRequestError, match="rate_hz"):
-        view().vehicle_history(START, START + S, rate)
+        complete(view().vehicle_history(START, START + S, rate))
 
 
 def test_given_a_range_that_ends_before_it_starts_then_the_request_is_malformed() -> None:
     with pytest.raises(MalformedRequestError, match="before it starts"):
-        view().vehicle_history(START + 1, START, 1.0)
+        complete(view().vehicle_history(START + 1, START, 1.0))
 
 
 def test_given_more_poses_than_go_in_a_reply_then_the_limit_is_named() -> None:
     platform = view()
-    assert platform.vehicle_history(START, START + (HISTORY_LIMIT - 1) * 1000, 1000.0)
+    assert complete(platform.vehicle_history(START, START + (HISTORY_LIMIT - 1) * 1000, 1000.0))
     for end in (START + HISTORY_LIMIT * 1000, (1 << 61) - 1):
         with pytest.raises(LimitError, match="at most 1000"):
-            platform.vehicle_history(START, end, 1000.0)
+            complete(platform.vehicle_history(START, end, 1000.0))
 
 
 def test_given_sensors_that_went_silent_then_the_latest_pose_is_not_valid_any_more() -> None:

@@ -23,6 +23,7 @@ from modelserver.query import PlatformView
 from modelserver.query.batch import lookup_batch
 from modelserver.query.explanation import explain
 from modelserver.query.motion import compute_motion
+from modelserver.query.steps import complete
 from modelserver.transforms.pose import Pose
 from modelserver.wire.codec import encode
 
@@ -86,8 +87,8 @@ def test_given_a_drive_then_many_instants_through_odom_are_the_services(
 ) -> None:
     # without LOCALIZATION_STATE the growth of Odom's covariance is unknown, so the larger one is assumed
     utimes = np.array(TIMES, dtype=np.int64)
-    mine = lookup_batch(view_of(receiver), SCAN, BASE, utimes, END, ODOM, True, END)
-    theirs = lookup_batch(exact, SCAN, BASE, utimes, END, ODOM, True, END)
+    mine = complete(lookup_batch(view_of(receiver), SCAN, BASE, utimes, END, ODOM, True, END))
+    theirs = complete(lookup_batch(exact, SCAN, BASE, utimes, END, ODOM, True, END))
     np.testing.assert_allclose(mine.vectors, theirs.vectors, atol=1e-9)
     assert mine.covariances is not None
     assert theirs.covariances is not None

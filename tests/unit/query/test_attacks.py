@@ -16,6 +16,7 @@ from modelserver.joints.history import JointHistory
 from modelserver.messages import Invalid, JointSample, JointsSample, Quality, SensorHeader, TimeQuery
 from modelserver.query.batch import lookup_batch
 from modelserver.query.motion import compute_motion
+from modelserver.query.steps import complete
 from modelserver.transforms.pose import Pose
 
 
@@ -23,7 +24,7 @@ def test_given_two_worlds_through_a_frame_of_the_vehicle_then_single_and_many_ag
     platform = view(2.0)
     at, then = T0 + S, T0 + S + S // 2
     one = lookup_between(platform, UTM, at, ODOM, then, BASE)
-    (row,) = lookup_batch(platform, UTM, ODOM, np.array([at]), then, BASE).vectors
+    (row,) = complete(lookup_batch(platform, UTM, ODOM, np.array([at]), then, BASE)).vectors
     assert one.transformation.pose.is_close(Pose(row[:3], row[3:]), 1e-9, 1e-9)
     X_OB = platform.transformation(BASE, ODOM, TimeQuery(then)).transformation.pose
     X_UB = platform.transformation(BASE, UTM, TimeQuery(at)).transformation.pose
@@ -54,7 +55,7 @@ def test_given_a_joint_without_sigma_then_the_world_behind_it_has_no_covariance(
     at = T0 + S // 2
     assert platform.transformation(SCAN, UTM, TimeQuery(at)).transformation.covariance is None
     assert platform.transformation(BASE, UTM, TimeQuery(at)).transformation.covariance is not None
-    covariances = lookup_batch(platform, SCAN, UTM, np.array([at])).covariances
+    covariances = complete(lookup_batch(platform, SCAN, UTM, np.array([at]))).covariances
     assert covariances is None or np.isnan(covariances).all()
 
 

@@ -17,6 +17,7 @@ from modelserver.joints.history import NO_JOINTS, JointHistory
 from modelserver.messages import MAX_REQUEST_INSTANTS, Invalid, JointSample, PoseAnswer, Quality, TimeQuery
 from modelserver.query import PlatformView
 from modelserver.query.batch import lookup_batch
+from modelserver.query.steps import complete
 from modelserver.transforms.pose import Pose
 
 FINGER = "Finger:Tip"
@@ -39,7 +40,7 @@ def utimes(low: float = 0.0, high: float = 2.0, count: int = 41) -> np.ndarray:
 
 def compare(platform: PlatformView, interest: str, reference: str, at: np.ndarray, **fixed: object) -> None:
     """Assert that every row equals a single query."""
-    found = lookup_batch(platform, interest, reference, at, **fixed)  # type: ignore[arg-type]
+    found = complete(lookup_batch(platform, interest, reference, at, **fixed))  # type: ignore[arg-type]
     unknown: list[bool] = []
     for row, when in enumerate(at.tolist()):
         try:
@@ -111,7 +112,7 @@ def test_given_a_fixed_frame_then_rows_are_answers_between_two_times(interest: s
 def test_given_the_time_of_reference_among_the_rows_then_the_vehicle_cancels_there() -> None:
     at = utimes(count=21)
     compare(held(), "Rover:Mast", BASE, at, fixed=UTM, reference_at=int(at[10]))
-    found = lookup_batch(held(), "Rover:Mast", BASE, at, int(at[10]), UTM)
+    found = complete(lookup_batch(held(), "Rover:Mast", BASE, at, int(at[10]), UTM))
     assert Quality.CORRELATION_UNKNOWN not in Quality(int(found.quality[10]))
     assert Quality.CORRELATION_UNKNOWN in Quality(int(found.quality[11]))
 
@@ -122,7 +123,7 @@ def test_given_instants_that_are_not_held_then_their_rows_state_it_and_the_other
 ) -> None:
     at = np.concatenate((utimes(-1.0, 0.5), utimes(1.5, 3.0)))
     compare(held(), interest, reference, at)
-    found = lookup_batch(held(), interest, reference, at)
+    found = complete(lookup_batch(held(), interest, reference, at))
     assert set(found.status.tolist()) == {Status.OK, Status.TOO_OLD, Status.TOO_NEW}
 
 
@@ -160,12 +161,12 @@ def test_given_an_origin_that_changes_then_only_rows_of_the_reported_one_have_a_
         each = estimate(n * 0.1)
         history = history.append(each if n < 10 else replace(each, origin=replace(ORIGIN, origin_id=78)))
     platform = replace(held(), history=history)
-    found = lookup_batch(platform, BASE, UTM, utimes())
+    found = complete(lookup_batch(platform, BASE, UTM, utimes()))
     assert found.origin is not None
     assert found.origin.origin_id == 78
     assert set(found.status[:20].tolist()) == {Status.NO_POSE}
     assert not found.status[21:].any()
-    first = lookup_batch(platform, BASE, UTM, utimes(0.0, 0.85))
+    first = complete(lookup_batch(platform, BASE, UTM, utimes(0.0, 0.85)))
     assert first.origin == ORIGIN
     assert not first.status.any()
 
@@ -183,7 +184,7 @@ def test_given_joints_that_were_stale_never_received_or_beyond_their_limits_then
     platform = replace(held(), joints=joints)
     for pair in ((SCAN, UTM), (DEEP, SCAN), (FINGER, BASE)):
         compare(platform, *pair, utimes(0.0, 1.5, 60))
-    found = lookup_batch(platform, DEEP, SCAN, utimes(0.0, 1.5, 60))
+    found = complete(lookup_batch(platform, DEEP, SCAN, utimes(0.0, 1.5, 60)))
     assert Invalid.STALE_JOINT in Invalid(int(found.invalid[30]))
     assert Invalid.JOINT_UNKNOWN in Invalid(int(found.invalid[0]))
     assert Quality.JOINT_DEFAULT in Quality(int(found.quality[0]))
@@ -197,19 +198,19 @@ def test_given_joints_without_sigma_at_times_then_the_covariance_is_unknown_ther
     for n in range(11):
         sample = JointSample("Slide", 0.1 * n, 0.001 if n < 5 else math.nan)
         joints, _ = joints.update(replace(joints_at(n * 0.1), joints=(sample,)), T0 + n * S // 10)
-    found = lookup_batch(replace(held(), joints=joints), "Upper:Root", BASE, utimes(0.0, 1.0, 11))
+    found = complete(lookup_batch(replace(held(), joints=joints), "Upper:Root", BASE, utimes(0.0, 1.0, 11)))
     assert found.covariances is not None
     assert np.isnan(found.covariances).any(axis=1).tolist() == [False] * 5 + [True] * 6
 
 
 def test_given_no_covariance_wanted_then_none_is_worked_out() -> None:
-    assert lookup_batch(held(), SCAN, UTM, utimes(), with_covariance=False).covariances is None
+    assert complete(lookup_batch(held(), SCAN, UTM, utimes(), with_covariance=False)).covariances is None
 
 
 @pytest.mark.parametrize(("interest", "reference"), [(SCAN, UTM), (DEEP, SCAN), ("Rover:Mast", BASE), (UTM, UTM)])
 @pytest.mark.parametrize("fixed", ["", ODOM, UTM])
 def test_given_no_instants_then_the_answer_is_empty(interest: str, reference: str, fixed: str) -> None:
-    found = lookup_batch(held(), interest, reference, np.zeros(0, dtype=np.int64), 0, fixed)
+    found = complete(lookup_batch(held(), interest, reference, np.zeros(0, dtype=np.int64), 0, fixed))
     assert found.vectors.shape == (0, 7)
     assert found.covariances is None or found.covariances.shape == (0, 36)
 
@@ -221,7 +222,7 @@ def test_given_instants_in_any_order_then_rows_are_in_that_order() -> None:
 
 def test_given_too_many_instants_then_the_error_states_the_limit() -> None:
     with pytest.raises(LimitError, match=f"{MAX_REQUEST_INSTANTS + 1} instants.*at most {MAX_REQUEST_INSTANTS}.*Split"):
-        lookup_batch(held(), SCAN, UTM, np.zeros(MAX_REQUEST_INSTANTS + 1, dtype=np.int64))
+        complete(lookup_batch(held(), SCAN, UTM, np.zeros(MAX_REQUEST_INSTANTS + 1, dtype=np.int64)))
 
 
 @pytest.mark.parametrize(
@@ -229,19 +230,19 @@ def test_given_too_many_instants_then_the_error_states_the_limit() -> None:
 )
 def test_given_a_frame_that_there_is_not_then_the_whole_query_fails(interest: str, reference: str, fixed: str) -> None:
     with pytest.raises(QueryError):
-        lookup_batch(held(), interest, reference, utimes(), 0, fixed)
+        complete(lookup_batch(held(), interest, reference, utimes(), 0, fixed))
 
 
 @pytest.mark.parametrize("reference", [BASE, UTM])
 def test_given_a_misspelt_fixed_frame_then_the_nearest_is_suggested(reference: str) -> None:
     with pytest.raises(UnknownFrameError) as caught:
-        lookup_batch(held(), SCAN, reference, utimes(), 0, "Odom:Orign")
+        complete(lookup_batch(held(), SCAN, reference, utimes(), 0, "Odom:Orign"))
     assert ODOM in caught.value.nearest
 
 
 def test_given_no_pose_at_all_then_the_whole_query_fails() -> None:
     with pytest.raises(NoPoseError):
-        lookup_batch(replace(held(), history=History(60.0)), SCAN, UTM, utimes())
+        complete(lookup_batch(replace(held(), history=History(60.0)), SCAN, UTM, utimes()))
 
 
 def test_given_a_clock_that_stepped_then_what_depends_on_time_is_invalid() -> None:

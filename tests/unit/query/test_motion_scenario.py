@@ -32,6 +32,7 @@ from modelserver.messages import (
 )
 from modelserver.query import PlatformView
 from modelserver.query.batch import lookup_batch
+from modelserver.query.steps import complete
 from modelserver.transforms.pose import Pose
 
 METERS, RADIANS = 0.001, math.radians(0.02)
@@ -73,7 +74,7 @@ def test_given_exact_poses_and_joints_then_every_instant_agrees_with_truth(inter
 
 def test_given_the_same_instants_in_one_query_then_they_agree_with_truth() -> None:
     seconds = instants()
-    found = lookup_batch(held(), SCAN, UTM, np.array([utime(at) for at in seconds]))
+    found = complete(lookup_batch(held(), SCAN, UTM, np.array([utime(at) for at in seconds])))
     assert not found.status.any()
     assert not found.invalid.any()
     for at, vector in zip(seconds, found.vectors, strict=True):
