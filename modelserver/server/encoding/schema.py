@@ -40,7 +40,6 @@ from modelserver.server.encoding.nodes import (
     ClassNode,
     Complex,
     EnumNode,
-    FixedTuple,
     MappingNode,
     NumpyArray,
     OptionalNode,
@@ -48,7 +47,6 @@ from modelserver.server.encoding.nodes import (
     Scalar,
     TupleNode,
     TypeNode,
-    UnionNode,
 )
 from modelserver.server.encoding.tokens import EncodingError, TokenReader, TokenWriter
 
@@ -79,18 +77,14 @@ class _FloatArray:
     pass
 
 
-class _Arrays:
-    """Replaces `array` in annotations: before Python 3.12 it takes no element type."""
-
-    def __class_getitem__(cls, element: type) -> type:
-        return {int: _IntArray, float: _FloatArray}[element]
-
+_ARRAYS: Final = {int: _IntArray, float: _FloatArray}
+"""Replaces `array` in annotations: before Python 3.12 it takes no element type."""
 
 _TYPECODES: Final[Mapping[Any, str]] = {_IntArray: "q", _FloatArray: "d"}
 
 
 def _get_hints(declared: Any) -> dict[str, Any]:
-    return typing.get_type_hints(declared, localns={"array": _Arrays})
+    return typing.get_type_hints(declared, localns={"array": _ARRAYS})
 
 
 def _expand_alias(hint: Any) -> Any:
@@ -138,8 +132,13 @@ class Schema:
         for index, record in enumerate(records):
             if index and record.text == records[index - 1].text:
                 raise SchemaError(f"two classes are named {record.text}")
-            record.set_index(index)
-        self.description: Final = json.dumps(self._describe(records), sort_keys=True, separators=(",", ":"))
+            record.index = index
+        description = {
+            "records": {record.text: [[name, node.text] for name, node in record.fields.items()] for record in records},
+            "enums": {node.text: node.describe() for node in self._enums.values()},
+            "roots": {name: node.text for name, node in self._roots.items()},
+        }
+        self.description: Final = json.dumps(description, sort_keys=True, separators=(",", ":"))
         """The schema as JSON text."""
         self.fingerprint: Final = hashlib.sha256(self.description.encode()).digest()
 
@@ -190,13 +189,6 @@ class Schema:
             + ("; ".join(found[:MAX_DIFFERENCES]) + more or "their description is damaged")
         )
 
-    def _describe(self, records: Sequence[RecordNode]) -> dict[str, Any]:
-        return {
-            "records": {record.text: record.describe() for record in records},
-            "enums": {node.text: node.describe() for node in self._enums.values()},
-            "roots": {name: node.text for name, node in self._roots.items()},
-        }
-
     # --- from annotations to nodes ---
 
     def _make_node(self, hint: Any, place: str) -> TypeNode:
@@ -216,7 +208,9 @@ class Schema:
         if origin is type:
             return ClassNode([self._get_record(cls, place) for cls in self._find_classes(arguments[0], place)])
         if origin in _SEQUENCES:
-            return self._make_sequence(origin, arguments, place)
+            if origin is tuple and arguments[-1:] != (...,):
+                return TupleNode([self._make_node(each, place) for each in arguments], fixed=True)
+            return TupleNode([self._make_node(arguments[0], place)], list if origin is list else tuple)
         if origin in (dict, collections.abc.Mapping):
             key, element = (self._make_node(each, place) for each in arguments)
             return MappingNode(key, element, mutable=origin is dict)
@@ -233,11 +227,6 @@ class Schema:
             return self._get_record(hint, place)
         raise SchemaError(f"{place}: {hint} cannot be stored")
 
-    def _make_sequence(self, origin: Any, arguments: tuple[Any, ...], place: str) -> TypeNode:
-        if origin is tuple and arguments[-1:] != (...,):
-            return FixedTuple([self._make_node(each, place) for each in arguments])
-        return TupleNode(self._make_node(arguments[0], place), list if origin is list else tuple)
-
     def _find_classes(self, hint: Any, place: str) -> list[type]:
         if hint in self._implementations:
             return sorted(self._implementations[hint], key=_get_name)
@@ -247,17 +236,17 @@ class Schema:
         return sorted(found, key=_get_name)
 
     def _make_union(self, arguments: Sequence[Any], place: str) -> TypeNode:
-        nodes = [(self._make_node(each, place), each) for each in arguments if each is not type(None)]
-        nodes.sort(key=lambda pair: pair[0].text)
+        nodes = [self._make_node(each, place) for each in arguments if each is not type(None)]
+        records = [record for node in nodes if isinstance(node, AnyRecord) for record in node.records]
         inner: TypeNode
         if len(nodes) == 1:
-            inner = nodes[0][0]
-        elif all(isinstance(node, Scalar) for node, _ in nodes):
+            inner = nodes[0]
+        elif all(isinstance(node, Scalar) for node in nodes):
             return Scalar(sorted({_SCALARS[each] for each in arguments}))
-        elif all(isinstance(node, (RecordNode, AnyRecord)) for node, _ in nodes):
-            inner = AnyRecord([record for node, _ in nodes for record in _records_of(node)])
+        elif all(isinstance(node, AnyRecord) for node in nodes):
+            inner = AnyRecord(sorted(records, key=lambda record: record.text))
         else:
-            inner = UnionNode([node for node, _ in nodes], [typing.get_origin(each) or each for _, each in nodes])
+            raise SchemaError(f"{place}: a union of {' and '.join(node.text for node in nodes)} cannot be stored")
         if len(nodes) == len(arguments):
             return inner
         if isinstance(inner, Scalar):
@@ -286,12 +275,12 @@ class Schema:
             hints = _get_hints(cls)
             fields = [each.name for each in dataclasses.fields(cls) if each.name not in omitted]
             defaults = [each for each in dataclasses.fields(cls) if each.name in omitted]
-            record.get_values, record.build = _make_getter(fields), _Rebuild(cls, fields, defaults)
+            record.get_values, record.build = _make_getter(fields), _make_builder(cls, fields, defaults)
         elif (
             slots and not slots - set(hints := _get_hints(cls)) and not any(_is_function(hints[each]) for each in slots)
         ):
             fields = sorted(slots)
-            record.get_values, record.build = _make_getter(fields), _Rebuild(cls, fields)
+            record.get_values, record.build = _make_getter(fields), _make_builder(cls, fields)
         else:
             hints = _get_hints(inspect.getattr_static(cls, "__init__"))
             fields = list(inspect.signature(cls).parameters)
@@ -302,13 +291,9 @@ class Schema:
             missing = [each for each in fields if each not in hints]
             if missing:
                 raise SchemaError(f"{name}: its constructor's {missing[0]} has no type, so it cannot be stored")
-            record.get_values, record.build = _make_getter(fields), _Construct(cls)
+            record.get_values, record.build = _make_getter(fields), lambda values: cls(*values)
             record.constructed = True
-        record.define(fields, [self._make_node(hints[each], f"{name}.{each}") for each in fields])
-
-
-def _records_of(node: TypeNode) -> Sequence[RecordNode]:
-    return node.records if isinstance(node, AnyRecord) else [node] if isinstance(node, RecordNode) else []
+        record.fields = {each: self._make_node(hints[each], f"{name}.{each}") for each in fields}
 
 
 def _is_function(hint: Any) -> bool:
@@ -317,11 +302,8 @@ def _is_function(hint: Any) -> bool:
 
 
 def _find_slots(cls: type) -> set[str]:
-    return {slot for base in cls.__mro__ for slot in _to_sequence(base.__dict__.get("__slots__", ()))}
-
-
-def _to_sequence(slots: str | Sequence[str]) -> Sequence[str]:
-    return (slots,) if isinstance(slots, str) else slots
+    found = [base.__dict__.get("__slots__", ()) for base in cls.__mro__]
+    return {slot for slots in found for slot in ((slots,) if isinstance(slots, str) else slots)}
 
 
 def _make_getter(fields: Sequence[str]) -> Callable[[Any], Sequence[Any]]:
@@ -332,29 +314,22 @@ def _make_getter(fields: Sequence[str]) -> Callable[[Any], Sequence[Any]]:
     return get if len(fields) > 1 else lambda value: (get(value),)
 
 
-class _Rebuild:
-    """Builds an instance from the values of its fields bit for bit, without the constructor."""
+def _make_builder(
+    cls: type, fields: Sequence[str], defaults: Sequence[dataclasses.Field[Any]] = ()
+) -> Callable[[Sequence[Any]], Any]:
+    """Return a function that builds an instance from the values of its fields bit for bit, without the constructor."""
+    put = object.__setattr__
 
-    def __init__(self, cls: type, fields: Sequence[str], defaults: Sequence[dataclasses.Field[Any]] = ()):
-        self._cls, self._fields, self._defaults = cls, tuple(fields), tuple(defaults)
-
-    def __call__(self, values: Sequence[Any]) -> Any:
-        made: object = object.__new__(self._cls)
-        put = object.__setattr__
-        for name, value in zip(self._fields, values, strict=True):
+    def build(values: Sequence[Any]) -> Any:
+        made: object = object.__new__(cls)
+        for name, value in zip(fields, values, strict=True):
             put(made, name, value)
-        for each in self._defaults:
+        for each in defaults:
             factory = each.default_factory
             put(made, each.name, each.default if factory is dataclasses.MISSING else factory())
         return made
 
-
-class _Construct:
-    def __init__(self, cls: type):
-        self._cls = cls
-
-    def __call__(self, values: Sequence[Any]) -> Any:
-        return self._cls(*values)
+    return build
 
 
 def list_differences(then: Any, now: Any) -> list[str]:

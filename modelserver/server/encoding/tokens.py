@@ -24,9 +24,6 @@ BLOCK_TOKENS: Final = 500
 MAX_BLOCK_BYTES: Final = 32 << 20
 """Greater than the longest array or text of a state."""
 
-MAX_INT_BYTES: Final = 4096
-"""Bytes of an integer."""
-
 SCALARS: Final = frozenset({type(None), bool, int, float, str, bytes})
 
 _LENGTH: Final = struct.Struct(">I")
@@ -84,27 +81,9 @@ class TokenWriter:
 def _convert_token(token: Any) -> Any:
     if type(token) is int and token not in _INT64:
         return token.to_bytes(token.bit_length() // 8 + 1, "little", signed=True)
-    return token.encode("utf-8", "surrogatepass") if type(token) is str and not _is_plain(token) else token
-
-
-def _is_plain(text: str) -> bool:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
-def int_of(token: bytes) -> int:
-    """Return the integer in a bytes token. Raises ValueError."""
-    if len(token) > MAX_INT_BYTES:
-        raise ValueError(f"an integer of {len(token)} bytes")
-    return int.from_bytes(token, "little", signed=True)
-
-
-def text_of(token: bytes) -> str:
-    """Return the text in a bytes token. Raises ValueError."""
-    return token.decode("utf-8", "surrogatepass")
+    if type(token) is str and any("\ud800" <= each <= "\udfff" for each in token):
+        return token.encode("utf-8", "surrogatepass")
+    return token
 
 
 class TokenReader:
