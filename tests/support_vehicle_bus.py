@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from modelserver.messages import Direction, JointsSample, SensorHeader, VehicleStatusSample, WheelSample, WheelsSample
-from msdrivers.devices.axis_settings import AxisSettings, NodSettings
+from msdrivers.devices.axis import AxisSettings, NodSettings
 from msdrivers.devices.vehicle_settings import CommandLimits, VehicleSettings
 from msdrivers.devices.wheels import WheelsSettings
 from msdrivers.endpoint import Endpoint, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send

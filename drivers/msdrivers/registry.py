@@ -148,8 +148,7 @@ def _make_vehicle_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
 
 
 def _load_axis() -> DeviceModules:
-    from msdrivers.devices.axis import AxisDriver
-    from msdrivers.devices.axis_settings import AxisSettings
+    from msdrivers.devices.axis import AxisDriver, AxisSettings
 
     return DeviceModules(AxisSettings, lambda settings, _: AxisDriver(settings))
 

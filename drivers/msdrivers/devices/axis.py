@@ -14,15 +14,14 @@ found first are restored on close.
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import NamedTuple, TypeAlias
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, NamedTuple, TypeAlias
 
 from modelserver.messages import NAN, JointSample, JointsSample, SensorHeader
-from msdrivers.devices.axis_settings import AxisSettings, NodSettings
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
 from msdrivers.protocol.bounded_counter import BoundedCounter
+from msdrivers.protocol.modbus.axis_map import STRICT, AxisRegisters
 from msdrivers.protocol.modbus.registers import (
     FailureKind,
     ModbusFailure,
@@ -38,81 +37,158 @@ from msdrivers.protocol.modbus.registers import (
     is_reply_to,
 )
 
+MIN_POLL_HZ = 50.0
 
-class _ReadStep(NamedTuple):
-    """Read a commanded register; `expected` in degrees, None to record what is found."""
+
+@dataclass(frozen=True, slots=True)
+class NodSettings:
+    """Nodding motion. Degrees and degrees per second."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
+
+    lower_deg: float
+    """Lower limit."""
+    upper_deg: float
+    """Upper limit."""
+    rate_deg: float = 30.0
+    """Rate between the limits; 0: stationary."""
+
+    def __post_init__(self) -> None:
+        if not self.lower_deg < self.upper_deg:
+            raise ValueError(f"lower_deg is below upper_deg, {self.upper_deg:g}, got {self.lower_deg:g}")
+
+
+@dataclass(frozen=True, slots=True)
+class AxisSettings:
+    """Settings of an axis. Raises ValueError with the key for an invalid value."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
+
+    source: str
+    """Source of the samples."""
+    joint: str
+    """Name of the constraint in the geometry file that the axis moves."""
+    registers: AxisRegisters
+    """Its register map."""
+    nod: NodSettings | None = None
+    """Nodding motion to set; None: the axis is only read."""
+    step_deg: float = 0.072
+    """Resolution of the angle, degrees."""
+    lowest_deg: float = -90.0
+    """Lowest possible angle, degrees; lower readings are rejected."""
+    highest_deg: float = 90.0
+    """Highest possible angle, degrees."""
+    slowest_deg: float = 2.0
+    """Lowest nodding rate, degrees per second."""
+    fastest_deg: float = 90.0
+    """Highest nodding rate, degrees per second; faster readings are rejected."""
+    poll_hz: float = 100.0
+    """Poll rate."""
+    reply_timeout: float = 0.1
+    """Reply timeout, seconds."""
+    retry_delay: float = 0.5
+    """Delay before a retry after an exception, seconds."""
+    silence: float = 1.0
+    """Seconds without a usable reply after which the driver is SILENT and reopens the line."""
+
+    def __post_init__(self) -> None:
+        if not (0 < len(self.joint) <= 200):
+            raise ValueError("joint is the name of a constraint in the geometry file, got nothing or too long a text")
+        for key, value, low, high in (
+            ("poll_hz", self.poll_hz, MIN_POLL_HZ, 1000.0),
+            ("step_deg", self.step_deg, 0.0, 10.0),
+            ("lowest_deg", self.lowest_deg, -3600.0, 3600.0),
+            ("highest_deg", self.highest_deg, -3600.0, 3600.0),
+            ("slowest_deg", self.slowest_deg, 0.0, 3600.0),
+            ("fastest_deg", self.fastest_deg, 0.01, 3600.0),
+            ("reply_timeout", self.reply_timeout, 0.005, 10.0),
+            ("retry_delay", self.retry_delay, 0.01, 60.0),
+            ("silence", self.silence, 0.05, 3600.0),
+        ):
+            if not low <= value <= high:
+                raise ValueError(f"{key} is between {low:g} and {high:g}, got {value:g}")
+        if not self.lowest_deg < self.highest_deg:
+            raise ValueError(f"lowest_deg is below highest_deg, {self.highest_deg:g}, got {self.lowest_deg:g}")
+        if not self.slowest_deg <= self.fastest_deg:
+            raise ValueError(f"slowest_deg is at most fastest_deg, {self.fastest_deg:g}, got {self.slowest_deg:g}")
+        if self.nod is not None:
+            why = self.find_nod_problem(self.nod)
+            if why:
+                raise ValueError(f"nod cannot be done: {why}")
+
+    def find_nod_problem(self, nod: NodSettings) -> str:
+        """Describe why the axis cannot do a nodding motion; empty if it can."""
+        if not self.registers.commanded:
+            return "registers names no lower_limit, upper_limit and nod_rate"
+        if nod.rate_deg != 0.0 and not self.slowest_deg <= nod.rate_deg <= self.fastest_deg:
+            allowed = f"{self.slowest_deg:g} to {self.fastest_deg:g} deg/s, or 0 (stationary)"
+            return f"rate_deg {nod.rate_deg:g} is not {allowed}"
+        if not (self.lowest_deg <= nod.lower_deg and nod.upper_deg <= self.highest_deg):
+            allowed = f"{self.lowest_deg:g} to {self.highest_deg:g} degrees"
+            return f"{nod.lower_deg:g} to {nod.upper_deg:g} degrees is not within {allowed}"
+        for name, value in (("lower_limit", nod.lower_deg), ("upper_limit", nod.upper_deg), ("nod_rate", nod.rate_deg)):
+            if not self.registers.commanded[name].can_hold(value):
+                return f"the registers of {name} cannot hold {value:g}"
+        return ""
+
+
+class _Step(NamedTuple):
+    """Write `degrees` to a commanded register; None: read it."""
 
     name: str
-    expected: float | None
+    degrees: float | None = None
 
 
-class _WriteStep(NamedTuple):
-    """Write a commanded register."""
-
-    name: str
-    degrees: float
-
-
-_Step: TypeAlias = _ReadStep | _WriteStep
+_Steps: TypeAlias = Generator[_Step, Registers | RegistersWritten, None]
 
 
 class NodSetup:
-    """The remaining steps of the setup; one request at a time, completed by `on_reply` or repeated."""
+    """The setup of a nodding motion: one step at a time, completed by `on_reply` or repeated."""
 
     def __init__(self, settings: AxisSettings):
         self._registers: Mapping[str, RegisterMap] = settings.registers.commanded
-        self._steps: deque[_Step] = deque()
-        self._nod: NodSettings | None = None
+        self._steps: _Steps | None = None
+        self._step: _Step | None = None
         self.found: dict[str, tuple[int, ...]] = {}
         """Original contents of the commanded registers, by name."""
         self._current: dict[str, float] = {}
+        self._warning = ""
 
     def start(self, nod: NodSettings) -> None:
         """Start to set a nodding motion, instead of the one in progress."""
-        self._nod = nod
-        self._steps = deque(_ReadStep(name, None) for name in self._registers)
+        self._steps = self._run(nod)
+        self._step = next(self._steps, None)
 
     def cancel(self) -> None:
         """Discard the remaining steps."""
-        self._steps.clear()
+        self._step = None
 
     @property
     def step_text(self) -> str:
         """Description of the next step; empty when done."""
-        if not self._steps:
+        if self._step is None:
             return ""
-        step = self._steps[0]
-        mapped = self._registers[step.name]
-        verb = "reading" if isinstance(step, _ReadStep) else f"writing {step.degrees:g} to"
-        return f"{verb} {step.name} (register {mapped.address})"
+        name, degrees = self._step
+        verb = "reading" if degrees is None else f"writing {degrees:g} to"
+        return f"{verb} {name} (register {self._registers[name].address})"
 
     def make_request(self, transaction: int) -> ReadRegisters | WriteRegisters | None:
         """Make the request of the next step; None when done."""
-        if not self._steps:
+        if self._step is None:
             return None
-        step = self._steps[0]
-        mapped = self._registers[step.name]
-        if isinstance(step, _ReadStep):
+        mapped, degrees = self._registers[self._step.name], self._step.degrees
+        if degrees is None:
             return ReadRegisters(mapped.address, mapped.registers, transaction=transaction)
-        return WriteRegisters(mapped.address, mapped.from_degrees(step.degrees), transaction)
+        return WriteRegisters(mapped.address, mapped.from_degrees(degrees), transaction)
 
     def on_reply(self, reply: Registers | RegistersWritten) -> str:
         """Complete a step; return a warning if the axis holds another value than was written, else empty."""
-        step = self._steps.popleft()
-        warning = ""
-        if isinstance(step, _WriteStep):
-            self._current[step.name] = step.degrees
-        if isinstance(step, _ReadStep) and isinstance(reply, Registers):
-            mapped = self._registers[step.name]
-            self._current[step.name] = mapped.to_degrees(reply.values)
-            if step.expected is None:
-                self.found.setdefault(step.name, reply.values)
-            elif tuple(reply.values) != mapped.from_degrees(step.expected):
-                actual = self._current[step.name]
-                warning = f"{step.name} is {actual:g} where {step.expected:g} was written: the axis's own limit"
-        if not self._steps and self._nod is not None:
-            self._plan_writes(self._nod)
-        return warning
+        self._warning = ""
+        try:
+            self._step = self._steps.send(reply) if self._steps is not None else None
+        except StopIteration:
+            self._step = None
+        return self._warning
 
     def make_restore_requests(self) -> list[WriteRegisters]:
         """Make the requests that restore the registers."""
@@ -122,12 +198,23 @@ class NodSetup:
         order = _order_writes(degrees["lower_limit"], self._current["upper_limit"])
         return [WriteRegisters(self._registers[name].address, self.found[name]) for name in order]
 
-    def _plan_writes(self, nod: NodSettings) -> None:
+    def _run(self, nod: NodSettings) -> _Steps:
+        for name, mapped in self._registers.items():
+            reply = yield _Step(name)
+            if isinstance(reply, Registers):
+                self._current[name] = mapped.to_degrees(reply.values)
+                self.found.setdefault(name, reply.values)
         wanted = {"lower_limit": nod.lower_deg, "upper_limit": nod.upper_deg, "nod_rate": nod.rate_deg}
         order = _order_writes(nod.lower_deg, self._current["upper_limit"])
-        self._steps.extend(_WriteStep(name, wanted[name]) for name in order)
-        self._steps.extend(_ReadStep(name, wanted[name]) for name in order)
-        self._nod = None
+        for name in order:
+            yield _Step(name, wanted[name])
+            self._current[name] = wanted[name]
+        for name in order:
+            mapped, reply = self._registers[name], (yield _Step(name))
+            if isinstance(reply, Registers) and reply.values != mapped.from_degrees(wanted[name]):
+                self._current[name] = mapped.to_degrees(reply.values)
+                actual = f"{name} is {self._current[name]:g} where {wanted[name]:g} was written"
+                self._warning = f"{actual}: the axis's own limit"
 
 
 def _order_writes(lower: float, present_upper: float) -> tuple[str, ...]:

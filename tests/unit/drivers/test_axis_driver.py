@@ -11,8 +11,7 @@ import pytest
 from support_vehicle_bus import AXIS_REGISTERS, DEG, START_UTIME, Wire, at, axis_settings
 
 from modelserver.messages import DriverHealth, DriverPhase, JointsSample
-from msdrivers.devices.axis import AxisDriver
-from msdrivers.devices.axis_settings import AxisSettings, NodSettings
+from msdrivers.devices.axis import AxisDriver, AxisSettings, NodSettings
 from msdrivers.emulate.axis import AxisEmulator, AxisUnit
 from msdrivers.endpoint import EndpointPhase, HostTime, MeasuredSample, Reopen, Send
 from msdrivers.fault_injection import InjectedFault
