@@ -109,17 +109,10 @@ def format_noise(log: str, noise: ImuNoise, advice: MountCheck | None) -> list[s
         lines.append(f"  {format_count(noise.dropped, 'sample')} without rates or forces dropped")
     for quantity in QUANTITIES:
         value = quantity.propose(noise)
-        if math.isfinite(value):
-            head = f"{value:.3g} {quantity.unit}"
-        elif math.isfinite(most := quantity.upper_limit(noise)):
-            head = f"not determined; at most {most:.3g} {quantity.unit}"
-        else:
-            head = "not determined"
-        lines.append(f"{quantity.name}: {head}")
-        lines += [
-            f"  {axis}: {_format_figure(quantity, each)}"
-            for axis, each in zip("xyz", quantity.axes(noise), strict=True)
-        ]
+        words = f"{value:.3g}" if math.isfinite(value) else _format_limit(quantity.upper_limit(noise))
+        lines.append(f"{quantity.name}: {words}" + (f" {quantity.unit}" if words[-1].isdigit() else ""))
+        figures = [_format_figure(quantity, axis) for axis in quantity.axes(noise)]
+        lines += [f"  {axis}: {figure}" for axis, figure in zip("xyz", figures, strict=True)]
     for name, axes in (("gyro", noise.gyro), ("accelerometer", noise.accelerometer)):
         missing: dict[str, str] = {}
         for axis, found in zip("xyz", axes, strict=True):
@@ -135,14 +128,21 @@ def format_noise(log: str, noise: ImuNoise, advice: MountCheck | None) -> list[s
 def _format_figure(quantity: _Quantity, axis: AxisNoise) -> str:
     figure = quantity.of(axis.figures)
     if figure is None:
-        most = quantity.limit(axis.figures)
-        return f"not determined; at most {most:.3g}" if math.isfinite(most) else "not determined"
+        return _format_limit(quantity.limit(axis.figures))
     where = f"at {figure.tau:.3g} s, {format_count(round(figure.clusters), 'cluster')}"
     return f"{figure.value:.3g} +- {figure.sigma / figure.value:.1%} ({where})"
 
 
+def _format_limit(most: float) -> str:
+    return f"not determined; at most {most:.3g}" if math.isfinite(most) else "not determined"
+
+
 def noise_to_dict(noise: ImuNoise, advice: MountCheck | None) -> dict[str, Any]:
     """Return the report on noise for scripts; what is not determined is null."""
+    mount = None
+    if advice is not None:
+        fitting = [list(each.rpy_deg) for each in advice.candidates]
+        mount = {"agrees": advice.is_consistent, "angle": advice.angle, "fitting_rpy_deg": fitting, "text": advice.text}
     return {
         "samples": noise.samples,
         "dropped": noise.dropped,
@@ -153,41 +153,25 @@ def noise_to_dict(noise: ImuNoise, advice: MountCheck | None) -> dict[str, Any]:
         "proposal": propose_settings(noise),
         "gyro": [_axis_to_dict(each) for each in noise.gyro],
         "accelerometer": [_axis_to_dict(each) for each in noise.accelerometer],
-        "mount": None
-        if advice is None
-        else {
-            "agrees": advice.is_consistent,
-            "angle": advice.angle,
-            "fitting_rpy_deg": [list(each.rpy_deg) for each in advice.candidates],
-            "text": advice.text,
-        },
+        "mount": mount,
     }
 
 
 def _axis_to_dict(axis: AxisNoise) -> dict[str, Any]:
-    figures = axis.figures
-    found = {"white": figures.white, "instability": figures.instability, "walk": figures.random_walk}
-    return {
-        **{name: None if each is None else asdict(each) for name, each in found.items()},
-        "instability_limit": _or_none(figures.instability_limit),
-        "walk_limit": _or_none(figures.random_walk_limit),
-        "missing": list(figures.missing),
-        "taus": list(axis.curve.taus),
-        "deviations": list(axis.curve.deviations),
+    figures = {
+        name.removeprefix("random_"): _or_none(value) if isinstance(value, float) else value
+        for name, value in asdict(axis.figures).items()
     }
+    return figures | {"taus": axis.curve.taus, "deviations": axis.curve.deviations}
 
 
 def format_noise_yaml(log: str, noise: ImuNoise) -> str:
     """Return the proposed settings as part of a vehicle file; undetermined ones are comments."""
-    lines = [
-        *_format_header(log, f"{noise.seconds:.0f} s stationary"),
-        "localization:",
-        "  filter:",
-    ]
+    lines = []
     for each in QUANTITIES:
+        value = each.propose(noise)
         if not each.setting:
             continue
-        value = each.propose(noise)
         if math.isfinite(value):
             more = f"; {VIBRATION_NOTE}" if each.setting == "accelerometer_noise" else ""
             lines.append(f"    {each.setting}: {value:.3e}   # {each.unit}, {each.name}{more}")
@@ -195,7 +179,7 @@ def format_noise_yaml(log: str, noise: ImuNoise) -> str:
             most = each.upper_limit(noise)
             words = f", at most {most:.1e} {each.unit}" if math.isfinite(most) else ""
             lines.append(f"    # {each.setting}: not determined from this record{words}")
-    return "\n".join(lines) + "\n"
+    return _format_proposal(log, f"{noise.seconds:.0f} s stationary", "filter", lines)
 
 
 def render_noise_page(log: str, noise: ImuNoise) -> str:
@@ -290,16 +274,11 @@ def format_magnetometer_yaml(log: str, found: MagnetometerFit) -> str:
     hard = ", ".join(f"{each:.4e}" for each in found.hard_iron)
     soft = ", ".join(f"{each:.6f}" for each in found.soft_iron)
     residual = f"residual {found.rms * 1e6:.3f} uT rms"
-    return "\n".join(
-        (
-            *_format_header(log, f"{how}, {residual}"),
-            "localization:",
-            "  magnetometer:",
-            f"    hard_iron: [{hard}]   # tesla, along the unit's axes",
-            f"    soft_iron: [{soft}]   # 3 x 3, row-major",
-            "",
-        )
-    )
+    lines = [
+        f"    hard_iron: [{hard}]   # tesla, along the unit's axes",
+        f"    soft_iron: [{soft}]   # 3 x 3, row-major",
+    ]
+    return _format_proposal(log, f"{how}, {residual}", "magnetometer", lines)
 
 
 def render_magnetometer_page(log: str, found: MagnetometerFit, fields: Array, up: Vector3) -> str:
@@ -328,11 +307,14 @@ def render_magnetometer_page(log: str, found: MagnetometerFit, fields: Array, up
     return _render_page(f"Magnetometer: {escape(log)}", words, [chart])
 
 
-def _format_header(log: str, how: str) -> tuple[str, ...]:
-    return (
+def _format_proposal(log: str, how: str, section: str, lines: Sequence[str]) -> str:
+    head = (
         f"# Proposed by modelserver calibrate from {escape(log)}: {how}.",
         "# Merge these lines into the vehicle file; nothing was changed.",
+        "localization:",
+        f"  {section}:",
     )
+    return "\n".join([*head, *lines, ""])
 
 
 def _format_numbers(values: Sequence[float], digits: int) -> str:

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,17 +33,14 @@ DISTANCE_STEP_M = 10.0
 """Distance by the wheels over which it is compared with the fixes', meters."""
 
 
-@dataclass(frozen=True, slots=True)
-class TurnRateComparison:
-    """Two turn rates compared: number of values, correlation, and ratio of the first's size to the second's."""
+class TurnRateComparison(NamedTuple):
+    """Two turn rates compared: correlation, and ratio of the first's size to the second's."""
 
-    count: int
     correlation: float
     ratio: float
 
 
-@dataclass(frozen=True, slots=True)
-class DistanceComparison:
+class DistanceComparison(NamedTuple):
     """Distance by wheels and by fixes over the same sections, meters."""
 
     wheels: float
@@ -66,9 +64,7 @@ class SensorMotion:
     @property
     def wheel_turn_rate(self) -> dict[int, float]:
         """Turn rate by the wheels of both sides, rad/s; empty without two sides."""
-        left = self._side_speed(1.0)
-        right = self._side_speed(-1.0)
-        track = self._track()
+        left, right, track = self._side_speed(1.0), self._side_speed(-1.0), self._track()
         if track < 0.05:
             return {}
         return {second: (right[second] - left[second]) / track for second in left.keys() & right.keys()}
@@ -103,18 +99,15 @@ class SensorMotion:
             known = [rates[second] for second in range(math.floor(t), math.ceil(u)) if second in rates]
             if known:
                 found[math.floor(t)] = (sum(known) / len(known) * (u - t), turn)
-        return _compare([a for a, _ in found.values()], [b for _, b in found.values()], 0.1)
+        return _compare(found.values(), 0.1)
 
-    def count_opposed(
-        self, turn: Mapping[int, float], min_speed: float = 0.3, max_turn_rate: float = 0.05
-    ) -> tuple[int, int]:
+    def count_opposed(self, turn: Mapping[int, float]) -> tuple[int, int]:
         """Return the seconds of straight driving in which the sides rolled against each other, and all of them."""
         left, right = self._side_speed(1.0), self._side_speed(-1.0)
         moving = [
             second
             for second in left.keys() & right.keys()
-            if min(abs(left[second]), abs(right[second])) > min_speed
-            and abs(turn.get(second, math.inf)) < max_turn_rate
+            if min(abs(left[second]), abs(right[second])) > 0.3 and abs(turn.get(second, math.inf)) < 0.05
         ]
         return sum(left[second] * right[second] < 0.0 for second in moving), len(moving)
 
@@ -125,24 +118,23 @@ class SensorMotion:
 
     def compare_distances(self) -> DistanceComparison:
         """Return the distances by wheels and by fixes, over sections of `DISTANCE_STEP_M` by the wheels."""
-        rolled = fixed = 0.0
         speed = self._mean_speed()
-        way = 0.0
+        rolled = fixed = distance = 0.0
         anchor: tuple[float, float, float] | None = None
         before = -math.inf
         for each in self.fixes:
             if anchor is None or each[0] - before > 5.0:
-                anchor, way, before = each, 0.0, each[0]
+                anchor, distance, before = each, 0.0, each[0]
                 continue
             seconds = range(math.floor(before), math.floor(each[0]) + 1)
             known = [speed[second] for second in seconds if second in speed]
             if known:
-                way += sum(known) / len(known) * (each[0] - before)
+                distance += sum(known) / len(known) * (each[0] - before)
             before = each[0]
-            if way >= DISTANCE_STEP_M:
-                rolled += way
-                fixed += math.hypot(each[1] - anchor[1], each[2] - anchor[2])
-                anchor, way = each, 0.0
+            if distance >= DISTANCE_STEP_M:
+                rolled += distance
+                fixed += math.dist(each[1:], anchor[1:])
+                anchor, distance = each, 0.0
         return DistanceComparison(rolled, fixed)
 
     def distance_travelled(self) -> float:
@@ -150,9 +142,7 @@ class SensorMotion:
         if self.wheels:
             return sum(self._mean_speed().values())
         places = _thin_by_distance(self.fixes, COURSE_STEP_M)
-        if not places:
-            return math.nan
-        return sum(math.hypot(b[1] - a[1], b[2] - a[2]) for a, b in pairwise(places))
+        return sum(math.dist(a[1:], b[1:]) for a, b in pairwise(places)) if places else math.nan
 
     def _mean_speed(self) -> dict[int, float]:
         """Return the mean magnitude of the wheels' speeds."""
@@ -181,19 +171,16 @@ class SensorMotion:
 
 def compare_turn_rates(first: Mapping[int, float], second: Mapping[int, float]) -> TurnRateComparison | None:
     """Compare two turn rates second by second; None without enough turns."""
-    shared = sorted(first.keys() & second.keys())
-    return _compare([first[each] for each in shared], [second[each] for each in shared], 0.02)
+    return _compare([(first[each], second[each]) for each in sorted(first.keys() & second.keys())], 0.02)
 
 
-def _compare(first: Sequence[float], second: Sequence[float], least: float) -> TurnRateComparison | None:
-    """Compare turns; None with fewer than 12, or where the second series is smaller than `least` (rms)."""
-    a, b = np.array(first), np.array(second)
-    squares = float((a * a).sum()), float((b * b).sum())
-    if len(a) < 12 or not squares[0] > 0.0 or squares[1] < len(b) * least * least:
+def _compare(turns: Collection[tuple[float, float]], least: float) -> TurnRateComparison | None:
+    """Compare pairs of turns; None with fewer than 12, or where the second ones are smaller than `least` (rms)."""
+    a, b = np.array([*turns]).reshape(-1, 2).T
+    squares, others = float(a @ a), float(b @ b)
+    if len(a) < 12 or not squares > 0.0 or others < len(b) * least * least:
         return None
-    return TurnRateComparison(
-        len(a), float((a * b).sum()) / math.sqrt(squares[0] * squares[1]), math.sqrt(squares[0] / squares[1])
-    )
+    return TurnRateComparison(float(a @ b) / math.sqrt(squares * others), math.sqrt(squares / others))
 
 
 class _SecondMeans:
@@ -253,6 +240,6 @@ def _thin_by_distance(places: Iterable[tuple[float, float, float]], least: float
     """Return the positions that are at least `least` from the one before."""
     found: list[tuple[float, float, float]] = []
     for each in places:
-        if not found or math.hypot(each[1] - found[-1][1], each[2] - found[-1][2]) >= least:
+        if not found or math.dist(each[1:], found[-1][1:]) >= least:
             found.append(each)
     return found
