@@ -114,7 +114,7 @@ def imu(
             f"{escape(str(log))}: no figure follows from {noise.seconds:.0f} s: the samples are frozen, "
             "or other errors exceed the noise; see --plot"
         )
-    _write_proposal(output, calibrate_report.format_noise_yaml(str(log), noise), force)
+    write_file(output, calibrate_report.format_noise_yaml(str(log), noise), replace=force)
 
 
 @command.command("magnetometer")
@@ -172,7 +172,7 @@ def magnetometer(
     if plot:
         page = calibrate_report.render_magnetometer_page(str(log), found, recorded.fields[good], found.coverage.axis)
         write_file(plot, page, replace=force)
-    _write_proposal(output, calibrate_report.format_magnetometer_yaml(str(log), found), force)
+    write_file(output, calibrate_report.format_magnetometer_yaml(str(log), found), replace=force)
 
 
 def _compute_noise(recorded: ImuRecording, used: SampleRange, samples: int) -> ImuNoise:
@@ -295,17 +295,7 @@ def _check_paths(begin: float, end: float, log: Path, targets: tuple[str, ...], 
     if len({os.path.realpath(each) for each in (*named, str(log))}) <= len(named):
         raise typer.BadParameter("LOG, --plot and --output must be different files")
     for target in named:
-        if not force and os.path.isfile(target):
-            # before reading, which may take long; writing checks it again
-            raise ModelServerError(f"{escape(target)} already exists; give --force to replace it, or another name")
-        check_writable(target)
-
-
-def _write_proposal(output: str, text: str, force: bool) -> None:
-    if output == "-":
-        typer.echo(text, nl=False)
-    elif output:
-        write_file(output, text, replace=force)
+        check_writable(target, force)
 
 
 def _print_damage(log: Path, recorded: ImuRecording) -> None:

@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
-from modelserver.errors import ModelServerError, Severity, find_nearest_names, quote
+from modelserver.errors import ModelServerError, Severity
 from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
 from modelserver.formats import FORMATS, check_file, format_of_path, save_model
-from mstools.terminal.options import Variables, parse_variables
-from mstools.terminal.output import describe_size, escape, format_count, print_problem, write_file
+from mstools.terminal.options import Variables, choose_name, parse_variables
+from mstools.terminal.output import check_writable, describe_size, escape, format_count, print_problem, write_file
 
 
 def command(
@@ -59,11 +59,18 @@ def command(
             f"{source} is a Miro process configuration, which becomes a vehicle file in YAML; name it FILE.yaml",
             param_hint="OUT",
         )
-    if target != "-" and not force and os.path.lexists(target):
-        # before reading, which may take long; writing checks it again
-        raise ModelServerError(f"{escape(target)} already exists; give --force to replace it, or another name")
+    check_writable(target, force)
     if is_process:
-        _convert_process(source, target, values, force)
+        # imported here: a geometry file needs no configuration libraries
+        from mstools.commands.convert_process import convert_process
+
+        text, warnings = convert_process(source, target, values)
+        for problem in warnings:
+            print_problem(problem, err=True)
+        write_file(target, text, replace=force)
+        if target != "-":
+            seen = f"{format_count(len(warnings), 'warning')}; modelserver check {escape(target)}"
+            typer.echo(f"{escape(target)}: {seen}", err=True)
         return
     model, problems = check_file(source, values, repair=repair)
     for problem in problems:
@@ -75,10 +82,8 @@ def command(
     saved = save_model(model, output_format)
     for loss in saved.unsupported:
         typer.echo(f"modelserver: the format does not support {escape(loss)}", err=True)
-    if target == "-":
-        typer.echo(saved.text, nl=False)
-    else:
-        write_file(target, saved.text, replace=force)
+    write_file(target, saved.text, replace=force)
+    if target != "-":
         typer.echo(f"{escape(target)}: {describe_size(model)}", err=True)
 
 
@@ -90,33 +95,9 @@ def is_process_file(file: str) -> bool:
         return detect_file_kind(stream.read(EXAMINED_BYTES)) is FileKind.MIRO_PROCESS
 
 
-def _convert_process(source: str, target: str, values: dict[str, str], force: bool) -> None:
-    """Write the vehicle file of a Miro process configuration."""
-    # imported here: a geometry file needs no configuration libraries
-    from mstools.commands.convert_process import convert_process
-
-    text, problems = convert_process(source, target, values)
-    for problem in problems:
-        print_problem(problem, err=True)
-    if target == "-":
-        typer.echo(text, nl=False)
-    else:
-        write_file(target, text, replace=force)
-        typer.echo(
-            f"{escape(target)}: {format_count(len(problems), 'warning')}; modelserver check {escape(target)}", err=True
-        )
-
-
 def _choose_format(form: str, target: str) -> str:
-    if form in FORMATS:
-        return form
     if form:
-        near = find_nearest_names(form, FORMATS)
-        raise typer.BadParameter(
-            f"{quote(form)} is an unknown format; "
-            + (f"did you mean {near[0]}?" if near else f"formats: {', '.join(FORMATS)}"),
-            param_hint="--to",
-        )
+        return choose_name(form, FORMATS, "format", "--to")
     if target == "-":
         raise typer.BadParameter(
             f"standard output has no extension; give the format: {', '.join(FORMATS)}", param_hint="--to"

@@ -13,7 +13,8 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
@@ -77,10 +78,8 @@ MAX_SETTINGS: Final = 10_000
 _MAPPINGS: Final = frozenset({("variables",), ("sensors", "wheels", "frames")})
 """Keys of the vehicle file with entries named by the user."""
 
-_TRUE, _FALSE = ("true", "1", "yes", "on"), ("false", "0", "no", "off")
 
-
-class Setting(NamedTuple):
+class ProcessParameter(NamedTuple):
     """A parameter of the process configuration with a value, or a list of values: `path` from its section down."""
 
     path: tuple[str, ...]
@@ -110,13 +109,16 @@ def convert_process(file: str, target: str, variables: Mapping[str, str] | None 
     with open(file, "rb") as stream:
         content = stream.read(EXAMINED_BYTES + 1)
     if len(content) > EXAMINED_BYTES:
-        problem = f"the file is larger than {EXAMINED_BYTES >> 20} MiB", "is this the process configuration?"
-        raise ConfigError([Problem(Severity.ERROR, problem[0], Location(file), problem[1])])
+        why = f"the file is larger than {EXAMINED_BYTES >> 20} MiB"
+        raise _make_error(why, Location(file), "is this the process configuration?")
     builder = ModelBuilder()
     root = xml_document.parse(content, builder, file)
     if root is None:
         raise GeometryError(builder.problems)
-    settings = list(read_settings(root, file))
+    settings = list(islice(_iter_parameters(root, ()), MAX_SETTINGS + 1))
+    if len(settings) > MAX_SETTINGS:
+        why = f"the file has more than {MAX_SETTINGS} parameters"
+        raise _make_error(why, Location(file, settings[-1].line), "remove the sections of other processes")
     matching = _KeyMatcher(file, settings)
     for setting in settings:
         matching.add(setting)
@@ -124,55 +126,47 @@ def convert_process(file: str, target: str, variables: Mapping[str, str] | None 
     model, problems = check_file(geometry, variables)
     if model is None:
         raise GeometryError(problems)
-    matching.put(("geometry",), _get_relative_path(geometry, target))
+    # as a vehicle file at `target` names it
+    folder = os.path.dirname(target) if target != "-" else None
+    matching.values["geometry",] = os.path.relpath(geometry, folder)
     matching.complete(model)
-    return Conversion(
-        _format_vehicle_file(matching, file), tuple(sorted(matching.problems, key=lambda each: each.line))
-    )
+    problems = tuple(sorted(matching.problems, key=lambda each: each.line))
+    return Conversion(_format_vehicle_file(matching, file), problems)
 
 
-def read_settings(root: Element, file: str) -> Iterator[Setting]:
-    """Yield every parameter with a value, or with a list of values, below the root, in the order of the file.
-
-    Raises ConfigError for more than `MAX_SETTINGS`.
-    """
-    for count, setting in enumerate(_iter_settings(root, ()), 1):
-        if count > MAX_SETTINGS:
-            why = f"the file has more than {MAX_SETTINGS} parameters"
-            fix = "remove the sections of other processes"
-            raise ConfigError([Problem(Severity.ERROR, why, Location(file, setting.line), fix)])
-        yield setting
+def _make_error(why: str, place: Location, fix: str) -> ConfigError:
+    return ConfigError([Problem(Severity.ERROR, why, place, fix)])
 
 
-def _iter_settings(element: Element, path: tuple[str, ...]) -> Iterator[Setting]:
+def _iter_parameters(element: Element, path: tuple[str, ...]) -> Iterator[ProcessParameter]:
+    """Yield every parameter with a value, or with a list of values, below an element, in the order of the file."""
     for number, child in enumerate(xml_document.iterate_children(element)):
         below = (*path, (child.get("name") or "").strip() or f"[{number}]")
         value, inside = child.get("value"), list(xml_document.iterate_children(child))
         if value is not None:
-            yield Setting(below, value.strip(), xml_document.get_line(child))
+            yield ProcessParameter(below, value.strip(), xml_document.get_line(child))
         elif inside and all(each.get("name") is None and each.get("value") is not None for each in inside):
-            yield Setting(
-                below, tuple([(each.get("value") or "").strip() for each in inside]), xml_document.get_line(child)
-            )
+            values = tuple([(each.get("value") or "").strip() for each in inside])
+            yield ProcessParameter(below, values, xml_document.get_line(child))
             continue
         # libxml2 limits the depth of this recursion
-        yield from _iter_settings(child, below)
+        yield from _iter_parameters(child, below)
 
 
 class _KeyMatcher:
     """Match parameters with keys of the vehicle file: value and source of each key, and the skipped parameters."""
 
-    def __init__(self, file: str, settings: Iterable[Setting]):
+    def __init__(self, file: str, settings: Iterable[ProcessParameter]):
         self.file = file
         self.own = {each.path[0] for each in settings if OWN_SECTION in _normalize(each.path[0])}
         self.values: dict[Key, Any] = {}
-        self.sources: dict[Key, Setting] = {}
+        self.sources: dict[Key, ProcessParameter] = {}
         self.notes: dict[Key, str] = {}
-        self.skipped: list[tuple[Setting, str]] = []
+        self.skipped: list[tuple[ProcessParameter, str]] = []
         self.problems: list[Problem] = []
         self._types = dict(_iter_keys(VehicleConfig, ()))
 
-    def add(self, setting: Setting) -> None:
+    def add(self, setting: ProcessParameter) -> None:
         """Match a parameter with a key, or skip it."""
         found = self._keys_of(setting)
         if len(found) != 1:
@@ -190,22 +184,13 @@ class _KeyMatcher:
             return
         self.values[key], self.sources[key] = value, setting
 
-    def skip(self, setting: Setting, why: str, nearest: tuple[str, ...] = ()) -> None:
+    def skip(self, setting: ProcessParameter, why: str, nearest: tuple[str, ...] = ()) -> None:
         """List a parameter as not converted, with a warning."""
         self.skipped.append((setting, why))
-        fix = (
-            f"write it under {' or '.join(nearest)} if that is what it means" if nearest else "see docs/vehicle-file.md"
-        )
+        fix = f"write it under {' or '.join(nearest)} if that is what it means" if nearest else ""
         message = f"{quote(setting.label, 80)} is not converted: {why}"
-        self.problems.append(
-            Problem(Severity.WARNING, message, Location(self.file, setting.line, setting.label), fix, nearest)
-        )
-
-    def put(self, key: Key, value: Any, note: str = "") -> None:
-        """Set a key; `note` is the reason if it does not come from a parameter."""
-        self.values[key] = value
-        if note:
-            self.notes[key] = note
+        place = Location(self.file, setting.line, setting.label)
+        self.problems.append(Problem(Severity.WARNING, message, place, fix or "see docs/vehicle-file.md", nearest))
 
     def drop(self, key: Key, why: str) -> None:
         """Remove the key of a parameter, which is skipped."""
@@ -214,20 +199,19 @@ class _KeyMatcher:
 
     def complete(self, model: Model) -> None:
         """Remove what the geometry or the vehicle file rejects, and add required keys."""
-        for key in [
-            key for key in self.values if key[-1].endswith("frame") or key[:-1] == ("sensors", "wheels", "frames")
-        ]:
-            try:
-                model.frame(self.values[key])
-            except QueryError as error:
-                self.drop(key, str(error))
-        if ("base_frame",) not in self.values:
-            frame = next((name for name in ("CG", "Origin") if model.root.has_frame(name)), model.root.frames[0].name)
-            self.put(
-                ("base_frame",), model.root.frame(frame).full_name, "no parameter names it; taken from the root body"
-            )
-        if ("vehicle",) not in self.values:
-            self.put(("vehicle",), model.name or model.root.name, "no parameter names it; taken from the geometry")
+        for key in tuple(self.values):
+            if key[-1].endswith("frame") or key[:-1] == ("sensors", "wheels", "frames"):
+                try:
+                    model.frame(self.values[key])
+                except QueryError as error:
+                    self.drop(key, str(error))
+        frame = next((name for name in ("CG", "Origin") if model.root.has_frame(name)), model.root.frames[0].name)
+        for name, value, place in (
+            ("base_frame", model.root.frame(frame).full_name, "root body"),
+            ("vehicle", model.name or model.root.name, "geometry"),
+        ):
+            if (name,) not in self.values:
+                self.values[name,], self.notes[name,] = value, f"no parameter names it; taken from the {place}"
         while True:
             _, problems = parse_partly(_format_vehicle_file(self, "").encode(), self.file)
             # remove wrong keys and check the rest again: a section's own rules are checked last
@@ -241,16 +225,13 @@ class _KeyMatcher:
     def _drop_wrong(self, problem: Problem) -> bool:
         """Remove the keys of a problem of the vehicle file; return whether there was one."""
         at = tuple(problem.element.split("."))
-        while at:
-            below = [key for key in self.sources if key[: len(at)] == at]
-            for key in below:
-                self.drop(key, problem.message)
-            if below:
-                return True
+        while at and not (below := [key for key in self.sources if key[: len(at)] == at]):
             at = at[:-1]
-        return False
+        for key in below if at else ():
+            self.drop(key, problem.message)
+        return bool(at)
 
-    def _keys_of(self, setting: Setting) -> list[Key]:
+    def _keys_of(self, setting: ProcessParameter) -> list[Key]:
         """Return the keys that match the longest part of a parameter's path."""
         words = [_normalize(each) for each in setting.path]
         # the file is common to all processes: a rate in the section of another one is not ours
@@ -294,38 +275,35 @@ def _get_choices(kind: Any) -> tuple[Any, ...]:
     return (kind,)
 
 
-def _parse_value(setting: Setting, kind: Any) -> Any:
+def _parse_value(setting: ProcessParameter, kind: Any) -> Any:
     """Return the value of a parameter as the type of its key. Raises ValueError with what is expected."""
-    switch = SWITCHES.get(_normalize(setting.path[-1]))
-    text = setting.value
-    if switch is not None:
-        return switch[0] if _parse_bool(text) else switch[1]
-    (kind, *_) = _get_choices(kind)
+    text, switch = setting.value, SWITCHES.get(_normalize(setting.path[-1]))
+    (kind, *_) = _get_choices(bool if switch else kind)
     if get_origin(kind) is tuple:
-        words = text.split() if isinstance(text, str) else text
-        return [float(_parse_number(word, float)) for word in words]
+        return [_parse_word(word, float) for word in (text.split() if isinstance(text, str) else text)]
     if not isinstance(text, str):
         raise ValueError(f"takes one value, got a list of {len(text)}")
-    if kind is bool:
-        return _parse_bool(text)
-    if kind in (int, float):
-        return _parse_number(text, kind)
     if get_origin(kind) is Literal and text.lower() in get_args(kind):
         return text.lower()
-    return text
+    value = _parse_word(text, kind)
+    return switch[0 if value else 1] if switch else value
 
 
-def _parse_bool(text: str | tuple[str, ...]) -> bool:
-    if not isinstance(text, str) or text.lower() not in _TRUE + _FALSE:
-        raise ValueError(f"takes true or false, got {quote(str(text), 40)}")
-    return text.lower() in _TRUE
+_BOOLEANS: Final = dict.fromkeys(("true", "1", "yes", "on"), True) | dict.fromkeys(("false", "0", "no", "off"), False)
+
+_PARSERS: Final[Mapping[Any, tuple[Callable[[str], Any], str]]] = {
+    bool: (lambda text: _BOOLEANS[text.lower()], "true or false"),
+    int: (int, "a whole number"),
+    float: (float, "a number"),
+}
 
 
-def _parse_number(text: str, kind: type) -> Any:
+def _parse_word(text: str, kind: Any) -> Any:
+    parse, expected = _PARSERS.get(kind, (str, ""))
     try:
-        return kind(text)
-    except ValueError:
-        raise ValueError(f"takes {'a whole number' if kind is int else 'a number'}, got {quote(text, 40)}") from None
+        return parse(text)
+    except (ValueError, KeyError):
+        raise ValueError(f"takes {expected}, got {quote(text, 40)}") from None
 
 
 def _find_geometry(matching: _KeyMatcher, file: str) -> str:
@@ -345,7 +323,7 @@ def _find_geometry(matching: _KeyMatcher, file: str) -> str:
             known = ", ".join(each.label for each in files[:5])
             why = "no parameter names the geometry file" + (f"; it may be one of {known}" if files else "")
             fix = 'add <parameter name="GeometryFile" value="geometry.xml"/> to its section'
-            raise ConfigError([Problem(Severity.ERROR, why, Location(file), fix)])
+            raise _make_error(why, Location(file), fix)
         (found,) = files
         matching.skipped = [each for each in matching.skipped if each[0] is not found]
         matching.problems = [each for each in matching.problems if each.element != found.label]
@@ -357,13 +335,8 @@ def _find_geometry(matching: _KeyMatcher, file: str) -> str:
         near = find_nearest_path(path)
         fix = f"did you mean {near}?" if near else "paths are taken relative to the process configuration; correct it"
         why = f"the geometry file {quote(named, 100)} is missing"
-        raise ConfigError([Problem(Severity.ERROR, why, Location(file, setting.line, setting.label), fix)])
+        raise _make_error(why, Location(file, setting.line, setting.label), fix)
     return str(path)
-
-
-def _get_relative_path(geometry: str, target: str) -> str:
-    """Return the path of the geometry file as a vehicle file at `target` names it."""
-    return os.path.relpath(geometry, os.path.dirname(target) if target != "-" else None)
 
 
 def _format_vehicle_file(matching: _KeyMatcher, file: str) -> str:

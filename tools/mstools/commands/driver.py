@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
     from msdrivers.links import Link
     from msdrivers.registry import DeviceKind
+    from msdrivers.runner import Runner
     from msdrivers.settings import DriverSettings
     from mstools.deployment.service_start import ServiceStart
 
@@ -44,17 +45,14 @@ def find_driver_problems(vehicle: VehicleConfig, file: str, constraints: Collect
     lines = read_config_lines(file)
     if not any(path[:1] == ("drivers",) for path in lines):
         return ()
+    # imported here: a vehicle file without drivers needs none of their libraries
     from msdrivers.settings import SourceMap, read_drivers
     from msdrivers.validation import find_shared_lines, find_unbuildable_drivers
 
     found, problems = read_drivers(vehicle.drivers, SourceMap(file, lines))
     drivers = found.values()
-    return (
-        *problems,
-        *find_unbuildable_drivers(drivers, Path(file).parent),
-        *find_shared_lines(drivers),
-        *find_misnamed(vehicle, drivers, constraints),
-    )
+    unbuildable = find_unbuildable_drivers(drivers, Path(file).parent)
+    return (*problems, *unbuildable, *find_shared_lines(drivers), *find_misnamed(vehicle, drivers, constraints))
 
 
 def find_misnamed(
@@ -175,8 +173,6 @@ def show_ports() -> None:
 
 def show_drivers(config: Path) -> None:
     """Print the drivers of a vehicle file, and their problems as `modelserver check` does."""
-    from mstools.commands.driver import constraints_of, find_driver_problems
-
     vehicle, drivers = load_drivers(config)
     for name, driver in drivers.items():
         typer.echo(escape(f"{name:<16} {driver.kind.name}: {driver.kind.description}; {driver.line}"))
@@ -226,8 +222,6 @@ def load_driver(
 
 def warn_of_names(vehicle: VehicleConfig, settings: DriverSettings) -> None:
     """Log the wheels and joints of a driver that the vehicle does not have: their samples are not used."""
-    from mstools.commands.driver import constraints_of, find_misnamed
-
     constraints = constraints_of(vehicle) if hasattr(settings.device_settings, "joint") else None
     for problem in find_misnamed(vehicle, [settings], constraints):
         logging.getLogger(__name__).warning("%s: %s; %s", problem.source, problem.message, problem.fix)
@@ -238,11 +232,10 @@ def channels_of(vehicle: VehicleConfig, settings: DriverSettings) -> dict[type, 
     from modelserver.messages import GpsSample, ImuSample, VehicleStatusSample, WheelsSample
 
     sensors = vehicle.sensors
-    subscribed = (
-        (GpsSample, sensors.gps),
-        (ImuSample, sensors.imu),
-        (WheelsSample, sensors.wheels),
-        (VehicleStatusSample, sensors.steering),
+    subscribed = zip(
+        (GpsSample, ImuSample, WheelsSample, VehicleStatusSample),
+        (sensors.gps, sensors.imu, sensors.wheels, sensors.steering),
+        strict=True,
     )
     channels: dict[type, str] = {kind: sensor.channel for kind, sensor in subscribed if sensor is not None}
     if settings.channel:
@@ -299,14 +292,21 @@ def run(
     attend: Callable[[], object] = lambda: None  # noqa: E731
     if kind.command_channel:
         attend = _subscribe_commands(bus, f"{vehicle.lcm.channel_prefix}{kind.command_channel}", runner)
+    stop_on_signal(runner)
+    notifier = Notifier.from_environment()
+    try:
+        runner.run(DriverSupervision(runner, notifier).wrap_callback(attend))
+    finally:
+        notifier.notify_stopping()
+
+
+def stop_on_signal(runner: Runner[Any]) -> None:
+    """Let SIGTERM and Ctrl-C end a runner."""
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: runner.stop())
-    supervision = DriverSupervision(runner, Notifier.from_environment())
-    with supervision.notify_stopping():
-        runner.run(supervision.wrap_callback(attend))
 
 
-def _subscribe_commands(bus: Any, channel: str, runner: Any) -> Callable[[], object]:
+def _subscribe_commands(bus: Any, channel: str, runner: Runner[Any]) -> Callable[[], object]:
     """Subscribe to a command channel; return the function that processes the received commands."""
     from modelserver.errors import WireError
     from modelserver.wire.channels import to_subscription_pattern
@@ -315,11 +315,9 @@ def _subscribe_commands(bus: Any, channel: str, runner: Any) -> Callable[[], obj
 
     def handle(_: str, data: bytes) -> None:
         try:
-            command = decode("vehicle_command_t", data)
+            runner.send_command(decode("vehicle_command_t", data))
         except WireError as error:
             runner.reject_command(error.reason, f"a command on {channel} rejected: {error}")
-            return
-        runner.send_command(command)
 
     bus.subscribe(to_subscription_pattern(channel), handle)
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 from modelserver.server.supervision.systemd import Notifier, StallDetector
@@ -36,14 +35,6 @@ class DriverSupervision:
             self._notify()
 
         return on_pass
-
-    @contextmanager
-    def notify_stopping(self) -> Iterator[None]:
-        """Notify systemd when the block ends."""
-        try:
-            yield
-        finally:
-            self._notifier.notify_stopping()
 
     def _notify(self) -> None:
         self._passes += 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import signal
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -14,8 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from modelserver.errors import ModelServerError, find_nearest_names, quote
-from mstools.commands.driver import channels_of, load_driver
+from modelserver.errors import ModelServerError, quote
+from mstools.commands.driver import channels_of, load_driver, stop_on_signal
+from mstools.terminal.options import choose_name
 
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
@@ -41,7 +41,7 @@ GPS_HZ = 4.0
 class DriveOptions:
     """What to measure: an LCM log, or without one a simulated drive of `seconds`.
 
-    start: its start, microseconds of UTC; None: now. own_field: see `simulate`.
+    start: its start, microseconds of UTC; None: now. own_field: hard iron, tesla along the sensor's axes.
     """
 
     log: Path | None
@@ -68,10 +68,7 @@ def samples_of(vehicle: VehicleConfig, settings: DriverSettings, wanted: DriveOp
         if start + round(wanted.seconds * 1e6) < now:
             ago = f"{(now - start) * 1e-6:.0f} s ago, and the drive lasts {wanted.seconds:g} s"
             raise ModelServerError(f"--start {wanted.start} is {ago}: it is over, so there are no samples")
-        samples, what = (
-            simulate(vehicle, settings, start, wanted.seconds, wanted.scenario, wanted.seed, wanted.own_field),
-            "the simulated drive",
-        )
+        samples, what = simulate(vehicle, settings, start, wanted), "the simulated drive"
     if wanted.start is not None or wanted.log is None:
         # samples before now are skipped, also those of the time that making the drive took
         now = time.time_ns() // 1000
@@ -103,68 +100,56 @@ def read_logged(file: Path, vehicle: VehicleConfig, settings: DriverSettings, st
 
     kind = settings.kind.sample
     channel = f"{vehicle.lcm.channel_prefix}{channels_of(vehicle, settings).get(kind) or CHANNELS[kind]}"
-    type_name = BY_NAME[CHANNELS[kind]].type_name
     shift = None
     with LogFile(file) as events:
         for event in events:
-            if event.channel != channel:
-                continue
-            sample: Sample = decode(type_name, event.data)
-            header = sample.header
-            shift = start_utime - header.utime if shift is None else shift
-            host = header.host_utime + shift if header.host_utime else 0
-            yield replace(sample, header=replace(header, utime=header.utime + shift, host_utime=host))
+            if event.channel == channel:
+                sample: Sample = decode(BY_NAME[CHANNELS[kind]].type_name, event.data)
+                header = sample.header
+                shift = start_utime - header.utime if shift is None else shift
+                host = header.host_utime + shift if header.host_utime else 0
+                yield replace(sample, header=replace(header, utime=header.utime + shift, host_utime=host))
     if shift is None:
         raise ModelServerError(f"{file} has no messages on {channel}; expected the driver's channel")
 
 
 def simulate(
-    vehicle: VehicleConfig,
-    settings: DriverSettings,
-    start_utime: int,
-    seconds: float,
-    scenario: str,
-    seed: int,
-    own_field: Vector3 = (0.0, 0.0, 0.0),
+    vehicle: VehicleConfig, settings: DriverSettings, start_utime: int, wanted: DriveOptions
 ) -> Iterator[Sample]:
     """Return the samples of a driver's sensor on a simulated drive from `start_utime` on.
 
-    `own_field`: hard iron, tesla along the sensor's axes. A receiver measures at the rate of its driver's settings,
-    wheels and the vehicle controller at 100 Hz. Steered wheels are those of the vehicle file and the driver's settings.
-    Raises ModelServerError for a sensor without a section in the vehicle file.
+    A receiver measures at the rate of its driver's settings, wheels and the vehicle controller at 100 Hz. Steered
+    wheels are those of the vehicle file and the driver's settings. Raises ModelServerError for a sensor without a
+    section in the vehicle file.
     """
     from modelserver.messages import GpsSample, ImuSample, VehicleStatusSample, WheelsSample
     from modelserver.simulation import GpsModel, ImuModel, MagnetometerModel, Timing, WheelsModel
     from mstools.demo.drive import WHEELS_HZ, make_simulation
 
-    sensors = vehicle.sensors
-    needed = {
-        GpsSample: (GpsSample, "gps", sensors.gps),
-        ImuSample: (ImuSample, "imu", sensors.imu),
-        WheelsSample: (WheelsSample, "wheels", sensors.wheels),
-        VehicleStatusSample: (VehicleStatusSample, "wheels", sensors.wheels),
-    }
-    if settings.kind.sample not in needed:
+    sections = {GpsSample: "gps", ImuSample: "imu", WheelsSample: "wheels", VehicleStatusSample: "wheels"}
+    sensors, kind = vehicle.sensors, settings.kind.sample
+    if kind not in sections:
         # it follows its commands
         return iter(())
-    kind, name, sensor = needed[settings.kind.sample]
-    if sensor is None:
-        raise ModelServerError(f"the vehicle file has no section sensors.{name}, which has the sensor's frame")
+    if getattr(sensors, sections[kind]) is None:
+        raise ModelServerError(
+            f"the vehicle file has no section sensors.{sections[kind]}, which has the sensor's frame"
+        )
     steered = sensors.steering.wheels if sensors.steering is not None else ()
     mapped = getattr(settings.device_settings, "wheels", {})
     wheels = [name for name, wheel in mapped.items() if wheel.is_steered or wheel.steering is not None]
     run = make_simulation(
         vehicle,
         start_utime,
-        seconds,
-        scenario,
-        seed,
+        wanted.seconds,
+        wanted.scenario,
+        wanted.seed,
         (kind,),
         gps_model=GpsModel(Timing(getattr(settings.device_settings, "rate_hz", GPS_HZ))),
-        imu_model=ImuModel(magnetometer=MagnetometerModel(hard_iron=own_field)),
+        imu_model=ImuModel(magnetometer=MagnetometerModel(hard_iron=wanted.own_field)),
         wheels_model=WheelsModel(Timing(WHEELS_HZ), steered=frozenset((*steered, *wheels))),
     )
-    return (sample for sample in run.events(seconds) if isinstance(sample, kind))
+    return (sample for sample in run.events(wanted.seconds) if isinstance(sample, kind))
 
 
 SCENARIOS = ("eight", "circle", "stand", "straight", "city")
@@ -225,10 +210,7 @@ def command(
     """
     from msdrivers.fault_injection import parse_fault
 
-    if scenario not in SCENARIOS:
-        near = find_nearest_names(scenario, SCENARIOS)
-        hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(SCENARIOS)}"
-        raise typer.BadParameter(f"{quote(scenario, 40)} is no scenario; {hint}", param_hint="--scenario")
+    choose_name(scenario, SCENARIOS, "scenario", "--scenario")
     if (pty, tcp is not None, bool(can)).count(True) != 1:
         raise typer.BadParameter("give one of --pty, --tcp PORT and --can CHANNEL", param_hint="--pty")
     if link is not None and not pty:
@@ -257,15 +239,10 @@ def command(
     line.open()
     typer.echo(f"{name} ({settings.kind.name}) is on {line.description}")
     runner = Runner(station, line, options, SystemTimeSource())
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: runner.stop())
+    stop_on_signal(runner)
     end = math.inf if seconds is None else time.monotonic() + seconds
 
-    def attend() -> None:
-        if time.monotonic() >= end:
-            runner.stop()
-
-    runner.run(attend)
+    runner.run(lambda: runner.stop() if time.monotonic() >= end else None)
 
 
 def _make_link(settings: DriverSettings, link: Path | None, tcp: int | None, can: str, interface: str) -> Link[Any]:

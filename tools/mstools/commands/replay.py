@@ -200,9 +200,6 @@ def replay_offline(
     as_json: bool,
 ) -> None:
     """Write the poses of a frame, the decisions and the report of a log to the given files."""
-    # one thread works; BLAS threads would only cost time
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     # imported before the clock starts: the printed speed is that of the replay
     from modelserver.config.vehicle_file import load_config
     from modelserver.server.offline import CSV_HEADER, OfflineRun

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,9 +27,6 @@ def run_verification(journal: Path, as_json: bool, key: Path | None = None) -> N
     `key`: the vehicle's key file. Without one authenticity is not verified, and a journal that is reproduced bit for
     bit exits with 0.
     """
-    # as in the daemon: with more threads BLAS sums in another order
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     from modelserver.server.journal.segments import files_of
     from modelserver.server.journal.verify import VerificationResult, verify
     from modelserver.signing.key_files import read_keys

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
@@ -35,9 +34,6 @@ def command(
     Example: modelserver run -c config/raptor/vehicle.yaml
     """
     check_log_options(log_level, log_format)
-    # the service has one thread; idle BLAS threads would disturb its timing
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     from modelserver.config.vehicle_file import load_config
     from modelserver.server import daemon
     from modelserver.server.supervision.systemd import Notifier

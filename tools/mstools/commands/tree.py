@@ -62,11 +62,7 @@ def command(
         return
     from mstools.terminal.model_tree import draw_svg
 
-    image = draw_svg(title, assemblies, frames)
-    if svg == "-":
-        typer.echo(image, nl=False)
-    else:
-        write_file(svg, image, force)
+    write_file(svg, draw_svg(title, assemblies, frames), force)
 
 
 def load_geometry(file: str, variables: dict[str, str]) -> Model:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from modelserver.errors import ModelServerError, RecordingError
-from mstools.terminal.output import check_writable, escape, format_count, write_file
+from mstools.terminal.output import check_writable, escape, format_count, to_json, write_file
 from mstools.terminal.progress import show_progress
 from mstools.tuning.search import Parameter, Score, SearchResult, SearchStep, Settings, search
 
@@ -82,10 +82,9 @@ def command(
         raise typer.BadParameter("tune needs the vehicle file: -c FILE")
     if as_json and output == "-":
         raise typer.BadParameter("--json and -o - both write to standard output; give a file for the proposal")
-    _check_output(output, (log, config), force)
-    # one thread works in each process; BLAS threads would only cost time
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    if output and os.path.realpath(output) in {os.path.realpath(each) for each in (log, config)}:
+        raise typer.BadParameter("LOG, --config and --output must be different files")
+    check_writable(output, force)
     from mstools.tuning import evaluation as tune_runs
 
     vehicle = tune_runs.load(config)
@@ -120,11 +119,7 @@ def command(
         typer.echo(json.dumps(as_data(result), indent=2, allow_nan=False))
     else:
         typer.echo("\n".join(format_result(escape(str(log)), result)), err=output == "-")
-    text = format_proposal(str(log), result)
-    if output == "-":
-        typer.echo(text, nl=False)
-    elif output:
-        write_file(output, text, replace=force)
+    write_file(output, format_proposal(str(log), result), replace=force)
 
 
 @dataclass
@@ -160,7 +155,9 @@ class Trials:
         good = [each for each in outcomes if each is not None]
         if len(good) < len(self.parts):
             return None
-        return Score(sum(each.likelihood for each in good) / len(good), good[0].rmse, _mean(good[-1].gaps))
+        gaps = good[-1].gaps
+        likelihood = sum(each.likelihood for each in good) / len(good)
+        return Score(likelihood, good[0].rmse, sum(gaps) / len(gaps) if gaps else math.nan)
 
 
 @dataclass(frozen=True)
@@ -212,8 +209,8 @@ def as_data(result: TuningResult) -> dict[str, object]:
 
     def format_side(score: Score, outcomes: Sequence[EvaluationResult]) -> dict[str, object]:
         return {
-            "likelihood": _or_none(score.likelihood),
-            "rmse": _or_none(score.rmse),
+            "likelihood": to_json(score.likelihood),
+            "rmse": to_json(score.rmse),
             "gap_ends": list(outcomes[-1].gaps),
             "nis": {each.kind: {"mean": each.mean, "beyond": each.beyond} for each in outcomes[0].consistency},
         }
@@ -313,22 +310,3 @@ def _print_step(step: SearchStep) -> None:
         f"RMSE {step.score.rmse:.3f} m",
         err=True,
     )
-
-
-def _check_output(output: str, inputs: Sequence[Path], force: bool) -> None:
-    if not output or output == "-":
-        return
-    if os.path.realpath(output) in {os.path.realpath(each) for each in inputs}:
-        raise typer.BadParameter("LOG, --config and --output must be different files")
-    if not force and os.path.isfile(output):
-        # before the work, which takes long; writing checks it again
-        raise ModelServerError(f"{escape(output)} already exists; give --force to replace it, or another name")
-    check_writable(output)
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values) if values else math.nan
-
-
-def _or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None

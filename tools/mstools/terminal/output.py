@@ -42,13 +42,9 @@ def format_count(count: int, one: str, several: str = "") -> str:
 def describe_size(model: Model) -> str:
     """Return the numbers of bodies, frames and constraints."""
     frames = sum(len(body.frames) for body in model.bodies)
-    return ", ".join(
-        (
-            format_count(len(model.bodies), "body", "bodies"),
-            format_count(frames, "frame"),
-            format_count(len(model.constraints), "constraint"),
-        )
-    )
+    bodies, constraints = len(model.bodies), len(model.constraints)
+    counts = format_count(bodies, "body", "bodies"), format_count(frames, "frame")
+    return ", ".join((*counts, format_count(constraints, "constraint")))
 
 
 def to_json(value: Any) -> Any:
@@ -69,16 +65,18 @@ def to_json(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def check_writable(path: str) -> None:
+def check_writable(path: str, replace: bool = True) -> None:
     """Raise the error of `open_atomic` for a file that cannot be written, before long work.
 
-    An existing file is accepted; an empty path and - (standard output) are no files.
+    An empty path and - (standard output) are no files.
     """
     if path in ("", "-"):
         return
     target = os.path.realpath(path)
     if os.path.isdir(target):
         raise ModelServerError(f"{escape(path)} is a directory; name a file in it")
+    if os.path.isfile(target) and not replace:
+        raise _make_exists_error(path)
     if os.path.exists(target) and not os.path.isfile(target):
         return
     folder = os.path.dirname(target)
@@ -89,9 +87,12 @@ def check_writable(path: str) -> None:
 
 
 def write_file(path: str, text: str, replace: bool) -> None:
-    """Write a file atomically; see `open_atomic`."""
-    with open_atomic(path, replace) as stream:
-        stream.write(text)
+    """Write a file atomically, see `open_atomic`; - is standard output, an empty path nothing."""
+    if path == "-":
+        typer.echo(text, nl=False)
+    elif path:
+        with open_atomic(path, replace) as stream:
+            stream.write(text)
 
 
 @contextlib.contextmanager
