@@ -128,7 +128,7 @@ class _RandomSideSlip:
     """
 
     def __init__(self, sigma: float, lasting: float, seed: int, count: int = 60):
-        noise = NoiseSource(seed, "wandering")
+        noise = NoiseSource(seed, "wandering").generator
         top = 0.5 / lasting
         amplitude = sigma * math.sqrt(2.0 / count)
         # one frequency in each of even cells: an even spectrum
@@ -272,7 +272,7 @@ def run_stronger(seed: int) -> DriveResult:
 
 
 def run_faults(seed: int) -> DriveResult:
-    chance = NoiseSource(seed, "faults")
+    chance = NoiseSource(seed, "faults").generator
     angle = chance.uniform(-math.pi, math.pi)
     far = (5.0, 20.0, 700.0)[seed % 3]
     jumped = chance.uniform(95.0, 105.0)

@@ -6,12 +6,9 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from modelserver.earth.geodesy import Geodesy
 from modelserver.messages import AbsolutePoseSample, RangeSample, RelativePoseSample
 from modelserver.simulation import kinematics
-from modelserver.simulation.noise import NoiseSource
-from modelserver.simulation.timing import Intervals, Timing, generate_headers, is_within
-from modelserver.simulation.trajectory import MotionModel
+from modelserver.simulation.timing import Intervals, Run, Timing, is_within
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
@@ -86,29 +83,16 @@ class RangeModel:
     outages: Intervals = ()
 
 
-def simulate_absolute_poses(
-    model: AbsolutePoseModel,
-    drive: MotionModel,
-    frame: str,
-    X_VF: Pose,
-    geodesy: Geodesy,
-    start_utime: int,
-    seed: int,
-    source: str,
-) -> Iterator[AbsolutePoseSample]:
+def simulate_absolute_poses(model: AbsolutePoseModel, run: Run, frame: str, X_VF: Pose) -> Iterator[AbsolutePoseSample]:
     """Yield samples without end. `X_VF` is the pose of `frame` in the vehicle's moving frame."""
-    noise = NoiseSource(seed, f"absolute/{source}").prefetch()
+    noise = run.noise("absolute/absolute_pose").prefetch()
     covariance = _covariance(model.position_sigma, model.orientation_sigma)
-    arrival = NoiseSource(seed, f"absolute/{source}/arrival")
-    for header in generate_headers(model.timing, start_utime, start_utime - 1_000_000, source, arrival):
+    for header, t in run.generate_headers(model.timing, "absolute/absolute_pose"):
         shift, turn = noise.vector(model.position_sigma), noise.vector(model.orientation_sigma)
-        t = (header.utime - start_utime) * 1e-6
         if is_within(model.outages, t):
             continue
-        true = kinematics.pose(drive.at(t), X_VF)
-        if model.frame_of_reference == UTM:
-            true = geodesy.pose_in_utm(true)
-        measured = _add_error(true, shift, turn)
+        true = kinematics.pose(run.drive.at(t), X_VF)
+        measured = _add_error(run.geodesy.pose_in_utm(true) if model.frame_of_reference == UTM else true, shift, turn)
         yield AbsolutePoseSample(
             header,
             frame,
@@ -119,53 +103,36 @@ def simulate_absolute_poses(
         )
 
 
-def simulate_relative_poses(
-    model: RelativePoseModel, drive: MotionModel, frame: str, X_VF: Pose, start_utime: int, seed: int, source: str
-) -> Iterator[RelativePoseSample]:
+def simulate_relative_poses(model: RelativePoseModel, run: Run, frame: str, X_VF: Pose) -> Iterator[RelativePoseSample]:
     """Yield samples without end, the first at the second instant. `X_VF` as in `simulate_absolute_poses`."""
-    noise = NoiseSource(seed, f"relative/{source}").prefetch()
+    noise = run.noise("relative/relative_pose").prefetch()
     scale = 1.0 + noise.normal(model.scale_sigma)
     covariance = _covariance(model.position_sigma, model.orientation_sigma)
-    arrival = NoiseSource(seed, f"relative/{source}/arrival")
     since: int | None = None
     before = Pose()
-    for header in generate_headers(model.timing, start_utime, start_utime - 1_000_000, source, arrival):
+    for header, t in run.generate_headers(model.timing, "relative/relative_pose"):
         shift, turn = noise.vector(model.position_sigma), noise.vector(model.orientation_sigma)
-        t = (header.utime - start_utime) * 1e-6
-        here = kinematics.pose(drive.at(t), X_VF)
+        here = kinematics.pose(run.drive.at(t), X_VF)
         if since is not None and not is_within(model.outages, t):
-            x, y, z = (step := before.inverse() @ here).xyz
-            measured = _add_error(Pose((x * scale, y * scale, z * scale), step.wxyz), shift, turn)
+            step = before.inverse() @ here
+            measured = _add_error(Pose(so3.scale(scale, step.xyz), step.wxyz), shift, turn)
             yield RelativePoseSample(header, frame, since, measured.xyz, measured.wxyz, covariance)
         before, since = here, header.utime
 
 
 def simulate_ranges(
-    model: RangeModel,
-    drive: MotionModel,
-    frame: str,
-    lever: Vector3,
-    beacons: Mapping[str, Vector3],
-    start_utime: int,
-    seed: int,
-    source: str,
+    model: RangeModel, run: Run, frame: str, X_VF: Pose, beacons: Mapping[str, Vector3]
 ) -> Iterator[RangeSample]:
-    """Yield samples without end. `beacons` are positions in World:ENU, meters, by name; `seq` counts samples.
-
-    `lever` is the position of `frame` in the vehicle's moving frame.
-    """
-    noise = NoiseSource(seed, f"range/{source}").prefetch()
+    """Yield samples without end. `beacons` are positions in World:ENU, meters, by name; `seq` counts samples."""
+    noise = run.noise("range/range").prefetch()
     biases = {name: noise.normal(model.bias_sigma) for name in beacons}
     sigma = max(math.hypot(model.sigma, model.bias_sigma), _MIN_SIGMA)
-    arrival = NoiseSource(seed, f"range/{source}/arrival")
-    X_VF = Pose(lever)
     seq = 0
-    for header in generate_headers(model.timing, start_utime, start_utime - 1_000_000, source, arrival):
+    for header, t in run.generate_headers(model.timing, "range/range"):
         errors = {name: bias + noise.normal(model.sigma) for name, bias in biases.items()}
-        t = (header.utime - start_utime) * 1e-6
         if is_within(model.outages, t):
             continue
-        here = kinematics.pose(drive.at(t), X_VF).xyz
+        here = kinematics.pose(run.drive.at(t), X_VF).xyz
         for name, place in beacons.items():
             distance = math.dist(here, place)
             if distance <= model.max_range:
@@ -176,8 +143,7 @@ def simulate_ranges(
 
 def _add_error(X: Pose, shift: Vector3, turn: Vector3) -> Pose:
     """Return the pose with an error along the axes of its frame of reference."""
-    (x, y, z), (dx, dy, dz) = X.xyz, shift
-    return Pose((x + dx, y + dy, z + dz), so3.multiply(so3.exponential(turn), X.wxyz))
+    return Pose(so3.add(X.xyz, shift), so3.multiply(so3.exponential(turn), X.wxyz))
 
 
 def _covariance(position_sigma: float, orientation_sigma: float) -> tuple[float, ...]:

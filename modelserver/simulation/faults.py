@@ -12,6 +12,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import fields, replace
 from typing import Any, TypeVar
 
+import numpy as np
+
 from modelserver.messages import RelativePoseSample, SensorHeader
 from modelserver.simulation.noise import NoiseSource
 from modelserver.simulation.scenario import Event
@@ -21,9 +23,9 @@ _E = TypeVar("_E", bound=Event)
 
 def drop(events: Iterable[Event], seed: int, share: float, source: str | None = None) -> Iterator[Event]:
     """Yield the samples without a random `share` of them."""
-    chance = NoiseSource(seed, f"drop/{source}")
+    chance = NoiseSource(seed, f"drop/{source}").generator
     for event in events:
-        if not (_is_from(event, source) and chance.bernoulli(share)):
+        if not (_is_from(event, source) and chance.random() < share):
             yield event
 
 
@@ -51,7 +53,7 @@ def delay(
     """
     if not 0.0 <= min_delay <= max_delay < math.inf:
         raise ValueError(f"delays must be finite and not negative; got {min_delay} to {max_delay} s")
-    chance = NoiseSource(seed, f"late/{source}")
+    chance = NoiseSource(seed, f"late/{source}").generator
     waiting: list[tuple[int, int, Event]] = []
     last: dict[str, int] = {}
     for number, event in enumerate(events):
@@ -61,7 +63,7 @@ def delay(
             yield heapq.heappop(waiting)[2]
         at = arrival
         if _is_from(event, source):
-            if chance.bernoulli(share):
+            if chance.random() < share:
                 at += round(chance.uniform(min_delay, max_delay) * 1e6)
             if in_order:
                 at = last[event.header.source] = max(at, last.get(event.header.source, at))
@@ -74,14 +76,14 @@ def duplicate(
     events: Iterable[Event], seed: int, share: float, source: str | None = None, max_delay: float = 0.0
 ) -> Iterator[Event]:
     """Yield a random `share` of the samples twice, the second one up to `max_delay` seconds later."""
-    chance = NoiseSource(seed, f"duplicate/{source}")
+    chance = NoiseSource(seed, f"duplicate/{source}").generator
     waiting: list[tuple[int, int, Event]] = []
     for number, event in enumerate(events):
         arrival = event.header.host_utime
         while waiting and waiting[0][0] <= arrival:
             yield heapq.heappop(waiting)[2]
         yield event
-        if _is_from(event, source) and chance.bernoulli(share):
+        if _is_from(event, source) and chance.random() < share:
             at = arrival + round(chance.uniform(0.0, max_delay) * 1e6)
             heapq.heappush(waiting, (at, number, _replace_header(event, host_utime=at)))
     while waiting:
@@ -90,9 +92,9 @@ def duplicate(
 
 def inject_nan(events: Iterable[Event], seed: int, share: float, source: str | None = None) -> Iterator[Event]:
     """Yield the samples, one number in a random `share` of them nan, also within vectors; not in headers."""
-    chance = NoiseSource(seed, f"nan/{source}")
+    chance = NoiseSource(seed, f"nan/{source}").generator
     for event in events:
-        yield _set_random_nan(event, chance) if _is_from(event, source) and chance.bernoulli(share) else event
+        yield _set_random_nan(event, chance) if _is_from(event, source) and chance.random() < share else event
 
 
 def step_clock_back(
@@ -130,11 +132,11 @@ def _replace_header(event: _E, **changes: int) -> _E:
     return replace(event, header=header)
 
 
-def _set_random_nan(event: Event, chance: NoiseSource) -> Event:
+def _set_random_nan(event: Event, chance: np.random.Generator) -> Event:
     numbers = [path for each in fields(event) if each.name != "header" for path in _float_paths(event, each.name)]
     if not numbers:
         return event
-    name, *inside = numbers[chance.integer(len(numbers))]
+    name, *inside = numbers[chance.integers(len(numbers))]
     return replace(event, **{name: _set_nan(getattr(event, name), tuple(inside))})
 
 

@@ -11,12 +11,11 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from modelserver.earth.geodesy import Geodesy, LocalFrame
+from modelserver.earth.geodesy import LocalFrame
 from modelserver.messages import NAN, FixType, GpsSample
 from modelserver.simulation import kinematics
-from modelserver.simulation.noise import GaussMarkov, NoiseSource, diagonal_covariance
-from modelserver.simulation.timing import Intervals, Timing, generate_headers, is_within
-from modelserver.simulation.trajectory import MotionModel
+from modelserver.simulation.noise import GaussMarkov, diagonal_covariance
+from modelserver.simulation.timing import Intervals, Run, Timing, is_within
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
@@ -79,39 +78,26 @@ class GpsModel:
         return cls(timing, correlated_sigma=0.0, white_sigma=0.0, velocity_sigma=0.0, baseline_sigma=0.0)
 
 
-def simulate_fixes(
-    model: GpsModel,
-    drive: MotionModel,
-    X_VA: Pose,
-    geodesy: Geodesy,
-    start_utime: int,
-    seed: int,
-    source: str,
-    second_antenna: Vector3 | None = None,
-) -> Iterator[GpsSample]:
+def simulate_fixes(model: GpsModel, run: Run, X_VA: Pose, second_antenna: Vector3 | None = None) -> Iterator[GpsSample]:
     """Yield fixes without end. `X_VA` is the antenna's pose in the vehicle's moving frame.
 
     Position is on the ellipsoid; velocity is along true east, north and up at the antenna's position. `second_antenna`
     is its position in the vehicle's moving frame, None for none.
     """
-    noise = NoiseSource(seed, f"gps/{source}").prefetch()
-    duplicate_noise = NoiseSource(seed, f"gps/{source}/duplicates")
-    baseline_noise = NoiseSource(seed, f"gps/{source}/baseline")
-    baseline = None
-    if second_antenna is not None:
-        baseline = (second_antenna[0] - X_VA.xyz[0], second_antenna[1] - X_VA.xyz[1], second_antenna[2] - X_VA.xyz[2])
+    drive, geodesy = run.drive, run.geodesy
+    noise = run.noise("gps/gps").prefetch()
+    duplicate_noise = run.noise("gps/gps/duplicates").generator
+    baseline_noise = run.noise("gps/gps/baseline")
+    baseline = so3.add(second_antenna, so3.scale(-1.0, X_VA.xyz)) if second_antenna is not None else None
     scales = (1.0, 1.0, model.vertical)
     correlated = [GaussMarkov(model.correlated_sigma * scale, model.time_constant, noise) for scale in scales]
     position_sigma = max(math.hypot(model.correlated_sigma, model.white_sigma), _MIN_SIGMA) * model.sigma_factor
     velocity_sigma = max(model.velocity_sigma, _MIN_SIGMA) * model.sigma_factor
-    position_covariance = (
-        diagonal_covariance(*(position_sigma * scale for scale in scales)) if model.has_covariance else None
+    position_covariance, velocity_covariance = (
+        diagonal_covariance(sigma, sigma, sigma * model.vertical) if model.has_covariance else None
+        for sigma in (position_sigma, velocity_sigma)
     )
-    velocity_covariance = (
-        diagonal_covariance(*(velocity_sigma * scale for scale in scales)) if model.has_covariance else None
-    )
-    stamps = generate_headers(model.timing, start_utime, GPS_EPOCH, source, NoiseSource(seed, f"gps/{source}/arrival"))
-    for header in stamps:
+    for header, t in run.generate_headers(model.timing, "gps/gps", GPS_EPOCH):
         # drawn during outages too, so that an outage does not change later fixes
         error = [
             process.step(1.0 / model.timing.rate_hz) + noise.normal(model.white_sigma * scale)
@@ -119,8 +105,7 @@ def simulate_fixes(
         ]
         velocity_error = noise.vector(model.velocity_sigma)
         baseline_error = baseline_noise.normal(model.baseline_sigma) if baseline else 0.0
-        times = 2 if model.duplicates and duplicate_noise.bernoulli(model.duplicates) else 1
-        t = (header.utime - start_utime) * 1e-6
+        times = 2 if model.duplicates and duplicate_noise.random() < model.duplicates else 1
         if is_within(model.outages, t):
             yield from (GpsSample(header, FixType.NONE, NAN, NAN, satellites=0),) * times
             continue
@@ -148,10 +133,9 @@ def simulate_fixes(
         local = LocalFrame.at(latitude, longitude, height).rotation_of(geodesy.tangent)
         if model.has_velocity:
             earlier = drive.at(t - model.unstated_latency - model.velocity_latency)
-            ve, vn, vu = so3.rotate(local, kinematics.velocity(earlier, X_VA.xyz))
-            ve += velocity_error[0]
-            vn += velocity_error[1]
-            vu += velocity_error[2] * model.vertical
+            de, dn, du = velocity_error
+            velocity = so3.rotate(local, kinematics.velocity(earlier, X_VA.xyz))
+            ve, vn, vu = so3.add(velocity, (de, dn, du * model.vertical))
             speed = math.hypot(ve, vn)
             sample = replace(
                 sample,
@@ -165,13 +149,9 @@ def simulate_fixes(
             )
         if baseline:
             east, north, _ = so3.rotate(local, so3.rotate(kinematics.orientation(motion), baseline))
-            sample = replace(
-                sample,
-                baseline_yaw=math.remainder(math.atan2(north, east) + baseline_error, math.tau),
-                baseline_yaw_sigma=max(model.baseline_sigma, 1e-4) * model.sigma_factor
-                if model.has_covariance
-                else NAN,
-            )
+            sigma = max(model.baseline_sigma, 1e-4) * model.sigma_factor if model.has_covariance else NAN
+            yaw = math.remainder(math.atan2(north, east) + baseline_error, math.tau)
+            sample = replace(sample, baseline_yaw=yaw, baseline_yaw_sigma=sigma)
         yield from (sample,) * times
 
 

@@ -53,7 +53,7 @@ class SlipAngle:
     __slots__ = ("_cornering", "_fade", "_sines")
 
     def __init__(self, model: SideSlip, seed: int):
-        noise = NoiseSource(seed, "side slip")
+        noise = NoiseSource(seed, "side slip").generator
         amplitude = model.random_sigma * math.sqrt(2.0 / model.count)
         shortest, longest = map(math.log, model.periods)
         self._cornering = model.cornering
@@ -141,7 +141,7 @@ class Terrain:
         cls, seed: int, steepness: float = 0.05, count: int = 4, lengths: tuple[float, float] = (20.0, 120.0)
     ) -> Terrain:
         """Return waves of random direction, phase and length whose slope has the root mean square `steepness`."""
-        noise = NoiseSource(seed, "terrain")
+        noise = NoiseSource(seed, "terrain").generator
         waves = []
         for _ in range(count):
             length = math.exp(noise.uniform(math.log(lengths[0]), math.log(lengths[1])))
@@ -202,49 +202,38 @@ class GroundMotion:
     def at(self, t: float) -> TrajectoryMotion:
         """Return the motion `t` seconds after the start."""
         plan = self._trajectory.at(t)
-        turn = (plan.yaw, plan.yaw_rate, plan.yaw_acceleration)
+        yaw, yaw_rate, yaw_acceleration = plan.yaw, plan.yaw_rate, plan.yaw_acceleration
         along, across = plan.speed, 0.0
         if self._slip is not None:
             b, b1, b2 = self._slip.at(t, plan, self._trajectory.higher_rates(t))
-            turn = (plan.yaw - b, plan.yaw_rate - b1, plan.yaw_acceleration - b2)
+            yaw, yaw_rate, yaw_acceleration = yaw - b, yaw_rate - b1, yaw_acceleration - b2
             along, across = plan.speed * math.cos(b), plan.speed * math.sin(b)
-        yaw, yaw_rate, yaw_acceleration = turn
         cos, sin = math.cos(yaw), math.sin(yaw)
         ax, ay, _ = plan.acceleration
         push = ax * cos + ay * sin
+        motion = plan._replace(
+            yaw=yaw,
+            yaw_rate=yaw_rate,
+            yaw_acceleration=yaw_acceleration,
+            speed=along,
+            forward_acceleration=push + yaw_rate * across,
+            lateral_speed=across,
+        )
         if self._terrain is None:
-            return TrajectoryMotion(
-                plan.position,
-                plan.velocity,
-                plan.acceleration,
-                yaw,
-                yaw_rate,
-                yaw_acceleration,
-                along,
-                push + yaw_rate * across,
-                plan.distance,
-                plan.curvature,
-                across,
-            )
+            return motion
         ground = self._terrain.evaluate(plan.position, plan.velocity, plan.acceleration)
-        slope = _Slope(turn, cos, sin, ground)
-        attitude = slope.attitude
+        slope = _Slope((yaw, yaw_rate, yaw_acceleration), cos, sin, ground)
         z, vz, az = ground.height
         # forward is (cos, sin, ahead) / length; a distance to the left is longer along the ground than in the plan
         left = across * slope.steepness / slope.length
-        return TrajectoryMotion(
-            (plan.position[0], plan.position[1], z),
-            (plan.velocity[0], plan.velocity[1], vz),
-            (ax, ay, az),
-            yaw,
-            yaw_rate,
-            yaw_acceleration,
-            (along + slope.ahead * vz) / slope.length,
-            (push + slope.ahead * az) / slope.length + attitude.rate[2] * left,
-            plan.distance,
-            plan.curvature,
-            left,
-            attitude,
+        return motion._replace(
+            position=(*plan.position[:2], z),
+            velocity=(*plan.velocity[:2], vz),
+            acceleration=(ax, ay, az),
+            speed=(along + slope.ahead * vz) / slope.length,
+            forward_acceleration=(push + slope.ahead * az) / slope.length + slope.attitude.rate[2] * left,
+            lateral_speed=left,
+            attitude=slope.attitude,
         )
 
 
@@ -253,8 +242,6 @@ class _Slope:
 
     `ahead` is the slope q along the heading, `length` sqrt(1 + q^2), `steepness` sqrt(1 + q^2 + p^2).
     """
-
-    __slots__ = ("ahead", "attitude", "length", "steepness")
 
     def __init__(self, turn: Vector3, cos: float, sin: float, ground: GroundState):
         yaw, w, w1 = turn

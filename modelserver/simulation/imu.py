@@ -23,15 +23,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from modelserver.earth import gravity as earth
-from modelserver.earth.geodesy import Geodesy, rotation_about_up
+from modelserver.earth.geodesy import rotation_about_up
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.simulation import kinematics
 from modelserver.simulation.noise import GaussMarkov, NoiseSource, diagonal_covariance, quantize
-from modelserver.simulation.timing import Intervals, Timing, generate_headers, is_within
-from modelserver.simulation.trajectory import MotionModel
+from modelserver.simulation.timing import Intervals, Run, Timing, is_within
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
-from modelserver.transforms.so3 import Quaternion, Vector3
+from modelserver.transforms.so3 import Matrix3, Quaternion, Vector3
 
 Rows = tuple[Vector3, Vector3, Vector3]
 
@@ -64,31 +63,31 @@ class MagnetometerModel:
 class SimulatedMagnetometer:
     """One simulated magnetometer."""
 
-    __slots__ = ("_model", "_noise")
-
     def __init__(self, model: MagnetometerModel, noise: NoiseSource):
         self._model = model
         self._noise = noise.prefetch()
 
     def ambient_field(self, t: float) -> Vector3:
         """Return the field around the vehicle along east, north, up at `t` seconds."""
-        e, n, u = self._model.field
-        for begin, end, (de, dn, du) in self._model.disturbances:
-            if begin <= t < end:
-                e, n, u = e + de, n + dn, u + du
-        return (e, n, u)
+        return so3.add(
+            self._model.field, *(field for begin, end, field in self._model.disturbances if begin <= t < end)
+        )
 
     def measure(self, t: float, q_SE: Quaternion) -> Vector3:
         """Return the sample along the sensor axes; `q_SE` rotates east, north, up to them."""
-        x, y, z = so3.rotate(q_SE, self.ambient_field(t))
-        a, b, c = self._model.soft_iron
-        hx, hy, hz = self._model.hard_iron
-        nx, ny, nz = self._noise.vector(self._model.noise)
-        return (
-            a[0] * x + a[1] * y + a[2] * z + hx + nx,
-            b[0] * x + b[1] * y + b[2] * z + hy + ny,
-            c[0] * x + c[1] * y + c[2] * z + hz + nz,
-        )
+        model = self._model
+        ambient = so3.rotate(q_SE, self.ambient_field(t))
+        return so3.add(_apply(model.soft_iron, ambient), model.hard_iron, self._noise.vector(model.noise))
+
+
+def _apply(M: Rows, v: Vector3) -> Vector3:
+    x, y, z = v
+    a, b, c = M
+    return (
+        a[0] * x + a[1] * y + a[2] * z,
+        b[0] * x + b[1] * y + b[2] * z,
+        c[0] * x + c[1] * y + c[2] * z,
+    )
 
 
 _MOVING_SPEED = 0.05
@@ -119,14 +118,13 @@ class TriadModel:
 class Triad:
     """One simulated triad of gyros or accelerometers."""
 
-    __slots__ = ("_drift", "_instability", "_model", "_noise", "_period", "_rows", "_walk")
-
     def __init__(self, model: TriadModel, rate_hz: float, noise: NoiseSource):
         self._model = model
         self._noise = noise.prefetch()
         misalignment = [noise.vector(model.misalignment_sigma) for _ in range(3)]
         scale = noise.vector(model.scale_sigma)
-        self._rows = [tuple(1.0 + scale[i] if i == j else misalignment[i][j] for j in range(3)) for i in range(3)]
+        x, y, z = ([1.0 + scale[i] if i == j else misalignment[i][j] for j in range(3)] for i in range(3))
+        self._rows = (so3.to_vector3(x), so3.to_vector3(y), so3.to_vector3(z))
         self._instability = [GaussMarkov(model.instability, model.instability_time, noise) for _ in range(3)]
         self._walk = (0.0, 0.0, 0.0)
         self._drift = model.walk / math.sqrt(rate_hz)
@@ -134,24 +132,15 @@ class Triad:
 
     def measure(self, true: Vector3, speed: float) -> Vector3:
         """Return the measured vector for a true one at the vehicle's `speed`, m/s."""
-        x, y, z = true
-        a, b, c = self._rows
-        dx, dy, dz = self._walk
+        model = self._model
         if self._drift:
-            wx, wy, wz = self._noise.vector(self._drift)
-            self._walk = dx, dy, dz = (dx + wx, dy + wy, dz + wz)
-        if self._model.instability:
-            one, two, three = self._instability
-            dt = self._period
-            dx, dy, dz = dx + one.step(dt), dy + two.step(dt), dz + three.step(dt)
-        if self._model.vibration and abs(speed) > _MOVING_SPEED:
-            wx, wy, wz = self._noise.vector(self._model.vibration)
-            dx, dy, dz = dx + wx, dy + wy, dz + wz
-        return (
-            a[0] * x + a[1] * y + a[2] * z + dx,
-            b[0] * x + b[1] * y + b[2] * z + dy,
-            c[0] * x + c[1] * y + c[2] * z + dz,
-        )
+            self._walk = so3.add(self._walk, self._noise.vector(self._drift))
+        errors = [self._walk]
+        if model.instability:
+            errors.append(so3.to_vector3(each.step(self._period) for each in self._instability))
+        if model.vibration and abs(speed) > _MOVING_SPEED:
+            errors.append(self._noise.vector(model.vibration))
+        return so3.add(_apply(self._rows, true), so3.add(*errors))
 
 
 _HALF = math.sqrt(0.5)
@@ -228,17 +217,11 @@ class ImuModel:
         )
 
 
-def simulate_imu(
-    model: ImuModel, drive: MotionModel, X_VS: Pose, geodesy: Geodesy, start_utime: int, seed: int, source: str
-) -> Iterator[ImuSample]:
+def simulate_imu(model: ImuModel, run: Run, X_VS: Pose) -> Iterator[ImuSample]:
     """Yield samples without end. `X_VS` is the pose of the sensor axes in the vehicle's moving frame."""
-    stamps = generate_headers(
-        model.timing, start_utime, start_utime - 1_000_000, source, NoiseSource(seed, f"imu/{source}/arrival")
-    )
-    unit = _SimulatedImu(model, drive, X_VS, geodesy, seed, source)
+    unit = _SimulatedImu(model, run, X_VS)
     last: ImuSample | None = None
-    for header in stamps:
-        t = (header.utime - start_utime) * 1e-6
+    for header, t in run.generate_headers(model.timing, "imu/imu"):
         if last is None or model.frozen_from is None or t < model.frozen_from:
             last = unit.sample(header, t)
         else:
@@ -250,75 +233,60 @@ def simulate_imu(
 class _SimulatedImu:
     """One simulated IMU: errors drawn once, and drifting ones."""
 
-    def __init__(self, model: ImuModel, drive: MotionModel, X_VS: Pose, geodesy: Geodesy, seed: int, source: str):
-        latitude, _, height = geodesy.geodetic_from_enu((0.0, 0.0, 0.0))
-        self.model = model
-        self.drive = drive
-        self.q_VS = X_VS.wxyz
-        self.lever = X_VS.xyz
+    def __init__(self, model: ImuModel, run: Run, X_VS: Pose):
+        latitude, _, height = run.geodesy.geodetic_from_enu((0.0, 0.0, 0.0))
+        self.model, self.drive, self.X_VS = model, run.drive, X_VS
         self.up = earth.gravity(latitude, height)
         self.earth_rate = earth.earth_rate(latitude) if model.earth_rotation else (0.0, 0.0, 0.0)
-        noise = NoiseSource(seed, f"imu/{source}")
-        rate = model.timing.rate_hz
+        noise, rate = run.noise("imu/imu"), model.timing.rate_hz
         self.gyro_bias = noise.vector(model.gyro_bias_sigma)
         self.accelerometer_bias = noise.vector(model.accelerometer_bias_sigma)
         self.tilt = noise.vector(model.tilt_sigma)
-        self.yaw_error = noise.uniform(-math.pi, math.pi)
+        self.yaw_error = noise.generator.uniform(-math.pi, math.pi)
         if model.yaw_offset is not None:
             self.yaw_error = model.yaw_offset
         self.noise = noise.prefetch()
         self.gyro_sigma = model.gyro_noise * math.sqrt(rate)
         self.accelerometer_sigma = model.accelerometer_noise * math.sqrt(rate)
         self.walk_sigma = model.gyro_walk / math.sqrt(rate)
-        orientation_sigma = max(math.hypot(model.tilt_sigma, model.tilt_noise), 1e-4)
         # standard deviation of a uniform angle
         yaw_sigma = math.pi / math.sqrt(3.0)
-        self.yaw_noise = NoiseSource(seed, f"imu/{source}/yaw")
+        self.yaw_noise = run.noise("imu/imu/yaw")
         if model.yaw_source is not YawSource.NONE:
             self.yaw_error = (model.yaw_offset or 0.0) + self.yaw_noise.normal(model.yaw_sigma)
             yaw_sigma = max(math.hypot(model.yaw_sigma, model.yaw_noise), 1e-4)
-        self.gyro_covariance = _isotropic(max(math.hypot(self.gyro_sigma, model.gyro_bias_sigma), 1e-6))
-        self.force_covariance = _isotropic(
-            max(math.hypot(self.accelerometer_sigma, model.accelerometer_bias_sigma), 1e-6)
-        )
-        self.orientation_covariance = diagonal_covariance(orientation_sigma, orientation_sigma, yaw_sigma)
+        tilt_sigma = max(math.hypot(model.tilt_sigma, model.tilt_noise), 1e-4)
+        self.orientation_covariance = diagonal_covariance(tilt_sigma, tilt_sigma, yaw_sigma)
+        self.gyro_covariance = _covariance(self.gyro_sigma, model.gyro_bias_sigma)
+        self.force_covariance = _covariance(self.accelerometer_sigma, model.accelerometer_bias_sigma)
         # None for speed: most units have no such errors
-        self.gyro = None if model.gyro == _IDEAL else Triad(model.gyro, rate, NoiseSource(seed, f"imu/{source}/gyro"))
-        self.accelerometer = (
-            None
-            if model.accelerometer == _IDEAL
-            else Triad(model.accelerometer, rate, NoiseSource(seed, f"imu/{source}/accelerometer"))
+        self.gyro, self.accelerometer = (
+            None if triad == _IDEAL else Triad(triad, rate, run.noise(f"imu/imu/{name}"))
+            for name, triad in (("gyro", model.gyro), ("accelerometer", model.accelerometer))
         )
         self.magnetometer = (
             None
             if model.magnetometer is None
-            else SimulatedMagnetometer(model.magnetometer, NoiseSource(seed, f"imu/{source}/magnetometer"))
+            else SimulatedMagnetometer(model.magnetometer, run.noise("imu/imu/magnetometer"))
         )
 
     def sample(self, header: SensorHeader, t: float) -> ImuSample:
-        model, noise, lever, turning = self.model, self.noise, self.lever, self.earth_rate
+        model, noise, lever, turning = self.model, self.noise, self.X_VS.xyz, self.earth_rate
         motion = self.drive.at(t)
-        q_ES = so3.multiply(kinematics.orientation(motion), self.q_VS)
+        q_ES = so3.multiply(kinematics.orientation(motion), self.X_VS.wxyz)
         q_SE = so3.conjugate(q_ES)
-        step = noise.vector(self.walk_sigma)
-        bias = self.gyro_bias
-        self.gyro_bias = bias = (bias[0] + step[0], bias[1] + step[1], bias[2] + step[2])
+        self.gyro_bias = so3.add(self.gyro_bias, noise.vector(self.walk_sigma))
         turn = kinematics.angular_rate(motion)
-        rate = so3.rotate(q_SE, (turning[0] + turn[0], turning[1] + turn[1], turning[2] + turn[2]))
-        force = so3.rotate(
-            q_SE,
-            _specific_force(
-                kinematics.acceleration(motion, lever), kinematics.velocity(motion, lever), turning, self.up
-            ),
-        )
+        rate = so3.rotate(q_SE, so3.add(turning, turn))
+        acceleration, velocity = kinematics.acceleration(motion, lever), kinematics.velocity(motion, lever)
+        force = so3.rotate(q_SE, _specific_force(acceleration, velocity, turning, self.up))
         if self.gyro is not None:
             rate = self.gyro.measure(rate, motion.speed)
         if self.accelerometer is not None:
             force = self.accelerometer.measure(force, motion.speed)
-        rate = _add_errors(rate, bias, noise.vector(self.gyro_sigma), model.gyro_step)
-        force = _add_errors(
-            force, self.accelerometer_bias, noise.vector(self.accelerometer_sigma), model.accelerometer_step
-        )
+        rate = _add_errors(model.gyro_step, rate, self.gyro_bias, noise.vector(self.gyro_sigma))
+        force_noise = noise.vector(self.accelerometer_sigma)
+        force = _add_errors(model.accelerometer_step, force, self.accelerometer_bias, force_noise)
         orientation = None
         if model.reference is not OrientationReference.NONE:
             orientation = self._orientation(t, q_ES)
@@ -339,9 +307,9 @@ class _SimulatedImu:
         )
 
     def _orientation(self, t: float, q_ES: Quaternion) -> Quaternion:
-        model, tilt = self.model, self.tilt
-        shake = self.noise.vector(model.tilt_noise)
-        tilted = so3.exponential((tilt[0] + shake[0], tilt[1] + shake[1], 0.0))
+        model = self.model
+        x, y, _ = so3.add(self.tilt, self.noise.vector(model.tilt_noise))
+        tilted = so3.exponential((x, y, 0.0))
         error = self.yaw_error
         if model.yaw_source is not YawSource.NONE:
             error += self.yaw_noise.normal(model.yaw_noise)
@@ -364,13 +332,11 @@ def _specific_force(acceleration: Vector3, velocity: Vector3, turning: Vector3, 
     return (ax + 2.0 * (n * vz - u * vy), ay + 2.0 * u * vx, az - 2.0 * n * vx + gravity)
 
 
-def _add_errors(true: Vector3, bias: Vector3, noise: Vector3, step: float) -> Vector3:
-    return (
-        quantize(true[0] + bias[0] + noise[0], step),
-        quantize(true[1] + bias[1] + noise[1], step),
-        quantize(true[2] + bias[2] + noise[2], step),
-    )
+def _add_errors(step: float, true: Vector3, *errors: Vector3) -> Vector3:
+    x, y, z = so3.add(true, *errors)
+    return (quantize(x, step), quantize(y, step), quantize(z, step)) if step else (x, y, z)
 
 
-def _isotropic(sigma: float) -> tuple[float, float, float, float, float, float, float, float, float]:
+def _covariance(noise: float, bias: float) -> Matrix3:
+    sigma = max(math.hypot(noise, bias), 1e-6)
     return diagonal_covariance(sigma, sigma, sigma)

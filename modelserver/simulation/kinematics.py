@@ -35,10 +35,10 @@ def angular_rate(motion: TrajectoryMotion) -> Vector3:
 
 def velocity(motion: TrajectoryMotion, lever: Vector3) -> Vector3:
     """Return the velocity of the point at `lever` in the vehicle's moving frame, m/s."""
-    vx, vy, vz = motion.velocity
     if motion.attitude is not None:
-        x, y, z = so3.rotate(motion.attitude.wxyz, _cross(motion.attitude.rate, lever))
-        return (vx + x, vy + y, vz + z)
+        turning = so3.cross(motion.attitude.rate, lever)
+        return so3.add(motion.velocity, so3.rotate(motion.attitude.wxyz, turning))
+    vx, vy, vz = motion.velocity
     x, y = _rotate_by_yaw(motion.yaw, lever)
     w = motion.yaw_rate
     return (vx - w * y, vy + w * x, vz)
@@ -46,20 +46,14 @@ def velocity(motion: TrajectoryMotion, lever: Vector3) -> Vector3:
 
 def acceleration(motion: TrajectoryMotion, lever: Vector3) -> Vector3:
     """Return the acceleration of the point at `lever` in the vehicle's moving frame, m/s2."""
-    ax, ay, az = motion.acceleration
     if motion.attitude is not None:
         q, rate, faster = motion.attitude
-        sx, sy, sz = _cross(faster, lever)
-        cx, cy, cz = _cross(rate, _cross(rate, lever))
-        x, y, z = so3.rotate(q, (sx + cx, sy + cy, sz + cz))
-        return (ax + x, ay + y, az + z)
+        relative = so3.add(so3.cross(faster, lever), so3.cross(rate, so3.cross(rate, lever)))
+        return so3.add(motion.acceleration, so3.rotate(q, relative))
+    ax, ay, az = motion.acceleration
     x, y = _rotate_by_yaw(motion.yaw, lever)
     w, wd = motion.yaw_rate, motion.yaw_acceleration
     return (ax - wd * y - w * w * x, ay + wd * x - w * w * y, az)
-
-
-def _cross(a: Vector3, b: Vector3) -> Vector3:
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def _rotate_by_yaw(yaw: float, v: Vector3) -> tuple[float, float]:

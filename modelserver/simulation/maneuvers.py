@@ -149,7 +149,7 @@ def city(seed: int, seconds: float = 120.0, speed: float = 6.0, min_radius: floa
         raise ValueError(
             f"seconds must be at least 20, speed and radius positive; got {seconds}, {speed}, {min_radius}"
         )
-    chance = NoiseSource(seed, "city")
+    chance = NoiseSource(seed, "city").generator
     phases = [DrivePhase(chance.uniform(2.0, 4.0))]
     left = seconds - phases[0].duration
     now = 0.0
@@ -163,7 +163,7 @@ def city(seed: int, seconds: float = 120.0, speed: float = 6.0, min_radius: floa
     while True:
         part: list[DrivePhase] = []
         end = now
-        kind = chance.integer(6) if now else 5
+        kind = chance.integers(6) if now else 5
         if kind == 4:
             part, end = [to(0.0), DrivePhase(chance.uniform(1.0, 6.0))], 0.0
         elif kind == 3:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from modelserver.transforms.so3 import Vector3
+from modelserver.transforms.so3 import Matrix3, Vector3
 
 _BLOCK = 512
 
@@ -47,27 +47,9 @@ class NoiseSource:
         x, y, z = self._random.standard_normal(3).tolist()
         return (sigma * x, sigma * y, sigma * z)
 
-    def uniform(self, low: float, high: float) -> float:
-        """Return a uniform number between `low` and `high`."""
-        return float(self._generator().uniform(low, high))
-
-    def bernoulli(self, probability: float) -> bool:
-        """Return True with a probability."""
-        return bool(self._generator().random() < probability)
-
-    def exponential(self, mean: float) -> float:
-        """Return an exponentially distributed number: the time to the next event of a Poisson process."""
-        return float(self._generator().exponential(mean))
-
-    def binomial(self, trials: int, probability: float) -> int:
-        """Return the number of successes in independent trials."""
-        return int(self._generator().binomial(trials, probability))
-
-    def integer(self, count: int) -> int:
-        """Return a uniform integer from 0 to below `count`."""
-        return int(self._generator().integers(count))
-
-    def _generator(self) -> np.random.Generator:
+    @property
+    def generator(self) -> np.random.Generator:
+        """Other distributions. Raises ValueError while normal numbers are prefetched."""
         if self._prefetched is not None:
             raise ValueError("this source prefetches normal numbers; use another NoiseSource for other distributions")
         return self._random
@@ -102,8 +84,6 @@ def quantize(value: float, step: float) -> float:
     return round(value / step) * step if step > 0 else value
 
 
-def diagonal_covariance(
-    x: float, y: float, z: float
-) -> tuple[float, float, float, float, float, float, float, float, float]:
+def diagonal_covariance(x: float, y: float, z: float) -> Matrix3:
     """Return the row-major covariance of three independent standard deviations."""
     return (x * x, 0.0, 0.0, 0.0, y * y, 0.0, 0.0, 0.0, z * z)

@@ -23,6 +23,7 @@ from modelserver.simulation.aiding import AbsolutePoseModel, RangeModel, Relativ
 from modelserver.simulation.gps import GpsModel
 from modelserver.simulation.ground_motion import SideSlip, Terrain, make_motion
 from modelserver.simulation.imu import ImuModel
+from modelserver.simulation.timing import Run
 from modelserver.simulation.trajectory import MotionModel, Trajectory
 from modelserver.simulation.wheels import StatusModel, WheelsModel
 from modelserver.transforms.pose import Pose
@@ -124,40 +125,27 @@ class Simulation:
         self.geodesy = Geodesy(origin)
         self.start_utime = start_utime
         self._X_VB = pose_of(base_frame)
-        drive = self.drive
+        run = Run(self.drive, self.geodesy, start_utime, seed)
         sensors: list[Iterator[Event]] = []
-        common = (self.geodesy, start_utime, seed)
         if imu_frame is not None:
-            sensors.append(imu.simulate_imu(imu_model or ImuModel(), drive, pose_of(imu_frame), *common, "imu"))
+            sensors.append(imu.simulate_imu(imu_model or ImuModel(), run, pose_of(imu_frame)))
         if wheel_frames:
             contacts = {name: pose_of(frame).xyz for name, frame in wheel_frames.items()}
-            sensors.append(
-                wheels.simulate_wheels(wheels_model or WheelsModel(), drive, contacts, start_utime, seed, "wheels")
-            )
+            sensors.append(wheels.simulate_wheels(wheels_model or WheelsModel(), run, contacts))
         if status_model is not None:
-            sensors.append(wheels.simulate_status(status_model, drive, start_utime, seed, "vehicle"))
+            sensors.append(wheels.simulate_status(status_model, run))
         if gps_frame is not None:
             second = pose_of(second_gps_frame).xyz if second_gps_frame is not None else None
-            sensors.append(
-                gps.simulate_fixes(gps_model or GpsModel(), drive, pose_of(gps_frame), *common, "gps", second)
-            )
+            sensors.append(gps.simulate_fixes(gps_model or GpsModel(), run, pose_of(gps_frame), second))
         if pose_frame is not None:
             poses = pose_model or AbsolutePoseModel()
-            sensors.append(
-                aiding.simulate_absolute_poses(poses, drive, pose_frame, pose_of(pose_frame), *common, "absolute_pose")
-            )
+            sensors.append(aiding.simulate_absolute_poses(poses, run, pose_frame, pose_of(pose_frame)))
         if odometry_frame is not None:
-            X_VF, odometry = pose_of(odometry_frame), odometry_model or RelativePoseModel()
-            sensors.append(
-                aiding.simulate_relative_poses(
-                    odometry, drive, odometry_frame, X_VF, start_utime, seed, "relative_pose"
-                )
-            )
+            odometry = odometry_model or RelativePoseModel()
+            sensors.append(aiding.simulate_relative_poses(odometry, run, odometry_frame, pose_of(odometry_frame)))
         if range_frame is not None and beacons:
-            lever, radio = pose_of(range_frame).xyz, range_model or RangeModel()
-            sensors.append(
-                aiding.simulate_ranges(radio, drive, range_frame, lever, beacons, start_utime, seed, "range")
-            )
+            radio, X_VF = range_model or RangeModel(), Pose(pose_of(range_frame).xyz)
+            sensors.append(aiding.simulate_ranges(radio, run, range_frame, X_VF, beacons))
         self._arrivals = heapq.merge(*sensors, key=lambda sample: sample.header.host_utime)
         self._next: Event | None = next(self._arrivals, None)
         self._until = start_utime
@@ -169,8 +157,7 @@ class Simulation:
 
     def _events_until(self, until: int) -> Iterator[Event]:
         while self._next is not None and self._next.header.host_utime < until:
-            sample = self._next
-            self._next = next(self._arrivals, None)
+            sample, self._next = self._next, next(self._arrivals, None)
             yield sample
 
     def truth(self, utime: int) -> Truth:

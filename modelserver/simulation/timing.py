@@ -1,4 +1,4 @@
-"""Sampling instants and latency of simulated sensors."""
+"""Sampling instants and latency of simulated sensors, and what the sensors of a run share."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from modelserver.earth.geodesy import Geodesy
 from modelserver.messages import SensorHeader
 from modelserver.simulation.noise import NoiseSource
+from modelserver.simulation.trajectory import MotionModel
 
 Intervals: TypeAlias = tuple[tuple[float, float], ...]
 """Begin and end in seconds since the start."""
@@ -35,26 +37,34 @@ class Timing:
             raise ValueError(f"rate_hz must be in (0, 10000], latency and jitter not negative; got {self}")
 
 
-def generate_headers(
-    timing: Timing, start_utime: int, device_epoch: int, source: str, noise: NoiseSource
-) -> Iterator[SensorHeader]:
-    """Yield the header of each sample without end; the first is measured at `start_utime`.
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What the sensors of a run share. `start_utime` is the instant of the first samples."""
 
-    `device_epoch` is the utime at which the device's own clock shows 0.
-    """
-    arrived = 0
-    seq = 0
-    noise.prefetch()
-    while True:
-        utime = start_utime + round(seq * 1e6 / timing.rate_hz)
-        delay = timing.latency + (abs(noise.normal(timing.jitter)) if timing.jitter else 0.0)
-        arrived = max(arrived, utime + round(delay * 1e6))
-        yield SensorHeader(
-            utime=utime,
-            source=source,
-            seq=seq,
-            host_utime=arrived,
-            device_utime=utime - device_epoch,
-            utime_sigma=0.0,
-        )
-        seq += 1
+    drive: MotionModel
+    geodesy: Geodesy
+    start_utime: int
+    seed: int
+
+    def noise(self, name: str) -> NoiseSource:
+        """Return the random generator of a name, by the run's seed."""
+        return NoiseSource(self.seed, name)
+
+    def generate_headers(
+        self, timing: Timing, name: str, device_epoch: int | None = None
+    ) -> Iterator[tuple[SensorHeader, float]]:
+        """Yield the header of each sample of `kind/source` without end, and its instant in seconds since the start.
+
+        `device_epoch` is the utime at which the device's own clock shows 0; None for a second before the start.
+        """
+        epoch = self.start_utime - 1_000_000 if device_epoch is None else device_epoch
+        noise = self.noise(f"{name}/arrival").prefetch()
+        source = name.rpartition("/")[2]
+        arrived = seq = 0
+        while True:
+            utime = self.start_utime + round(seq * 1e6 / timing.rate_hz)
+            delay = timing.latency + (abs(noise.normal(timing.jitter)) if timing.jitter else 0.0)
+            arrived = max(arrived, utime + round(delay * 1e6))
+            header = SensorHeader(utime, source, seq, host_utime=arrived, device_utime=utime - epoch, utime_sigma=0.0)
+            yield header, (utime - self.start_utime) * 1e-6
+            seq += 1

@@ -129,34 +129,27 @@ class Trajectory:
 
     def at(self, t: float) -> TrajectoryMotion:
         """Return the motion `t` seconds after the start."""
-        t = min(max(t, 0.0), self.duration)
-        index = max(bisect_right(self._starts, t) - 1, 0)
-        return self._pieces[index].at(t - self._starts[index])
+        piece, u = self._locate(t)
+        return piece.at(u)
 
     def higher_rates(self, t: float) -> Vector3:
         """Return first and second rate of curvature (1/m/s, 1/m/s2) and jerk (m/s3, second rate of speed)."""
+        piece, u = self._locate(t)
+        return (
+            _evaluate(piece.curvature_rate, u),
+            _evaluate(piece.curvature_rate_rate, u),
+            _evaluate(piece.jerk, u),
+        )
+
+    def _locate(self, t: float) -> tuple[_Piece, float]:
+        """Return the phase at an instant, and the share of its duration that is over."""
         t = min(max(t, 0.0), self.duration)
         index = max(bisect_right(self._starts, t) - 1, 0)
-        return self._pieces[index].higher_rates(t - self._starts[index])
+        return self._pieces[index], (t - self._starts[index]) / self._pieces[index].duration
 
 
 class _Piece:
-    """Polynomials of one phase."""
-
-    __slots__ = (
-        "curvature",
-        "curvature_rate",
-        "curvature_rate_rate",
-        "distance",
-        "duration",
-        "jerk",
-        "knots",
-        "speed",
-        "speed_rate",
-        "yaw",
-        "yaw_acceleration",
-        "yaw_rate",
-    )
+    """Polynomials of one phase, of the share u of its duration."""
 
     def __init__(
         self,
@@ -167,17 +160,20 @@ class _Piece:
         yaw: float,
         distance: float,
     ):
+
+        def derive(coefficients: Coefficients) -> Coefficients:
+            return _trim(polynomial.polyder(coefficients) / duration)
+
+        def integrate(coefficients: Coefficients, start: float) -> Coefficients:
+            return _trim(polynomial.polyint(np.multiply(coefficients, duration), k=start))
+
         self.duration = duration
-        self.speed = _ramp(*speed)
-        self.curvature = _ramp(*curvature)
+        self.speed, self.curvature = _ramp(*speed), _ramp(*curvature)
         self.yaw_rate = _trim(polynomial.polymul(self.speed, self.curvature))
-        self.speed_rate = _trim(polynomial.polyder(self.speed) / duration)
-        self.jerk = _trim(polynomial.polyder(self.speed_rate) / duration)
-        self.curvature_rate = _trim(polynomial.polyder(self.curvature) / duration)
-        self.curvature_rate_rate = _trim(polynomial.polyder(self.curvature_rate) / duration)
-        self.yaw_acceleration = _trim(polynomial.polyder(self.yaw_rate) / duration)
-        self.yaw = _trim(polynomial.polyint(np.multiply(self.yaw_rate, duration), k=yaw))
-        self.distance = _trim(polynomial.polyint(np.multiply(self.speed, duration), k=distance))
+        self.speed_rate, self.curvature_rate = derive(self.speed), derive(self.curvature)
+        self.jerk, self.curvature_rate_rate = derive(self.speed_rate), derive(self.curvature_rate)
+        self.yaw_acceleration = derive(self.yaw_rate)
+        self.yaw, self.distance = integrate(self.yaw_rate, yaw), integrate(self.speed, distance)
         steps = max(1, math.ceil(duration / _KNOT_SECONDS))
         self.knots = [start]
         for step in range(steps):
@@ -197,8 +193,7 @@ class _Piece:
             y += distance * math.sin(angle)
         return (x, y)
 
-    def at(self, t: float) -> TrajectoryMotion:
-        u = t / self.duration
+    def at(self, u: float) -> TrajectoryMotion:
         steps = len(self.knots) - 1
         knot = min(int(u * steps), steps - 1)
         x, y = self._integrate(self.knots[knot], knot / steps, u - knot / steps)
@@ -219,10 +214,6 @@ class _Piece:
             _evaluate(self.distance, u),
             _evaluate(self.curvature, u),
         )
-
-    def higher_rates(self, t: float) -> Vector3:
-        u = t / self.duration
-        return (_evaluate(self.curvature_rate, u), _evaluate(self.curvature_rate_rate, u), _evaluate(self.jerk, u))
 
 
 def _ramp(start: float, end: float) -> Coefficients:

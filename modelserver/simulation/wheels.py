@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 
 from modelserver.messages import NAN, Direction, VehicleMode, VehicleStatusSample, WheelSample, WheelsSample
 from modelserver.simulation.noise import NoiseSource, quantize
-from modelserver.simulation.timing import Timing, generate_headers
+from modelserver.simulation.timing import Run, Timing
 from modelserver.simulation.trajectory import MotionModel, Trajectory, TrajectoryMotion
 from modelserver.transforms.so3 import Vector3
 
@@ -46,95 +46,6 @@ class EncoderModel:
     speed_from_travel: bool = False
     has_travel: bool = True
     has_speed: bool = True
-
-
-class Encoder:
-    """One simulated encoder; each call of `sample` follows the last."""
-
-    def __init__(
-        self,
-        model: EncoderModel,
-        name: str,
-        *,
-        scale: float,
-        travel_step: float,
-        speed_sigma: float,
-        stationary_speed: float,
-        noise: NoiseSource,
-        faults: NoiseSource,
-    ):
-        """Set up the encoder of a wheel; the measures are those of `WheelsModel`.
-
-        `scale` is the measured per true travel. `noise` is shared by the wheels, `faults` is the wheel's own.
-        """
-        self._model = model
-        self._name = name
-        self._scale = scale
-        self._step = travel_step
-        self._noise_sigma = speed_sigma
-        self._stationary_speed = stationary_speed
-        self._noise = noise
-        self._faults = faults
-        self._stuck_from = min((t for wheel, t in model.stuck if wheel == name), default=math.inf)
-        self._sign = -1.0 if name in model.swapped else 1.0
-        self._travel_sigma = max(travel_step / math.sqrt(12.0), 1e-4) if model.has_travel else NAN
-        self._speed_sigma = max(speed_sigma, 1e-4) if model.has_speed else NAN
-        self._rotated = 0.0
-        self._counted = 0.0
-        self._pulses = 0
-        self._t = 0.0
-        self._burst = faults.exponential(1.0 / model.burst_rate) if model.burst_rate else math.inf
-
-    def sample(self, t: float, rolled: float, speed: float, excess: float, steering: float) -> WheelSample:
-        """Return the encoder's sample at `t` seconds.
-
-        `rolled` (m since the last sample) and `speed` are those over ground; wheel slip multiplies them by `excess`.
-        """
-        model = self._model
-        seen = self._scale * excess
-        if self._is_spinning(t):
-            seen *= 1.0 + model.burst_excess
-        error = self._noise.normal(self._noise_sigma) if abs(speed) > self._stationary_speed else 0.0
-        measured = speed * seen + error
-        stuck = t >= self._stuck_from
-        if stuck:
-            measured = speed = 0.0
-        else:
-            self._rotated += rolled * seen
-        travel = self._count() if model.missed and self._step else quantize(self._rotated, self._step)
-        if model.speed_from_travel:
-            measured = (travel - self._counted) / (t - self._t) if t > self._t else 0.0
-            speed = measured
-        self._counted, self._t = travel, t
-        sign = self._sign
-        return WheelSample(
-            self._name,
-            travel=sign * travel if model.has_travel else NAN,
-            travel_sigma=self._travel_sigma,
-            speed=sign * measured if model.has_speed else NAN,
-            speed_sigma=self._speed_sigma,
-            direction=_direction(sign * speed, self._stationary_speed),
-            steering=steering,
-        )
-
-    def _is_spinning(self, t: float) -> bool:
-        while t >= self._burst + self._model.burst_seconds:
-            self._burst += self._model.burst_seconds + self._faults.exponential(1.0 / self._model.burst_rate)
-        return t >= self._burst
-
-    def _count(self) -> float:
-        """Return the travel of the counted pulses, meters."""
-        pulses = round(self._rotated / self._step)
-        new = pulses - self._pulses
-        self._pulses = pulses
-        counted = abs(new) - self._faults.binomial(abs(new), self._model.missed)
-        return self._counted + math.copysign(counted, new) * self._step
-
-
-def _direction(speed: float, stationary_speed: float) -> Direction:
-    if abs(speed) <= stationary_speed:
-        return Direction.STOPPED
-    return Direction.FORWARD if speed > 0 else Direction.BACKWARD
 
 
 _GRAVITY = 9.81
@@ -180,47 +91,90 @@ class WheelsModel:
         return cls(timing, scale_sigma=0.0, speed_sigma=0.0, travel_step=0.0, steered=steered)
 
 
-def simulate_wheels(
-    model: WheelsModel,
-    drive: MotionModel,
-    contacts: Mapping[str, Vector3],
-    start_utime: int,
-    seed: int,
-    source: str,
-) -> Iterator[WheelsSample]:
-    """Yield samples without end. `contacts` has each wheel's contact point in the vehicle's moving frame, meters."""
-    noise = NoiseSource(seed, f"wheels/{source}")
-    encoders = {
-        name: Encoder(
-            model.encoder,
-            name,
-            scale=1.0 + noise.normal(model.scale_sigma),
-            travel_step=model.travel_step,
-            speed_sigma=model.speed_sigma,
-            stationary_speed=model.stationary_speed,
-            noise=noise,
-            faults=NoiseSource(seed, f"wheels/{source}/{name}"),
+class Encoder:
+    """One simulated encoder; each call of `sample` follows the last."""
+
+    def __init__(self, model: WheelsModel, name: str, noise: NoiseSource, faults: NoiseSource):
+        """Draw the errors of a wheel's encoder; `noise` is shared by the wheels, `faults` is the wheel's own."""
+        self._model, self._faulty = model, model.encoder
+        self._name = name
+        self._scale = 1.0 + noise.normal(model.scale_sigma)
+        self._noise, self._faults = noise, faults.generator
+        self._stuck_from = min((t for wheel, t in self._faulty.stuck if wheel == name), default=math.inf)
+        self._sign = -1.0 if name in self._faulty.swapped else 1.0
+        self._rotated = self._counted = self._t = 0.0
+        self._pulses = 0
+        rate = self._faulty.burst_rate
+        self._burst = self._faults.exponential(1.0 / rate) if rate else math.inf
+
+    def sample(self, t: float, rolled: float, speed: float, excess: float, steering: float) -> WheelSample:
+        """Return the encoder's sample at `t` seconds.
+
+        `rolled` (m since the last sample) and `speed` are those over ground; wheel slip multiplies them by `excess`.
+        """
+        model, faulty = self._model, self._faulty
+        seen = self._scale * excess
+        if self._is_spinning(t):
+            seen *= 1.0 + faulty.burst_excess
+        error = self._noise.normal(model.speed_sigma) if abs(speed) > model.stationary_speed else 0.0
+        measured = speed * seen + error
+        if t >= self._stuck_from:
+            measured = speed = 0.0
+        else:
+            self._rotated += rolled * seen
+        travel = self._count() if faulty.missed and model.travel_step else quantize(self._rotated, model.travel_step)
+        if faulty.speed_from_travel:
+            measured = speed = (travel - self._counted) / (t - self._t) if t > self._t else 0.0
+        self._counted, self._t = travel, t
+        sign = self._sign
+        return WheelSample(
+            self._name,
+            travel=sign * travel if faulty.has_travel else NAN,
+            travel_sigma=max(model.travel_step / math.sqrt(12.0), 1e-4) if faulty.has_travel else NAN,
+            speed=sign * measured if faulty.has_speed else NAN,
+            speed_sigma=max(model.speed_sigma, 1e-4) if faulty.has_speed else NAN,
+            direction=_direction(sign * speed, model.stationary_speed),
+            steering=steering,
         )
-        for name in contacts
-    }
+
+    def _is_spinning(self, t: float) -> bool:
+        faulty = self._faulty
+        while t >= self._burst + faulty.burst_seconds:
+            self._burst += faulty.burst_seconds + self._faults.exponential(1.0 / faulty.burst_rate)
+        return t >= self._burst
+
+    def _count(self) -> float:
+        """Return the travel of the counted pulses, meters."""
+        before, self._pulses = self._pulses, round(self._rotated / self._model.travel_step)
+        new = self._pulses - before
+        counted = abs(new) - self._faults.binomial(abs(new), self._faulty.missed)
+        return self._counted + math.copysign(counted, new) * self._model.travel_step
+
+
+def _direction(speed: float, stationary_speed: float) -> Direction:
+    if abs(speed) <= stationary_speed:
+        return Direction.STOPPED
+    return Direction.FORWARD if speed > 0 else Direction.BACKWARD
+
+
+def simulate_wheels(model: WheelsModel, run: Run, contacts: Mapping[str, Vector3]) -> Iterator[WheelsSample]:
+    """Yield samples without end. `contacts` has each wheel's contact point in the vehicle's moving frame, meters."""
+    noise = run.noise("wheels/wheels")
+    encoders = {name: Encoder(model, name, noise, run.noise(f"wheels/wheels/{name}")) for name in contacts}
     noise.prefetch()
-    stamps = generate_headers(
-        model.timing, start_utime, start_utime - 1_000_000, source, NoiseSource(seed, f"wheels/{source}/arrival")
-    )
-    rolling = _WheelOdometry(model, drive, contacts)
-    for header in stamps:
-        t = (header.utime - start_utime) * 1e-6 - model.unstated_latency
+    rolling = _WheelOdometry(model, run.drive, contacts)
+    for header, t in run.generate_headers(model.timing, "wheels/wheels"):
+        t -= model.unstated_latency
         motion, distances = rolling.advance(t)
         excess = 1.0 + model.slip * _traction(motion) / _GRAVITY
         wheels = []
         for name, contact in contacts.items():
             if name in model.steered:
-                speed = rolling.steered_speed(motion, contact)
+                speed = _steered_speed(motion, contact)
                 steering = math.atan2(motion.curvature * contact[0], 1.0 - motion.curvature * contact[1])
             else:
-                rates = _rates(motion)
-                speed = rates[0] - model.track_factor * contact[1] * rates[1] + contact[2] * rates[2]
-                steering = 0.0
+                forward, turn, pitch = _rates(motion)
+                speed, steering = forward - model.track_factor * contact[1] * turn + contact[2] * pitch, 0.0
             wheels.append(encoders[name].sample(t, distances[name], speed, excess, steering))
         yield WheelsSample(header, tuple(wheels))
 
@@ -234,7 +188,6 @@ class _WheelOdometry:
         self.contacts = contacts
         # on level ground without side slip the travel of wheels that do not steer has a closed form
         self.has_closed_form = isinstance(drive, Trajectory)
-        self.steered_speed = _steered_speed if self.has_closed_form else _steered_speed_sliding
         self.quadrature = bool(model.steered) or not self.has_closed_form
         self.previous = drive.at(0.0)
         self.t_previous = 0.0
@@ -257,7 +210,7 @@ class _WheelOdometry:
         distances = {}
         for name, contact in self.contacts.items():
             if name in model.steered:
-                distances[name] = elapsed * sum(weight * self.steered_speed(each, contact) for each, weight in between)
+                distances[name] = elapsed * sum(weight * _steered_speed(each, contact) for each, weight in between)
             else:
                 distances[name] = along - model.track_factor * contact[1] * turned + contact[2] * pitched
         self.previous, self.t_previous = motion, t
@@ -277,16 +230,11 @@ class StatusModel:
     angle_error: float = 0.0
 
 
-def simulate_status(
-    model: StatusModel, drive: MotionModel, start_utime: int, seed: int, source: str
-) -> Iterator[VehicleStatusSample]:
+def simulate_status(model: StatusModel, run: Run) -> Iterator[VehicleStatusSample]:
     """Yield the controller's samples without end: forward speed and steering angle of the equivalent front wheel."""
-    noise = NoiseSource(seed, f"status/{source}")
-    stamps = generate_headers(
-        model.timing, start_utime, start_utime - 1_000_000, source, NoiseSource(seed, f"status/{source}/arrival")
-    )
-    for header in stamps:
-        motion = drive.at((header.utime - start_utime) * 1e-6)
+    noise = run.noise("status/vehicle")
+    for header, t in run.generate_headers(model.timing, "status/vehicle"):
+        motion = run.drive.at(t)
         angle = math.atan(motion.curvature * model.wheelbase) + model.angle_error + noise.normal(model.angle_sigma)
         yield VehicleStatusSample(header, VehicleMode.AUTONOMOUS, motion.speed, angle)
 
@@ -299,12 +247,6 @@ def _rates(motion: TrajectoryMotion) -> Vector3:
 
 
 def _steered_speed(motion: TrajectoryMotion, contact: Vector3) -> float:
-    """Return the speed of a contact point along its direction of motion, negative in reverse."""
-    k = motion.curvature
-    return motion.speed * math.hypot(1.0 - k * contact[1], k * contact[0])
-
-
-def _steered_speed_sliding(motion: TrajectoryMotion, contact: Vector3) -> float:
     """Return the speed of a contact point along its wheel, negative in reverse, steered as without side slip."""
     k = motion.curvature
     x, y, z = contact

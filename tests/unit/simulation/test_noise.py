@@ -16,11 +16,11 @@ def test_prefetched_numbers_are_the_same():
 @pytest.mark.parametrize(
     "draw",
     [
-        lambda noise: noise.uniform(0.0, 1.0),
-        lambda noise: noise.bernoulli(0.5),
-        lambda noise: noise.exponential(1.0),
-        lambda noise: noise.binomial(10, 0.5),
-        lambda noise: noise.integer(3),
+        lambda noise: noise.generator.uniform(0.0, 1.0),
+        lambda noise: noise.generator.random() < 0.5,
+        lambda noise: noise.generator.exponential(1.0),
+        lambda noise: noise.generator.binomial(10, 0.5),
+        lambda noise: noise.generator.integers(3),
     ],
 )
 def test_other_distributions_follow_the_seed_and_are_rejected_while_prefetching(draw):
