@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from modelserver.errors import RecordingError, WireError, find_nearest_names
-from modelserver.messages import FixType, GpsSample, ImuSample
+from modelserver.messages import FixType
 from modelserver.transforms.so3 import Array, Vector3
 from modelserver.wire.codec import decode
 from modelserver.wire.eventlog import LogFile
@@ -54,8 +56,7 @@ def read_recording(log: Path, channel: str, gps_channel: str, begin: float, end:
     utimes: list[int] = []
     fixes: list[Vector3] = []
     counts: Counter[str] = Counter()
-    bad = 0
-    why = ""
+    errors: list[str] = []
     with LogFile(log) as recording, show_progress(f"reading {log.name}", recording.size) as show:
         first: int | None = None
         for number, event in enumerate(recording):
@@ -67,40 +68,31 @@ def read_recording(log: Path, channel: str, gps_channel: str, begin: float, end:
             if event.channel not in (channel, gps_channel) or not begin <= at < end:
                 continue
             try:
-                if event.channel == channel:
-                    sample: ImuSample = decode("imu_t", event.data)
-                    rate, force, field = sample.angular_velocity, sample.specific_force, sample.magnetic_field
-                    rows.append((at, *(rate or _NONE), *(force or _NONE), *(field or _NONE)))
-                    utimes.append(sample.header.utime)
-                else:
-                    fix: GpsSample = decode("gps_t", event.data)
-                    if fix.fix_type is not FixType.NONE:
-                        fixes.append((fix.latitude_deg, fix.longitude_deg, fix.height_ellipsoidal))
+                sample: Any = decode("imu_t" if event.channel == channel else "gps_t", event.data)
             except WireError as error:
-                bad += event.channel == channel
-                why = why or str(error)
+                if event.channel == channel:
+                    errors.append(str(error))
+                continue
+            if event.channel == channel:
+                vectors = (sample.angular_velocity, sample.specific_force, sample.magnetic_field)
+                rows.append((at, *chain.from_iterable(each or _NONE for each in vectors)))
+                utimes.append(sample.header.utime)
+            elif sample.fix_type is not FixType.NONE:
+                fixes.append((sample.latitude_deg, sample.longitude_deg, sample.height_ellipsoidal))
         damage = tuple(map(str, recording.damage))
     if channel not in counts:
         near = find_nearest_names(channel, counts)
         offer = f"nearest: {', '.join(near)}" if near else f"it has: {', '.join(sorted(counts))}"
         raise RecordingError(f"{log}: no messages on channel {channel}; {offer}; select the IMU's with --channel")
-    if not rows and bad:
-        raise RecordingError(f"{log}: channel {channel} has no imu_t: {why}; select the IMU's with --channel")
+    if not rows and errors:
+        raise RecordingError(f"{log}: channel {channel} has no imu_t: {errors[0]}; select the IMU's with --channel")
     if not rows:
         raise RecordingError(
             f"{log}: none of {format_count(counts[channel], 'message')} on {channel} lies between --from and --to"
         )
-    table = np.array(rows)
-    return ImuRecording(
-        utimes=np.array(utimes, dtype=np.int64),
-        times=table[:, 0],
-        rates=table[:, 1:4],
-        forces=table[:, 4:7],
-        fields=table[:, 7:10],
-        position=_median_fix(fixes),
-        malformed=bad,
-        damage=damage,
-    )
+    times, rates, forces, fields = np.split(np.array(rows), (1, 4, 7), axis=1)
+    stamps = np.array(utimes, dtype=np.int64)
+    return ImuRecording(stamps, times[:, 0], rates, forces, fields, _median_fix(fixes), len(errors), damage)
 
 
 def finite_rows(*columns: Array) -> npt.NDArray[np.bool_]:

@@ -258,44 +258,40 @@ class ReplayCollector:
             return (utime - first_utime) * 1e-6
 
         snapshots = tuple(replace(each, t=seconds(utime)) for utime, each in self._states)
+        config = self._vehicle.config
         self._close_frozen()
         return ReplayData(
-            vehicle=self._vehicle.config.vehicle,
+            vehicle=config.vehicle,
             log=log,
             first_utime=first_utime,
             duration=max(seconds(last_utime), 0.0),
-            settings=self._vehicle.config.localization.filter,
+            settings=config.localization.filter,
             snapshots=snapshots,
             fixes=self._evaluate_fixes(first_utime, snapshots),
             decisions=tuple(self._decisions),
             wheels=self._compare_wheels(first_utime, snapshots),
-            sensors=tuple(
-                SourceTimes(name, tuple(sorted(map(seconds, times)))) for name, times in sorted(self._times.items())
-            ),
+            sensors=tuple(SourceTimes(n, tuple(sorted(map(seconds, t)))) for n, t in sorted(self._times.items())),
             rejected=dict(rejected),
             mean_force=self._mean_force(),
             frozen=tuple((seconds(a), seconds(b)) for a, b in self._frozen),
             origin=self._origin,
-            mode=self._vehicle.config.localization.initial_mode,
+            mode=config.localization.initial_mode,
             missing_channels=self._find_missing_channels(channels),
             channels=tuple(sorted(channels)),
             sensor_keys=dict(self._keys),
             wheel_names=tuple(self._wheel_names),
-            sensor_motion=self._sensor_motion.finish(self._wheel_speeds, self._lateral_offsets()),
+            sensor_motion=self._sensor_motion.finish(
+                self._wheel_speeds,
+                {name: self._rig.pose(frame).xyz[1] for name, frame in self._rig.wheel_frames.items()},
+            ),
         )
 
     def _find_missing_channels(self, channels: Collection[str]) -> tuple[tuple[str, str], ...]:
-        config = self._vehicle.config
-        sensors = config.sensors
-        named = [("gps", sensors.gps), ("imu", sensors.imu), ("wheels", sensors.wheels)]
-        return tuple(
-            (key, f"{config.lcm.channel_prefix}{each.channel}")
-            for key, each in (*named, *((f"aiding.{name}", each) for name, each in sensors.aiding.items()))
-            if each is not None and f"{config.lcm.channel_prefix}{each.channel}" not in channels
-        )
-
-    def _lateral_offsets(self) -> dict[str, float]:
-        return {name: self._rig.pose(frame).xyz[1] for name, frame in self._rig.wheel_frames.items()}
+        sensors, prefix = self._vehicle.config.sensors, self._vehicle.config.lcm.channel_prefix
+        named = (("gps", sensors.gps), ("imu", sensors.imu), ("wheels", sensors.wheels))
+        aiding = ((f"aiding.{name}", each) for name, each in sensors.aiding.items())
+        expected = [(key, f"{prefix}{each.channel}") for key, each in (*named, *aiding) if each is not None]
+        return tuple(each for each in expected if each[1] not in channels)
 
     # --- during the replay ----------------------------------------------------------------------------------
 

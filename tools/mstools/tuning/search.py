@@ -94,30 +94,27 @@ def search(
         return {name: value for name, value in trial.items() if value != begin[name]}
 
     for number in range(rounds):
-        changed = False
+        accepted_before = len(steps)
         for parameter in parameters:
             name = parameter.name
             if name in insensitive:
                 continue
-            trials = [t for t in (_step(parameter, values[name], begin[name], up) for up in (True, False)) if t]
+            both = [_step(parameter, values[name], begin[name], up) for up in (True, False)]
+            trials = [each for each in both if each]
             scores = evaluate([change({**values, name: trial}) for trial in trials])
             if number == 0 and all(s is None or abs(s.likelihood - best.likelihood) < MIN_EFFECT for s in scores):
                 insensitive.append(name)
                 continue
-            accepted = _best(best, trials, scores)
-            while accepted is not None:
-                trial, score = accepted
-                up = trial > values[name]
-                step = SearchStep(name, values[name], trial, score)
-                values[name], best, changed = trial, score, True
-                steps.append(step)
+            while (accepted := _best(best, trials, scores)) is not None:
+                trial, best = accepted
+                steps.append(SearchStep(name, values[name], trial, best))
                 if on_step is not None:
-                    on_step(step)
-                farther = _step(parameter, trial, begin[name], up)
-                accepted = None
-                if farther:
-                    accepted = _best(best, [farther], evaluate([change({**values, name: farther})]))
-        if not changed:
+                    on_step(steps[-1])
+                farther = _step(parameter, trial, begin[name], trial > values[name])
+                values[name] = trial
+                trials = [farther] if farther else []
+                scores = evaluate([change({**values, name: each}) for each in trials]) if trials else []
+        if len(steps) == accepted_before:
             break
     return SearchResult(change(values), best, tuple(steps), tuple(insensitive))
 
@@ -136,12 +133,9 @@ def _best(best: Score, trials: Sequence[float], scores: Sequence[Score | None]) 
     good = [
         (trial, score)
         for trial, score in zip(trials, scores, strict=True)
-        if score is not None and score.likelihood > best.likelihood + MIN_GAIN and _is_as_accurate(score, best)
+        if score is not None
+        and score.likelihood > best.likelihood + MIN_GAIN
+        and score.rmse <= best.rmse * RMSE_SLACK
+        and (math.isnan(best.gaps) or score.gaps <= best.gaps * GAPS_SLACK)
     ]
     return max(good, key=lambda each: each[1].likelihood, default=None)
-
-
-def _is_as_accurate(score: Score, best: Score) -> bool:
-    if not score.rmse <= best.rmse * RMSE_SLACK:
-        return False
-    return math.isnan(best.gaps) or score.gaps <= best.gaps * GAPS_SLACK
