@@ -10,7 +10,7 @@ from typing import Generic, TypeVar
 
 from modelserver.messages import Direction, JointsSample, SensorHeader, VehicleStatusSample, WheelSample, WheelsSample
 from msdrivers.devices.axis import AxisSettings, NodSettings
-from msdrivers.devices.vehicle_settings import CommandLimits, VehicleSettings
+from msdrivers.devices.vehicle import CommandLimits, VehicleSettings
 from msdrivers.devices.wheels import WheelsSettings
 from msdrivers.endpoint import Endpoint, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
 from msdrivers.protocol.can.database import CanDatabase, parse_dbc

@@ -134,8 +134,7 @@ def _make_wheels_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
 
 
 def _load_vehicle() -> DeviceModules:
-    from msdrivers.devices.vehicle import VehicleDriver
-    from msdrivers.devices.vehicle_settings import VehicleSettings
+    from msdrivers.devices.vehicle import VehicleDriver, VehicleSettings
 
     return DeviceModules(VehicleSettings, lambda settings, folder: VehicleDriver(settings, _load_dbc(settings, folder)))
 

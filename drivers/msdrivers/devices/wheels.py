@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from modelserver.errors import quote
 from modelserver.messages import NAN, Direction, SensorHeader, WheelSample, WheelsSample
-from msdrivers.devices.can_monitor import CanDriver
+from msdrivers.devices.can_driver import CanDriver
 from msdrivers.endpoint import EndpointStatus, HostTime, MeasuredSample, Output
 from msdrivers.protocol.can.database import CanDatabase, CanFrameSet
 from msdrivers.protocol.can.frame import CanFrame
@@ -100,15 +100,15 @@ class WheelsDriver(CanDriver):
         for instant in instants:
             warnings: list[Output[CanFrame]] = []
             wheels = tuple(self._make_wheel_sample(wheel, instant, warnings) for wheel in self._wheels)
-            self._counts["incomplete"] += not instant.is_complete
+            self.counts["incomplete"] += not instant.is_complete
             if all(_is_empty(wheel) for wheel in wheels):
-                self._counts["rejected.empty"] += 1
+                self.counts["rejected.empty"] += 1
                 outputs += warnings
                 continue
             header = SensorHeader(instant.utime, self.settings.source, self._seq, instant.utime)
             self._seq += 1
-            self._counts["samples"] += 1
-            outputs += self._monitor.on_usable(now, f"{len(wheels)} wheels received")
+            self.counts["samples"] += 1
+            outputs += self._on_usable(now, f"{len(wheels)} wheels received")
             outputs.append(MeasuredSample(WheelsSample(header, wheels), self.settings.delay, self.settings.delay_sigma))
             outputs += warnings
         return outputs
@@ -139,12 +139,12 @@ class WheelsDriver(CanDriver):
 
     def _warn(self, name: str, reason: str, warnings: list[Output[CanFrame]]) -> None:
         key = reason if reason == "resumed" else f"rejected.{reason}"
-        self._counts[key] += 1
+        self.counts[key] += 1
         if f"{name} {reason}" in self._warned:
             return
         self._warned.add(f"{name} {reason}")
         text = f"wheel {name}: {_WARNINGS[reason].format(self.settings.max_speed)}"
-        warnings.append(EndpointStatus(self._monitor.phase, text, is_warning=reason != "resumed"))
+        warnings.append(EndpointStatus(self.phase, text, is_warning=reason != "resumed"))
 
 
 _WARNINGS = {

@@ -10,8 +10,7 @@ from support_vehicle_bus import START_UTIME, at, raptor_dbc, vehicle_settings
 
 from modelserver.errors import ConfigError
 from modelserver.messages import VehicleCommand
-from msdrivers.devices.vehicle import VehicleDriver
-from msdrivers.devices.vehicle_settings import CommandLimits
+from msdrivers.devices.vehicle import CommandLimits, VehicleDriver
 from msdrivers.endpoint import EndpointStatus, Output, Reopen, Send
 from msdrivers.protocol.can.database import CanDatabase, parse_dbc
 from msdrivers.protocol.can.frame import CanFrame, make_bus_off_frame

@@ -21,8 +21,7 @@ from support_vehicle_bus import (
 
 from modelserver.errors import ConfigError
 from modelserver.messages import SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
-from msdrivers.devices.vehicle import VehicleDriver
-from msdrivers.devices.vehicle_settings import CommandLimits, VehicleSettings
+from msdrivers.devices.vehicle import CommandLimits, VehicleDriver, VehicleSettings
 from msdrivers.emulate.vehicle import VehicleEmulator, VehicleUnit
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Send
 from msdrivers.fault_injection import InjectedFault

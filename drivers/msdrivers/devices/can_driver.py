@@ -1,0 +1,152 @@
+"""Common part of the drivers on a CAN bus: decoding, assembly of instants, silence, malformed frames, bus-off."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Mapping
+from typing import Protocol
+
+from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Reopen
+from msdrivers.protocol.can.database import CanDatabase, CanFrameAssembler, CanFrameSet, FrameError
+from msdrivers.protocol.can.frame import CanFrame, FrameKey
+
+MAX_SEEN = 8
+"""Identifiers that are remembered for the status text."""
+
+
+def get_arrival_time(frame: CanFrame, now: HostTime) -> HostTime:
+    """Return the receive time of a frame that is read `now`: its own stamp if it has one."""
+    if not 0 < frame.utime <= now.utime:
+        return now
+    return HostTime(now.monotonic_ns - (now.utime - frame.utime) * 1000, frame.utime)
+
+
+class CanSettingsProtocol(Protocol):
+    """Settings that every driver on a CAN bus has."""
+
+    @property
+    def silence(self) -> float:
+        """Timeout for usable frames, seconds."""
+
+    @property
+    def window(self) -> float:
+        """How long to wait for the other frames of an instant, seconds."""
+
+
+class CanDriver(ABC):
+    """Base of an `Endpoint` of CAN frames: decodes the needed frames and assembles those of one instant.
+
+    Silence, errors and recovery are reported once per change. Without needed frames there is no silence.
+    """
+
+    def __init__(self, settings: CanSettingsProtocol, database: CanDatabase, needed: Mapping[FrameKey, str]):
+        """`needed` are the kinds of frame and their names."""
+        self.phase = EndpointPhase.WAITING
+        self.is_bus_off = False
+        """The interface is bus-off; nothing can be sent."""
+        self.counts: Counter[str] = Counter()
+        """Frames, samples, incomplete instants, silences, commands, and rejections by reason."""
+        self._database, self._needed, self._silence_s = database, needed, settings.silence
+        self._assembler = CanFrameAssembler(frozenset(needed), round(settings.window * 1e9))
+        self._seq = 0
+        self._silence_deadline_ns: int | None = None
+        self._seen: dict[FrameKey, None] = {}
+        self._reported_malformed: set[FrameKey] = set()
+        self._has_only_malformed = False
+
+    def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
+        """Discard incomplete instants and start the silence timer."""
+        self._assembler.clear()
+        self.phase, self.is_bus_off = EndpointPhase.WAITING, False
+        self._reported_malformed.clear()
+        self._restart_silence_timer(now)
+        return [EndpointStatus(EndpointPhase.WAITING, f"waiting for {self._format_needed()}")] if self._needed else []
+
+    def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
+        """Process a received frame."""
+        if unit.is_error:
+            return self._on_error_frame(unit)
+        if unit.key not in self._needed:
+            self.counts["other_frames"] += 1
+            if len(self._seen) < MAX_SEEN:
+                self._seen[unit.key] = None
+            return []
+        try:
+            values = self._database.decode(unit)
+        except FrameError as error:
+            return self._on_malformed_frame(unit, error)
+        self.counts["frames"] += 1
+        arrival = get_arrival_time(unit, now)
+        return self._publish(self._assembler.add(unit.key, values, arrival.monotonic_ns, arrival.utime), now)
+
+    def on_timer(self, now: HostTime) -> list[Output[CanFrame]]:
+        """Publish instants whose window has passed; report silence after its timeout."""
+        outputs = self._publish(self._assembler.pop_expired(now.monotonic_ns), now)
+        if self._silence_deadline_ns is not None and now.monotonic_ns >= self._silence_deadline_ns:
+            self._silence_deadline_ns = None
+            self.phase = EndpointPhase.SILENT
+            self.counts["silences"] += 1
+            outputs.append(EndpointStatus(EndpointPhase.SILENT, self._explain_silence()))
+        return outputs
+
+    def get_deadline(self) -> int | None:
+        """Return when to call `on_timer`, monotonic nanoseconds."""
+        deadlines = (self._assembler.get_deadline(), self._silence_deadline_ns)
+        return min((each for each in deadlines if each is not None), default=None)
+
+    def on_close(self, now: HostTime) -> list[Output[CanFrame]]:
+        """Send nothing."""
+        return []
+
+    @abstractmethod
+    def _publish(self, instants: list[CanFrameSet], now: HostTime) -> list[Output[CanFrame]]:
+        """Make the samples of complete and expired instants."""
+
+    def _on_usable(self, now: HostTime, text: str) -> list[Output[CanFrame]]:
+        """Record usable data; report `text` at the first."""
+        self._restart_silence_timer(now)
+        if self.phase is EndpointPhase.STREAMING:
+            return []
+        self.phase = EndpointPhase.STREAMING
+        return [EndpointStatus(EndpointPhase.STREAMING, text)]
+
+    def _on_malformed_frame(self, frame: CanFrame, error: FrameError) -> list[Output[CanFrame]]:
+        """Count a malformed frame; reported once per kind."""
+        self.counts[f"rejected.{error.reason}"] += 1
+        self._has_only_malformed = True
+        if frame.key in self._reported_malformed:
+            return []
+        self._reported_malformed.add(frame.key)
+        return [EndpointStatus(self.phase, f"{error}; such frames are counted and not used", is_warning=True)]
+
+    def _on_error_frame(self, frame: CanFrame) -> list[Output[CanFrame]]:
+        """Process an error frame of the interface; bus-off requests a reopening, once."""
+        self.counts["error_frames"] += 1
+        if not frame.is_bus_off or self.is_bus_off:
+            return []
+        self.counts["bus_off"] += 1
+        self.is_bus_off, self.phase, self._silence_deadline_ns = True, EndpointPhase.SILENT, None
+        why = "the CAN interface went bus-off: too many frames failed"
+        fix = "check wiring, the terminators at both ends (60 ohm between the lines) and the bit rate"
+        return [
+            EndpointStatus(EndpointPhase.SILENT, f"{why}; {fix}; nothing is published or sent until it is back"),
+            Reopen(why),
+        ]
+
+    def _restart_silence_timer(self, now: HostTime) -> None:
+        self._silence_deadline_ns = now.monotonic_ns + round(self._silence_s * 1e9) if self._needed else None
+        self._has_only_malformed = False
+        self._seen.clear()
+
+    def _explain_silence(self) -> str:
+        head = f"no usable {self._format_needed()} for {self._silence_s:g} s"
+        if self._has_only_malformed:
+            return f"{head}: frames arrive but do not match the DBC; use the DBC of this controller's version"
+        if self._seen:
+            seen = ", ".join(map(str, self._seen)) + (", ..." if len(self._seen) == MAX_SEEN else "")
+            return f"{head}; on the bus are {seen}: is the controller on, and is this its DBC and its bus?"
+        return f"{head}, and nothing else on the bus: check power, wiring, the interface's name and the bit rate"
+
+    def _format_needed(self) -> str:
+        return ", ".join(f"{name} ({key})" for key, name in sorted(self._needed.items()))
