@@ -97,7 +97,7 @@ TERMS = {
     "token bucket": "modelserver/server/requests/scheduler.py",
     "duplicate publisher": "modelserver/core/publisher_conflict.py",
     "backoff": "drivers/msdrivers/runner.py",
-    "dead-man": "drivers/msdrivers/devices/command_arbiter.py",
+    "dead-man": "drivers/msdrivers/devices/vehicle.py",
     "watchdog": "modelserver/server/supervision/systemd.py",
     "HMAC": "modelserver/signing/signatures.py",
     "replay attack": "modelserver/server/requests/signed_commands.py",
