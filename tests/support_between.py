@@ -15,8 +15,7 @@ from modelserver.geometry import names
 from modelserver.geometry.topology import Edge, EdgeKind
 from modelserver.messages import NO_FLAGS, Estimate, Invalid, Policy, PoseAnswer, Quality, TimeQuery
 from modelserver.query.path import PathState, PathStep, lookup_path
-from modelserver.query.view import PlatformView
-from modelserver.query.world_frames import is_absolute
+from modelserver.query.view import PlatformView, is_absolute
 from modelserver.transforms import chain, so3
 from modelserver.transforms.so3 import Array
 from modelserver.transforms.transformation import Transformation

@@ -32,8 +32,7 @@ from modelserver.query.batch_links import (
 )
 from modelserver.query.path import PathState, lookup_path
 from modelserver.query.steps import Steps
-from modelserver.query.view import PlatformView
-from modelserver.query.world_frames import WORLD_FRAMES, check_not_reserved
+from modelserver.query.view import WORLD_FRAMES, PlatformView, check_not_reserved
 from modelserver.transforms import chain
 from modelserver.transforms.chain import ChainLinkBatch
 from modelserver.transforms.pose_array import PoseArray
@@ -169,13 +168,9 @@ def _find_links(
             # the correlation of the vehicle's two poses is unknown
             forth, back = [forth[0]._replace(factor=None)], back._replace(factor=None)
         else:
-            check_not_reserved(reference)
-            view.check_on_vehicle(reference)
             on_vehicle, rows = yield from _path_links(view, view.get_path_from_vehicle(reference), rows)
             forth = [link._replace(forward=not link.forward) for link in reversed(on_vehicle)]
         return [*forth, back._replace(forward=False)], rows
-    check_not_reserved(interest)
-    view.check_on_vehicle(interest)
     on_vehicle, rows = yield from _path_links(view, view.get_path_from_vehicle(interest), rows)
     return [*forth, *on_vehicle], rows
 

@@ -20,8 +20,7 @@ from modelserver.joints.history import MAX_GAP_S
 from modelserver.joints.rotation_vector import ROTATION_VECTOR_TYPES, interpolate_batch
 from modelserver.messages import Estimate, Invalid, Origin, Quality
 from modelserver.query.steps import Steps
-from modelserver.query.view import ODOM_INVALID, PlatformView
-from modelserver.query.world_frames import find_vehicle_pose
+from modelserver.query.view import ODOM_INVALID, PlatformView, find_vehicle_pose
 from modelserver.transforms import chain, pose_array
 from modelserver.transforms.chain import ChainLinkBatch
 from modelserver.transforms.pose_array import PoseArray

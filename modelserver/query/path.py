@@ -13,8 +13,14 @@ from modelserver.geometry.topology import Edge, EdgeKind
 from modelserver.joints.history import Reading
 from modelserver.messages import NO_FLAGS, VALID, Estimate, Invalid, Quality, TimeQuery
 from modelserver.query.joint_lookup import JointReadings
-from modelserver.query.view import ODOM_INVALID, PlatformView
-from modelserver.query.world_frames import WORLD_FRAMES, check_not_reserved, get_vehicle_pose, is_absolute
+from modelserver.query.view import (
+    ODOM_INVALID,
+    WORLD_FRAMES,
+    PlatformView,
+    check_not_reserved,
+    get_vehicle_pose,
+    is_absolute,
+)
 from modelserver.transforms import chain
 from modelserver.transforms.chain import ChainLink
 from modelserver.transforms.pose import Pose
@@ -75,8 +81,6 @@ def lookup_path(view: PlatformView, interest: str, reference: str, time: TimeQue
         return PathState(estimate.utime, tuple(ends), estimate.invalid, estimate.quality)
     (world,) = of_world
     frame = interest if world == reference else reference
-    check_not_reserved(frame)
-    view.check_on_vehicle(frame)
     path = view.get_path_from_vehicle(frame)
     estimate, joints = view.lookup_vehicle_and_joints(path, time, now)
     if world == reference:

@@ -15,7 +15,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from modelserver.errors import (
     QueryError,
     TooNewError,
     TooOldError,
+    UnknownFrameError,
+    find_nearest_names,
+    quote,
 )
 from modelserver.estimation.history import History, restamp
 from modelserver.estimation.interface import Localizer
@@ -49,13 +52,6 @@ from modelserver.messages import (
 )
 from modelserver.query.joint_lookup import NO_READINGS, JointReadings, find_tracks, lookup_joints
 from modelserver.query.steps import Steps
-from modelserver.query.world_frames import (
-    WORLD_FRAMES,
-    check_not_reserved,
-    find_vehicle_pose,
-    get_vehicle_pose,
-    is_absolute,
-)
 from modelserver.transforms import covariance as cov
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array
@@ -66,6 +62,38 @@ PREDICTION_LIMIT_S: Final = 5.0
 
 HISTORY_LIMIT: Final = 1000
 """Poses in one reply to getHistory."""
+
+WORLD_FRAMES: Final = frozenset({names.WORLD_UTM, names.WORLD_ENU, names.ODOM})
+"""World:UTM and World:ENU (map frame of REP-105), Odom:Origin."""
+
+
+def is_absolute(frame: str) -> bool:
+    """Return whether a frame is fixed to the earth."""
+    return frame in (names.WORLD_UTM, names.WORLD_ENU)
+
+
+def check_not_reserved(frame: str) -> None:
+    """Raise UnknownFrameError for a frame of the bodies World and Odom that does not exist."""
+    if frame.partition(":")[0] in names.RESERVED_BODIES:
+        raise UnknownFrameError(
+            f"there is no frame {quote(frame)}; the world frames are {', '.join(sorted(WORLD_FRAMES))}",
+            find_nearest_names(frame, WORLD_FRAMES),
+        )
+
+
+def find_vehicle_pose(world: str, estimate: Estimate) -> Pose | None:
+    """Return the rolling frame's pose in a world frame, None where it is unknown."""
+    if world == names.WORLD_UTM:
+        return estimate.utm
+    return estimate.odom if world == names.ODOM else estimate.enu
+
+
+def get_vehicle_pose(world: str, estimate: Estimate) -> Pose:
+    """Return the rolling frame's pose in a world frame. Raises NoPoseError."""
+    pose = find_vehicle_pose(world, estimate)
+    if pose is None:
+        raise NoPoseError(f"the vehicle's pose in {world} is not known yet: {estimate.invalid.explain()}")
+    return pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,10 +128,6 @@ class PlatformView:
         reference = frame_of_reference in WORLD_FRAMES
         if not interest and not reference:
             return self._lookup_within_vehicle(frame_of_interest, frame_of_reference, time, now)
-        for frame, world in ((frame_of_interest, interest), (frame_of_reference, reference)):
-            if not world:
-                check_not_reserved(frame)
-                self.check_on_vehicle(frame)
         if frame_of_interest == frame_of_reference:
             return PoseAnswer(Transformation(frame_of_interest, frame_of_reference, Pose.identity(), _ZERO))
         if interest and reference:
@@ -154,8 +178,15 @@ class PlatformView:
         )
 
     def get_path_from_vehicle(self, frame: str) -> KinematicPath:
-        """Return the kinematic path from the rolling frame to a frame of the vehicle. Raises QueryError."""
-        return self.model.get_kinematic_path(frame, self.rolling_frame)
+        """Return the kinematic path from the rolling frame to a frame of the vehicle.
+
+        Raises a QueryError where the frame does not exist, or is not joined to the rolling frame.
+        """
+        check_not_reserved(frame)
+        try:
+            return self.model.get_kinematic_path(frame, self.rolling_frame)
+        except NotConnectedError as error:
+            raise NotConnectedError(f"the world is known at {self.rolling_frame} only: {error}") from None
 
     def lookup_joints(self, path: KinematicPath, time: TimeQuery, now: int) -> tuple[int, JointReadings]:
         """Return time and positions of the joints of a path; the latest time is one that all joints have reached."""
@@ -308,31 +339,18 @@ class PlatformView:
         """
         X_WB = get_vehicle_pose(world, estimate)
         numbers = estimate.odom_covariance if world == names.ODOM else estimate.covariance
+        fixed: Transformation | None = None
         if frame == self.rolling_frame:
-            at_base = (
-                None
-                if numbers is None
-                else partial(_inverse_world_covariance if inverted else _world_covariance, numbers, X_WB)
-            )
-            return X_WB.inverse() if inverted else X_WB, at_base
-        if path.joints:
+            X_BF, X_WF = None, X_WB
+        elif path.joints:
             X_BF = path.compute_pose(joints.positions)
-            survey = partial(_mount_covariance, path, joints)
+            X_WF = X_WB @ X_BF
         else:
             fixed = self.model.get_transformation(frame, self.rolling_frame)
             X_BF = fixed.pose
-            survey = partial(_fixed_covariance, fixed, path)
-        function = _inverse_frame_covariance if inverted else _frame_covariance
-        X_WF = X_WB @ X_BF
-        known = None if numbers is None else partial(function, numbers, X_WB, X_BF, survey)
+            X_WF = X_WB @ X_BF
+        known = None if numbers is None else partial(_covariance, numbers, X_WB, X_BF, path, joints, fixed, inverted)
         return X_WF.inverse() if inverted else X_WF, known
-
-    def check_on_vehicle(self, frame: str) -> None:
-        """Raise a QueryError where the frame does not exist, or is not joined to the rolling frame."""
-        try:
-            self.model.get_kinematic_path(frame, self.rolling_frame)
-        except NotConnectedError as error:
-            raise NotConnectedError(f"the world is known at {self.rolling_frame} only: {error}") from None
 
     def _build_answer(
         self,
@@ -392,52 +410,34 @@ ODOM_INVALID = Invalid.NO_IMU | Invalid.STALE_IMU | Invalid.CLOCK_STEPPED | Inva
 """Reasons against a pose in Odom, which needs no fix and no origin."""
 
 
-CovarianceFunction: TypeAlias = Callable[[], Array | None]
-"""Returns the covariance of the path from the vehicle to a frame."""
-
-
-def _world_covariance(numbers: tuple[float, ...], X_WB: Pose) -> Array:
-    return np.array(numbers).reshape(6, 6)
-
-
-def _inverse_world_covariance(numbers: tuple[float, ...], X_WB: Pose) -> Array:
-    """Return the covariance of a world's pose in the vehicle, whose origin is at the end of a long lever arm."""
-    return cov.rotate(X_WB.rotation.T, cov.apply_lever_arm(_world_covariance(numbers, X_WB), -X_WB.position))
-
-
-def _frame_covariance(numbers: tuple[float, ...], X_WB: Pose, X_BF: Pose, survey: CovarianceFunction) -> Array | None:
-    """Return the covariance of a frame of the vehicle in a world."""
-    joints = survey()
-    if joints is None:
-        return None
-    # the heading may be off by tens of degrees before the vehicle has moved
-    return cov.apply_lever_arm(_world_covariance(numbers, X_WB), X_WB.rotation @ X_BF.position) + cov.rotate(
-        X_WB.rotation, joints
-    )
-
-
-def _inverse_frame_covariance(
-    numbers: tuple[float, ...], X_WB: Pose, X_BF: Pose, survey: CovarianceFunction
+def _covariance(
+    numbers: tuple[float, ...],
+    X_WB: Pose,
+    X_BF: Pose | None,
+    path: KinematicPath,
+    joints: JointReadings,
+    fixed: Transformation | None,
+    inverted: bool,
 ) -> Array | None:
-    """Return the covariance of a world in a frame of the vehicle."""
-    joints = survey()
-    if joints is None:
-        return None
-    return cov.compose(
-        X_BF.inverse(), cov.invert(X_BF, joints), X_WB.inverse(), _inverse_world_covariance(numbers, X_WB)
-    )
+    """Return the covariance of a frame of the vehicle in a world, `inverted` of the world in the frame.
 
-
-def _mount_covariance(path: KinematicPath, joints: JointReadings) -> Array | None:
-    """Return the covariance of a path from the vehicle, with its joints at their positions.
-
-    A mount without sigmas counts as exact: the vehicle's own error is far larger. A joint without a sigma does not: the
-    end of a long arm may be anywhere.
+    X_BF: None for the rolling frame. fixed: the frame in the rolling frame, where no joint moves between them.
     """
-    found = path.compute_covariance(joints.positions, joints.sigmas, unstated_is_exact=True)
-    return None if found is None else as_array(found)
-
-
-def _fixed_covariance(fixed: Transformation, path: KinematicPath) -> Array | None:
-    found = fixed.covariance
-    return _mount_covariance(path, NO_READINGS) if found is None else found
+    P = np.array(numbers).reshape(6, 6)
+    if inverted:
+        # the world's origin is at the end of a long lever arm
+        P = cov.rotate(X_WB.rotation.T, cov.apply_lever_arm(P, -X_WB.position))
+    if X_BF is None:
+        return P
+    Q = None if fixed is None else fixed.covariance
+    if Q is None:
+        # A mount without sigmas counts as exact: the vehicle's own error is far larger. A joint without a sigma does
+        # not: the end of a long arm may be anywhere.
+        of_path = path.compute_covariance(joints.positions, joints.sigmas, unstated_is_exact=True)
+        if of_path is None:
+            return None
+        Q = as_array(of_path)
+    if inverted:
+        return cov.compose(X_BF.inverse(), cov.invert(X_BF, Q), X_WB.inverse(), P)
+    # the heading may be off by tens of degrees before the vehicle has moved
+    return cov.apply_lever_arm(P, X_WB.rotation @ X_BF.position) + cov.rotate(X_WB.rotation, Q)

@@ -86,7 +86,7 @@ TERMS = {
     "parallel axis": "modelserver/geometry/inertia.py",
     "twist": "modelserver/query/motion.py",
     # robot_localization
-    "map frame": "modelserver/query/world_frames.py",
+    "map frame": "modelserver/query/view.py",
     "REP-105": f"{FILTER}/odometry.py",
     "odometry": f"{FILTER}/odometry.py",
     "skid-steer": f"{FILTER}/measurements/wheels.py",
