@@ -1,7 +1,7 @@
 """Verification of a journal by replay: every record is processed again, and what is published is compared bit for bit.
 
-Messages that differ within `comparison.TOLERANCE`, as on another build or machine, are a result of their own. `chain`
-checks that the segments are complete, in order and authentic.
+Messages that differ within `comparison.TOLERANCE`, as on another build or machine, are a result of their own. `segments`
+checks that they are complete, in order and authentic.
 
 A run is the life of one service process. Its segments follow each other, and the replay continues from one into the
 next. After a gap (dropped by the ring, lost records, damaged bytes) it restarts from the state in the head of the next
@@ -11,9 +11,8 @@ a differing reply about the past counts as `unverifiable`, not as a difference.
 
 from __future__ import annotations
 
-import mmap
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from itertools import zip_longest
@@ -21,13 +20,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from modelserver.errors import RecordingError, WireError
-from modelserver.files.regular import open_regular
 from modelserver.messages import GetHistory, GetTransformations, HealthWarning, Rejected
 from modelserver.server.journal import environment
 from modelserver.server.journal import state as journal_state
-from modelserver.server.journal.chain import NEWEST_NAME, ChainFinding, ChainVerifier, read_newest
 from modelserver.server.journal.comparison import Deviation, compute_deviation
 from modelserver.server.journal.replay import PublishedMessage, ReplayLoop
+from modelserver.server.journal.segments import NEWEST_NAME, ChainVerifier, open_mapped, read_newest
 from modelserver.signing.signatures import Key
 from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode
@@ -192,7 +190,7 @@ def verify(
 class _Verifier:
     def __init__(self, show: Callable[[int], object], keys: Sequence[Key] = ()):
         self.report = VerificationReport()
-        self._chain = ChainVerifier(keys)
+        self._chain = ChainVerifier(self._add_finding, keys)
         self._keys = keys
         self._on_progress = show
         self._replay: ReplayLoop | None = None
@@ -212,10 +210,9 @@ class _Verifier:
         end: SegmentEnd | None = None
         report, before = self.report, self.report.bytes
         facts: dict[str, Any] | None = None
-        with open_regular(path) as file:
-            size = file.seek(0, 2)
-            data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if size else b""
-        try:
+        with open_mapped(path) as data:
+            size = len(data)
+            report.bytes += size
             for item in read_segment(data):
                 if report.difference is not None:
                     return
@@ -235,10 +232,6 @@ class _Verifier:
                     self._is_closed, end = True, item
                     if not item.is_intact:
                         self._add_finding("the checksum over the whole segment is wrong", is_damage=True)
-        finally:
-            report.bytes = before + size
-            if not isinstance(data, bytes):
-                data.close()
         if facts is None:
             if size == 0 or any(each.segment == path for each in report.findings):
                 self._stop()
@@ -248,7 +241,7 @@ class _Verifier:
                 return
             raise RecordingError(f"{path}: is no journal of a modelserver")
         report.segments += 1
-        self._add_findings(self._chain.end(facts, end))
+        self._chain.end(facts, end)
         if not self._is_closed:
             if not any(each.segment == path for each in report.findings):
                 self._add_finding("is not closed: it is being written, or the process or machine stopped")
@@ -266,7 +259,7 @@ class _Verifier:
             )
         assert isinstance(part, int)
         assert isinstance(lost, int)
-        self._add_findings(self._chain.begin(self._path, facts))
+        self._chain.begin(self._path, facts)
         for each in environment.list_differences(facts):
             if each not in self.report.environment_differences:
                 self.report.environment_differences.append(each)
@@ -446,15 +439,10 @@ class _Verifier:
         except RecordingError as error:
             self._add_finding(str(error), is_damage=True)
             return
-        findings = self._chain.finish(newest)
-        self._add_findings(findings)
+        self._chain.finish(newest)
         report.is_complete = newest is not None
         if newest is None:
             self._add_finding(f"the file {NEWEST_NAME} is missing, so segments after it may be missing too")
-
-    def _add_findings(self, findings: Iterable[ChainFinding]) -> None:
-        for each in findings:
-            self._add_finding(each.text, each.is_damage)
 
     def _add_finding(self, text: str, is_damage: bool = False) -> None:
         self.report.findings.append(JournalFinding(self._path, text, is_damage))

@@ -27,9 +27,16 @@ from modelserver.messages import CHANNEL_OF
 from modelserver.server.clock import Clock
 from modelserver.server.journal import environment
 from modelserver.server.journal import state as journal_state
-from modelserver.server.journal.chain import NEWEST_NAME, NewestMarker, read_last_segment, read_newest, seal_segment
 from modelserver.server.journal.queue import JournalEntry, JournalQueue, SegmentStart
-from modelserver.server.journal.segments import Ring, Segment
+from modelserver.server.journal.segments import (
+    NEWEST_NAME,
+    NewestMarker,
+    Ring,
+    Segment,
+    read_last_segment,
+    read_newest,
+    seal_segment,
+)
 from modelserver.server.log import escape_text
 from modelserver.server.persistence.directory import (
     FileLock,

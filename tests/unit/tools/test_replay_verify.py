@@ -10,7 +10,7 @@ import pytest
 from support_journal import SMALL, JournalRig
 from support_samples import gps
 
-from modelserver.server.journal.chain import NEWEST_NAME, NewestMarker
+from modelserver.server.journal.segments import NEWEST_NAME, NewestMarker
 from modelserver.server.journal.verify import VerificationResult
 from modelserver.signing.key_files import generate_key, write_key
 from modelserver.wire.codec import encode
