@@ -1,6 +1,6 @@
 """Faults between sensor and server: pure transforms of a stream of samples in order of arrival.
 
-Each takes samples and yields samples, so that they nest: `drop(delay(run.events(60.0), 3, "gps", 0.5), 4, 0.1)`.
+Each takes samples and yields samples, so that they nest: `duplicate(delay(run.events(60.0), 3, "gps", 0.5), 4, 0.1)`.
 `source` selects the samples by the source of their header; None selects all. The same seed gives the same faults.
 """
 
@@ -9,31 +9,14 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import fields, replace
-from typing import Any, TypeVar
-
-import numpy as np
+from dataclasses import replace
+from typing import TypeVar
 
 from modelserver.messages import RelativePoseSample, SensorHeader
 from modelserver.simulation.noise import NoiseSource
 from modelserver.simulation.scenario import Event
 
 _E = TypeVar("_E", bound=Event)
-
-
-def drop(events: Iterable[Event], seed: int, share: float, source: str | None = None) -> Iterator[Event]:
-    """Yield the samples without a random `share` of them."""
-    chance = NoiseSource(seed, f"drop/{source}").generator
-    for event in events:
-        if not (_is_from(event, source) and chance.random() < share):
-            yield event
-
-
-def cut(events: Iterable[Event], begin_utime: int, end_utime: int, source: str | None = None) -> Iterator[Event]:
-    """Yield the samples without those that arrive in [begin_utime, end_utime)."""
-    for event in events:
-        if not (_is_from(event, source) and begin_utime <= event.header.host_utime < end_utime):
-            yield event
 
 
 def delay(
@@ -44,29 +27,23 @@ def delay(
     share: float = 1.0,
     *,
     min_delay: float = 0.0,
-    in_order: bool = False,
 ) -> Iterator[Event]:
     """Yield the samples, a random `share` of them delayed by `min_delay` to `max_delay` seconds, uniformly distributed.
 
-    Their host_utime moves, their utime stays, and the stream stays in order of arrival. With `in_order` the samples of
-    a source keep their order, else they may overtake each other.
+    Their host_utime moves, their utime stays, and the stream stays in order of arrival: samples may overtake others.
     """
     if not 0.0 <= min_delay <= max_delay < math.inf:
         raise ValueError(f"delays must be finite and not negative; got {min_delay} to {max_delay} s")
     chance = NoiseSource(seed, f"late/{source}").generator
     waiting: list[tuple[int, int, Event]] = []
-    last: dict[str, int] = {}
     for number, event in enumerate(events):
         arrival = event.header.host_utime
         # no later event can arrive before this one
         while waiting and waiting[0][0] <= arrival:
             yield heapq.heappop(waiting)[2]
         at = arrival
-        if _is_from(event, source):
-            if chance.random() < share:
-                at += round(chance.uniform(min_delay, max_delay) * 1e6)
-            if in_order:
-                at = last[event.header.source] = max(at, last.get(event.header.source, at))
+        if _is_from(event, source) and chance.random() < share:
+            at += round(chance.uniform(min_delay, max_delay) * 1e6)
         heapq.heappush(waiting, (at, number, event if at == arrival else _replace_header(event, host_utime=at)))
     while waiting:
         yield heapq.heappop(waiting)[2]
@@ -88,13 +65,6 @@ def duplicate(
             heapq.heappush(waiting, (at, number, _replace_header(event, host_utime=at)))
     while waiting:
         yield heapq.heappop(waiting)[2]
-
-
-def inject_nan(events: Iterable[Event], seed: int, share: float, source: str | None = None) -> Iterator[Event]:
-    """Yield the samples, one number in a random `share` of them nan, also within vectors; not in headers."""
-    chance = NoiseSource(seed, f"nan/{source}").generator
-    for event in events:
-        yield _set_random_nan(event, chance) if _is_from(event, source) and chance.random() < share else event
 
 
 def step_clock_back(
@@ -130,37 +100,3 @@ def _replace_header(event: _E, **changes: int) -> _E:
     """Return the sample with other fields in its header."""
     header: SensorHeader = replace(event.header, **changes)  # type: ignore[arg-type]
     return replace(event, header=header)
-
-
-def _set_random_nan(event: Event, chance: np.random.Generator) -> Event:
-    numbers = [path for each in fields(event) if each.name != "header" for path in _float_paths(event, each.name)]
-    if not numbers:
-        return event
-    name, *inside = numbers[chance.integers(len(numbers))]
-    return replace(event, **{name: _set_nan(getattr(event, name), tuple(inside))})
-
-
-def _float_paths(value: Any, *path: Any) -> Iterator[tuple[Any, ...]]:
-    """Yield the paths (field names and indices) to the floats in a field that are not nan."""
-    found = value
-    for step in path:
-        found = getattr(found, step) if isinstance(step, str) else found[step]
-    if isinstance(found, float):
-        if not math.isnan(found):
-            yield path
-    elif isinstance(found, tuple):
-        for place in range(len(found)):
-            yield from _float_paths(value, *path, place)
-    elif hasattr(found, "__dataclass_fields__"):
-        for each in fields(found):
-            yield from _float_paths(value, *path, each.name)
-
-
-def _set_nan(value: Any, path: tuple[Any, ...]) -> Any:
-    """Return the value with nan at a path."""
-    if not path:
-        return math.nan
-    step, *rest = path
-    if isinstance(step, str):
-        return replace(value, **{step: _set_nan(getattr(value, step), tuple(rest))})
-    return (*value[:step], _set_nan(value[step], tuple(rest)), *value[step + 1 :])

@@ -2,7 +2,7 @@
 
 Position error per axis: e(t) = g(t) + n, where g is a first-order Gauss-Markov process (multipath, age of corrections)
 and n is white; vertical errors are `vertical` times larger. Velocity error is white and may have a latency of its own.
-Faults: outages, jumps, duplicates, latency that the stamp does not include, wrong stated covariance.
+Faults: outages, jumps, latency that the stamp does not include, wrong stated covariance.
 """
 
 from __future__ import annotations
@@ -46,9 +46,8 @@ class GpsModel:
     undulation : geoid height above the ellipsoid, nan for a receiver that does not report it
     unstated_latency : age of the whole fix at its utime
     jumps : (begin, end, east, north): offsets of the fixes, meters
-    duplicates : share of fixes that are sent twice
     sigma_factor : stated over true standard deviations
-    has_velocity, has_covariance : whether velocity, speed and course, and any standard deviations are reported
+    has_velocity : whether velocity, speed and course are reported
     baseline_sigma : error of the yaw of a two-antenna baseline, radians
     """
 
@@ -66,10 +65,8 @@ class GpsModel:
     undulation: float = NAN
     unstated_latency: float = 0.0
     jumps: tuple[tuple[float, float, float, float], ...] = ()
-    duplicates: float = 0.0
     sigma_factor: float = 1.0
     has_velocity: bool = True
-    has_covariance: bool = True
     baseline_sigma: float = 0.003
 
     @classmethod
@@ -86,7 +83,6 @@ def simulate_fixes(model: GpsModel, run: Run, X_VA: Pose, second_antenna: Vector
     """
     drive, geodesy = run.drive, run.geodesy
     noise = run.noise("gps/gps").prefetch()
-    duplicate_noise = run.noise("gps/gps/duplicates").generator
     baseline_noise = run.noise("gps/gps/baseline")
     baseline = so3.add(second_antenna, so3.scale(-1.0, X_VA.xyz)) if second_antenna is not None else None
     scales = (1.0, 1.0, model.vertical)
@@ -94,8 +90,7 @@ def simulate_fixes(model: GpsModel, run: Run, X_VA: Pose, second_antenna: Vector
     position_sigma = max(math.hypot(model.correlated_sigma, model.white_sigma), _MIN_SIGMA) * model.sigma_factor
     velocity_sigma = max(model.velocity_sigma, _MIN_SIGMA) * model.sigma_factor
     position_covariance, velocity_covariance = (
-        diagonal_covariance(sigma, sigma, sigma * model.vertical) if model.has_covariance else None
-        for sigma in (position_sigma, velocity_sigma)
+        diagonal_covariance(sigma, sigma, sigma * model.vertical) for sigma in (position_sigma, velocity_sigma)
     )
     for header, t in run.generate_headers(model.timing, "gps/gps", GPS_EPOCH):
         # drawn during outages too, so that an outage does not change later fixes
@@ -105,9 +100,8 @@ def simulate_fixes(model: GpsModel, run: Run, X_VA: Pose, second_antenna: Vector
         ]
         velocity_error = noise.vector(model.velocity_sigma)
         baseline_error = baseline_noise.normal(model.baseline_sigma) if baseline else 0.0
-        times = 2 if model.duplicates and duplicate_noise.random() < model.duplicates else 1
         if is_within(model.outages, t):
-            yield from (GpsSample(header, FixType.NONE, NAN, NAN, satellites=0),) * times
+            yield GpsSample(header, FixType.NONE, NAN, NAN, satellites=0)
             continue
         for begin, end, east, north in model.jumps:
             if begin <= t < end:
@@ -143,16 +137,16 @@ def simulate_fixes(model: GpsModel, run: Run, X_VA: Pose, second_antenna: Vector
                 velocity_covariance=velocity_covariance,
                 velocity_latency=model.velocity_latency,
                 speed=speed,
-                speed_sigma=velocity_sigma if model.has_covariance else NAN,
+                speed_sigma=velocity_sigma,
                 course=math.atan2(vn, ve),
-                course_sigma=_course_sigma(velocity_sigma, speed) if model.has_covariance else NAN,
+                course_sigma=_course_sigma(velocity_sigma, speed),
             )
         if baseline:
             east, north, _ = so3.rotate(local, so3.rotate(kinematics.orientation(motion), baseline))
-            sigma = max(model.baseline_sigma, 1e-4) * model.sigma_factor if model.has_covariance else NAN
+            sigma = max(model.baseline_sigma, 1e-4) * model.sigma_factor
             yaw = math.remainder(math.atan2(north, east) + baseline_error, math.tau)
             sample = replace(sample, baseline_yaw=yaw, baseline_yaw_sigma=sigma)
-        yield from (sample,) * times
+        yield sample
 
 
 def _course_sigma(velocity_sigma: float, speed: float) -> float:

@@ -2,7 +2,7 @@
 
 Measurement of the gyros and accelerometers, along the sensor axes (`_SimulatedImu`):
 
-    y = quantize(M x + b + b_walk(t) + b_instability(t) + vibration + n)
+    y = M x + b + b_walk(t) + b_instability(t) + vibration + n
 
 x is the true angular rate (with the Earth's, if `earth_rotation`) or the specific force f = a + 2 w_e x v - g (Groves
 (2013) 5.4), M scale errors and misalignment drawn once, b a constant bias, b_walk a random walk, b_instability a
@@ -26,7 +26,7 @@ from modelserver.earth import gravity as earth
 from modelserver.earth.geodesy import rotation_about_up
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.simulation import kinematics
-from modelserver.simulation.noise import GaussMarkov, NoiseSource, diagonal_covariance, quantize
+from modelserver.simulation.noise import GaussMarkov, NoiseSource, diagonal_covariance
 from modelserver.simulation.timing import Intervals, Run, Timing, is_within
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
@@ -165,7 +165,6 @@ class ImuModel:
     gyro_bias_sigma, accelerometer_bias_sigma : standard deviation of each axis's bias, drawn once
     gyro_walk : random walk of the gyro bias, rad/s/sqrt(s)
     gyro_noise, accelerometer_noise : noise densities, rad/s/sqrt(Hz) and m/s2/sqrt(Hz)
-    gyro_step, accelerometer_step : quantization, 0 for none
     tilt_sigma, tilt_noise : standard deviation of the tilt error drawn once, and of each sample's
     yaw_offset : initial yaw, None for a random one
     reference : frame that its orientation refers to; NONE for a unit without orientation
@@ -182,10 +181,8 @@ class ImuModel:
     gyro_bias_sigma: float = 0.003
     gyro_walk: float = 1e-5
     gyro_noise: float = 1e-3
-    gyro_step: float = 0.0
     accelerometer_bias_sigma: float = 0.03
     accelerometer_noise: float = 3e-3
-    accelerometer_step: float = 0.0
     tilt_sigma: float = 0.004
     tilt_noise: float = 0.001
     yaw_offset: float | None = None
@@ -284,9 +281,8 @@ class _SimulatedImu:
             rate = self.gyro.measure(rate, motion.speed)
         if self.accelerometer is not None:
             force = self.accelerometer.measure(force, motion.speed)
-        rate = _add_errors(model.gyro_step, rate, self.gyro_bias, noise.vector(self.gyro_sigma))
-        force_noise = noise.vector(self.accelerometer_sigma)
-        force = _add_errors(model.accelerometer_step, force, self.accelerometer_bias, force_noise)
+        rate = so3.add(rate, self.gyro_bias, noise.vector(self.gyro_sigma))
+        force = so3.add(force, self.accelerometer_bias, noise.vector(self.accelerometer_sigma))
         orientation = None
         if model.reference is not OrientationReference.NONE:
             orientation = self._orientation(t, q_ES)
@@ -330,11 +326,6 @@ def _specific_force(acceleration: Vector3, velocity: Vector3, turning: Vector3, 
     vx, vy, vz = velocity
     ax, ay, az = acceleration
     return (ax + 2.0 * (n * vz - u * vy), ay + 2.0 * u * vx, az - 2.0 * n * vx + gravity)
-
-
-def _add_errors(step: float, true: Vector3, *errors: Vector3) -> Vector3:
-    x, y, z = so3.add(true, *errors)
-    return (quantize(x, step), quantize(y, step), quantize(z, step)) if step else (x, y, z)
 
 
 def _covariance(noise: float, bias: float) -> Matrix3:

@@ -1,10 +1,10 @@
 """Wheel odometry simulation: travel, speed and direction of each wheel, and the vehicle controller's status.
 
 Kinematics: the speed of a contact point at (x, y, z) of the rolling frame is v_x - k w_z y + w_y z along the vehicle
-(k is `track_factor`, over 1 for skid steering), and for a steered wheel the speed along the wheel, which is steered for
+and for a steered wheel the speed along the wheel, which is steered for
 level ground without side slip. Travel is its integral: closed form on level ground without slip, else Gauss-Legendre
 with three nodes per sample.
-Encoder: travel is quantized to pulses, of which some may be missed; scale error per wheel; slip proportional to
+Encoder: travel is quantized to pulses; scale error per wheel; slip proportional to
 traction; bursts of wheel spin; stuck and swapped encoders (`EncoderModel`).
 Limits: side slip is not measured by a wheel; the wheels follow the slope of the ground without suspension.
 """
@@ -15,7 +15,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from modelserver.messages import NAN, Direction, VehicleMode, VehicleStatusSample, WheelSample, WheelsSample
+from modelserver.messages import Direction, VehicleMode, VehicleStatusSample, WheelSample, WheelsSample
 from modelserver.simulation.noise import NoiseSource, quantize
 from modelserver.simulation.timing import Run, Timing
 from modelserver.simulation.trajectory import MotionModel, Trajectory, TrajectoryMotion
@@ -30,22 +30,15 @@ class EncoderModel:
     ----------
     burst_rate, burst_seconds, burst_excess : wheel spin of each wheel: starts per second, duration, share of excess
         travel
-    missed : share of pulses that are not counted, for encoders with a `travel_step`
     stuck : (wheel, time): from then on the encoder gives no pulses
     swapped : wheels that count backward when they roll forward
-    speed_from_travel : compute speed from the pulses since the last sample
-    has_travel, has_speed : whether they are reported; otherwise nan
     """
 
     burst_rate: float = 0.0
     burst_seconds: float = 1.0
     burst_excess: float = 0.5
-    missed: float = 0.0
     stuck: tuple[tuple[str, float], ...] = ()
     swapped: frozenset[str] = frozenset()
-    speed_from_travel: bool = False
-    has_travel: bool = True
-    has_speed: bool = True
 
 
 _GRAVITY = 9.81
@@ -69,7 +62,6 @@ class WheelsModel:
     slip : share of excess rotation at a traction of 1 g
     stationary_speed : speed below which an encoder measures none
     steered : names of the wheels that steer into the direction of motion of their contact points
-    track_factor : effective over geometric track of a skid-steered vehicle (1.5 to 2)
     unstated_latency : age of a sample at its utime, s
     encoder : faults of the encoders
     """
@@ -81,7 +73,6 @@ class WheelsModel:
     slip: float = 0.0
     stationary_speed: float = 0.02
     steered: frozenset[str] = frozenset()
-    track_factor: float = 1.0
     unstated_latency: float = 0.0
     encoder: EncoderModel = field(default_factory=EncoderModel)
 
@@ -102,8 +93,7 @@ class Encoder:
         self._noise, self._faults = noise, faults.generator
         self._stuck_from = min((t for wheel, t in self._faulty.stuck if wheel == name), default=math.inf)
         self._sign = -1.0 if name in self._faulty.swapped else 1.0
-        self._rotated = self._counted = self._t = 0.0
-        self._pulses = 0
+        self._rotated = 0.0
         rate = self._faulty.burst_rate
         self._burst = self._faults.exponential(1.0 / rate) if rate else math.inf
 
@@ -122,17 +112,13 @@ class Encoder:
             measured = speed = 0.0
         else:
             self._rotated += rolled * seen
-        travel = self._count() if faulty.missed and model.travel_step else quantize(self._rotated, model.travel_step)
-        if faulty.speed_from_travel:
-            measured = speed = (travel - self._counted) / (t - self._t) if t > self._t else 0.0
-        self._counted, self._t = travel, t
         sign = self._sign
         return WheelSample(
             self._name,
-            travel=sign * travel if faulty.has_travel else NAN,
-            travel_sigma=max(model.travel_step / math.sqrt(12.0), 1e-4) if faulty.has_travel else NAN,
-            speed=sign * measured if faulty.has_speed else NAN,
-            speed_sigma=max(model.speed_sigma, 1e-4) if faulty.has_speed else NAN,
+            travel=sign * quantize(self._rotated, model.travel_step),
+            travel_sigma=max(model.travel_step / math.sqrt(12.0), 1e-4),
+            speed=sign * measured,
+            speed_sigma=max(model.speed_sigma, 1e-4),
             direction=_direction(sign * speed, model.stationary_speed),
             steering=steering,
         )
@@ -142,13 +128,6 @@ class Encoder:
         while t >= self._burst + faulty.burst_seconds:
             self._burst += faulty.burst_seconds + self._faults.exponential(1.0 / faulty.burst_rate)
         return t >= self._burst
-
-    def _count(self) -> float:
-        """Return the travel of the counted pulses, meters."""
-        before, self._pulses = self._pulses, round(self._rotated / self._model.travel_step)
-        new = self._pulses - before
-        counted = abs(new) - self._faults.binomial(abs(new), self._faulty.missed)
-        return self._counted + math.copysign(counted, new) * self._model.travel_step
 
 
 def _direction(speed: float, stationary_speed: float) -> Direction:
@@ -174,7 +153,7 @@ def simulate_wheels(model: WheelsModel, run: Run, contacts: Mapping[str, Vector3
                 steering = math.atan2(motion.curvature * contact[0], 1.0 - motion.curvature * contact[1])
             else:
                 forward, turn, pitch = _rates(motion)
-                speed, steering = forward - model.track_factor * contact[1] * turn + contact[2] * pitch, 0.0
+                speed, steering = forward - contact[1] * turn + contact[2] * pitch, 0.0
             wheels.append(encoders[name].sample(t, distances[name], speed, excess, steering))
         yield WheelsSample(header, tuple(wheels))
 
@@ -212,7 +191,7 @@ class _WheelOdometry:
             if name in model.steered:
                 distances[name] = elapsed * sum(weight * _steered_speed(each, contact) for each, weight in between)
             else:
-                distances[name] = along - model.track_factor * contact[1] * turned + contact[2] * pitched
+                distances[name] = along - contact[1] * turned + contact[2] * pitched
         self.previous, self.t_previous = motion, t
         return motion, distances
 

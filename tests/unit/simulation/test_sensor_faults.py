@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -55,16 +54,6 @@ def test_jumps_shift_fixes_for_a_while(simulate, origin):
         np.testing.assert_allclose(enu(other, origin) - enu(one, origin), (east, -4.0 * (5 <= t < 8), 0.0), atol=1e-6)
 
 
-def test_fixes_can_come_twice(simulate):
-    fixes = list(simulate(gps_model=GpsModel(duplicates=0.3)).events(200.0))
-    twice = sum(one == other for one, other in pairwise(fixes))
-    assert twice / (len(fixes) - twice) == pytest.approx(0.3, abs=0.06)
-    arrivals = [fix.header.host_utime for fix in fixes]
-    assert arrivals == sorted(arrivals)
-    singles = [repr(one) for one, other in pairwise(fixes) if one != other]
-    assert singles == [repr(fix) for fix in simulate(gps_model=GpsModel()).events(200.0)][: len(singles)]
-
-
 def test_what_is_stated_can_be_wrong_or_missing(simulate):
     def first(**more):
         return next(simulate(gps_model=GpsModel(**more), second_gps_frame="Car:Second").events(1.0))
@@ -80,11 +69,6 @@ def test_what_is_stated_can_be_wrong_or_missing(simulate):
     assert mute.velocity_covariance is None
     assert all(map(math.isnan, (mute.speed, mute.course, mute.speed_sigma, mute.course_sigma, mute.velocity_latency)))
     assert mute.position_covariance == sound.position_covariance
-    vague = first(has_covariance=False)
-    assert vague.position_covariance is None
-    assert vague.velocity_covariance is None
-    assert all(map(math.isnan, (vague.speed_sigma, vague.course_sigma, vague.baseline_yaw_sigma)))
-    assert vague.velocity == sound.velocity
 
 
 def test_the_baseline_is_as_good_as_stated_and_only_there_with_two_antennas(simulate):
@@ -230,16 +214,6 @@ def with_faults(**faults) -> WheelsModel:
     return replace(WheelsModel.noise_free(), encoder=EncoderModel(**faults))
 
 
-def test_a_vehicle_that_skids_turns_its_wheels_more_than_it_turns(simulate):
-    model = replace(WheelsModel.noise_free(), track_factor=1.8)
-    run = simulate(wheels_model=model)
-    for sample in run.events(40.0):
-        left, right = (each for each in sample.wheels if each.name.startswith("rear"))
-        truth = run.truth(sample.header.utime)
-        assert right.speed - left.speed == pytest.approx(1.8 * 1.2 * truth.yaw_rate, abs=1e-9)
-        assert right.travel - left.travel == pytest.approx(1.8 * 1.2 * (truth.yaw - 0.4), abs=1e-9)
-
-
 def test_wheels_spin_in_bursts_each_for_itself(simulate):
     run = simulate(RUN, wheels_model=with_faults(burst_rate=0.2, burst_seconds=1.0, burst_excess=0.5))
     spins = {"rear_left": [], "rear_right": []}
@@ -252,18 +226,6 @@ def test_wheels_spin_in_bursts_each_for_itself(simulate):
     left, right = spins.values()
     assert 0 < sum(left) < len(left)
     assert left != right
-
-
-def test_a_poor_encoder_misses_pulses_and_counts_its_speed(simulate):
-    model = WheelsModel(
-        Timing(5.0), 0.0, 0.0, travel_step=0.1, encoder=EncoderModel(missed=0.2, speed_from_travel=True)
-    )
-    samples = wheel(simulate(RUN, wheels_model=model), "rear_left", 40.0)
-    assert samples[-1].travel == pytest.approx(0.8 * 60.0, rel=0.05)
-    for one, other in pairwise(samples):
-        assert other.travel >= one.travel
-        assert other.speed == pytest.approx((other.travel - one.travel) * 5.0, abs=1e-9)
-        assert other.travel / 0.1 == pytest.approx(round(other.travel / 0.1), abs=1e-6)
 
 
 def test_a_stuck_encoder_and_one_that_counts_backward(simulate):
@@ -284,17 +246,6 @@ def test_a_stuck_encoder_and_one_that_counts_backward(simulate):
         else:
             assert (each["rear_left"].travel, each["rear_left"].speed) == (reached, 0.0)
             assert each["rear_left"].direction is Direction.STOPPED
-
-
-def test_encoders_may_report_only_travel_or_only_speed(simulate):
-    for each in wheel(simulate(wheels_model=with_faults(has_travel=False)), "rear_left", 5.0):
-        assert math.isnan(each.travel)
-        assert math.isnan(each.travel_sigma)
-        assert math.isfinite(each.speed)
-    for each in wheel(simulate(wheels_model=with_faults(has_speed=False)), "rear_left", 5.0):
-        assert math.isnan(each.speed)
-        assert math.isnan(each.speed_sigma)
-        assert math.isfinite(each.travel)
 
 
 def test_wheels_can_have_unstated_latency(simulate):

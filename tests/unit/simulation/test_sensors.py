@@ -185,15 +185,6 @@ def test_its_noise_is_that_of_the_model():
     np.testing.assert_allclose(force.std(axis=0), imu.accelerometer_noise * 10.0, rtol=0.05)
 
 
-def test_quantized_samples_are_multiples_of_the_step():
-    imu = replace(ImuModel(), gyro_step=0.01, accelerometer_step=0.05)
-    run = simulation(imu_model=imu, gps_frame=None, wheel_frames=None)
-    for sample in run.events(5.0):
-        for values, step in ((sample.angular_velocity, 0.01), (sample.specific_force, 0.05)):
-            counts = np.array(values) / step
-            np.testing.assert_allclose(counts, np.round(counts), atol=1e-6)
-
-
 # --- the receiver -------------------------------------------------------------------------------------------
 
 
