@@ -112,11 +112,11 @@ class AxisSettings:
         if not self.slowest_deg <= self.fastest_deg:
             raise ValueError(f"slowest_deg is at most fastest_deg, {self.fastest_deg:g}, got {self.slowest_deg:g}")
         if self.nod is not None:
-            why = self.find_nod_problem(self.nod)
+            why = self._find_nod_problem(self.nod)
             if why:
                 raise ValueError(f"nod cannot be done: {why}")
 
-    def find_nod_problem(self, nod: NodSettings) -> str:
+    def _find_nod_problem(self, nod: NodSettings) -> str:
         """Describe why the axis cannot do a nodding motion; empty if it can."""
         if not self.registers.commanded:
             return "registers names no lower_limit, upper_limit and nod_rate"
@@ -155,7 +155,7 @@ class NodSetup:
         self._warning = ""
 
     def start(self, nod: NodSettings) -> None:
-        """Start to set a nodding motion, instead of the one in progress."""
+        """Start from the beginning."""
         self._steps = self._run(nod)
         self._step = next(self._steps, None)
 
@@ -307,25 +307,24 @@ class AxisDriver:
     """
 
     def __init__(self, settings: AxisSettings):
-        self.settings = settings
-        registers = settings.registers
+        self.settings, registers = settings, settings.registers
+        self.max_silence = settings.silence
+        self.counts = BoundedCounter()
+        """Polls, samples, unanswered requests, skipped polls, and what was rejected by reason."""
         self._table = RegisterTable(registers.table)
         self._length = max(each.address + each.registers for each in registers.measured.values()) - registers.begin
         self._readings = ReadingValidator(settings)
         self._nod_setup = NodSetup(settings)
-        self._nod = settings.nod
         self._pending: _PendingRequest | None = None
         self._transaction = 0
         self._period_ns = round(1e9 / settings.poll_hz)
-        self._next_ns = 0
-        self._step_ns = 0
-        self._received_ns = self._usable_ns = 0
+        self._reply_ns, self._silence_ns = round(settings.reply_timeout * 1e9), round(settings.silence * 1e9)
+        self._next_ns = self._step_ns = self._received_ns = self._usable_ns = 0
         self._silent_ns: int | None = None
         self._is_open = False
         self._reported: set[str] = set()
         self._phase = EndpointPhase.WAITING
         self._seq = 0
-        self._counts = BoundedCounter()
 
     def on_open(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Begin: set the nodding up, then read."""
@@ -335,25 +334,9 @@ class AxisDriver:
         self._phase = EndpointPhase.WAITING
         self._next_ns = self._step_ns = self._received_ns = self._usable_ns = now.monotonic_ns
         self._silent_ns = now.monotonic_ns + self._silence_ns
-        if self._nod is not None:
-            self._nod_setup.start(self._nod)
+        if self.settings.nod is not None:
+            self._nod_setup.start(self.settings.nod)
         return [EndpointStatus(self._phase, f"asking the axis for joint {self.settings.joint}"), *self._send_next(now)]
-
-    def set_nod(self, nod: NodSettings, now: HostTime) -> list[Output[ModbusUnit]]:
-        """Change the nodding motion; one that the axis cannot do is rejected with a warning."""
-        why = self.settings.find_nod_problem(nod)
-        if why:
-            self._counts["rejected.nod"] += 1
-            return [EndpointStatus(self._phase, f"nodding rejected: {why}", is_warning=True)]
-        self._nod = nod
-        self._reported -= {"nod"}
-        if not self._is_open:
-            return []
-        self._nod_setup.start(nod)
-        # a pending step belongs to the previous request
-        if self._pending is not None and not self._pending.is_poll:
-            self._pending = None
-        return self._send_next(now)
 
     def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
         """Process a reply or a failure."""
@@ -361,7 +344,7 @@ class AxisDriver:
             return self._on_line_error(f"the line to the axis broke: {unit.text}")
         pending = self._pending
         if pending is None or unit.transaction != pending.request.transaction or not self._is_open:
-            self._counts["rejected.stale"] += 1
+            self.counts["rejected.stale"] += 1
             return []
         if isinstance(unit, ModbusFailure):
             if unit.kind is FailureKind.TIMEOUT:
@@ -370,7 +353,7 @@ class AxisDriver:
         self._pending = None
         self._received_ns = now.monotonic_ns
         if not is_reply_to(unit, pending.request):
-            self._counts["rejected.length"] += 1
+            self.counts["rejected.length"] += 1
             return self._warn_once(
                 "length",
                 f"the reply to {describe_request(pending.request)} has another address or length; it is not used",
@@ -381,7 +364,7 @@ class AxisDriver:
         if isinstance(unit, Registers | RegistersWritten):
             warning = self._nod_setup.on_reply(unit)
             if warning:
-                self._counts["readback"] += 1
+                self.counts["readback"] += 1
                 outputs.append(EndpointStatus(self._phase, warning, is_warning=True))
             elif not self._nod_setup.step_text:
                 outputs.append(EndpointStatus(self._phase, "the nodding motion is set"))
@@ -397,7 +380,7 @@ class AxisDriver:
             # an axis that does not answer at all is reported by the reply timeout, when the line is reopened
             if self._received_ns > self._usable_ns:
                 self._phase = EndpointPhase.SILENT
-                self._counts["silences"] += 1
+                self.counts["silences"] += 1
                 why = f"no usable reading for {self.settings.silence:g} s although the axis answers"
                 outputs.append(EndpointStatus(EndpointPhase.SILENT, f"{why}; see the counters rejected.*"))
         return outputs + self._send_next(now)
@@ -420,24 +403,6 @@ class AxisDriver:
             for request in self._nod_setup.make_restore_requests()
         ]
 
-    @property
-    def max_silence(self) -> float:
-        """Longest normal silence, seconds."""
-        return self.settings.silence
-
-    @property
-    def counts(self) -> Mapping[str, int]:
-        """Polls, samples, unanswered requests, skipped polls, and what was rejected by reason."""
-        return self._counts
-
-    @property
-    def _reply_ns(self) -> int:
-        return round(self.settings.reply_timeout * 1e9)
-
-    @property
-    def _silence_ns(self) -> int:
-        return round(self.settings.silence * 1e9)
-
     def _send_next(self, now: HostTime) -> list[Output[ModbusUnit]]:
         """Send what is due, if nothing is under way: a reading, else a step of the nodding's set-up between two."""
         at = now.monotonic_ns
@@ -450,9 +415,9 @@ class AxisDriver:
         request = None if is_poll else self._nod_setup.make_request(transaction)
         if request is None:
             request = ReadRegisters(self.settings.registers.begin, self._length, self._table, transaction)
-            self._counts["polls"] += 1
+            self.counts["polls"] += 1
             late = (at - self._next_ns) // self._period_ns
-            self._counts["skipped"] += late
+            self.counts["skipped"] += late
             self._next_ns += (late + 1) * self._period_ns
         self._pending = _PendingRequest(request, at, is_poll)
         return [Send(request)]
@@ -465,7 +430,7 @@ class AxisDriver:
         round_trip_ns = now.monotonic_ns - pending.sent_ns
         joint, word = self._readings.validate(unit.values, pending.sent_ns + round_trip_ns // 2, round_trip_ns // 2)
         if word:
-            self._counts[word if word == "repeated" else f"rejected.{word}"] += 1
+            self.counts[word if word == "repeated" else f"rejected.{word}"] += 1
         outputs = self._warn_once(word, _WARNINGS[word]) if word else []
         if joint is None:
             return outputs
@@ -473,7 +438,7 @@ class AxisDriver:
         self._silent_ns = now.monotonic_ns + self._silence_ns
         header = SensorHeader(now.utime, self.settings.source, self._seq, now.utime)
         self._seq += 1
-        self._counts["samples"] += 1
+        self.counts["samples"] += 1
         if self._phase is not EndpointPhase.STREAMING:
             self._phase = EndpointPhase.STREAMING
             outputs = [EndpointStatus(self._phase, f"the axis reports joint {self.settings.joint}"), *outputs]
@@ -486,7 +451,7 @@ class AxisDriver:
         ]
 
     def _on_timeout(self, now: HostTime) -> list[Output[ModbusUnit]]:
-        self._counts["unanswered"] += 1
+        self.counts["unanswered"] += 1
         self._pending = None
         if now.monotonic_ns - self._received_ns < self._silence_ns:
             return self._send_next(now)
@@ -496,7 +461,7 @@ class AxisDriver:
     def _on_exception(
         self, pending: _PendingRequest, failure: ModbusFailure, now: HostTime
     ) -> list[Output[ModbusUnit]]:
-        self._counts.add(f"rejected.exception_{failure.code}")
+        self.counts.add(f"rejected.exception_{failure.code}")
         self._pending = None
         self._received_ns = now.monotonic_ns
         again_ns = now.monotonic_ns + round(self.settings.retry_delay * 1e9)
@@ -519,7 +484,7 @@ class AxisDriver:
             return []
         self._is_open, self._pending, self._silent_ns = False, None, None
         self._phase = EndpointPhase.SILENT
-        self._counts["line_errors"] += 1
+        self.counts["line_errors"] += 1
         return [EndpointStatus(EndpointPhase.SILENT, why), Reopen(why)]
 
     def _warn_once(self, word: str, text: str) -> list[Output[ModbusUnit]]:

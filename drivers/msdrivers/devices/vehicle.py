@@ -324,6 +324,7 @@ class VehicleDriver(CanDriver):
         self._status = bind_status(settings.status, database, f"{place}.status") if settings.status else None
         signals = self._status.signals if self._status is not None else {}
         super().__init__(settings, database, {signal.key: signal.message for signal in signals.values()})
+        self.max_silence = settings.silence if signals else math.inf
         self._has_status_words = "fault_bits" in signals or "commands_rejected" in signals
         self._mode: VehicleMode | None = None
         self._arbiter: CommandArbiter | None = None
@@ -377,11 +378,6 @@ class VehicleDriver(CanDriver):
     def on_close(self, now: HostTime) -> list[Output[CanFrame]]:
         """Stop the vehicle if it was commanded from here."""
         return self._arbiter.on_close(now) if self._arbiter is not None else []
-
-    @property
-    def max_silence(self) -> float:
-        """Longest normal silence, seconds; inf if no status is mapped."""
-        return self.settings.silence if self._needed else math.inf
 
     def _publish(self, instants: list[CanFrameSet], now: HostTime) -> list[Output[CanFrame]]:
         status = self._status

@@ -75,6 +75,7 @@ class WheelsDriver(CanDriver):
     def __init__(self, settings: WheelsSettings, database: CanDatabase):
         """Bind the signals. Raises ConfigError for unknown or unsuitable ones."""
         self.settings = settings
+        self.max_silence = settings.silence
         place = f"drivers.{settings.source}.wheels"
         self._wheels = bind_wheels(settings.wheels, database, place, settings.max_speed, settings.frame_delay)
         signals = (signal for wheel in self._wheels for signal in wheel.signals)
@@ -89,11 +90,6 @@ class WheelsDriver(CanDriver):
         """Start; the odometers continue, since the counters may have."""
         self._warned.clear()
         return super().on_open(now)
-
-    @property
-    def max_silence(self) -> float:
-        """Longest normal silence, seconds."""
-        return self.settings.silence
 
     def _publish(self, instants: list[CanFrameSet], now: HostTime) -> list[Output[CanFrame]]:
         outputs: list[Output[CanFrame]] = []

@@ -31,6 +31,7 @@ class GpsDriver:
 
     def __init__(self, settings: GpsSettings) -> None:
         self._settings = settings
+        self.max_silence = settings.silence
         self._novatel = settings.protocol == "novatel"
         self._stream = GpsStream()
         self._fixes = FixAssembler(settings.logs, round(settings.hold * _SECOND_NS), self._silence_ns)
@@ -109,11 +110,6 @@ class GpsDriver:
         if not self._settings.restore_on_exit:
             return []
         return [Send(command.encode("ascii") + b"\r\n") for command in self._settings.make_undo_commands()]
-
-    @property
-    def max_silence(self) -> float:
-        """Longest normal silence, seconds."""
-        return self._settings.silence
 
     @property
     def _current_baud(self) -> int | None:
