@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -15,9 +16,9 @@ from modelserver.messages import DriverHealth, Health
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.listener import DaemonListener, handle_until
 from mstools.terminal.health_text import as_data, format_line, format_report, is_healthy
-from mstools.terminal.interrupts import Interrupts
 from mstools.terminal.options import JsonOption, PrefixOption, UrlOption
 from mstools.terminal.output import replace_unencodable
+from mstools.terminal.progress import catch_signals, open_screen
 
 if TYPE_CHECKING:
     import lcm
@@ -65,7 +66,6 @@ def command(
 
     Example: modelserver status --watch
     """
-
     drivers: tuple[str, ...] = ()
     if config is not None:
         from modelserver.config.vehicle_file import load_config
@@ -85,12 +85,10 @@ def command(
     listener.listen(
         max(0.0, min(DRIVER_WAIT_S, timeout) - (time.monotonic() - began)), lambda: listener.has_drivers(drivers)
     )
-    assert listener.health is not None
-    if as_json:
-        typer.echo(json.dumps(as_data(listener.health, listener.drivers.values()), indent=2))
-    else:
-        typer.echo(replace_unencodable(format_report(listener.health, listener.drivers.values(), drivers)))
-    if not is_healthy(listener.health):
+    reports = (listener.report, listener.drivers.values())
+    text = json.dumps(as_data(*reports), indent=2) if as_json else replace_unencodable(format_report(*reports, drivers))
+    typer.echo(text)
+    if not is_healthy(listener.report):
         raise typer.Exit(EXIT_UNHEALTHY)
 
 
@@ -110,6 +108,18 @@ class HealthListener(DaemonListener):
     def _on_driver(self, health: DriverHealth) -> None:
         if health.source in self.drivers or len(self.drivers) < MAX_NAMES:
             self.drivers[health.source] = health
+
+    @property
+    def report(self) -> Health:
+        """The last report, after one was received."""
+        assert self.health is not None
+        return self.health
+
+    def wait_for_report(self, seconds: float, stop: Event) -> bool:
+        """Wait up to `seconds`, or until `stop`, for another report; return whether there was one."""
+        before = self.reports
+        self.listen(seconds, lambda: stop.is_set() or self.reports > before)
+        return self.reports > before
 
     def has_drivers(self, drivers: tuple[str, ...]) -> bool:
         """Return whether all these drivers have reported; False for none, as others may exist."""
@@ -161,41 +171,26 @@ def watch_reports(listener: HealthListener, drivers: tuple[str, ...], as_json: b
     if as_json or not sys.stdout.isatty():
         _print_lines(listener, as_json)
         return
-    from rich.console import Console
-    from rich.live import Live
     from rich.text import Text
 
     last = time.monotonic()
-    with Interrupts() as stop, Live(console=Console(highlight=False), screen=True, auto_refresh=False) as live:
-        while not stop.is_set:
-            assert listener.health is not None
+    with catch_signals() as stop, open_screen() as live:
+        while not stop.is_set():
             silent = time.monotonic() - last
-            text = format_report(listener.health, listener.drivers.values(), drivers)
+            text = format_report(listener.report, listener.drivers.values(), drivers)
             if silent > SILENT_S:
                 text = f"NO REPORT for {silent:.0f} s; the last one:\n\n{text}"
             live.update(Text(replace_unencodable(text), overflow="crop", no_wrap=True), refresh=True)
-            if _wait_for_report(listener, 1.0, stop):
+            if listener.wait_for_report(1.0, stop):
                 last = time.monotonic()
 
 
 def _print_lines(listener: HealthListener, as_json: bool) -> None:
-    with Interrupts() as stop:
-        while not stop.is_set:
-            assert listener.health is not None
-            data = (
-                json.dumps(as_data(listener.health, listener.drivers.values()))
-                if as_json
-                else replace_unencodable(format_line(listener.health))
-            )
-            typer.echo(data)
+    with catch_signals() as stop:
+        while not stop.is_set():
+            data = as_data(listener.report, listener.drivers.values()) if as_json else None
+            typer.echo(json.dumps(data) if as_json else replace_unencodable(format_line(listener.report)))
             sys.stdout.flush()
             began = time.monotonic()
-            while not _wait_for_report(listener, SILENT_S, stop) and not stop.is_set:
+            while not listener.wait_for_report(SILENT_S, stop) and not stop.is_set():
                 typer.echo(f"no report for {time.monotonic() - began:.0f} s", err=True)
-
-
-def _wait_for_report(listener: HealthListener, seconds: float, stop: Interrupts) -> bool:
-    """Wait up to `seconds` for another report; return whether there was one."""
-    before = listener.reports
-    listener.listen(seconds, lambda: stop.is_set or listener.reports > before)
-    return listener.reports > before

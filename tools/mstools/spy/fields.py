@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
+from itertools import islice
 from typing import Any, Final
 
 from mstools.spy.lcm_wheel import MissingToolError, find_type_files
@@ -111,17 +112,15 @@ MAX_UTIME: Final = 4_102_444_800_000_000
 
 def format_fields(message: Any, constants: Mapping[tuple[str, str], Constants]) -> list[str]:
     """Format a message, an instance of a class of lcm-gen, as lines; nested structures are indented."""
-    lines: list[str] = []
-    for line in _format_structure(message, constants, 0):
-        if len(lines) == MAX_LINES:
-            lines.append("... and more")
-            break
-        lines.append(line)
-    return lines
+    lines = list(islice(_format_structure(message, constants, 0), MAX_LINES + 1))
+    return lines if len(lines) <= MAX_LINES else [*lines[:MAX_LINES], "... and more"]
 
 
 def _format_structure(message: Any, constants: Mapping[tuple[str, str], Constants], depth: int) -> Iterator[str]:
     indent = "  " * depth
+    if depth == MAX_DEPTH:
+        yield f"{indent}..."
+        return
     kind = type(message)
     names = kind.__slots__
     width = max(map(len, names), default=0)
@@ -129,29 +128,23 @@ def _format_structure(message: Any, constants: Mapping[tuple[str, str], Constant
         value = getattr(message, name)
         head = f"{indent}{name:<{width}}"
         known = constants.get((kind.__name__, name))
+        is_array = dimensions and not isinstance(value, bytes) and value
         if _is_structure(value):
             yield f"{indent}{name}"
-            yield from _format_nested(value, constants, depth)
-        elif dimensions and not isinstance(value, bytes) and value and _is_structure(value[0]):
+            yield from _format_structure(value, constants, depth + 1)
+        elif is_array and _is_structure(value[0]):
             for number, each in enumerate(value[:MAX_ENTRIES]):
                 yield f"{indent}{name}[{number}]"
-                yield from _format_nested(each, constants, depth)
+                yield from _format_structure(each, constants, depth + 1)
             if len(value) > MAX_ENTRIES:
                 yield f"{indent}... and {len(value) - MAX_ENTRIES} more of {name}"
-        elif dimensions and len(dimensions) > 1 and not isinstance(value, bytes) and value:
+        elif is_array and len(dimensions) > 1:
             for number, row in enumerate(value[:MAX_NUMBERS]):
                 yield f"{head if not number else indent + ' ' * width} {_format_array(row, None)}"
             if len(value) > MAX_NUMBERS:
                 yield f"{indent}{' ' * width} ... and {len(value) - MAX_NUMBERS} rows more"
         else:
             yield f"{head} {format_value(name, value, known)}"
-
-
-def _format_nested(value: Any, constants: Mapping[tuple[str, str], Constants], depth: int) -> Iterator[str]:
-    if depth + 1 >= MAX_DEPTH:
-        yield f"{'  ' * (depth + 1)}..."
-    else:
-        yield from _format_structure(value, constants, depth + 1)
 
 
 def _is_structure(value: Any) -> bool:
@@ -175,7 +168,7 @@ def format_value(name: str, value: Any, constants: Constants | None = None) -> s
     if constants is not None:
         return constants.describe(value)
     if (name == "utime" or name.endswith("_utime")) and 0 < value < MAX_UTIME:
-        return f"{value} ({_format_time(value)})"
+        return f"{value} ({datetime.fromtimestamp(value / 1e6, UTC):%Y-%m-%d %H:%M:%S.%f UTC})"
     return str(value)
 
 
@@ -185,7 +178,3 @@ def _format_array(values: Sequence[Any], constants: Constants | None) -> str:
     shown = ", ".join(format_value("", each, constants) for each in values[:MAX_NUMBERS])
     more = f", ... ({len(values)})" if len(values) > MAX_NUMBERS else ""
     return f"[{shown}{more}]"
-
-
-def _format_time(utime: int) -> str:
-    return datetime.fromtimestamp(utime / 1e6, UTC).strftime("%Y-%m-%d %H:%M:%S.%f UTC")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import select
@@ -10,10 +9,10 @@ import sys
 import termios
 import time
 import tty
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from enum import Enum, auto
-from types import TracebackType
+from enum import Enum
 from typing import TYPE_CHECKING, Any, Final
 
 import typer
@@ -25,9 +24,9 @@ from modelserver.wire.encoded import type_name_of
 from modelserver.wire.provider import handle_message
 from mstools.spy.fields import format_fields, load_constants
 from mstools.spy.traffic import BusTraffic, ChannelStatistics
-from mstools.terminal.health_text import format_duration
-from mstools.terminal.interrupts import Interrupts
+from mstools.terminal.health_text import format_duration, format_number
 from mstools.terminal.output import escape, format_table, replace_unencodable
+from mstools.terminal.progress import catch_signals, open_screen
 
 if TYPE_CHECKING:
     import lcm
@@ -35,47 +34,23 @@ if TYPE_CHECKING:
 
 
 class KeyBinding(Enum):
-    """A key of the live view."""
+    """A key of the live view: what terminals send for it (ECMA-48 and xterm)."""
 
-    UP = auto()
-    DOWN = auto()
-    PAGE_UP = auto()
-    PAGE_DOWN = auto()
-    HOME = auto()
-    END = auto()
-    ENTER = auto()
-    BACK = auto()
-    QUIT = auto()
+    UP = (b"\x1b[A", b"\x1bOA", b"k")
+    DOWN = (b"\x1b[B", b"\x1bOB", b"j")
+    PAGE_UP = (b"\x1b[5~",)
+    PAGE_DOWN = (b"\x1b[6~", b" ")
+    HOME = (b"\x1b[H", b"\x1b[1~")
+    END = (b"\x1b[F", b"\x1b[4~")
+    ENTER = (b"\r", b"\n", b"\x1b[C")
+    BACK = (b"\x1b[D", b"\x7f", b"\x1b")
+    QUIT = (b"q", b"Q", b"\x03", b"\x04")
 
 
-_KEYS: Final = {
-    b"\x1b[A": KeyBinding.UP,
-    b"\x1bOA": KeyBinding.UP,
-    b"k": KeyBinding.UP,
-    b"\x1b[B": KeyBinding.DOWN,
-    b"\x1bOB": KeyBinding.DOWN,
-    b"j": KeyBinding.DOWN,
-    b"\x1b[5~": KeyBinding.PAGE_UP,
-    b"\x1b[6~": KeyBinding.PAGE_DOWN,
-    b" ": KeyBinding.PAGE_DOWN,
-    b"\x1b[H": KeyBinding.HOME,
-    b"\x1b[1~": KeyBinding.HOME,
-    b"\x1b[F": KeyBinding.END,
-    b"\x1b[4~": KeyBinding.END,
-    b"\r": KeyBinding.ENTER,
-    b"\n": KeyBinding.ENTER,
-    b"\x1b[C": KeyBinding.ENTER,
-    b"\x1b[D": KeyBinding.BACK,
-    b"\x7f": KeyBinding.BACK,
-    b"\x1b": KeyBinding.BACK,
-    b"q": KeyBinding.QUIT,
-    b"Q": KeyBinding.QUIT,
-    b"\x03": KeyBinding.QUIT,
-    b"\x04": KeyBinding.QUIT,
-}
+_KEYS: Final = {code: key for key in KeyBinding for code in key.value}
 
 _KEY_PATTERN: Final = re.compile(rb"\x1b\[[0-9;]*[A-Za-z~]|\x1bO[A-Za-z]|.", re.DOTALL)
-"""A key as a terminal sends it: an escape sequence (ECMA-48 and xterm), or a byte."""
+"""An escape sequence, or a byte."""
 
 
 def parse_keys(data: bytes) -> Sequence[KeyBinding]:
@@ -83,28 +58,18 @@ def parse_keys(data: bytes) -> Sequence[KeyBinding]:
     return [_KEYS[piece] for piece in _KEY_PATTERN.findall(data) if piece in _KEYS]
 
 
-class Keyboard:
-    """Standard input as single keys without echo; `fileno` is -1 where it is no terminal."""
-
-    def __init__(self) -> None:
-        self.fileno = sys.stdin.fileno() if sys.stdin is not None and sys.stdin.isatty() else -1
-        self._previous: list[Any] | None = None
-
-    def __enter__(self) -> Keyboard:
-        if self.fileno >= 0:
-            self._previous = termios.tcgetattr(self.fileno)
-            tty.setcbreak(self.fileno)
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        if self._previous is not None:
-            termios.tcsetattr(self.fileno, termios.TCSADRAIN, self._previous)
-
-    def read(self) -> Sequence[KeyBinding]:
-        """Read the pressed keys; call it when `fileno` is ready."""
-        data = os.read(self.fileno, 1024)
-        # no data: the terminal was closed
-        return parse_keys(data) if data else [KeyBinding.QUIT]
+@contextmanager
+def open_keyboard() -> Iterator[int]:
+    """Let standard input give single keys without echo; yield its descriptor, -1 where it is no terminal."""
+    fileno = sys.stdin.fileno() if sys.stdin is not None and sys.stdin.isatty() else -1
+    previous = termios.tcgetattr(fileno) if fileno >= 0 else None
+    try:
+        if previous is not None:
+            tty.setcbreak(fileno)
+        yield fileno
+    finally:
+        if previous is not None:
+            termios.tcsetattr(fileno, termios.TCSADRAIN, previous)
 
 
 REFRESH_S: Final = 0.25
@@ -115,8 +80,6 @@ LISTEN_S: Final = 2.0
 
 HEADER: Final = ("channel", "type", "count", "Hz", "jitter ms", "kB/s", "bytes", "age", "bad")
 
-NUMERIC_COLUMNS: Final = tuple(range(2, 9))
-
 HELP: Final = "up/down select, enter shows the fields, left goes back, q quits"
 
 
@@ -125,14 +88,10 @@ class BusListener:
 
     def __init__(self, bus: lcm.LCM, clock: Callable[[], float] = time.monotonic):
         self.traffic = BusTraffic(clock(), type_name_of, is_decodable)
-        self._bus = bus
-        self._clock = clock
+        self._bus, self._clock = bus, clock
         self.fileno = bus.fileno()
         # 0 is no limit: messages that LCM drops could not be counted
-        bus.subscribe(".*", self._on_message).set_queue_capacity(0)
-
-    def _on_message(self, channel: str, data: bytes) -> None:
-        self.traffic.add(channel, data, self._clock())
+        bus.subscribe(".*", lambda channel, data: self.traffic.add(channel, data, clock())).set_queue_capacity(0)
 
     def drain(self, until: float) -> None:
         """Process the queued messages, but not after `until`: a flood must not stop the display."""
@@ -151,38 +110,44 @@ class BusListener:
         return False
 
 
+_TOP_LEVEL_TYPES: Final = frozenset(get_type_names())
+
+
 def is_decodable(type_name: str, data: bytes) -> bool:
     """Return whether a message of a known type decodes as the server decodes it."""
-    if type_name not in _TOP_LEVEL_TYPES:
-        return True  # only a part of other messages
-    try:
-        decode(type_name, data)
-    except WireError:
-        return False
+    if type_name in _TOP_LEVEL_TYPES:  # others are only parts of messages
+        try:
+            decode(type_name, data)
+        except WireError:
+            return False
     return True
-
-
-_TOP_LEVEL_TYPES: Final = frozenset(get_type_names())
 
 
 def format_rows(traffic: BusTraffic, now: float) -> list[tuple[str, ...]]:
     """Format the rows of the table."""
-    return [_format_row(traffic, seen, now) for seen in traffic.list_channels()]
+    rows: list[tuple[str, ...]] = []
+    for seen in traffic.list_channels():
+        rate, flow = traffic.get_rates(seen, now)
+        rows.append(
+            (
+                truncate(escape(seen.channel), 40),
+                seen.type_name or "(unknown)",
+                str(seen.count),
+                f"{rate:.1f}",
+                format_number(seen.jitter * 1e3, 1),
+                f"{flow / 1e3:.1f}",
+                str(seen.size),
+                format_duration(max(0.0, now - seen.last_s)),
+                str(seen.undecodable or ""),
+            )
+        )
+    return rows
 
 
-def _format_row(traffic: BusTraffic, seen: ChannelStatistics, now: float) -> tuple[str, ...]:
-    rate, flow = traffic.get_rates(seen, now)
-    return (
-        truncate(escape(seen.channel), 40),
-        seen.type_name or "(unknown)",
-        str(seen.count),
-        f"{rate:.1f}",
-        "-" if math.isnan(seen.jitter) else f"{seen.jitter * 1e3:.1f}",
-        f"{flow / 1e3:.1f}",
-        str(seen.size),
-        format_duration(max(0.0, now - seen.last_s)),
-        str(seen.undecodable or ""),
-    )
+def format_channel_table(traffic: BusTraffic, now: float, indent: str) -> str:
+    """Format the table of all channels."""
+    rows = format_rows(traffic, now)
+    return replace_unencodable(format_table(HEADER, rows, indent=indent, numbers=range(2, len(HEADER))))
 
 
 def truncate(text: str, width: int) -> str:
@@ -218,24 +183,15 @@ def print_once(listener: BusListener, seconds: float, channel: str = "") -> None
     now, traffic = time.monotonic(), listener.traffic
     typer.echo(f"{format_summary(traffic, now)}, in {seconds:g} s")
     if traffic.channels:
-        typer.echo(
-            replace_unencodable(format_table(HEADER, format_rows(traffic, now), indent="", numbers=NUMERIC_COLUMNS))
-        )
+        typer.echo(format_channel_table(traffic, now, ""))
     else:
         typer.echo("no message received: is the daemon running, on this bus (--url)? modelserver doctor checks the bus")
     if channel:
-        typer.echo("")
-        typer.echo(
-            "\n".join([escape(channel), *(f"  {each}" for each in format_message(_select_channel(traffic, channel)))])
-        )
-
-
-def _select_channel(traffic: BusTraffic, channel: str) -> ChannelStatistics:
-    if channel in traffic.channels:
-        return traffic.channels[channel]
-    near = find_nearest_names(channel, traffic.channels)
-    offer = f"; nearest: {', '.join(quote(each, 64) for each in near)}" if near else ""
-    raise ModelServerError(f"no message on {quote(channel, 64)}{offer}")
+        if channel not in traffic.channels:
+            near = ", ".join(quote(each, 64) for each in find_nearest_names(channel, traffic.channels))
+            raise ModelServerError(f"no message on {quote(channel, 64)}{f'; nearest: {near}' if near else ''}")
+        fields = (f"  {each}" for each in format_message(traffic.channels[channel]))
+        typer.echo("\n".join(["", escape(channel), *fields]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,10 +212,14 @@ class SpyView:
         if not names:
             return self
         at = names.index(self.channel) if self.channel in names else 0
-        step = {KeyBinding.UP: -1, KeyBinding.DOWN: 1, KeyBinding.PAGE_UP: -page, KeyBinding.PAGE_DOWN: page}.get(
-            key, 0
-        )
-        to = {KeyBinding.HOME: 0, KeyBinding.END: len(names) - 1}.get(key, at + step)
+        to = {
+            KeyBinding.UP: at - 1,
+            KeyBinding.DOWN: at + 1,
+            KeyBinding.PAGE_UP: at - page,
+            KeyBinding.PAGE_DOWN: at + page,
+            KeyBinding.HOME: 0,
+            KeyBinding.END: len(names) - 1,
+        }[key]
         return replace(self, channel=names[max(0, min(to, len(names) - 1))])
 
 
@@ -270,17 +230,14 @@ def render(traffic: BusTraffic, view: SpyView, now: float, height: int, note: st
     text = Text(no_wrap=True, overflow="crop")
     text.append(f"{format_summary(traffic, now)}\n", "bold")
     seen = traffic.list_channels()
-    lines = replace_unencodable(
-        format_table(HEADER, format_rows(traffic, now), indent=" ", numbers=NUMERIC_COLUMNS)
-    ).split("\n")
+    lines = format_channel_table(traffic, now, " ").split("\n")
     text.append(f"{lines[0]}\n", "bold underline")
     names = [each.channel for each in seen]
     at = names.index(view.channel) if view.channel in names else 0
     space = max(1, height - 3)
     found: list[str] = []
     if view.is_open:
-        selected = traffic.channels.get(view.channel)
-        found = format_message(selected) if selected is not None else ["no message yet"]
+        found = format_message(traffic.channels[view.channel]) if view.channel in names else ["no message yet"]
         # a third for the table, more if the fields leave it
         space = max(1, min(len(seen), max((height - 6) // 3, height - 6 - len(found))))
     first = max(0, min(at - space // 2, len(seen) - space))
@@ -300,23 +257,22 @@ def render(traffic: BusTraffic, view: SpyView, now: float, height: int, note: st
 
 def watch(listener: BusListener, channel: str = "") -> None:
     """Show the live table until q, Ctrl-C or SIGTERM."""
-    from rich.console import Console
-    from rich.live import Live
-
-    console = Console(highlight=False)
     view = SpyView(channel, bool(channel))
-    with Interrupts() as stop, Keyboard() as keyboard, Live(console=console, screen=True, auto_refresh=False) as live:
-        while not stop.is_set:
+    with catch_signals() as stop, open_keyboard() as keyboard, open_screen() as live:
+        while not stop.is_set():
             names = [each.channel for each in listener.traffic.list_channels()]
             if not view.channel and names:
                 view = replace(view, channel=names[0])
-            note = HELP if keyboard.fileno >= 0 else "Ctrl-C quits"
+            note = HELP if keyboard >= 0 else "Ctrl-C quits"
             if view.is_open and view.channel not in names and (near := find_nearest_names(view.channel, names)):
                 note = f"no message on {escape(view.channel)}; nearest: {', '.join(map(escape, near))}. {note}"
-            live.update(render(listener.traffic, view, time.monotonic(), console.height, note), refresh=True)
-            if listener.listen(time.monotonic() + REFRESH_S, keyboard.fileno):
-                for key in keyboard.read():
-                    after = view.handle_key(key, names, max(1, console.height // 2))
+            height = live.console.height
+            live.update(render(listener.traffic, view, time.monotonic(), height, note), refresh=True)
+            if listener.listen(time.monotonic() + REFRESH_S, keyboard):
+                data = os.read(keyboard, 1024)
+                # no data: the terminal was closed
+                for key in parse_keys(data) if data else [KeyBinding.QUIT]:
+                    after = view.handle_key(key, names, max(1, height // 2))
                     if after is None:
                         return
                     view = after

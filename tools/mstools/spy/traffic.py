@@ -84,12 +84,11 @@ class BusTraffic:
         stats.count += 1
         stats.size, stats.last, stats.last_s = len(data), data, now
         stats.type_name = self._type_of(data)
-        number = int(now / BUCKET_S)
+        number, count, size = int(now / BUCKET_S), 0, 0
         if stats.buckets and stats.buckets[-1][0] == number:
             _, count, size = stats.buckets.pop()
-            stats.buckets.append((number, count + 1, size + len(data)))
-        else:
-            stats.buckets.append((number, 1, len(data)))
+        stats.buckets.append((number, count + 1, size + len(data)))
+        if not count:
             self._drop_old_buckets(stats, now)
         if stats.type_name and self._may_check(now) and not self._is_decodable(stats.type_name, data):
             stats.undecodable += 1

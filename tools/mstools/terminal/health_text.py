@@ -8,15 +8,7 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 from modelserver.core import DEGRADED, RUNNING, STARTING
-from modelserver.messages import (
-    ChannelHealth,
-    DriverHealth,
-    DriverPhase,
-    Health,
-    Invalid,
-    LocalizationHealth,
-    Phase,
-)
+from modelserver.messages import ChannelHealth, DriverHealth, DriverPhase, Health, Invalid, LocalizationHealth, Phase
 from mstools.terminal.output import escape, format_count, format_table, to_json
 
 STATE_NAMES: Final = {STARTING: "STARTING", RUNNING: "RUNNING", DEGRADED: "DEGRADED"}
@@ -64,47 +56,33 @@ def _format_head(health: Health) -> str:
 
 def _format_body(health: Health) -> str:
     localization = health.localization
-    rows: list[tuple[str, str]] = []
     if localization.mode is None:
-        rows.append(("pose", "none: no localization sensor is configured"))
+        rows = [("pose", "none: no localization sensor is configured")]
     else:
-        reasons = health.invalid_reasons.explain()
-        rows.append(("pose", f"NOT VALID: {reasons}" if health.invalid_reasons else "valid"))
         bounds = _format_bounds(localization)
         if math.isfinite(localization.seconds_to_limit):
             bounds += f"; {format_duration(localization.seconds_to_limit)} to the limit without further measurements"
-        rows.append(("", bounds))
-        rows.append(
-            (
-                "filter",
-                f"mode {localization.mode.name.lower()}{_format_motion(health)}; "
-                f"{_format_fix_age(localization.fix_age)}",
-            )
-        )
+        mode = f"mode {localization.mode.name.lower()}{_format_motion(health)}"
         origin = f"origin {health.origin_id & (1 << 64) - 1:016x}" if health.origin_id else "no origin yet"
-        rows.append(
-            ("", f"epoch {health.pose_epoch}, {origin}, {format_count(health.poses_published, 'pose')} published")
-        )
-    rows.append(("geometry", f"revision {health.model_revision}"))
+        published = format_count(health.poses_published, "pose")
+        rows = [
+            ("pose", f"NOT VALID: {health.invalid_reasons.explain()}" if health.invalid_reasons else "valid"),
+            ("", bounds),
+            ("filter", f"{mode}; {_format_fix_age(localization.fix_age)}"),
+            ("", f"epoch {health.pose_epoch}, {origin}, {published} published"),
+        ]
     latency = (health.tick_latency_p50, health.tick_latency_p90, health.tick_latency_p99, health.tick_latency_max)
-    rows.append(
-        (
-            "loop",
-            f"tick latency {' / '.join(format_number(each * 1e3, 2) for each in latency)} ms (p50, p90, p99, max); "
-            f"{format_count(health.ticks_missed, 'tick')} missed, "
-            f"{format_count(health.handler_errors, 'internal error')}",
-        )
-    )
+    ticks = f"tick latency {' / '.join(format_number(each * 1e3, 2) for each in latency)} ms (p50, p90, p99, max)"
+    missed, errors = format_count(health.ticks_missed, "tick"), format_count(health.handler_errors, "internal error")
     cpu = "CPU load unknown" if math.isnan(health.cpu_share) else f"{health.cpu_share:.0%} of a CPU"
     memory = f"{health.memory / 1e6:.0f} MB" if health.memory else "memory unknown"
-    rows.append(("process", f"{cpu}, {memory}"))
-    rows.append(
-        (
-            "requests",
-            f"{health.requests_answered} answered, {health.requests_waiting} waiting for data, "
-            f"{health.requests_queued} queued",
-        )
-    )
+    waiting = f"{health.requests_waiting} waiting for data, {health.requests_queued} queued"
+    rows += [
+        ("geometry", f"revision {health.model_revision}"),
+        ("loop", f"{ticks}; {missed} missed, {errors}"),
+        ("process", f"{cpu}, {memory}"),
+        ("requests", f"{health.requests_answered} answered, {waiting}"),
+    ]
     return "\n".join(f"{name:<9} {escape(text)}".rstrip() for name, text in rows)
 
 
@@ -113,16 +91,19 @@ def _format_bounds(localization: LocalizationHealth) -> str:
     position, heading = localization.horizontal_protection_level, localization.heading_protection_level
     if not math.isfinite(position) and not math.isfinite(heading):
         return "protection levels unknown"
-    return (
-        f"protection level {f'{position:.2f} m' if math.isfinite(position) else 'of position unknown'}, "
-        f"heading {f'{format_degrees(heading)} deg' if math.isfinite(heading) else 'unknown'}"
-    )
+    meters = f"{position:.2f} m" if math.isfinite(position) else "of position unknown"
+    degrees = f"{math.degrees(heading):.1f} deg" if math.isfinite(heading) else "unknown"
+    return f"protection level {meters}, heading {degrees}"
 
 
 def is_current(health: Health) -> bool:
     """Return whether phase and motion are current: the sensors that they are estimated from are not silent."""
-    sensors = [each for each in health.channels if each.channel.startswith(SENSOR_PREFIX) and each.count]
-    return Invalid.STALE_IMU not in health.invalid_reasons and any(not each.silent for each in sensors)
+    return Invalid.STALE_IMU not in health.invalid_reasons and any(not each.silent for each in _get_sensors(health))
+
+
+def _get_sensors(health: Health) -> list[ChannelHealth]:
+    """Return the sensors with samples."""
+    return [each for each in health.channels if each.channel.startswith(SENSOR_PREFIX) and each.count]
 
 
 def _format_motion(health: Health) -> str:
@@ -130,7 +111,7 @@ def _format_motion(health: Health) -> str:
     localization = health.localization
     phase = "" if localization.phase is None else localization.phase.name.lower()
     head = f", {phase}" if phase else ", no filter"
-    if not any(each.channel.startswith(SENSOR_PREFIX) and each.count for each in health.channels):
+    if not _get_sensors(health):
         return f"{head}: no sensor sample received yet"
     # during leveling only a stationary vehicle is detected
     motion = "stationary" if localization.stationary else "" if localization.phase is Phase.LEVELING else "moving"
@@ -149,12 +130,8 @@ def _format_fix_age(age_s: float) -> str:
     return f"last fix used {format_duration(age_s)} ago"
 
 
-def _format_rate(each: ChannelHealth) -> str:
-    """Format a source's rate; - in its first period."""
-    return "-" if _is_fresh(each) else format_number(each.rate_hz, 1)
-
-
 def _is_fresh(each: ChannelHealth) -> bool:
+    """Return whether a source is in its first period, without a rate."""
     return bool(each.count) and not each.silent and each.rate_hz == 0.0 and each.age < FRESH_S
 
 
@@ -163,8 +140,8 @@ def _format_channels(channels: Iterable[ChannelHealth]) -> str:
         (
             each.channel,
             str(each.count),
-            _format_rate(each),
-            format_age(each.age),
+            "-" if _is_fresh(each) else format_number(each.rate_hz, 1),
+            format_duration(each.age),
             format_number(each.delay_max * 1e3, 1),
             f"{each.used}/{each.measured}" if each.measured else "",
             "never received" if not each.count else "SILENT" if each.silent else "",
@@ -183,7 +160,7 @@ def _format_drivers(drivers: Iterable[DriverHealth], missing: Iterable[str]) -> 
             each.device,
             each.phase.name.lower() if each.phase is DriverPhase.STREAMING else each.phase.name,
             format_number(each.rate_hz, 1),
-            format_age(each.age),
+            format_duration(each.age),
             str(each.reconnects),
             each.link,
             each.text,
@@ -205,11 +182,8 @@ def format_line(health: Health) -> str:
     localization = health.localization
     parts = [format_clock(health.utime), STATE_NAMES.get(health.state, str(health.state))]
     if localization.mode is not None:
-        parts.append(
-            f"pose not valid: {health.invalid_reasons.explain()}"
-            if health.invalid_reasons
-            else _format_bounds(localization)
-        )
+        reasons = health.invalid_reasons
+        parts.append(f"pose not valid: {reasons.explain()}" if reasons else _format_bounds(localization))
     parts += [f"{each.channel} {_format_source(each)}" for each in health.channels[:MAX_ROWS]]
     parts.append(f"tick latency p99 {health.tick_latency_p99 * 1e3:.2f} ms")
     parts += [f"{name}: {text}" for name, text in health.warnings]
@@ -241,18 +215,8 @@ def format_number(value: float, digits: int) -> str:
     return f"{value:.{digits}f}" if math.isfinite(value) else "-"
 
 
-def format_degrees(radians: float) -> str:
-    """Format an angle in degrees."""
-    return format_number(math.degrees(radians), 1)
-
-
-def format_age(seconds: float) -> str:
-    """Format an age, - for never."""
-    return format_duration(seconds) if math.isfinite(seconds) else "-"
-
-
 def format_duration(seconds: float) -> str:
-    """Format a duration in milliseconds, seconds, minutes, hours or days."""
+    """Format a duration in milliseconds, seconds, minutes, hours or days; - if it is not finite."""
     if not math.isfinite(seconds):
         return "-"
     if seconds < 0.9995:

@@ -46,8 +46,8 @@ def build_nodes(model: Model) -> list[list[BodyNode]]:
 
 def _build_assembly(model: Model, topology: Topology, root: str, loops: dict[str, list[str]]) -> list[BodyNode]:
     below: dict[str, list[Crossing]] = {}
-    for body, onward in topology.traverse_breadth_first(root):
-        below.setdefault(body, []).append(onward)
+    for onward in topology.traverse_breadth_first(root):
+        below.setdefault(onward.near_body, []).append(onward)
     drawn: list[BodyNode] = []
     # no recursion: a chain may be longer than Python's stack
     waiting: list[tuple[str, tuple[bool, ...], Crossing | None, int]] = [(root, (), None, -1)]
