@@ -48,7 +48,7 @@ class _FrameTreeWriter:
         self.crossings: dict[str, Crossing] = {}
         topology = Topology(model.bodies, model.constraints)
         for assembly in topology.assemblies:
-            self.crossings |= {each.far_body: each for _, each in topology.traverse_breadth_first(assembly[0])}
+            self.crossings |= {each.far_body: each for each in topology.traverse_breadth_first(assembly[0])}
         self.used = {crossing.constraint.name for crossing in self.crossings.values()}
         self.aligned = {body: self._find_aligned_mount(body, crossing) for body, crossing in self.crossings.items()}
         """For each mounted body the frame that its instance represents too, empty for none."""

@@ -130,7 +130,7 @@ class _UrdfWriter:
         self.model = model
         topology = Topology(model.bodies, model.constraints)
         root, *_ = topology.assemblies
-        self.crossings = {each.far_body: each for _, each in topology.traverse_breadth_first(root[0])}
+        self.crossings = {each.far_body: each for each in topology.traverse_breadth_first(root[0])}
         self.bodies = [body for body in model.bodies if body.name in set(root)]
         self.links: dict[str, str] = {body.name: body.name for body in self.bodies}
         """Links to write, each with the body that it represents, empty for none."""

@@ -288,7 +288,7 @@ class FrameTree:
         for number, assembly in enumerate(topology.assemblies):
             root = assembly[0]
             self._add_frames(bodies[root], FrameNode(number, root, Pose.identity()))
-            for _, crossing in topology.traverse_breadth_first(root):
+            for crossing in topology.traverse_breadth_first(root):
                 body = bodies[crossing.far_body]
                 self._add_frames(body, self._cross(crossing, body), crossing.far_frame)
 

@@ -76,25 +76,18 @@ def compute_misclosure(path: Sequence[Crossing], frame: Callable[[str], BodyFram
         if factor is None:
             missing.append(edge.name)
         links.append(ChainLink(edge.pose, edge.forward, factor, source))
-    around = chain.compose(links)
+    places = chain.frame_poses(links)
+    around = places[-1]
     meters, radians = around.distance(Pose.identity())
     with np.errstate(over="ignore", invalid="ignore"):
         covariance = chain.covariance(links)
     # the covariance neglects the second order in the rotation, lever arm times square of the angle: tolerate as much
     second = 2.0 * min(radians, FIRST_ORDER) ** 2
-    tolerance = np.repeat((second * _max_distance(links), second), 3)
+    farthest = max(math.hypot(*place.xyz) for place in places)
+    tolerance = np.repeat((second * farthest, second), 3)
     residual = np.array((*around.xyz, *so3.logarithm(around.wxyz)))
     sigmas = None if covariance is None else residual_significance(residual, covariance, tolerance)
     return LoopMisclosure(meters, radians, sigmas, tuple(missing), tuple(joints))
-
-
-def _max_distance(links: Sequence[ChainLink]) -> float:
-    """Return the largest distance of a link's end from the start of the loop, meters."""
-    place, farthest = Pose.identity(), 0.0
-    for link in links:
-        place = place @ (link.X_FT if link.forward else link.X_FT.inverse())
-        farthest = max(farthest, math.hypot(*place.xyz))
-    return farthest
 
 
 def residual_significance(residual: Array, covariance: Array, tolerance: Array | float = 0.0) -> float:

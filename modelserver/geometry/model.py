@@ -12,20 +12,23 @@ from enum import StrEnum
 from functools import partial
 
 from modelserver.errors import (
+    Location,
+    MalformedRequestError,
     NotConnectedError,
     Problem,
+    Severity,
     UnknownBodyError,
     UnknownFrameError,
     find_nearest_names,
     quote,
 )
 from modelserver.geometry import names
-from modelserver.geometry import topology as adjacency
 from modelserver.geometry.joint import Coordinates, Joint
 from modelserver.geometry.kinematic_path import FrameNode, FrameTree, KinematicPath
 from modelserver.geometry.mimic import resolve_mimics
+from modelserver.geometry.names import format_names
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
-from modelserver.geometry.topology import Crossing, Edge, Neighbor, Topology, list_edges
+from modelserver.geometry.topology import Crossing, Edge, Neighbor, Topology, full_name, list_edges
 from modelserver.transforms import chain
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.transformation import Transformation
@@ -134,7 +137,7 @@ class Model:
         `frame` is a full name, `Body:Frame`, or a frame of this model. Raises UnknownBodyError or UnknownFrameError
         with the nearest names.
         """
-        name = adjacency.full_name(frame)
+        name = full_name(frame)
         self.frame(name)
         return tuple([Neighbor(self.frame(each.far_frame), each) for each in self._topology.crossings(name)])
 
@@ -144,7 +147,18 @@ class Model:
         `constraint` names the one to cross where the frame has several. Raises as `neighbors`, and NotConnectedError
         where the frame has no such constraint, MalformedRequestError where it has several and none is named.
         """
-        return adjacency.select_one(adjacency.full_name(frame), self.neighbors(frame), constraint)
+        found = [each for each in self.neighbors(frame) if constraint in ("", each.constraint.name)]
+        if len(found) == 1:
+            return found[0]
+        name, known = full_name(frame), [each.name for each in self.constraints_of(frame)]
+        if constraint:
+            there = f"it has {format_names(known)}" if known else "it has none"
+            near = find_nearest_names(constraint, known)
+            raise NotConnectedError(f"frame {name} has no constraint {quote(constraint)}; {there}", near)
+        if not found:
+            raise NotConnectedError(f"frame {name} has no constraint, so no frame is next to it")
+        several = f"{len(found)} constraints, {format_names(known)}"
+        raise MalformedRequestError(f"frame {name} has {several}; name the one to cross")
 
     def verify(self, frame: str | BodyFrame) -> tuple[Problem, ...]:
         """Return the problems of a frame, none where it is valid (the report's verifyConstraint).
@@ -152,11 +166,24 @@ class Model:
         A frame value that differs from the model's is an error, an orphaned body a warning, several constraints a note:
         a strict model allows one. Raises as `neighbors`.
         """
-        found = self.neighbors(frame)
-        name = adjacency.full_name(frame)
-        is_other = not isinstance(frame, str) and self.frame(name) != frame
-        is_orphan = names.split(name)[0] not in self.assemblies[0]
-        return adjacency.find_problems(name, found, is_other, is_orphan, self.root.name)
+        known = [each.name for each in self.constraints_of(frame)]
+        name = full_name(frame)
+        body, root = name.partition(":")[0], self.root.name
+        problems = []
+        if not isinstance(frame, str) and self.frame(name) != frame:
+            message = "the model's frame of this name differs from this one"
+            fix = "take the frame from this model, or build a model with this frame in it"
+            problems.append((Severity.ERROR, message, fix))
+        if body not in self.assemblies[0]:
+            message = f"body {body} is an orphan: no constraints lead to the root body {root}"
+            fix = f"add a constraint that joins it to {root} or to what is mounted there"
+            problems.append((Severity.WARNING, message, fix))
+        if len(known) > 1:
+            message = f"the frame has {len(known)} constraints, {format_names(known)}; a strict model allows one"
+            fix = "give each constraint a frame of its own, if the file has to load with strict"
+            problems.append((Severity.NOTE, message, fix))
+        source = Location(element=f"frame {name}")
+        return tuple([Problem(severity, message, source, fix) for severity, message, fix in problems])
 
     def is_static(self, frame_of_interest: str, frame_of_reference: str) -> bool:
         """Return whether no joint lies between two frames: the report's pose type, static or dynamic.

@@ -9,27 +9,16 @@ constraints, and movable joints.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
 
-from modelserver.errors import (
-    LimitError,
-    Location,
-    MalformedRequestError,
-    NotConnectedError,
-    Problem,
-    Severity,
-    UnknownFrameError,
-    find_nearest_names,
-    quote,
-)
+from modelserver.errors import LimitError, UnknownFrameError, quote
 from modelserver.geometry import names
 from modelserver.geometry.joint import Joint
-from modelserver.geometry.names import format_names
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array
@@ -72,16 +61,20 @@ class Crossing:
         return X_FT if self.forward else X_FT.inverse()
 
 
-@dataclass(frozen=True, slots=True)
-class LoopClosure:
-    """A constraint that joins two bodies which are joined already.
+class LoopClosure(NamedTuple):
+    """A constraint that joins two bodies which are joined already: the path around the loop, the constraint first."""
 
-    `bodies` are those of the loop, `path` the constraints crossed around it.
-    """
-
-    constraint: str
-    bodies: tuple[str, ...]
     path: tuple[Crossing, ...]
+
+    @property
+    def constraint(self) -> str:
+        """The name of the constraint."""
+        return self.path[0].constraint.name
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """The bodies of the loop."""
+        return tuple([crossing.far_body for crossing in reversed(self.path)])
 
 
 class Topology:
@@ -107,26 +100,21 @@ class Topology:
         assemblies = []
         for start in self._bodies:
             if start not in seen:
-                assembly = (
-                    start,
-                    *(crossing.far_body for _, crossing in self.traverse_breadth_first(start)),
-                )
+                assembly = (start, *(crossing.far_body for crossing in self.traverse_breadth_first(start)))
                 seen.update(assembly)
                 assemblies.append(assembly)
         return tuple(assemblies)
 
-    def traverse_breadth_first(self, start: str) -> Iterator[tuple[str, Crossing]]:
-        """Traverse the bodies breadth-first from `start`; yield the predecessor of each body and the crossing to it."""
+    def traverse_breadth_first(self, start: str) -> Iterator[Crossing]:
+        """Traverse the bodies breadth-first from `start`; yield the crossing to each."""
         seen = {start}
         queue = deque([start])
         while queue:
-            body = queue.popleft()
-            for crossing in self._by_body[body]:
-                entered = crossing.far_body
-                if entered not in seen:
-                    seen.add(entered)
-                    queue.append(entered)
-                    yield body, crossing
+            for crossing in self._by_body[queue.popleft()]:
+                if crossing.far_body not in seen:
+                    seen.add(crossing.far_body)
+                    queue.append(crossing.far_body)
+                    yield crossing
 
     def crossings(self, frame: str) -> tuple[Crossing, ...]:
         """Return the constraints at a frame, given by its full name, each in the sense that leads away from it."""
@@ -136,51 +124,24 @@ class Topology:
         """Return the constraints that are not in the breadth-first spanning tree."""
         closures = []
         for assembly in self.assemblies:
-            start = assembly[0]
-            reached: dict[str, tuple[str, Crossing]] = {}
-            used = set()
-            for body, crossing in self.traverse_breadth_first(start):
-                entered = crossing.far_body
-                reached[entered] = (body, crossing)
-                used.add(crossing.constraint.name)
+            reached = {each.far_body: each for each in self.traverse_breadth_first(assembly[0])}
+            used = {crossing.constraint.name for crossing in reached.values()}
             for body in assembly:
                 for crossing in self._by_body[body]:
-                    name = crossing.constraint.name
-                    if name in used:
-                        continue
-                    used.add(name)
-                    entered = crossing.far_body
-                    back = self._tree_path(reached, entered, body)
-                    closures.append(LoopClosure(name, _find_loop_bodies(reached, body, entered), (crossing, *back)))
+                    if crossing.constraint.name not in used:
+                        used.add(crossing.constraint.name)
+                        closures.append(LoopClosure((crossing, *_tree_path(reached, crossing.far_body, body))))
         return tuple(closures)
-
-    @staticmethod
-    def _tree_path(reached: dict[str, tuple[str, Crossing]], start: str, target: str) -> tuple[Crossing, ...]:
-        """Return the crossings from one body to another along a spanning tree."""
-
-        def climb(body: str) -> list[Crossing]:
-            line = []
-            while body in reached:
-                body, crossing = reached[body]
-                line.append(crossing)
-            return line
-
-        rising, falling = climb(start), climb(target)
-        while rising and falling and rising[-1] is falling[-1]:
-            rising.pop()
-            falling.pop()
-        return (*[Crossing(each.constraint, not each.forward) for each in rising], *reversed(falling))
 
     def find_shortest_path(self, body: str, target: str) -> tuple[Crossing, ...] | None:
         """Return the crossings of a shortest path from one body to another, None where there is none."""
         if body == target:
             return ()
-        predecessors: dict[str, tuple[str, Crossing]] = {}
-        for previous, crossing in self.traverse_breadth_first(body):
-            entered = crossing.far_body
-            predecessors[entered] = (previous, crossing)
-            if entered == target:
-                return _backtrack(predecessors, body, target)
+        reached: dict[str, Crossing] = {}
+        for crossing in self.traverse_breadth_first(body):
+            reached[crossing.far_body] = crossing
+            if crossing.far_body == target:
+                return tuple(reversed(_climb(reached, target)))
         return None
 
     def find_path_depth_first(self, body: str, frame: str, target: str) -> tuple[Crossing, ...] | None:
@@ -231,28 +192,22 @@ class Topology:
                 yield name, crossing
 
 
-def _backtrack(predecessors: dict[str, tuple[str, Crossing]], start: str, target: str) -> tuple[Crossing, ...]:
-    path = []
-    while target != start:
-        target, crossing = predecessors[target]
-        path.append(crossing)
-    return tuple(reversed(path))
+def _climb(reached: Mapping[str, Crossing], body: str) -> list[Crossing]:
+    """Return the crossings of a spanning tree that lead to a body, the last first."""
+    line = []
+    while body in reached:
+        line.append(reached[body])
+        body = line[-1].near_body
+    return line
 
 
-def _find_loop_bodies(reached: dict[str, tuple[str, Crossing]], a: str, b: str) -> tuple[str, ...]:
-    """Return the bodies of the loop that joining `a` and `b` closes, given the spanning tree."""
-
-    def ancestors(body: str) -> list[str]:
-        line = [body]
-        while body in reached:
-            body = reached[body][0]
-            line.append(body)
-        return line
-
-    line_a, line_b = ancestors(a), ancestors(b)
-    above_b = set(line_b)
-    shared = next(body for body in line_a if body in above_b)
-    return (*line_a[: line_a.index(shared) + 1], *reversed(line_b[: line_b.index(shared)]))
+def _tree_path(reached: Mapping[str, Crossing], start: str, target: str) -> tuple[Crossing, ...]:
+    """Return the crossings from one body to another along a spanning tree."""
+    rising, falling = _climb(reached, start), _climb(reached, target)
+    while rising and falling and rising[-1] is falling[-1]:
+        rising.pop()
+        falling.pop()
+    return (*[Crossing(each.constraint, not each.forward) for each in rising], *reversed(falling))
 
 
 class Neighbor(NamedTuple):
@@ -272,29 +227,6 @@ class Neighbor(NamedTuple):
         return self.crossing.pose
 
 
-def select_one(frame: str, found: Sequence[Neighbor], constraint: str) -> Neighbor:
-    """Return the neighbor across the constraint of that name, or the only one where `constraint` is empty.
-
-    Raises NotConnectedError where there is none, MalformedRequestError where there are several and none is named.
-    """
-    known = [each.constraint.name for each in found]
-    if constraint:
-        for each in found:
-            if each.constraint.name == constraint:
-                return each
-        there = f"it has {format_names(known)}" if known else "it has none"
-        raise NotConnectedError(
-            f"frame {frame} has no constraint {quote(constraint)}; {there}", find_nearest_names(constraint, known)
-        )
-    if not found:
-        raise NotConnectedError(f"frame {frame} has no constraint, so no frame is next to it")
-    if len(found) > 1:
-        raise MalformedRequestError(
-            f"frame {frame} has {len(found)} constraints, {format_names(known)}; name the one to cross"
-        )
-    return found[0]
-
-
 def full_name(frame: str | BodyFrame) -> str:
     """Return the full name of a frame given by name or value. Raises UnknownFrameError for a value on no body."""
     if isinstance(frame, str):
@@ -302,44 +234,6 @@ def full_name(frame: str | BodyFrame) -> str:
     if not frame.body:
         raise UnknownFrameError(f"frame {quote(frame.name)} is on no body; add it to one, or give its name Body:Frame")
     return frame.full_name
-
-
-def find_problems(
-    name: str, found: Sequence[Neighbor], is_other: bool, is_orphan: bool, root: str
-) -> tuple[Problem, ...]:
-    """Return the problems of a frame: differs from the model's, body is an orphan, several constraints."""
-    problems = []
-    source = Location(element=f"frame {name}")
-    if is_other:
-        problems.append(
-            Problem(
-                Severity.ERROR,
-                "the model's frame of this name differs from this one",
-                source,
-                "take the frame from this model, or build a model with this frame in it",
-            )
-        )
-    if is_orphan:
-        body = name.partition(":")[0]
-        problems.append(
-            Problem(
-                Severity.WARNING,
-                f"body {body} is an orphan: no constraints lead to the root body {root}",
-                source,
-                f"add a constraint that joins it to {root} or to what is mounted there",
-            )
-        )
-    if len(found) > 1:
-        problems.append(
-            Problem(
-                Severity.NOTE,
-                f"the frame has {len(found)} constraints, {format_names([each.constraint.name for each in found])}; "
-                "a strict model allows one",
-                source,
-                "give each constraint a frame of its own, if the file has to load with strict",
-            )
-        )
-    return tuple(problems)
 
 
 class EdgeKind(StrEnum):

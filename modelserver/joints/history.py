@@ -11,7 +11,7 @@ from modelserver.errors import find_nearest_names, quote
 from modelserver.geometry.joint import Joint, JointType, coordinate_names
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Constraint
-from modelserver.joints.track import MAX_GAP_S, MAX_READINGS, PREDICTION_LIMIT_S, JointTrack, Provenance, Reading
+from modelserver.joints.track import JointTrack, ReadingValues
 from modelserver.messages import NAN, JointSample, JointsSample, SensorHeader
 
 MAX_CLOCK_LEAD_S: Final = 0.1
@@ -112,12 +112,8 @@ class JointHistory:
                 rejected.append(f"duplicate {joint.name}")
                 continue
             seen.add(joint.name)
-            held = self.tracks if tracks is None else tracks
-            track = held.get(joint.name)
-            if track is None:
-                track = JointTrack(self._seconds, self._coordinates[joint.name].is_continuous)
-            values = (joint.position, self._get_sigma(joint), joint.rate, joint.rate_sigma)
-            extended = track.insert(sample.header.utime, values)
+            track = self._get_track(joint.name, self.tracks if tracks is None else tracks)
+            extended = track.insert(sample.header.utime, self._get_values(joint))
             if extended is track:
                 # or it brings nothing new
                 if track.is_too_old(sample.header.utime):
@@ -133,6 +129,9 @@ class JointHistory:
         known = JointHistory.__new__(JointHistory)
         known._coordinates, known._seconds, known.tracks = self._coordinates, self._seconds, MappingProxyType(tracks)
         return known
+
+    def _get_track(self, name: str, tracks: Mapping[str, JointTrack]) -> JointTrack:
+        return tracks.get(name) or JointTrack(self._seconds, self._coordinates[name].is_continuous)
 
     def get_newest_samples(self, utime: int) -> list[JointsSample]:
         """Return the newest reading of every joint, as samples sent at `utime`: one for each instant."""
@@ -155,27 +154,20 @@ class JointHistory:
         tracks = dict(self.tracks)
         for joint in sample.joints:
             known = tracks.get(joint.name)
-            if (
-                joint.position != joint.position
-                or (known is not None and known.last >= utime)
-                or self._find_problem(joint)
-            ):
+            is_older = known is not None and known.last >= utime
+            if joint.position != joint.position or is_older or self._find_problem(joint):
                 continue
-            track = known or JointTrack(self._seconds, self._coordinates[joint.name].is_continuous)
-            extended = track.insert(utime, (joint.position, self._get_sigma(joint), joint.rate, joint.rate_sigma))
+            extended = self._get_track(joint.name, tracks).insert(utime, self._get_values(joint))
             extended.source = sample.header.source
             tracks[joint.name] = extended
-        return (
-            self._replace_tracks(tracks)
-            if any(track is not self.tracks.get(name) for name, track in tracks.items())
-            else self
-        )
+        return self if tracks == self.tracks else self._replace_tracks(tracks)
 
-    def _get_sigma(self, joint: JointSample) -> float:
-        if joint.position_sigma == joint.position_sigma:
-            return joint.position_sigma
-        known = self._coordinates[joint.name]
-        return known.joint.sigma[known.number] if known.joint.sigma else NAN
+    def _get_values(self, joint: JointSample) -> ReadingValues:
+        """Return a measurement; a sigma that it does not state is that of the joint."""
+        sigma, known = joint.position_sigma, self._coordinates[joint.name]
+        if sigma != sigma:
+            sigma = known.joint.sigma[known.number] if known.joint.sigma else NAN
+        return joint.position, sigma, joint.rate, joint.rate_sigma
 
     def _find_problem(self, joint: JointSample, with_suggestion: bool = True) -> str:
         if joint.name not in self._coordinates:
@@ -194,10 +186,7 @@ class JointHistory:
 
     def detach(self) -> JointHistory:
         """Return a copy whose lists no successor extends."""
-        other = JointHistory.__new__(JointHistory)
-        other._coordinates, other._seconds = self._coordinates, self._seconds
-        other.tracks = MappingProxyType({name: track.detach() for name, track in self.tracks.items()})
-        return other
+        return self._replace_tracks({name: track.detach() for name, track in self.tracks.items()})
 
     def for_model(self, model: Model) -> JointHistory:
         """Return the history for another model, with the readings of the joints that have the same type there."""
@@ -207,22 +196,7 @@ class JointHistory:
             new, old = other._coordinates.get(name), self._coordinates[name]
             if new is not None and (new.joint.type, new.number) == (old.joint.type, old.number):
                 tracks[name] = track.with_continuous(new.is_continuous)
-        other.tracks = MappingProxyType(tracks)
-        return other
+        return other._replace_tracks(tracks)
 
 
 NO_JOINTS: Final = JointHistory((), 0.0)
-
-__all__ = [
-    "MAX_CLOCK_LEAD_S",
-    "MAX_GAP_S",
-    "MAX_PLAUSIBLE",
-    "MAX_READINGS",
-    "NO_JOINTS",
-    "PREDICTION_LIMIT_S",
-    "Coordinate",
-    "JointHistory",
-    "JointTrack",
-    "Provenance",
-    "Reading",
-]

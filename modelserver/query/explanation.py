@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from modelserver.geometry.topology import EdgeKind
-from modelserver.joints.history import MAX_CLOCK_LEAD_S, MAX_GAP_S, Provenance
+from modelserver.joints.history import MAX_CLOCK_LEAD_S
+from modelserver.joints.track import MAX_GAP_S, Provenance
 from modelserver.messages import NAN, EdgeReport, Estimate, Explanation, Policy, Quality, TimeQuery
 from modelserver.query.path import PathStep, lookup_path
 from modelserver.query.view import PlatformView

@@ -10,8 +10,9 @@ from modelserver.geometry.joint import Coordinates
 from modelserver.geometry.kinematic_path import KinematicPath
 from modelserver.geometry.mimic import JointDrive
 from modelserver.geometry.model import Model
-from modelserver.joints.history import MAX_CLOCK_LEAD_S, MAX_GAP_S, JointHistory, JointTrack, Provenance, Reading
+from modelserver.joints.history import MAX_CLOCK_LEAD_S, JointHistory
 from modelserver.joints.rotation_vector import ROTATION_VECTOR_TYPES, combine
+from modelserver.joints.track import MAX_GAP_S, JointTrack, Provenance, Reading
 from modelserver.messages import NAN, NO_FLAGS, VALID, Invalid, Policy, Quality
 
 _QUALITY_OF: Mapping[Provenance, int] = {

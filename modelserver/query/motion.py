@@ -12,7 +12,7 @@ import numpy as np
 from modelserver.errors import NoPoseError
 from modelserver.geometry.joint import Joint
 from modelserver.geometry.topology import EdgeKind
-from modelserver.joints.history import Provenance
+from modelserver.joints.track import Provenance
 from modelserver.messages import NAN, Estimate, MotionAnswer, Policy, TimeQuery
 from modelserver.query.path import PathStep, lookup_path
 from modelserver.query.view import PlatformView

@@ -10,7 +10,7 @@ import numpy as np
 from modelserver.geometry import names
 from modelserver.geometry.kinematic_path import KinematicPath
 from modelserver.geometry.topology import Edge, EdgeKind
-from modelserver.joints.history import Reading
+from modelserver.joints.track import Reading
 from modelserver.messages import NO_FLAGS, VALID, Estimate, Invalid, Quality, TimeQuery
 from modelserver.query.joint_lookup import JointReadings
 from modelserver.query.view import (

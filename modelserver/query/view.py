@@ -37,7 +37,8 @@ from modelserver.geometry import names
 from modelserver.geometry.kinematic_path import KinematicPath
 from modelserver.geometry.model import Model
 from modelserver.geometry.path_covariance import as_array
-from modelserver.joints.history import NO_JOINTS, JointHistory, JointTrack
+from modelserver.joints.history import NO_JOINTS, JointHistory
+from modelserver.joints.track import JointTrack
 from modelserver.messages import (
     NAN,
     NO_FLAGS,

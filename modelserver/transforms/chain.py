@@ -21,6 +21,8 @@ for each chain, or a single row where they are equal in all.
 
 from __future__ import annotations
 
+import itertools
+import operator
 from collections.abc import Hashable, Sequence
 from typing import Final, NamedTuple
 
@@ -50,12 +52,15 @@ class ChainLink(NamedTuple):
     is_large_angle: bool = False
 
 
+def frame_poses(links: Sequence[ChainLink]) -> list[Pose]:
+    """Return the poses of all frames of a chain in its first frame, the first included."""
+    steps = (link.X_FT if link.forward else link.X_FT.inverse() for link in links)
+    return list(itertools.accumulate(steps, operator.matmul, initial=Pose.identity()))
+
+
 def compose(links: Sequence[ChainLink]) -> Pose:
     """Return the pose of a chain's last frame in its first."""
-    pose = Pose.identity()
-    for link in links:
-        pose = pose @ (link.X_FT if link.forward else link.X_FT.inverse())
-    return pose
+    return frame_poses(links)[-1]
 
 
 def contributions(links: Sequence[ChainLink]) -> dict[tuple[Hashable, ...], Array] | None:
@@ -64,9 +69,7 @@ def contributions(links: Sequence[ChainLink]) -> dict[tuple[Hashable, ...], Arra
     None where a link states no covariance. The additional covariance of a large-angle link has a source of its own,
     `(*source, LARGE_ANGLE)`.
     """
-    places: list[Pose] = [Pose.identity()]
-    for link in links:
-        places.append(places[-1] @ (link.X_FT if link.forward else link.X_FT.inverse()))
+    places = frame_poses(links)
     far = places[-1].xyz
     shares: dict[tuple[Hashable, ...], Array] = {}
     for number, link in enumerate(links):
@@ -143,10 +146,8 @@ def compose_batch(links: Sequence[ChainLinkBatch]) -> PoseArray:
 
 def frame_pose_batch(links: Sequence[ChainLinkBatch]) -> list[PoseArray]:
     """Return the poses of all frames of the chains in their first frames, the first frame included."""
-    found = [PoseArray(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]]))]
-    for link in links:
-        found.append(found[-1] @ (link.X_FT if link.forward else link.X_FT.inverse()))
-    return found
+    steps = (link.X_FT if link.forward else link.X_FT.inverse() for link in links)
+    return list(itertools.accumulate(steps, operator.matmul, initial=PoseArray.of(Pose.identity())))
 
 
 def covariance_batch(

@@ -1,16 +1,18 @@
 """Arrays of poses: positions (n, 3) and unit quaternions (n, 4), scalar first.
 
 For batch queries, as the thousand beams of a scan. A single pose is faster in plain floats: see `so3`, which has the
-same functions and formulas for one rotation.
+same functions for one rotation, and whose formulas are applied to columns here.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array
 
@@ -43,17 +45,16 @@ class PoseArray(NamedTuple):
 
 def multiply(a: Array, b: Array) -> Array:
     """Return the products a b."""
-    aw, ax, ay, az = a.T
-    bw, bx, by, bz = b.T
-    return np.stack(
-        (
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ),
-        axis=1,
-    )
+    return _by_row(so3.multiply(_by_column(a), _by_column(b)))
+
+
+def _by_column(values: Array) -> Any:
+    """Return the columns, to which the formulas of `so3` apply as they do to floats."""
+    return values.T
+
+
+def _by_row(columns: Sequence[Any]) -> Array:
+    return np.stack(columns, axis=1)
 
 
 def conjugate(q: Array) -> Array:
@@ -63,14 +64,7 @@ def conjugate(q: Array) -> Array:
 
 def rotate(q: Array, v: Array) -> Array:
     """Return R(q) v."""
-    w, x, y, z = q.T
-    vx, vy, vz = v.T
-    tx = 2.0 * (y * vz - z * vy)
-    ty = 2.0 * (z * vx - x * vz)
-    tz = 2.0 * (x * vy - y * vx)
-    return np.stack(
-        (vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx), axis=1
-    )
+    return _by_row(so3.rotate(_by_column(q), _by_column(v)))
 
 
 def from_axis_angle(axis: Array, angles: Array) -> Array:
@@ -124,13 +118,4 @@ def slerp(a: Array, b: Array, fraction: Array) -> Array:
 
 def to_matrices(q: Array) -> Array:
     """Return the rotation matrices (n, 3, 3)."""
-    w, x, y, z = q.T
-    xx, yy, zz = x * x, y * y, z * z
-    xy, xz, yz = x * y, x * z, y * z
-    wx, wy, wz = w * x, w * y, w * z
-    rows = (
-        (1.0 - 2.0 * (yy + zz), 2.0 * (xy - wz), 2.0 * (xz + wy)),
-        (2.0 * (xy + wz), 1.0 - 2.0 * (xx + zz), 2.0 * (yz - wx)),
-        (2.0 * (xz - wy), 2.0 * (yz + wx), 1.0 - 2.0 * (xx + yy)),
-    )
-    return np.moveaxis(np.array(rows), 2, 0)
+    return np.moveaxis(np.array(so3.matrix_rows(_by_column(q))), 2, 0)

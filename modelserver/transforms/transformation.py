@@ -33,7 +33,8 @@ class Transformation:
     ----------
     frame_of_interest, frame_of_reference : names, `Body:Frame`
     pose : X_RI
-    covariance : (6, 6) along the axes of the frame of reference, or None where it is unknown
+    covariance : (6, 6) along the axes of the frame of reference, None where it is unknown, or a function that returns
+        it, or its 36 numbers, at first access
     utime : microseconds since the Unix epoch, 0 for a relation that does not change with time
     invalid_reasons : bits of `modelserver.messages.Invalid`, 0 where it is valid
     pose_epoch, origin_id : 0 where no world frame is involved
@@ -74,10 +75,6 @@ class Transformation:
         origin_id: int = 0,
         model_revision: str = "",
     ):
-        """Create a transformation.
-
-        `covariance` may be a function, called at first access, that returns (6, 6) or 36 floats.
-        """
         if covariance is not None and not callable(covariance):
             covariance = _freeze_covariance(covariance)
         _put_interest(self, frame_of_interest)
@@ -154,18 +151,12 @@ class Transformation:
         """Return the same with more reasons against using it."""
         if not reasons & ~self.invalid_reasons:
             return self
-        covariance = self._covariance
-        return Transformation(
-            self.frame_of_interest,
-            self.frame_of_reference,
-            self.pose,
-            self.covariance if isinstance(covariance, tuple) else covariance,
-            self.utime,
-            self.invalid_reasons | reasons,
-            self.pose_epoch,
-            self.origin_id,
-            self.model_revision,
+        covariance = self.covariance if isinstance(self._covariance, tuple) else self._covariance
+        found = Transformation(
+            self.frame_of_interest, self.frame_of_reference, self.pose, covariance, *self._validity()
         )
+        _put_invalid(found, self.invalid_reasons | reasons)
+        return found
 
     def inverse(self) -> Transformation:
         """Return the pose of the frame of reference in the frame of interest."""
@@ -175,15 +166,7 @@ class Transformation:
             return None if mine is None else cov.invert(self.pose, mine)
 
         return Transformation(
-            self.frame_of_reference,
-            self.frame_of_interest,
-            self.pose.inverse(),
-            invert_covariance,
-            self.utime,
-            self.invalid_reasons,
-            self.pose_epoch,
-            self.origin_id,
-            self.model_revision,
+            self.frame_of_reference, self.frame_of_interest, self.pose.inverse(), invert_covariance, *self._validity()
         )
 
     def __matmul__(self, other: Transformation) -> Transformation:
@@ -227,19 +210,12 @@ class Transformation:
             self.model_revision if self.model_revision == other.model_revision else "",
         )
 
+    def _validity(self) -> tuple[int, int, int, int, str]:
+        return self.utime, self.invalid_reasons, self.pose_epoch, self.origin_id, self.model_revision
+
     def _values(self) -> tuple[object, ...]:
-        covariance = self.covariance
-        return (
-            self.frame_of_interest,
-            self.frame_of_reference,
-            self.pose,
-            None if covariance is None else covariance.tobytes(),
-            self.utime,
-            self.invalid_reasons,
-            self.pose_epoch,
-            self.origin_id,
-            self.model_revision,
-        )
+        numbers = None if self.covariance is None else self.covariance.tobytes()
+        return self.frame_of_interest, self.frame_of_reference, self.pose, numbers, *self._validity()
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Transformation) and self._values() == other._values()
@@ -248,20 +224,8 @@ class Transformation:
         return hash((self.frame_of_interest, self.frame_of_reference, self.pose, self.utime))
 
     def __reduce__(self) -> tuple[type[Transformation], tuple[object, ...]]:
-        return (
-            Transformation,
-            (
-                self.frame_of_interest,
-                self.frame_of_reference,
-                self.pose,
-                self.covariance,
-                self.utime,
-                self.invalid_reasons,
-                self.pose_epoch,
-                self.origin_id,
-                self.model_revision,
-            ),
-        )
+        values = (self.frame_of_interest, self.frame_of_reference, self.pose, self.covariance, *self._validity())
+        return Transformation, values
 
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError("a Transformation is immutable; make a new one")
@@ -278,12 +242,7 @@ class Transformation:
 
 
 # Setting a slot by its descriptor bypasses the guard above, at half the cost of object.__setattr__.
-_put_interest = Transformation.__dict__["frame_of_interest"].__set__
-_put_reference = Transformation.__dict__["frame_of_reference"].__set__
-_put_pose = Transformation.__dict__["pose"].__set__
-_put_covariance = Transformation.__dict__["_covariance"].__set__
-_put_utime = Transformation.__dict__["utime"].__set__
-_put_invalid = Transformation.__dict__["invalid_reasons"].__set__
-_put_epoch = Transformation.__dict__["pose_epoch"].__set__
-_put_origin = Transformation.__dict__["origin_id"].__set__
-_put_revision = Transformation.__dict__["model_revision"].__set__
+(
+    _put_covariance, _put_interest, _put_reference, _put_invalid, _put_revision, _put_origin, _put_pose, _put_epoch,
+    _put_utime,
+) = (Transformation.__dict__[name].__set__ for name in Transformation.__slots__)  # fmt: skip

@@ -16,18 +16,16 @@ from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import Joint, JointType
 from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Constraint
-from modelserver.joints.history import (
-    MAX_CLOCK_LEAD_S,
+from modelserver.joints.history import MAX_CLOCK_LEAD_S, MAX_PLAUSIBLE, MAX_SUGGESTIONS, JointHistory
+from modelserver.joints.track import (
+    BLOCK_SIZE,
     MAX_GAP_S,
-    MAX_PLAUSIBLE,
     MAX_READINGS,
-    MAX_SUGGESTIONS,
+    MIN_ACCELERATION,
     PREDICTION_LIMIT_S,
-    JointHistory,
     JointTrack,
     Provenance,
 )
-from modelserver.joints.track import BLOCK_SIZE, MIN_ACCELERATION
 from modelserver.messages import NAN, Invalid, JointSample, JointsSample, Policy, Quality, SensorHeader, TimeQuery
 from modelserver.query import PlatformView
 from modelserver.query.batch import lookup_batch
