@@ -33,17 +33,7 @@ class FileKind(Enum):
 
 _KEY: Final = re.compile(rb"^([A-Za-z_]+)[ \t]*:(?=\s|$)", re.MULTILINE)
 _VEHICLE: Final = frozenset(
-    (
-        b"vehicle",
-        b"geometry",
-        b"base_frame",
-        b"rolling_frame",
-        b"sensors",
-        b"lcm",
-        b"publish",
-        b"localization",
-        b"drivers",
-    )
+    b"vehicle geometry base_frame rolling_frame sensors lcm publish localization drivers".split()
 )
 _REQUIRED: Final = frozenset((b"vehicle", b"base_frame"))
 _GEOMETRY: Final = frozenset((b"bodies", b"constraints", b"templates"))

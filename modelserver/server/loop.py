@@ -188,7 +188,7 @@ class Loop:
         self._sensor_channels: set[str] = set()
         self._subscribe(settings.sensors)
         self._requests = RequestHandler(
-            self, bus, clock, self._log, prefix, settings.limits, hooks.verifier, hooks.run_delay
+            self, bus, clock, self._log, self._journal, prefix, settings.limits, hooks.verifier, hooks.run_delay
         )
 
     def run(self) -> None:
@@ -207,11 +207,6 @@ class Loop:
     def is_sensor_channel(self, channel: str) -> bool:
         """Return whether a subscribed channel carries samples."""
         return channel in self._sensor_channels
-
-    @property
-    def requests_waiting(self) -> int:
-        """Requests that wait to be answered."""
-        return self._requests.waiting
 
     def set_warning(self, subject: str, text: str = "") -> None:
         """Set a warning of the health report; an empty text clears it."""
@@ -349,10 +344,6 @@ class Loop:
         if outputs:
             self.send(outputs)
 
-    def record(self, kind: RecordKind, channel: str, data: bytes, now: Instant) -> None:
-        """Record in the journal a request that is not passed to the core, whole, so that its reply can be replayed."""
-        self._journal.record_message(kind, (channel, data), now)
-
     def publish(self, channel: str, data: bytes) -> None:
         """Publish a message: the only place that does."""
         self._journal.record_published(channel, data)
@@ -374,9 +365,6 @@ class Loop:
         self.publish(output.channel, encoded)
         self._requests.cache(output, encoded)
 
-    def _defer(self, output: DeferredAnswer) -> None:
-        self._requests.defer(output)
-
     def _send_pose(self, output: PublishPose) -> None:
         world, vector, odom = encode(output.world), encode(output.world, "pose_vector_t"), encode(output.odom)
         self._timer.wait_to_publish()
@@ -388,9 +376,6 @@ class Loop:
         for start in range(0, len(output.decisions), MAX_DECISIONS):
             part = output.decisions[start : start + MAX_DECISIONS]
             self.publish(self._decisions, encode(PublishDecisions(output.utime, part)))
-
-    def _send_navigation(self, output: PublishNavigation) -> None:
-        self.publish(self._state, encode(output.state))
 
     def _send_health(self, output: PublishHealth) -> None:
         self.publish(self._health, encode(output.health))
@@ -437,20 +422,17 @@ class Loop:
     def _persist(self, output: PersistState) -> None:
         self.step(HealthWarning("restart", self._hooks.on_persist(output.state)), self._clock.now())
 
-    def _log_start(self, output: ReportStart) -> None:
-        log.info("%s", output.text)
-
 
 _SENDERS: Mapping[type, Callable[[Loop, Any], None]] = {
     SendReply: Loop._send_reply,
-    DeferredAnswer: Loop._defer,
+    DeferredAnswer: lambda loop, output: loop._requests.defer(output),
     PublishPose: Loop._send_pose,
     PublishHealth: Loop._send_health,
     PersistOrigin: Loop._send_origin,
     PublishDecisions: Loop._send_decisions,
-    PublishNavigation: Loop._send_navigation,
+    PublishNavigation: lambda loop, output: loop.publish(loop._state, encode(output.state)),
     LoadModel: Loop._load,
     PublishSnapshot: Loop._send_snapshot,
     PersistState: Loop._persist,
-    ReportStart: Loop._log_start,
+    ReportStart: lambda loop, output: log.info("%s", output.text),
 }

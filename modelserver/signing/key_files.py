@@ -43,7 +43,7 @@ def read_keys(path: str | Path) -> tuple[Key, ...]:
     Raises KeyFileError, also if another user can read or replace the file.
     """
     path = Path(path)
-    name = quote(str(path), MAX_PATH_LENGTH)
+    name = _show(path)
     credential = _find_credential(path.name)
     try:
         with open_regular(credential or path) as file:
@@ -68,6 +68,10 @@ def read_keys(path: str | Path) -> tuple[Key, ...]:
             )
         _check_folders(path)
     return _parse_keys(raw, str(path))
+
+
+def _show(path: object) -> str:
+    return quote(str(path), MAX_PATH_LENGTH)
 
 
 def find_group_writable_folder(path: str | Path) -> str:
@@ -95,7 +99,7 @@ def _check_folders(path: Path) -> None:
             status = folder.stat()
         except OSError:
             continue
-        where = f"the key file {quote(str(path), MAX_PATH_LENGTH)} is reached by the folder {folder}"
+        where = f"the key file {_show(path)} is reached by the folder {folder}"
         # in a folder with the sticky bit, such as /tmp, only its owner can replace a file
         if status.st_mode & stat.S_IWOTH and not status.st_mode & stat.S_ISVTX:
             mode = stat.S_IMODE(status.st_mode)
@@ -132,13 +136,13 @@ def _find_credential(name: str) -> Path | None:
 
 def _parse_keys(raw: bytes, path: str) -> tuple[Key, ...]:
     if len(raw) > MAX_BYTES:
-        raise KeyFileError(f"{quote(path, MAX_PATH_LENGTH)} is longer than {MAX_BYTES} bytes and no key file")
+        raise KeyFileError(f"{_show(path)} is longer than {MAX_BYTES} bytes and no key file")
     found: dict[str, Key] = {}
     for number, line in enumerate(raw.decode("utf-8", "replace").splitlines(), 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         # no message quotes the line: it may be the secret
-        where = f"{quote(path, MAX_PATH_LENGTH)} line {number}"
+        where = f"{_show(path)} line {number}"
         name, _, secret = line.strip().partition(" ")
         try:
             key = Key(name, bytes.fromhex(secret.strip()))
@@ -154,9 +158,7 @@ def _parse_keys(raw: bytes, path: str) -> tuple[Key, ...]:
             raise KeyFileError(f"{where}: the name is given twice")
         found[name] = key
     if not 1 <= len(found) <= MAX_KEYS:
-        raise KeyFileError(
-            f"{quote(path, MAX_PATH_LENGTH)} holds {len(found)} keys; 1 to {MAX_KEYS} are taken; {_HINT}"
-        )
+        raise KeyFileError(f"{_show(path)} holds {len(found)} keys; 1 to {MAX_KEYS} are taken; {_HINT}")
     return tuple(found.values())
 
 
@@ -180,11 +182,10 @@ def write_key(path: str | Path, key: Key) -> None:
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
     except FileExistsError:
         raise KeyFileError(
-            f"{quote(str(path), MAX_PATH_LENGTH)} exists already; its key may be in use. Remove it first, or name "
-            "another file"
+            f"{_show(path)} exists already; its key may be in use. Remove it first, or name another file"
         ) from None
     except OSError as error:
-        raise KeyFileError(f"{quote(str(path), MAX_PATH_LENGTH)} cannot be written: {error.strerror}") from None
+        raise KeyFileError(f"{_show(path)} cannot be written: {error.strerror}") from None
     with open(handle, "w", encoding="utf-8") as file:
         file.write(f"{about}\n{key.name} {key.secret.hex()}\n")
         file.flush()

@@ -26,7 +26,7 @@ from modelserver.server.fake_bus import FakeBus
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.journal import state as journal_state
 from modelserver.server.loop import Hooks, Loop, LoopSettings
-from modelserver.server.requests.handler import get_request_type
+from modelserver.server.requests.handler import REQUEST_TYPES
 from modelserver.server.vehicle import Vehicle
 from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode, read_request_header
@@ -98,9 +98,11 @@ class ReplayLoop(Loop):
         except WireError as error:
             header = read_request_header(record.data)
             if record.kind is RecordKind.MALFORMED and header is not None:
-                kind = get_request_type(channel.type_name)
-                assert kind is not None
-                self.send(core.reply_error(self.state, kind, header, Status.MALFORMED, str(error), now))
+                self.send(
+                    core.reply_error(
+                        self.state, REQUEST_TYPES[channel.type_name], header, Status.MALFORMED, str(error), now
+                    )
+                )
                 return
             raise RecordingError(f"a request on {record.channel} cannot be decoded: {error}") from error
         if record.kind is RecordKind.REQUEST:

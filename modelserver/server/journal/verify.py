@@ -1,7 +1,7 @@
 """Verification of a journal by replay: every record is processed again, and what is published is compared bit for bit.
 
-Messages that differ within `comparison.TOLERANCE`, as on another build or machine, are a result of their own. `segments`
-checks that they are complete, in order and authentic.
+Messages that differ within `comparison.TOLERANCE`, as on another build or machine, are a result of their own.
+`segments` checks that they are complete, in order and authentic.
 
 A run is the life of one service process. Its segments follow each other, and the replay continues from one into the
 next. After a gap (dropped by the ring, lost records, damaged bytes) it restarts from the state in the head of the next

@@ -45,6 +45,7 @@ from modelserver.messages import (
 from modelserver.query.answers import DeferredAnswer, compute_replies, effort_of, is_deferred
 from modelserver.server.bus import Bus
 from modelserver.server.clock import Clock
+from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.log import RateLimitedLog, escape_text
 from modelserver.server.requests.deferred import DeferredReply, estimate_reply_bytes
 from modelserver.server.requests.scheduler import (
@@ -98,10 +99,6 @@ class RequestContext(Protocol):
         """Pass an event to the core and send its outputs; `received` is the message that it was decoded from."""
         ...
 
-    def record(self, kind: RecordKind, channel: str, data: bytes, now: Instant) -> None:
-        """Record in the journal a message that is not passed to the core."""
-        ...
-
     def publish(self, channel: str, data: bytes) -> None:
         """Publish a message."""
         ...
@@ -128,6 +125,7 @@ class RequestHandler:
         bus: Bus,
         clock: Clock,
         log: RateLimitedLog,
+        journal: JournalQueue,
         prefix: str,
         limits: LimitsConfig,
         verifier: CommandVerifier | None = None,
@@ -137,6 +135,7 @@ class RequestHandler:
         self._bus = bus
         self._clock = clock
         self._log = log
+        self._journal = journal
         self._prefix = prefix
         self._verifier = verifier
         self._per_pass = limits.requests_per_pass
@@ -318,7 +317,7 @@ class RequestHandler:
         except Exception:
             return  # counted already: as dropped
         now = self._clock.now()
-        self._context.record(RecordKind.OVERLOAD, dropped.channel, dropped.data, now)
+        self._journal.record_message(RecordKind.OVERLOAD, (dropped.channel, dropped.data), now)
         self._context.send(core.reply_overloaded(self._context.state, request, now))
 
     def _count_dropped(self) -> None:
@@ -360,9 +359,8 @@ class RequestHandler:
         if deferred.ready:
             count = deferred.portion
             # a record of its own, so that a replay of the journal sends the portion at the same place
-            self._context.record(
-                RecordKind.DEFERRED_PART, deferred.channel, count.to_bytes(4, "big"), self._clock.now()
-            )
+            part = (deferred.channel, count.to_bytes(4, "big"))
+            self._journal.record_message(RecordKind.DEFERRED_PART, part, self._clock.now())
             self.send_deferred(count)
 
     def _answer(self, queued: QueuedRequest) -> None:
@@ -379,10 +377,10 @@ class RequestHandler:
         except Exception as error:
             context.handle_error(channel, error, data)
             header = read_request_header(data) if isinstance(error, WireError) and error.reason == "malformed" else None
-            kind = get_request_type(type_name)
+            kind = REQUEST_TYPES.get(type_name)
             if header is not None and kind is not None:
                 now = self._clock.now()
-                context.record(RecordKind.MALFORMED, channel, data, now)
+                self._journal.record_message(RecordKind.MALFORMED, (channel, data), now)
                 context.send(core.reply_error(context.state, kind, header, Status.MALFORMED, str(error), now))
             return
         effort = effort_of(request)
@@ -415,7 +413,7 @@ class RequestHandler:
         header = RequestHeader(0, client.decode("utf-8", "replace"))
         if not is_answerable(header, context.state.settings.reply_prefix):
             return False
-        context.record(RecordKind.CACHED, channel, data, now)
+        self._journal.record_message(RecordKind.CACHED, (channel, data), now)
         context.publish(header.reply_channel, reply)
         self._answered += 1
         return True
@@ -433,7 +431,7 @@ class RequestHandler:
         """Reply to a request whose handling failed."""
         context, now = self._context, self._clock.now()
         context.handle_error(queued.channel, error)
-        context.record(RecordKind.FAILED, queued.channel, queued.data, now)
+        self._journal.record_message(RecordKind.FAILED, (queued.channel, queued.data), now)
         context.send(core.reply_internal_error(context.state, request, now))
 
     def _execute_signed(self, channel: str, data: bytes) -> None:
@@ -450,7 +448,7 @@ class RequestHandler:
                 self._context.handle_error(channel, error)
                 if not isinstance(result.command, SwitchMode):
                     own = f"{self._prefix}{CHANNEL_OF[type(result.command)]}"
-                    self._context.record(RecordKind.FAILED, own, encode(result.command), now)
+                    self._journal.record_message(RecordKind.FAILED, (own, encode(result.command)), now)
                     self._context.send(core.reply_internal_error(self._context.state, result.command, now))
             return
         self._context.step(result, now)
@@ -469,10 +467,5 @@ def client_of(data: bytes) -> bytes:
     return data[20:end] if 20 < end <= 83 and end < len(data) and data[20] > 0x20 else b""
 
 
-def get_request_type(type_name: str) -> type[Request] | None:
-    """Return the request class of a wire type."""
-    return _REQUEST_TYPES.get(type_name)
-
-
-_REQUEST_TYPES: Mapping[str, type[Request]] = {BY_NAME[channel].type_name: kind for kind, channel in CHANNEL_OF.items()}
+REQUEST_TYPES: Mapping[str, type[Request]] = {BY_NAME[channel].type_name: kind for kind, channel in CHANNEL_OF.items()}
 """Request class of each wire type."""

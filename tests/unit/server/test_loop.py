@@ -220,7 +220,7 @@ def test_given_a_burst_of_requests_then_each_is_answered_or_counted_as_dropped(c
     for n in range(count):
         rig.send(GetBodyList(RequestHeader(n, "REPLY_TEST")))
     turns = 0
-    while rig.bus.requests.pending or rig.loop.requests_waiting:
+    while rig.bus.requests.pending or rig.loop._requests.waiting:
         rig.loop.run_once()
         turns += 1
         assert turns < count

@@ -151,7 +151,7 @@ def test_given_five_clients_that_do_not_wait_then_a_polite_sixth_gets_each_reply
     assert max(took) < 0.05
     assert rig.loop.state.ticks_missed == 0
     rig.run(4.0)
-    assert rig.loop.requests_waiting == rig.inbox.pending == 0
+    assert rig.loop._requests.waiting == rig.inbox.pending == 0
 
 
 def lone_client(rig: Rig, count: int) -> list[float]:
@@ -276,4 +276,4 @@ def test_given_a_reply_channel_that_may_not_be_used_then_a_long_request_is_count
     rig.run(0.1)
     assert dict(rig.loop.state.rejected) == {("PLATFORM_GET_TRANSFORMATIONS", "reply_channel"): 1}
     assert [channel for channel, _ in rig.bus.published if channel.startswith("REPLY")] == ["REPLY_TEST"]
-    assert rig.loop.requests_waiting == 0
+    assert rig.loop._requests.waiting == 0

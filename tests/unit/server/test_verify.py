@@ -471,7 +471,7 @@ def test_given_a_long_answer_that_is_not_finished_when_verified_then_what_was_se
     slow_steps(monkeypatch, rig, 0.02)
     ask_long(rig)
     rig.run_cycles(10)
-    assert rig.loop.requests_waiting == 1
+    assert rig.loop._requests.waiting == 1
     assert is_reproduced(again(rig))
 
 
