@@ -22,7 +22,7 @@ from modelserver.client.remote import decode_pose_reply
 from modelserver.core import CoreSettings, CoreState, Instant
 from modelserver.formats import load_model
 from modelserver.messages import JointSample, JointsSample, SensorHeader
-from modelserver.wire import queries
+from modelserver.wire import codec
 from modelserver.wire.codec import decode, encode, pack_get_transformation
 
 START_UTIME: Final = 1_700_000_000_000_000
@@ -58,7 +58,7 @@ def load_core(moving: bool) -> tuple[CoreState, list[str], Instant]:
 
 def measure(moving: bool, seed: int) -> tuple[dict[str, list[float]], list[bool]]:
     """Return the seconds of each part of each query, every pair once in random order; and which pass a joint."""
-    queries._ANSWER_CACHE.clear()
+    codec._ANSWER_CACHE.clear()
     state, names, now = load_core(moving)
     pairs = list(itertools.product(names, repeat=2))
     random.Random(seed).shuffle(pairs)

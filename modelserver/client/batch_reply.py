@@ -78,13 +78,9 @@ def concatenate(parts: list[PoseBatch]) -> PoseBatch:
     first, *more = parts
     if not more:
         return first
-    covariances = [part.covariances for part in parts if part.covariances is not None]
-    return first._replace(
-        utimes=np.concatenate([part.utimes for part in parts]),
-        vectors=np.concatenate([part.vectors for part in parts]),
-        status=np.concatenate([part.status for part in parts]),
-        invalid=np.concatenate([part.invalid for part in parts]),
-        quality=np.concatenate([part.quality for part in parts]),
-        epochs=np.concatenate([part.epochs for part in parts]),
-        covariances=np.concatenate(covariances) if len(covariances) == len(parts) else None,
+    # an array that one part does not have is none of the whole: the covariances
+    columns = [[each for each in column if isinstance(each, np.ndarray)] for column in zip(*parts, strict=True)]
+    return PoseBatch._make(
+        np.concatenate(column) if len(column) == len(parts) else None if column else value
+        for column, value in zip(columns, first, strict=True)
     )

@@ -22,7 +22,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -108,8 +108,7 @@ class MirrorReceiver:
 
     def __init__(self, channel_prefix: str = "", snapshot: ModelSnapshot | None = None, keep_geometry: bool = False):
         self.state = MirrorState()
-        self._pose_channel = f"{channel_prefix}POSE"
-        self._odom_channel = f"{channel_prefix}POSE_ODOM"
+        self._worlds = {f"{channel_prefix}POSE": names.WORLD_UTM, f"{channel_prefix}POSE_ODOM": names.ODOM}
         self._snapshot_channel = f"{channel_prefix}MODEL_SNAPSHOT"
         self._held_joints_channel = f"{channel_prefix}JOINTS_HELD"
         self._state_channel = f"{channel_prefix}LOCALIZATION_STATE"
@@ -118,8 +117,7 @@ class MirrorReceiver:
         self._assembler = SnapshotAssembler()
         self._snapshot_utime = 0
         self._snapshot_bytes = b""
-        self._world_pose: PoseAnswer | None = None
-        self._odom_pose: PoseAnswer | None = None
+        self._poses: dict[str, PoseAnswer] = {}
         self._odom_samples: deque[OdomSample] = deque()
         self._last_odom: Transformation | None = None
         self._epoch = 0
@@ -132,13 +130,7 @@ class MirrorReceiver:
     @property
     def channels(self) -> tuple[str, ...]:
         """The channels to subscribe to; the channel of the joints is known from the first snapshot on."""
-        always = (
-            self._snapshot_channel,
-            self._held_joints_channel,
-            self._pose_channel,
-            self._odom_channel,
-            self._state_channel,
-        )
+        always = (self._snapshot_channel, self._held_joints_channel, *self._worlds, self._state_channel)
         snapshot = self.state.snapshot
         return (*always, snapshot.joints_channel) if snapshot is not None else always
 
@@ -151,10 +143,8 @@ class MirrorReceiver:
         """Process a message received at `now`; return whether the state changed. Raises nothing."""
         before = self.state
         try:
-            if channel == self._pose_channel:
-                self._process_pose(decode("pose_transform_t", data), now)
-            elif channel == self._odom_channel:
-                self._process_odom(decode("pose_transform_t", data), now)
+            if channel in self._worlds:
+                self._process_pose(channel, decode("pose_transform_t", data), now)
             elif channel == self._snapshot_channel:
                 self._process_snapshot_part(decode("model_snapshot_t", data), now)
             elif channel == self._state_channel:
@@ -162,7 +152,7 @@ class MirrorReceiver:
             elif before.snapshot is not None and channel == before.snapshot.joints_channel:
                 self._process_joints(decode("joints_t", data), now, before.snapshot)
             elif before.snapshot is not None and channel == self._held_joints_channel:
-                self._process_held_joints(decode("joints_t", data), now, before.snapshot)
+                self._process_held_joints(decode("joints_t", data), now)
         except WireError as error:
             self._reject(channel, error.reason)
         return self.state is not before
@@ -175,11 +165,8 @@ class MirrorReceiver:
 
     def _estimate_clock_offset(self, utime: int, now: int) -> int:
         """Return the offset of the server's clock from a stamp that may lie in its past, as that of a pose may."""
-        offset = utime - now
-        if not self._has_clock:
-            self._has_clock = True
-            return offset
-        return max(offset, self.state.clock_offset)
+        had_clock, self._has_clock = self._has_clock, True
+        return max(utime - now, self.state.clock_offset) if had_clock else utime - now
 
     # --- geometry
 
@@ -210,32 +197,35 @@ class MirrorReceiver:
         else:
             joints = state.joints.for_model(snapshot.model)
         history = state.history.with_duration(snapshot.history_s)
-        self.state = replace(
-            state,
+        self._replace(
             snapshot=snapshot,
             history=history,
             joints=joints,
-            view=_build_view(snapshot, state.extrapolator, history, joints),
             other_revision="",
             static_transforms={},
             static_answers={},
         )
 
+    def _replace(self, **changes: Any) -> None:
+        """Change the state, and with it the view."""
+        state = replace(self.state, **changes)
+        if state.snapshot is not None:
+            # published poses are of the base frame, so it also takes the place of the rolling frame
+            model, base = state.snapshot.model, state.snapshot.base_frame
+            view = PlatformView(model, base, state.extrapolator, state.history, base, joints=state.joints)
+            state = replace(state, view=view)
+        self.state = state
+
     # --- poses
 
-    def _process_pose(self, pose: PoseAnswer, now: int) -> None:
-        if self._is_foreign(pose, names.WORLD_UTM):
-            self._reject(self._pose_channel, "other frames")
+    def _process_pose(self, channel: str, pose: PoseAnswer, now: int) -> None:
+        world = self._worlds[channel]
+        if self._is_foreign(pose, world):
+            self._reject(channel, "other frames")
             return
-        self._world_pose = pose
-        self._process_pose_pair(now)
-
-    def _process_odom(self, pose: PoseAnswer, now: int) -> None:
-        if self._is_foreign(pose, names.ODOM):
-            self._reject(self._odom_channel, "other frames")
-            return
-        self._odom_pose = pose
-        self._process_pose_pair(now)
+        self._poses[world] = pose
+        if len({each.transformation.utime for each in self._poses.values()}) == 1 < len(self._poses):
+            self._process_pose_pair(self._poses.pop(names.WORLD_UTM), self._poses.pop(names.ODOM), now)
 
     def _is_foreign(self, pose: PoseAnswer, world: str) -> bool:
         """Return whether a pose is not of this vehicle's base frame in `world`."""
@@ -249,12 +239,8 @@ class MirrorReceiver:
             and transformation.frame_of_interest != snapshot.base_frame
         )
 
-    def _process_pose_pair(self, now: int) -> None:
+    def _process_pose_pair(self, world: PoseAnswer, odom: PoseAnswer, now: int) -> None:
         """Process a POSE and a POSE_ODOM of the same time."""
-        world, odom = self._world_pose, self._odom_pose
-        if world is None or odom is None or world.transformation.utime != odom.transformation.utime:
-            return
-        self._world_pose = self._odom_pose = None
         state, transformation, utime = self.state, world.transformation, world.transformation.utime
         history = state.history
         sample = OdomSample(utime, odom.transformation.pose)
@@ -272,18 +258,15 @@ class MirrorReceiver:
         is_known = odom.transformation.covariance is not None
         if is_known and not history.is_too_soon(utime):
             history = history.append(estimate)
-        extrapolator = PoseExtrapolator(estimate, period)
         snapshot, received, other = state.snapshot, state.geometry_received, ""
         if snapshot is not None:
             if transformation.model_revision == snapshot.model.revision:
                 received = now
             elif not self._keep_geometry:
                 other = transformation.model_revision or "(unnamed)"
-        self.state = replace(
-            state,
+        self._replace(
             history=history,
-            extrapolator=extrapolator,
-            view=None if snapshot is None else _build_view(snapshot, extrapolator, history, state.joints),
+            extrapolator=PoseExtrapolator(estimate, period),
             pose_received=now if is_known else state.pose_received,
             geometry_received=received,
             clock_offset=self._estimate_clock_offset(utime, now),
@@ -335,10 +318,9 @@ class MirrorReceiver:
         for reason in reasons:
             self._reject(snapshot.joints_channel, quote(reason, 120))
         if joints is not state.joints:
-            view = _build_view(snapshot, state.extrapolator, state.history, joints)
-            self.state = replace(state, joints=joints, view=view, joints_received=now)
+            self._replace(joints=joints, joints_received=now)
 
-    def _process_held_joints(self, sample: JointsSample, now: int, snapshot: ModelSnapshot) -> None:
+    def _process_held_joints(self, sample: JointsSample, now: int) -> None:
         """Restore joint positions from before this client listened; they do not count as received now."""
         state = self.state
         if sample.header.utime > state.get_service_time(now) + FUTURE_TOLERANCE_US:
@@ -346,13 +328,4 @@ class MirrorReceiver:
             return
         joints = state.joints.restore(sample)
         if joints is not state.joints:
-            self.state = replace(
-                state, joints=joints, view=_build_view(snapshot, state.extrapolator, state.history, joints)
-            )
-
-
-def _build_view(
-    snapshot: ModelSnapshot, extrapolator: PoseExtrapolator, history: History, joints: JointHistory
-) -> PlatformView:
-    # published poses are of the base frame, so it also takes the place of the rolling frame
-    return PlatformView(snapshot.model, snapshot.base_frame, extrapolator, history, snapshot.base_frame, joints=joints)
+            self._replace(joints=joints)

@@ -98,13 +98,4 @@ class PoseBatch(NamedTuple):
 
     def slice_instants(self, first: int, end: int) -> PoseBatch:
         """Return the poses at the instants `first:end`."""
-        some = slice(first, end)
-        return self._replace(
-            utimes=self.utimes[some],
-            vectors=self.vectors[some],
-            status=self.status[some],
-            invalid=self.invalid[some],
-            quality=self.quality[some],
-            epochs=self.epochs[some],
-            covariances=None if self.covariances is None else self.covariances[some],
-        )
+        return PoseBatch._make([each[first:end] if isinstance(each, np.ndarray) else each for each in self])
