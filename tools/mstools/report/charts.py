@@ -134,8 +134,9 @@ def render_panels(label: str, x: Axis, panels: Sequence[Panel], events: Sequence
 
 def render_map(label: str, x: str, y: str, series: Sequence[Series], heights: tuple[float, float] = (420, 900)) -> str:
     """Return an SVG map with one scale for both axes, whose labels are `x` and `y`; its height fits within limits."""
-    spans = [value_range([v for each in series for v in values(each)], min_width=2.0) for values in (_get_x, _get_y)]
-    (west, east), (south, north) = spans
+    (west, east), (south, north) = spans = [
+        value_range((value for each in series for value in getattr(each, axis)), min_width=2.0) for axis in "xy"
+    ]
     height = min(max(INNER * (north - south) / (east - west), heights[0]), heights[1])
     scale = max((east - west) / INNER, (north - south) / height)
     axes = [
@@ -164,14 +165,6 @@ def render_strip(label: str, x: Axis, rows: Sequence[StripRow], events: Sequence
         ]
     parts += _render_verticals(at, 2.0, bottom, (), events)
     return _render_svg(label, bottom + 38, [*parts, *_render_x_axis(x, left, width, bottom)])
-
-
-def _get_x(series: Series) -> Sequence[float]:
-    return series.x
-
-
-def _get_y(series: Series) -> Sequence[float]:
-    return series.y
 
 
 # --- parts --------------------------------------------------------------------------------------------------

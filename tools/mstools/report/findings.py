@@ -21,7 +21,7 @@ import numpy as np
 from modelserver.messages import Decision, Invalid, Verdict
 from modelserver.transforms.so3 import Array
 from mstools.report import consistency
-from mstools.report.replay_data import ReplayData, ReportFinding, StateSample, error, note, warning
+from mstools.report.replay_data import ReplayData, ReportFinding, error, note, warning
 from mstools.report.sensor_checks import SENSOR_CHECKS
 from mstools.terminal.output import format_count
 
@@ -87,18 +87,17 @@ def check_direction(data: ReplayData) -> Iterable[ReportFinding]:
 
 def check_wheel_scale(data: ReplayData) -> Iterable[ReportFinding]:
     """Find wheels whose radius or rolling direction differs from driver and geometry."""
-    last = _last_state(data)
     settings = data.settings
-    scale, sigma = _get_state(last, "wheel_scale")
-    if math.isfinite(scale) and abs(scale) > max(2.0 * settings.wheel_scale_sigma, 3.0 * sigma):
+    scale, sigma = _get_state(data, "wheel_scale")
+    if abs(scale) > max(2.0 * settings.wheel_scale_sigma, 3.0 * sigma):
         word = "too long" if scale > 0.0 else "too short"
         yield warning(
             f"The distance by the wheels is {abs(scale):.1%} {word}",
             f"wheel_scale ended at {scale:+.3f} +- {sigma:.3f}; its prior sigma is {settings.wheel_scale_sigma:.3f}.",
             f"Multiply the wheel radius in the driver by {1.0 / (1.0 + scale):.3f}.",
         )
-    yaw, sigma = _get_state(last, "wheel_yaw")
-    if math.isfinite(yaw) and abs(yaw) > max(3.0 * settings.wheel_yaw_sigma, 3.0 * sigma):
+    yaw, sigma = _get_state(data, "wheel_yaw")
+    if abs(yaw) > max(3.0 * settings.wheel_yaw_sigma, 3.0 * sigma):
         yield warning(
             f"The wheels roll {abs(math.degrees(yaw)):.1f} degrees to the {'left' if yaw > 0.0 else 'right'}",
             f"wheel_yaw ended at {math.degrees(yaw):+.2f} +- {math.degrees(sigma):.2f} degrees from the geometry's x.",
@@ -125,18 +124,16 @@ def check_frozen_imu(data: ReplayData) -> Iterable[ReportFinding]:
 
 def check_biases(data: ReplayData) -> Iterable[ReportFinding]:
     """Find biases far outside the data sheet."""
-    last, settings = _last_state(data), data.settings
-    for kind, limit, unit, factor in (
-        ("gyro_bias", settings.gyro_bias_sigma, "deg/s", math.degrees(1.0)),
-        ("accelerometer_bias", settings.accelerometer_bias_sigma, "m/s2", 1.0),
+    for kind, words, unit, factor in (
+        ("gyro_bias", "Gyro bias about", "deg/s", math.degrees(1.0)),
+        ("accelerometer_bias", "Accelerometer bias along", "m/s2", 1.0),
     ):
+        limit = getattr(data.settings, f"{kind}_sigma")
         for axis in "xyz":
-            value, sigma = _get_state(last, f"{kind}_{axis}")
-            if math.isfinite(value) and abs(value) > 3.0 * limit and abs(value) > 3.0 * sigma:
+            value, sigma = _get_state(data, f"{kind}_{axis}")
+            if abs(value) > 3.0 * max(limit, sigma):
                 yield warning(
-                    f"{kind.replace('_', ' ').capitalize()} about {axis} is far outside its data sheet"
-                    if kind == "gyro_bias"
-                    else f"Accelerometer bias along {axis} is far outside its data sheet",
+                    f"{words} {axis} is far outside its data sheet",
                     f"It ended at {value * factor:+.3g} +- {sigma * factor:.2g} {unit}; {kind}_sigma is "
                     f"{limit * factor:.3g}.",
                     f"Check the unit and its mount; if the unit is that poor, set localization.filter.{kind}_sigma "
@@ -305,26 +302,19 @@ def check_validity(data: ReplayData, has_cause: bool = False) -> Iterable[Report
 
     `has_cause`: other findings explain it; then the reasons given with poses are not repeated.
     """
+    consequence = ("Probably a consequence of the findings above.", "Fix those first.")
     if not data.snapshots:
-        yield error(
-            "There was never a state",
-            "Probably a consequence of the findings above."
-            if has_cause
-            else "No sample of a configured sensor could be used.",
-            "Fix those first." if has_cause else "Compare the channels in the log with those in the vehicle file.",
-        )
+        reason = "No sample of a configured sensor could be used."
+        advice = "Compare the channels in the log with those in the vehicle file."
+        yield error("There was never a state", *(consequence if has_cause else (reason, advice)))
         return
     first = next((n for n, each in enumerate(data.snapshots) if not each.invalid), None)
     if first is None:
-        words = data.snapshots[-1].invalid.explain()
-        yield error(
-            "The pose was never valid",
-            "Probably a consequence of the findings above." if has_cause else f"At the end: {words}.",
-            "Fix those first."
-            if has_cause
-            else "Heading alignment takes a few meters of driving with fixes; the strip below shows the reasons over "
-            "time.",
+        reason = f"At the end: {data.snapshots[-1].invalid.explain()}."
+        advice = (
+            "Heading alignment takes a few meters of driving with fixes; the strip below shows the reasons over time."
         )
+        yield error("The pose was never valid", *(consequence if has_cause else (reason, advice)))
         return
     after = data.snapshots[first:]
     bad = [each for each in after if each.invalid]
@@ -368,12 +358,7 @@ STATE_CHECKS: tuple[Check, ...] = (check_wheel_scale, check_biases, check_latenc
 """Checks that need a filter without divergence."""
 
 
-def _last_state(data: ReplayData) -> StateSample | None:
-    return next((each for each in reversed(data.snapshots) if each.values), None)
-
-
-def _get_state(snapshot: StateSample | None, name: str) -> tuple[float, float]:
-    """Return the value and sigma of a state, nan where there is none."""
-    if snapshot is None or name not in snapshot.values:
-        return math.nan, math.nan
-    return snapshot.values[name], snapshot.sigmas[name]
+def _get_state(data: ReplayData, name: str) -> tuple[float, float]:
+    """Return the value and sigma of a state at the end, nan where there is none."""
+    last = next((each for each in reversed(data.snapshots) if each.values), None)
+    return (math.nan, math.nan) if last is None else (last.values.get(name, math.nan), last.sigmas.get(name, math.nan))

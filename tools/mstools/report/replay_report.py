@@ -315,10 +315,7 @@ def _render_motion(data: ReplayData) -> str:
     ):
         lines = [
             Series(words, t, [convert(getattr(each, field)) for each in states], color)
-            for words, field, color in (
-                ("sigma", sigma, charts.BLUE),
-                ("protection level", bound, charts.ORANGE),
-            )
+            for words, field, color in (("sigma", sigma, charts.BLUE), ("protection level", bound, charts.ORANGE))
         ]
         axis = decade_axis(unit, [*lines[0].y, *lines[1].y])
         drawn.append(Panel(f"{title}: uncertainty", axis, lines, 110.0))
@@ -341,17 +338,10 @@ def _render_consistency(data: ReplayData) -> str:
     found = consistency.compute_consistency(data.decisions)
     if not found:
         return f"<p>No innovations: {_explain_no_decisions(data)}.</p>"
-    rows = [
-        (
-            each.kind,
-            str(each.count),
-            str(each.rejected),
-            f"{each.mean:.2f}",
-            f"{each.beyond:.1%}",
-            "consistent" if 0.5 <= each.mean <= 1.5 else "too large" if each.mean > 1.5 else "too small",
-        )
-        for each in found
-    ]
+    rows = []
+    for each in found:
+        words = "consistent" if 0.5 <= each.mean <= 1.5 else "too large" if each.mean > 1.5 else "too small"
+        rows.append((each.kind, f"{each.count}", f"{each.rejected}", f"{each.mean:.2f}", f"{each.beyond:.1%}", words))
     head = ("kind", "compared", "rejected by the gate", "mean NIS", "beyond 95 %", "errors for its sigma")
     x = _time_axis(data)
     drawn = [level("expected", x, 1.0)]
@@ -376,10 +366,9 @@ def _render_innovations(data: ReplayData) -> str:
         if each.dof:
             kinds.setdefault(each.kind, []).append(each)
     drawn = [
-        panel
+        _innovation_panel(data, kind, n, [each for each in found if each.dof > n])
         for kind, found in sorted(kinds.items())
         for n in range(max(each.dof for each in found))
-        if (panel := _innovation_panel(data, kind, n, [each for each in found if each.dof > n])) is not None
     ]
     if not drawn:
         return "<p>No innovations.</p>"
@@ -390,13 +379,12 @@ def _render_innovations(data: ReplayData) -> str:
     )
 
 
-def _innovation_panel(data: ReplayData, kind: str, n: int, found: Sequence[Decision]) -> Panel | None:
+def _innovation_panel(data: ReplayData, kind: str, n: int, found: Sequence[Decision]) -> Panel:
     names = COMPONENTS.get(kind, ())
     name = names[n] if n < len(names) and (len(names) > 1 or found[0].dof == 1) else f"component {n + 1}"
     sigma = [2.0 * math.sqrt(max(each.innovation_covariance[n * (each.dof + 1)], 0.0)) for each in found]
     # the first innovations of a kind may have any size: they would hide all others
-    order = sorted(sigma)
-    typical = order[int(0.95 * (len(order) - 1))]
+    typical = sorted(sigma)[int(0.95 * (len(sigma) - 1))]
     residuals = [each.residual[n] for each in found]
     low, high = value_range(residuals, 0.99)
     reach = max(min(1.15 * typical, 12.0 * max(-low, high)), -low, high, 1e-9)
@@ -405,11 +393,8 @@ def _innovation_panel(data: ReplayData, kind: str, n: int, found: Sequence[Decis
         Series("2 sigma", t, [-value for value in sigma], charts.SKY, shape="band", high=sigma),
         level("", _time_axis(data), 0.0),
     ]
-    for verdict, color in (
-        (Verdict.MONITORED, charts.AMBER),
-        (Verdict.USED, charts.BLUE),
-        (Verdict.REJECTED, charts.RED),
-    ):
+    colors = {Verdict.MONITORED: charts.AMBER, Verdict.USED: charts.BLUE, Verdict.REJECTED: charts.RED}
+    for verdict, color in colors.items():
         chosen = [(a, b) for a, b, each in zip(t, residuals, found, strict=True) if each.verdict is verdict]
         if chosen:
             drawn.append(charts.dots(verdict.name.lower(), chosen, color, 2.4))
