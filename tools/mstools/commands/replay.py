@@ -7,13 +7,12 @@ import json
 import math
 import os
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
 
@@ -23,12 +22,11 @@ from modelserver.messages import Decision, Invalid, Verdict
 from modelserver.wire.encoded import is_of_service
 from modelserver.wire.eventlog import LogEvent, LogFile
 from mstools.terminal.options import JsonOption, UrlOption
-from mstools.terminal.output import check_writable, escape, format_count, open_atomic
+from mstools.terminal.output import check_writable, escape, format_count, open_atomic, to_json
 from mstools.terminal.progress import show_progress
 
 if TYPE_CHECKING:
     from modelserver.server.offline import OfflineRun, TrackRow
-    from mstools.report.replay_data import ReplayCollector
 
 RATE_HZ = 50.0
 """Default rate of poses."""
@@ -150,7 +148,7 @@ def replay_to_bus(
     as_json: bool,
     restamp: bool = False,
 ) -> None:
-    """Publish a log on the bus."""
+    """Publish a log on the bus: some channels, with an empty set all but a daemon's, with None all."""
     from modelserver.config.vehicle_file import load_config
     from modelserver.server.clock import Clock
     from modelserver.server.playback import Player
@@ -159,8 +157,10 @@ def replay_to_bus(
     if not url and config is not None:
         url = load_config(config).lcm.url
     with LogFile(log) as recording:
-        bus = open_lcm(resolve_url(url))
-        player = Player(bus.publish, speed, Clock(), time.sleep, restamp)
+        player = Player(open_lcm(resolve_url(url)).publish, speed, Clock(), time.sleep, restamp)
+        events: Iterable[LogEvent] = recording
+        if channels is not None:
+            events = _filter_channels(recording, channels) if channels else _exclude_service_messages(recording)
         try:
             with show_progress(f"replaying {log.name}", recording.size) as show:
                 updated = 0.0
@@ -171,12 +171,7 @@ def replay_to_bus(
                         updated = now
                         show(event.end)
 
-                if channels is None:
-                    player.play(recording, on_event)
-                elif channels:
-                    player.play(_filter_channels(recording, channels), on_event)
-                else:
-                    player.play(_exclude_service_messages(recording), on_event)
+                player.play(events, on_event)
         finally:
             report = {"sent": player.sent, "seconds": player.duration, "max_delay": player.max_delay}
             words = (
@@ -211,21 +206,8 @@ def replay_offline(
             f"{config}: no localization sensor is configured (section 'sensors' is empty), so there is no pose"
         )
     times = None if at_times is None else read_times(at_times)
-    geometry = Path(vehicle.config.geometry)
-    inputs = [log, config, geometry, *([] if at_times is None else [at_times])]
-    taken: dict[str, str] = {}
-    for target, what in ((poses, "poses"), (decisions, "decisions"), (report, "report")):
-        if target:
-            _check_output(target, inputs)
-            check_writable(target)
-            place = os.path.realpath(target)
-            if target != "-" and place in taken:
-                raise RecordingError(
-                    f"{target}: already the file of the {taken[place]}; give another one for the {what}"
-                )
-            taken[place] = what
-    if not poses:
-        times = []
+    inputs = [log, config, Path(vehicle.config.geometry), *([] if at_times is None else [at_times])]
+    _check_outputs({"poses": poses, "decisions": decisions, "report": report}, inputs)
     with LogFile(log) as recording:
         run = OfflineRun(vehicle, _filter_channels(recording, channels), frame or vehicle.config.base_frame)
         collector = None
@@ -239,31 +221,36 @@ def replay_offline(
         gc.freeze()
         gc.set_threshold(50_000, 20, 100)
         started = time.monotonic()
-        pose_counts = PoseCounts()
-        rejected: Counter[tuple[str, str, str]] = Counter()
+        counts = ReplayCounts()
+        seen: set[str] = set()
         with (
             _open_output(poses) if poses else nullcontext() as out,
             _open_output(decisions) if decisions else nullcontext() as ledger,
             show_progress(f"replaying {log.name}", recording.size) as show,
         ):
-            listeners: list[Callable[[Decision], object]] = [partial(_count_rejected, rejected)]
-            if ledger is not None:
-                listeners.append(partial(_write_decision, ledger))
-            if collector is not None:
-                listeners.append(collector.on_decision)
-            seen: set[str] = set()
+
+            def on_decision(decision: Decision) -> None:
+                counts.count_decision(decision)
+                if ledger is not None:
+                    values = to_json(decision) | {"verdict": decision.verdict.name.lower()}
+                    ledger.write(json.dumps(values, allow_nan=False) + "\n")
+                if collector is not None:
+                    collector.on_decision(decision)
+
             run.log = _track_progress(run.log, show, seen)
-            run.on_decision = partial(_notify, listeners)
+            run.on_decision = on_decision
             if out is not None:
                 out.write(CSV_HEADER + "\n")
-            for row in run.rows(times, rate):
+            # without a file of poses none is asked for
+            for row in run.rows(times if poses else [], rate):
                 if out is not None:
                     out.write(row.to_csv() + "\n")
-                pose_counts.count(row)
+                counts.count_pose(row)
         wall = time.monotonic() - started
+        text = counts.to_text(run, wall, bool(poses))
         on_stderr = "-" in (poses, decisions, report)
-        _print_counts(run, pose_counts if poses else None, rejected, wall, as_json, on_stderr)
-        if times:
+        typer.echo(json.dumps(counts.as_data(run, wall)) if as_json else text, err=on_stderr)
+        if times and poses:
             _warn_of_times(times, run, at_times)
         if not run.samples:
             configured = _join_sorted(
@@ -274,7 +261,15 @@ def replay_offline(
                 f"the log has: {_join_sorted(run.unconfigured_channels)}"
             )
         if collector is not None:
-            _write_report(collector, run, log, report, seen, quiet=as_json)
+            from mstools.report import replay_report
+            from mstools.report.findings import collect_findings
+
+            replayed = collector.finish(log.name, run.first_utime, run.last_utime, run.rejected, seen)
+            with _open_output(report) as out:
+                out.write(replay_report.render_page(replayed))
+            if not as_json:
+                findings = replay_report.format_summary(collect_findings(replayed), report)
+                typer.echo("\n".join(findings), err=report == "-")
         _report_damage(recording)
 
 
@@ -289,75 +284,68 @@ def _track_progress(
         yield event
 
 
-def _notify(listeners: Iterable[Callable[[Decision], object]], decision: Decision) -> None:
-    for each in listeners:
-        each(decision)
-
-
 @dataclass
-class PoseCounts:
-    """Number of written poses, of valid ones, and of those with each invalid reason."""
+class ReplayCounts:
+    """Number of poses, of valid ones, and of those with each invalid reason; rejected measurements by their kind."""
 
     written: int = 0
     valid: int = 0
     reasons: Counter[Invalid] = field(default_factory=Counter)
+    rejected: defaultdict[tuple[str, str], Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
 
-    def count(self, row: TrackRow) -> None:
+    def count_pose(self, row: TrackRow) -> None:
         """Count a pose."""
         self.written += 1
         self.valid += row.valid
         if not row.valid:
             self.reasons.update(flag for flag in Invalid if row.invalid & flag)
 
-    def to_text(self, frame: str) -> str:
+    def count_decision(self, decision: Decision) -> None:
+        """Count a rejected measurement."""
+        if decision.verdict is Verdict.REJECTED:
+            self.rejected[f"sensor:{decision.source}", decision.reason or "rejected"][decision.kind] += 1
+
+    def as_data(self, run: OfflineRun, wall: float) -> dict[str, Any]:
+        """Return the counts as JSON data; `wall`: duration of the run, seconds."""
+        span = (run.last_utime - run.first_utime) * 1e-6
+        return {
+            "poses": self.written,
+            "valid": self.valid,
+            "invalid_reasons": {str(flag.name): n for flag, n in self.reasons.most_common()},
+            "events": run.events,
+            "samples": run.samples,
+            "seconds": span,
+            "wall_seconds": wall,
+            "real_time_factor": span / wall if wall > 0 else math.nan,
+            "rejected": [
+                {
+                    "source": source,
+                    "reason": reason,
+                    "count": n,
+                    "kinds": dict(sorted(self.rejected[source, reason].items())),
+                }
+                for (source, reason), n in sorted(run.rejected.items())
+            ],
+        }
+
+    def to_text(self, run: OfflineRun, wall: float, has_poses: bool) -> str:
         """Format the counts."""
-        text = f"{format_count(self.written, 'pose')} of {frame}, {self.valid} valid"
-        if self.valid == self.written:
-            return text
-        mostly = "".join(f", mostly {flag.name}" for flag, _ in self.reasons.most_common(1))
-        return f"{text} (not valid: {self.written - self.valid}{mostly})"
-
-
-def _count_rejected(rejected: Counter[tuple[str, str, str]], decision: Decision) -> None:
-    if decision.verdict is Verdict.REJECTED:
-        rejected[f"sensor:{decision.source}", decision.reason or "rejected", decision.kind] += 1
-
-
-def _print_counts(
-    run: OfflineRun,
-    poses: PoseCounts | None,
-    rejected: Counter[tuple[str, str, str]],
-    wall: float,
-    as_json: bool,
-    on_stderr: bool,
-) -> None:
-    span = (run.last_utime - run.first_utime) * 1e-6
-    kinds = {
-        (source, reason): {kind: n for (s, r, kind), n in sorted(rejected.items()) if (s, r) == (source, reason)}
-        for source, reason in run.rejected
-    }
-    counts = {
-        "poses": poses.written if poses else 0,
-        "valid": poses.valid if poses else 0,
-        "invalid_reasons": {str(flag.name): n for flag, n in poses.reasons.most_common()} if poses else {},
-        "events": run.events,
-        "samples": run.samples,
-        "seconds": span,
-        "wall_seconds": wall,
-        "real_time_factor": span / wall if wall > 0 else math.nan,
-        "rejected": [
-            {"source": s, "reason": r, "count": n, "kinds": kinds[s, r]} for (s, r), n in sorted(run.rejected.items())
-        ],
-    }
-    head = f"{poses.to_text(run.frame)}, from " if poses else ""
-    lines = [
-        f"{head}{run.samples} of {run.events} messages; "
-        f"{span:.1f} s in {wall:.2f} s: {counts['real_time_factor']:.0f} times real time"
-    ]
-    for (source, reason), count in sorted(run.rejected.items()):
-        of = ", ".join(kind if n == count else f"{n} {kind}" for kind, n in kinds[source, reason].items())
-        lines.append(escape(f"  not used: {count} of {source}, {reason}{f' ({of})' if of else ''}"))
-    typer.echo(json.dumps(counts) if as_json else "\n".join(lines), err=on_stderr)
+        data, head = self.as_data(run, wall), ""
+        if has_poses:
+            head = f"{format_count(self.written, 'pose')} of {run.frame}, {self.valid} valid"
+            if self.valid < self.written:
+                mostly = "".join(f", mostly {flag.name}" for flag, _ in self.reasons.most_common(1))
+                head += f" (not valid: {self.written - self.valid}{mostly})"
+            head += ", from "
+        lines = [
+            f"{head}{run.samples} of {run.events} messages; "
+            f"{data['seconds']:.1f} s in {wall:.2f} s: {data['real_time_factor']:.0f} times real time"
+        ]
+        for each in data["rejected"]:
+            of = ", ".join(kind if n == each["count"] else f"{n} {kind}" for kind, n in each["kinds"].items())
+            what = f"{each['count']} of {each['source']}, {each['reason']}{f' ({of})' if of else ''}"
+            lines.append(escape(f"  not used: {what}"))
+        return "\n".join(lines)
 
 
 UNITS = (("seconds", 1_000_000.0), ("milliseconds", 1_000.0), ("nanoseconds", 0.001))
@@ -374,20 +362,6 @@ def _warn_of_times(times: list[int], run: OfflineRun, path: Path | None) -> None
             hint += f"; these look like {unit}"
             break
     typer.echo(f"modelserver: {path}: none of {format_count(len(times), 'time')} lies within the log: {hint}", err=True)
-
-
-def _write_report(
-    collector: ReplayCollector, run: OfflineRun, log: Path, report: str, channels: set[str], quiet: bool
-) -> None:
-    """Write the report, and print its findings."""
-    from mstools.report import replay_report
-    from mstools.report.findings import collect_findings
-
-    replayed = collector.finish(log.name, run.first_utime, run.last_utime, run.rejected, channels)
-    with _open_output(report) as out:
-        out.write(replay_report.render_page(replayed))
-    if not quiet:
-        typer.echo("\n".join(replay_report.format_summary(collect_findings(replayed), report)), err=report == "-")
 
 
 def read_times(path: Path) -> list[int]:
@@ -442,24 +416,21 @@ def _open_output(path: str) -> AbstractContextManager[TextIO]:
     return open_atomic(path, replace=True)
 
 
-def _check_output(path: str, inputs: Iterable[Path]) -> None:
-    """Raise RecordingError if the output would overwrite an input."""
-    target = Path(path)
-    for each in inputs:
-        if path != "-" and target.exists() and each.exists() and target.samefile(each):
-            raise RecordingError(f"{path}: is an input of this command; give another file")
-
-
-def _write_decision(ledger: TextIO, decision: Decision) -> None:
-    """Write a decision as a line of JSON, with null for nan."""
-    values = decision._asdict() | {"verdict": decision.verdict.name.lower()}
-    ledger.write(json.dumps({key: _to_json(value) for key, value in values.items()}, allow_nan=False) + "\n")
-
-
-def _to_json(value: object) -> object:
-    if isinstance(value, tuple):
-        return [_to_json(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _check_outputs(targets: dict[str, str], inputs: Iterable[Path]) -> None:
+    """Raise RecordingError or ModelServerError for an output that is an input or another output, or not writable."""
+    taken: dict[str, str] = {}
+    for what, path in targets.items():
+        if not path:
+            continue
+        target = Path(path)
+        for each in inputs:
+            if path != "-" and target.exists() and each.exists() and target.samefile(each):
+                raise RecordingError(f"{path}: is an input of this command; give another file")
+        check_writable(path)
+        place = os.path.realpath(path)
+        if path != "-" and place in taken:
+            raise RecordingError(f"{path}: already the file of the {taken[place]}; give another one for the {what}")
+        taken[place] = what
 
 
 def _exclude_service_messages(recording: Iterable[LogEvent]) -> Iterator[LogEvent]:

@@ -52,6 +52,8 @@ def to_json(value: Any) -> Any:
 
     Named tuples and dataclasses are objects.
     """
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
     if dataclasses.is_dataclass(value):
         return {each.name: to_json(getattr(value, each.name)) for each in dataclasses.fields(value)}
     if hasattr(value, "_asdict"):
@@ -60,9 +62,7 @@ def to_json(value: Any) -> Any:
         return {key: to_json(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
         return [to_json(each) for each in value]
-    if isinstance(value, IntEnum):
-        return value.name
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return value.name if isinstance(value, IntEnum) else value
 
 
 def check_writable(path: str, replace: bool = True) -> None:
