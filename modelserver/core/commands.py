@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from modelserver import messages
 from modelserver.core.host_clock import Instant
 from modelserver.core.requests import reply_error
 from modelserver.core.samples import COMMAND_FUTURE_LIMIT_S, switch_mode, update_localizer
@@ -22,29 +23,6 @@ from modelserver.estimation.interface import Localizer, LocalizerEvent
 from modelserver.geometry import names
 from modelserver.geometry.difference import describe_changes
 from modelserver.geometry.model import Model
-from modelserver.messages import (
-    CHANNEL_OF,
-    AbsolutePoseSample,
-    Acknowledgement,
-    Decision,
-    LoadModel,
-    Origin,
-    Output,
-    PoseAnswer,
-    PublishSnapshot,
-    Rejected,
-    ReloadModel,
-    ReloadReply,
-    ReplyHeader,
-    SendReply,
-    SensorHeader,
-    SetHTransform,
-    SetStateVector,
-    SignedCommand,
-    SwitchMode,
-    Verdict,
-    is_answerable,
-)
 from modelserver.transforms.covariance import find_problem
 
 
@@ -55,13 +33,13 @@ class ModelLoaded:
     `request` is the client's request, None for a reload by signal.
     """
 
-    request: ReloadModel | None
+    request: messages.ReloadModel | None
     model: Model | None = None
     localizer: Localizer | None = None
     why: str = ""
 
 
-COMMANDS: Final = (ReloadModel, SetStateVector, SetHTransform)
+COMMANDS: Final = (messages.ReloadModel, messages.SetStateVector, messages.SetHTransform)
 """Requests that must be signed."""
 
 SET_COVARIANCE: Final = tuple(np.diag([1.0] * 3 + [math.radians(5.0) ** 2] * 3).ravel().tolist())
@@ -76,33 +54,41 @@ UNSIGNED_MESSAGE: Final = (
 )
 
 
-def deny_unsigned(state: CoreState, command: ReloadModel | SetStateVector | SetHTransform, now: Instant) -> StepResult:
+def deny_unsigned(
+    state: CoreState, command: messages.ReloadModel | messages.SetStateVector | messages.SetHTransform, now: Instant
+) -> StepResult:
     """Deny a command without signature."""
     forbidden = _forbid(state, command, now)
     if forbidden is not None:
         return forbidden
-    state = count_rejection(state, CHANNEL_OF[type(command)], "unsigned")
+    state = count_rejection(state, messages.CHANNEL_OF[type(command)], "unsigned")
     return state, reply_error(state, type(command), command.header, Status.FORBIDDEN, UNSIGNED_MESSAGE, now)
 
 
-def execute_command(state: CoreState, signed: SignedCommand, now: Instant) -> StepResult:
+def execute_command(state: CoreState, signed: messages.SignedCommand, now: Instant) -> StepResult:
     """Execute a command whose signature is verified, where the vehicle file permits it."""
     command = signed.command
-    if isinstance(command, SwitchMode):
+    if isinstance(command, messages.SwitchMode):
         return switch_mode(state, command, now)
     forbidden = _forbid(state, command, now)
     if forbidden is not None:
         return forbidden
-    return (state, (LoadModel(command),)) if isinstance(command, ReloadModel) else _set_pose(state, command, now)
+    return (
+        (state, (messages.LoadModel(command),))
+        if isinstance(command, messages.ReloadModel)
+        else _set_pose(state, command, now)
+    )
 
 
-def _forbid(state: CoreState, command: ReloadModel | SetStateVector | SetHTransform, now: Instant) -> StepResult | None:
+def _forbid(
+    state: CoreState, command: messages.ReloadModel | messages.SetStateVector | messages.SetHTransform, now: Instant
+) -> StepResult | None:
     """Reject a command whose reply channel, or which itself, is not permitted; None if it is."""
-    channel, settings = CHANNEL_OF[type(command)], state.settings
-    if not is_answerable(command.header, settings.reply_prefix):
+    channel, settings = messages.CHANNEL_OF[type(command)], state.settings
+    if not messages.is_answerable(command.header, settings.reply_prefix):
         return count_rejection(state, channel, "reply_channel"), ()
     name, is_permitted = "set_pose", settings.may_set_pose
-    if isinstance(command, ReloadModel):
+    if isinstance(command, messages.ReloadModel):
         name, is_permitted = "reload", settings.may_reload
     if is_permitted:
         return None
@@ -118,25 +104,27 @@ def apply_model(state: CoreState, loaded: ModelLoaded, now: Instant) -> StepResu
     """Replace the geometry as a whole, or keep the old one if the new one could not be loaded."""
     request, model = loaded.request, loaded.model
     if model is None:
-        state = count_rejection(state, CHANNEL_OF[ReloadModel], "rejected")
+        state = count_rejection(state, messages.CHANNEL_OF[messages.ReloadModel], "rejected")
         if request is None:
             return state, ()
-        return state, reply_error(state, ReloadModel, request.header, Status.REJECTED, loaded.why, now)
+        return state, reply_error(state, messages.ReloadModel, request.header, Status.REJECTED, loaded.why, now)
     changes = describe_changes(state.model, model)
-    outputs: list[Output] = []
+    outputs: list[messages.Output] = []
     if request is None or not request.dry_run:
         view = replace(state.view, model=model, localizer=loaded.localizer, joints=state.view.joints.for_model(model))
         due = now.monotonic_ns + state.settings.snapshot_period_ns
         state = state._replace(view=view, snapshot_due_ns=due)
-        outputs.append(PublishSnapshot(now.utime))
+        outputs.append(messages.PublishSnapshot(now.utime))
     if request is not None:
         state = state._replace(requests_answered=state.requests_answered + 1)
-        header = ReplyHeader(request.header.request_id, now.utime, model_revision=state.model.revision)
-        outputs.append(SendReply(request.header.reply_channel, ReloadReply(header, model.revision, changes)))
+        header = messages.ReplyHeader(request.header.request_id, now.utime, model_revision=state.model.revision)
+        outputs.append(
+            messages.SendReply(request.header.reply_channel, messages.ReloadReply(header, model.revision, changes))
+        )
     return state, tuple(outputs)
 
 
-def _set_pose(state: CoreState, request: SetStateVector | SetHTransform, now: Instant) -> StepResult:
+def _set_pose(state: CoreState, request: messages.SetStateVector | messages.SetHTransform, now: Instant) -> StepResult:
     """Fuse a pose that a client sets."""
     given, view = request.pose.transformation, state.view
     state = state._replace(requests_answered=state.requests_answered + 1)
@@ -161,8 +149,8 @@ def _set_pose(state: CoreState, request: SetStateVector | SetHTransform, now: In
     if why or view.localizer is None:
         return state, reply_error(state, type(request), request.header, Status.REJECTED, why, now)
     covariance = SET_COVARIANCE if given.covariance is None else tuple(given.covariance.ravel().tolist())
-    sample = AbsolutePoseSample(
-        SensorHeader(given.utime or now.utime, OPERATOR, state.requests_answered),
+    sample = messages.AbsolutePoseSample(
+        messages.SensorHeader(given.utime or now.utime, OPERATOR, state.requests_answered),
         given.frame_of_interest,
         given.frame_of_reference,
         given.pose.xyz,
@@ -173,7 +161,7 @@ def _set_pose(state: CoreState, request: SetStateVector | SetHTransform, now: In
     localizer, events = view.localizer.process(sample)
     reasons = [reason for event in events if (reason := _get_rejection_reason(event, sample))]
     state, outputs = update_localizer(state, view.localizer, sample, now)
-    header = ReplyHeader(request.header.request_id, now.utime, model_revision=state.model.revision)
+    header = messages.ReplyHeader(request.header.request_id, now.utime, model_revision=state.model.revision)
     if reasons:
         text = f"localization rejected the pose: {', '.join(reasons)}"
         if not _STAMP_REASONS.isdisjoint(reasons):
@@ -182,23 +170,23 @@ def _set_pose(state: CoreState, request: SetStateVector | SetHTransform, now: In
     elif localizer is view.localizer:
         text = "the active mode fuses no external poses (raw mode uses GPS and IMU only)"
         header = header._replace(status=Status.REJECTED, message=text)
-    return state, (*outputs, SendReply(request.header.reply_channel, Acknowledgement(header)))
+    return state, (*outputs, messages.SendReply(request.header.reply_channel, messages.Acknowledgement(header)))
 
 
 _STAMP_REASONS: Final = frozenset({"too_old", "out_of_sequence", "duplicate"})
 
 
-def _get_rejection_reason(event: LocalizerEvent, sample: AbsolutePoseSample) -> str:
+def _get_rejection_reason(event: LocalizerEvent, sample: messages.AbsolutePoseSample) -> str:
     """Return why a sample was rejected, else an empty text; a decision may also be on an earlier sample."""
-    if isinstance(event, Rejected):
+    if isinstance(event, messages.Rejected):
         return event.reason
-    if isinstance(event, Decision) and event.verdict is Verdict.REJECTED:
+    if isinstance(event, messages.Decision) and event.verdict is messages.Verdict.REJECTED:
         is_own = (event.source, event.seq) == (sample.header.source, sample.header.seq)
         return (event.reason or "rejected") if is_own else ""
     return ""
 
 
-def _has_other_origin(pose: PoseAnswer, origin: Origin) -> bool:
+def _has_other_origin(pose: messages.PoseAnswer, origin: messages.Origin) -> bool:
     """Return whether a pose names another origin; without a name it means the server's."""
     named = pose.transformation.origin_id
     return (pose.origin is not None and pose.origin != origin) or (named != 0 and named != origin.origin_id)

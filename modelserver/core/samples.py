@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import replace
 from typing import Final
 
+from modelserver import messages
 from modelserver.core.host_clock import Instant
 from modelserver.core.requests import answer_waiting
 from modelserver.core.state import (
@@ -24,22 +25,6 @@ from modelserver.core.state import (
 )
 from modelserver.estimation.interface import Localizer
 from modelserver.geometry import names
-from modelserver.messages import (
-    VALID,
-    Decision,
-    HealthWarning,
-    Invalid,
-    JointsSample,
-    Output,
-    PersistOrigin,
-    PublishDecisions,
-    PublishPose,
-    Rejected,
-    ReportStart,
-    Sample,
-    SwitchMode,
-    Verdict,
-)
 from modelserver.query import PlatformView
 
 COMMAND_FUTURE_LIMIT_S: Final = 1.0
@@ -53,7 +38,7 @@ WARM_START: Final = "warm_start"
 """Kind of the decisions on the persisted state of an earlier run."""
 
 
-def process_sample(state: CoreState, sample: Sample, now: Instant) -> StepResult:
+def process_sample(state: CoreState, sample: messages.Sample, now: Instant) -> StepResult:
     """Process a sample of a sensor."""
     source = f"sensor:{sample.header.source}"
     state = count_message(state, source, sample.header.host_utime, now)
@@ -63,7 +48,7 @@ def process_sample(state: CoreState, sample: Sample, now: Instant) -> StepResult
     if sample.header.utime > now.utime + SAMPLE_FUTURE_LIMIT_S * 1e6:
         # rejected for its own source alone: any publisher can stamp as it likes
         return count_rejection(state, source, "future"), ()
-    if isinstance(sample, JointsSample):
+    if isinstance(sample, messages.JointsSample):
         return process_joints(state, sample, now)
     if state.localizer is None:
         return state, ()
@@ -78,11 +63,11 @@ def check_host_clock(state: CoreState, now: Instant) -> CoreState:
     set_back = state.host_clock.has_stepped_back(now)
     state = state._replace(host_clock=state.host_clock.update(now, set_back))
     if set_back and state.localizer is not None:
-        state = state._replace(view=replace(state.view, invalid=Invalid.CLOCK_STEPPED))
+        state = state._replace(view=replace(state.view, invalid=messages.Invalid.CLOCK_STEPPED))
     return state
 
 
-def process_joints(state: CoreState, sample: JointsSample, now: Instant) -> StepResult:
+def process_joints(state: CoreState, sample: messages.JointsSample, now: Instant) -> StepResult:
     """Process positions of joints."""
     joints, rejected = state.view.joints.update(sample, now.utime)
     for reason, count in Counter(rejected).items():
@@ -96,7 +81,7 @@ def process_joints(state: CoreState, sample: JointsSample, now: Instant) -> Step
     return state, tuple(replies)
 
 
-def switch_mode(state: CoreState, command: SwitchMode, now: Instant) -> StepResult:
+def switch_mode(state: CoreState, command: messages.SwitchMode, now: Instant) -> StepResult:
     """Switch the localization mode."""
     source = f"command:{command.header.source}"
     state = count_message(state, source, command.header.host_utime, now)
@@ -107,17 +92,19 @@ def switch_mode(state: CoreState, command: SwitchMode, now: Instant) -> StepResu
     return update_localizer(state, state.localizer, command, now)
 
 
-def update_localizer(state: CoreState, before: Localizer, sample: Sample | SwitchMode, now: Instant) -> StepResult:
+def update_localizer(
+    state: CoreState, before: Localizer, sample: messages.Sample | messages.SwitchMode, now: Instant
+) -> StepResult:
     """Update the localizer with a sample or a mode command, and publish what follows from it."""
     localizer, events = before.process(sample)
-    outputs: list[Output] = []
-    decisions: list[Decision] = []
+    outputs: list[messages.Output] = []
+    decisions: list[messages.Decision] = []
     is_rejected = False
     for event in events:
-        if isinstance(event, Rejected):
+        if isinstance(event, messages.Rejected):
             state = count_rejection(state, event.channel, event.reason)
             is_rejected = True
-        elif isinstance(event, PersistOrigin):
+        elif isinstance(event, messages.PersistOrigin):
             outputs.append(event)
         else:
             decisions.append(event)
@@ -125,12 +112,12 @@ def update_localizer(state: CoreState, before: Localizer, sample: Sample | Switc
             if event.kind == WARM_START:
                 state, reports = report_start(state, event, now)
                 outputs.extend(reports)
-            if event.verdict is Verdict.REJECTED:
+            if event.verdict is messages.Verdict.REJECTED:
                 state = count_rejection(state, f"sensor:{event.source}", event.reason or "rejected")
                 # a delayed decision is on an earlier sample
                 is_rejected |= (event.source, event.seq) == (sample.header.source, sample.header.seq)
     if decisions and state.settings.publish_decisions:
-        outputs.append(PublishDecisions(now.utime, tuple(decisions)))
+        outputs.append(messages.PublishDecisions(now.utime, tuple(decisions)))
     if localizer is before:
         return state, tuple(outputs)
     utime = localizer.utime
@@ -142,7 +129,7 @@ def update_localizer(state: CoreState, before: Localizer, sample: Sample | Switc
     invalid = view.invalid
     if invalid and has_estimate and not is_rejected and utime <= now.utime + SAMPLE_FUTURE_LIMIT_S * 1e6:
         # the estimate is of the host's new time of day
-        invalid = VALID
+        invalid = messages.VALID
     view = PlatformView(view.model, view.base_frame, localizer, history, view.rolling_frame, invalid, view.joints)
     state = state._replace(view=view)
     if has_estimate:
@@ -156,14 +143,14 @@ def update_localizer(state: CoreState, before: Localizer, sample: Sample | Switc
     return state, tuple(outputs)
 
 
-def report_start(state: CoreState, decision: Decision, now: Instant) -> StepResult:
+def report_start(state: CoreState, decision: messages.Decision, now: Instant) -> StepResult:
     """Report what became of the persisted state of an earlier run."""
     if now.monotonic_ns - state.started_ns <= START_REPORT_NS:
-        state, _ = handle_warning(state, HealthWarning(START, decision.reason), now)
-    return state, (ReportStart(decision.reason),)
+        state, _ = handle_warning(state, messages.HealthWarning(START, decision.reason), now)
+    return state, (messages.ReportStart(decision.reason),)
 
 
-def publish_pose(state: CoreState, utime: int) -> tuple[CoreState, PublishPose]:
+def publish_pose(state: CoreState, utime: int) -> tuple[CoreState, messages.PublishPose]:
     """Make the poses to publish for an instant."""
     assert state.localizer is not None
     estimate = state.localizer.estimate(utime)
@@ -177,4 +164,4 @@ def publish_pose(state: CoreState, utime: int) -> tuple[CoreState, PublishPose]:
         run_state=run_state,
         pose_invalid=world.transformation.invalid_reasons,
     )
-    return state, PublishPose(world, view.get_published_pose(estimate, names.ODOM))
+    return state, messages.PublishPose(world, view.get_published_pose(estimate, names.ODOM))

@@ -7,27 +7,13 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, Literal, NamedTuple, TypeAlias
 
+from modelserver import messages
 from modelserver.core.host_clock import HostClock, Instant
 from modelserver.errors import NotConnectedError
 from modelserver.estimation.history import History
 from modelserver.estimation.interface import Localizer
 from modelserver.geometry.model import Model
 from modelserver.joints.history import JointHistory
-from modelserver.messages import (
-    NAN,
-    Decision,
-    Gauges,
-    GetExplanation,
-    GetHTransform,
-    GetMotion,
-    GetStateVector,
-    GetTransformation,
-    HealthWarning,
-    Output,
-    Rejected,
-    Sample,
-    Verdict,
-)
 from modelserver.query import PlatformView
 from modelserver.query.answers import DeferredAnswer
 
@@ -55,7 +41,13 @@ UNCOUNTED_KINDS: Final = frozenset(("inertial", "steering", "imu_tilt", "imu_yaw
 CHANGE_PERIOD_NS: Final = 100_000_000
 """Nanoseconds between two evaluations of the health conditions: alternating conditions cannot flood the bus."""
 
-TimedRequest: TypeAlias = GetTransformation | GetStateVector | GetHTransform | GetMotion | GetExplanation
+TimedRequest: TypeAlias = (
+    messages.GetTransformation
+    | messages.GetStateVector
+    | messages.GetHTransform
+    | messages.GetMotion
+    | messages.GetExplanation
+)
 """A request that names a time, and may wait for its data."""
 
 
@@ -104,7 +96,7 @@ class ExpectedSensor(NamedTuple):
     """A configured sensor: its channel, the type of its samples, and its source name if that is configured."""
 
     channel: str
-    kind: type[Sample]
+    kind: type[messages.Sample]
     source: str = ""
 
 
@@ -125,9 +117,9 @@ class SourceTraffic(NamedTuple):
     last_received_ns: int = 0
     reported: int = 0
     interval: float = 0.0
-    delay: float = NAN
+    delay: float = messages.NAN
     rate: float = 0.0
-    reported_delay: float = NAN
+    reported_delay: float = messages.NAN
     measured: int = 0
     used: int = 0
     dropped: int = 0
@@ -156,9 +148,9 @@ class HealthInputs(NamedTuple):
     at `due_ns`; `reported` are those of the last report.
     """
 
-    gauges: Gauges = Gauges()
+    gauges: messages.Gauges = messages.Gauges()
     gauges_ns: int = 0
-    cpu_share: float = NAN
+    cpu_share: float = messages.NAN
     due_ns: int = 0
     reported: HealthConditions = HealthConditions()
 
@@ -208,10 +200,10 @@ class CoreState(NamedTuple):
         return self.view.history
 
 
-Outputs: TypeAlias = tuple[Output, ...]
+Outputs: TypeAlias = tuple[messages.Output, ...]
 StepResult: TypeAlias = tuple[CoreState, Outputs]
 
-AllOutputs: TypeAlias = tuple[Output | DeferredAnswer, ...]
+AllOutputs: TypeAlias = tuple[messages.Output | DeferredAnswer, ...]
 """Outputs of an event, also of a request with a deferred answer."""
 
 
@@ -237,12 +229,12 @@ def check_rigid(model: Model, base_frame: str, rolling_frame: str) -> None:
         )
 
 
-def handle_rejected(state: CoreState, rejected: Rejected, now: Instant) -> StepResult:
+def handle_rejected(state: CoreState, rejected: messages.Rejected, now: Instant) -> StepResult:
     """Count a rejected message."""
     return count_rejection(state, rejected.channel, rejected.reason, rejected.count), ()
 
 
-def handle_warning(state: CoreState, warning: HealthWarning, now: Instant) -> StepResult:
+def handle_warning(state: CoreState, warning: messages.HealthWarning, now: Instant) -> StepResult:
     """Set or clear a warning; a health report follows within `CHANGE_PERIOD_NS`."""
     known = state.warnings.get(warning.subject, "")
     if known == warning.text or (not known and len(state.warnings) >= MAX_COUNTERS):
@@ -283,16 +275,16 @@ def count_message(state: CoreState, source: str, host_utime: int, now: Instant) 
     return state._replace(traffic={**state.traffic, source: updated})
 
 
-def count_decision(state: CoreState, decision: Decision) -> CoreState:
+def count_decision(state: CoreState, decision: messages.Decision) -> CoreState:
     """Count a decision of localization on a measurement for its source."""
     source = f"sensor:{decision.source}"
     known = state.traffic.get(source)
     if known is None or decision.kind in UNCOUNTED_KINDS:
         return state
-    is_rejected = decision.verdict is Verdict.REJECTED
+    is_rejected = decision.verdict is messages.Verdict.REJECTED
     updated = known._replace(
         measured=known.measured + 1,
-        used=known.used + (decision.verdict in (Verdict.USED, Verdict.RESET)),
+        used=known.used + (decision.verdict in (messages.Verdict.USED, messages.Verdict.RESET)),
         dropped=known.dropped + 1 if is_rejected else 0,
         reason=decision.reason if is_rejected else "",
     )
@@ -304,7 +296,7 @@ def get_silence_limit(interval: float) -> float:
     return max(MIN_SILENCE_S, SILENT_INTERVALS * interval)
 
 
-def mark_received(state: CoreState, sample: Sample) -> CoreState:
+def mark_received(state: CoreState, sample: messages.Sample) -> CoreState:
     """Remove the sensors that a sample may be from from the missing ones."""
     kind, source = type(sample), sample.header.source
     missing = tuple(

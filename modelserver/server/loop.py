@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from modelserver import core
+from modelserver import core, messages
 from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.core import AllOutputs, CoreState, Instant
 from modelserver.core.commands import ModelLoaded
@@ -28,27 +28,6 @@ from modelserver.core.publisher_conflict import PublisherConflictDetector
 from modelserver.errors import WireError
 from modelserver.geometry import names
 from modelserver.geometry.model import Model
-from modelserver.messages import (
-    Event,
-    Gauges,
-    HealthWarning,
-    LoadModel,
-    PersistedState,
-    PersistOrigin,
-    PersistState,
-    PublishDecisions,
-    PublishHealth,
-    PublishNavigation,
-    PublishPose,
-    PublishSnapshot,
-    Rejected,
-    ReportStart,
-    SendReply,
-    SignedCommand,
-    SnapshotPart,
-    SwitchMode,
-    Tick,
-)
 from modelserver.query.answers import DeferredAnswer
 from modelserver.server.bus import Bus
 from modelserver.server.clock import Clock
@@ -84,7 +63,7 @@ FLOOD_PAUSE_S = 0.002
 """How long requests wait for the next pass at most, seconds, in a flood or without time for them."""
 
 
-def _report_no_file(command: LoadModel, state: CoreState) -> ModelLoaded:
+def _report_no_file(command: messages.LoadModel, state: CoreState) -> ModelLoaded:
     return ModelLoaded(command.request, why="this server has no geometry file to read")
 
 
@@ -107,13 +86,13 @@ class Hooks:
     journal: records everything that is handled and published; one that nothing begins records nothing.
     """
 
-    on_origin: Callable[[PersistOrigin], None] = lambda origin: None
-    on_mode_switch: Callable[[SwitchMode, CoreState, CoreState], None] = lambda command, before, after: None
-    on_load: Callable[[LoadModel, CoreState], ModelLoaded] = _report_no_file
+    on_origin: Callable[[messages.PersistOrigin], None] = lambda origin: None
+    on_mode_switch: Callable[[messages.SwitchMode, CoreState, CoreState], None] = lambda command, before, after: None
+    on_load: Callable[[messages.LoadModel, CoreState], ModelLoaded] = _report_no_file
     snapshot: Callable[[CoreState], bytes] = lambda state: b""
     channels: Callable[[CoreState], Mapping[str, SensorChannel]] = lambda state: {}
-    on_persist: Callable[[PersistedState], str] = lambda state: ""
-    gauges: Callable[[int], Gauges | None] = lambda waiting: None
+    on_persist: Callable[[messages.PersistedState], str] = lambda state: ""
+    gauges: Callable[[int], messages.Gauges | None] = lambda waiting: None
     run_delay: Callable[[], int | None] = lambda: None
     on_tick: Callable[[CoreState], None] = lambda state: None
     verifier: CommandVerifier | None = None
@@ -129,9 +108,9 @@ class SnapshotEncoder:
     def __init__(self, encode_snapshot: Callable[[CoreState], bytes]):
         self._encode_snapshot = encode_snapshot
         self._model: Model | None = None
-        self._parts: list[SnapshotPart] = []
+        self._parts: list[messages.SnapshotPart] = []
 
-    def encode_parts(self, state: CoreState, utime: int) -> list[SnapshotPart]:
+    def encode_parts(self, state: CoreState, utime: int) -> list[messages.SnapshotPart]:
         """Return the messages to publish at `utime`."""
         if self._model is not state.model:
             self._parts = split_snapshot(self._encode_snapshot(state), state.model.revision, utime)
@@ -210,7 +189,7 @@ class Loop:
 
     def set_warning(self, subject: str, text: str = "") -> None:
         """Set a warning of the health report; an empty text clears it."""
-        self.step(HealthWarning(subject, text), self._clock.now())
+        self.step(messages.HealthWarning(subject, text), self._clock.now())
 
     def run_once(self) -> None:
         """Make one pass: samples, the tick if it is due, a slice of request work, then wait."""
@@ -220,7 +199,7 @@ class Loop:
             self._journal.begin(self.state, self._clock.now())
         if self._reload_requested:
             self._reload_requested = False
-            self.send((LoadModel(),))
+            self.send((messages.LoadModel(),))
         has_backlog = self._drain_sensors()
         if has_backlog and self._has_backlog:
             requests.contention.add_sensor_backlog(self._clock.monotonic_ns())
@@ -262,7 +241,7 @@ class Loop:
         try:
             try:
                 gauges = self._hooks.gauges(self._requests.waiting) if is_report_due else None
-                self.step(Tick(latency_ns * 1e-9, missed, self._requests.pop_answered(), gauges), now)
+                self.step(messages.Tick(latency_ns * 1e-9, missed, self._requests.pop_answered(), gauges), now)
                 self._hooks.on_tick(self.state)
             finally:
                 self._timer.finish_tick()
@@ -271,11 +250,11 @@ class Loop:
         for warning in self._journal.poll_warnings():
             self.step(warning, self._clock.now())
 
-    def execute(self, command: SignedCommand, now: Instant) -> None:
+    def execute(self, command: messages.SignedCommand, now: Instant) -> None:
         """Execute a command whose signature is verified."""
         before = self.state
         self.step(command, now)
-        if isinstance(command.command, SwitchMode):
+        if isinstance(command.command, messages.SwitchMode):
             self._hooks.on_mode_switch(command.command, before, self.state)
 
     def _subscribe(self, channels: Mapping[str, SensorChannel]) -> None:
@@ -298,7 +277,7 @@ class Loop:
                     self._rejections.drop(RecordKind.DROPPED, channel, PUBLISHER_CONFLICT, data, now)
                     return
                 event = sensor.decode(data)
-                if isinstance(event, SwitchMode):
+                if isinstance(event, messages.SwitchMode):
                     self._handle_mode_command(channel, event, now)
                 else:
                     self.step(event, now, (channel, data))
@@ -307,10 +286,10 @@ class Loop:
 
         return handle
 
-    def _handle_mode_command(self, channel: str, command: SwitchMode, now: Instant) -> None:
+    def _handle_mode_command(self, channel: str, command: messages.SwitchMode, now: Instant) -> None:
         """Execute an unsigned mode command if no signature is required; else reject it."""
         if self._hooks.verifier is None:
-            self.execute(SignedCommand(command), now)
+            self.execute(messages.SignedCommand(command), now)
             return
         self._rejections.count(channel, "unsigned", now)
         self._logged.add((channel, "unsigned"))
@@ -329,15 +308,17 @@ class Loop:
             self._log.warning(f"{channel}:{reason}", "rejected a message on %s: %s", channel, error)
         elif isinstance(error, OSError) and error.errno in NETWORK_ERRORS:
             reason = "network"
-            self.step(Rejected(channel, reason), now)
+            self.step(messages.Rejected(channel, reason), now)
             self._log.warning(f"{channel}:{reason}", "%s could not be sent: %s", channel, error)
         else:
             reason = "handler"
-            self.step(Rejected(channel, reason), now)
+            self.step(messages.Rejected(channel, reason), now)
             self._log.exception(f"{channel}:{reason}", "internal error while handling %s", channel)
         self._logged.add((channel, reason))
 
-    def step(self, event: Event | ModelLoaded, now: Instant, received: tuple[str, bytes] | None = None) -> None:
+    def step(
+        self, event: messages.Event | ModelLoaded, now: Instant, received: tuple[str, bytes] | None = None
+    ) -> None:
         """Pass an event to the core and send its outputs; `received` is the message that it was decoded from."""
         self._journal.record_event(event, now, received)
         self.state, outputs = core.step(self.state, event, now)
@@ -360,24 +341,24 @@ class Loop:
             except Exception as error:
                 self.handle_error(type(output).__name__, error)
 
-    def _send_reply(self, output: SendReply) -> None:
+    def _send_reply(self, output: messages.SendReply) -> None:
         encoded = encode(output.reply)
         self.publish(output.channel, encoded)
         self._requests.cache(output, encoded)
 
-    def _send_pose(self, output: PublishPose) -> None:
+    def _send_pose(self, output: messages.PublishPose) -> None:
         world, vector, odom = encode(output.world), encode(output.world, "pose_vector_t"), encode(output.odom)
         self._timer.wait_to_publish()
         self.publish(self._pose, world)
         self.publish(self._pose_vector, vector)
         self.publish(self._odom, odom)
 
-    def _send_decisions(self, output: PublishDecisions) -> None:
+    def _send_decisions(self, output: messages.PublishDecisions) -> None:
         for start in range(0, len(output.decisions), MAX_DECISIONS):
             part = output.decisions[start : start + MAX_DECISIONS]
-            self.publish(self._decisions, encode(PublishDecisions(output.utime, part)))
+            self.publish(self._decisions, encode(messages.PublishDecisions(output.utime, part)))
 
-    def _send_health(self, output: PublishHealth) -> None:
+    def _send_health(self, output: messages.PublishHealth) -> None:
         self.publish(self._health, encode(output.health))
         for source, reason, count in output.health.rejected:
             if (source, reason) not in self._logged:
@@ -390,7 +371,7 @@ class Loop:
                     self._health,
                 )
 
-    def _load(self, output: LoadModel) -> None:
+    def _load(self, output: messages.LoadModel) -> None:
         before = self.state.model.revision
         loaded = self._hooks.on_load(output, self.state)
         self.step(loaded, self._clock.now())
@@ -402,13 +383,13 @@ class Loop:
             self._subscribe(self._hooks.channels(self.state))
             log.info("the geometry was reloaded: revision %s, before %s", loaded.model.revision, before)
 
-    def _send_snapshot(self, output: PublishSnapshot) -> None:
+    def _send_snapshot(self, output: messages.PublishSnapshot) -> None:
         for part in self._snapshot.encode_parts(self.state, output.utime):
             self.publish(self._model, encode(part))
         for held in self.state.view.joints.get_newest_samples(output.utime):
             self.publish(self._held, encode(held))
 
-    def _send_origin(self, output: PersistOrigin) -> None:
+    def _send_origin(self, output: messages.PersistOrigin) -> None:
         origin = output.origin
         log.info(
             "origin of %s set at %.3f E %.3f N %.3f m, zone %d%s",
@@ -419,20 +400,20 @@ class Loop:
         )
         self._hooks.on_origin(output)
 
-    def _persist(self, output: PersistState) -> None:
-        self.step(HealthWarning("restart", self._hooks.on_persist(output.state)), self._clock.now())
+    def _persist(self, output: messages.PersistState) -> None:
+        self.step(messages.HealthWarning("restart", self._hooks.on_persist(output.state)), self._clock.now())
 
 
 _SENDERS: Mapping[type, Callable[[Loop, Any], None]] = {
-    SendReply: Loop._send_reply,
+    messages.SendReply: Loop._send_reply,
     DeferredAnswer: lambda loop, output: loop._requests.defer(output),
-    PublishPose: Loop._send_pose,
-    PublishHealth: Loop._send_health,
-    PersistOrigin: Loop._send_origin,
-    PublishDecisions: Loop._send_decisions,
-    PublishNavigation: lambda loop, output: loop.publish(loop._state, encode(output.state)),
-    LoadModel: Loop._load,
-    PublishSnapshot: Loop._send_snapshot,
-    PersistState: Loop._persist,
-    ReportStart: lambda loop, output: log.info("%s", output.text),
+    messages.PublishPose: Loop._send_pose,
+    messages.PublishHealth: Loop._send_health,
+    messages.PersistOrigin: Loop._send_origin,
+    messages.PublishDecisions: Loop._send_decisions,
+    messages.PublishNavigation: lambda loop, output: loop.publish(loop._state, encode(output.state)),
+    messages.LoadModel: Loop._load,
+    messages.PublishSnapshot: Loop._send_snapshot,
+    messages.PersistState: Loop._persist,
+    messages.ReportStart: lambda loop, output: log.info("%s", output.text),
 }

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from modelserver import core
+from modelserver import core, messages
 from modelserver.config.vehicle_file import KEY_HINT, VehicleConfig, add_lines
 from modelserver.core import CoreSettings, CoreState, ExpectedSensor, Instant
 from modelserver.core.commands import ModelLoaded
@@ -34,21 +34,6 @@ from modelserver.formats import FileExamination, examine_file
 from modelserver.formats.snapshot import ModelSnapshot, encode_snapshot
 from modelserver.geometry import Model
 from modelserver.geometry.parts import suggest_frame
-from modelserver.messages import (
-    AbsolutePoseSample,
-    GpsSample,
-    ImuSample,
-    JointsSample,
-    LoadModel,
-    Origin,
-    RangeSample,
-    RelativePoseSample,
-    RestoredState,
-    Sample,
-    SensorFinding,
-    VehicleStatusSample,
-    WheelsSample,
-)
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.requests.signed_commands import MODE_TYPE, CommandVerifier
 from modelserver.signing.key_files import read_keys
@@ -67,10 +52,10 @@ HOUSEKEEPING_HZ = 50.0
 MODE_CHANNEL = "LOCALIZATION_MODE"
 """Default channel of mode commands."""
 
-AIDING_SAMPLES: Mapping[str, type[Sample]] = {
-    "absolute_pose": AbsolutePoseSample,
-    "relative_pose": RelativePoseSample,
-    "range": RangeSample,
+AIDING_SAMPLES: Mapping[str, type[messages.Sample]] = {
+    "absolute_pose": messages.AbsolutePoseSample,
+    "relative_pose": messages.RelativePoseSample,
+    "range": messages.RangeSample,
 }
 """Samples of aiding sources, by their type in the vehicle file."""
 
@@ -88,7 +73,7 @@ class Vehicle:
     rig: SensorRig | None = None
 
     def start_core(
-        self, now: Instant, origin: Origin | None = None, restored: RestoredState | None = None
+        self, now: Instant, origin: messages.Origin | None = None, restored: messages.RestoredState | None = None
     ) -> CoreState:
         """Make the first state of the core.
 
@@ -142,7 +127,7 @@ class Vehicle:
             Setup(self.rig, self.config.localization.filter), self.config.localization.raw, self.mounts
         )
 
-    def find_unusable_sensors(self) -> tuple[SensorFinding, ...]:
+    def find_unusable_sensors(self) -> tuple[messages.SensorFinding, ...]:
         """Find the configured sensors that localization cannot use in its initial mode, with the reasons."""
         return () if self.rig is None else find_unusable(self.rig, self.config.localization.initial_mode)
 
@@ -176,7 +161,7 @@ class Vehicle:
             )
         )
 
-    def reload_model(self, command: LoadModel, state: CoreState, file: str = "") -> ModelLoaded:
+    def reload_model(self, command: messages.LoadModel, state: CoreState, file: str = "") -> ModelLoaded:
         """Read the geometry file again, and check all of it against the vehicle file."""
         try:
             vehicle = load_vehicle(self.config, file)
@@ -228,7 +213,7 @@ class Vehicle:
         channels = {
             each.channel: SensorChannel(get_type_name(each.sample), each.latency_us)
             for each in _list_sensors(self.config)
-            if has_joints or each.sample is not JointsSample
+            if has_joints or each.sample is not messages.JointsSample
         }
         if self.config.localization.mode_channel:
             name = f"{self.config.lcm.channel_prefix}{self.config.localization.mode_channel}"
@@ -242,18 +227,18 @@ class _ConfiguredSensor(NamedTuple):
     key: str
     channel: str
     latency_us: int
-    sample: type[Sample]
+    sample: type[messages.Sample]
     source: str = ""
 
 
 def _list_sensors(config: VehicleConfig) -> list[_ConfiguredSensor]:
     prefix, sensors = config.lcm.channel_prefix, config.sensors
-    listed: list[tuple[str, Any, type[Sample], str]] = [
-        ("gps", sensors.gps, GpsSample, ""),
-        ("imu", sensors.imu, ImuSample, ""),
-        ("wheels", sensors.wheels, WheelsSample, ""),
-        ("wheels.steering", sensors.steering, VehicleStatusSample, ""),
-        ("joints", sensors.joints, JointsSample, ""),
+    listed: list[tuple[str, Any, type[messages.Sample], str]] = [
+        ("gps", sensors.gps, messages.GpsSample, ""),
+        ("imu", sensors.imu, messages.ImuSample, ""),
+        ("wheels", sensors.wheels, messages.WheelsSample, ""),
+        ("wheels.steering", sensors.steering, messages.VehicleStatusSample, ""),
+        ("joints", sensors.joints, messages.JointsSample, ""),
         *((f"aiding.{name}", each, AIDING_SAMPLES[each.type], name) for name, each in sensors.aiding.items()),
     ]
     return [
@@ -416,7 +401,7 @@ def _find_channel_problems(config: VehicleConfig, file: str) -> list[Problem]:
     return problems
 
 
-def get_configured_origin(config: VehicleConfig) -> Origin | None:
+def get_configured_origin(config: VehicleConfig) -> messages.Origin | None:
     """Return the configured origin; None if it is to be captured."""
     origin = config.origin
     if origin.initial_utm is None or origin.zone is None:

@@ -8,18 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Container, Mapping
 
-from modelserver import core
+from modelserver import core, messages
 from modelserver.core import AllOutputs, Instant
 from modelserver.errors import RecordingError, Status, WireError
-from modelserver.messages import (
-    PublishDecisions,
-    PublishHealth,
-    PublishNavigation,
-    PublishPose,
-    PublishSnapshot,
-    Request,
-    SendReply,
-)
 from modelserver.query.answers import DeferredAnswer
 from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus
@@ -35,13 +26,13 @@ from modelserver.wire.journal import JournalRecord, RecordKind
 PublishedMessage = tuple[str, bytes]
 
 PUBLISHING_OUTPUTS = (
-    SendReply,
+    messages.SendReply,
     DeferredAnswer,
-    PublishPose,
-    PublishHealth,
-    PublishDecisions,
-    PublishNavigation,
-    PublishSnapshot,
+    messages.PublishPose,
+    messages.PublishHealth,
+    messages.PublishDecisions,
+    messages.PublishNavigation,
+    messages.PublishSnapshot,
 )
 
 
@@ -94,7 +85,7 @@ class ReplayLoop(Loop):
         if channel is None:
             raise RecordingError(f"{record.channel} is no request channel")
         try:
-            request: Request = decode(channel.type_name, record.data)
+            request: messages.Request = decode(channel.type_name, record.data)
         except WireError as error:
             header = read_request_header(record.data)
             if record.kind is RecordKind.MALFORMED and header is not None:

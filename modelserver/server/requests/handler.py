@@ -22,26 +22,11 @@ from contextlib import suppress
 from itertools import islice, product
 from typing import Final, Protocol
 
-from modelserver import core
+from modelserver import core, messages
 from modelserver.config.vehicle_file import LimitsConfig
 from modelserver.core import CoreState, Instant
 from modelserver.errors import QueryError, Status, WireError
 from modelserver.geometry import names
-from modelserver.messages import (
-    CHANNEL_OF,
-    Event,
-    GetTransformation,
-    HealthWarning,
-    Output,
-    Rejected,
-    Request,
-    RequestHeader,
-    SendReply,
-    SignedCommand,
-    SwitchMode,
-    TimeQuery,
-    is_answerable,
-)
 from modelserver.query.answers import DeferredAnswer, compute_replies, effort_of, is_deferred
 from modelserver.server.bus import Bus
 from modelserver.server.clock import Clock
@@ -95,7 +80,7 @@ class RequestContext(Protocol):
 
     state: CoreState
 
-    def step(self, event: Event, now: Instant, received: tuple[str, bytes] | None = None) -> None:
+    def step(self, event: messages.Event, now: Instant, received: tuple[str, bytes] | None = None) -> None:
         """Pass an event to the core and send its outputs; `received` is the message that it was decoded from."""
         ...
 
@@ -103,7 +88,7 @@ class RequestContext(Protocol):
         """Publish a message."""
         ...
 
-    def send(self, outputs: tuple[Output, ...]) -> None:
+    def send(self, outputs: tuple[messages.Output, ...]) -> None:
         """Send outputs of the core."""
         ...
 
@@ -111,7 +96,7 @@ class RequestContext(Protocol):
         """Count and log an error while handling a message."""
         ...
 
-    def execute(self, command: SignedCommand, now: Instant) -> None:
+    def execute(self, command: messages.SignedCommand, now: Instant) -> None:
         """Execute a signed command."""
         ...
 
@@ -213,7 +198,7 @@ class RequestHandler:
         report = scheduler.report(now)
         if report is not None and report != self._report:
             self._report = report
-            self._context.step(HealthWarning("requests", report), clock.now())
+            self._context.step(messages.HealthWarning("requests", report), clock.now())
 
     def prepare(self, until_ns: int) -> bool:
         """Compute some static replies ahead of time, before `until_ns`; return whether there are more.
@@ -238,14 +223,14 @@ class RequestHandler:
             with suppress(QueryError):
                 if view.model.rigid_transformation(*pair) is None:
                     continue
-                request = GetTransformation(RequestHeader(0, ""), *pair, TimeQuery())
+                request = messages.GetTransformation(messages.RequestHeader(0, ""), *pair, messages.TimeQuery())
                 for reply in compute_replies(view, request, now.utime):
                     self._cache.add(encode(request), b"", reply, encode(reply))
             if self._clock.monotonic_ns() - now.monotonic_ns >= PREPARE_NS:
                 break
         return True
 
-    def cache(self, output: SendReply, encoded: bytes) -> None:
+    def cache(self, output: messages.SendReply, encoded: bytes) -> None:
         """Cache a reply that has just been sent, if it answers the current request and does not depend on time."""
         current = self._current
         if current is not None and current.type_name == CACHED_TYPE and current.client:
@@ -325,7 +310,7 @@ class RequestHandler:
         dropped, self._dropped = self._dropped, {}
         now = self._clock.now()
         for channel, count in dropped.items():
-            self._context.step(Rejected(channel, "overload", count), now)
+            self._context.step(messages.Rejected(channel, "overload", count), now)
 
     def _work_deferred(self, now_ns: int, end_ns: int, due_ns: int, may_defer: bool) -> bool:
         """Work on the deferred reply, or begin the next one; return whether the work can continue at once."""
@@ -394,7 +379,7 @@ class RequestHandler:
             self._scheduler.charge(client, effort - 1.0, self._clock.monotonic_ns())
         self._handle(queued, request)
 
-    def _handle(self, queued: QueuedRequest, request: Request) -> None:
+    def _handle(self, queued: QueuedRequest, request: messages.Request) -> None:
         """Pass a request to the core."""
         self._current = queued
         try:
@@ -410,8 +395,8 @@ class RequestHandler:
         reply = self._model_cache().find(data, client, now.utime)
         if reply is None:
             return False
-        header = RequestHeader(0, client.decode("utf-8", "replace"))
-        if not is_answerable(header, context.state.settings.reply_prefix):
+        header = messages.RequestHeader(0, client.decode("utf-8", "replace"))
+        if not messages.is_answerable(header, context.state.settings.reply_prefix):
             return False
         self._journal.record_message(RecordKind.CACHED, (channel, data), now)
         context.publish(header.reply_channel, reply)
@@ -427,7 +412,7 @@ class RequestHandler:
             self._unprepared = islice(product(frames, frames), MAX_ENTRIES)
         return self._cache
 
-    def _fail(self, queued: QueuedRequest, request: Request, error: Exception) -> None:
+    def _fail(self, queued: QueuedRequest, request: messages.Request, error: Exception) -> None:
         """Reply to a request whose handling failed."""
         context, now = self._context, self._clock.now()
         context.handle_error(queued.channel, error)
@@ -440,14 +425,14 @@ class RequestHandler:
             return
         now = self._clock.now()
         result = self._verifier.verify(data, now)
-        if isinstance(result, SignedCommand):
+        if isinstance(result, messages.SignedCommand):
             log.info("%s, signed by %s", type(result.command).__name__, escape_text(result.sender))
             try:
                 self._context.execute(result, now)
             except Exception as error:
                 self._context.handle_error(channel, error)
-                if not isinstance(result.command, SwitchMode):
-                    own = f"{self._prefix}{CHANNEL_OF[type(result.command)]}"
+                if not isinstance(result.command, messages.SwitchMode):
+                    own = f"{self._prefix}{messages.CHANNEL_OF[type(result.command)]}"
                     self._journal.record_message(RecordKind.FAILED, (own, encode(result.command)), now)
                     self._context.send(core.reply_internal_error(self._context.state, result.command, now))
             return
@@ -467,5 +452,7 @@ def client_of(data: bytes) -> bytes:
     return data[20:end] if 20 < end <= 83 and end < len(data) and data[20] > 0x20 else b""
 
 
-REQUEST_TYPES: Mapping[str, type[Request]] = {BY_NAME[channel].type_name: kind for kind, channel in CHANNEL_OF.items()}
+REQUEST_TYPES: Mapping[str, type[messages.Request]] = {
+    BY_NAME[channel].type_name: kind for kind, channel in messages.CHANNEL_OF.items()
+}
 """Request class of each wire type."""
