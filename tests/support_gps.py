@@ -11,6 +11,7 @@ from modelserver.messages import FixType, GpsSample, SensorHeader
 from msdrivers.devices.gps import GpsDriver
 from msdrivers.emulate.gps import GpsEmulator
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
+from msdrivers.fault_injection import FaultInjector
 
 START = 1_700_000_000_000_000
 SECOND = 1_000_000
@@ -55,7 +56,7 @@ class Line:
     """
 
     driver: GpsDriver
-    device: GpsEmulator
+    device: GpsEmulator | FaultInjector[bytes]
     to_host: Callable[[bytes], Sequence[bytes]] = lambda data: [data]
     utime: int = START
     is_broken: bool = False

@@ -1,20 +1,22 @@
 """Emulator of a satellite receiver: sends logs and sentences of a series of samples.
 
 It takes the commands of a NovAtel OEM4 that a driver needs (`log`, `unlog`, `unlogall`, and some without effect here),
-answers and prompts as it does, and forgets what was asked for when it restarts. With `answers` off and `saved` logs it
-is a plain NMEA receiver.
+and answers and prompts as it does. With `is_answering` off and `saved` logs it is a plain NMEA receiver.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from modelserver.messages import GpsSample
 from msdrivers.emulate import gps_logs
-from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Send
+from msdrivers.endpoint import HostTime, Output, Send
 
+_PORT = "COM1"
+_PROMPT = f"[{_PORT}]".encode()
 _MAX_COMMAND_BYTES = 200
 _NO_EFFECT_COMMANDS = frozenset({"fix", "com", "datum", "saveconfig", "undulationauto", "ecutoff", "dgpstimeout"})
 """Commands that are accepted and change nothing here."""
@@ -22,19 +24,15 @@ _NO_EFFECT_COMMANDS = frozenset({"fix", "com", "datum", "saveconfig", "undulatio
 
 @dataclass(frozen=True, slots=True)
 class GpsUnit:
-    """Configuration of the receiver. Seconds; `shift`: microseconds added to the samples' stamps to get host time.
+    """Configuration of the receiver.
 
     saved: lines of its saved configuration, e.g. "log com1 gpgga ontime 0.25", carried out when it starts.
-    latency: from the instant of a sample to the first byte of its logs. boot: from a restart to the prompt.
-    answers: whether it listens at all.
+    latency: from the instant of a sample to the first byte of its logs, seconds. is_answering: whether it listens.
     """
 
-    port: str = "COM1"
     saved: tuple[str, ...] = ()
     latency: float = 0.02
-    boot_time: float = 2.0
     is_answering: bool = True
-    shift: int = 0
 
 
 @dataclass(slots=True)
@@ -55,14 +53,11 @@ class GpsEmulator:
         self._logs: dict[str, _LogRequest] = {}
         self._line = bytearray()
         self._now: HostTime | None = None
-        self._boot_done_ns: int | None = None
-        self._counts: Counter[str] = Counter()
-        self._run_saved_commands()
-
-    @property
-    def counts(self) -> Mapping[str, int]:
-        """Commands accepted and rejected, logs by name, restarts."""
-        return dict(self._counts)
+        self.counts: Counter[str] = Counter()
+        """Commands accepted and rejected, logs by name."""
+        for line in self._unit.saved:
+            if error := self._execute(line):
+                raise ValueError(f"saved configuration, '{line}': {error}")
 
     @property
     def logs(self) -> tuple[str, ...]:
@@ -74,21 +69,12 @@ class GpsEmulator:
         first = self._now is None
         self._now = now
         self._line.clear()
-        return self._make_prompt() if first else []
-
-    def restart(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Lose power and start again: silent for `boot`, then the prompt, and only what is saved is on."""
-        self._now = now
-        self._counts["restarts"] += 1
-        self._boot_done_ns = now.monotonic_ns + round(self._unit.boot_time * 1e9)
-        self._logs.clear()
-        self._line.clear()
-        return [EndpointStatus(EndpointPhase.SILENT, "the emulated receiver restarts")]
+        return [Send(b"\r\n" + _PROMPT)] if first and self._unit.is_answering else []
 
     def on_receive(self, unit: bytes, now: HostTime) -> Sequence[Output[bytes]]:
         """Process commands: lines that end with CR or LF."""
         self._now = now
-        if not self._unit.is_answering or self._boot_done_ns is not None:
+        if not self._unit.is_answering:
             return []
         out: list[Output[bytes]] = []
         for byte in unit:
@@ -100,73 +86,52 @@ class GpsEmulator:
             self._line.clear()
             if line:
                 error = self._execute(line)
-                self._counts["rejected" if error else "accepted"] += 1
+                self.counts["rejected" if error else "accepted"] += 1
                 answer = f"<ERROR:{error}" if error else "<OK"
-                out.append(Send(f"\r\n{answer}\r\n{self._prompt}".encode("ascii")))
+                out.append(Send(f"\r\n{answer}\r\n".encode("ascii") + _PROMPT))
         return out
 
     def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
-        """Finish a restart that is due; send the logs of the samples up to now."""
+        """Send the logs of the samples up to now."""
         self._now = now
         out: list[Output[bytes]] = []
-        if self._boot_done_ns is not None and now.monotonic_ns >= self._boot_done_ns:
-            self._boot_done_ns = None
-            self._run_saved_commands()
-            out += self._make_prompt()
         while self._next is not None and self._get_send_utime(self._next) <= now.utime:
-            if self._boot_done_ns is None:
-                logs = self._make_logs(self._next)
-                if logs:
-                    out.append(Send(logs))
+            logs = self._make_logs(self._next)
+            if logs:
+                out.append(Send(logs))
             self._next = next(self._samples, None)
         return out
 
     def get_deadline(self) -> int | None:
-        """Return when the next sample is due, or the restart is complete."""
-        if self._now is None:
+        """Return when the next sample is due."""
+        if self._now is None or self._next is None:
             return None
-        times = [] if self._boot_done_ns is None else [self._boot_done_ns]
-        if self._next is not None:
-            times.append(self._now.monotonic_ns + (self._get_send_utime(self._next) - self._now.utime) * 1000)
-        return min(times, default=None)
+        return self._now.monotonic_ns + (self._get_send_utime(self._next) - self._now.utime) * 1000
 
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
         """Send nothing."""
         return []
 
-    @property
-    def _prompt(self) -> str:
-        return f"[{self._unit.port}]"
-
-    def _make_prompt(self) -> list[Output[bytes]]:
-        return [Send(f"\r\n{self._prompt}".encode("ascii"))] if self._unit.is_answering else []
-
     def _get_send_utime(self, sample: GpsSample) -> int:
-        return sample.header.utime + self._unit.shift + round(self._unit.latency * 1e6)
+        return sample.header.utime + round(self._unit.latency * 1e6)
 
     def _make_logs(self, sample: GpsSample) -> bytes:
-        utime = sample.header.utime + self._unit.shift
+        utime = sample.header.utime
         logs = b""
         for name, wanted in self._logs.items():
             # half a millisecond of grace: stamps are rounded
             if wanted.last is not None and utime - wanted.last < wanted.period - 500:
                 continue
             wanted.last = utime
-            logs += gps_logs.encode_sample(name, sample, utime, self._unit.port)
-            self._counts[name] += 1
+            logs += gps_logs.encode_sample(name, sample, utime, _PORT)
+            self.counts[name] += 1
         return logs
-
-    def _run_saved_commands(self) -> None:
-        for line in self._unit.saved:
-            error = self._execute(line)
-            if error:
-                raise ValueError(f"saved configuration, '{line}': {error}")
 
     def _execute(self, line: str) -> str:
         """Carry a command out. Return what is wrong with it; empty if nothing is."""
         words = line.lower().split()
         command, fields = words[0], words[1:]
-        if fields and command in ("log", "unlog", "unlogall") and self._is_port(fields[0]):
+        if fields and command in ("log", "unlog", "unlogall") and fields[0] in ("thisport", _PORT.lower()):
             fields = fields[1:]
         if command == "unlogall":
             self._logs.clear()
@@ -184,19 +149,13 @@ class GpsEmulator:
 
     def _execute_log(self, fields: Sequence[str]) -> str:
         trigger = fields[1] if len(fields) > 1 else "onchanged"
-        if trigger in ("onnew", "onchanged"):
-            self._logs[fields[0]] = _LogRequest(0)
-            return ""
-        if trigger != "ontime" or len(fields) < 3:
+        period = 0.0
+        if trigger == "ontime" and len(fields) > 2:
+            with suppress(ValueError):
+                period = float(fields[2])
+            if not 0.05 <= period <= 86_400.0:
+                return "Invalid period"
+        elif trigger not in ("onnew", "onchanged"):
             return "Invalid trigger"
-        try:
-            period = float(fields[2])
-        except ValueError:
-            period = 0.0
-        if not 0.05 <= period <= 86_400.0:
-            return "Invalid period"
         self._logs[fields[0]] = _LogRequest(round(period * 1e6))
         return ""
-
-    def _is_port(self, word: str) -> bool:
-        return word in ("thisport", self._unit.port.lower())

@@ -23,32 +23,16 @@ from msdrivers.protocol.novatel import (
 )
 from msdrivers.protocol.novatel.logs import Body
 
-_TYPES = {
-    FixType.FIX_2D: PositionType.FIXEDHEIGHT,
-    FixType.FIX_3D: PositionType.SINGLE,
-    FixType.DIFFERENTIAL: PositionType.PSRDIFF,
-    FixType.RTK_FLOAT: PositionType.NARROW_FLOAT,
-    FixType.RTK_FIXED: PositionType.NARROW_INT,
-    FixType.DEAD_RECKONING: PositionType.PROPAGATED,
+_FIXES = {
+    FixType.NONE: (PositionType.NONE, "0", "N"),
+    FixType.FIX_2D: (PositionType.FIXEDHEIGHT, "1", "A"),
+    FixType.FIX_3D: (PositionType.SINGLE, "1", "A"),
+    FixType.DIFFERENTIAL: (PositionType.PSRDIFF, "2", "D"),
+    FixType.RTK_FLOAT: (PositionType.NARROW_FLOAT, "5", "F"),
+    FixType.RTK_FIXED: (PositionType.NARROW_INT, "4", "R"),
+    FixType.DEAD_RECKONING: (PositionType.PROPAGATED, "6", "E"),
 }
-_QUALITY = {
-    FixType.NONE: "0",
-    FixType.FIX_2D: "1",
-    FixType.FIX_3D: "1",
-    FixType.DIFFERENTIAL: "2",
-    FixType.RTK_FLOAT: "5",
-    FixType.RTK_FIXED: "4",
-    FixType.DEAD_RECKONING: "6",
-}
-_MODE = {
-    FixType.NONE: "N",
-    FixType.FIX_2D: "A",
-    FixType.FIX_3D: "A",
-    FixType.DIFFERENTIAL: "D",
-    FixType.RTK_FLOAT: "F",
-    FixType.RTK_FIXED: "R",
-    FixType.DEAD_RECKONING: "E",
-}
+"""Position type, quality in GGA, mode in RMC and VTG."""
 _WGS84 = 61
 
 
@@ -62,9 +46,8 @@ def encode_sample(name: str, sample: GpsSample, utime: int, port: str = "COM1") 
     if name in NMEA:
         return NMEA[name](sample, utime)
     week, microseconds = gps_time.gps_of(utime)
-    log_name = name[:-1].upper()
-    binary = name[-1] == "b"
-    header = LogHeader(log_name, week, microseconds // 1000, TimeStatus.FINESTEERING, port, 0, 0, binary)
+    status, binary = TimeStatus.FINESTEERING, name[-1] == "b"
+    header = LogHeader(name[:-1].upper(), week, microseconds // 1000, status, port, 0, 0, binary)
     return encode(NovatelLog(header, NOVATEL[name[:-1]](sample)))
 
 
@@ -104,14 +87,9 @@ def _make_position(sample: GpsSample) -> Position:
     if sample.fix_type is FixType.NONE:
         status, zeros = SolutionStatus.INSUFFICIENT_OBS, (0.0,) * 4
         return Position(status, PositionType.NONE, *zeros, _WGS84, 0.0, 0.0, 0.0, "", 0.0, 0.0, 0, 0)
-    used = max(0, sample.satellites)
-    place = (
-        sample.latitude_deg,
-        sample.longitude_deg,
-        _nan_to_zero(_get_height_msl(sample)),
-        _nan_to_zero(sample.undulation),
-    )
-    kind = _TYPES[sample.fix_type]
+    used, kind = max(0, sample.satellites), _FIXES[sample.fix_type][0]
+    heights = _nan_to_zero(_get_height_msl(sample)), _nan_to_zero(sample.undulation)
+    place = (sample.latitude_deg, sample.longitude_deg, *heights)
     return Position(SolutionStatus.SOL_COMPUTED, kind, *place, _WGS84, *_get_sigmas(sample), "", 0.0, 0.0, used, used)
 
 
@@ -119,26 +97,16 @@ def _make_velocity(sample: GpsSample) -> Velocity:
     speed, course, climb = _get_motion(sample)
     if sample.fix_type is FixType.NONE or speed != speed:
         return Velocity(SolutionStatus.INSUFFICIENT_OBS, PositionType.NONE, 0.0, 0.0, 0.0, 0.0, 0.0)
+    latency, track = _nan_to_zero(sample.velocity_latency), _track_from_course(_nan_to_zero(course))
     kind = PositionType.DOPPLER_VELOCITY
-    latency = _nan_to_zero(sample.velocity_latency)
-    return Velocity(
-        SolutionStatus.SOL_COMPUTED,
-        kind,
-        latency,
-        0.0,
-        speed,
-        _track_from_course(_nan_to_zero(course)),
-        _nan_to_zero(climb),
-    )
+    return Velocity(SolutionStatus.SOL_COMPUTED, kind, latency, 0.0, speed, track, _nan_to_zero(climb))
 
 
 def _make_heading(sample: GpsSample) -> HeadingLog:
     if sample.baseline_yaw != sample.baseline_yaw:
         return HeadingLog(SolutionStatus.INSUFFICIENT_OBS, PositionType.NONE, -1.0, 0.0, 0.0, 0.0, 0.0, "", 0, 0)
-    sigma = math.degrees(_nan_to_zero(sample.baseline_yaw_sigma))
-    used = max(0, sample.satellites)
-    kind = PositionType.NARROW_INT
-    heading = _track_from_course(sample.baseline_yaw)
+    sigma, used = math.degrees(_nan_to_zero(sample.baseline_yaw_sigma)), max(0, sample.satellites)
+    kind, heading = PositionType.NARROW_INT, _track_from_course(sample.baseline_yaw)
     return HeadingLog(SolutionStatus.SOL_COMPUTED, kind, 1.0, heading, 0.0, sigma, sigma, "", used, used)
 
 
@@ -157,10 +125,6 @@ def _format_clock(utime: int) -> str:
     return nmea.format_time_of_day(utime % gps_time.DAY)
 
 
-def _to_datetime(utime: int) -> datetime:
-    return datetime.fromtimestamp(utime // gps_time.SECOND, UTC)
-
-
 def _format_position(sample: GpsSample) -> tuple[str, str, str, str]:
     return (*nmea.format_angle(sample.latitude_deg, "NS", 2), *nmea.format_angle(sample.longitude_deg, "EW", 3))
 
@@ -168,22 +132,16 @@ def _format_position(sample: GpsSample) -> tuple[str, str, str, str]:
 def _format_gga(sample: GpsSample, utime: int) -> bytes:
     count = str(sample.satellites) if sample.satellites >= 0 else ""
     heights = (nmea.format_number(_get_height_msl(sample), 4), "M", nmea.format_number(sample.undulation, 4), "M")
-    fields = (
-        _format_clock(utime),
-        *_format_position(sample),
-        _QUALITY[sample.fix_type],
-        count,
-        nmea.format_number(sample.hdop, 2),
-    )
-    return nmea.encode("GP", "GGA", (*fields, *heights, "", ""))
+    quality = (_FIXES[sample.fix_type][1], count, nmea.format_number(sample.hdop, 2))
+    return nmea.encode("GP", "GGA", (_format_clock(utime), *_format_position(sample), *quality, *heights, "", ""))
 
 
 def _format_rmc(sample: GpsSample, utime: int) -> bytes:
     speed, course, _ = _get_motion(sample)
-    status = "V" if sample.fix_type is FixType.NONE else "A"
+    status, mode = "V" if sample.fix_type is FixType.NONE else "A", _FIXES[sample.fix_type][2]
     motion = (nmea.format_number(speed / KNOT, 4), nmea.format_number(_track_from_course(course), 4))
-    date = _to_datetime(utime).strftime("%d%m%y")
-    fields = (_format_clock(utime), status, *_format_position(sample), *motion, date, "", "", _MODE[sample.fix_type])
+    date = datetime.fromtimestamp(utime // gps_time.SECOND, UTC).strftime("%d%m%y")
+    fields = (_format_clock(utime), status, *_format_position(sample), *motion, date, "", "", mode)
     return nmea.encode("GP", "RMC", fields)
 
 
@@ -191,7 +149,7 @@ def _format_vtg(sample: GpsSample, utime: int) -> bytes:
     speed, course, _ = _get_motion(sample)
     track = nmea.format_number(_track_from_course(course), 4)
     speeds = (nmea.format_number(speed / KNOT, 4), "N", nmea.format_number(speed / KMH, 4), "K")
-    return nmea.encode("GP", "VTG", (track, "T", "", "M", *speeds, _MODE[sample.fix_type]))
+    return nmea.encode("GP", "VTG", (track, "T", "", "M", *speeds, _FIXES[sample.fix_type][2]))
 
 
 def _format_gsa(sample: GpsSample, utime: int) -> bytes:
@@ -202,9 +160,8 @@ def _format_gsa(sample: GpsSample, utime: int) -> bytes:
 
 def _format_gst(sample: GpsSample, utime: int) -> bytes:
     sigmas = _get_sigmas(sample) if sample.position_covariance else (math.nan,) * 3
-    return nmea.encode(
-        "GP", "GST", (_format_clock(utime), *[""] * 4, *(nmea.format_number(each, 3) for each in sigmas))
-    )
+    fields = (nmea.format_number(each, 3) for each in sigmas)
+    return nmea.encode("GP", "GST", (_format_clock(utime), *[""] * 4, *fields))
 
 
 def _format_hdt(sample: GpsSample, utime: int) -> bytes:
@@ -212,7 +169,7 @@ def _format_hdt(sample: GpsSample, utime: int) -> bytes:
 
 
 def _format_zda(sample: GpsSample, utime: int) -> bytes:
-    day = _to_datetime(utime)
+    day = datetime.fromtimestamp(utime // gps_time.SECOND, UTC)
     return nmea.encode("GP", "ZDA", (_format_clock(utime), f"{day:%d}", f"{day:%m}", f"{day:%Y}", "00", "00"))
 
 
