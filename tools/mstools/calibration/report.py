@@ -57,11 +57,9 @@ class _Quantity:
     figure: str
 
     def axes(self, noise: ImuNoise) -> tuple[AxisNoise, ...]:
-        """Return the axes of the sensor."""
         return getattr(noise, self.sensor)  # type: ignore[no-any-return]
 
     def of(self, figures: NoiseParameters) -> NoiseParameter | None:
-        """Return the figure of an axis."""
         return getattr(figures, self.figure)  # type: ignore[no-any-return]
 
     def limit(self, figures: NoiseParameters) -> float:

@@ -10,10 +10,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import IO
+from typing import NamedTuple
 
 from modelserver.errors import ModelServerError
 
@@ -48,8 +47,7 @@ class DemoError(ModelServerError):
     """The demo failed; the message is what was missing."""
 
 
-@dataclass(slots=True)
-class ChildProcess:
+class ChildProcess(NamedTuple):
     """A child process and its log file."""
 
     name: str
@@ -96,12 +94,11 @@ class ChildProcesses:
         """Start a Python process with these arguments."""
         log = self._scratch / f"{len(self._started)}.log"
         environment = os.environ | {"STATE_DIRECTORY": str(self._scratch)}
-        with contextlib.ExitStack() as stack:
-            output: IO[bytes] | None = None if self._verbose else stack.enter_context(log.open("wb"))
-            # a session of its own: Ctrl-C reaches only the demo, which ends them in order
+        with contextlib.nullcontext() if self._verbose else log.open("wb") as output:
+            # a session of its own: Ctrl-C reaches only the demo, which ends them in order; nothing is written to its
+            # standard input, which closes when the demo ends
             process = subprocess.Popen(
                 [sys.executable, *arguments],
-                # never written to: it closes when the demo ends
                 stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=output,

@@ -200,8 +200,6 @@ def evaluate(job: EvaluationJob) -> EvaluationResult:
 
 def apply_settings(vehicle: Vehicle, settings: Mapping[str, float]) -> Vehicle:
     """Return the vehicle with changed filter settings. Raises ValueError for one out of range."""
-    if not settings:
-        return vehicle
     localization = vehicle.config.localization
     settled = replace(localization.filter, **dict[str, Any](settings))
     return replace(vehicle, config=replace(vehicle.config, localization=replace(localization, filter=settled)))
@@ -214,10 +212,8 @@ def _drop_withheld(events: Iterable[LogEvent], channel: str, withheld: set[int])
 
 
 def _error(row: TrackRow, sample: GpsSample, localizer: Localizer | None) -> float:
-    if localizer is None or not math.isfinite(row.easting):
-        return math.nan
-    origin = localizer.estimate(sample.header.utime).origin
-    if origin is None:
+    origin = localizer.estimate(sample.header.utime).origin if localizer is not None else None
+    if origin is None or not math.isfinite(row.easting):
         return math.nan
     height = sample.height_ellipsoidal if math.isfinite(sample.height_ellipsoidal) else 0.0
     try:
