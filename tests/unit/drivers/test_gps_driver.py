@@ -10,8 +10,8 @@ from support_gps import SECOND, START, Line, add_noise, drive, now_at, split_in_
 
 from modelserver.messages import FixType, SensorHeader
 from msdrivers.devices.gps import GpsDriver, GpsSettings
+from msdrivers.devices.gps.driver import SetupDialogue, SetupProgress
 from msdrivers.devices.gps.fixes import sample_from_novatel
-from msdrivers.devices.gps.setup_dialogue import SetupDialogue, SetupProgress
 from msdrivers.emulate.gps import GpsEmulator, GpsUnit
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Send
 from msdrivers.fault_injection import FaultInjector, InjectedFault
@@ -459,7 +459,7 @@ def test_given_answers_that_come_late_or_not_when_set_up_then_each_is_its_own_co
 
     send(dialogue.start(now))
     while dialogue.progress is SetupProgress.RUNNING:
-        due = dialogue.get_deadline()
+        due = dialogue.deadline_ns
         assert due is not None
         if coming and coming[0][0] <= due:
             now, command = coming.pop(0)

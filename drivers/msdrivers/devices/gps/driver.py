@@ -1,23 +1,206 @@
 """Driver of a satellite receiver: configures it, publishes its fixes, diagnoses errors.
 
-A NovAtel receiver is configured by commands (`setup_dialogue`); without an answer the next baud rate is tried. Without
+A NovAtel receiver is configured by commands (`SetupDialogue`); without an answer the next baud rate is tried. Without
 a fix for `silence` the setup is repeated, because a restarted receiver forgets its logs. A plain NMEA receiver is only
 read.
 """
 
 from __future__ import annotations
 
+import re
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
+from enum import Enum
 
 from modelserver.messages import SensorHeader
 from msdrivers.devices.gps.fixes import FixAssembler, GpsFix
-from msdrivers.devices.gps.line_monitor import LineMonitor, explain_missing_receiver
 from msdrivers.devices.gps.settings import GpsSettings
-from msdrivers.devices.gps.setup_dialogue import SetupDialogue, SetupProgress
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
 from msdrivers.protocol.gps_stream import GpsMessage, GpsStream
+from msdrivers.protocol.nmea.epochs import POSITION_KINDS
 from msdrivers.protocol.novatel import CommandResponse, NovatelLog, Prompt
+
+QUOTED_BYTES = 24
+"""Quoted bytes of the beginning."""
+MAX_NAMES = 6
+MIN_FLAWED_SENTENCES = 2
+"""Fewer flawed sentences may be chance."""
+_ADDRESS = re.compile(rb"\$([A-Z]{2}[A-Z]{3}|P[A-Z]{3,5}),")
+_FLAWS = {
+    "rejected.nmea_incomplete": "without checksum",
+    "rejected.nmea_field": "with a right checksum and a field that cannot be",
+}
+_REMEDIES = {
+    _FLAWS["rejected.nmea_incomplete"]: "switch its checksums on",
+    _FLAWS["rejected.nmea_field"]: "compare its sentences with NMEA 0183, it writes them otherwise",
+}
+
+
+class LineMonitor:
+    """Records the first bytes, the amount of data and the sentence names since the last `reset`."""
+
+    def __init__(self) -> None:
+        self.reset({})
+
+    def reset(self, counts: Mapping[str, int]) -> None:
+        """Start over; `counts` are the parser's present counters."""
+        self._bytes_received, self._first_bytes = 0, b""
+        self._names: set[str] = set()
+        self._counts_at_reset = dict(counts)
+
+    def add(self, data: bytes) -> None:
+        """Record received data."""
+        self._bytes_received += len(data)
+        if len(self._first_bytes) < QUOTED_BYTES:
+            self._first_bytes = (self._first_bytes + data)[:QUOTED_BYTES]
+        if len(self._names) < MAX_NAMES:
+            self._names.update(each.decode("ascii") for each in _ADDRESS.findall(data)[:MAX_NAMES])
+
+    def list_valid_kinds(self, counts: Mapping[str, int]) -> list[str]:
+        """Return the kinds of valid frames since the reset, e.g. "nmea.GPRMC"."""
+        return [
+            kind
+            for kind, number in counts.items()
+            if kind.startswith(("nmea.", "novatel.")) and number > self._counts_at_reset.get(kind, 0)
+        ]
+
+    def find_flaw(self, counts: Mapping[str, int]) -> str:
+        """Describe a flaw common to complete sentences (the baud rate is right then); empty if there is none."""
+        if not self._names or self.list_valid_kinds(counts):
+            return ""
+        for reason, words in _FLAWS.items():
+            if counts.get(reason, 0) - self._counts_at_reset.get(reason, 0) >= MIN_FLAWED_SENTENCES:
+                return words
+        return ""
+
+    def explain_missing_fix(self, counts: Mapping[str, int], seconds: float) -> str:
+        """Explain a missing fix on a line with NMEA sentences, with a remedy."""
+        placed = [kind for kind in self.list_valid_kinds(counts) if kind[-3:] in POSITION_KINDS]
+        if placed:
+            kinds = ", ".join(kind.partition(".")[2] for kind in placed)
+            return f"{kinds} arrive, but their time does not advance: no new fix for {seconds:g} s; check the receiver"
+        text = f"no GGA or RMC for {seconds:g} s, received {self.describe(counts)} since"
+        if self.list_valid_kinds(counts):
+            return f"{text}; switch GGA or RMC on in the receiver"
+        flaw = self.find_flaw(counts)
+        return f"{text}; {_REMEDIES[flaw]}" if flaw else text
+
+    def describe(self, counts: Mapping[str, int]) -> str:
+        """Describe the received data."""
+        if not self._bytes_received:
+            return "nothing"
+        kinds, names = self.list_valid_kinds(counts), ", ".join(sorted(self._names))
+        if kinds == ["nmea.unsupported"] and names:
+            return f"{names}, which are not used"
+        if flaw := self.find_flaw(counts):
+            return f"{names} {flaw}"
+        if kinds:
+            return f"{', '.join(kind.partition('.')[2] for kind in kinds[:6])}{' and more' if len(kinds) > 6 else ''}"
+        rejected = sum(
+            number - self._counts_at_reset.get(kind, 0)
+            for kind, number in counts.items()
+            if kind.startswith("rejected.")
+        )
+        broken = f" ({rejected} damaged ones)" if rejected else ""
+        text = f"{self._bytes_received} bytes that are neither NovAtel logs nor NMEA sentences"
+        return f"{text}{broken}, beginning {self._first_bytes!r}"
+
+
+def explain_missing_receiver(wanted: str, attempts: Sequence[tuple[int | None, str]]) -> str:
+    """Explain that no receiver was found: attempts, received data, remedy."""
+    tried = "; ".join(f"{f'at {baud} baud ' if baud else ''}received {what}" for baud, what in attempts)
+    if all(what == "nothing" for _, what in attempts):
+        advice = "check the receiver's power, the cable, and that the port is the right one"
+    elif all("bytes that are neither" in what or what == "nothing" for _, what in attempts):
+        advice = "another device is on this port, or its baud rate was not tried: check the port and `bauds`"
+    else:
+        advice = (
+            "it sends data but does not answer: check that the line can send to it, that it is a NovAtel receiver "
+            "(else set protocol: nmea), and `device_port`"
+        )
+    return f"no {wanted} on this line: {tried}; {advice}"
+
+
+class SetupProgress(Enum):
+    """State of the dialogue."""
+
+    IDLE = "idle"
+    RUNNING = "asking"
+    DONE = "done"
+    TIMED_OUT = "unanswered"
+
+
+class SetupDialogue:
+    """Sends commands and awaits their responses, one at a time. Times are monotonic nanoseconds.
+
+    After a retry more than one response may arrive. Before the next command the dialogue waits for them, so that none
+    is taken for the response to that command.
+    """
+
+    def __init__(self, commands: Sequence[str], answer_ns: int, attempts: int) -> None:
+        self._commands, self._timeout_ns, self._attempts = tuple(commands), answer_ns, attempts
+        self._index = self._attempt = 0
+        self._is_settling = False
+        """A command was sent more than once; further responses may arrive."""
+        self.deadline_ns: int | None = None
+        self._last_answer_ns: int | None = None
+        self.progress = SetupProgress.IDLE
+        self.rejected: list[tuple[str, str]] = []
+        """Rejected commands and the receiver's error texts."""
+
+    def start(self, now_ns: int) -> bytes:
+        """Start from the first command; return the bytes to send, with an end of line first to flush partial input."""
+        self._index = self._attempt = 0
+        self._is_settling = False
+        self.rejected = []
+        self._last_answer_ns = None
+        return b"\r\n" + self._send_command(now_ns)
+
+    def stop(self) -> None:
+        """Stop waiting for responses."""
+        self.progress, self.deadline_ns = SetupProgress.IDLE, None
+
+    def on_response(self, answer: CommandResponse, now_ns: int) -> bytes:
+        """Process a response; return the next bytes to send, or none."""
+        self._last_answer_ns = now_ns
+        if self.progress is not SetupProgress.RUNNING or self._is_settling:
+            return b""
+        if not answer.is_ok:
+            self.rejected.append((self._commands[self._index], answer.error))
+        self._index += 1
+        tries, self._attempt = self._attempt, 0
+        if self._index == len(self._commands):
+            self.progress, self.deadline_ns = SetupProgress.DONE, None
+            return b""
+        if tries > 1:
+            # each as late as this one; they would pass for answers to the next command
+            self._is_settling = True
+            self.deadline_ns = now_ns + tries * self._timeout_ns
+            return b""
+        return self._send_command(now_ns)
+
+    def on_timer(self, now_ns: int) -> bytes:
+        """Repeat the command after a timeout; stop after the last attempt."""
+        if self.deadline_ns is None or now_ns < self.deadline_ns:
+            return b""
+        self._is_settling = False
+        if self._attempt >= self._attempts:
+            self.progress, self.deadline_ns = SetupProgress.TIMED_OUT, None
+            return b""
+        return self._send_command(now_ns)
+
+    def expects_prompt(self, now_ns: int) -> bool:
+        """Return whether a prompt belongs to a response, and is not that of a restarted receiver."""
+        return self.progress is SetupProgress.RUNNING or (
+            self._last_answer_ns is not None and now_ns - self._last_answer_ns < self._timeout_ns
+        )
+
+    def _send_command(self, now_ns: int) -> bytes:
+        self.progress = SetupProgress.RUNNING
+        self._attempt += 1
+        self.deadline_ns = now_ns + self._timeout_ns
+        return self._commands[self._index].encode("ascii") + b"\r\n"
+
 
 _SECOND_NS = 1_000_000_000
 _WARNING_INTERVAL_NS = 60 * _SECOND_NS
@@ -75,10 +258,7 @@ class GpsDriver:
         self._arrivals.append((self._stream.offset, now.utime))
         self._monitor.add(unit)
         self._last_byte_ns = now.monotonic_ns
-        out: list[Output[bytes]] = []
-        for message in self._stream.feed(unit):
-            out += self._on_message(message, now)
-        return out
+        return [output for message in self._stream.feed(unit) for output in self._on_message(message, now)]
 
     def on_timer(self, now: HostTime) -> Sequence[Output[bytes]]:
         """Do what is due."""
@@ -88,8 +268,7 @@ class GpsDriver:
             for epoch in self._stream.flush():
                 out += self._on_message(epoch, now)
         out += self._publish_fixes(self._fixes.on_timer(now), now)
-        again = self._setup.on_timer(now.monotonic_ns)
-        if again:
+        if again := self._setup.on_timer(now.monotonic_ns):
             out.append(Send(again))
         elif self._setup.progress is SetupProgress.TIMED_OUT:
             out += self._on_setup_timeout(now)
@@ -101,7 +280,7 @@ class GpsDriver:
         """Return when to call `on_timer`, monotonic nanoseconds."""
         asking = self._setup.progress is SetupProgress.RUNNING
         timeout = None if asking else self._timeout_ns
-        times = (self._gap_ns, self._fixes.get_deadline(), self._setup.get_deadline(), timeout)
+        times = (self._gap_ns, self._fixes.get_deadline(), self._setup.deadline_ns, timeout)
         return min((each for each in times if each is not None), default=None)
 
     def on_close(self, now: HostTime) -> Sequence[Output[bytes]]:
@@ -143,13 +322,12 @@ class GpsDriver:
             return self._on_command_response(message, now)
         if isinstance(message, Prompt):
             return self._on_prompt(message, now)
+        # the receive time of the message's first byte
+        start = message.start
+        arrival = next((utime for offset, utime in reversed(self._arrivals) if offset <= start), self._arrivals[0][1])
         if isinstance(message, NovatelLog):
-            return self._publish_fixes(self._fixes.add_log(message, self._get_arrival_utime(message.start), now), now)
-        return self._publish_fixes(self._fixes.add_epoch(message, self._get_arrival_utime(message.start), now), now)
-
-    def _get_arrival_utime(self, start: int) -> int:
-        """Return the receive time of the byte at `start` of the stream."""
-        return next((utime for offset, utime in reversed(self._arrivals) if offset <= start), self._arrivals[0][1])
+            return self._publish_fixes(self._fixes.add_log(message, arrival, now), now)
+        return self._publish_fixes(self._fixes.add_epoch(message, arrival, now), now)
 
     def _publish_fixes(self, fixes: Sequence[GpsFix], now: HostTime) -> list[Output[bytes]]:
         out: list[Output[bytes]] = []
@@ -162,10 +340,8 @@ class GpsDriver:
             self._attempts = []
             delay = self._settings.delay + fix.delay
             out.append(MeasuredSample(fix.to_sample(header), delay, self._settings.delay_sigma))
-            if self._setup.progress is not SetupProgress.RUNNING and (self._phase, self._origin) != (
-                EndpointPhase.STREAMING,
-                fix.origin,
-            ):
+            present = (self._phase, self._origin)
+            if self._setup.progress is not SetupProgress.RUNNING and present != (EndpointPhase.STREAMING, fix.origin):
                 out += self._set_status(EndpointPhase.STREAMING, f"receiving {fix.origin}")
             self._origin = fix.origin
         for problem in self._fixes.pop_problems():
@@ -183,9 +359,8 @@ class GpsDriver:
             out += self._set_status(EndpointPhase.CONFIGURING, "a NovAtel receiver answers, setting it up")
         if len(self._setup.rejected) > rejected:
             command, words = self._setup.rejected[-1]
-            text = (
-                f"the receiver rejected '{command}': {words}; check the settings `commands`, `device_port` and the logs"
-            )
+            fix = "check the settings `commands`, `device_port` and the logs"
+            text = f"the receiver rejected '{command}': {words}; {fix}"
             out += self._set_status(EndpointPhase.CONFIGURING, text, is_warning=True)
         if following:
             return [*out, Send(following)]
@@ -218,21 +393,18 @@ class GpsDriver:
 
     def _on_data_timeout(self, now: HostTime) -> list[Output[bytes]]:
         """Repeat the setup if data arrives (a restart loses the logs), else try the next baud rate."""
-        received, counts = self._monitor.describe(self._stream.counts), self._stream.counts
-        if (
-            self._phase is EndpointPhase.STREAMING
-            or self._monitor.list_valid_kinds(counts)
-            or self._monitor.find_flaw(counts)
-        ):
-            if self._novatel:
-                missing = f"no {self._settings.position_log} for {self._settings.silence:g} s"
-                text = f"{missing}, received {received} since, setting the receiver up again"
-            else:
-                text = self._monitor.explain_missing_fix(counts, self._settings.silence)
-            out = self._set_status(EndpointPhase.SILENT, text)
-            self._monitor.reset(self._stream.counts)
-            return [*out, *self._start_setup(now)]
-        return self._try_next_baud(now)
+        counts, monitor = self._stream.counts, self._monitor
+        is_streaming = self._phase is EndpointPhase.STREAMING
+        if not (is_streaming or monitor.list_valid_kinds(counts) or monitor.find_flaw(counts)):
+            return self._try_next_baud(now)
+        if self._novatel:
+            missing = f"no {self._settings.position_log} for {self._settings.silence:g} s"
+            text = f"{missing}, received {monitor.describe(counts)} since, setting the receiver up again"
+        else:
+            text = monitor.explain_missing_fix(counts, self._settings.silence)
+        out = self._set_status(EndpointPhase.SILENT, text)
+        monitor.reset(counts)
+        return [*out, *self._start_setup(now)]
 
     def _try_next_baud(self, now: HostTime) -> list[Output[bytes]]:
         received = self._monitor.describe(self._stream.counts)

@@ -27,52 +27,26 @@ from msdrivers.protocol.novatel import (
     Velocity,
 )
 
-USABLE_TIME = frozenset(
-    {
-        TimeStatus.COARSE,
-        TimeStatus.COARSESTEERING,
-        TimeStatus.FREEWHEELING,
-        TimeStatus.FINEADJUSTING,
-        TimeStatus.FINE,
-        TimeStatus.FINEBACKUPSTEERING,
-        TimeStatus.FINESTEERING,
-    }
-)
+USABLE_TIME = frozenset(TimeStatus) - {
+    TimeStatus.UNKNOWN,
+    TimeStatus.APPROXIMATE,
+    TimeStatus.COARSEADJUSTING,
+    TimeStatus.SATTIME,
+}
 """With the other statuses the header's time may be wrong by seconds or years."""
 
 FIX_TYPES: dict[int, FixType] = {
-    PositionType.FIXEDHEIGHT: FixType.FIX_2D,
-    PositionType.FLOATCONV: FixType.RTK_FLOAT,
-    PositionType.WIDELANE: FixType.RTK_FIXED,
-    PositionType.NARROWLANE: FixType.RTK_FIXED,
-    PositionType.SINGLE: FixType.FIX_3D,
-    PositionType.PSRDIFF: FixType.DIFFERENTIAL,
-    PositionType.WAAS: FixType.DIFFERENTIAL,
-    PositionType.PROPAGATED: FixType.DEAD_RECKONING,
-    PositionType.OMNISTAR: FixType.DIFFERENTIAL,
-    PositionType.L1_FLOAT: FixType.RTK_FLOAT,
-    PositionType.IONOFREE_FLOAT: FixType.RTK_FLOAT,
-    PositionType.NARROW_FLOAT: FixType.RTK_FLOAT,
-    PositionType.L1_INT: FixType.RTK_FIXED,
-    PositionType.WIDE_INT: FixType.RTK_FIXED,
-    PositionType.NARROW_INT: FixType.RTK_FIXED,
-    PositionType.RTK_DIRECT_INS: FixType.RTK_FIXED,
-    PositionType.INS_SBAS: FixType.DIFFERENTIAL,
-    PositionType.INS_PSRSP: FixType.FIX_3D,
-    PositionType.INS_PSRDIFF: FixType.DIFFERENTIAL,
-    PositionType.INS_RTKFLOAT: FixType.RTK_FLOAT,
-    PositionType.INS_RTKFIXED: FixType.RTK_FIXED,
-    PositionType.OMNISTAR_HP: FixType.DIFFERENTIAL,
-    PositionType.OMNISTAR_XP: FixType.DIFFERENTIAL,
-    PositionType.CDGPS: FixType.DIFFERENTIAL,
-    PositionType.PPP_CONVERGING: FixType.DIFFERENTIAL,
-    PositionType.PPP: FixType.DIFFERENTIAL,
-    PositionType.INS_PPP_CONVERGING: FixType.DIFFERENTIAL,
-    PositionType.INS_PPP: FixType.DIFFERENTIAL,
-    PositionType.PPP_BASIC_CONVERGING: FixType.DIFFERENTIAL,
-    PositionType.PPP_BASIC: FixType.DIFFERENTIAL,
-    PositionType.INS_PPP_BASIC_CONVERGING: FixType.DIFFERENTIAL,
-    PositionType.INS_PPP_BASIC: FixType.DIFFERENTIAL,
+    PositionType[name]: fix_type
+    for fix_type, names in {
+        FixType.FIX_2D: "FIXEDHEIGHT",
+        FixType.FIX_3D: "SINGLE INS_PSRSP",
+        FixType.DEAD_RECKONING: "PROPAGATED",
+        FixType.DIFFERENTIAL: "PSRDIFF WAAS OMNISTAR INS_SBAS INS_PSRDIFF OMNISTAR_HP OMNISTAR_XP CDGPS PPP_CONVERGING "
+        "PPP INS_PPP_CONVERGING INS_PPP PPP_BASIC_CONVERGING PPP_BASIC INS_PPP_BASIC_CONVERGING INS_PPP_BASIC",
+        FixType.RTK_FLOAT: "FLOATCONV L1_FLOAT IONOFREE_FLOAT NARROW_FLOAT INS_RTKFLOAT",
+        FixType.RTK_FIXED: "WIDELANE NARROWLANE L1_INT WIDE_INT NARROW_INT RTK_DIRECT_INS INS_RTKFIXED",
+    }.items()
+    for name in names.split()
 }
 """The others are no satellite positions: none, entered by hand (FIXEDPOS), velocity only, or unknown."""
 
@@ -109,10 +83,9 @@ def sample_from_novatel(
     """Convert a position log, with velocity and heading of the same instant if available, to a sample."""
     # without a solution the receiver sends zeros
     empty = position.type == PositionType.NONE and position.latitude == 0.0 and position.longitude == 0.0
-    height = NAN if empty else position.height
-    undulation = NAN if empty else position.undulation
-    moving = velocity is not None and _is_solved(velocity)
-    turned = heading is not None and _is_solved(heading)
+    height, undulation = (NAN, NAN) if empty else (position.height, position.undulation)
+    velocity = velocity if velocity is not None and _is_solved(velocity) else None
+    heading = heading if heading is not None and _is_solved(heading) else None
     return GpsSample(
         header,
         FIX_TYPES.get(position.type, FixType.NONE) if _is_solved(position) else FixType.NONE,
@@ -123,14 +96,12 @@ def sample_from_novatel(
         undulation=undulation,
         satellites=position.used,
         position_covariance=to_covariance(position.sigma_longitude, position.sigma_latitude, position.sigma_height),
-        velocity=_to_enu(velocity) if moving and velocity else None,
-        velocity_latency=max(0.0, velocity.latency - position.solution_age) if moving and velocity else NAN,
-        speed=velocity.horizontal if moving and velocity else NAN,
-        course=course_from_track(velocity.track) if moving and velocity else NAN,
-        baseline_yaw=course_from_track(heading.heading) if turned and heading else NAN,
-        baseline_yaw_sigma=math.radians(heading.sigma_heading)
-        if turned and heading and heading.sigma_heading > 0.0
-        else NAN,
+        velocity=_to_enu(velocity) if velocity else None,
+        velocity_latency=max(0.0, velocity.latency - position.solution_age) if velocity else NAN,
+        speed=velocity.horizontal if velocity else NAN,
+        course=course_from_track(velocity.track) if velocity else NAN,
+        baseline_yaw=course_from_track(heading.heading) if heading else NAN,
+        baseline_yaw_sigma=math.radians(heading.sigma_heading) if heading and heading.sigma_heading > 0.0 else NAN,
     )
 
 
@@ -180,9 +151,7 @@ class FixAssembler:
     """
 
     def __init__(self, logs: Sequence[str], hold_ns: int, silence_ns: int) -> None:
-        self._logs = tuple(logs)
-        self._hold_ns = hold_ns
-        self._silence_ns = silence_ns
+        self._logs, self._hold_ns, self._silence_ns = tuple(logs), hold_ns, silence_ns
         self._parts: dict[str, tuple[tuple[int, int], Velocity | HeadingLog]] = {}
         self._waiting: tuple[GpsFix, tuple[int, int], int] | None = None
         self._last_log: tuple[int, int] | None = None
