@@ -21,7 +21,6 @@ import socket
 import struct
 import time
 from collections.abc import Callable
-from enum import Enum
 from typing import Final, Protocol, TypeAlias
 
 from modelserver.wire.channels import to_subscription_pattern
@@ -163,15 +162,6 @@ class Bus(Protocol):
         ...
 
 
-class InboxState(Enum):
-    """What `LcmBus.wait` has found out about an inbox."""
-
-    EMPTY = 0
-    ONE = 1
-    """It was empty, and a message has arrived. Later ones are found by the next wait."""
-    UNKNOWN = 2
-
-
 MIN_SLEEP_S: Final = 20e-6
 """A wait that took longer has found the inboxes empty at first."""
 
@@ -183,7 +173,8 @@ class LcmInbox:
         self._queue_bytes = queue_bytes
         self.lcm = open_lcm(url)
         self.fileno = self.lcm.fileno()
-        self.expected = InboxState.UNKNOWN
+        self.expected: int | None = None
+        """Messages that `LcmBus.wait` has found: 0, 1 (later ones are found by the next wait), None = unknown."""
 
     def subscribe(self, channel: str, handler: Handler) -> None:
         """Call `handler` with every message of exactly `channel`."""
@@ -199,14 +190,11 @@ class LcmInbox:
         subscription.set_queue_capacity(limit.capacity)
 
     def drain(self, limit: int, seconds: float = math.inf) -> int:
-        """Handle the messages that have arrived, at most `limit` and for at most `seconds`, without waiting.
-
-        Returns the number of handled messages. One that is in progress when the time is up is the last.
-        """
-        expected, self.expected = self.expected, InboxState.UNKNOWN
-        if expected is InboxState.EMPTY or not limit:
+        """See `Inbox`."""
+        expected, self.expected = self.expected, None
+        if expected == 0 or not limit:
             return 0
-        if expected is InboxState.ONE:
+        if expected == 1:
             # saves a system call while a client waits for its reply
             self.lcm.handle()
             return 1
@@ -241,7 +229,7 @@ class LcmBus:
             self._membership.renew()
         if not requests:
             readable, _, _ = select.select((self.sensors.fileno,), (), (), max(0.0, seconds))
-            self.sensors.expected = InboxState.UNKNOWN if readable else InboxState.EMPTY
+            self.sensors.expected = None if readable else 0
             return
         # poll is cheaper but counts in milliseconds; select meets the deadline to the microsecond
         milliseconds = int(seconds * 1e3)
@@ -249,6 +237,6 @@ class LcmBus:
         if not ready:
             files = (self.sensors.fileno, self.requests.fileno)
             ready, _, _ = select.select(files, (), (), max(0.0, seconds - milliseconds * 1e-3))
-        some = InboxState.ONE if time.monotonic() - begin > MIN_SLEEP_S else InboxState.UNKNOWN
+        some = 1 if time.monotonic() - begin > MIN_SLEEP_S else None
         for inbox in (self.sensors, self.requests):
-            inbox.expected = some if inbox.fileno in ready else InboxState.EMPTY
+            inbox.expected = some if inbox.fileno in ready else 0

@@ -12,22 +12,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from modelserver import core, messages
+from modelserver import core, errors, messages
 from modelserver.config.vehicle_file import KEY_HINT, VehicleConfig, add_lines
 from modelserver.core import CoreSettings, CoreState, ExpectedSensor, Instant
 from modelserver.core.commands import ModelLoaded
 from modelserver.core.state import START
 from modelserver.earth.geodesy import GeodesyError, make_origin
-from modelserver.errors import (
-    ConfigError,
-    GeometryError,
-    KeyFileError,
-    Location,
-    Problem,
-    QueryError,
-    Severity,
-    Suggestion,
-)
 from modelserver.estimation.findings import find_unusable
 from modelserver.estimation.sensor_rig import Mounts, SensorRig, SteeringSignal
 from modelserver.formats import FileExamination, examine_file
@@ -136,8 +126,8 @@ class Vehicle:
         path = self.config.commands.key_file
         try:
             return read_keys(path) if path else ()
-        except KeyFileError as error:
-            raise ConfigError(add_lines([_make_problem(file, "commands.key_file", str(error))], file)) from None
+        except errors.KeyFileError as error:
+            raise errors.ConfigError(add_lines([_make_problem(file, "commands.key_file", str(error))], file)) from None
 
     def make_command_verifier(self, started_ns: int, file: str = "") -> CommandVerifier:
         """Make the verifier of signed commands. Raises ConfigError if the key file is invalid."""
@@ -165,7 +155,7 @@ class Vehicle:
         """Read the geometry file again, and check all of it against the vehicle file."""
         try:
             vehicle = load_vehicle(self.config, file)
-        except (GeometryError, ConfigError) as error:
+        except (errors.GeometryError, errors.ConfigError) as error:
             return ModelLoaded(command.request, why=str(error))
         except Exception as error:
             log.exception("reloading the geometry failed")
@@ -268,9 +258,9 @@ def load_vehicle(config: VehicleConfig, file: str = "", strict: bool = False) ->
     geometry, problems = examine_vehicle(config, file, strict)
     model = geometry.model
     if model is None and geometry.problems:
-        raise GeometryError(geometry.problems)
+        raise errors.GeometryError(geometry.problems)
     if model is None or problems:
-        raise ConfigError(problems)
+        raise errors.ConfigError(problems)
     mounts = None
     gps, imu = config.sensors.gps, config.sensors.imu
     if gps is not None and imu is not None:
@@ -280,14 +270,14 @@ def load_vehicle(config: VehicleConfig, file: str = "", strict: bool = False) ->
 
 def examine_vehicle(
     config: VehicleConfig, file: str = "", strict: bool = False
-) -> tuple[FileExamination, tuple[Problem, ...]]:
+) -> tuple[FileExamination, tuple[errors.Problem, ...]]:
     """Find all problems of the geometry and of the vehicle file at once.
 
     Frames are looked up also in a geometry with errors, as far as its bodies can be read. An empty name of the geometry
     or of the base frame means that the vehicle file lacks it.
     """
     geometry = FileExamination()
-    problems: list[Problem] = []
+    problems: list[errors.Problem] = []
     if config.geometry:
         try:
             geometry = examine_file(config.geometry, config.variables, strict=strict)
@@ -311,11 +301,11 @@ def examine_vehicle(
     return geometry, tuple(add_lines(problems, file))
 
 
-def _make_problem(file: str, key: str, why: str, fix: str = "", near: tuple[str, ...] = ()) -> Problem:
-    return Problem(Severity.ERROR, why, Location(file, element=key), fix, near)
+def _make_problem(file: str, key: str, why: str, fix: str = "", near: tuple[str, ...] = ()) -> errors.Problem:
+    return errors.Problem(errors.Severity.ERROR, why, errors.Location(file, element=key), fix, near)
 
 
-def _find_frame_problems(config: VehicleConfig, model: Model, file: str, is_whole: bool) -> list[Problem]:
+def _find_frame_problems(config: VehicleConfig, model: Model, file: str, is_whole: bool) -> list[errors.Problem]:
     """Check the frames that the vehicle file names; only an `is_whole` model has constraints."""
     gps, imu = config.sensors.gps, config.sensors.imu
     named = [("base_frame", config.base_frame), ("rolling_frame", config.rolling_frame)]
@@ -324,16 +314,16 @@ def _find_frame_problems(config: VehicleConfig, model: Model, file: str, is_whol
     if config.sensors.wheels is not None:
         named += [(f"sensors.wheels.frames.{name}", frame) for name, frame in config.sensors.wheels.frames.items()]
     see = f"see: modelserver bodies --model {config.geometry}"
-    problems: list[Problem] = []
+    problems: list[errors.Problem] = []
     unknown: set[str] = set()
     for key, frame in named:
         if not frame and key in ("base_frame", "rolling_frame", "sensors.gps.second_frame"):
             continue
         try:
             model.frame(frame)
-        except QueryError as error:
+        except errors.QueryError as error:
             unknown.add(frame)
-            near = Suggestion.of(frame, suggest_frame(frame, {body.name: body for body in model.bodies}))
+            near = errors.Suggestion.of(frame, suggest_frame(frame, {body.name: body for body in model.bodies}))
             fix = f"write {near[0]}" if near else see
             problems.append(_make_problem(file, key, str(error), fix, near))
     if not is_whole or not config.base_frame or config.base_frame in unknown:
@@ -345,7 +335,7 @@ def _find_frame_problems(config: VehicleConfig, model: Model, file: str, is_whol
         try:
             model.get_transformation(frame, config.base_frame)
             joints = () if body in unknown else model.get_kinematic_path(frame, body).joints
-        except QueryError as error:
+        except errors.QueryError as error:
             problems.append(_make_problem(file, key, str(error), see))
             continue
         if joints:
@@ -377,7 +367,7 @@ def _make_rig(config: VehicleConfig, model: Model) -> SensorRig | None:
     )
 
 
-def _find_channel_problems(config: VehicleConfig, file: str) -> list[Problem]:
+def _find_channel_problems(config: VehicleConfig, file: str) -> list[errors.Problem]:
     """Check that no channel has two uses."""
     prefix, reply_prefix = config.lcm.channel_prefix, config.lcm.reply_prefix
     used = {f"sensors.{each.key}.channel": each.channel for each in _list_sensors(config)}

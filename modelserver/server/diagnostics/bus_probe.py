@@ -19,15 +19,7 @@ from modelserver.errors import BusError, WireError, quote
 from modelserver.messages import GetBodyList, Health, RequestHeader
 from modelserver.server.bus import Inbox
 from modelserver.server.clock import Clock
-from modelserver.server.diagnostics.checks import (
-    BusFacts,
-    Diagnosis,
-    DiagnosisLevel,
-    DiscoveredServers,
-    Server,
-    evaluate_bus,
-    filter_by_level,
-)
+from modelserver.server.diagnostics import checks
 from modelserver.server.diagnostics.machine import read_bus_facts
 from modelserver.wire.channels import PROBE_CHANNEL, REPLY_PREFIX, to_subscription_pattern
 from modelserver.wire.codec import decode, encode
@@ -76,13 +68,13 @@ def _is_echoed(sender: lcm.LCM, receiver: lcm.LCM, payload: bytes, seconds: floa
 
 def discover_servers(
     url: str, prefix: str, reply_prefix: str = REPLY_PREFIX, seconds: float = 1.3
-) -> DiscoveredServers:
+) -> checks.DiscoveredServers:
     """Collect the servers that publish health reports, and count the replies to one request. Raises BusError.
 
     The default time is longer than the period of health reports.
     """
     receiver = open_lcm(url)
-    servers: dict[Server, None] = {}
+    servers: dict[checks.Server, None] = {}
     request = RequestHeader(secrets.randbits(62) + 1, f"{reply_prefix}{REPLY_NAME}")
 
     def on_health(channel: str, data: bytes) -> None:
@@ -92,7 +84,7 @@ def discover_servers(
             return
         if len(servers) < MAX_SERVERS:
             own_prefix = channel.removesuffix("MODELSERVER_HEALTH")
-            servers[Server(health.host, health.pid, health.vehicle, health.version, own_prefix)] = None
+            servers[checks.Server(health.host, health.pid, health.vehicle, health.version, own_prefix)] = None
 
     count = 0
 
@@ -105,7 +97,7 @@ def discover_servers(
     receiver.subscribe(to_subscription_pattern(request.reply_channel), on_reply)
     receiver.publish(f"{prefix}PLATFORM_GET_BODY_LIST", encode(GetBodyList(request)))
     _receive_until(receiver, seconds, lambda: False)
-    return DiscoveredServers(tuple(servers), count)
+    return checks.DiscoveredServers(tuple(servers), count)
 
 
 def _receive_until(receiver: lcm.LCM, seconds: float, until: Callable[[], bool]) -> bool:
@@ -187,25 +179,25 @@ BUS_SUBJECT = "bus"
 
 
 def probe_bus(
-    url: str, read: Callable[[str], BusFacts] = lambda url: read_bus_facts(url, probe_delivery)
-) -> tuple[Diagnosis, ...]:
+    url: str, read: Callable[[str], checks.BusFacts] = lambda url: read_bus_facts(url, probe_delivery)
+) -> tuple[checks.Diagnosis, ...]:
     """Check the bus at `url`; takes a few milliseconds if it works.
 
     Raises BusError if it does not deliver an own message.
     """
     # packets that other programs lost before this one started are not reported
-    findings = evaluate_bus(replace(read(url), dropped=None))
-    errors = filter_by_level(findings, DiagnosisLevel.ERROR)
+    findings = checks.evaluate_bus(replace(read(url), dropped=None))
+    errors = checks.filter_by_level(findings, checks.DiagnosisLevel.ERROR)
     if errors:
         raise BusError(f"the bus at {url} does not work: {'; '.join(map(str, errors))} (details: modelserver doctor)")
     return findings
 
 
-def report_findings(findings: Iterable[Diagnosis], set_warning: Callable[[str, str], None]) -> None:
+def report_findings(findings: Iterable[checks.Diagnosis], set_warning: Callable[[str, str], None]) -> None:
     """Log the findings, and set a health warning for those to be fixed."""
     findings = tuple(findings)
     for finding in findings:
-        log.log(logging.WARNING if finding.level >= DiagnosisLevel.WARNING else logging.DEBUG, "%s", finding)
-    warnings = filter_by_level(findings)
+        log.log(logging.WARNING if finding.level >= checks.DiagnosisLevel.WARNING else logging.DEBUG, "%s", finding)
+    warnings = checks.filter_by_level(findings)
     if warnings:
         set_warning(BUS_SUBJECT, "; ".join(map(str, warnings)))

@@ -33,18 +33,12 @@ def read_gauges(queued: int, statm: Path = STATM) -> Gauges:
 
 def read_resident_bytes(statm: Path = STATM) -> int:
     """Read the resident memory of this process, bytes; 0 if unknown."""
-    try:
-        return int(statm.read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, IndexError):
-        return 0
+    return (_read_int(statm, 1) or 0) * os.sysconf("SC_PAGE_SIZE")
 
 
 def read_run_delay(schedstat: Path = SCHEDSTAT) -> int | None:
     """Read the run-queue delay of this thread: how long it was ready without a processor, ns; None if unknown."""
-    try:
-        return int(schedstat.read_bytes().split()[1])
-    except (OSError, ValueError, IndexError):
-        return None
+    return _read_int(schedstat, 1)
 
 
 _SIOCGIFFLAGS: Final = 0x8913
@@ -154,10 +148,10 @@ def count_dropped(port: int, proc: Path = PROC) -> int | None:
     return sum(int(row[-1]) for row in rows if len(row) > 12 and int(row[1].rpartition(":")[2], 16) == port)
 
 
-def _read_int(path: Path) -> int | None:
+def _read_int(path: Path, word: int = 0) -> int | None:
     try:
-        return int(path.read_text())
-    except (OSError, ValueError):
+        return int(path.read_bytes().split()[word])
+    except (OSError, ValueError, IndexError):
         return None
 
 

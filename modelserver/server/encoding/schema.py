@@ -34,20 +34,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from modelserver.errors import RecordingError
-from modelserver.server.encoding.nodes import (
-    AnyRecord,
-    ArrayNode,
-    ClassNode,
-    Complex,
-    EnumNode,
-    MappingNode,
-    NumpyArray,
-    OptionalNode,
-    RecordNode,
-    Scalar,
-    TupleNode,
-    TypeNode,
-)
+from modelserver.server.encoding import nodes
 from modelserver.server.encoding.tokens import EncodingError, TokenReader, TokenWriter
 
 _SCALARS: Final[Mapping[Any, str]] = {
@@ -122,9 +109,9 @@ class Schema:
     ):
         self._implementations = implementations or {}
         self._omitted = omitted or {}
-        self._records: dict[type, RecordNode] = {}
-        self._enums: dict[type, EnumNode] = {}
-        self._undefined: list[RecordNode] = []
+        self._records: dict[type, nodes.RecordNode] = {}
+        self._enums: dict[type, nodes.EnumNode] = {}
+        self._undefined: list[nodes.RecordNode] = []
         self._roots = {name: self._make_node(annotation, f"root {name}") for name, annotation in sorted(roots.items())}
         while self._undefined:
             self._define(self._undefined.pop())
@@ -141,11 +128,6 @@ class Schema:
         self.description: Final = json.dumps(description, sort_keys=True, separators=(",", ":"))
         """The schema as JSON text."""
         self.fingerprint: Final = hashlib.sha256(self.description.encode()).digest()
-
-    @property
-    def classes(self) -> tuple[type, ...]:
-        """The classes whose instances can be stored."""
-        return tuple(self._records)
 
     def encode(self, root: str, value: object, pause: Callable[[], object] = lambda: None) -> bytes:
         """Encode a value; `pause` is called about every 0.2 ms.
@@ -191,38 +173,38 @@ class Schema:
 
     # --- from annotations to nodes ---
 
-    def _make_node(self, hint: Any, place: str) -> TypeNode:
+    def _make_node(self, hint: Any, place: str) -> nodes.TypeNode:
         hint = _expand_alias(hint)
         origin, arguments = typing.get_origin(hint), typing.get_args(hint)
         if hint in _SCALARS:
-            return Scalar([_SCALARS[hint]])
+            return nodes.Scalar([_SCALARS[hint]])
         if hint in self._implementations:
             classes = sorted(self._implementations[hint], key=_get_name)
-            return AnyRecord([self._get_record(cls, place) for cls in classes], f"any {_get_name(hint)}")
+            return nodes.AnyRecord([self._get_record(cls, place) for cls in classes], f"any {_get_name(hint)}")
         if origin in (typing.Union, types.UnionType):
             return self._make_union(arguments, place)
         if origin is Literal:
-            return Scalar(sorted({_SCALARS[type(value)] for value in arguments}), arguments)
+            return nodes.Scalar(sorted({_SCALARS[type(value)] for value in arguments}), arguments)
         if origin is typing.ClassVar or hint is Any:
             raise SchemaError(f"{place}: {hint} cannot be stored; declare what it holds")
         if origin is type:
-            return ClassNode([self._get_record(cls, place) for cls in self._find_classes(arguments[0], place)])
+            return nodes.ClassNode([self._get_record(cls, place) for cls in self._find_classes(arguments[0], place)])
         if origin in _SEQUENCES:
             if origin is tuple and arguments[-1:] != (...,):
-                return TupleNode([self._make_node(each, place) for each in arguments], fixed=True)
-            return TupleNode([self._make_node(arguments[0], place)], list if origin is list else tuple)
+                return nodes.TupleNode([self._make_node(each, place) for each in arguments], fixed=True)
+            return nodes.TupleNode([self._make_node(arguments[0], place)], list if origin is list else tuple)
         if origin in (dict, collections.abc.Mapping):
             key, element = (self._make_node(each, place) for each in arguments)
-            return MappingNode(key, element, mutable=origin is dict)
+            return nodes.MappingNode(key, element, mutable=origin is dict)
         if hint in _TYPECODES:
-            return ArrayNode(_TYPECODES[hint])
+            return nodes.ArrayNode(_TYPECODES[hint])
         if origin is np.ndarray:
             (scalar,) = typing.get_args(arguments[1])
-            return NumpyArray(np.dtype(scalar).name)
+            return nodes.NumpyArray(np.dtype(scalar).name)
         if hint is complex:
-            return Complex()
+            return nodes.Complex()
         if isinstance(hint, type) and issubclass(hint, Enum):
-            return self._enums.setdefault(hint, EnumNode(hint, _get_name(hint)))
+            return self._enums.setdefault(hint, nodes.EnumNode(hint, _get_name(hint)))
         if isinstance(hint, type) and origin is None:
             return self._get_record(hint, place)
         raise SchemaError(f"{place}: {hint} cannot be stored")
@@ -235,34 +217,36 @@ class Schema:
             raise SchemaError(f"{place}: type[{hint}] cannot be stored")
         return sorted(found, key=_get_name)
 
-    def _make_union(self, arguments: Sequence[Any], place: str) -> TypeNode:
-        nodes = [self._make_node(each, place) for each in arguments if each is not type(None)]
-        records = [record for node in nodes if isinstance(node, AnyRecord) for record in node.records]
-        inner: TypeNode
-        if len(nodes) == 1:
-            inner = nodes[0]
-        elif all(isinstance(node, Scalar) for node in nodes):
-            return Scalar(sorted({_SCALARS[each] for each in arguments}))
-        elif all(isinstance(node, AnyRecord) for node in nodes):
-            inner = AnyRecord(sorted(records, key=lambda record: record.text))
+    def _make_union(self, arguments: Sequence[Any], place: str) -> nodes.TypeNode:
+        alternatives = [self._make_node(each, place) for each in arguments if each is not type(None)]
+        records = [record for node in alternatives if isinstance(node, nodes.AnyRecord) for record in node.records]
+        inner: nodes.TypeNode
+        if len(alternatives) == 1:
+            inner = alternatives[0]
+        elif all(isinstance(node, nodes.Scalar) for node in alternatives):
+            return nodes.Scalar(sorted({_SCALARS[each] for each in arguments}))
+        elif all(isinstance(node, nodes.AnyRecord) for node in alternatives):
+            inner = nodes.AnyRecord(sorted(records, key=lambda record: record.text))
         else:
-            raise SchemaError(f"{place}: a union of {' and '.join(node.text for node in nodes)} cannot be stored")
-        if len(nodes) == len(arguments):
+            raise SchemaError(
+                f"{place}: a union of {' and '.join(node.text for node in alternatives)} cannot be stored"
+            )
+        if len(alternatives) == len(arguments):
             return inner
-        if isinstance(inner, Scalar):
-            return Scalar(sorted({*inner.names, "None"}))
-        return OptionalNode(inner)
+        if isinstance(inner, nodes.Scalar):
+            return nodes.Scalar(sorted({*inner.names, "None"}))
+        return nodes.OptionalNode(inner)
 
-    def _get_record(self, cls: type, place: str) -> RecordNode:
+    def _get_record(self, cls: type, place: str) -> nodes.RecordNode:
         found = self._records.get(cls)
         if found is None:
             if cls.__module__ == "builtins" or getattr(cls, "_is_protocol", False):
                 raise SchemaError(f"{place}: {cls} cannot be stored; declare what it holds")
-            found = self._records[cls] = RecordNode(cls, _get_name(cls))
+            found = self._records[cls] = nodes.RecordNode(cls, _get_name(cls))
             self._undefined.append(found)
         return found
 
-    def _define(self, record: RecordNode) -> None:
+    def _define(self, record: nodes.RecordNode) -> None:
         cls, name = record.cls, record.text
         omitted = self._omitted.get(cls, frozenset())
         slots = _find_slots(cls)

@@ -27,18 +27,9 @@ from modelserver.server.journal.comparison import Deviation, compute_deviation
 from modelserver.server.journal.replay import PublishedMessage, ReplayLoop
 from modelserver.server.journal.segments import NEWEST_NAME, ChainVerifier, open_mapped, read_newest
 from modelserver.signing.signatures import Key
+from modelserver.wire import journal
 from modelserver.wire.channels import BY_NAME
 from modelserver.wire.codec import decode
-from modelserver.wire.journal import (
-    FORMAT,
-    CorruptRegion,
-    JournalRecord,
-    RecordKind,
-    SegmentEnd,
-    SegmentHead,
-    SegmentState,
-    read_segment,
-)
 
 POSES: Final = ("POSE", "POSE_VECTOR", "POSE_ODOM")
 
@@ -152,9 +143,9 @@ class _Group:
     """A record, or several records with interleaved outputs, and what was published."""
 
     segment: Path
-    record: JournalRecord
+    record: journal.JournalRecord
     replayed: list[PublishedMessage]
-    recorded: list[JournalRecord] = field(default_factory=list)
+    recorded: list[journal.JournalRecord] = field(default_factory=list)
 
 
 def verify(
@@ -207,28 +198,28 @@ class _Verifier:
     def verify_segment(self, path: Path) -> None:
         """Verify the next segment."""
         self._path, self._is_closed, continues = path, False, False
-        end: SegmentEnd | None = None
+        end: journal.SegmentEnd | None = None
         report, before = self.report, self.report.bytes
         facts: dict[str, Any] | None = None
         with open_mapped(path) as data:
             size = len(data)
             report.bytes += size
-            for item in read_segment(data):
+            for item in journal.read_segment(data):
                 if report.difference is not None:
                     return
-                if isinstance(item, JournalRecord):
+                if isinstance(item, journal.JournalRecord):
                     if report.handled % 512 == 0:
                         self._on_progress(before + item.at)
                     self._process(item)
-                elif isinstance(item, SegmentHead):
+                elif isinstance(item, journal.SegmentHead):
                     facts = item.facts
                     continues = self._read_head(facts)
-                elif isinstance(item, SegmentState):
+                elif isinstance(item, journal.SegmentState):
                     if not continues:
                         self._begin(item, facts)
-                elif isinstance(item, CorruptRegion):
+                elif isinstance(item, journal.CorruptRegion):
                     self._report_corruption(item)
-                elif isinstance(item, SegmentEnd):
+                elif isinstance(item, journal.SegmentEnd):
                     self._is_closed, end = True, item
                     if not item.is_intact:
                         self._add_finding("the checksum over the whole segment is wrong", is_damage=True)
@@ -252,9 +243,9 @@ class _Verifier:
         """Process the head of a segment; return whether it continues the one before."""
         run, part, lost = str(facts.get("run")), facts.get("part"), facts.get("lost")
         numbers = (part, lost, facts.get("number"), facts.get("run_number"))
-        if facts.get("format") != FORMAT or not all(type(each) is int for each in numbers):
+        if facts.get("format") != journal.FORMAT or not all(type(each) is int for each in numbers):
             raise RecordingError(
-                f"{self._path}: is a journal of format {facts.get('format')}; this build reads {FORMAT}; "
+                f"{self._path}: is a journal of format {facts.get('format')}; this build reads {journal.FORMAT}; "
                 "verify it with the build that wrote it"
             )
         assert isinstance(part, int)
@@ -276,7 +267,7 @@ class _Verifier:
             self._add_finding(f"{lost} records before it are lost: disk error, or the disk was too slow")
         return continues
 
-    def _begin(self, state: SegmentState, facts: dict[str, Any] | None) -> None:
+    def _begin(self, state: journal.SegmentState, facts: dict[str, Any] | None) -> None:
         self.close()
         self._replay, self._at_ns = None, 0
         try:
@@ -289,15 +280,15 @@ class _Verifier:
             if len(history):
                 self._held_until = history.last + round(replay.state.settings.history_s * 1e6)
 
-    def _process(self, record: JournalRecord) -> None:
+    def _process(self, record: journal.JournalRecord) -> None:
         report, replay = self.report, self._replay
         report.first_utime = report.first_utime or record.utime
         report.last_utime = record.utime
         if replay is None:
-            if record.kind is RecordKind.PUBLISHED:
+            if record.kind is journal.RecordKind.PUBLISHED:
                 report.skipped[record.channel] += 1
             return
-        if record.kind is RecordKind.PUBLISHED:
+        if record.kind is journal.RecordKind.PUBLISHED:
             if self._group is None:
                 self._group = _Group(self._path, record, [])
             self._group.recorded.append(record)
@@ -323,9 +314,9 @@ class _Verifier:
             self._group.replayed += published
 
     @staticmethod
-    def _is_interleaved(record: JournalRecord) -> bool:
+    def _is_interleaved(record: journal.JournalRecord) -> bool:
         """Return whether a record may come between outputs of one step: a publishing or persisting error."""
-        if record.kind is not RecordKind.EVENT:
+        if record.kind is not journal.RecordKind.EVENT:
             return False
         try:
             return isinstance(journal_state.decode_event(record.data), (Rejected, HealthWarning))
@@ -364,7 +355,7 @@ class _Verifier:
             )
             return
 
-    def _is_close(self, recorded: JournalRecord, replayed: PublishedMessage) -> bool:
+    def _is_close(self, recorded: journal.JournalRecord, replayed: PublishedMessage) -> bool:
         """Return whether a message is equal within the tolerance, and update the maximum deviation."""
         report = self.report
         off = compute_deviation(recorded.data, replayed[1]) if replayed[0] == recorded.channel else None
@@ -378,17 +369,17 @@ class _Verifier:
         report.max_deviation = report.max_deviation.elementwise_max(off)
         return True
 
-    def _needs_history(self, record: JournalRecord) -> bool:
+    def _needs_history(self, record: journal.JournalRecord) -> bool:
         """Return whether a reply may depend on poses before the restart of the replay."""
         replay = self._replay
         if replay is None or not len(replay.state.history) or replay.state.history.last >= self._held_until:
             return False
         if record.kind not in (
-            RecordKind.REQUEST,
-            RecordKind.CACHED,
-            RecordKind.MALFORMED,
-            RecordKind.OVERLOAD,
-            RecordKind.FAILED,
+            journal.RecordKind.REQUEST,
+            journal.RecordKind.CACHED,
+            journal.RecordKind.MALFORMED,
+            journal.RecordKind.OVERLOAD,
+            journal.RecordKind.FAILED,
         ):
             # a deferred request is answered later
             return True
@@ -401,7 +392,7 @@ class _Verifier:
             return True
         return bool(getattr(getattr(request, "time", None), "at", 0))
 
-    def _report_corruption(self, broken: CorruptRegion) -> None:
+    def _report_corruption(self, broken: journal.CorruptRegion) -> None:
         if broken.tail:
             self._add_finding(
                 f"is truncated at byte {broken.start}: the last {broken.length} bytes are not sealed and not used "

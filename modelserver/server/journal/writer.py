@@ -46,17 +46,7 @@ from modelserver.server.persistence.directory import (
     write_atomically,
 )
 from modelserver.signing.signatures import Key
-from modelserver.wire.journal import (
-    FORMAT,
-    JournalRecord,
-    RecordKind,
-    SegmentEnd,
-    encode_batch,
-    encode_end,
-    encode_file,
-    encode_head,
-    encode_state,
-)
+from modelserver.wire import journal
 
 log = logging.getLogger(__name__)
 
@@ -187,7 +177,7 @@ class JournalWriter:
 
     def _write(self, entries: list[JournalEntry]) -> None:
         """Write entries: a batch for the records between two segment starts."""
-        records: list[JournalRecord] = []
+        records: list[journal.JournalRecord] = []
         for number, entry in enumerate(entries):
             if isinstance(entry.event, SegmentStart):
                 try:
@@ -203,20 +193,20 @@ class JournalWriter:
                 records.append(self._record(entry))
         self._write_batch(records)
 
-    def _record(self, entry: JournalEntry) -> JournalRecord:
+    def _record(self, entry: JournalEntry) -> journal.JournalRecord:
         kind, data = entry.kind, entry.data
-        if kind is RecordKind.EVENT:
+        if kind is journal.RecordKind.EVENT:
             data = journal_state.encode_event(entry.event, self._pause)
-        elif kind is RecordKind.REQUEST and type(entry.event) not in CHANNEL_OF:
-            kind = RecordKind.SAMPLE
-        return JournalRecord(kind, entry.now.monotonic_ns, entry.now.utime, entry.channel, data)
+        elif kind is journal.RecordKind.REQUEST and type(entry.event) not in CHANNEL_OF:
+            kind = journal.RecordKind.SAMPLE
+        return journal.JournalRecord(kind, entry.now.monotonic_ns, entry.now.utime, entry.channel, data)
 
-    def _write_batch(self, records: list[JournalRecord]) -> None:
+    def _write_batch(self, records: list[journal.JournalRecord]) -> None:
         if not records or self._segment is None:
             self._lost += len(records)
             return
         try:
-            self._segment.append(encode_batch(self._batch, records))
+            self._segment.append(journal.encode_batch(self._batch, records))
         except OSError:
             self._lost += len(records)
             raise
@@ -234,17 +224,17 @@ class JournalWriter:
         except OSError:
             self._lost = lost
             raise
-        facts = {"format": FORMAT, "part": self._part, "lost": lost, "utime": now.utime, **self._context.facts}
+        facts = {"format": journal.FORMAT, "part": self._part, "lost": lost, "utime": now.utime, **self._context.facts}
         facts["history_s"] = journal_state.HISTORY_S if len(beginning.state.history) else None
         facts["key"] = "" if self._key is None else self._key.name
         facts |= {"number": segment.number, "run_number": self._run_number, "previous": self._previous}
         self._previous = ""
         self._segment, self._batch = segment, 0
         try:
-            segment.append(encode_head(facts, now.utime))
+            segment.append(journal.encode_head(facts, now.utime))
             for name, data in self._context.files:
-                segment.append(encode_file(name, data[:MAX_FILE_BYTES], now.utime))
-            segment.append(encode_state(state, now.utime))
+                segment.append(journal.encode_file(name, data[:MAX_FILE_BYTES], now.utime))
+            segment.append(journal.encode_state(state, now.utime))
             self._write_newest(segment.number)
         except OSError:
             self._lost = lost
@@ -263,8 +253,10 @@ class JournalWriter:
         segment, self._segment = self._segment, None
         if segment is not None:
             try:
-                end = SegmentEnd(True, segment.digest.digest(), seal_segment(self._key, segment.digest.digest()))
-                segment.append(encode_end(end.digest, self._clock.utime(), end.mac))
+                end = journal.SegmentEnd(
+                    True, segment.digest.digest(), seal_segment(self._key, segment.digest.digest())
+                )
+                segment.append(journal.encode_end(end.digest, self._clock.utime(), end.mac))
                 segment.sync()
                 self._previous = end.seal.hex()
                 self._write_newest(segment.number)
