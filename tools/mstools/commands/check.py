@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 from collections import Counter
@@ -18,11 +17,10 @@ from modelserver.formats import check_file
 from modelserver.geometry.model import Model
 from mstools.commands.driver import find_driver_problems
 from mstools.terminal.options import JsonOption, Variables, parse_variables
-from mstools.terminal.output import describe_size, escape, format_count, print_problem
+from mstools.terminal.output import describe_size, escape, format_count, print_problem, to_json
 from mstools.terminal.problems import find_nearest_path
 
 if TYPE_CHECKING:
-    from modelserver.config.vehicle_file import VehicleConfig
     from modelserver.server.vehicle import Vehicle
 
 
@@ -52,8 +50,7 @@ def command(
     else:
         for file, model, problems in results:
             _print(file, model, problems, notes)
-    if any(_has_findings(problems) for _, _, problems in results):
-        raise typer.Exit(1)
+    raise typer.Exit(int(any(_has_findings(problems) for _, _, problems in results)))
 
 
 def _check(file: str, variables: dict[str, str], strict: bool) -> tuple[Model | None, tuple[Problem, ...]]:
@@ -93,7 +90,12 @@ def check_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tuple[
         return None, problems
     # each stage checks what it can, whatever another has found: one run reports all problems
     geometry, of_vehicle = examine_vehicle(config, file, strict)
-    more = [*of_vehicle, *find_driver_problems(config, file, geometry.constraints), *_find_notes(config, file)]
+    more = [*of_vehicle, *find_driver_problems(config, file, geometry.constraints)]
+    sensors = config.sensors
+    if sensors.gps is None and sensors.imu is None and sensors.wheels is None:
+        # valid, but rarely intended
+        words = "no localization sensor is configured, so there is no pose"
+        more.append(Problem(Severity.NOTE, words, Location(file, element="sensors"), "see docs/vehicle-file.md"))
     if geometry.model is not None and config.base_frame and not of_vehicle:
         try:
             vehicle = load_vehicle(config, file, strict)
@@ -113,17 +115,9 @@ def check_vehicle(file: str, strict: bool = False) -> tuple[Model | None, tuple[
 
 def _is_within(element: str, wrong: set[str]) -> bool:
     """Return whether a finding follows from a wrong value that was dropped: its own key, or the sensors."""
-    if element == "localization.mode" or element == "sensors":
+    if element in ("localization.mode", "sensors"):
         return any(each.partition(".")[0] == "sensors" for each in wrong)
     return any(f"{element}.".startswith(f"{each}.") or f"{each}.".startswith(f"{element}.") for each in wrong if each)
-
-
-def _find_notes(config: VehicleConfig, file: str) -> Iterator[Problem]:
-    """Yield notes on what a vehicle file may have but rarely intends."""
-    sensors = config.sensors
-    if sensors.gps is None and sensors.imu is None and sensors.wheels is None:
-        words = "no localization sensor is configured, so there is no pose"
-        yield Problem(Severity.NOTE, words, Location(file, element="sensors"), "see docs/vehicle-file.md")
 
 
 def _find_unusable_sensors(vehicle: Vehicle, file: str) -> Iterator[Problem]:
@@ -159,9 +153,8 @@ def _as_data(file: str, model: Model | None, problems: tuple[Problem, ...]) -> d
         "errors": count[Severity.ERROR],
         "warnings": count[Severity.WARNING],
         "notes": count[Severity.NOTE],
-        "model": None
-        if model is None
-        else {
+        "model": model
+        and {
             "name": model.name,
             "revision": model.revision,
             "bodies": len(model.bodies),
@@ -170,14 +163,8 @@ def _as_data(file: str, model: Model | None, problems: tuple[Problem, ...]) -> d
         },
         "problems": [
             {
-                "severity": str(problem.severity),
-                "file": problem.file,
-                "line": problem.line,
-                "element": problem.element,
-                "message": problem.message,
-                "fix": problem.fix,
-                "nearest": list(problem.nearest),
-                "edit": None if problem.edit is None else dataclasses.asdict(problem.edit),
+                name: to_json(getattr(problem, name))
+                for name in ("severity", "file", "line", "element", "message", "fix", "nearest", "edit")
             }
             for problem in problems
         ],

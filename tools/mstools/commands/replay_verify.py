@@ -46,10 +46,7 @@ def run_verification(journal: Path, as_json: bool, key: Path | None = None) -> N
             typer.echo(f"modelserver: {len(found.findings) - MAX_FINDINGS} more findings (--json has all)", err=True)
         if found.environment_differences:
             typer.echo(escape(f"modelserver: bits may differ: {'; '.join(found.environment_differences)}"), err=True)
-    is_done = found.result is VerificationResult.AUTHENTIC or (
-        found.result is VerificationResult.REPRODUCED and not keys
-    )
-    if not is_done:
+    if found.result is not VerificationResult.REPRODUCED or keys:
         raise typer.Exit(found.result)
 
 
@@ -64,24 +61,18 @@ def format_result(found: VerificationReport, keyed: bool = False) -> list[str]:
         "records replayed"
     ]
     exact, close = sum(found.reproduced.values()), sum(found.within_tolerance.values())
-    if exact:
-        text.append(
-            f"{found.reproduced_poses} poses and {exact - found.reproduced_poses} other messages are reproduced bit "
-            "for bit:"
-        )
-        text += [f"  {name:24} {count:9}" for name, count in sorted(found.reproduced.items())]
-    if close:
-        text.append(
-            f"{format_count(close, 'message')} are the same within {TOLERANCE:g} m and rad: {_format_largest(found)}:"
-        )
-        text += [f"  {name:24} {count:9}" for name, count in sorted(found.within_tolerance.items())]
+    poses, same = found.reproduced_poses, f"the same within {TOLERANCE:g} m and rad: {_format_largest(found)}"
+    for counts, what in (
+        (found.reproduced, f"{poses} poses and {exact - poses} other messages are reproduced bit for bit"),
+        (found.within_tolerance, f"{format_count(close, 'message')} are {same}"),
+    ):
+        if any(counts.values()):
+            text += [f"{what}:", *(f"  {name:24} {count:9}" for name, count in sorted(counts.items()))]
     if not exact and not close:
         text.append("nothing is reproduced: it has no sent messages, or no state to start from")
     if found.skipped:
-        text.append(
-            f"not verified: {format_count(sum(found.skipped.values()), 'message')}, which depend on a state before the "
-            "journal"
-        )
+        skipped = format_count(sum(found.skipped.values()), "message")
+        text.append(f"not verified: {skipped}, which depend on a state before the journal")
     if found.unverifiable:
         text.append(f"not verified: {found.unverifiable} replies about times before the first remaining segment")
     if found.difference is not None:
@@ -118,10 +109,11 @@ def _format_time(utime: int) -> str:
 
 def _format_difference(first: Difference) -> list[str]:
     place = f"{first.segment} at byte {first.at}, utime {first.utime} ({_format_time(first.utime)})"
+    head = f"NOT REPRODUCED: a message on {first.channel}"
     if first.replayed is None:
-        return [f"NOT REPRODUCED: a message on {first.channel} was published, and is not published now: {place}"]
+        return [f"{head} was published, and is not published now: {place}"]
     if first.recorded is None:
-        return [f"NOT REPRODUCED: a message on {first.channel} is published now, and was not published then: {place}"]
+        return [f"{head} is published now, and was not published then: {place}"]
     text = [f"NOT REPRODUCED: {first.channel} differs: {place}"]
     fields = find_differences(first.recorded, first.replayed)
     text += [f"  {name}: was {was}, is {now}" for name, was, now in fields[:MAX_FIELDS]]
@@ -147,7 +139,9 @@ def _format_value(value: Any) -> str:
 
 
 def _as_json(found: VerificationReport) -> dict[str, Any]:
-    first = found.difference
+    first, fields = found.difference, []
+    if first is not None and first.recorded is not None and first.replayed is not None:
+        fields = find_differences(first.recorded, first.replayed)
     return {
         "result": found.result.name.lower(),
         "proved": found.is_reproduced,
@@ -161,28 +155,18 @@ def _as_json(found: VerificationReport) -> dict[str, Any]:
         "poses": found.reproduced_poses,
         "exact": dict(sorted(found.reproduced.items())),
         "close": dict(sorted(found.within_tolerance.items())),
-        "largest": {
-            "meters": found.max_deviation.meters,
-            "radians": found.max_deviation.radians,
-            "share": found.max_deviation.share,
-        },
+        "largest": {name: getattr(found.max_deviation, name) for name in ("meters", "radians", "share")},
         "skipped": sum(found.skipped.values()),
         "old_replies": found.unverifiable,
         "lost": found.lost,
         "findings": [{"segment": str(e.segment), "text": e.text, "damage": e.is_damage} for e in found.findings],
         "other": found.environment_differences,
-        "difference": None
-        if first is None
-        else {
+        "difference": first
+        and {
             "segment": str(first.segment),
             "byte": first.at,
             "utime": first.utime,
             "channel": first.channel,
-            "fields": []
-            if first.recorded is None or first.replayed is None
-            else [
-                {"field": name, "was": was, "is": now}
-                for name, was, now in find_differences(first.recorded, first.replayed)
-            ],
+            "fields": [{"field": name, "was": was, "is": now} for name, was, now in fields],
         },
     }

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from modelserver.errors import ModelServerError, RecordingError
+from mstools.terminal.options import JsonOption
 from mstools.terminal.output import check_writable, escape, format_count, to_json, write_file
 from mstools.terminal.progress import show_progress
 from mstools.tuning.search import Parameter, Score, SearchResult, SearchStep, Settings, search
@@ -64,7 +65,7 @@ def command(
     processes: Annotated[
         int, typer.Option(min=0, max=64, metavar="N", help="Parallel runs. 0: one per processor.")
     ] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")] = False,
+    as_json: JsonOption = False,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
     """Tune the filter's noise settings on a recording; docs/tuning.md explains how.
@@ -94,10 +95,10 @@ def command(
         raise RecordingError(f"{escape(str(config))}: localization.mode is raw, without a filter to tune")
     chosen = [each.parameter for each in TUNABLES if _has_sensor(vehicle, each.needs) and (each.quick or not quick)]
     sigmas = sorted(tune_runs.stated_sigma(each, vehicle) for each in fixes.samples)
-    # a floor below the receiver's sigma has no effect: steps upward start there
-    chosen = [
-        Parameter(p.name, p.low, p.high, sigmas[len(sigmas) // 2]) if p.name == "gps_sigma_floor" else p for p in chosen
-    ]
+    for number, each in enumerate(chosen):
+        # a floor below the receiver's sigma has no effect: steps upward start there
+        if each.name == "gps_sigma_floor":
+            chosen[number] = Parameter(each.name, each.low, each.high, sigmas[len(sigmas) // 2])
     parts: tuple[Part, ...] = ("half",) if quick else ("half", "outage")
     settings = vehicle.config.localization.filter
     begin = {each.name: float(getattr(settings, each.name)) for each in chosen}
@@ -187,10 +188,8 @@ def format_result(log: str, result: TuningResult) -> list[str]:
     ]
     text += [f"{name:34}{a:10.3f}{b:10.3f}" for name, a, b in rows if math.isfinite(a)]
     later = {each.kind: each for each in result.after[0].consistency}
-    for each in result.before[0].consistency:
-        text.append(_format_nis(each, later.get(each.kind)))
-    for name, value in found.settings.items():
-        text.append(f"{name}: {result.begin[name]:g} -> {value:g}")
+    text += [_format_nis(each, later.get(each.kind)) for each in result.before[0].consistency]
+    text += [f"{name}: {result.begin[name]:g} -> {value:g}" for name, value in found.settings.items()]
     if not found.settings:
         text.append("No step helps enough: the settings fit this recording.")
     if found.insensitive:
@@ -227,20 +226,17 @@ def as_data(result: TuningResult) -> dict[str, object]:
 
 def format_proposal(log: str, result: TuningResult) -> str:
     """Format the proposed settings as part of a vehicle file."""
-    found = result.found
+    first, found = result.first, result.found
+    likelihood = f"{first.likelihood:.3f} -> {found.score.likelihood:.3f}"
     head = [
-        f"# Proposed by modelserver tune from {escape(log)}: log-likelihood of a withheld fix "
-        f"{result.first.likelihood:.3f} -> {found.score.likelihood:.3f},",
-        f"# RMSE {result.first.rmse:.3f} -> {found.score.rmse:.3f} m."
+        f"# Proposed by modelserver tune from {escape(log)}: log-likelihood of a withheld fix {likelihood},",
+        f"# RMSE {first.rmse:.3f} -> {found.score.rmse:.3f} m."
         " Try it on another recording before you merge it; nothing was changed.",
     ]
     if not found.settings:
         return "\n".join([*head, "localization: {filter: {}}   # no step helps enough"]) + "\n"
     settings = [f"    {name}: {value:.6g}   # was {result.begin[name]:.6g}" for name, value in found.settings.items()]
     return "\n".join([*head, "localization:", "  filter:", *settings]) + "\n"
-
-
-# --- parts --------------------------------------------------------------------------------------------------
 
 
 @contextmanager
