@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
-from msdrivers.protocol.framing import FrameFormat, FrameScanner
+from msdrivers.protocol.framing import FrameScanner
 from msdrivers.protocol.nmea import EpochAssembler, NmeaEpoch, NmeaSentence, SentenceFormat
 from msdrivers.protocol.novatel import (
     AsciiFormat,
@@ -21,46 +20,26 @@ GpsMessage: TypeAlias = NmeaEpoch | NovatelLog | CommandResponse | Prompt
 """Each has `start`: offset of its first byte in the stream, to find its receive time."""
 
 
-class GpsStream:
+class GpsStream(FrameScanner[Any]):
     """Parses bytes to messages in the order of their completion. Never raises; memory is bounded.
 
     The messages do not depend on how the bytes are split, except for calls of `flush`.
     """
 
     def __init__(self) -> None:
-        formats: tuple[FrameFormat[NmeaSentence | NovatelLog | CommandResponse | Prompt], ...] = (
-            SentenceFormat(),
-            BinaryFormat(),
-            AsciiFormat(),
-            TextFormat(),
-            PromptFormat(),
-        )
-        self._scanner = FrameScanner(formats)
+        super().__init__((SentenceFormat(), BinaryFormat(), AsciiFormat(), TextFormat(), PromptFormat()))
         self._epochs = EpochAssembler()
 
     @property
-    def offset(self) -> int:
-        """Bytes that were fed."""
-        return self._scanner.offset
-
-    @property
-    def pending_bytes(self) -> int:
-        """Bytes kept of an incomplete frame."""
-        return self._scanner.pending_bytes
-
-    @property
-    def counts(self) -> Mapping[str, int]:
+    def counts(self) -> dict[str, int]:
         """Frames by kind, `rejected.<reason>`, `skipped` bytes."""
-        return {**self._scanner.counts, **({"rejected.late": self._epochs.late} if self._epochs.late else {})}
+        return super().counts | ({"rejected.late": self._epochs.late} if self._epochs.late else {})
 
     def feed(self, data: bytes) -> list[GpsMessage]:
         """Return what `data` completes."""
         messages: list[GpsMessage] = []
-        for each in self._scanner.feed(data):
-            if isinstance(each, NmeaSentence):
-                messages += self._epochs.add(each)
-            else:
-                messages.append(each)
+        for each in super().feed(data):
+            messages += self._epochs.add(each) if isinstance(each, NmeaSentence) else [each]
         return messages
 
     def flush(self) -> list[NmeaEpoch]:
@@ -69,5 +48,5 @@ class GpsStream:
 
     def clear(self) -> None:
         """Discard what is incomplete after the line was closed; counters and offsets continue."""
-        self._scanner.clear()
+        super().clear()
         self._epochs.clear()

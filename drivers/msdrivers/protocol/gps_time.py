@@ -18,25 +18,9 @@ _EPOCH_DAYS = (date(1980, 1, 6) - date(1970, 1, 1)).days
 GPS_EPOCH = _EPOCH_DAYS * DAY
 """utime of the beginning of GPS time."""
 
-_LEAP_DATES = (
-    date(1981, 7, 1),
-    date(1982, 7, 1),
-    date(1983, 7, 1),
-    date(1985, 7, 1),
-    date(1988, 1, 1),
-    date(1990, 1, 1),
-    date(1991, 1, 1),
-    date(1992, 7, 1),
-    date(1993, 7, 1),
-    date(1994, 7, 1),
-    date(1996, 1, 1),
-    date(1997, 7, 1),
-    date(1999, 1, 1),
-    date(2006, 1, 1),
-    date(2009, 1, 1),
-    date(2012, 7, 1),
-    date(2015, 7, 1),
-    date(2017, 1, 1),
+_LEAP_DATES = sorted(
+    [date(year, 1, 1) for year in (1988, 1990, 1991, 1996, 1999, 2006, 2009, 2017)]
+    + [date(year, 7, 1) for year in (1981, 1982, 1983, 1985, 1992, 1993, 1994, 1997, 2012, 2015)]
 )
 """Days before whose beginning a second was inserted, since 1980 (IERS Bulletin C; none after 2017 up to 2026)."""
 

@@ -20,7 +20,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.estimation.calibration.errors import CalibrationError
+from modelserver.estimation.calibration import CalibrationError
 from modelserver.transforms.so3 import Array
 
 INSTABILITY_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)

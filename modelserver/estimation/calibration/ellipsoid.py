@@ -20,8 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.estimation.calibration import quadric
-from modelserver.estimation.calibration.errors import CalibrationError
+from modelserver.estimation.calibration import CalibrationError, quadric
 from modelserver.transforms.so3 import Array, Matrix3, Vector3, to_vector3
 
 SECTORS = 12
@@ -55,11 +54,6 @@ class Coverage:
     sectors: tuple[bool, ...]
     axis: Vector3
     spread: float
-
-    @property
-    def share(self) -> float:
-        """Share of the sectors that are covered."""
-        return sum(self.sectors) / len(self.sectors)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,27 +101,8 @@ def fit_all_axes(fields: npt.ArrayLike, strength: float = math.nan, horizontal: 
     """
     points = _select_finite(fields)
     found = quadric.fit(points)
-    known = math.isfinite(strength)
-    radius = float(np.linalg.det(found.matrix)) ** (-1.0 / 3.0)
-    target = strength if known else radius
-    unit = found.normalize(points[found.is_inlier])
-    coverage = _sphere_coverage(unit)
-    _check_coverage(coverage)
-    A = found.matrix * target
-    _check_axis_ratio(A, known)
-    rms = _rms(unit, found.weights[found.is_inlier]) * target
-    return MagnetometerFit(
-        hard_iron=to_vector3(found.center),
-        soft_iron=_matrix(A),
-        is_planar=False,
-        strength=target,
-        is_strength_known=known,
-        rms=_check_residual(rms, target),
-        heading_rms=rms / horizontal,
-        coverage=coverage,
-        samples=len(points),
-        outliers=int((~found.is_inlier).sum()),
-    )
+    coverage = _sphere_coverage(found.normalize(points[found.is_inlier]))
+    return _make_fit(found, points, np.eye(3), 0.0, strength, horizontal, coverage)
 
 
 def fit_level(
@@ -156,28 +131,52 @@ def fit_level(
         found = quadric.fit(level)
     except CalibrationError as error:
         raise _add_coverage(error, level) from None
-    known = math.isfinite(horizontal)
-    radius = float(np.linalg.det(found.matrix)) ** -0.5
-    target = horizontal if known else radius
     unit = found.normalize(level[found.is_inlier])
     coverage = Coverage(_covered_sectors(unit[:, 0], unit[:, 1]), to_vector3(E[:, 2]), math.nan)
-    _check_coverage(coverage)
-    A = np.eye(3)
-    A[:2, :2] = found.matrix * target
-    _check_axis_ratio(A[:2, :2], known)
-    weights = found.weights[found.is_inlier]
-    rms = _rms(unit, weights) * target
     offset = 0.0
     if math.isfinite(vertical):
-        offset = float(np.average(height[found.is_inlier], weights=weights)) - vertical
+        offset = float(np.average(height[found.is_inlier], weights=found.weights[found.is_inlier])) - vertical
+    return _make_fit(found, level, E, offset, horizontal, math.nan, coverage)
+
+
+def _make_fit(
+    found: quadric.Quadric,
+    points: Array,
+    E: Array,
+    offset: float,
+    strength: float,
+    horizontal: float,
+    coverage: Coverage,
+) -> MagnetometerFit:
+    """Scale a quadric to the field's strength, NaN for the mean radius, and check it. Raises CalibrationError.
+
+    `points` are along the first columns of `E`, axes along the sensor's; `offset` is the hard iron along the last.
+    """
+    dimension = points.shape[1]
+    known = math.isfinite(strength)
+    target = strength if known else float(np.linalg.det(found.matrix)) ** (-1.0 / dimension)
+    _check_coverage(coverage)
+    scaled = found.matrix * target
+    _check_axis_ratio(scaled, known)
+    off = np.linalg.norm(found.normalize(points[found.is_inlier]), axis=1) - 1.0
+    rms = math.sqrt(float(np.average(off**2, weights=found.weights[found.is_inlier]))) * target
+    if rms > MAX_RESIDUAL * target:
+        raise CalibrationError(
+            f"the samples scatter by {rms / target:.0%} of the field about the fit, {MAX_RESIDUAL:.0%} are "
+            "allowed: the vehicle was not turned, or something else moved the field; turn in one place, away from iron"
+        )
+    A = np.eye(3)
+    A[:dimension, :dimension] = scaled
+    A = E @ A @ E.T
+    a, b, c, d, e, f, g, h, i = (float(each) for each in ((A + A.T) / 2.0).ravel())
     return MagnetometerFit(
-        hard_iron=to_vector3(E @ np.array([*found.center, offset])),
-        soft_iron=_matrix(E @ A @ E.T),
-        is_planar=True,
+        hard_iron=to_vector3(E @ np.array([*found.center, offset])[:3]),
+        soft_iron=(a, b, c, d, e, f, g, h, i),
+        is_planar=dimension == 2,
         strength=target,
         is_strength_known=known,
-        rms=_check_residual(rms, target),
-        heading_rms=rms / target,
+        rms=rms,
+        heading_rms=rms / (target if dimension == 2 else horizontal),
         coverage=coverage,
         samples=len(points),
         outliers=int((~found.is_inlier).sum()),
@@ -266,22 +265,3 @@ def _check_axis_ratio(A: Array, known: bool) -> None:
             f"the measured field is {1.0 / float(np.mean(values)):.2g} times the earth's at the place: check its "
             "scale (tesla; 1 gauss is 1e-4 tesla), or whether it turned at all"
         )
-
-
-def _rms(unit: Array, weights: Array) -> float:
-    off = np.linalg.norm(unit, axis=1) - 1.0
-    return math.sqrt(float(np.average(off**2, weights=weights)))
-
-
-def _check_residual(rms: float, strength: float) -> float:
-    if rms > MAX_RESIDUAL * strength:
-        raise CalibrationError(
-            f"the samples scatter by {rms / strength:.0%} of the field about the fit, {MAX_RESIDUAL:.0%} are "
-            "allowed: the vehicle was not turned, or something else moved the field; turn in one place, away from iron"
-        )
-    return rms
-
-
-def _matrix(values: Array) -> Matrix3:
-    a, b, c, d, e, f, g, h, i = (float(each) for each in ((values + values.T) / 2.0).ravel())
-    return (a, b, c, d, e, f, g, h, i)

@@ -10,7 +10,7 @@ import itertools
 import math
 from dataclasses import dataclass, replace
 
-from modelserver.estimation.calibration.errors import CalibrationError
+from modelserver.estimation.calibration import CalibrationError
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
 
@@ -56,7 +56,7 @@ class MountCheck:
     text: str
 
 
-def check_mount(mean_force: Vector3, q_base_sensor: Quaternion, max_tilt: float = MAX_TILT) -> MountCheck:
+def check_mount(mean_force: Vector3, q_base_sensor: Quaternion) -> MountCheck:
     """Compare the specific force at rest with the stated mount.
 
     Candidates are the 24 rotations onto the vehicle's axes, each followed by the tilt of the stated mount relative to
@@ -66,7 +66,6 @@ def check_mount(mean_force: Vector3, q_base_sensor: Quaternion, max_tilt: float 
     ----------
     mean_force : mean specific force along the sensor's axes, m/s2, on nearly level ground
     q_base_sensor : the stated rotation R_base_sensor; base: x forward, y left, z up
-    max_tilt : radians
 
     Raises
     ------
@@ -84,8 +83,8 @@ def check_mount(mean_force: Vector3, q_base_sensor: Quaternion, max_tilt: float 
     stated = so3.rotate(so3.conjugate(q_stated), _UP)
     angle = _angle(measured, stated)
     corrected = so3.normalize(so3.multiply(_shortest_rotation(so3.rotate(q_stated, measured), _UP), q_stated))
-    is_consistent = angle <= max_tilt
-    candidates = () if is_consistent else _find_candidates(measured, q_stated, max_tilt)
+    is_consistent = angle <= MAX_TILT
+    candidates = () if is_consistent else _find_candidates(measured, q_stated)
     check = MountCheck(is_consistent, angle, measured, stated, strength, candidates, _rpy_deg(corrected), "")
     return replace(check, text=_describe(check))
 
@@ -108,7 +107,7 @@ def axis_name(direction: Vector3) -> str:
     return f"{'+' if direction[index] >= 0 else '-'}{'xyz'[index]}"
 
 
-def _find_candidates(measured: Vector3, q_stated: Quaternion, limit: float) -> tuple[MountCandidate, ...]:
+def _find_candidates(measured: Vector3, q_stated: Quaternion) -> tuple[MountCandidate, ...]:
     rotations = aligned_rotations()
     nearest = min(rotations, key=lambda each: _rotation_angle(each, q_stated))
     # the tilt of the bracket stays when the unit is rotated in it
@@ -116,7 +115,7 @@ def _find_candidates(measured: Vector3, q_stated: Quaternion, limit: float) -> t
     found = []
     for each in rotations:
         q = so3.normalize(so3.multiply(tilt, each))
-        if _angle(so3.rotate(q, measured), _UP) <= limit:
+        if _angle(so3.rotate(q, measured), _UP) <= MAX_TILT:
             found.append(MountCandidate(_rpy_deg(q), _rotation_angle(q, q_stated)))
     # rounded, for a fixed order of mounts equally near
     return tuple(

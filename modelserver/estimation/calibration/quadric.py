@@ -20,7 +20,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.estimation.calibration.errors import CalibrationError
+from modelserver.estimation.calibration import CalibrationError
 from modelserver.transforms.so3 import Array
 
 TUKEY = 4.685

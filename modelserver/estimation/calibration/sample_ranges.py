@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.estimation.calibration.errors import CalibrationError
+from modelserver.estimation.calibration import CalibrationError
 from modelserver.transforms.so3 import Array
 
 MAX_GAP_PERIODS = 5.0
@@ -50,15 +50,14 @@ def median_period(utimes: npt.ArrayLike) -> float:
     return usual
 
 
-def find_gap_free_ranges(utimes: npt.ArrayLike, gap: float = 0.0) -> tuple[SampleRange, ...]:
-    """Return the ranges of two samples or more without a step longer than `gap` seconds or backward.
+def find_gap_free_ranges(utimes: npt.ArrayLike) -> tuple[SampleRange, ...]:
+    """Return the ranges of two samples or more without a gap or a step backward. `utimes`: (n,) microseconds.
 
-    `utimes`: (n,) microseconds; a `gap` of 0 is five times the median step. Within a range the samples count as evenly
-    spaced at its mean rate: the jitter of stamps is the transport's, and interpolating lost samples would reduce the
-    noise. Raises CalibrationError as `median_period`.
+    Within a range the samples count as evenly spaced at its mean rate: the jitter of stamps is the transport's, and
+    interpolating lost samples would reduce the noise. Raises CalibrationError as `median_period`.
     """
     stamps = np.asarray(utimes, dtype=np.int64)
-    limit = gap or MAX_GAP_PERIODS * median_period(stamps)
+    limit = MAX_GAP_PERIODS * median_period(stamps)
     steps = np.diff(stamps) * 1e-6
     ends = np.flatnonzero((steps > limit) | (steps < 0.0)) + 1
     bounds = [0, *ends.tolist(), stamps.size]
@@ -76,42 +75,32 @@ MIN_BLOCK_SAMPLES = 10
 """Least samples in a block: of fewer the spread is too uncertain."""
 
 
-@dataclass(frozen=True, slots=True)
-class StationaryLimits:
-    """Limits of a stationary unit. A block counts as stationary when every limit holds on every axis."""
-
-    spread_factor: float = 3.0
-    """Spread of a block, as a multiple of the quietest tenth's: engines, wind and steps come and go. The spread of ten
-    samples has a standard error of a quarter, so of many blocks one has twice the least by chance.
-    """
-    rate_spread: float = 0.05
-    """Largest spread of the rates in a block, rad/s: five times the noise of a 3DM-GX1 at 100 Hz (1e-3 rad/sqrt(s))."""
-    force_spread: float = 0.3
-    """Largest spread of the specific force in a block, m/s2: seven times the noise of a 3DM-GX1 at 100 Hz (0.4 mg per
-    sqrt(Hz)); driving on a road vibrates more.
-    """
-    rate_step: float = 0.01
-    """Largest difference of a block's mean rate from that of the stationary blocks, rad/s: 0.6 deg/s is a bias' change
-    with temperature (3DM-GX1: 0.7 deg/s over its whole range), and a slow turn.
-    """
-    force_step: float = 0.2
-    """The same of the specific force, m/s2: a fiftieth of g is a tilt of one degree."""
-    rate: float = 0.1
-    """Largest mean rate, rad/s: no unit's bias is as large as 6 deg/s, so the vehicle turns."""
+SPREAD_FACTOR = 3.0
+"""Largest spread of a stationary block, as a multiple of the quietest tenth's: engines, wind and steps come and go. The
+spread of ten samples has a standard error of a quarter, so of many blocks one has twice the least by chance.
+"""
+MAX_SPREADS = np.array([0.05] * 3 + [0.3] * 3)
+"""Largest spreads in a block: of the rates, rad/s, five times the noise of a 3DM-GX1 at 100 Hz (1e-3 rad/sqrt(s)); of
+the specific force, m/s2, seven times its noise (0.4 mg per sqrt(Hz)): driving on a road vibrates more.
+"""
+RATE_STEP = 0.01
+"""Largest difference of a block's mean rate from that of the stationary blocks, rad/s: 0.6 deg/s is a bias' change with
+temperature (3DM-GX1: 0.7 deg/s over its whole range), and a slow turn.
+"""
+FORCE_STEP = 0.2
+"""Largest step of the mean specific force between blocks, m/s2: a fiftieth of g is a tilt of one degree."""
+MAX_RATE = 0.1
+"""Largest mean rate, rad/s: no unit's bias is as large as 6 deg/s, so the vehicle turns."""
 
 
 def find_stationary_ranges(
-    utimes: npt.ArrayLike,
-    rates: npt.ArrayLike,
-    forces: npt.ArrayLike,
-    limits: StationaryLimits | None = None,
+    utimes: npt.ArrayLike, rates: npt.ArrayLike, forces: npt.ArrayLike
 ) -> tuple[SampleRange, ...]:
     """Return the ranges without a gap in which the vehicle was stationary, in order.
 
     `utimes`: (n,) microseconds; `rates`: (n, 3) rad/s; `forces`: (n, 3) m/s2, along the unit's axes, all finite. Raises
     CalibrationError as `median_period`.
     """
-    limits = limits or StationaryLimits()
     stamps = np.asarray(utimes, dtype=np.int64)
     values = np.column_stack((np.asarray(rates, dtype=float), np.asarray(forces, dtype=float)))
     size = max(round(BLOCK_S / median_period(stamps)), MIN_BLOCK_SAMPLES)
@@ -122,18 +111,17 @@ def find_stationary_ranges(
     all_means = np.concatenate([means for _, means, _ in blocks])
     all_spreads = np.concatenate([spreads for _, _, spreads in blocks])
     quietest = np.quantile(all_spreads, 0.1, axis=0)
-    largest = np.minimum(limits.spread_factor * quietest + 1e-12, _of_both(limits.rate_spread, limits.force_spread))
-    quiet = _is_quiet(all_means, all_spreads, largest, limits)
+    largest = np.minimum(SPREAD_FACTOR * quietest + 1e-12, MAX_SPREADS)
+    quiet = _is_quiet(all_means, all_spreads, largest)
     if not quiet.any():
         return ()
-    usual = np.median(all_means[quiet], axis=0)
-    step = _of_both(limits.rate_step, limits.force_step)
-    # a vehicle that parks on another slope is stationary as well: compare only the rates with the other blocks
-    step[3:] = np.inf
+    usual = np.median(all_means[quiet, :3], axis=0)
     for stretch, means, spreads in blocks:
-        stationary = _is_quiet(means, spreads, largest, limits) & (np.abs(means - usual) <= step).all(axis=1)
+        # a vehicle that parks on another slope is stationary as well: compare only the rates with the other blocks
+        near = (np.abs(means[:, :3] - usual) <= RATE_STEP).all(axis=1)
+        stationary = _is_quiet(means, spreads, largest) & near
         # a gentle start does not increase the spread: it is a step from one block to the next
-        stationary[1:] &= np.abs(np.diff(means[:, 3:], axis=0)).max(axis=1, initial=0.0) <= limits.force_step
+        stationary[1:] &= np.abs(np.diff(means[:, 3:], axis=0)).max(axis=1, initial=0.0) <= FORCE_STEP
         for a, b in _runs(stationary):
             start, stop = stretch.start + a * size, stretch.start + b * size
             found.append(SampleRange(start, stop, float(stamps[stop - 1] - stamps[start]) * 1e-6))
@@ -147,14 +135,10 @@ def _blocks(values: Array, size: int) -> tuple[Array, Array]:
     return cut.mean(axis=1), cut.std(axis=1)
 
 
-def _is_quiet(means: Array, spreads: Array, largest: Array, limits: StationaryLimits) -> npt.NDArray[np.bool_]:
-    turning = np.abs(means[:, :3]).max(axis=1, initial=0.0) > limits.rate
+def _is_quiet(means: Array, spreads: Array, largest: Array) -> npt.NDArray[np.bool_]:
+    turning = np.abs(means[:, :3]).max(axis=1, initial=0.0) > MAX_RATE
     quiet: npt.NDArray[np.bool_] = (spreads <= largest).all(axis=1) & ~turning
     return quiet
-
-
-def _of_both(rate: float, force: float) -> Array:
-    return np.array([rate] * 3 + [force] * 3)
 
 
 def _runs(flags: npt.NDArray[np.bool_]) -> list[tuple[int, int]]:

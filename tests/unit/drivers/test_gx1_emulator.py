@@ -11,6 +11,7 @@ from modelserver.earth.geodesy import Geodesy, origin_at
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.simulation import DrivePhase, ImuModel, Trajectory
 from modelserver.simulation.imu import MagnetometerModel, simulate_imu
+from modelserver.simulation.timing import Run
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings, HeadingSource
@@ -139,7 +140,7 @@ def test_given_a_simulated_drive_then_the_driver_gives_back_what_the_simulated_u
         [DrivePhase(2.0), DrivePhase(4.0, speed=4.0), DrivePhase(6.0, curvature=0.1), DrivePhase(4.0, speed=0.0)]
     )
     model = ImuModel(magnetometer=MagnetometerModel(), yaw_source=YawSource.MAGNETIC)
-    made = simulate_imu(model, drive, mount, geodesy, START_UTIME, 1, "imu")
+    made = simulate_imu(model, Run(drive, geodesy, START_UTIME, seed=1), mount)
     felt = {each.header.utime: each for each, _ in zip(made, range(1500), strict=False)}
     settings = Gx1Settings("imu", CommandByte.QUATERNION_VECTORS, HeadingSource.MAGNETIC)
     line = Line(Gx1Driver(settings), Gx1Emulator(felt.values()))

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 from scipy.signal import lfilter
 
+from modelserver.estimation.calibration import CalibrationError
 from modelserver.estimation.calibration.allan import (
     INSTABILITY_FLOOR,
     AllanCurve,
@@ -17,7 +18,6 @@ from modelserver.estimation.calibration.allan import (
     cluster_sizes,
     fit_noise_parameters,
 )
-from modelserver.estimation.calibration.errors import CalibrationError
 from modelserver.estimation.calibration.sample_ranges import find_gap_free_ranges, find_stationary_ranges, median_period
 
 Series = npt.NDArray[np.float64]

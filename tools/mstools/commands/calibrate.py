@@ -13,10 +13,9 @@ import numpy as np
 import typer
 
 from modelserver.errors import ModelServerError
-from modelserver.estimation.calibration import mount
+from modelserver.estimation.calibration import CalibrationError, mount
 from modelserver.estimation.calibration.allan import NoiseParameters, allan_deviation, fit_noise_parameters
 from modelserver.estimation.calibration.ellipsoid import MagnetometerFit, fit_all_axes, fit_level
-from modelserver.estimation.calibration.errors import CalibrationError
 from modelserver.estimation.calibration.sample_ranges import SampleRange, find_stationary_ranges
 from modelserver.transforms.so3 import Vector3
 from mstools.calibration import imu_recording as calibrate_log

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import inf, isfinite
 from typing import TYPE_CHECKING, NamedTuple
 
 from modelserver.errors import (
@@ -39,7 +40,7 @@ class FrameError(ModelServerError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class BoundSignal:
-    """A signal of the database; `minimum` and `maximum` are physical values, None without limits."""
+    """A signal of the database; `minimum` and `maximum` are physical values, infinite without limits."""
 
     key: FrameKey
     message: str
@@ -49,27 +50,18 @@ class BoundSignal:
     is_float: bool
     scale: float
     offset: float
-    minimum: float | None
-    maximum: float | None
+    minimum: float
+    maximum: float
 
     def to_physical(self, raw: float) -> float | None:
         """Return the physical value of raw bits; None (missing) if it is non-finite or outside the DBC's range."""
         value = raw * self.scale + self.offset
         slack = 1e-6 * abs(self.scale)
-        if value != value or value in (float("inf"), float("-inf")):
-            return None
-        if self.minimum is not None and value < self.minimum - slack:
-            return None
-        if self.maximum is not None and value > self.maximum + slack:
-            return None
-        return value
+        return value if isfinite(value) and self.minimum - slack <= value <= self.maximum + slack else None
 
     def to_raw(self, physical: float) -> int:
         """Return the raw bits nearest to a physical value, clamped to the signal's length and the DBC's range."""
-        if self.minimum is not None:
-            physical = max(physical, self.minimum)
-        if self.maximum is not None:
-            physical = min(physical, self.maximum)
+        physical = min(max(physical, self.minimum), self.maximum)
         low = -(1 << (self.length - 1)) if self.is_signed else 0
         return min(max(round((physical - self.offset) / self.scale), low), low + (1 << self.length) - 1)
 
@@ -171,8 +163,10 @@ class SignalBinder:
         `whole`: it must be an integer of at most `bits` bits.
         """
         message_name, _, name = path.partition(".")
-        message = self.find_message(message_name, key, f"{{}}.{name}" if name else "{}")
+        message = self._database.messages.get(message_name)
         if message is None:
+            form = f"{{}}.{name}" if name else "{}"
+            self._add_missing(key, "there is no message", message_name, list(self._database.messages), form)
             return None
         signal = next((each for each in message.signals if each.name == name), None)
         if signal is None:
@@ -188,13 +182,6 @@ class SignalBinder:
             )
             return None
         return _bind_signal(message, signal)
-
-    def find_message(self, name: str, key: str, form: str = "{}") -> Message | None:
-        """Return a message; add a problem and return None if it is unknown. `form`: its spelling in the settings."""
-        message = self._database.messages.get(name)
-        if message is None:
-            self._add_missing(key, "there is no message", name, list(self._database.messages), form)
-        return message
 
     def add_problem(self, key: str, message: str, fix: str, nearest: tuple[str, ...] = ()) -> None:
         """Add a problem of the setting `key`: it is fixed there, not in the DBC file."""
@@ -225,8 +212,8 @@ def _bind_signal(message: Message, signal: Signal) -> BoundSignal:
         signal.is_float,
         float(signal.scale),
         float(signal.offset),
-        None if signal.minimum is None else float(signal.minimum),
-        None if signal.maximum is None else float(signal.maximum),
+        -inf if signal.minimum is None else float(signal.minimum),
+        inf if signal.maximum is None else float(signal.maximum),
     )
 
 
@@ -240,9 +227,7 @@ class CanFrameSet(NamedTuple):
 
     def raw(self, signal: BoundSignal | None) -> float | None:
         """Return the raw value of a signal; None if it was not received."""
-        if signal is None:
-            return None
-        return self.values.get(signal.key, {}).get(signal.name)
+        return None if signal is None else self.values.get(signal.key, {}).get(signal.name)
 
     def physical(self, signal: BoundSignal | None) -> float | None:
         """Return the physical value of a signal; None if it is missing."""
@@ -256,8 +241,6 @@ class CanFrameAssembler:
     A repeated frame starts the next instant: the missing frames of the last one were lost.
     """
 
-    __slots__ = ("_needed", "_pending", "_started_ns", "_utime", "_window_ns")
-
     def __init__(self, needed: frozenset[FrameKey], window_ns: int):
         """`needed` are the kinds of frame that make an instant."""
         self._needed = needed
@@ -267,8 +250,7 @@ class CanFrameAssembler:
     def clear(self) -> None:
         """Discard the incomplete instant."""
         self._pending: dict[FrameKey, dict[str, float]] = {}
-        self._started_ns = 0
-        self._utime = 0
+        self._started_ns = self._utime = 0
 
     def add(self, key: FrameKey, values: dict[str, float], monotonic_ns: int, utime: int) -> list[CanFrameSet]:
         """Add a frame's values; return the instants that it completes or ends."""

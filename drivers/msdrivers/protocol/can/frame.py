@@ -5,16 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-MAX_BASE_ID = 0x7FF
-MAX_EXTENDED_ID = 0x1FFF_FFFF
-MAX_DATA = 64
-"""Bytes in a frame: 8 in classic CAN, 64 in CAN FD."""
-
 BUS_OFF = 0x40
-BUS_PASSIVE_OR_WARNING = 0x04
-NO_ACKNOWLEDGE = 0x20
-RESTARTED = 0x100
-"""Classes of error in the identifier of an error frame, as Linux gives them (linux/can/error.h, CAN_ERR_*)."""
+"""Class of error in the identifier of an error frame, as Linux gives it (linux/can/error.h, CAN_ERR_BUSOFF)."""
 
 
 class FrameKey(NamedTuple):

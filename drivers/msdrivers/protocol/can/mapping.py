@@ -15,6 +15,13 @@ from typing import ClassVar
 STRICT: dict[str, object] = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
 
 
+class Strict:
+    """Base of settings that pydantic reads without conversions and without further keys."""
+
+    __slots__ = ()
+    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
+
+
 def check_signal(signal: str, key: str = "signal") -> None:
     """Raise ValueError unless the text is a signal path."""
     message, dot, name = signal.partition(".")
@@ -29,10 +36,8 @@ def check_factor(value: float, key: str) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class SignalMap:
+class SignalMap(Strict):
     """A number: `signal` times `scale` plus `offset`, in SI units and radians."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     signal: str
     """Message.Signal in the DBC file."""
@@ -49,10 +54,8 @@ class SignalMap:
 
 
 @dataclass(frozen=True, slots=True)
-class CountMap:
+class CountMap(Strict):
     """Encoder counter that wraps."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     signal: str
     """Message.Signal in the DBC file; the raw bits are read, since they are what wraps."""
@@ -72,10 +75,8 @@ class CountMap:
 
 
 @dataclass(frozen=True, slots=True)
-class SpeedMap:
+class SpeedMap(Strict):
     """Speed of a wheel's contact point."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     signal: str
     """Message.Signal in the DBC file."""
@@ -95,10 +96,8 @@ class SpeedMap:
 
 
 @dataclass(frozen=True, slots=True)
-class DirectionMap:
+class DirectionMap(Strict):
     """Direction of a wheel's rotation: the signal's number for each; any other number means unknown."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     signal: str
     """Message.Signal in the DBC file."""
@@ -116,10 +115,8 @@ class DirectionMap:
 
 
 @dataclass(frozen=True, slots=True)
-class WheelMap:
+class WheelMap(Strict):
     """Signals of one wheel; omitted ones are published as not measured."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     count: CountMap | None = None
     """Source of its travel."""
@@ -156,10 +153,8 @@ class WheelMap:
 
 
 @dataclass(frozen=True, slots=True)
-class StatusMap:
+class StatusMap(Strict):
     """Signals of the vehicle controller's status; omitted ones are published as missing."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     mode: str = ""
     """Message.Signal of the driving mode; empty: the controller has none."""
@@ -193,10 +188,8 @@ class StatusMap:
 
 
 @dataclass(frozen=True, slots=True)
-class CommandMap:
+class CommandMap(Strict):
     """Signals of a command to the vehicle controller."""
-
-    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     forward_speed: SignalMap
     """m/s, forward positive, is `scale` times the signal plus `offset`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -79,12 +80,16 @@ def bind_wheels(
     binder = SignalBinder(database, place)
     bound = []
     for name, wheel in wheels.items():
-        count = binder.bind_signal(wheel.count.signal, f"{name}.count", whole=True) if wheel.count else None
-        speed = binder.bind_signal(wheel.speed.signal, f"{name}.speed") if wheel.speed else None
-        direction = (
-            binder.bind_signal(wheel.direction.signal, f"{name}.direction", whole=True) if wheel.direction else None
+        parts = (
+            ("count", wheel.count),
+            ("speed", wheel.speed),
+            ("direction", wheel.direction),
+            ("steering", wheel.steering),
         )
-        steering = binder.bind_signal(wheel.steering.signal, f"{name}.steering") if wheel.steering else None
+        count, speed, direction, steering = (
+            binder.bind_signal(part.signal, f"{name}.{key}", whole=key in ("count", "direction")) if part else None
+            for key, part in parts
+        )
         if count is not None and wheel.count is not None:
             _check_count(binder, name, wheel.count.wrap, count)
         if speed is not None and wheel.speed is not None:
@@ -110,7 +115,7 @@ def _check_count(binder: SignalBinder, name: str, wrap: int, count: BoundSignal)
 
 def _check_speed(binder: SignalBinder, name: str, speed: SpeedMap, signal: BoundSignal) -> None:
     path = f"{signal.message}.{signal.name}"
-    if speed.is_magnitude and signal.minimum is not None and signal.minimum < 0.0:
+    if speed.is_magnitude and -math.inf < signal.minimum < 0.0:
         fix = "leave is_magnitude out: the signal has a sign of its own"
         binder.add_problem(f"{name}.speed.is_magnitude", f"{path} goes down to {signal.minimum:g}", fix)
 

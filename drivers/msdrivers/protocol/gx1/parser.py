@@ -17,21 +17,15 @@ ReplyValidator = Callable[[Gx1Packet], str]
 """Returns the reason to reject a reply with a valid checksum; empty to accept it."""
 
 
-def _accept_all(_: Gx1Packet) -> str:
-    return ""
-
-
 class Gx1Parser:
     """Finds the expected replies; see the module."""
 
-    __slots__ = ("_buffer", "_expected", "_start_pattern", "_streamed", "_validate", "counts")
-
-    def __init__(self, judge: ReplyValidator = _accept_all):
+    def __init__(self, judge: ReplyValidator = lambda _: ""):
         self._validate = judge
         self._buffer = bytearray()
         self._streamed: frozenset[int] = frozenset()
         self._expected: Counter[int] = Counter()
-        self._start_pattern = _compile_pattern(set())
+        self._update_pattern()
         self.counts: Counter[str] = Counter()
         """`skipped` bytes outside of replies, and `rejected.<reason>`."""
 
@@ -83,23 +77,14 @@ class Gx1Parser:
             at += LENGTHS[command]
             found.append(packet)
             if command not in self._streamed:
-                self._on_expected_reply(command)
+                self._expected -= Counter((command,))
+                self._update_pattern()
         # a match object locks the buffer against resizing
         del match
         del buffer[:at]
         return found
 
-    def _on_expected_reply(self, command: int) -> None:
-        self._expected[command] -= 1
-        if not self._expected[command]:
-            self.cancel(command)
-
     def _update_pattern(self) -> None:
-        self._start_pattern = _compile_pattern(self._streamed | self._expected.keys())
-
-
-def _compile_pattern(commands: set[int] | frozenset[int]) -> re.Pattern[bytes]:
-    """Return the pattern of a reply's first byte; of nothing where no reply is expected."""
-    if not commands:
-        return re.compile(b"(?!)")
-    return re.compile(b"[" + b"".join(re.escape(bytes((command,))) for command in sorted(commands)) + b"]")
+        """Match the first byte of a reply; nothing where none is expected."""
+        first = re.escape(bytes(sorted(self._streamed | self._expected.keys())))
+        self._start_pattern = re.compile(b"[" + first + b"]" if first else b"(?!)")

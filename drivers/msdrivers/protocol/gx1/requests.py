@@ -6,55 +6,16 @@ from typing import NamedTuple
 
 from msdrivers.protocol.gx1.packets import LAYOUTS, CommandByte
 
-STOP = bytes((CommandByte.CONTINUOUS, 0, 0))
-"""Stop the continuous mode."""
-
-HARD_IRON_KEY = b"\x71\x3e"
-_WRITE_KEY, _WRITE_END = 0x71, 0xAA
 LAST_ADDRESS = 254
 
-
-def make_poll(command: int) -> bytes:
-    """Return the request for one reply of a command that takes no data."""
-    return bytes((command,))
-
-
-def make_stream(command: int) -> bytes:
-    """Return the request to stream a reply."""
-    return bytes((CommandByte.CONTINUOUS, 0, command))
-
-
-def make_read_eeprom(address: int) -> bytes:
-    """Return the request for a word of the EEPROM, at an even address up to 254."""
-    return bytes((CommandByte.READ_EEPROM, *_encode_address(address)))
-
-
-def make_write_eeprom(address: int, value: int) -> bytes:
-    """Return the request to write a word, signed or unsigned 16 bit, to the EEPROM."""
-    word = (value & 0xFFFF).to_bytes(2, "big")
-    return bytes((CommandByte.WRITE_EEPROM, _WRITE_KEY, *_encode_address(address), *word, _WRITE_END))
-
-
-def make_hard_iron_start() -> bytes:
-    """Return the request to begin the collection of the magnetic field's extremes."""
-    return bytes((CommandByte.HARD_IRON_START,)) + HARD_IRON_KEY
-
-
-def make_hard_iron_compute(two_dimensional: bool, magnitude_z: int) -> bytes:
-    """Return the request to compute and store the hard-iron offsets.
-
-    The type byte is 1 for two dimensions and 0 for three. `magnitude_z` is the raw value of the vertical
-    field, which only the procedure in two dimensions uses.
-    """
-    kind = 1 if two_dimensional else 0
-    word = (magnitude_z & 0xFFFF).to_bytes(2, "big")
-    return bytes((CommandByte.HARD_IRON_COMPUTE,)) + HARD_IRON_KEY + bytes((kind,)) + word
-
-
-def _encode_address(address: int) -> bytes:
-    if not 0 <= address <= LAST_ADDRESS or address % 2:
-        raise ValueError(f"an address of the EEPROM is even and 0..{LAST_ADDRESS}, got {address}")
-    return address.to_bytes(2, "big")
+_FRAMES: dict[int, tuple[bytes, int, bytes]] = dict.fromkeys(LAYOUTS, (b"", 0, b"")) | {
+    CommandByte.CONTINUOUS: (b"\0", 1, b""),
+    CommandByte.READ_EEPROM: (b"", 2, b""),
+    CommandByte.WRITE_EEPROM: (b"\x71", 4, b"\xaa"),
+    CommandByte.HARD_IRON_START: (b"\x71\x3e", 0, b""),
+    CommandByte.HARD_IRON_COMPUTE: (b"\x71\x3e", 3, b""),
+}
+"""Command -> the key between it and its data, the length of the data, and the bytes after them."""
 
 
 class Gx1Request(NamedTuple):
@@ -63,20 +24,62 @@ class Gx1Request(NamedTuple):
     command: int
     data: bytes = b""
 
+    def to_bytes(self) -> bytes:
+        """Encode the request."""
+        key, _, end = _FRAMES[self.command]
+        return bytes((self.command,)) + key + self.data + end
 
-_LENGTHS = dict.fromkeys(LAYOUTS, 1) | {
-    CommandByte.CONTINUOUS: 3,
-    CommandByte.READ_EEPROM: 3,
-    CommandByte.WRITE_EEPROM: 7,
-    CommandByte.HARD_IRON_START: 3,
-    CommandByte.HARD_IRON_COMPUTE: 6,
-}
+
+def make_poll(command: int) -> bytes:
+    """Return the request for one reply of a command that takes no data."""
+    return Gx1Request(command).to_bytes()
+
+
+def make_stream(command: int) -> bytes:
+    """Return the request to stream a reply."""
+    return Gx1Request(CommandByte.CONTINUOUS, bytes((command,))).to_bytes()
+
+
+STOP = make_stream(0)
+"""Stop the continuous mode."""
+
+
+def make_read_eeprom(address: int) -> bytes:
+    """Return the request for a word of the EEPROM, at an even address up to 254."""
+    return Gx1Request(CommandByte.READ_EEPROM, _encode_address(address)).to_bytes()
+
+
+def make_write_eeprom(address: int, value: int) -> bytes:
+    """Return the request to write a word, signed or unsigned 16 bit, to the EEPROM."""
+    return Gx1Request(CommandByte.WRITE_EEPROM, _encode_address(address) + _encode_word(value)).to_bytes()
+
+
+def make_hard_iron_start() -> bytes:
+    """Return the request to begin the collection of the magnetic field's extremes."""
+    return Gx1Request(CommandByte.HARD_IRON_START).to_bytes()
+
+
+def make_hard_iron_compute(two_dimensional: bool, magnitude_z: int) -> bytes:
+    """Return the request to compute and store the hard-iron offsets.
+
+    The type byte is 1 for two dimensions and 0 for three. `magnitude_z` is the raw value of the vertical
+    field, which only the procedure in two dimensions uses.
+    """
+    return Gx1Request(CommandByte.HARD_IRON_COMPUTE, bytes((two_dimensional,)) + _encode_word(magnitude_z)).to_bytes()
+
+
+def _encode_word(value: int) -> bytes:
+    return (value & 0xFFFF).to_bytes(2, "big")
+
+
+def _encode_address(address: int) -> bytes:
+    if not 0 <= address <= LAST_ADDRESS or address % 2:
+        raise ValueError(f"an address of the EEPROM is even and 0..{LAST_ADDRESS}, got {address}")
+    return _encode_word(address)
 
 
 class RequestParser:
     """Requests out of the bytes that come to a device. What fits no request is skipped, byte by byte."""
-
-    __slots__ = ("_buffer", "skipped")
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -87,33 +90,21 @@ class RequestParser:
         self._buffer += data
         buffer, at, found = self._buffer, 0, []
         while at < len(buffer):
-            length = _LENGTHS.get(buffer[at], 0)
-            if length > len(buffer) - at:
+            command = buffer[at]
+            key, length, end = _FRAMES.get(command, (b"", 0, b""))
+            begin = at + 1 + len(key)
+            after = begin + length + len(end)
+            if after > len(buffer):
                 break
-            request = _parse_request(bytes(buffer[at : at + length])) if length else None
-            if request is None:
+            if command in _FRAMES and buffer.startswith(key, at + 1) and buffer.startswith(end, begin + length):
+                found.append(Gx1Request(command, bytes(buffer[begin : begin + length])))
+                at = after
+            else:
                 at += 1
                 self.skipped += 1
-            else:
-                at += length
-                found.append(request)
         del buffer[:at]
         return found
 
     def clear(self) -> None:
         """Forget a request that has begun."""
         self._buffer.clear()
-
-
-def _parse_request(raw: bytes) -> Gx1Request | None:
-    """Return the request that the bytes are; None if a key or a fixed byte in it is wrong."""
-    command = raw[0]
-    if command == CommandByte.CONTINUOUS:
-        return Gx1Request(command, raw[2:]) if raw[1] == 0 else None
-    if command == CommandByte.READ_EEPROM:
-        return Gx1Request(command, raw[1:])
-    if command == CommandByte.WRITE_EEPROM:
-        return Gx1Request(command, raw[2:6]) if (raw[1], raw[6]) == (_WRITE_KEY, _WRITE_END) else None
-    if command in (CommandByte.HARD_IRON_START, CommandByte.HARD_IRON_COMPUTE):
-        return Gx1Request(command, raw[3:]) if raw[1:3] == HARD_IRON_KEY else None
-    return Gx1Request(command)

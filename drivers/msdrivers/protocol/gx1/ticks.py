@@ -30,8 +30,6 @@ class TickUnwrapper:
     `COUNTER_RANGE` when the counter has jumped or `reset` was called.
     """
 
-    __slots__ = ("_agreeing_count", "_at_ns", "_candidate", "_count", "_last", "_ticks_per_ns", "has_jumped")
-
     def __init__(self) -> None:
         self._last: int | None = None
         self._at_ns = 0
