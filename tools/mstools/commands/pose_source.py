@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,25 +20,20 @@ if TYPE_CHECKING:
     from mstools.recordings.log_platform import LogPlatform
 
 
-def _check_world_frames(*frames: str) -> None:
-    """Raise UnknownFrameError for an unknown frame of the reserved bodies."""
-    known = (names.WORLD_UTM, names.WORLD_ENU, names.ODOM)
-    for frame in frames:
-        if frame.partition(":")[0] in names.RESERVED_BODIES and frame not in known:
-            text = f"{quote(frame, 80)} is an unknown frame; known: {', '.join(known)}"
-            raise UnknownFrameError(text, find_nearest_names(frame, known, 1))
-
-
 class FileAnswers(FrameClient):
     """Poses of a geometry file, with joints at their defaults; times are ignored. Raises GeometryError, OSError."""
 
     def __init__(self, path: Path, settings: list[str] | None):
-        self._model = load_given_model(path, settings)
+        self._model = load_given_model(path, parse_variables(settings))
 
     def _query_pose(self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int) -> PoseAnswer:
-        asked = {frame.partition(":")[0] for frame in (interest, reference)}
-        if not asked.isdisjoint(names.RESERVED_BODIES):
-            _check_world_frames(interest, reference)
+        known = (names.WORLD_UTM, names.WORLD_ENU, names.ODOM)
+        reserved = [each for each in (interest, reference) if each.partition(":")[0] in names.RESERVED_BODIES]
+        for frame in reserved:
+            if frame not in known:
+                text = f"{quote(frame, 80)} is an unknown frame; known: {', '.join(known)}"
+                raise UnknownFrameError(text, find_nearest_names(frame, known, 1))
+        if reserved:
             raise ModelServerError("a geometry file has no pose of the vehicle in the world; query the daemon")
         rests = bool(self._model.get_kinematic_path(interest, reference).joints)
         return PoseAnswer(
@@ -65,11 +61,11 @@ class FileAnswers(FrameClient):
         return reply
 
 
-def load_given_model(path: Path, settings: list[str] | None) -> Model:
-    """Load the geometry file of the options, and print its problems. Raises GeometryError, OSError."""
+def load_given_model(path: str | Path, variables: Mapping[str, str]) -> Model:
+    """Load a geometry file, and print its problems. Raises GeometryError, OSError."""
     from modelserver.formats import load_model
 
-    model = load_model(path, variables=parse_variables(settings))
+    model = load_model(path, variables=variables)
     for problem in model.problems:
         print_problem(problem, err=True)
     return model
@@ -83,14 +79,12 @@ def open_log_answers(log: Path, model: Path | None, settings: list[str] | None, 
 
     if model is None:
         return LogPlatform(log, prefix)
-    given = load_given_model(model, settings)
+    given = load_given_model(model, parse_variables(settings))
     root = f"{given.root.name}:{given.root.frames[0].name}"
     source = LogPlatform(log, prefix, ModelSnapshot("", given, root, root, HISTORY_S, f"{prefix}JOINTS"))
     if source.revision not in ("", given.revision):
-        typer.echo(
-            f"modelserver: note: {model} has revision {given.revision}, but the poses in {log} have {source.revision}",
-            err=True,
-        )
+        there = f"{model} has revision {given.revision}, but the poses in {log} have {source.revision}"
+        typer.echo(f"modelserver: note: {there}", err=True)
     return source
 
 

@@ -44,19 +44,20 @@ def describe_edges(explanation: Explanation) -> str:
         (
             edge.kind,
             edge.name,
-            _format_edge(edge),
+            f"{' → '.join(edge.ends if edge.forward else edge.ends[::-1])}{'' if edge.forward else ', inverse'}",
             edge.provenance.replace("_", " "),
             "-" if math.isnan(edge.age) else f"{edge.age:.3f} s",
             edge.source or "-",
             ", ".join(format_coordinates(edge)) or "-",
-            _format_percent(edge.position_share),
-            _format_percent(edge.rotation_share),
+            _format_shares(edge.position_share),
+            _format_shares(edge.rotation_share),
         )
         for edge in explanation.edges
     ]
-    total = ("sum", *[""] * 6, _format_sum(each.position_share for each in explanation.edges),
-             _format_sum(each.rotation_share for each in explanation.edges))  # fmt: skip
-    lines = [heading, format_table(_EDGE_HEADER, [*rows, total], numbers=(4, 7, 8))]
+    position = _format_shares(*(each.position_share for each in explanation.edges))
+    rotation = _format_shares(*(each.rotation_share for each in explanation.edges))
+    rows.append(("sum", "", "", "", "", "", "", position, rotation))
+    lines = [heading, format_table(_EDGE_HEADER, rows, numbers=(4, 7, 8))]
     lines.append("  position and rotation: shares of the sum of the variances")
     lines += [f"  {edge.name}: {edge.warning}" for edge in explanation.edges if edge.warning]
     if any(math.isnan(edge.position_share) for edge in explanation.edges):
@@ -64,18 +65,10 @@ def describe_edges(explanation: Explanation) -> str:
     return replace_unencodable("\n".join(lines))
 
 
-def _format_edge(edge: EdgeReport) -> str:
-    near, far = edge.ends if edge.forward else reversed(edge.ends)
-    return f"{near} → {far}{'' if edge.forward else ', inverse'}"
-
-
-def _format_percent(share: float) -> str:
-    return "-" if math.isnan(share) else f"{100.0 * share:.1f} %"
-
-
-def _format_sum(shares: Iterable[float]) -> str:
+def _format_shares(*shares: float) -> str:
+    """Format the sum of the known shares."""
     known = [share for share in shares if not math.isnan(share)]
-    return _format_percent(sum(known)) if known else "-"
+    return f"{100.0 * sum(known):.1f} %" if known else "-"
 
 
 def format_coordinates(edge: EdgeReport) -> list[str]:
@@ -84,18 +77,13 @@ def format_coordinates(edge: EdgeReport) -> list[str]:
     if values == (0.0,):
         return ["0"]
     X = edge.pose if edge.forward else edge.pose.inverse()
-    match len(values):
-        case 1:
-            angles: tuple[bool, ...] = (X.xyz == (0.0, 0.0, 0.0),)
-        case 3:
-            x, y, z = values
-            angles = (
-                (True,) * 3
-                if X.is_close(Pose((0.0, 0.0, 0.0), so3.exponential((x, y, z))), 1e-9, 1e-9)
-                else (False, False, True)
-            )
-        case _:
-            angles = (False,) * 3 + (True,) * 3
+    angles: tuple[bool, ...] = (False,) * 3 + (True,) * 3
+    if len(values) == 1:
+        angles = (X.xyz == (0.0, 0.0, 0.0),)
+    elif len(values) == 3:
+        x, y, z = values
+        is_spherical = X.is_close(Pose((0.0, 0.0, 0.0), so3.exponential((x, y, z))), 1e-9, 1e-9)
+        angles = (True,) * 3 if is_spherical else (False, False, True)
     return [
         f"{math.degrees(value) + 0.0:.3f} deg" if angle else f"{value + 0.0:.4f} m"
         for value, angle in zip(values, angles, strict=False)
@@ -141,10 +129,8 @@ def describe_motion(motion: MotionAnswer) -> str:
         ("acceleration", motion.acceleration, 1.0, "m/s2", ()),
         ("angular acceleration", motion.angular_acceleration, math.degrees(1.0), "deg/s2", ()),
     ]
-    lines = [
-        escape(f"{transformation.frame_of_interest} moves in {transformation.frame_of_reference}, ")
-        + escape(f"along the axes of {motion.expressed_in}")
-    ]
+    where = f"{transformation.frame_of_interest} moves in {transformation.frame_of_reference}"
+    lines = [escape(f"{where}, along the axes of {motion.expressed_in}")]
     for name, values, scale, unit, sigma in rows:
         text = f"  {name:<21}{_format_vector(values, scale, unit)}"
         lines.append(f"{text},  sigma {_format_vector(sigma, scale, '')}".rstrip() if sigma else text)

@@ -9,17 +9,10 @@ import typer
 
 from modelserver.errors import NoServerError
 from modelserver.geometry.model import Model
+from mstools.commands.pose_source import load_given_model
 from mstools.terminal.model_tree import BodyNode, build_nodes, describe_crossing
 from mstools.terminal.options import PrefixOption, UrlOption, Variables, parse_variables
-from mstools.terminal.output import (
-    check_writable,
-    describe_size,
-    escape,
-    format_count,
-    print_problem,
-    replace_unencodable,
-    write_file,
-)
+from mstools.terminal.output import check_writable, describe_size, escape, format_count, replace_unencodable, write_file
 
 if TYPE_CHECKING:
     from modelserver.formats.snapshot import ModelSnapshot
@@ -70,19 +63,14 @@ def load_geometry(file: str, variables: dict[str, str]) -> Model:
 
     Raises GeometryError, ConfigError, OSError.
     """
-    from modelserver.formats import load_model
     from mstools.commands.check import is_vehicle_file
 
     if is_vehicle_file(file):
         from modelserver.config.vehicle_file import load_config
 
         config = load_config(file)
-        model = load_model(config.geometry, variables={**config.variables, **variables})
-    else:
-        model = load_model(file, variables=variables)
-    for problem in model.problems:
-        print_problem(problem, err=True)
-    return model
+        file, variables = config.geometry, {**config.variables, **variables}
+    return load_given_model(file, variables)
 
 
 def receive_geometry(url: str, prefix: str, seconds: float) -> ModelSnapshot:

@@ -254,12 +254,19 @@ def render_udev_rules(
     check_serial(given, drivers)
     for driver in drivers:
         own = f"{DEVICE_FOLDER}{driver.name}"
-        device = given.get(driver.name, "") or _id_of(driver.port, facts)
-        known = _find_rule(driver.name, facts.rules)
+        device = given.get(driver.name, "") or (driver.port if driver.port.startswith(BY_ID) else "")
+        device = device or next((name for name, port in sorted(facts.by_id.items()) if port == driver.port), "")
+        link = f'SYMLINK+="modelserver/{driver.name}"'
+        known = [each for each in facts.rules.splitlines() if each.startswith("SUBSYSTEM") and each.endswith(link)]
         if device:
-            lines.append(_render_rule(driver.name, device.removeprefix(BY_ID)))
+            device = device.removeprefix(BY_ID)
+            _check_device(device)
+            # systemd's own rules make the link by id, from vendor, product and serial number
+            match = f'SUBSYSTEM=="tty", SYMLINK=="{BY_ID.removeprefix("/dev/")}{device}"'
+            # ModemManager would send data to it otherwise, from which some devices do not recover
+            lines.append(f'{match}, ENV{{ID_MM_DEVICE_IGNORE}}="1", {link}')
         elif known:
-            lines.append(known)
+            lines.append(known[0])
         else:
             fix = f"plug it in, or: --serial {driver.name}={BY_ID}..."
             notes.append(f"no device id is known for driver {driver.name} (port {driver.port}); {fix}")
@@ -290,23 +297,3 @@ def check_serial(given: Mapping[str, str], drivers: Iterable[SerialDriver]) -> N
 def _check_device(device: str) -> None:
     if not _DEVICE_NAME.fullmatch(device):
         raise ModelServerError(f"{quote(device)} is not a name below {BY_ID}: only letters, digits and #+-.:=@_")
-
-
-def _id_of(port: str, facts: SystemFacts) -> str:
-    """Return the name below /dev/serial/by-id of a port, empty for none."""
-    if port.startswith(BY_ID):
-        return port.removeprefix(BY_ID)
-    return next((name for name, device in sorted(facts.by_id.items()) if device == port), "")
-
-
-def _render_rule(name: str, device: str) -> str:
-    _check_device(device)
-    # systemd's own rules make the link by id, from vendor, product and serial number
-    match = f'SUBSYSTEM=="tty", SYMLINK=="{BY_ID.removeprefix("/dev/")}{device}"'
-    # ModemManager would send data to it otherwise, from which some devices do not recover
-    return f'{match}, ENV{{ID_MM_DEVICE_IGNORE}}="1", SYMLINK+="modelserver/{name}"'
-
-
-def _find_rule(name: str, text: str) -> str:
-    ending = f'SYMLINK+="modelserver/{name}"'
-    return next((line for line in text.splitlines() if line.startswith("SUBSYSTEM") and line.endswith(ending)), "")

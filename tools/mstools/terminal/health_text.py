@@ -32,7 +32,10 @@ def format_report(health: Health, drivers: Iterable[DriverHealth] = (), expected
     """Format a report for the terminal; `expected` names the drivers of the vehicle file."""
     drivers = sorted(drivers, key=lambda each: each.source)
     missing = [name for name in expected if name not in {each.source for each in drivers}]
-    parts = [_format_head(health), _format_body(health)]
+    state = STATE_NAMES.get(health.state, str(health.state))
+    who = f", process {health.pid} on {health.host}" if health.pid else ""
+    head = f"{health.vehicle}: {state}, up {format_duration(health.uptime)}; modelserver {health.version}{who}"
+    parts = [escape(f"{head}, {format_clock(health.utime)}"), _format_body(health)]
     if health.warnings:
         parts.append("warnings\n" + "\n".join(f"  {escape(name)}: {escape(text)}" for name, text in health.warnings))
     if health.channels:
@@ -43,15 +46,6 @@ def format_report(health: Health, drivers: Iterable[DriverHealth] = (), expected
         rows = [(name, reason, str(count)) for name, reason, count in health.rejected]
         parts.append("rejected\n" + _format_limited_table(("what", "reason", "count"), rows, numbers=(2,)))
     return "\n\n".join(parts)
-
-
-def _format_head(health: Health) -> str:
-    state = STATE_NAMES.get(health.state, str(health.state))
-    who = f", process {health.pid} on {health.host}" if health.pid else ""
-    return escape(
-        f"{health.vehicle}: {state}, up {format_duration(health.uptime)}; modelserver {health.version}{who}, "
-        f"{format_clock(health.utime)}"
-    )
 
 
 def _format_body(health: Health) -> str:

@@ -141,48 +141,39 @@ def draw_svg(title: str, assemblies: Sequence[Sequence[BodyNode]], with_frames: 
             x = MARGIN + STEP * node.depth
             places.append(y)
             if node.crossing is not None:
-                parts.append(_draw_branch(x - STEP + 6, places[node.parent], x, y, _get_color(node)))
-            words = (
-                describe_crossing(node.crossing) if node.crossing is not None else "root" if not number else "orphan"
-            )
-            lines = [(words, _get_color(node)), *((each, LOOP) for each in node.loops)]
-            if with_frames:
-                lines += [
-                    (each, FIXED) for each in textwrap.wrap(", ".join(node.frames), LINE_LENGTH, break_long_words=False)
-                ]
-            parts.append(_draw_body(x, y, node, lines[0]))
+                branch = f"M{x - STEP + 6} {places[node.parent] + 6}V{y}H{x - 4}"
+                parts.append(f'<path d="{branch}" fill="none" stroke="{_get_color(node)}" stroke-width="1.4"/>')
+            words = "orphan" if number else "root"
+            words = words if node.crossing is None else describe_crossing(node.crossing)
+            parts.append(_draw_body(x, y, node, words))
             width = max(width, x + LETTER_WIDTH * (len(node.body) + len(words) + 4) + MARGIN)
-            for words, color in lines[1:]:
+            lines = [(each, LOOP) for each in node.loops]
+            if with_frames:
+                frames = textwrap.wrap(", ".join(node.frames), LINE_LENGTH, break_long_words=False)
+                lines += [(each, FIXED) for each in frames]
+            for words, color in lines:
                 y += ROW
-                parts.append(_draw_text(x + 18, y, words, color, "italic"))
+                text = f'<text x="{x + 18}" y="{y + 4}" fill="{color}" font-style="italic">'
+                parts.append(f"{text}{html.escape(words)}</text>")
                 width = max(width, x + 18 + LETTER_WIDTH * len(words) + MARGIN)
             y += ROW
     height = y + MARGIN - ROW // 2
     name = html.escape(title)
-    return "\n".join(
-        (
-            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height}" '
-            f'viewBox="0 0 {width:.0f} {height}" role="img" aria-label="{name}" font-family="sans-serif" '
-            'font-size="12">',
-            '<rect width="100%" height="100%" fill="#fff"/>',
-            f'<text x="{MARGIN}" y="{MARGIN + 4}" font-size="14" font-weight="bold">{name}</text>',
-            *parts,
-            "</svg>",
-            "",
-        )
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height}" '
+        f'viewBox="0 0 {width:.0f} {height}" role="img" aria-label="{name}" font-family="sans-serif" font-size="12">',
+        '<rect width="100%" height="100%" fill="#fff"/>',
+        f'<text x="{MARGIN}" y="{MARGIN + 4}" font-size="14" font-weight="bold">{name}</text>',
     )
+    return "\n".join((*head, *parts, "</svg>", ""))
 
 
 def _get_color(node: BodyNode) -> str:
     return MOVING if node.crossing is not None and node.crossing.constraint.joint.is_movable else FIXED
 
 
-def _draw_branch(x1: int, y1: int, x2: int, y2: int, color: str) -> str:
-    return f'<path d="M{x1} {y1 + 6}V{y2}H{x2 - 4}" fill="none" stroke="{color}" stroke-width="1.4"/>'
-
-
-def _draw_body(x: int, y: int, node: BodyNode, label: tuple[str, str]) -> str:
-    words, color = label
+def _draw_body(x: int, y: int, node: BodyNode, words: str) -> str:
+    color = _get_color(node)
     dashed = ' stroke-dasharray="3 2"' if node.loops else ""
     ring = LOOP if node.loops else color
     return (
@@ -190,7 +181,3 @@ def _draw_body(x: int, y: int, node: BodyNode, label: tuple[str, str]) -> str:
         f'<text x="{x + 18}" y="{y + 4}"><tspan font-weight="bold">{html.escape(node.body)}</tspan>'
         f'<tspan dx="10" fill="{color}">{html.escape(words)}</tspan></text>'
     )
-
-
-def _draw_text(x: int, y: int, words: str, color: str, style: str) -> str:
-    return f'<text x="{x}" y="{y + 4}" fill="{color}" font-style="{style}">{html.escape(words)}</text>'
