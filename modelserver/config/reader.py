@@ -158,7 +158,7 @@ def read_lines(raw: bytes, name: str, schema: type) -> dict[Path_, int]:
 def _compose(raw: bytes, name: str, schema: type) -> tuple[SettingsReader, Any]:
     """Return the plain values of a file, and the reader that has their lines."""
     if len(raw) > MAX_BYTES:
-        raise _make_error(name, 0, f"the file is larger than {MAX_BYTES >> 20} MiB", "is this the vehicle file?")
+        raise make_error(name, 0, f"the file is larger than {MAX_BYTES >> 20} MiB", "is this the vehicle file?")
     try:
         if not raw.startswith((b"\xff\xfe", b"\xfe\xff")):
             raw.decode()
@@ -168,11 +168,11 @@ def _compose(raw: bytes, name: str, schema: type) -> tuple[SettingsReader, Any]:
         mark = getattr(error, "problem_mark", None)
         what = getattr(error, "problem", None) or str(error).splitlines()[0]
         line = mark.line + 1 if mark else 0
-        raise _make_error(name, line, f"not YAML: {what}", "check indentation and quotes") from None
+        raise make_error(name, line, f"not YAML: {what}", "check indentation and quotes") from None
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
         what = f"not text in UTF-8: byte 0x{raw[error.start]:02x} in this line"
-        raise _make_error(name, line, what, "save it as UTF-8; is this the vehicle file?") from None
+        raise make_error(name, line, what, "save it as UTF-8; is this the vehicle file?") from None
     if not isinstance(node, yaml.MappingNode):
         missing = dataclasses.MISSING
         required = [
@@ -181,7 +181,7 @@ def _compose(raw: bytes, name: str, schema: type) -> tuple[SettingsReader, Any]:
             if each.default is missing and each.default_factory is missing
         ]
         what = "the file is empty" if node is None else "the file is not a mapping (key: value, one per line)"
-        raise _make_error(name, 1, what, f"start with: {', '.join(required)}")
+        raise make_error(name, 1, what, f"start with: {', '.join(required)}")
     reader = SettingsReader(name, schema)
     return reader, reader.read_value(node, ())
 
@@ -372,12 +372,13 @@ def _check_shape(raw: bytes, name: str) -> None:
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
             if depth > MAX_DEPTH:
-                raise _make_error(name, line, "nested too deeply", "look for brackets that are not closed")
+                raise make_error(name, line, "nested too deeply", "look for brackets that are not closed")
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
         elif isinstance(event, yaml.AliasEvent):
-            raise _make_error(name, line, f"aliases (*{event.anchor}) are not supported", "write the value again")
+            raise make_error(name, line, f"aliases (*{event.anchor}) are not supported", "write the value again")
 
 
-def _make_error(name: str, line: int, message: str, fix: str) -> ConfigError:
+def make_error(name: str, line: int, message: str, fix: str) -> ConfigError:
+    """Return the error of a file that cannot be read; line 0 for the whole file."""
     return ConfigError([Problem(Severity.ERROR, message, Location(name, line), fix)])

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import ConfigDict
 
 from modelserver.config import reader
-from modelserver.errors import ConfigError, Location, Problem, Severity, quote
+from modelserver.errors import ConfigError, Problem, quote
 from modelserver.estimation.filter.settings import FilterSettings
 from modelserver.estimation.magnetometer import MagnetometerCalibration
 from modelserver.estimation.raw.settings import RawSettings
@@ -494,17 +494,13 @@ def _read_bytes(path: Path) -> bytes:
     except NotRegularFileError as error:
         there = next((each for each in ("vehicle.yaml", "vehicle.yml") if (path / each).is_file()), "")
         fix = f"give {path / there}" if error.is_directory and there else "give the vehicle file itself"
-        raise _make_error(path, f"this is {error.kind}, {NOT_A_VEHICLE_FILE}", fix) from None
+        raise reader.make_error(str(path), 0, f"this is {error.kind}, {NOT_A_VEHICLE_FILE}", fix) from None
     kind = detect_file_kind(raw)
     if kind in _FIXES:
         what = kind.value if kind.is_empty else f"{kind.value}, {NOT_A_VEHICLE_FILE}"
         command = format_conversion_command(str(path)) if kind is FileKind.MIRO_PROCESS else ""
-        raise _make_error(path, what, _FIXES[kind].format(name=path.name, command=command))
+        raise reader.make_error(str(path), 0, what, _FIXES[kind].format(name=path.name, command=command))
     return raw
-
-
-def _make_error(path: Path, what: str, fix: str) -> ConfigError:
-    return ConfigError([Problem(Severity.ERROR, what, Location(str(path)), fix)])
 
 
 def _resolve_paths(config: VehicleConfig, path: Path) -> VehicleConfig:

@@ -315,9 +315,7 @@ class _BotFramesReader(ElementReader):
         return top if self.is_valid_name(top, self.enter(named[0].line, "root_frame")) else None
 
     def is_valid_name(self, name: str, at: ElementReader) -> bool:
-        fault = names.find_problem(name)
-        if name in names.RESERVED_BODIES:
-            fault = "this name is reserved for the server's world frames"
+        fault = names.find_body_problem(name)
         if fault:
             at.error(f"frame {quote(name)}: {fault}", "rename it, here and in relative_to")
         return not fault

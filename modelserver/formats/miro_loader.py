@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 from modelserver.errors import Suggestion, quote
 from modelserver.formats.reading import ElementReader, label, parse_numbers, suggest_known_key
 from modelserver.formats.xml_document import NamedParameters, get_line, get_name, get_tag, iterate_children
-from modelserver.geometry.builder import ModelBuilder
-from modelserver.geometry.review import BodyBuilder
+from modelserver.geometry.builder import BodyBuilder, ModelBuilder
 from modelserver.transforms.pose import Pose
 
 if TYPE_CHECKING:

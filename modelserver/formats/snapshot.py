@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Final
 
 from modelserver.errors import GeometryError, WireError
 from modelserver.formats import parse_model
@@ -29,18 +31,20 @@ class ModelSnapshot:
     """Microseconds by which the stamps on `joints_channel` are later than the measurement."""
 
 
+_SETTINGS: Final[dict[str, Callable[[Any], Any]]] = {
+    "vehicle": str,
+    "base_frame": str,
+    "rolling_frame": str,
+    "history_s": float,
+    "joints_channel": str,
+    "joints_latency_us": int,
+}
+
+
 def encode_snapshot(snapshot: ModelSnapshot) -> bytes:
     """Encode a snapshot as a zlib stream of JSON."""
-    content = {
-        "vehicle": snapshot.vehicle,
-        "base_frame": snapshot.base_frame,
-        "rolling_frame": snapshot.rolling_frame,
-        "history_s": snapshot.history_s,
-        "joints_channel": snapshot.joints_channel,
-        "joints_latency_us": snapshot.joints_latency_us,
-        "revision": snapshot.model.revision,
-        "geometry": save(snapshot.model, exact=True).text,
-    }
+    content = {key: getattr(snapshot, key) for key in _SETTINGS}
+    content |= {"revision": snapshot.model.revision, "geometry": save(snapshot.model, exact=True).text}
     return zlib.compress(json.dumps(content, ensure_ascii=False).encode(), 9)
 
 
@@ -53,18 +57,10 @@ def decode_snapshot(data: bytes) -> ModelSnapshot:
             raise WireError("malformed", f"a snapshot decompresses to more than {MAX_BYTES} bytes")
         content = json.loads(text)
         model = parse_model(content["geometry"].encode(), "the service's snapshot")
-        snapshot = ModelSnapshot(
-            str(content["vehicle"]),
-            model,
-            str(content["base_frame"]),
-            str(content["rolling_frame"]),
-            float(content["history_s"]),
-            str(content["joints_channel"]),
-            int(content["joints_latency_us"]),
-        )
+        settings = {key: kind(content[key]) for key, kind in _SETTINGS.items()}
         revision = str(content["revision"])
     except (zlib.error, ValueError, KeyError, TypeError, AttributeError, RecursionError, GeometryError) as error:
         raise WireError("malformed", f"not a snapshot of a geometry: {error}") from None
     if model.revision != revision:
         raise WireError("malformed", f"the snapshot states revision {revision}, but its geometry has {model.revision}")
-    return snapshot
+    return ModelSnapshot(model=model, **settings)

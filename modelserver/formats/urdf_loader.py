@@ -21,9 +21,8 @@ from modelserver.formats.reading import MAX_SUGGESTIONS, ORIGIN, find_cycles, la
 from modelserver.formats.urdf_elements import UrdfElement, read_inertial, read_materials, read_origin, read_shape
 from modelserver.formats.xml_document import get_tag
 from modelserver.geometry import names
-from modelserver.geometry.builder import ModelBuilder
+from modelserver.geometry.builder import BodyBuilder, ModelBuilder
 from modelserver.geometry.joint import FIXED, Coordinates, Joint, JointType, Mimic
-from modelserver.geometry.review import BodyBuilder
 from modelserver.geometry.shape import Material, Shape
 from modelserver.transforms.pose import Pose
 
@@ -137,9 +136,7 @@ class _UrdfReader:
 
     def is_valid_name(self, at: UrdfElement, first: UrdfElement | None) -> bool:
         """Return whether the name of a link or joint is valid in a model and new; otherwise report an error."""
-        fault = names.find_problem(at.name)
-        if at.name in names.RESERVED_BODIES and at.tag == "link":
-            fault = "this name is reserved for the server's world frames"
+        fault = names.find_body_problem(at.name) if at.tag == "link" else names.find_problem(at.name)
         if fault:
             self.reject(at, f"{at.place}: {fault}", "rename it, here and wherever it is used")
         elif first is not None:

@@ -21,9 +21,8 @@ from dataclasses import dataclass
 
 from modelserver.errors import Location, Severity, Suggestion, quote, suggest_name
 from modelserver.formats.reading import label
-from modelserver.formats.yaml_joint import read_joint
+from modelserver.formats.yaml_elements import POSE_KEYS, SigmaDefaults, read_joint, read_pose, read_sigma
 from modelserver.formats.yaml_nodes import NodeKind, YamlMapping, YamlNode, parse_yaml
-from modelserver.formats.yaml_pose import POSE_KEYS, SigmaDefaults, read_pose, read_sigma
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.joint import FIXED
 from modelserver.geometry.parts import BodyFrame, Sigma

@@ -1,10 +1,9 @@
 """The vehicle's geometry: bodies, frames, constraints, and the graph that they form. Pure."""
 
-from modelserver.geometry.builder import ModelBuilder
+from modelserver.geometry.builder import BodyBuilder, ModelBuilder
 from modelserver.geometry.joint import Joint, JointType, Mimic
 from modelserver.geometry.model import Model, Search
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
-from modelserver.geometry.review import BodyBuilder
 from modelserver.geometry.shape import Material, Shape, ShapeKind
 from modelserver.geometry.topology import Neighbor
 

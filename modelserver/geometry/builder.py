@@ -14,17 +14,75 @@ A file reader fills one and adds the problems that it met; a program may do the 
 
 from __future__ import annotations
 
-from modelserver.errors import GeometryError, Location, NotConnectedError, Problem, Severity, quote
+import math
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+from modelserver.errors import GeometryError, Location, NotConnectedError, Problem, Severity, Suggestion, quote
+from modelserver.geometry import loop_closure as loops
+from modelserver.geometry import names
 from modelserver.geometry.joint import FIXED, Joint
+from modelserver.geometry.joint_rules import JointRules, LocatedConstraint
 from modelserver.geometry.model import Model
-from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
-from modelserver.geometry.review import NO_LOCATION, BodyBuilder, ModelDraft, ModelReview
-from modelserver.geometry.topology import full_name
+from modelserver.geometry.names import MAX_LISTED, format_first_location, format_names
+from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma, suggest_frame
+from modelserver.geometry.shape import Shape
+from modelserver.geometry.topology import Topology, full_name
 from modelserver.transforms.pose import Pose
 
+MAX_LOOP_SIGMAS = 3.0
+"""A loop misclosure of more standard deviations is a warning: one in 370 correct surveys exceeds it."""
 
-class ModelBuilder(ModelDraft):
-    """Collects a model; `build` checks it. See the module's example."""
+MAX_SUGGESTIONS = 100
+"""Constraint ends for which the nearest names are searched, which is slow."""
+
+
+NO_LOCATION: Final = Location()
+
+
+@dataclass(slots=True)
+class BodyBuilder:
+    """Collects one body; created by `ModelBuilder.add_body`."""
+
+    name: str
+    source: Location = NO_LOCATION
+    description: str = ""
+    pose: Pose | None = None
+    inertia: tuple[tuple[float, ...], ...] | None = None
+    frames: list[tuple[BodyFrame, Location]] = field(default_factory=list)
+    visuals: tuple[Shape, ...] = ()
+    collisions: tuple[Shape, ...] = ()
+
+    def add_frame(
+        self,
+        name: str,
+        pose: Pose | None = None,
+        description: str = "",
+        sigma: Sigma | None = None,
+        source: Location = NO_LOCATION,
+    ) -> BodyBuilder:
+        """Add a frame at `pose` in body coordinates; return this body."""
+        self.frames.append((BodyFrame(name, pose or Pose.identity(), description, sigma, self.name), source))
+        return self
+
+
+@dataclass(slots=True, eq=False)
+class ModelBuilder:
+    """Collects a model; `build` checks it. See the module's example.
+
+    strict: apply the 2005 rule that a frame has one constraint at most. problems: those met while reading.
+    unreadable_joints: constraints whose joint could not be read; they are added as fixed. unresolved_ends: constraint,
+    end (From or To) and frame of constraints with one end missing; the other end is checked too.
+    """
+
+    name: str = ""
+    description: str = ""
+    strict: bool = False
+    problems: list[Problem] = field(default_factory=list)
+    unreadable_joints: set[str] = field(default_factory=set)
+    unresolved_ends: list[tuple[str, str, str, Location]] = field(default_factory=list)
+    bodies: list[BodyBuilder] = field(default_factory=list)
+    constraints: list[tuple[Constraint, Location]] = field(default_factory=list)
 
     @classmethod
     def from_model(cls, model: Model, strict: bool = False) -> ModelBuilder:
@@ -123,7 +181,7 @@ class ModelBuilder(ModelDraft):
 
         It answers whether a frame exists, and nothing else: it has no constraints.
         """
-        bodies = ModelReview(self, repair=True).check_bodies()
+        bodies = _ModelReview(self, repair=True).check_bodies()
         return Model(tuple(bodies.values()), (), self.name, self.description) if bodies else None
 
     @property
@@ -145,7 +203,7 @@ class ModelBuilder(ModelDraft):
 
     def check(self, repair: bool = False) -> tuple[Model | None, tuple[Problem, ...]]:
         """Return the model, or None where there is an error, and every problem in the order of the file."""
-        review = ModelReview(self, repair)
+        review = _ModelReview(self, repair)
         bodies = review.check_bodies()
         bodies, constraints = review.check_connections(bodies, review.check_joints(review.check_constraints(bodies)))
         problems = tuple(
@@ -154,3 +212,223 @@ class ModelBuilder(ModelDraft):
         if any(problem.severity is Severity.ERROR for problem in problems):
             return None, problems
         return Model(tuple(bodies.values()), constraints, self.name, self.description, problems), problems
+
+
+class _ModelReview:
+    """One pass over a model (report 4.5): finds problems, and returns what is left when the invalid is dropped."""
+
+    def __init__(self, draft: ModelBuilder, repair: bool):
+        self.draft = draft
+        self.repair = repair
+        self.problems = list(draft.problems)
+        self.locations: dict[str, Location] = {}
+        self.suggestion_count = 0
+
+    def report(self, message: str, source: Location, fix: str, nearest: tuple[str, ...] = ()) -> None:
+        """Report something invalid: an error, or with repair the warning that it was removed."""
+        severity, removed = (Severity.WARNING, "; removed") if self.repair else (Severity.ERROR, "")
+        self.problems.append(Problem(severity, message + removed, source, fix, nearest))
+
+    def add_problem(self, severity: Severity, message: str, source: Location, fix: str = "") -> None:
+        """Report a problem that leaves the model usable."""
+        self.problems.append(Problem(severity, message, source, fix))
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether there is any error so far."""
+        return any(problem.severity is Severity.ERROR for problem in self.problems)
+
+    def _is_new_name(
+        self, label: str, name: str, source: Location, seen: dict[str, Location], example: str, fix: str = ""
+    ) -> bool:
+        """Return whether a name is valid and not among those `seen`, to which it is added; otherwise report it."""
+        if fault := names.find_problem(name):
+            self.report(f"{label}: {fault}", source, f"give it a plain name, e.g. {example}")
+        elif name in seen:
+            twice = f"{label} is defined twice{format_first_location(seen[name])}"
+            self.report(twice, source, fix or "rename one of the two")
+        else:
+            seen[name] = source
+            return True
+        return False
+
+    def check_bodies(self) -> dict[str, Body]:
+        """Return the bodies by name, each with its well-formed frames."""
+        valid: dict[str, Body] = {}
+        fix = "rename one; to duplicate a device, give the copy a name of its own"
+        for draft in self.draft.bodies:
+            label = f"body {quote(draft.name)}"
+            if draft.name in names.RESERVED_BODIES:
+                self.report(f"{label}: this name is reserved for the server's world frames", draft.source, "rename it")
+                continue
+            if not self._is_new_name(label, draft.name, draft.source, self.locations, "FrontCamera", fix):
+                continue
+            frames = self._check_frames(draft)
+            if not frames:
+                self.report(
+                    f"{label} has no frame; a body needs at least one", draft.source, "add a frame, e.g. Origin"
+                )
+                if self.repair:
+                    continue
+            body = Body(draft.name, frames, draft.description, draft.pose, None, draft.visuals, draft.collisions)
+            try:
+                body = replace(body, inertia=draft.inertia)
+            except ValueError as error:
+                self.report(f"{label}: {error}", draft.source, "write 6 rows of 6 numbers, or leave it out")
+            valid[draft.name] = body
+        if not valid and not self.has_errors:
+            # not after an error: it is the cause
+            fix = "a model has two bodies or more, each with a frame"
+            self.add_problem(Severity.ERROR, "there is no body", NO_LOCATION, fix)
+        elif len(valid) == 1:
+            (only,) = valid
+            message = f"there is one body, {only}; most models join two or more"
+            fix = "add the bodies mounted on it, or leave it if the vehicle is one rigid body"
+            self.add_problem(Severity.NOTE, message, self.locations[only], fix)
+        return valid
+
+    def _check_frames(self, draft: BodyBuilder) -> tuple[BodyFrame, ...]:
+        seen: dict[str, Location] = {}
+        return tuple(
+            frame
+            for frame, source in draft.frames
+            if self._is_new_name(
+                f"frame {quote(frame.name)} of body {quote(draft.name)}", frame.name, source, seen, "ImagePlane"
+            )
+        )
+
+    def check_constraints(self, bodies: dict[str, Body]) -> tuple[LocatedConstraint, ...]:
+        """Return the well-formed constraints: both ends exist and differ; in strict mode, one for each frame."""
+        valid: list[LocatedConstraint] = []
+        by_name: dict[str, Location] = {}
+        by_frame: dict[str, tuple[str, Location]] = {}
+        for constraint, source in self.draft.constraints:
+            label = f"constraint {quote(constraint.name)}"
+            if not self._is_new_name(label, constraint.name, source, by_name, "DigiclopsFixed"):
+                continue
+            ends = (("From", constraint.from_), ("To", constraint.to))
+            # a list, so that both ends are checked
+            exist = [self._check_end(label, *end, bodies, source) for end in ends]
+            if not all(exist):
+                continue
+            if constraint.from_ == constraint.to:
+                fix = "a constraint joins two different frames; name the partner in To"
+                self.report(f"{label}: From equals To ({constraint.from_})", source, fix)
+                continue
+            if names.split(constraint.from_)[0] == names.split(constraint.to)[0]:
+                self.report(
+                    f"{label} joins two frames of one body, {constraint.from_} and {constraint.to}",
+                    source,
+                    "frames of a body are already fixed to each other; remove it, or move one frame to another body",
+                )
+                continue
+            taken = [(end, *by_frame[end]) for _, end in ends if self.draft.strict and end in by_frame]
+            for end, other, place in taken:
+                first = f"frame {end} already has constraint {other}{format_first_location(place)}"
+                own = f"add a frame of its own to body {names.split(end)[0]} for this constraint, or leave strict out"
+                self.report(f"{label}: {first}; a frame has one at most", source, own)
+            if not taken:
+                by_frame |= {end: (constraint.name, source) for _, end in ends}
+                valid.append((constraint, source))
+        for name, sense, end, source in self.draft.unresolved_ends:
+            self._check_end(f"constraint {quote(name)}", sense, end, bodies, source)
+        return tuple(valid)
+
+    def _check_end(self, label: str, sense: str, end: str, bodies: dict[str, Body], source: Location) -> bool:
+        fix = "write it as Body:Frame, with the names in the file"
+        try:
+            body, frame = names.split(end)
+        except ValueError:
+            problem = f"{quote(end)} is not of the form Body:Frame"
+        else:
+            if body not in bodies:
+                problem = f"names body {quote(body)}, which does not exist"
+            elif not bodies[body].has_frame(frame):
+                problem = f"names frame {quote(frame)}, which body {body} does not have"
+                known = [each.name for each in bodies[body].frames[: MAX_LISTED + 1]]
+                fix = f"body {body} has: {format_names(known)}"
+            else:
+                return True
+        near = self._suggest_end(end, bodies)
+        self.report(f"{label}: {sense} {problem}", source, f"write {near[0]}" if near else fix, near)
+        return False
+
+    def check_joints(self, placed: tuple[LocatedConstraint, ...]) -> tuple[LocatedConstraint, ...]:
+        """Return the constraints whose joints are valid, with the defaults of mimic joints applied."""
+        known = [constraint.name for constraint, _ in self.draft.constraints]
+        return JointRules(self.report, self.add_problem, known, self.draft.unreadable_joints, self.repair).apply(placed)
+
+    def _suggest_end(self, end: str, bodies: dict[str, Body]) -> Suggestion:
+        """Return a suggestion for an end of a constraint that does not exist.
+
+        None where several constraints name the missing body and none the suggested one: then the latter is misspelled.
+        """
+        self.suggestion_count += 1
+        if self.suggestion_count > MAX_SUGGESTIONS or not (near := suggest_frame(end, bodies)):
+            return Suggestion()
+        wrong, _, _ = end.partition(":")
+        right, _, _ = near.partition(":")
+        named = [each.partition(":")[0] for other, _ in self.draft.constraints for each in (other.from_, other.to)]
+        if wrong != right and named.count(wrong) > 1 and right not in named:
+            return Suggestion()
+        return Suggestion.of(end, near)
+
+    def check_connections(
+        self, bodies: dict[str, Body], placed: tuple[LocatedConstraint, ...]
+    ) -> tuple[dict[str, Body], tuple[Constraint, ...]]:
+        """Report orphans and loops; return what is left: with repair, only what is traceable to the root."""
+        constraints = tuple(constraint for constraint, _ in placed)
+        if self.has_errors or not bodies:
+            # orphans are a consequence of invalid constraints
+            return bodies, constraints
+        topology = Topology(tuple(bodies.values()), constraints)
+        sources = {constraint.name: source for constraint, source in placed}
+        root, *orphaned = topology.assemblies
+        for assembly in orphaned:
+            for body in assembly:
+                end = "removed" if self.repair else "it answers only inside its own assembly"
+                message = f"body {body} is an orphan: no constraints lead to the root body {root[0]}; {end}"
+                fix = f"add a constraint that joins it to {root[0]} or to what is mounted there"
+                self.add_problem(Severity.WARNING, message, self.locations[body], fix)
+        for closing in topology.find_loop_closures():
+            found = loops.compute_misclosure(closing.path, lambda name: _frame_of(bodies, name))
+            bad = not found.is_exact and (found.sigmas is None or found.sigmas > MAX_LOOP_SIGMAS)
+            self.add_problem(
+                Severity.WARNING if bad else Severity.NOTE,
+                f"constraint {closing.constraint} closes a loop through {format_names(closing.bodies)}; "
+                f"{_describe_misclosure(found)}; answers take the shortest path",
+                sources[closing.constraint],
+                _suggest_fix(found) if bad else "",
+            )
+        if self.repair:
+            valid = set(root)
+            bodies = {name: body for name, body in bodies.items() if name in valid}
+            constraints = tuple(each for each in constraints if names.split(each.from_)[0] in valid)
+        return bodies, constraints
+
+
+def _frame_of(bodies: dict[str, Body], name: str) -> BodyFrame:
+    body, frame = names.split(name)
+    return bodies[body].frame(frame)
+
+
+def _describe_misclosure(found: loops.LoopMisclosure) -> str:
+    """Return the misclosure of a loop as text."""
+    if found.is_exact:
+        return "it closes exactly" + (", with joints at their defaults" if found.joints else "")
+    joints = ", with joints at their defaults," if found.joints else ""
+    text = f"its misclosure{joints} is {found.meters * 1e3:.3g} mm and {math.degrees(found.radians):.3g} deg"
+    if found.sigmas is None:
+        return f"{text}, and no sigma is stated for {format_names(found.missing_sigmas)}"
+    if math.isinf(found.sigmas):
+        return f"{text}, in a direction that the surveys state as exact"
+    more = "more than " if found.sigmas >= loops.MAX_SIGMAS else ""
+    return f"{text}, {more}{found.sigmas:.1f} sigma of the surveys"
+
+
+def _suggest_fix(found: loops.LoopMisclosure) -> str:
+    if found.sigmas is None:
+        missing = format_names(found.missing_sigmas)
+        return f"state sigma: of {missing}, remove one constraint of the loop, or fix the survey"
+    rest = " or the default of a joint" if found.joints else ""
+    return f"remove one constraint of the loop, or fix the survey of its frames{rest}"

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from typing import TypeVar
 
 from modelserver.geometry.joint import Joint
 from modelserver.geometry.model import Model
 from modelserver.geometry.names import join
-from modelserver.geometry.parts import Constraint
 from modelserver.transforms.pose import Pose
+
+T = TypeVar("T")
 
 MIN_METERS = 1e-9
 MIN_RADIANS = 1e-9
@@ -17,27 +20,29 @@ MIN_RADIANS = 1e-9
 
 def describe_changes(old: Model, new: Model) -> tuple[str, ...]:
     """Return what is added, removed or changed, a line each; empty where both models give the same answers."""
-    lines = []
-    before, after = ({body.name: body for body in model.bodies} for model in (old, new))
-    lines += [f"body {name} is removed" for name in before if name not in after]
-    lines += [f"body {name} is new" for name in after if name not in before]
-    for name, body in after.items():
-        if name not in before:
-            continue
-        was = {frame.name: frame for frame in before[name]}
-        now = {frame.name: frame for frame in body}
-        lines += [f"frame {join(name, each)} is removed" for each in was if each not in now]
-        lines += [f"frame {join(name, each)} is new" for each in now if each not in was]
-        for each, frame in now.items():
-            if each in was:
-                lines += _compare_poses(f"frame {join(name, each)}", was[each].pose, frame.pose)
-                if was[each].sigma != frame.sigma:
-                    lines.append(f"frame {join(name, each)} states another sigma")
-        if before[name].inertia != body.inertia:
+    bodies = [{each.name: each for each in model.bodies} for model in (old, new)]
+    lines = _list_additions("body", *bodies)
+    for name, before, after in _pair(*bodies):
+        frames = [{join(name, each.name): each for each in body} for body in (before, after)]
+        lines += _list_additions("frame", *frames)
+        for full, was, now in _pair(*frames):
+            lines += _compare_poses(f"frame {full}", was.pose, now.pose)
+            if was.sigma != now.sigma:
+                lines.append(f"frame {full} states another sigma")
+        if before.inertia != after.inertia:
             lines.append(f"body {name} has another inertia")
-    lines += _compare_constraints(
-        {each.name: each for each in old.constraints}, {each.name: each for each in new.constraints}
-    )
+    constraints = [{each.name: each for each in model.constraints} for model in (old, new)]
+    lines += _list_additions("constraint", *constraints)
+    for name, first, second in _pair(*constraints):
+        if (first.from_, first.to) != (second.from_, second.to):
+            lines.append(
+                f"constraint {name} joins {second.from_} and {second.to}, it joined {first.from_} and {first.to}"
+            )
+        lines += _compare_poses(f"constraint {name}", first.pose, second.pose)
+        if first.sigma != second.sigma:
+            lines.append(f"constraint {name} states another sigma")
+        if first.joint != second.joint:
+            lines.append(f"the joint of constraint {name} {_compare_joints(first.joint, second.joint)}")
     if old.root.name != new.root.name:
         lines.append(f"the root body is {new.root.name}, it was {old.root.name}")
     if not lines and old.revision != new.revision:
@@ -45,21 +50,14 @@ def describe_changes(old: Model, new: Model) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _compare_constraints(was: dict[str, Constraint], now: dict[str, Constraint]) -> list[str]:
-    lines = [f"constraint {name} is removed" for name in was if name not in now]
-    lines += [f"constraint {name} is new" for name in now if name not in was]
-    for name, each in now.items():
-        if name not in was:
-            continue
-        old = was[name]
-        if (old.from_, old.to) != (each.from_, each.to):
-            lines.append(f"constraint {name} joins {each.from_} and {each.to}, it joined {old.from_} and {old.to}")
-        lines += _compare_poses(f"constraint {name}", old.pose, each.pose)
-        if old.sigma != each.sigma:
-            lines.append(f"constraint {name} states another sigma")
-        if old.joint != each.joint:
-            lines.append(f"the joint of constraint {name} {_compare_joints(old.joint, each.joint)}")
-    return lines
+def _list_additions(what: str, was: dict[str, T], now: dict[str, T]) -> list[str]:
+    lines = [f"{what} {name} is removed" for name in was if name not in now]
+    return lines + [f"{what} {name} is new" for name in now if name not in was]
+
+
+def _pair(was: dict[str, T], now: dict[str, T]) -> Iterator[tuple[str, T, T]]:
+    """Yield name, old and new value of what both have."""
+    return ((name, was[name], each) for name, each in now.items() if name in was)
 
 
 def _compare_joints(old: Joint, new: Joint) -> str:

@@ -31,7 +31,6 @@ from modelserver.geometry.joint import Coordinates, Joint, JointType
 from modelserver.geometry.parts import Body
 from modelserver.geometry.path_covariance import (
     EdgeCovariance,
-    JointCrossing,
     JointJacobian,
     PathCovariance,
     PlainPose,
@@ -94,7 +93,7 @@ class KinematicPath:
                 joints.append(PathJoint.of(pose, edge))
                 pose = Pose.identity()
             else:
-                pose = pose @ (edge.pose if edge.forward else edge.pose.inverse())
+                pose = pose @ edge.step
         self.is_in_loop = is_in_loop
         self.joints = tuple(joints)
         self.last = pose
@@ -327,7 +326,7 @@ class FrameTree:
             node = FrameNode(parent.assembly, body, _IDENTITY, depth, edge, back, jacobian=motion)
             node.parent = parent
             return node
-        X_GN = parent.X_GN @ (edge.pose if edge.forward else edge.pose.inverse())
+        X_GN = parent.X_GN @ edge.step
         covariance = None
         if edge.sigma is not None and not edge.sigma.is_zero:
             X_F, X_T = (parent.X_GN, X_GN) if edge.forward else (X_GN, parent.X_GN)
@@ -396,24 +395,15 @@ class FrameTree:
 
 
 def _build_covariance(up: Sequence[FrameNode], down: Sequence[FrameNode]) -> PathCovariance:
-    segments: list[list[EdgeCovariance]] = [[]]
-    crossings: list[JointCrossing] = []
-    is_stated = True
-    for nodes, is_upward in ((up, True), (down, False)):
-        for node in nodes:
-            if node.covariance is not None:
-                segments[-1].append(node.covariance)
-            elif node.is_sigma_missing:
-                is_stated = False
-            elif node.jacobian is not None:
-                edge = node.reverse_edge if is_upward else node.edge
-                assert edge is not None
-                number = len(crossings)
-                # the Jacobian is that of the segment that contains F: before the joint, or behind it
-                at, sign = (number, 1.0) if edge.forward else (number + 1, -1.0)
-                crossings.append(JointCrossing(node.jacobian, at, sign, edge.leader or edge.name))
-                segments.append([])
-    return PathCovariance(segments, crossings, is_stated)
+    found = PathCovariance()
+    for node, edge in (*[(each, each.reverse_edge) for each in up], *[(each, each.edge) for each in down]):
+        if node.covariance is not None:
+            found.add_edge(node.covariance)
+        elif node.is_sigma_missing:
+            found.is_complete = False
+        elif node.jacobian is not None and edge is not None:
+            found.add_joint(node.jacobian, edge)
+    return found
 
 
 def _collect_edges(up: Sequence[FrameNode], down: Sequence[FrameNode]) -> tuple[Edge, ...]:

@@ -45,6 +45,11 @@ def find_problem(name: str) -> str:
     return ""
 
 
+def find_body_problem(name: str) -> str:
+    """Return why a name of a body is not allowed in a file, "" if it is."""
+    return "this name is reserved for the server's world frames" if name in RESERVED_BODIES else find_problem(name)
+
+
 MAX_LISTED = 12
 """Names that a message lists at most."""
 

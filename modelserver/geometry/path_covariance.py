@@ -90,64 +90,51 @@ class JointJacobian(NamedTuple):
         return twists
 
 
-class JointCrossing(NamedTuple):
-    """A joint on a path: its Jacobian in the base of segment number `segment`, and the sense of the crossing.
-
-    `sign` is -1.0 where it is passed from T to F. Joints of one `source` have common errors.
-    """
-
-    jacobian: JointJacobian
-    segment: int
-    sign: float
-    source: str
-
-
 class PathCovariance:
     """Covariance of the far end of a path, for any position of its joints; see the module.
 
-    `segments` holds the fixed edges of each rigid segment, `crossings` the joints between them. `is_complete` is false
-    where an edge states no sigma, and counts as exact here.
+    Edges and joints are added in the order of the path. `is_complete` is false where an edge states no sigma, and
+    counts as exact here.
     """
 
     __slots__ = ("_joints", "_segments", "is_complete")
 
-    def __init__(
-        self,
-        segments: Sequence[Sequence[EdgeCovariance]],
-        crossings: Sequence[JointCrossing] = (),
-        is_stated: bool = True,
-    ):
-        self.is_complete = is_stated
-        self._segments = segments
-        # the joints of each segment, with their numbers on the path
-        self._joints: list[list[tuple[int, JointCrossing]]] = [[] for _ in segments]
-        for number, each in enumerate(crossings):
-            self._joints[each.segment].append((number, each))
+    def __init__(self) -> None:
+        self.is_complete = True
+        self._segments: list[list[EdgeCovariance]] = [[]]
+        # for each segment number, Jacobian, sign and source of the joints whose F frame is in it
+        self._joints: list[list[tuple[int, JointJacobian, float, str]]] = [[]]
+
+    def add_edge(self, covariance: EdgeCovariance) -> None:
+        """Add a fixed edge, with its covariance in the base of the last segment."""
+        self._segments[-1].append(covariance)
+
+    def add_joint(self, jacobian: JointJacobian, edge: Edge) -> None:
+        """Add a joint and the segment behind it. Joints that follow one leader have common errors."""
+        number = len(self._segments) - 1
+        self._segments.append([])
+        self._joints.append([])
+        # F is before the joint where it is passed forward, else behind it, where it has the opposite sign
+        segment, sign = (number, 1.0) if edge.forward else (number + 1, -1.0)
+        self._joints[segment].append((number, jacobian, sign, edge.leader or edge.name))
 
     @classmethod
     def from_edges(cls, edges: Sequence[Edge]) -> PathCovariance:
         """Return that of a path given by its edges; each segment's base is its first frame."""
-        segments: list[list[EdgeCovariance]] = [[]]
-        crossings: list[JointCrossing] = []
-        is_stated = True
+        found = cls()
         pose = Pose.identity()
         for edge in edges:
             if edge.joint is not None:
-                number = len(crossings)
-                # F is the last frame of this segment, or the first of the next
-                motion = JointJacobian.at(edge.joint, pose if edge.forward else Pose.identity())
-                at, sign = (number, 1.0) if edge.forward else (number + 1, -1.0)
-                crossings.append(JointCrossing(motion, at, sign, edge.leader or edge.name))
-                segments.append([])
+                found.add_joint(JointJacobian.at(edge.joint, pose if edge.forward else Pose.identity()), edge)
                 pose = Pose.identity()
                 continue
-            behind = pose @ (edge.pose if edge.forward else edge.pose.inverse())
+            behind = pose @ edge.step
             if edge.sigma is not None:
                 X_F, X_T = (pose, behind) if edge.forward else (behind, pose)
-                segments[-1].append(edge_covariance(X_F.wxyz, X_T.xyz, edge.sigma))
-            is_stated &= not edge.is_sigma_missing
+                found.add_edge(edge_covariance(X_F.wxyz, X_T.xyz, edge.sigma))
+            found.is_complete &= not edge.is_sigma_missing
             pose = behind
-        return cls(segments, crossings, is_stated)
+        return found
 
     def compute(
         self, bases: Sequence[PlainPose], far: Vector3, positions: Sequence[Coordinates], sigmas: Sequence[Coordinates]
@@ -170,8 +157,7 @@ class PathCovariance:
                 isotropic, rest = add_edges(isotropic, edges, lever, q)
                 if rest is not None:
                     others = rest if others is None else tuple(map(add, others, rest))
-            for index, crossing in joints:
-                motion, sign, source = crossing.jacobian, crossing.sign, crossing.source
+            for index, motion, sign, source in joints:
                 units = motion.twists if motion.joint.count == 1 else motion.compute_twists(positions[index])
                 for coordinate, (v, w) in enumerate(units):
                     s = sigmas[index][coordinate] * sign

@@ -266,6 +266,11 @@ class Edge(NamedTuple):
     leader: str = ""
 
     @property
+    def step(self) -> Pose:
+        """The pose of the end that is reached in the end that is left."""
+        return self.pose if self.forward else self.pose.inverse()
+
+    @property
     def is_sigma_missing(self) -> bool:
         """Whether a fixed edge states no sigma; an identity pose is exact by definition."""
         return self.sigma is None and self.pose != _IDENTITY
