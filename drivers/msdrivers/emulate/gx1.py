@@ -50,8 +50,6 @@ class SampleInterpolator:
     Missing vectors are zero, a missing orientation is level and north.
     """
 
-    __slots__ = ("_after", "_before", "_remaining")
-
     def __init__(self, samples: Iterable[ImuSample]):
         """`samples` have increasing stamps."""
         self._remaining: Iterator[ImuSample] = iter(samples)
@@ -84,16 +82,10 @@ def _sense(sample: ImuSample) -> SensedState:
 
 
 def _interpolate(a: SensedState, b: SensedState, share: float) -> SensedState:
-    return SensedState(
-        _interpolate_vector(a.rate, b.rate, share),
-        _interpolate_vector(a.force, b.force, share),
-        _interpolate_vector(a.field, b.field, share),
-        so3.slerp(a.orientation, b.orientation, share),
+    rate, force, field = (
+        so3.add(so3.scale(1.0 - share, x), so3.scale(share, y)) for x, y in zip(a[:3], b[:3], strict=True)
     )
-
-
-def _interpolate_vector(a: Vector3, b: Vector3, share: float) -> Vector3:
-    return (a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * (b[2] - a[2]))
+    return SensedState(rate, force, field, so3.slerp(a.orientation, b.orientation, share))
 
 
 MAX_BACKLOG_CYCLES = 100
@@ -141,12 +133,8 @@ class Gx1Emulator:
             self._opened_ns = now.monotonic_ns
             self._faults.start(now.monotonic_ns)
             self._switch_on(now.monotonic_ns, self.unit.tick_offset)
-        return [
-            EndpointStatus(
-                EndpointPhase.STREAMING if self.streamed else EndpointPhase.WAITING,
-                f"3DM-GX1 {self.unit.serial} emulated",
-            )
-        ]
+        phase = EndpointPhase.STREAMING if self.streamed else EndpointPhase.WAITING
+        return [EndpointStatus(phase, f"3DM-GX1 {self.unit.serial} emulated")]
 
     def on_receive(self, unit: bytes, now: HostTime) -> list[Output[bytes]]:
         """Process received bytes."""
@@ -196,10 +184,8 @@ class Gx1Emulator:
         self._tick, self._capture = 0, None
         self._outbox.clear()
         self._requests.clear()
-        addresses = (EepromAddress.GYRO_GAIN, EepromAddress.ACCELEROMETER_GAIN, EepromAddress.MAGNETOMETER_GAIN)
         # its own scales are in its firmware: a zero word affects only the host
-        gyro, accelerometer, magnetometer = (self.eeprom.read_word(address) or 1000 for address in addresses)
-        self._gains = Gains(gyro, accelerometer, magnetometer)
+        self._gains = Gains(*(self.eeprom.read_word(address) or 1000 for address in EepromAddress.GAINS))
 
     def _run_cycles(self, now_ns: int) -> None:
         """Run the calculation cycles up to now."""
@@ -222,58 +208,54 @@ class Gx1Emulator:
         instant = self._sense(at_ns)
         if instant is None:
             return
+        unit, gains = self.unit, self._gains
         words: tuple[int, ...]
-        vectors = {
-            "field": self._get_field_words(instant, self._get_offsets()),
-            "acceleration": vector_to_words(_scale(instant.force, self.unit.force_sign), self._gains.accelerometer, G0),
-            "rate": vector_to_words(_subtract(self._get_rate(instant), self._bias), self._gains.gyro),
-        }
+        field = self._get_field_words(instant, vector_from_words(self._get_offset_words(), gains.magnetometer, TESLA))
+        force = vector_to_words(so3.scale(unit.force_sign, instant.force), gains.accelerometer, G0)
+        rate = vector_to_words(_subtract(so3.add(instant.rate, unit.gyro_bias), self._bias), gains.gyro)
         if command == CommandByte.EULER_VECTORS:
-            words = (*euler_to_words(instant.orientation), *vectors["acceleration"], *vectors["rate"])
+            words = (*euler_to_words(instant.orientation), *force, *rate)
         elif command in (CommandByte.INSTANTANEOUS_EULER, CommandByte.STABILIZED_EULER):
             words = euler_to_words(instant.orientation)
         else:
-            words = (*vectors["field"], *vectors["acceleration"], *vectors["rate"])
+            words = (*field, *force, *rate)
             if command == CommandByte.QUATERNION_VECTORS:
                 words = (*quaternion_to_words(instant.orientation), *words)
         self._queue_reply(command, words, at_ns)
 
-    def _get_rate(self, instant: SensedState) -> Vector3:
-        x, y, z = instant.rate
-        a, b, c = self.unit.gyro_bias
-        return (x + a, y + b, z + c)
-
     def _get_field_words(self, instant: SensedState, offsets: Vector3) -> tuple[int, int, int]:
-        x, y, z = instant.field
-        a, b, c = self.unit.field_offset
-        return vector_to_words(_subtract((x + a, y + b, z + c), offsets), self._gains.magnetometer, TESLA)
+        field = _subtract(so3.add(instant.field, self.unit.field_offset), offsets)
+        return vector_to_words(field, self._gains.magnetometer, TESLA)
 
-    def _get_offsets(self) -> Vector3:
-        words = (_to_signed(self.eeprom.read_word(address)) for address in EepromAddress.HARD_IRON)
-        return vector_from_words(words, self._gains.magnetometer, TESLA)
+    def _get_offset_words(self) -> tuple[int, ...]:
+        return tuple(_to_signed(self.eeprom.read_word(address)) for address in EepromAddress.HARD_IRON)
 
     def _capture_bias(self, at_ns: int) -> None:
         assert self._capture is not None
         until_ns, rates = self._capture
         instant = self._sense(at_ns)
         if instant is not None:
-            rates.append(self._get_rate(instant))
+            rates.append(so3.add(instant.rate, self.unit.gyro_bias))
         if at_ns < until_ns:
             return
         if rates:
-            x, y, z = (sum(axis) / len(rates) for axis in zip(*rates, strict=True))
-            self._bias = (x, y, z)
+            self._bias = so3.scale(1.0 / len(rates), so3.add(*rates))
         self._capture = None
         self._queue_reply(CommandByte.CAPTURE_BIAS, (), at_ns)
 
     def _on_request(self, request: Gx1Request, now: HostTime) -> None:
         command, data, at_ns = request.command, request.data, now.monotonic_ns
+        constants = {
+            CommandByte.TEMPERATURE: temperature_to_word(self.unit.celsius),
+            CommandByte.FIRMWARE: self.unit.firmware,
+            CommandByte.SERIAL: self.unit.serial,
+        }
         if self._capture is not None:
             return
         if command in MEASUREMENTS:
             self._send_measurement(command, at_ns)
-        elif command == CommandByte.TEMPERATURE:
-            self._queue_reply(command, (temperature_to_word(self.unit.celsius),), at_ns)
+        elif (word := constants.get(CommandByte(command))) is not None:
+            self._queue_reply(command, (word,), at_ns)
         elif command == CommandByte.CAPTURE_BIAS:
             self._capture = (at_ns + round(self.unit.bias_capture * 1e9), [])
         elif command == CommandByte.CONTINUOUS:
@@ -285,17 +267,13 @@ class Gx1Emulator:
             if command == CommandByte.WRITE_EEPROM and address % 2 == 0 and address < 256:
                 self._write({address: int.from_bytes(data[2:], "big")})
             self._queue_reply(command, (self.eeprom.read_word(address),), at_ns)
-        elif command == CommandByte.FIRMWARE:
-            self._queue_reply(command, (self.unit.firmware,), at_ns)
-        elif command == CommandByte.SERIAL:
-            self._queue_reply(command, (self.unit.serial,), at_ns)
         else:
             self._on_hard_iron(command, data, at_ns)
 
     def _on_hard_iron(self, command: int, data: bytes, at_ns: int) -> None:
         if command == CommandByte.HARD_IRON_START:
             self._extremes = ([MAX_WORD] * 3, [MIN_WORD] * 3)
-            self._store_offsets((0, 0, 0))
+            self._write(dict.fromkeys(EepromAddress.HARD_IRON, 0))
             self._queue_reply(command, (), at_ns)
             return
         low, high = self._extremes
@@ -311,24 +289,17 @@ class Gx1Emulator:
             return
         two_dimensional, magnitude_z = data[0] == 1, _to_signed(int.from_bytes(data[1:], "big"))
         x, y, z = ((a + b) // 2 for a, b in zip(low, high, strict=True))
-        self._store_offsets((x, y, z - magnitude_z if two_dimensional else z))
-        self._queue_reply(
-            command, tuple(_to_signed(self.eeprom.read_word(address)) for address in EepromAddress.HARD_IRON), at_ns
-        )
-
-    def _store_offsets(self, words: tuple[int, int, int]) -> None:
-        self._write(dict(zip(EepromAddress.HARD_IRON, words, strict=True)))
+        offsets = (x, y, z - magnitude_z if two_dimensional else z)
+        self._write(dict(zip(EepromAddress.HARD_IRON, offsets, strict=True)))
+        self._queue_reply(command, self._get_offset_words(), at_ns)
 
     def _write(self, changes: Mapping[int, int]) -> None:
         self.eeprom = self.eeprom.write(changes)
         self._save_eeprom(self.eeprom)
 
     def _queue_reply(self, command: int, words: tuple[int, ...], at_ns: int) -> None:
-        ticks = (
-            None
-            if command in (CommandByte.CONTINUOUS, CommandByte.FIRMWARE, CommandByte.SERIAL)
-            else self._clock.ticks_at(at_ns)
-        )
+        has_ticks = command not in (CommandByte.CONTINUOUS, CommandByte.FIRMWARE, CommandByte.SERIAL)
+        ticks = self._clock.ticks_at(at_ns) if has_ticks else None
         send_ns = at_ns + round(self.unit.delay * 1e9)
         if self._outbox:
             send_ns = max(send_ns, self._outbox[-1][0])
@@ -350,10 +321,5 @@ def _to_signed(word: int) -> int:
     return (word + 32768) % 65536 - 32768
 
 
-def _scale(value: Vector3, factor: float) -> Vector3:
-    x, y, z = value
-    return (x * factor, y * factor, z * factor)
-
-
 def _subtract(value: Vector3, less: Vector3) -> Vector3:
-    return (value[0] - less[0], value[1] - less[1], value[2] - less[2])
+    return so3.add(value, so3.scale(-1.0, less))

@@ -24,12 +24,7 @@ class Eeprom:
         """Return one with gains, and the timer words of 100 Hz or those of 6.5536 ms a tick."""
         timer = (4, 10, 250, 10) if hundred_hertz else (16, 16, 256, 1)
         words = dict(zip(EepromAddress.TIMER, timer, strict=True))
-        words |= zip(
-            (EepromAddress.GYRO_GAIN, EepromAddress.ACCELEROMETER_GAIN, EepromAddress.MAGNETOMETER_GAIN),
-            gains,
-            strict=True,
-        )
-        return cls().write(words)
+        return cls().write(words | dict(zip(EepromAddress.GAINS, gains, strict=True)))
 
     def read_word(self, address: int) -> int:
         """Return a word; 0 at an invalid address."""
@@ -93,9 +88,8 @@ class UnitClock:
     @classmethod
     def make(cls, eeprom: Eeprom, unit: Gx1Unit, started_ns: int, offset: int) -> UnitClock:
         """Return the clock as the timer words have it; 10 ms a tick where they are zero."""
-        return cls(
-            started_ns, tick_from_timer_words(map(eeprom.read_word, EepromAddress.TIMER)) or 0.01, unit.drift, offset
-        )
+        tick_s = tick_from_timer_words(map(eeprom.read_word, EepromAddress.TIMER))
+        return cls(started_ns, tick_s or 0.01, unit.drift, offset)
 
     def instant_of(self, tick: int) -> int:
         """Return when a tick since the start begins."""
