@@ -73,46 +73,36 @@ def imu(
 
     Example: modelserver calibrate imu stationary.lcm --plot allan.html -o imu.yaml
     """
-    _check_paths(begin, end, log, (plot, output), force)
-    if as_json and output == "-":
-        raise typer.BadParameter("--json and -o - both write to standard output; give a file for the proposal")
+    _check_options(begin, end, log, plot, output, as_json, force)
     recorded = calibrate_log.read_recording(log, channel, "", begin, end)
     good = calibrate_log.finite_rows(recorded.rates, recorded.forces)
     if not good.any():
-        raise CalibrationError(
-            f"{escape(str(log))}: {format_count(good.size, 'sample')} on {channel}, none with angular velocity and "
-            "specific force: it is no IMU's channel, or its driver publishes neither"
-        )
-    valid = dataclasses.replace(
-        recorded, **{name: getattr(recorded, name)[good] for name in ("utimes", "times", "rates", "forces", "fields")}
-    )
+        why = "none with angular velocity and specific force: it is no IMU's channel, or its driver publishes neither"
+        raise _make_error(log, f"{format_count(good.size, 'sample')} on {channel}, {why}")
+    columns = ("utimes", "times", "rates", "forces", "fields")
+    valid = dataclasses.replace(recorded, **{name: getattr(recorded, name)[good] for name in columns})
     stretches = find_stationary_ranges(valid.utimes, valid.rates, valid.forces)
     if not stretches:
         _print_up_axis(config, valid, as_json, output == "-")
-        raise CalibrationError(
-            f"{escape(str(log))}: the vehicle is never stationary in {_format_span(valid)}; record it stationary, "
-            "with the engine off, for 10 minutes or more"
-        )
+        span, fix = valid.times[-1] - valid.times[0], "with the engine off, for 10 minutes or more"
+        raise _make_error(log, f"the vehicle is never stationary in {span:.1f} s; record it stationary, {fix}")
     used = max(stretches, key=lambda each: each.seconds)
     noise = _compute_noise(valid, used, good.size)
     advice = None if config is None else _mount_advice(config, valid.forces[used.start : used.stop])
     if as_json:
-        typer.echo(json.dumps(calibrate_report.noise_to_dict(noise, advice), indent=2, allow_nan=False))
+        text = json.dumps(calibrate_report.noise_to_dict(noise, advice), indent=2, allow_nan=False)
     else:
-        typer.echo("\n".join(calibrate_report.format_noise(escape(str(log)), noise, advice)), err=output == "-")
+        text = "\n".join(calibrate_report.format_noise(escape(str(log)), noise, advice))
+    typer.echo(text, err=output == "-")
     _print_damage(log, recorded)
     if plot:
         write_file(plot, calibrate_report.render_noise_page(str(log), noise), replace=force)
     if noise.seconds < MIN_STATIONARY_S:
-        raise CalibrationError(
-            f"{escape(str(log))}: the longest stationary range is {noise.seconds:.1f} s; {MIN_STATIONARY_S:.0f} s are "
-            "needed for a proposal, 10 minutes for the bias random walk: record longer"
-        )
+        needed = f"{MIN_STATIONARY_S:.0f} s are needed for a proposal, 10 minutes for the bias random walk"
+        raise _make_error(log, f"the longest stationary range is {noise.seconds:.1f} s; {needed}: record longer")
     if not calibrate_report.propose_settings(noise):
-        raise CalibrationError(
-            f"{escape(str(log))}: no figure follows from {noise.seconds:.0f} s: the samples are frozen, "
-            "or other errors exceed the noise; see --plot"
-        )
+        why = "the samples are frozen, or other errors exceed the noise; see --plot"
+        raise _make_error(log, f"no figure follows from {noise.seconds:.0f} s: {why}")
     write_file(output, calibrate_report.format_noise_yaml(str(log), noise), replace=force)
 
 
@@ -146,27 +136,22 @@ def magnetometer(
     Example:
       modelserver calibrate magnetometer turned.lcm --plot circle.html -o magnetometer.yaml
     """
-    _check_paths(begin, end, log, (plot, output), force)
-    if as_json and output == "-":
-        raise typer.BadParameter("--json and -o - both write to standard output; give a file for the proposal")
+    _check_options(begin, end, log, plot, output, as_json, force)
     given = _parse_place(place)
     recorded = calibrate_log.read_recording(log, channel, gps_channel, begin, end)
     good = calibrate_log.finite_rows(recorded.fields)
     if not good.any():
-        raise CalibrationError(
-            f"{escape(str(log))}: {format_count(good.size, 'sample')} on {channel}, none with a magnetic field: it has "
-            "no magnetometer, or its driver does not publish it"
-        )
+        why = "none with a magnetic field: it has no magnetometer, or its driver does not publish it"
+        raise _make_error(log, f"{format_count(good.size, 'sample')} on {channel}, {why}")
     where = given or recorded.position
     field = None if where is None else _get_field(where, int(np.median(recorded.utimes)))
     up = _estimate_up(recorded)
     found = _fit(log, recorded.fields[good], up, field, all_axes)
     if as_json:
-        typer.echo(json.dumps(calibrate_report.magnetometer_to_dict(found, where, field), indent=2, allow_nan=False))
+        text = json.dumps(calibrate_report.magnetometer_to_dict(found, where, field), indent=2, allow_nan=False)
     else:
-        typer.echo(
-            "\n".join(calibrate_report.format_magnetometer(escape(str(log)), found, where, field)), err=output == "-"
-        )
+        text = "\n".join(calibrate_report.format_magnetometer(escape(str(log)), found, where, field))
+    typer.echo(text, err=output == "-")
     _print_damage(log, recorded)
     if plot:
         page = calibrate_report.render_magnetometer_page(str(log), found, recorded.fields[good], found.coverage.axis)
@@ -216,25 +201,21 @@ def _mount_advice(config: Path, forces: Any) -> mount.MountCheck:
 def _print_up_axis(config: Path | None, recorded: ImuRecording, as_json: bool, on_stderr: bool) -> None:
     """Print which axis of the IMU points up, from the mean specific force of a drive, whose accelerations cancel."""
     x, y, z = (float(each) for each in recorded.forces.mean(axis=0))
-    up, angle = mount.axis_name((x, y, z)), math.nan
-    strength = math.hypot(x, y, z)
+    up, strength = mount.axis_name((x, y, z)), math.hypot(x, y, z)
+    angle = math.nan
     if strength > 0.0:
         angle = math.degrees(math.acos(min(max(abs(x), abs(y), abs(z)) / strength, 1.0)))
-    words = [
-        f"mean specific force of the drive: {strength:.2f} m/s2, {angle:.0f} degrees from the IMU's {up} axis, which "
-        "points up"
-    ]
-    text = ""
+    direction = f"{angle:.0f} degrees from the IMU's {up} axis, which points up"
+    lines = [f"mean specific force of the drive: {strength:.2f} m/s2, {direction}"]
+    advice = ""
     if config is not None:
         try:
-            text = _mount_advice(config, recorded.forces).text
+            advice = _mount_advice(config, recorded.forces).text
         except CalibrationError as error:
-            text = str(error)
-        words.append(f"mount: {text}")
-    if as_json:
-        typer.echo(json.dumps({"up": up, "mount": {"text": text} if text else None}, indent=2))
-    else:
-        typer.echo("\n".join(words), err=on_stderr)
+            advice = str(error)
+        lines.append(f"mount: {advice}")
+    data = {"up": up, "mount": {"text": advice} if advice else None}
+    typer.echo(json.dumps(data, indent=2) if as_json else "\n".join(lines), err=on_stderr)
 
 
 def _fit(log: Path, fields: Any, up: Vector3 | None, field: Vector3 | None, all_axes: bool) -> MagnetometerFit:
@@ -243,12 +224,11 @@ def _fit(log: Path, fields: Any, up: Vector3 | None, field: Vector3 | None, all_
         if all_axes:
             return fit_all_axes(fields, math.nan if field is None else math.hypot(*field), horizontal)
         if up is None:
-            raise CalibrationError(
-                "the IMU has no specific force, so up is unknown; turn it about all axes and give --all-axes"
-            )
+            why = "the IMU has no specific force, so up is unknown; turn it about all axes and give --all-axes"
+            raise CalibrationError(why)
         return fit_level(fields, up, horizontal, math.nan if field is None else field[2])
     except CalibrationError as error:
-        raise CalibrationError(f"{escape(str(log))}: {error}") from None
+        raise _make_error(log, str(error)) from None
 
 
 def _estimate_up(recorded: ImuRecording) -> Vector3 | None:
@@ -264,10 +244,8 @@ def _get_field(place: Vector3, utime: int) -> Vector3 | None:
     from modelserver.earth import magnetism
 
     if not magnetism.is_covered(utime):
-        typer.echo(
-            "modelserver: the samples' stamps are outside the World Magnetic Model's years; the strength stays open",
-            err=True,
-        )
+        why = "the samples' stamps are outside the World Magnetic Model's years; the strength stays open"
+        typer.echo(f"modelserver: {why}", err=True)
         return None
     return magnetism.field_at(*place, utime)
 
@@ -287,25 +265,23 @@ def _parse_place(text: str) -> Vector3 | None:
     return (latitude, longitude, 0.0)
 
 
-def _check_paths(begin: float, end: float, log: Path, targets: tuple[str, ...], force: bool) -> None:
+def _check_options(begin: float, end: float, log: Path, plot: str, output: str, as_json: bool, force: bool) -> None:
     if not (math.isfinite(begin) and begin >= 0.0 and end > begin):
         raise typer.BadParameter(f"--from {begin:g} --to {end:g} is no range; expected 0 <= from < to, seconds")
-    named = [each for each in targets if each and each != "-"]
+    named = [each for each in (plot, output) if each and each != "-"]
     if len({os.path.realpath(each) for each in (*named, str(log))}) <= len(named):
         raise typer.BadParameter("LOG, --plot and --output must be different files")
     for target in named:
         check_writable(target, force)
+    if as_json and output == "-":
+        raise typer.BadParameter("--json and -o - both write to standard output; give a file for the proposal")
 
 
 def _print_damage(log: Path, recorded: ImuRecording) -> None:
-    if recorded.malformed:
-        typer.echo(
-            f"modelserver: {escape(str(log))}: {format_count(recorded.malformed, 'message')} of the channel left out",
-            err=True,
-        )
-    for each in recorded.damage[:5]:
+    lost = format_count(recorded.malformed, "message") + " of the channel left out" if recorded.malformed else ""
+    for each in filter(None, (lost, *recorded.damage[:5])):
         typer.echo(f"modelserver: {escape(str(log))}: {each}", err=True)
 
 
-def _format_span(recorded: ImuRecording) -> str:
-    return f"{float(recorded.times[-1] - recorded.times[0]):.1f} s"
+def _make_error(log: Path, why: str) -> CalibrationError:
+    return CalibrationError(f"{escape(str(log))}: {why}")

@@ -70,7 +70,7 @@ def command(
       modelserver import-bag drive.bag drive.lcm
       modelserver replay drive.lcm -c config/husky/vehicle.yaml --poses poses.csv
     """
-    if not (math.isfinite(track_width) and 0.0 < track_width < 100.0):
+    if not 0.0 < track_width < 100.0:
         raise typer.BadParameter(f"a track width must be above 0 and below 100 m, got {track_width:g}")
     if math.isfinite(undulation) and altitude is not Altitude.MSL:
         raise typer.BadParameter("--undulation goes with --altitude msl")
@@ -173,6 +173,7 @@ def choose_topics(
             raise RecordingError(f"{bag}: two topics for {kind}; a log has one source of each type")
         chosen[name] = kind
     reports = {name: TopicReport(name, each.type_name) for name, each in known.items()}
+    taken = {kind: name for name, kind in chosen.items()}
     for each in sorted(known.values(), key=lambda each: (-each.count, each.name)):
         found = ROS_TYPES.get(each.type_name)
         if each.name in chosen:
@@ -181,9 +182,9 @@ def choose_topics(
             reports[each.name].skipped = "unsupported type"
         elif each.count == 0:
             reports[each.name].skipped = "no messages"
-        elif found in chosen.values():
-            taken = next(name for name, kind in chosen.items() if kind is found)
-            reports[each.name].skipped = f"{taken} is the {found} source; --topic {each.name}={found} selects this one"
+        elif taken.setdefault(found, each.name) != each.name:
+            other = f"{taken[found]} is the {found} source"
+            reports[each.name].skipped = f"{other}; --topic {each.name}={found} selects this one"
         else:
             chosen[each.name] = found
     if not chosen:
@@ -206,8 +207,7 @@ def _write(
     total = sum(each.count for each in bag.topics if each.name in chosen)
     for name, kind in chosen.items():
         reports[name].channel = f"{prefix}{kind.upper()}"
-    first = last = 0
-    done = 0
+    first = last = done = 0
     out = lcm.EventLog(str(path), "w", overwrite=True)
     try:
         with show_progress(f"importing {path.name.strip('.')}", total) as show:
