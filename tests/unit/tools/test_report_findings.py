@@ -98,7 +98,7 @@ def test_given_fixes_with_a_latency_then_it_is_estimated(tau: float) -> None:
         t = 0.25 * n
         v = (2.0 * math.cos(0.3 * t), 2.0 * math.sin(0.3 * t))
         residual = (-tau * v[0] + 3.0 + noise[n, 0], -tau * v[1] + noise[n, 1])
-        fixes.append(FixRecord(t, (0.0, 0.0, 0.0), 0.5, "used", "", residual, v))
+        fixes.append(FixRecord(t, (0.0, 0.0, 0.0), "used", "", residual, v))
     given = make_data(fixes=tuple(fixes))
     found = estimate_fix_latency(given)
     assert found is not None
@@ -110,7 +110,7 @@ def test_given_fixes_with_a_latency_then_it_is_estimated(tau: float) -> None:
 
 
 def test_given_a_straight_drive_then_no_latency_can_be_estimated() -> None:
-    fixes = tuple(FixRecord(0.25 * n, None, 0.5, "used", "", (-1.0, 0.0), (2.0, 0.0)) for n in range(400))
+    fixes = tuple(FixRecord(0.25 * n, None, "used", "", (-1.0, 0.0), (2.0, 0.0)) for n in range(400))
     assert estimate_fix_latency(make_data(fixes=fixes)) is None
 
 
@@ -153,7 +153,7 @@ def test_given_a_vehicle_that_always_backs_up_then_swapped_front_and_rear_are_su
 
 
 def test_given_rejected_and_delayed_samples_and_gaps_then_all_are_found_worst_first() -> None:
-    fixes = tuple(FixRecord(n, None, 1.0, "rejected" if n % 2 else "used", "gate") for n in range(40))
+    fixes = tuple(FixRecord(n, None, "rejected" if n % 2 else "used", "gate") for n in range(40))
     found = collect_findings(
         make_data(
             fixes=fixes,
@@ -174,9 +174,7 @@ def test_given_rejected_and_delayed_samples_and_gaps_then_all_are_found_worst_fi
 
 
 def test_given_fixes_without_numbers_then_only_that_reason_is_explained() -> None:
-    fixes = tuple(
-        FixRecord(n, None, math.nan, "rejected" if n % 2 else "used", "nan" if n % 2 else "") for n in range(40)
-    )
+    fixes = tuple(FixRecord(n, None, "rejected" if n % 2 else "used", "nan" if n % 2 else "") for n in range(40))
     (found,) = collect_findings(make_data(fixes=fixes))
     assert found.observation == "Of 40 fixes as positions: 20 nan."
     assert "nan: " in found.advice

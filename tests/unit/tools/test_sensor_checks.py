@@ -9,10 +9,10 @@ from dataclasses import replace
 import pytest
 
 from modelserver.estimation.filter.settings import FilterSettings
-from modelserver.messages import VALID, Decision, FixType, GpsSample, ImuSample, Mode, Phase, SensorHeader, Verdict
+from modelserver.messages import VALID, Decision, FixType, GpsSample, Mode, Phase, SensorHeader, Verdict
 from mstools.report.findings import collect_findings
 from mstools.report.replay_data import FindingLevel, ReplayData, ReportFinding, SourceTimes, StateSample
-from mstools.report.sensor_motion import SensorMotion, SensorMotionCollector
+from mstools.report.sensor_motion import SecondMeans, SensorMotion, compute_sensor_motion
 
 START = 1_700_000_000
 SECONDS = 120
@@ -29,8 +29,8 @@ def make_motion(
     swapped: bool = False,
 ) -> SensorMotion:
     """Return the motion of a drive, alternately 20 s straight and 20 s in a wide turn; factors corrupt the sensors."""
-    collector = SensorMotionCollector((1.0, 0.0, 0.0, 0.0) if with_gyro else None)
-    turns = []
+    rates = SecondMeans()
+    fixes, turns = [], []
     x = y = yaw = 0.0
     for n in range(SECONDS):
         rate = (0.0, 0.1, 0.0, -0.1)[n // 20 % 4]
@@ -38,14 +38,14 @@ def make_motion(
         x, y = x + 2.0 * math.cos(yaw), y + 2.0 * math.sin(yaw)
         header = SensorHeader((START + n) * 1_000_000, "any")
         if with_gyro:
-            collector.on_imu(ImuSample(header, angular_velocity=(0.0, 0.0, gyro * rate)))
+            rates.add(START + n, gyro * rate)
         north, east = (math.degrees(each / RADIUS) * degrees for each in (y, x))
-        collector.on_fix(GpsSample(header, FixType.FIX_3D, north, east))
+        fixes.append(GpsSample(header, FixType.FIX_3D, north, east))
         speeds = {"left": left * (2.0 - rate * TRACK / 2.0), "right": right * (2.0 + rate * TRACK / 2.0)}
         if swapped:
             speeds = {"left": speeds["right"], "right": speeds["left"]}
         turns += [(header.utime, name, speed, 0.0) for name, speed in speeds.items()]
-    return collector.finish(turns, {"left": TRACK / 2.0, "right": -TRACK / 2.0})
+    return compute_sensor_motion(rates.finish(), fixes, turns, {"left": TRACK / 2.0, "right": -TRACK / 2.0})
 
 
 def make_data(**more: object) -> ReplayData:

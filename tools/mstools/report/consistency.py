@@ -24,7 +24,7 @@ class Consistency:
 
     Attributes
     ----------
-    count, numbers : innovations and their components
+    count : number of innovations
     rejected : innovations that the gate rejected; included in `mean` and `beyond`
     mean : mean NIS per degree of freedom
     beyond : share of innovations beyond the 95 % limit
@@ -32,7 +32,6 @@ class Consistency:
 
     kind: str
     count: int
-    numbers: int
     rejected: int
     mean: float
     beyond: float
@@ -50,12 +49,10 @@ def compute_consistency(decisions: Iterable[Decision]) -> list[Consistency]:
 
 
 def _summarize(kind: str, found: list[Decision]) -> Consistency:
-    numbers = sum(each.dof for each in found)
     rejected = sum(each.verdict is Verdict.REJECTED for each in found)
     beyond = sum(each.statistic > gate_limit(each.dof, 0.05) for each in found)
-    return Consistency(
-        kind, len(found), numbers, rejected, sum(each.statistic for each in found) / numbers, beyond / len(found)
-    )
+    mean = sum(each.statistic for each in found) / sum(each.dof for each in found)
+    return Consistency(kind, len(found), rejected, mean, beyond / len(found))
 
 
 def compute_running_nis(decisions: Iterable[Decision], window_s: float) -> tuple[list[int], list[float]]:

@@ -34,7 +34,7 @@ from modelserver.server.vehicle import Vehicle
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
-from mstools.report.sensor_motion import SensorMotion, SensorMotionCollector
+from mstools.report.sensor_motion import SecondMeans, SensorMotion, compute_sensor_motion
 
 SNAPSHOT_PERIOD_US = 200_000
 """Shortest interval between two stored states, microseconds."""
@@ -86,7 +86,6 @@ class FixRecord:
 
     t: float
     position: Vector3 | None
-    sigma: float
     verdict: str
     reason: str
     residual: tuple[float, float] | None = None
@@ -115,9 +114,9 @@ class SourceTimes:
         """Median interval between two samples, seconds; nan with fewer than two."""
         return float(np.median(np.diff(self.times))) if len(self.times) > 1 else math.nan
 
-    def find_gaps(self, factor: float = 3.0, min_gap: float = 0.2) -> list[tuple[float, float]]:
-        """Return begin and end of the intervals longer than `factor` periods and `min_gap` seconds."""
-        limit = max(factor * self.period, min_gap)
+    def find_gaps(self) -> list[tuple[float, float]]:
+        """Return begin and end of the intervals longer than three periods and 0.2 s."""
+        limit = max(3.0 * self.period, 0.2)
         return [(a, b) for a, b in pairwise(self.times) if b - a > limit]
 
 
@@ -213,9 +212,8 @@ class ReplayCollector:
         self._last_snapshot_utime = 0
         self._keys: dict[str, str] = {}
         self._wheel_names: dict[str, None] = {}
-        self._sensor_motion = SensorMotionCollector(
-            self._rig.pose(self._rig.imu_frame).wxyz if self._rig.imu_frame else None
-        )
+        self._yaw_rates = SecondMeans()
+        self._q_rolling_imu = self._rig.pose(self._rig.imu_frame).wxyz if self._rig.imu_frame else None
 
     def on_decision(self, decision: Decision) -> None:
         """Store a decision."""
@@ -232,12 +230,10 @@ class ReplayCollector:
             self._keys[header.source] = name
         if isinstance(sample, GpsSample):
             self._fixes.append(sample)
-            self._sensor_motion.on_fix(sample)
         elif isinstance(sample, WheelsSample):
             self._add_wheels(sample)
         elif isinstance(sample, ImuSample):
             self._add_imu(sample)
-            self._sensor_motion.on_imu(sample)
         # before the first state, the estimate at the sample has the reasons why there is none
         utime = localizer.utime or header.utime
         if utime >= self._last_snapshot_utime + SNAPSHOT_PERIOD_US or 0 < utime < self._last_snapshot_utime:
@@ -280,7 +276,9 @@ class ReplayCollector:
             channels=tuple(sorted(channels)),
             sensor_keys=dict(self._keys),
             wheel_names=tuple(self._wheel_names),
-            sensor_motion=self._sensor_motion.finish(
+            sensor_motion=compute_sensor_motion(
+                self._yaw_rates.finish(),
+                self._fixes,
                 self._wheel_speeds,
                 {name: self._rig.pose(frame).xyz[1] for name, frame in self._rig.wheel_frames.items()},
             ),
@@ -345,7 +343,10 @@ class ReplayCollector:
         if sample.specific_force is not None and all(map(math.isfinite, sample.specific_force)):
             self._forces += sample.specific_force
             self._force_count += 1
-        measured = (sample.specific_force, sample.angular_velocity)
+        rate = sample.angular_velocity
+        if self._q_rolling_imu is not None and rate is not None and all(map(math.isfinite, rate)):
+            self._yaw_rates.add(sample.header.utime // 1_000_000, so3.rotate(self._q_rolling_imu, rate)[2])
+        measured = (sample.specific_force, rate)
         if self._imu is None or measured != (self._imu.specific_force, self._imu.angular_velocity):
             self._close_frozen()
             self._same_since = sample.header.utime
@@ -358,10 +359,10 @@ class ReplayCollector:
             self._same_since = last.header.utime
 
     def _mean_force(self) -> Vector3 | None:
-        if not self._force_count or not self._rig.imu_frame:
+        if not self._force_count or self._q_rolling_imu is None:
             return None
         x, y, z = (self._forces / self._force_count).tolist()
-        return so3.rotate(self._rig.pose(self._rig.imu_frame).wxyz, (x, y, z))
+        return so3.rotate(self._q_rolling_imu, (x, y, z))
 
     # --- at the end -----------------------------------------------------------------------------------------
 
@@ -380,7 +381,7 @@ class ReplayCollector:
             if isinstance(fix, str):
                 # without decisions, as in raw mode, the gate's own
                 words = (verdict, reason) if decided else ("rejected", fix)
-                found.append(FixRecord(t, None, math.nan, *words))
+                found.append(FixRecord(t, None, *words))
                 continue
             place = residual = velocity = None
             if geodesy is not None:
@@ -395,7 +396,7 @@ class ReplayCollector:
                 a, b = (before.values.get(name, 0.0) for name in WANDER[:2])
                 residual = (decision.residual[0] + east * a, decision.residual[1] + north * b)
                 velocity = _velocity(before)
-            found.append(FixRecord(t, place, fix.sigma, verdict, reason, residual, velocity))
+            found.append(FixRecord(t, place, verdict, reason, residual, velocity))
         return tuple(found)
 
     def _compare_wheels(self, first_utime: int, snapshots: tuple[StateSample, ...]) -> tuple[WheelComparison, ...]:

@@ -17,9 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from modelserver.messages import FixType, GpsSample, ImuSample
-from modelserver.transforms import so3
-from modelserver.transforms.so3 import Quaternion
+from modelserver.messages import FixType, GpsSample
 
 EARTH_RADIUS = 6_371_000.0
 
@@ -146,7 +144,7 @@ class SensorMotion:
 
     def _mean_speed(self) -> dict[int, float]:
         """Return the mean magnitude of the wheels' speeds."""
-        means = _SecondMeans()
+        means = SecondMeans()
         for speeds in self.wheels.values():
             for second, value in speeds.items():
                 means.add(second, abs(value))
@@ -183,57 +181,45 @@ def _compare(turns: Collection[tuple[float, float]], least: float) -> TurnRateCo
     return TurnRateComparison(float(a @ b) / math.sqrt(squares * others), math.sqrt(squares / others))
 
 
-class _SecondMeans:
-    """Means of the values of each second."""
+class SecondMeans:
+    """Means of the values of each second since 1970."""
 
     def __init__(self) -> None:
         self._sums: defaultdict[int, tuple[float, int]] = defaultdict(lambda: (0.0, 0))
 
     def add(self, second: int, value: float) -> None:
+        """Add a value."""
         total, count = self._sums[second]
         self._sums[second] = (total + value, count + 1)
 
     def finish(self) -> dict[int, float]:
+        """Return the means."""
         return {second: total / count for second, (total, count) in sorted(self._sums.items())}
 
 
-class SensorMotionCollector:
-    """Accumulates the sensor data of a `SensorMotion`. `q_base_imu` rotates the IMU's axes to the vehicle's."""
+def compute_sensor_motion(
+    gyro: Mapping[int, float],
+    fixes: Iterable[GpsSample],
+    turns: Iterable[tuple[int, str, float, float]],
+    sides: Mapping[str, float],
+) -> SensorMotion:
+    """Return the motion by each sensor.
 
-    def __init__(self, q_base_imu: Quaternion | None):
-        self._q_base_imu = q_base_imu
-        self._rates = _SecondMeans()
-        self._positions: list[tuple[float, float, float]] = []
-
-    def on_imu(self, sample: ImuSample) -> None:
-        """Add the rate about the vehicle's up axis."""
-        rate = sample.angular_velocity
-        if self._q_base_imu is None or rate is None or not all(map(math.isfinite, rate)):
-            return
-        self._rates.add(sample.header.utime // 1_000_000, so3.rotate(self._q_base_imu, rate)[2])
-
-    def on_fix(self, sample: GpsSample) -> None:
-        """Add the position of a fix."""
-        latitude, longitude = sample.latitude_deg, sample.longitude_deg
-        if sample.fix_type is not FixType.NONE and math.isfinite(latitude) and math.isfinite(longitude):
-            self._positions.append((sample.header.utime * 1e-6, latitude, longitude))
-
-    def finish(self, turns: Iterable[tuple[int, str, float, float]], sides: Mapping[str, float]) -> SensorMotion:
-        """Return the result. `turns` are utime, wheel, speed and steering; steered samples are left out."""
-        wheels: defaultdict[str, _SecondMeans] = defaultdict(_SecondMeans)
-        for utime, name, speed, steering in turns:
-            if name in sides and abs(steering) < 0.02:
-                wheels[name].add(utime // 1_000_000, speed)
-        speeds = {name: means.finish() for name, means in wheels.items()}
-        return SensorMotion(self._rates.finish(), speeds, dict(sides), self._fixes())
-
-    def _fixes(self) -> tuple[tuple[float, float, float], ...]:
-        if not self._positions:
-            return ()
-        _, latitude, longitude = self._positions[0]
-        scale = math.radians(1.0) * EARTH_RADIUS
-        across = math.cos(math.radians(latitude))
-        return tuple((t, scale * across * (b - longitude), scale * (a - latitude)) for t, a, b in self._positions)
+    `turns` are utime, wheel, speed and steering, of which steered ones are left out; `sides` the lateral offsets.
+    """
+    wheels: defaultdict[str, SecondMeans] = defaultdict(SecondMeans)
+    for utime, name, speed, steering in turns:
+        if name in sides and abs(steering) < 0.02:
+            wheels[name].add(utime // 1_000_000, speed)
+    speeds = {name: means.finish() for name, means in wheels.items()}
+    places = [
+        (each.header.utime * 1e-6, math.radians(each.latitude_deg), math.radians(each.longitude_deg))
+        for each in fixes
+        if each.fix_type is not FixType.NONE and math.isfinite(each.latitude_deg + each.longitude_deg)
+    ]
+    _, north, east = places[0] if places else (0.0, 0.0, 0.0)
+    flat = tuple((t, EARTH_RADIUS * math.cos(north) * (b - east), EARTH_RADIUS * (a - north)) for t, a, b in places)
+    return SensorMotion(gyro, speeds, dict(sides), flat)
 
 
 def _thin_by_distance(places: Iterable[tuple[float, float, float]], least: float) -> list[tuple[float, float, float]]:
