@@ -324,28 +324,25 @@ def list_differences(then: Any, now: Any) -> list[str]:
         if ours is None:
             found.append(f"{name}: this build has no such type")
         elif fields != ours:
-            found += _list_field_differences(name, dict(fields), dict(ours))
+            was, own = dict(fields), dict(ours)
+            changed = [f"{name}.{field}: this build has no such field" for field in was.keys() - own]
+            changed += [f"{name}.{field}: the writer had no such field" for field in own.keys() - was]
+            changed += [
+                f"{name}.{field}: written as {was[field]}, this build has {own[field]}"
+                for field in was.keys() & own
+                if was[field] != own[field]
+            ]
+            found += sorted(changed) or [f"{name}: its fields are in another order"]
     found += [f"{name}: the writer had no such type" for name in sorted(now["records"]) if name not in then["records"]]
     for name, members in sorted(then["enums"].items()):
         ours = now["enums"].get(name)
         if ours is not None and members != ours:
-            changed = sorted(key for key in {**members, **ours} if members.get(key) != ours.get(key))
-            found.append(f"{name}: member {changed[0]} was {members.get(changed[0])}, is {ours.get(changed[0])}")
+            member = min(key for key in {**members, **ours} if members.get(key) != ours.get(key))
+            found.append(f"{name}: member {member} was {members.get(member)}, is {ours.get(member)}")
     for name, text in sorted(then["roots"].items()):
         if now["roots"].get(name) != text:
             found.append(f"{name}: written as {text}, this build has {now['roots'].get(name)}")
     return [each[:MAX_DIFFERENCE_LENGTH] for each in found]
-
-
-def _list_field_differences(name: str, then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    missing = [f"{name}.{field}: this build has no such field" for field in then if field not in now]
-    added = [f"{name}.{field}: the writer had no such field" for field in now if field not in then]
-    changed = [
-        f"{name}.{field}: written as {text}, this build has {now[field]}"
-        for field, text in then.items()
-        if field in now and now[field] != text
-    ]
-    return missing + added + changed or [f"{name}: its fields are in another order"]
 
 
 MAGIC: Final = b"MSvalue1"

@@ -17,13 +17,6 @@ import mslcm
 TOLERANCE: Final = 1e-9
 """Meters, radians, and relative difference of other numbers."""
 
-_VECTORS: Final = ("vec", "vector", "vectors")
-"""Fields of a position in meters and a quaternion."""
-
-_POSITIONS: Final = ("position",)
-_ORIENTATIONS: Final = ("orientation",)
-_MATRICES: Final = ("h_transform",)
-
 
 class FieldChange(NamedTuple):
     """A field that differs: its full name with indices, and both values."""
@@ -101,13 +94,13 @@ def compute_deviation(was: bytes, now: bytes) -> Deviation | None:
 def _to_deviation(change: FieldChange, off: float) -> Deviation:
     field, *indices = change.name.rpartition(".")[2].replace("]", "").split("[")
     place = int(indices[-1]) if indices else 0
-    if field in _VECTORS:
+    if field in ("vec", "vector", "vectors"):  # a position in meters, then a quaternion
         # a component changes by at most half the angle, in up to three components
         return Deviation(meters=off) if place < 3 else Deviation(radians=4.0 * off)
-    if field in _POSITIONS:
+    if field == "position":
         return Deviation(meters=off)
-    if field in _ORIENTATIONS:
+    if field == "orientation":
         return Deviation(radians=4.0 * off)
-    if field in _MATRICES:
+    if field == "h_transform":
         return Deviation(meters=off) if place == 3 else Deviation(radians=2.0 * off)
     return Deviation(share=off / max(1.0, abs(change.recorded)))

@@ -221,16 +221,13 @@ class JournalWriter:
             run = journal_state.RunState(self._context.config, journal_state.detach(beginning.state))
             state = journal_state.encode_run(run, self._pause)
             segment = self._create_segment()
-        except OSError:
-            self._lost = lost
-            raise
-        facts = {"format": journal.FORMAT, "part": self._part, "lost": lost, "utime": now.utime, **self._context.facts}
-        facts["history_s"] = journal_state.HISTORY_S if len(beginning.state.history) else None
-        facts["key"] = "" if self._key is None else self._key.name
-        facts |= {"number": segment.number, "run_number": self._run_number, "previous": self._previous}
-        self._previous = ""
-        self._segment, self._batch = segment, 0
-        try:
+            facts: dict[str, Any] = {"format": journal.FORMAT, "part": self._part, "lost": lost, "utime": now.utime}
+            facts |= self._context.facts
+            facts["history_s"] = journal_state.HISTORY_S if len(beginning.state.history) else None
+            facts["key"] = "" if self._key is None else self._key.name
+            facts |= {"number": segment.number, "run_number": self._run_number, "previous": self._previous}
+            self._previous = ""
+            self._segment, self._batch = segment, 0
             segment.append(journal.encode_head(facts, now.utime))
             for name, data in self._context.files:
                 segment.append(journal.encode_file(name, data[:MAX_FILE_BYTES], now.utime))

@@ -9,6 +9,7 @@ import os
 import shlex
 import tempfile
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -150,49 +151,35 @@ def write_atomically(path: Path, data: bytes) -> None:
         os.close(directory)
 
 
-_DISK_FULL: Final = (errno.ENOSPC, errno.EDQUOT)
-_ACCESS_DENIED: Final = (errno.EACCES, errno.EPERM)
-_PATH_BLOCKED: Final = (errno.EEXIST, errno.ENOTDIR, errno.ELOOP)
+_FULL = "free space on its disk (df -h {place}), or set another {setting} in the vehicle file"
+_DENIED = (
+    "let the service's user write there (sudo chown -R {user} {place}), or set another {setting} in the vehicle file"
+)
+_BLOCKED = "move the file at this path away (ls -ld {place}), or set another {setting}"
+_READ_ONLY = (
+    "set a writable {setting} in the vehicle file (under systemd: /var/lib/modelserver), or mount its file system"
+)
+_REMEDIES: Final[Mapping[int | None, str]] = {
+    **dict.fromkeys((0, None), "the log has its traceback; report it"),
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), _FULL),
+    **dict.fromkeys((errno.EACCES, errno.EPERM), _DENIED),
+    **dict.fromkeys((errno.EEXIST, errno.ENOTDIR, errno.ELOOP), _BLOCKED),
+    errno.EROFS: f"{_READ_ONLY} read-write",
+    errno.ENOENT: "it is created again",
+    errno.EWOULDBLOCK: "stop one of the two, or set another {setting} in the vehicle file of this one",
+}
+_OTHER_REMEDY = "see the kernel log (sudo dmesg | tail), or set another {setting} in the vehicle file"
 
 
 def describe_error(error: OSError, directory: Path, setting: str) -> str:
     """Return cause and remedy of an error of a directory, in one line for people.
 
-    `setting` is the key of the vehicle file that names the directory.
+    `setting` is the key of the vehicle file that names the directory. The cause is the system's message, with the path
+    where it is outside the directory (temporary names inside vary).
     """
-    return f"{describe_cause(error, directory)}; {suggest_remedy(error, directory, setting)}"
-
-
-def describe_cause(error: OSError, directory: Path) -> str:
-    """Return the system's message, with the path where it is outside the directory (temporary names inside vary)."""
-    if isinstance(error, LockHeldError):
-        return f"{error.holder} writes there already"
-    why = error.strerror or str(error)
-    named = str(error.filename or "")
-    return escape_text(f"{why} ({named})" if named and not Path(named).is_relative_to(directory) else why)
-
-
-def suggest_remedy(error: OSError, directory: Path, setting: str) -> str:
-    """Return the remedy for an error of a directory."""
+    named, cause = str(error.filename or ""), error.strerror or str(error)
+    if named and not isinstance(error, LockHeldError) and not Path(named).is_relative_to(directory):
+        cause += f" ({named})"
     place = shlex.quote(escape_text(str(directory)))
-    if not error.errno:
-        return "the log has its traceback; report it"
-    if isinstance(error, LockHeldError):
-        return f"stop one of the two, or set another {setting} in the vehicle file of this one"
-    if error.errno in _DISK_FULL:
-        return f"free space on its disk (df -h {place}), or set another {setting} in the vehicle file"
-    if error.errno in _ACCESS_DENIED:
-        return (
-            f"let the service's user write there (sudo chown -R {os.geteuid()} {place}), or set another {setting} in "
-            "the vehicle file"
-        )
-    if error.errno == errno.EROFS:
-        return (
-            f"set a writable {setting} in the vehicle file (under systemd: /var/lib/modelserver), or "
-            "mount its file system read-write"
-        )
-    if error.errno in _PATH_BLOCKED:
-        return f"move the file at this path away (ls -ld {place}), or set another {setting}"
-    if error.errno == errno.ENOENT:
-        return "it is created again"
-    return f"see the kernel log (sudo dmesg | tail), or set another {setting} in the vehicle file"
+    remedy = _REMEDIES.get(error.errno, _OTHER_REMEDY).format(place=place, setting=setting, user=os.geteuid())
+    return f"{escape_text(cause)}; {remedy}"

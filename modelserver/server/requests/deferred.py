@@ -9,7 +9,7 @@ from modelserver.messages import GetHistory, GetTransformations, Request
 from modelserver.query import HISTORY_LIMIT
 from modelserver.query.answers import COVARIANCES_IN_PART, DeferredAnswer
 from modelserver.query.steps import Steps, complete
-from modelserver.server.requests.scheduler import MAX_REPLY_BYTES
+from modelserver.server.requests.scheduler import MAX_REPLY_BYTES, QueuedRequest
 from modelserver.wire.codec import encode
 
 PORTION_BYTES: Final = 100_000
@@ -36,9 +36,13 @@ def estimate_reply_bytes(request: Request) -> int:
 
 
 class DeferredReply:
-    """The reply of a deferred answer: `step` until it is `ready`, then `pop` messages."""
+    """The reply of a deferred answer: `step` until it is `ready`, then `pop` messages.
 
-    def __init__(self, answer: DeferredAnswer):
+    `queued` is the request as received; None in a replay of the journal.
+    """
+
+    def __init__(self, answer: DeferredAnswer, queued: QueuedRequest | None = None):
+        self.queued = queued
         self.request = answer.request
         self.channel = answer.request.header.reply_channel
         self.ready = False

@@ -135,7 +135,6 @@ class RequestHandler:
         self._report = ""
         self._current: QueuedRequest | None = None
         self._deferred: DeferredReply | None = None
-        self._deferred_request: QueuedRequest | None = None
         self._stepped_ns = 0
         self._is_first = False
         self.is_flooded = False
@@ -238,8 +237,7 @@ class RequestHandler:
 
     def defer(self, answer: DeferredAnswer) -> None:
         """Begin a deferred answer; one is in progress at a time."""
-        self._deferred = DeferredReply(answer)
-        self._deferred_request = self._current
+        self._deferred = DeferredReply(answer, self._current)
 
     def send_deferred(self, count: int) -> None:
         """Send the next messages of the deferred reply in progress, also in a replay of the journal."""
@@ -254,7 +252,7 @@ class RequestHandler:
 
     def drop_deferred(self) -> None:
         """Abort the deferred reply in progress."""
-        self._deferred = self._deferred_request = None
+        self._deferred = None
 
     def _receive(self, until_ns: int) -> bool:
         """Receive requests into their clients' queues; return whether more may wait in liblcm's queue."""
@@ -336,10 +334,9 @@ class RequestHandler:
             try:
                 deferred.step()
             except Exception as error:
-                request = self._deferred_request
                 self.drop_deferred()
-                assert request is not None
-                self._fail(request, deferred.request, error)
+                assert deferred.queued is not None
+                self._fail(deferred.queued, deferred.request, error)
                 return
         if deferred.ready:
             count = deferred.portion

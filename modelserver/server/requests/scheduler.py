@@ -225,19 +225,17 @@ class RequestScheduler:
             self._refill(client, now_ns)
         elif count >= MAX_QUEUED_BEYOND_RATE and count > client.tokens and not self.may_exceed:
             return request
+        dropped = None
         if self.queued < self._limits.queued_requests:
             self.queued += 1
-            requests.append(request)
-            if not count:
-                self._append(client)
-            return None
-        # the usual case in a flood, without searching the others: a queue of at least the mean length
-        if count * (len(self._within) + len(self._beyond)) >= self.queued:
-            return request
-        longest = max((*self._within, *self._beyond), key=lambda each: len(each.requests))
-        if len(longest.requests) <= count + 1:
-            return request
-        dropped = longest.requests.pop()
+        else:
+            # the usual case in a flood, without searching the others: a queue of at least the mean length
+            if count * (len(self._within) + len(self._beyond)) >= self.queued:
+                return request
+            longest = max((*self._within, *self._beyond), key=lambda each: len(each.requests))
+            if len(longest.requests) <= count + 1:
+                return request
+            dropped = longest.requests.pop()
         requests.append(request)
         if not count:
             self._append(client)

@@ -13,7 +13,7 @@ from typing import Final
 from modelserver.core import CoreState, Instant
 from modelserver.core.commands import ModelLoaded
 from modelserver.errors import quote
-from modelserver.messages import Invalid, LoadModel
+from modelserver.messages import LoadModel
 from modelserver.server.clock import Clock
 from modelserver.server.supervision.systemd import Notifier, StallDetector
 
@@ -93,14 +93,11 @@ def format_status(state: CoreState, now: Instant, reload_error: str = "") -> str
         parts.append(f"reload failed, the old model stays: {reload_error}")
     parts += [f"{subject}: {text}" for subject, text in sorted(state.warnings.items())]
     if state.localizer is None:
-        return "; ".join([*parts, "no localization sensor"])
-    return "; ".join(
-        [
-            *parts,
-            _format_sensors(state, now),
-            _format_pose(state.localizer.estimate(now.utime).invalid | state.view.invalid),
-        ]
-    )
+        parts.append("no localization sensor")
+    else:
+        invalid = state.localizer.estimate(now.utime).invalid | state.view.invalid
+        parts += [_format_sensors(state, now), f"no valid pose: {invalid.explain()}" if invalid else "pose valid"]
+    return "; ".join(parts)
 
 
 def _format_sensors(state: CoreState, now: Instant) -> str:
@@ -113,7 +110,3 @@ def _format_sensors(state: CoreState, now: Instant) -> str:
     active = len(ages) - len(silent)
     text = f"{active} sensor{'s' * (active != 1)} active"
     return text + (f", silent: {', '.join(silent[:MAX_SHOWN])}{', ...' * (len(silent) > MAX_SHOWN)}" if silent else "")
-
-
-def _format_pose(invalid: Invalid) -> str:
-    return f"no valid pose: {invalid.explain()}" if invalid else "pose valid"
