@@ -6,9 +6,13 @@ begin with `@`, what Python needs beyond that:
     struct:  @value NAME [tuple]       the value class: a frozen dataclass, or a NamedTuple
              @part                     only a part of other messages: no message of its own
              @codec MODULE [value]     its codec is written by hand in modelserver.wire.MODULE; its value class as well
+             @answer NAME TEXT         of a reply: what is behind the header is a value of its own, None unless it is OK
              @order NAME ...           the order of the fields in the value, where it is another one
              @verify                   `wire.fields.verify_TYPE(value)` checks what concerns several fields
     field:   @as NAME                  its name in the value
+             @of EXPRESSION [CLASS]    a part of an attribute, which is a CLASS or a tuple of such parts
+             @pose                     seven numbers that are a Pose
+             @word                     a str, the name of one of the constants above it, which count from 0
              @default EXPRESSION       its default in the value
              @optional                 None in Python where the first number is nan
              @none NUMBER              None in Python for this number
@@ -21,6 +25,8 @@ begin with `@`, what Python needs beyond that:
              @least NUMBER             of a count: fewer entries are malformed
              @property NAME            of a count: a property of the value has it
              @rows NAME [CLASS]        of a count: arrays of this length are columns; the value has a tuple of rows
+             @triangle COUNT           of a count: the lower triangle of a matrix of so many rows
+             @empty_nan                an empty tuple in Python where the first number is nan
              @if_ok NAME               read only if the reply's status is OK, else None
 
 The value has no field for the count of an array. Consecutive fields of fixed size are packed and unpacked together,
@@ -29,12 +35,14 @@ those of nested messages included.
 
 from __future__ import annotations
 
+import itertools
+import math
 import re
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final, TypeAlias, TypeVar
 
 T = TypeVar("T")
 
@@ -75,7 +83,27 @@ class Field:
     @property
     def value_name(self) -> str:
         """Its name in the value."""
-        return self.options.get("if_ok") or self.options.get("as") or self.name
+        return self.options.get("if_ok") or self.options.get("as") or re.split(r"\W", self.of)[0] or self.name
+
+    @property
+    def of(self) -> str:
+        """Where it is in an attribute, and the class of the attribute; empty for an attribute of its own."""
+        return self.options.get("of", "")
+
+    @property
+    def rows(self) -> str:
+        """Of a count, the attribute that has the arrays as its columns; empty for none."""
+        return self.options.get("rows", "").partition(" ")[0]
+
+    @property
+    def words(self) -> str:
+        """The name of the constant with the words of a field that is a word."""
+        return f"{self.name.upper()}_WORDS"
+
+    @property
+    def is_optional(self) -> bool:
+        """Whether it may be None in Python."""
+        return not {"optional", "none", "if_ok"}.isdisjoint(self.options)
 
     @property
     def is_variable(self) -> bool:
@@ -85,10 +113,7 @@ class Field:
     @property
     def size(self) -> int:
         """Number of entries of an array of fixed size, 1 for a scalar."""
-        size = 1
-        for each in self.dimensions:
-            size *= int(each)
-        return size
+        return math.prod(map(int, self.dimensions))
 
 
 @dataclass(frozen=True)
@@ -129,6 +154,16 @@ class Struct:
         """Return the field of that name if it counts the entries of an array."""
         is_counted = any(name in each.dimensions for each in self.fields)
         return next((each for each in self.fields if is_counted and each.name == name), None)
+
+    def is_column_of_rows(self, each: Field) -> bool:
+        """Return whether a field is an array that is a column of rows in the value."""
+        return any((count := self.count_of(dimension)) and count.rows for dimension in each.dimensions)
+
+    @property
+    def answer(self) -> Struct | None:
+        """Of a reply, what is behind its header, if that is a value of its own."""
+        name, _, about = self.options.get("answer", "").partition(" ")
+        return Struct(self.name, about, {"value": f"{name} tuple"}, self.fields[1:]) if name else None
 
     def columns(self, count: Field) -> list[Field]:
         """Return the arrays whose length is `count`."""
@@ -216,7 +251,7 @@ class _Values:
                 parts += self._write_struct(self._structs[each.type])
             parts += self._write_enumeration(each)
         if struct.value and not struct.codec.endswith(" value"):
-            parts.append(self._write_class(struct))
+            parts += self._write_classes(struct)
         return parts
 
     def _write_enumeration(self, each: Field) -> list[str]:
@@ -231,71 +266,64 @@ class _Values:
                 lines.append(_docstring(constant.comment, "    "))
         return ["\n".join(lines)]
 
-    def _write_class(self, struct: Struct) -> str:
-        self.names.append(struct.value)
+    def _write_classes(self, struct: Struct) -> list[str]:
+        """Return the class of a struct, behind those of its rows and of its answer."""
         parts: list[str] = []
-        head = f"class {struct.value}(NamedTuple):" if struct.is_tuple else f"class {struct.value}:"
-        lines = [] if struct.is_tuple else ["@dataclass(frozen=True, slots=True)"]
-        lines += [head, self._class_docstring(struct), ""]
-        for name, annotation, default in self.attributes(struct, parts):
-            lines.append(f"    {name}: {annotation}" + (f" = {default}" if default else ""))
+        about = dict[str, str]()
+        attributes = dict[str, tuple[str, str]]()
+        answer = struct.answer
+        for each in struct.fields:
+            count = struct.count_of(each.name)
+            if answer is not None and each in answer.fields:
+                continue
+            if count is not None and "rows" in count.options:
+                name, _, row = count.options["rows"].partition(" ")
+                columns = struct.columns(count)
+                if row:
+                    parts.append(self._write_row(row, f"One row of `{name}` of {struct.value}.", columns))
+                element = row or f"tuple[{', '.join(self.annotation(column, element=True) for column in columns)}]"
+                attributes[name] = (f"tuple[{element}, ...]", count.options.get("default", ""))
+            elif count is None and not struct.is_column_of_rows(each):
+                name = each.value_name
+                about[name] = f"{about[name]} {each.comment}" if name in about else each.comment
+                kind = each.of.partition(" ")[2] or self.annotation(each)
+                if name in attributes and not each.of.endswith(kind):
+                    kind = f"tuple[{attributes[name][0]}, {kind}]"
+                attributes[name] = (kind, self.default(each))
+        if answer is not None:
+            parts += self._write_classes(answer)
+            about["answer"] = "None unless the status is OK."
+            attributes["answer"] = (f"{answer.value} | None", "None")
+        ordered = [(name, *attributes[name]) for name in struct.in_order({name: name for name in attributes})]
+        lines = [self._write_class(struct.value, struct.is_tuple, struct.comment, about, ordered)]
         for each in struct.fields:
             if "property" in each.options:
                 counted = struct.columns(each)[0].value_name
                 lines += ["", "    @property", f"    def {each.options['property']}(self) -> int:"]
                 lines += [_docstring(each.comment, "        "), f"        return len(self.{counted})"]
-        return "\n\n\n".join([*parts, "\n".join(lines)])
+        return [*parts, "\n".join(lines)]
 
-    def _class_docstring(self, struct: Struct) -> str:
-        about = struct.comment.strip()
-        rows = {each.name for each in struct.fields if "rows" in each.options}
-        documented = [
-            (each.value_name, each.comment)
-            for each in struct.fields
-            if struct.count_of(each.name) is None and not rows & set(each.dimensions)
-        ]
-        lines = [
-            f'    """{line}' if number == 0 else f"    {line}".rstrip() for number, line in enumerate(_wrap(about, 113))
-        ]
-        lines += ["", "    Attributes", "    ----------"]
-        for name, comment in documented:
-            lines.append(f"    {name}")
-            lines += [f"        {line}" for line in _wrap(comment, 112)]
-        return "\n".join([*lines, '    """'])
+    def _write_row(self, name: str, text: str, columns: Sequence[Field]) -> str:
+        attributes = [(each.value_name, self.annotation(each, element=True), self.default(each)) for each in columns]
+        return self._write_class(name, False, text, {each.value_name: each.comment for each in columns}, attributes)
 
-    def attributes(self, struct: Struct, rows: list[str] | None = None) -> list[tuple[str, str, str]]:
-        """Return name, annotation and default of each attribute; add the row classes to `rows`."""
-        return struct.in_order({each[0]: each for each in self._attributes(struct, rows)})
-
-    def _attributes(self, struct: Struct, rows: list[str] | None) -> Iterator[tuple[str, str, str]]:
-        for each in struct.fields:
-            count = struct.count_of(each.name)
-            if count is not None:
-                if "rows" in count.options:
-                    name, _, row = count.options["rows"].partition(" ")
-                    if row and rows is not None:
-                        rows.append(self._write_row(struct, count, row))
-                    columns = ", ".join(self.annotation(column, element=True) for column in struct.columns(count))
-                    yield name, f"tuple[{row or f'tuple[{columns}]'}, ...]", count.options.get("default", "")
-                continue
-            if any((dimension := struct.count_of(d)) and "rows" in dimension.options for d in each.dimensions):
-                continue
-            yield each.value_name, self.annotation(each), self.default(each)
-
-    def _write_row(self, struct: Struct, count: Field, row: str) -> str:
-        self.names.append(row)
-        lines = ["@dataclass(frozen=True, slots=True)", f"class {row}:"]
-        lines += [f'    """One row of `{count.options["rows"].partition(" ")[0]}` of {struct.value}.', ""]
-        lines += ["    Attributes", "    ----------"]
-        for each in struct.columns(count):
-            lines.append(f"    {each.value_name}")
-            lines += [f"        {line}" for line in _wrap(each.comment, 112)]
-        lines += ['    """', ""]
-        for each in struct.columns(count):
-            default = self.default(each)
-            lines.append(
-                f"    {each.value_name}: {self.annotation(each, element=True)}" + (f" = {default}" if default else "")
-            )
+    def _write_class(
+        self,
+        name: str,
+        is_tuple: bool,
+        text: str,
+        about: Mapping[str, str],
+        attributes: Iterable[tuple[str, str, str]],
+    ) -> str:
+        self.names.append(name)
+        lines = (
+            [f"class {name}(NamedTuple):"] if is_tuple else ["@dataclass(frozen=True, slots=True)", f"class {name}:"]
+        )
+        body = [*_wrap(f'"""{text}', 116), "", "Attributes", "----------"]
+        for attribute, comment in about.items():
+            body += [attribute, *(f"    {line}" for line in _wrap(comment, 112))]
+        lines += [f"    {line}".rstrip() for line in [*body, '"""', ""]]
+        lines += [f"    {each}: {kind}" + (f" = {default}" if default else "") for each, kind, default in attributes]
         return "\n".join(lines)
 
     def default(self, each: Field) -> str:
@@ -304,50 +332,32 @@ class _Values:
             given = each.options["default"]
             enumeration = each.options.get("enum", "").partition(" ")[0]
             return "NAN" if given == "nan" else f"{enumeration}.{given}" if enumeration and given.isupper() else given
-        return "None" if {"optional", "none", "if_ok"} & each.options.keys() and "required" not in each.options else ""
+        return "None" if each.is_optional and "required" not in each.options else ""
 
     def annotation(self, each: Field, element: bool = False) -> str:
         """Return the type of a field in Python, of one entry for an `element` of an array."""
         name = self._scalar(each)
         if each.type == "byte":
             return "bytes"
-        if each.dimensions and not element:
-            if each.is_variable:
-                name = f"tuple[{name}, ...]"
-            elif name == "float" and each.size in VECTORS and len(each.dimensions) == 1:
-                name = VECTORS[each.size]
-            else:
-                name = f"tuple[{name}, ...]"
-        return f"{name} | None" if {"optional", "none", "if_ok"} & each.options.keys() else name
+        if each.dimensions and not element and "pose" not in each.options:
+            is_vector = name == "float" and len(each.dimensions) == 1 and not each.is_variable and each.size in VECTORS
+            name = VECTORS[each.size] if is_vector else f"tuple[{name}, ...]"
+        return f"{name} | None" if each.is_optional else name
 
     def _scalar(self, each: Field) -> str:
         if "enum" in each.options or "flags" in each.options:
             return (each.options.get("enum") or each.options["flags"]).partition(" ")[0]
         if each.type in self._structs:
             return self._structs[each.type].value
+        if "word" in each.options or "pose" in each.options:
+            return "str" if "word" in each.options else "Pose"
         return {"boolean": "bool", "string": "str", "double": "float", "float": "float"}.get(each.type, "int")
 
 
 # --- codec --------------------------------------------------------------------------------------------------
 
-
-@dataclass
-class _Atoms:
-    """What a message is made of, in the order of the wire: numbers of fixed size, and expressions of bytes."""
-
-    parts: list[tuple[str, list[str]]] = field(default_factory=list)
-
-    def numbers(self, code: str, expression: str) -> None:
-        """Add numbers of fixed size."""
-        if self.parts and self.parts[-1][0]:
-            last, expressions = self.parts[-1]
-            self.parts[-1] = (last + code, [*expressions, expression])
-        else:
-            self.parts.append((code, [expression]))
-
-    def bytes(self, expression: str) -> None:
-        """Add an expression of bytes, or of an unpacked sequence of them."""
-        self.parts.append(("", [expression]))
+Atom: TypeAlias = tuple[str, str]
+"""A part of a message: a struct code and the expression of its numbers; an empty code for an expression of bytes."""
 
 
 class _Codecs:
@@ -365,87 +375,118 @@ class _Codecs:
         """Return the definitions of the formats that were used."""
         return "\n".join(f'{name} = struct.Struct(">{code}")' for code, name in self._formats.items())
 
+    def write_constants(self, struct: Struct) -> list[str]:
+        """Return the words of fields that are words in Python, and the bytes in place of an answer."""
+        lines = [
+            f"{each.words} = {tuple(constant.name.lower() for constant in each.constants)}"
+            for each in struct.fields
+            if "word" in each.options
+        ]
+        if struct.answer is not None:
+            pieces = [self._write_nothing(each) for each in struct.answer.fields if not each.is_variable]
+            lines.append(f"NO_{struct.base.upper()} = {' + '.join(pieces)}")
+        return lines
+
+    def _write_nothing(self, each: Field) -> str:
+        if each.type in self.structs:
+            return f"NO_{self.structs[each.type].base.upper()}"
+        return 'pack_text("")' if each.type == "string" else f"bytes({each.size * SIZES[CODES[each.type]]})"
+
     # writing
 
     def write_packer(self, struct: Struct) -> str:
         """Return the function that packs a value without the fingerprint."""
-        atoms = _Atoms()
+        atoms: list[Atom] = []
         limits: list[str] = []
-        self._collect(struct, "value", atoms, limits)
+        if struct.answer is None:
+            self._collect(struct, "value", atoms, limits)
+        else:
+            atoms.append(("", "pack_reply_header(value.header)"))
+            nothing = f"pack_reply_header(value.header) + NO_{struct.base.upper()}"
+            limits += ["if value.answer is None:", f"    return {nothing}"]
+            self._collect(struct.answer, "value.answer", atoms, limits)
         lines = [
             f"def pack_{struct.base}(value: {struct.value}) -> bytes:",
             f'    """Return the bytes of a {struct.name} without the fingerprint."""',
             *(f"    {limit}" for limit in limits),
         ]
-        pieces = []
-        for code, expressions in atoms.parts:
-            pieces += [f"{self.struct_of(code)}.pack({', '.join(expressions)})"] if code else expressions
+        pieces: list[str] = []
+        for has_code, group in itertools.groupby(atoms, lambda atom: bool(atom[0])):
+            codes, expressions = zip(*group, strict=True)
+            pieces += [f"{self.struct_of(''.join(codes))}.pack({', '.join(expressions)})"] if has_code else expressions
         if len(pieces) == 1 and not pieces[0].startswith("*"):
             return "\n".join([*lines, f"    return {pieces[0]}"])
         if len(pieces) <= 12 and not any(piece.startswith("*") for piece in pieces):
             return "\n".join([*lines, f'    return b"{"%b" * len(pieces)}" % ({", ".join(pieces)})'])
         return "\n".join([*lines, f'    return b"".join(({", ".join(pieces)}))'])
 
-    def _collect(self, struct: Struct, value: str, atoms: _Atoms, limits: list[str]) -> None:
+    def _collect(self, struct: Struct, value: str, atoms: list[Atom], limits: list[str]) -> None:
         for each in struct.fields:
             count = struct.count_of(each.name)
-            if count is not None:
-                counted = f"len({self._count_expression(struct, count, value)})"
-                if "max" in count.options:
-                    limits.append(f'check_outgoing({counted}, {count.options["max"]}, "{count.name}")')
-                atoms.numbers(CODES[each.type], counted)
+            if count is None:
+                self._collect_field(struct, each, value, atoms, limits)
                 continue
-            self._collect_field(struct, each, value, atoms, limits)
+            counted = self._length(struct, count, value)
+            if "max" in count.options:
+                limits.append(f'check_outgoing({counted}, {count.options["max"]}, "{count.name}")')
+            atoms.append((CODES[each.type], counted))
 
-    def _count_expression(self, struct: Struct, count: Field, value: str) -> str:
-        if "rows" in count.options:
-            return f"{value}.{count.options['rows'].partition(' ')[0]}"
-        return f"{value}.{struct.columns(count)[0].value_name}"
+    def _length(self, struct: Struct, count: Field, value: str) -> str:
+        """Return the expression of a count."""
+        if "triangle" in count.options:
+            rows = self._triangle_rows(struct, count, value)
+            return f"{rows} * ({rows} + 1) // 2"
+        return f"len({value}.{count.rows or struct.columns(count)[0].value_name})"
 
-    def _collect_field(self, struct: Struct, each: Field, value: str, atoms: _Atoms, limits: list[str]) -> None:
-        expression = f"{value}.{each.value_name}"
-        rows = next((c for d in each.dimensions if (c := struct.count_of(d)) and "rows" in c.options), None)
-        if rows is not None:
-            table = self._count_expression(struct, rows, value)
-            row = rows.options["rows"].partition(" ")[2]
-            number = [other.name for other in struct.columns(rows)].index(each.name)
-            expression = (
-                f"[each.{each.value_name} for each in {table}]" if row else f"[each[{number}] for each in {table}]"
-            )
+    def _triangle_rows(self, struct: Struct, count: Field, value: str) -> str:
+        rows = struct.count_of(count.options["triangle"])
+        assert rows is not None
+        return self._length(struct, rows, value)
+
+    def _collect_field(self, struct: Struct, each: Field, value: str, atoms: list[Atom], limits: list[str]) -> None:
+        expression = f"{value}.{each.of.partition(' ')[0] or each.value_name}"
+        count = struct.count_of(each.dimensions[0]) if each.dimensions else None
+        if count is not None and count.rows:
+            number = [other.name for other in struct.columns(count)].index(each.name)
+            entry = f"each.{each.value_name}" if " " in count.options["rows"] else f"each[{number}]"
+            expression = f"[{entry} for each in {value}.{count.rows}]"
+        code = CODES.get(each.type, "")
         if each.type in self.structs:
             self._collect_nested(each, expression, atoms, limits)
         elif each.type == "string":
-            atoms.bytes(f"*map(pack_text, {expression})" if each.dimensions else f"pack_text({expression})")
+            atoms.append(("", f"*map(pack_text, {expression})" if each.dimensions else f"pack_text({expression})"))
         elif each.type == "byte":
-            if each.is_variable:
-                atoms.bytes(expression)
+            atoms.append(("", expression) if count is not None else (f"{each.size}s", expression))
+        elif count is not None:
+            if "triangle" in count.options:
+                atoms.append(("", f"pack_triangle({expression}, {self._triangle_rows(struct, count, value)})"))
+            elif "empty_nan" in each.options:
+                atoms.append(("", f"pack_matrix({expression}, {self._length(struct, count, value)})"))
             else:
-                atoms.numbers(f"{each.size}s", expression)
-        elif each.is_variable:
-            if "empty_nan" in each.options:
-                first = struct.columns(struct.count_of(each.dimensions[0]))[0].value_name  # type: ignore[arg-type]
-                atoms.bytes(f"pack_matrix({expression}, len({value}.{first}))")
-            else:
-                atoms.bytes(f'pack_numbers("{CODES[each.type]}", {expression})')
+                is_first = count.rows or struct.columns(count)[0] is each
+                more = "" if is_first else f", {self._length(struct, count, value)}"
+                atoms.append(("", f'pack_numbers("{code}", {expression}{more})'))
+        elif "pose" in each.options:
+            atoms.append((f"{each.size}{code}", f"*{expression}.xyz, *{expression}.wxyz"))
         elif each.dimensions:
-            code = f"{each.size}{CODES[each.type]}"
-            atoms.numbers(
-                code, f"*({expression} or NAN{each.size})" if "optional" in each.options else f"*{expression}"
-            )
+            may_lack = {"optional", "empty_nan"} & each.options.keys()
+            atoms.append((f"{each.size}{code}", f"*({expression} or NAN{each.size})" if may_lack else f"*{expression}"))
+        elif "word" in each.options:
+            atoms.append((code, f"{each.words}.index({expression})"))
         elif "none" in each.options:
-            atoms.numbers(CODES[each.type], f"{each.options['none']} if {expression} is None else {expression}")
+            atoms.append((code, f"{each.options['none']} if {expression} is None else {expression}"))
         else:
-            atoms.numbers(CODES[each.type], expression)
+            atoms.append((code, expression))
 
-    def _collect_nested(self, each: Field, expression: str, atoms: _Atoms, limits: list[str]) -> None:
+    def _collect_nested(self, each: Field, expression: str, atoms: list[Atom], limits: list[str]) -> None:
         nested = self.structs[each.type]
         packer = f"pack_{nested.base}"
         if each.dimensions:
-            atoms.bytes(f"*map({packer}, {expression})")
+            atoms.append(("", f"*map({packer}, {expression})"))
         elif "if_ok" in each.options:
-            atoms.bytes(f"NO_{nested.base.upper()} if {expression} is None else {packer}({expression})")
+            atoms.append(("", f"NO_{nested.base.upper()} if {expression} is None else {packer}({expression})"))
         elif nested.codec:
-            atoms.bytes(f"{packer}({expression})")
+            atoms.append(("", f"{packer}({expression})"))
         else:
             self._collect(nested, expression, atoms, limits)
 
@@ -454,7 +495,13 @@ class _Codecs:
     def write_unpacker(self, struct: Struct) -> str:
         """Return the function that unpacks a value from where its fields begin."""
         reader = _Reader(self)
-        result = reader.read_struct(struct, "")
+        if struct.answer is None:
+            result = reader.read_struct(struct, "")
+        else:
+            nothing = f"NO_{struct.base.upper()}"
+            reader.lines += ["header, at = unpack_reply_header(data, at)", "if header.status is not Status.OK:"]
+            reader.lines.append(f"    return {struct.value}(header), skip_nothing(data, at, {nothing})")
+            result = f"{struct.value}(header, {reader.read_struct(struct.answer, '')})"
         reader.flush()
         if "verify" in struct.options:
             result = f"verify_{struct.base}({result})"
@@ -475,7 +522,6 @@ class _Reader:
         self.lines: list[str] = []
         self._pending: list[tuple[str, str]] = []  # code and name of numbers of fixed size
         self._offset = 0
-        self._names: dict[str, str] = {}
 
     def position(self) -> str:
         """Return the expression of where the next field begins."""
@@ -485,20 +531,17 @@ class _Reader:
         """Write the reading of the numbers that wait."""
         if not self._pending:
             return
-        code = "".join(code for code, _ in self._pending)
-        targets = []
-        for each, name in self._pending:
-            found = re.fullmatch(r"(\d+)([a-z])", each)
-            if found and found[2] != "s":
-                targets += [f"{name}_{n}" for n in range(int(found[1]))] if int(found[1]) <= 9 else [f"*{name}"]
-            else:
+        targets, begin = [], self.position()
+        for code, name in self._pending:
+            size = int(code[:-1] or 1)
+            self._offset += size * SIZES[code[-1]]
+            if len(code) == 1 or code[-1] == "s":
                 targets.append(name)
-        left = ", ".join(targets)
+            else:
+                targets += [f"{name}_{n}" for n in range(size)] if size <= 9 else [f"*{name}"]
+        unpacker = self._codecs.struct_of("".join(code for code, _ in self._pending))
         comma = "," if len(targets) == 1 else ""
-        self.lines.append(f"{left}{comma} = {self._codecs.struct_of(code)}.unpack_from(data, {self.position()})")
-        self._offset += sum(
-            (int(found[1]) if found[1] else 1) * SIZES[found[2]] for found in re.finditer(r"(\d*)([a-z])", code)
-        )
+        self.lines.append(f"{', '.join(targets)}{comma} = {unpacker}.unpack_from(data, {begin})")
         self._pending = []
 
     def _settle(self) -> str:
@@ -510,100 +553,106 @@ class _Reader:
     def read_struct(self, struct: Struct, prefix: str) -> str:
         """Write the reading of a struct; return the expression of its value."""
         arguments: dict[str, str] = {}
-        tables: dict[str, list[str]] = {}
+        parts: dict[str, list[str]] = {}
         status = ""
         for each in struct.fields:
             name = f"{prefix}{each.name}" + ("_" if each.name in ("at", "data") else "")
-            count = struct.count_of(each.name)
-            if count is not None:
-                self._pending.append((CODES[each.type], name))
-                self.flush()
-                limit = count.options.get("max") or count.options.get("limit")
-                most = f", {limit}" if limit else ""
-                most += f", {count.options['least']}" if "least" in count.options else ""
-                self.lines.append(f'check_count({name}, "{each.name}"{most})')
-                if "rows" in count.options:
-                    tables[each.name] = []
-                    arguments[count.options["rows"].partition(" ")[0]] = f"@{each.name}"
+            if struct.count_of(each.name) is not None:
+                self._read_count(each, name, prefix)
                 continue
-            rows = next((d for d in each.dimensions if d in tables), "")
             value = self._read_field(struct, each, name, prefix, status)
-            if rows:
-                tables[rows].append(value)
+            count = struct.count_of(each.dimensions[0]) if each.dimensions else None
+            if count is not None and count.rows:
+                columns = parts.setdefault(count.rows, [])
+                columns.append(value)
+                row = count.options["rows"].partition(" ")[2]
+                table = ", ".join(columns)
+                arguments[count.rows] = f"tuple(map({row}, {table}))" if row else f"tuple(zip({table}, strict=True))"
+            elif each.of:
+                of_value = parts.setdefault(each.value_name, [])
+                of_value.append(value)
+                arguments[each.value_name] = f"{each.of.partition(' ')[2]}({', '.join(of_value)})"
             else:
                 arguments[each.value_name] = value
             if each.type == "reply_header_t":
                 status = f"{name}.status"
-        made = []
-        for argument in struct.in_order(arguments):
-            if argument.startswith("@"):
-                count = struct.count_of(argument[1:])
-                assert count is not None
-                row = count.options["rows"].partition(" ")[2]
-                columns = ", ".join(tables[argument[1:]])
-                made.append(f"tuple(map({row}, {columns}))" if row else f"tuple(zip({columns}, strict=True))")
-            else:
-                made.append(argument)
-        return f"{struct.value}({', '.join(made)})"
+        return f"{struct.value}({', '.join(struct.in_order(arguments))})"
+
+    def _read_count(self, each: Field, name: str, prefix: str) -> None:
+        self._pending.append((CODES[each.type], name))
+        self.flush()
+        limit = each.options.get("max") or each.options.get("limit", "")
+        bounds = [limit, each.options["least"]] if "least" in each.options else [limit] if limit else []
+        if "triangle" in each.options:
+            rows = f"{prefix}{each.options['triangle']}"
+            bounds = [f"{rows} * ({rows} + 1) // 2"] * 2
+        arguments = ", ".join([name, f'"{each.name}"', *bounds])
+        self.lines.append(f"check_count({arguments})")
 
     def _read_field(self, struct: Struct, each: Field, name: str, prefix: str, status: str) -> str:
         if each.type in self._codecs.structs:
             return self._read_nested(self._codecs.structs[each.type], each, name, prefix, status)
+        count = f"{prefix}{each.dimensions[0]}" if each.is_variable else ""
         if each.type == "string":
-            if each.dimensions:
-                position = self._settle()
-                self.lines.append(f"{name}, at = read_texts(data, {position}, {prefix}{each.dimensions[0]})")
-                return self._check_expression(each, name, plural=True)
             position = self._settle()
-            self.lines.append(f"{name}, at = read_text(data, {position})")
-            return self._check_expression(each, name)
-        if each.is_variable:
-            count = f"{prefix}{each.dimensions[0]}"
+            read = f"read_each(read_text, data, {position}, {count})" if count else f"read_text(data, {position})"
+            self.lines.append(f"{name}, at = {read}")
+            return self._check_expression(each, name, plural=bool(count))
+        if count:
             position = self._settle()
             if each.type == "byte":
                 self.lines.append(f"{name}, at = read_bytes(data, {position}, {count})")
                 return name
             total = " * ".join(f"{prefix}{d}" for d in each.dimensions)
             self.lines.append(f'{name}, at = read_numbers("{CODES[each.type]}", data, {position}, {total})')
+            counting = struct.count_of(each.dimensions[0])
+            if counting is not None and "triangle" in counting.options:
+                return f"read_triangle({name}, {prefix}{counting.options['triangle']})"
             if "enum" in each.options:
                 enumeration = each.options["enum"].partition(" ")[0]
                 return f'[read_enum({enumeration}, each, "{each.name}") for each in {name}]'
             if "empty_nan" in each.options:
                 return f"() if {name} and {name}[0] != {name}[0] else {name}"
             return self._check_expression(each, name, plural=True)
+        if each.type == "byte":
+            self._pending.append((f"{each.size}s", name))
+            return name
         if each.dimensions:
-            if each.type == "byte":
-                self._pending.append((f"{each.size}s", name))
-                return name
-            self._pending.append((f"{each.size}{CODES[each.type]}", name))
-            if each.size <= 9:
-                numbers = [f"{name}_{n}" for n in range(each.size)]
-                value = f"({', '.join(numbers)})"
-                if "optional" in each.options:
-                    known = f"read_{VECTORS[each.size].lower()}({value})"
-                    if "check" not in each.options:
-                        return known
-                    return f"None if ({name} := {known}) is None else {self._check_expression(each, name)}"
-                return self._check_expression(each, value)
-            # a star takes the rest: nothing may follow it in the same reading
-            self.flush()
-            if "optional" in each.options:
-                return f"None if {name}[0] != {name}[0] else {self._check_expression(each, f'tuple({name})')}"
-            return self._check_expression(each, f"tuple({name})")
+            return self._read_array(each, name)
         self._pending.append((CODES[each.type], name))
         if "none" in each.options:
             return f"None if {name} == {each.options['none']} else {self._scalar(each, name)}"
         return self._scalar(each, name)
 
+    def _read_array(self, each: Field, name: str) -> str:
+        """Read numbers of fixed size."""
+        self._pending.append((f"{each.size}{CODES[each.type]}", name))
+        if each.size > 9:
+            # a star takes the rest: nothing may follow it in the same reading
+            self.flush()
+            if {"optional", "empty_nan"} & each.options.keys():
+                absent = "None" if "optional" in each.options else "()"
+                return f"{absent} if {name}[0] != {name}[0] else {self._check_expression(each, f'tuple({name})')}"
+            return self._check_expression(each, f"tuple({name})")
+        numbers = [f"{name}_{n}" for n in range(each.size)]
+        if "pose" in each.options:
+            return f"Pose(({', '.join(numbers[:3])}), ({', '.join(numbers[3:])}))"
+        value = f"({', '.join(numbers)})"
+        if "optional" not in each.options:
+            return self._check_expression(each, value)
+        known = f"read_{VECTORS[each.size].lower()}({value})"
+        if "check" not in each.options:
+            return known
+        return f"None if ({name} := {known}) is None else {self._check_expression(each, name)}"
+
     def _scalar(self, each: Field, name: str) -> str:
         if "enum" in each.options:
-            enumeration = each.options["enum"].partition(" ")[0]
-            return f'read_enum({enumeration}, {name}, "{each.name}")'
+            return f'read_enum({each.options["enum"].partition(" ")[0]}, {name}, "{each.name}")'
+        if "word" in each.options:
+            return f'read_word({each.words}, {name}, "{each.name}")'
         if "flags" in each.options:
             return f"{each.options['flags']}({name})"
-        if each.type == "boolean":
-            return f"bool({name})"
-        return self._check_expression(each, name)
+        return f"bool({name})" if each.type == "boolean" else self._check_expression(each, name)
 
     @staticmethod
     def _check_expression(each: Field, value: str, plural: bool = False) -> str:
@@ -611,11 +660,11 @@ class _Reader:
             return f'check_{each.options["check_all"]}({value}, "{each.name}")'
         if "check" not in each.options:
             return value
-        check, _, more = each.options["check"].partition(" ")
-        arguments = f', "{each.name}"' + (f", {', '.join(more.split())}" if more else "")
+        check, *more = each.options["check"].split()
+        arguments = ", ".join([f'"{each.name}"', *more])
         if plural:
-            return f"tuple([check_{check}(each{arguments}) for each in {value}])"
-        return f"check_{check}({value}{arguments})"
+            return f"tuple([check_{check}(each, {arguments}) for each in {value}])"
+        return f"check_{check}({value}, {arguments})"
 
     def _read_nested(self, nested: Struct, each: Field, name: str, prefix: str, status: str) -> str:
         unpacker = f"unpack_{nested.base}"
@@ -635,9 +684,7 @@ class _Reader:
             self.lines.append(f"{name}, at = {unpacker}(data, {position})")
             return name
         value = self.read_struct(nested, f"{name}_")
-        if "verify" in nested.options:
-            value = f"verify_{nested.base}({value})"
-        return value
+        return f"verify_{nested.base}({value})" if "verify" in nested.options else value
 
 
 # --- text ---------------------------------------------------------------------------------------------------
@@ -695,6 +742,7 @@ def _values_module(body: str) -> str:
         "from modelserver.errors import Status\n"
         "from modelserver.messages.answers import PoseAnswer\n"
         "from modelserver.messages.flags import NAN, NO_FLAGS, VALID, Invalid, Quality\n"
+        "from modelserver.transforms.pose import Pose\n"
         "from modelserver.transforms.so3 import Matrix3, Quaternion, Vector3\n\n"
         f"\n{body}\n"
     )
@@ -704,11 +752,12 @@ HAND_VALUES: Final = ("Invalid", "Quality")
 """Flags that no .lcm file declares."""
 
 _WORD: Final = re.compile(r"\b[A-Za-z]\w+\b")
-_HELPER: Final = re.compile(r"(check|verify|read|pack)_[a-z_0-9]+|NAN\d+|MAX_[A-Z_]+|Codec")
+_HELPER: Final = re.compile(r"(check|verify|read|pack|skip)_[a-z_0-9]+|NAN\d+|MAX_[A-Z_]+|Codec")
 
 
 def _codec_module(structs: Mapping[str, Struct], names: set[str], fingerprints: Mapping[str, str]) -> str:
     codecs = _Codecs(structs)
+    constants: list[str] = []
     functions: list[str] = []
     table: list[str] = []
     of_module: dict[str, set[str]] = {}
@@ -716,10 +765,13 @@ def _codec_module(structs: Mapping[str, Struct], names: set[str], fingerprints: 
         if not each.value:
             continue
         names.add(each.value)
+        if each.answer is not None:
+            names.add(each.answer.value)
         if each.codec:
             by_hand = {f"{verb}_{each.base}" for verb in ("pack", "unpack", "skip")} | {f"NO_{each.base.upper()}"}
             of_module.setdefault(each.codec.partition(" ")[0], set()).update(by_hand)
         else:
+            constants += codecs.write_constants(each)
             functions += [codecs.write_packer(each), codecs.write_unpacker(each)]
         if "part" not in each.options:
             row = (
@@ -730,9 +782,9 @@ def _codec_module(structs: Mapping[str, Struct], names: set[str], fingerprints: 
                 f"unpack_{each.base}",
             )
             table.append(f"    Codec({', '.join(row)}),")
-    body = "\n\n\n".join([*functions, "\n".join(["CODECS = (", *table, ")"])])
+    body = "\n\n\n".join(["\n".join(constants), *functions, "\n".join(["CODECS = (", *table, ")"])])
     used = set(_WORD.findall(body))
-    here = {f"{verb}_{each.base}" for verb in ("pack", "unpack") for each in structs.values()}
+    here = {f"{verb}_{each.base}" for verb in ("pack", "unpack", "skip") for each in structs.values()}
     of_module["fields"] = {word for word in used if _HELPER.fullmatch(word)} - here
     imports = "".join(
         f"from modelserver.wire.{module} import {', '.join(sorted(wanted & used))}\n"
@@ -745,6 +797,7 @@ def _codec_module(structs: Mapping[str, Struct], names: set[str], fingerprints: 
         "import struct\nfrom collections.abc import Mapping\nfrom typing import Final\n\n"
         "from modelserver.errors import Status\n"
         f"from modelserver.messages import {', '.join(sorted(names & used))}\n"
+        "from modelserver.transforms.pose import Pose\n"
         f"{imports}\nFINGERPRINTS: Final[Mapping[str, bytes]] = {{\n{numbers}\n}}\n"
         f'"""Of the wire types, as lcm-gen computes them."""\n\n{codecs.formats()}\n\n\n{body}\n'
     )

@@ -33,14 +33,14 @@ class absolute_pose_t(object):
         """
         The frame of the vehicle whose pose this is: full name, Body:Frame; 200 characters at most on each side of the
         colon.
-        @check frame_name
+        @check name MAX_FRAME_NAME
         LCM Type: string
         """
 
         self.frame_of_reference = ""
         """
         The frame it is expressed in: World:UTM or World:ENU.
-        @check frame_name
+        @check name MAX_FRAME_NAME
         LCM Type: string
         """
 

@@ -12,8 +12,8 @@ import mslcm
 class get_explanation_reply_t(object):
     """
     Reply to get_explanation_request_t.
-    @value ExplanationReply
-    @codec motion value
+    @value ExplanationReply tuple
+    @answer Explanation A pose with the edges of the path that it was computed along.
     """
 
     __slots__ = ["header", "transform", "num_edges", "edges"]
@@ -32,6 +32,7 @@ class get_explanation_reply_t(object):
         self.transform = mslcm.pose_transform_t()
         """
         The pose asked for. Meaningful only when header.status is OK.
+        @as answer
         LCM Type: mslcm.pose_transform_t
         """
 

@@ -39,14 +39,14 @@ class get_explanation_request_t(object):
         self.frame_of_interest = ""
         """
         The frame whose pose is asked for: full name, as in get_transformation_request_t.
-        @check frame_name
+        @check name MAX_FRAME_NAME
         LCM Type: string
         """
 
         self.frame_of_reference = ""
         """
         The frame it is to be expressed in: full name.
-        @check frame_name
+        @check name MAX_FRAME_NAME
         LCM Type: string
         """
 

@@ -12,8 +12,8 @@ import mslcm
 class get_motion_reply_t(object):
     """
     Reply to get_motion_request_t.
-    @value MotionReply
-    @codec motion value
+    @value MotionReply tuple
+    @answer MotionAnswer Pose and motion of a frame relative to another one, along the axes of `expressed_in`.
     """
 
     __slots__ = ["header", "transform", "expressed_in", "velocity", "angular_velocity", "acceleration", "angular_acceleration", "covariance"]
@@ -32,6 +32,7 @@ class get_motion_reply_t(object):
         self.transform = mslcm.pose_transform_t()
         """
         Pose of the frame of interest in the frame of reference. Meaningful only when header.status is OK, as all below.
+        @as pose
         LCM Type: mslcm.pose_transform_t
         """
 
@@ -68,6 +69,7 @@ class get_motion_reply_t(object):
         self.covariance = [ 0.0 for dim0 in range(36) ]
         """
         Covariance of velocity and rate, row-major, (m/s)2 and (rad/s)2. nan = not known.
+        @optional
         LCM Type: double[36]
         """
 

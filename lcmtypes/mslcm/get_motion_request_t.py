@@ -31,21 +31,21 @@ class get_motion_request_t(object):
         self.frame_of_interest = ""
         """
         The frame whose motion is asked for: full name, as in get_transformation_request_t.
-        @check frame_name
+        @check name MAX_FRAME_NAME
         LCM Type: string
         """
 
         self.frame_of_reference = ""
         """
         The frame that the motion is relative to, as an observer fixed to it measures it.
-        @check frame_name
+        @check name MAX_FRAME_NAME
         LCM Type: string
         """
 
         self.expressed_in = ""
         """
         The frame along whose axes the vectors are to be; empty: frame_of_reference.
-        @default "" @check frame_name
+        @default "" @check name MAX_FRAME_NAME
         LCM Type: string
         """
 

@@ -39,14 +39,14 @@ class get_transformations_request_t(object):
         self.frames_of_interest = []
         """
         The frames whose poses are asked for: full names, as in get_transformation_request_t.
-        @check frame_name
+        @check name MAX_FRAME_NAME
         LCM Type: string[num_pairs]
         """
 
         self.frames_of_reference = []
         """
         The frames they are to be expressed in.
-        @check frame_name
+        @check name MAX_FRAME_NAME
         LCM Type: string[num_pairs]
         """
 
@@ -69,7 +69,7 @@ class get_transformations_request_t(object):
         A frame that is assumed to be fixed: then the poses are those of the frames of interest at the instants in the
         frames of reference at reference_at. Odom:Origin for short times, a world frame otherwise. Empty: both at the
         same instant.
-        @default "" @check frame_name
+        @default "" @check name MAX_FRAME_NAME
         LCM Type: string
         """
 

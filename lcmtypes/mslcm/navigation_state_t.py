@@ -11,7 +11,6 @@ class navigation_state_t(object):
     """
     State of the localization filter, for diagnostics.
     @value NavigationState
-    @codec navigation value
     """
 
     __slots__ = ["utime", "mode", "phase", "stationary", "invalid_reasons", "pose_epoch", "latitude_deg", "longitude_deg", "height", "position", "orientation", "linear_velocity", "angular_velocity", "twist_covariance", "n", "names", "values", "num_covariance", "covariance"]
@@ -31,6 +30,7 @@ class navigation_state_t(object):
         self.utime = 0
         """
         The instant the state holds for, that of the newest measurement in it, microseconds since the Unix epoch (UTC).
+        @check utime
         LCM Type: int64_t
         """
 
@@ -57,6 +57,7 @@ class navigation_state_t(object):
         self.invalid_reasons = 0
         """
         Why the pose may not be used, bit by bit as in pose_transform_t; 0 = it may.
+        @as invalid @flags Invalid
         LCM Type: int32_t
         """
 
@@ -87,12 +88,14 @@ class navigation_state_t(object):
         self.position = [ 0.0 for dim0 in range(3) ]
         """
         Position of the rolling frame in the tangent plane (true east, true north, up at its origin), meters.
+        @of pose.xyz Pose @check position
         LCM Type: double[3]
         """
 
         self.orientation = [ 0.0 for dim0 in range(4) ]
         """
         Unit quaternion of the rolling frame in the tangent plane (east, north, up), scalar first (w x y z).
+        @of pose.wxyz Pose @check unit_quaternion
         LCM Type: double[4]
         """
 
@@ -112,18 +115,21 @@ class navigation_state_t(object):
         """
         Covariance of linear_velocity and angular_velocity, row-major, along the rolling frame's axes, (m/s)2, (rad/s)2
         and their product. The first number nan: not known.
+        @empty_nan
         LCM Type: double[36]
         """
 
         self.n = 0
         """
         Number of error states, 0 to 64.
+        @max MAX_STATES
         LCM Type: int32_t
         """
 
         self.names = []
         """
         Their names, e.g. position_east, gyro_bias_x, wheel_scale; 64 characters at most each.
+        @check name
         LCM Type: string[n]
         """
 
@@ -136,6 +142,7 @@ class navigation_state_t(object):
         self.num_covariance = 0
         """
         Numbers in covariance: n (n + 1) / 2.
+        @triangle n
         LCM Type: int32_t
         """
 

@@ -8,7 +8,12 @@ from io import BytesIO
 import struct
 
 class path_edge_t(object):
-    """ One edge of the path from a frame of reference to a frame of interest. """
+    """
+    One edge of the path from a frame of reference to a frame of interest.
+    @value EdgeReport tuple
+    @part
+    @order kind name forward ends pose provenance stamp age source coordinates position_share rotation_share warning
+    """
 
     __slots__ = ["kind", "name", "from_end", "to_end", "forward", "vector", "provenance", "stamp", "age", "source", "num_coordinates", "coordinates", "position_share", "rotation_share", "warning"]
 
@@ -41,6 +46,7 @@ class path_edge_t(object):
         self.kind = 0
         """
         What it is: FRAME to VEHICLE.
+        @word
         LCM Type: int8_t
         """
 
@@ -53,12 +59,14 @@ class path_edge_t(object):
         self.from_end = ""
         """
         Name at the end that poses in the file start from.
+        @of ends[0]
         LCM Type: string
         """
 
         self.to_end = ""
         """
         Name at the other end.
+        @of ends[1]
         LCM Type: string
         """
 
@@ -71,60 +79,70 @@ class path_edge_t(object):
         self.vector = [ 0.0 for dim0 in range(7) ]
         """
         Pose of the end traversed last in that traversed first: px py pz (m), qs qx qy qz.
+        @as pose @pose
         LCM Type: double[7]
         """
 
         self.provenance = 0
         """
         Provenance of its value: FIXED to DEFAULT.
+        @word
         LCM Type: int8_t
         """
 
         self.stamp = 0
         """
         Instant of the newest measurement in it, microseconds since the Unix epoch (UTC); 0 = none.
+        @default 0
         LCM Type: int64_t
         """
 
         self.age = 0.0
         """
         How old that was when the server answered, seconds; nan = none.
+        @default nan
         LCM Type: double
         """
 
         self.source = ""
         """
         Source: header.source of a joint's newest sample, or localization; empty = none.
+        @default ""
         LCM Type: string
         """
 
         self.num_coordinates = 0
         """
         Number of coordinates of a joint.
+        @limit 6
         LCM Type: int32_t
         """
 
         self.coordinates = []
         """
         Position of the joint: radians or meters.
+        @default ()
         LCM Type: double[num_coordinates]
         """
 
         self.position_share = 0.0
         """
         Its part of the sum of the variances of the position, 0 to 1; nan = it states no sigma, and counts as exact.
+        @default nan
         LCM Type: double
         """
 
         self.rotation_share = 0.0
         """
         Its part of the sum of the variances of the rotation, 0 to 1; nan as above.
+        @default nan
         LCM Type: double
         """
 
         self.warning = ""
         """
         Warning in words, e.g. that a joint was silent or is beyond its limits; empty = none.
+        @default ""
         LCM Type: string
         """
 

@@ -31,7 +31,7 @@ class range_t(object):
         self.frame = ""
         """
         The frame of the vehicle that measures: full name, Body:Frame; 200 characters at most on each side of the colon.
-        @check frame_name
+        @check name MAX_FRAME_NAME
         LCM Type: string
         """
 
@@ -52,7 +52,7 @@ class range_t(object):
         self.frame_of_reference = ""
         """
         The frame that beacon_position is expressed in: World:UTM or World:ENU.
-        @check frame_name
+        @check name MAX_FRAME_NAME
         LCM Type: string
         """
 

@@ -39,7 +39,7 @@ class relative_pose_t(object):
         self.frame = ""
         """
         The frame of the vehicle: full name, Body:Frame; 200 characters at most on each side of the colon.
-        @check frame_name
+        @check name MAX_FRAME_NAME
         LCM Type: string
         """
 

@@ -11,5 +11,4 @@ from modelserver.messages.estimates import *
 from modelserver.messages.events import *
 from modelserver.messages.flags import *
 from modelserver.messages.generated import *
-from modelserver.messages.navigation import *
 from modelserver.messages.persistence import *

@@ -1,4 +1,4 @@
-"""Answers to queries: poses with their validity, motions, explanations and batches."""
+"""Answers to queries: poses with their validity, one and in batches."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy.typing as npt
 
 from modelserver.messages.estimates import Origin
 from modelserver.messages.flags import NAN, NO_FLAGS, Quality
-from modelserver.transforms.pose import Pose
-from modelserver.transforms.so3 import Array, Vector3
+from modelserver.transforms.so3 import Array
 from modelserver.transforms.transformation import Transformation
 
 
@@ -26,55 +25,6 @@ class PoseAnswer(NamedTuple):
     horizontal_protection_level: float = NAN
     heading_protection_level: float = NAN
     seconds_to_limit: float = NAN
-
-
-class MotionAnswer(NamedTuple):
-    """Pose and motion of a frame relative to another one, along the axes of `expressed_in`.
-
-    Velocity (m/s) and acceleration (m/s2) are those of the frame's origin, angular velocity and acceleration in rad/s
-    and rad/s2; nan = not known. `covariance` is that of velocity and angular velocity (36 numbers, row-major), None =
-    not known.
-    """
-
-    pose: PoseAnswer
-    expressed_in: str
-    velocity: Vector3
-    angular_velocity: Vector3
-    acceleration: Vector3
-    angular_acceleration: Vector3
-    covariance: tuple[float, ...] | None = None
-
-
-class EdgeReport(NamedTuple):
-    """One edge of the path between two frames, from the frame of reference on; see path_edge_t.
-
-    `kind` is frame, constraint, joint or vehicle; `ends` its two names, traversed from the first to the second if
-    `forward`; `pose` that of the far end in the near one, as traversed. `provenance` is fixed, measured, interpolated,
-    held, predicted or default; `stamp` the utime of its newest measurement, 0 = none, `age` its age in seconds.
-    `position_share` and `rotation_share` are its parts of the variance, 0 to 1, nan = no sigma is stated. `warning` is
-    empty where nothing is wrong.
-    """
-
-    kind: str
-    name: str
-    forward: bool
-    ends: tuple[str, str]
-    pose: Pose
-    provenance: str
-    stamp: int = 0
-    age: float = NAN
-    source: str = ""
-    coordinates: tuple[float, ...] = ()
-    position_share: float = NAN
-    rotation_share: float = NAN
-    warning: str = ""
-
-
-class Explanation(NamedTuple):
-    """A pose with the edges of the path that it was computed along."""
-
-    answer: PoseAnswer
-    edges: tuple[EdgeReport, ...]
 
 
 class PoseBatch(NamedTuple):

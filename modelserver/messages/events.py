@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, NamedTuple, TypeAlias
 
-from modelserver.messages.answers import Explanation, MotionAnswer, PoseAnswer, PoseBatch
+from modelserver.messages.answers import PoseAnswer, PoseBatch
 from modelserver.messages.estimates import Origin
 from modelserver.messages.flags import NAN
 from modelserver.messages.generated import (
     AbsolutePoseSample,
     Acknowledgement,
+    ExplanationReply,
     GetBodyFrameList,
     GetBodyList,
     GetExplanation,
@@ -28,7 +29,11 @@ from modelserver.messages.generated import (
     HistoryReply,
     ImuSample,
     JointsSample,
+    Mode,
+    MotionReply,
     NameListReply,
+    NavigationState,
+    Phase,
     PublishDecisions,
     RangeSample,
     RelativePoseSample,
@@ -44,7 +49,6 @@ from modelserver.messages.generated import (
     VehicleStatusSample,
     WheelsSample,
 )
-from modelserver.messages.navigation import NavigationState
 from modelserver.messages.persistence import PersistedState
 
 Sample: TypeAlias = (
@@ -125,20 +129,6 @@ class PoseBatchReply(NamedTuple):
     poses: PoseBatch | None = None
 
 
-class MotionReply(NamedTuple):
-    """Answers GetMotion; `answer` is None unless the status is OK."""
-
-    header: ReplyHeader
-    answer: MotionAnswer | None = None
-
-
-class ExplanationReply(NamedTuple):
-    """Answers GetExplanation; `answer` is None unless the status is OK."""
-
-    header: ReplyHeader
-    answer: Explanation | None = None
-
-
 Reply: TypeAlias = (
     TransformReply
     | NameListReply
@@ -150,6 +140,35 @@ Reply: TypeAlias = (
     | ReloadReply
     | Acknowledgement
 )
+
+
+class SensorFinding(NamedTuple):
+    """Why a configured sensor cannot be used, in whole or in part.
+
+    `sensor` is its key under `sensors`, `element` the responsible key of the vehicle file, `reason` a word for
+    programs, `text` what is wrong and its effect, `fix` the remedy. `is_choice`: the vehicle file asks for it, e.g. by
+    its mode.
+    """
+
+    sensor: str
+    reason: str
+    element: str
+    text: str
+    fix: str = ""
+    is_choice: bool = False
+
+
+class LocalizerSummary(NamedTuple):
+    """Summary of a localizer: `phase` is None in raw mode, `fix_utime` 0 before the first used fix.
+
+    `findings` lists the configured sensors that cannot be used now.
+    """
+
+    mode: Mode
+    phase: Phase | None = None
+    stationary: bool = False
+    fix_utime: int = 0
+    findings: tuple[SensorFinding, ...] = ()
 
 
 class Gauges(NamedTuple):

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from modelserver.errors import Status
 from modelserver.messages.answers import PoseAnswer
 from modelserver.messages.flags import NAN, Invalid
+from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Matrix3, Quaternion, Vector3
 
 
@@ -341,6 +342,84 @@ class GetBodyList(NamedTuple):
     header: RequestHeader
 
 
+class EdgeReport(NamedTuple):
+    """One edge of the path from a frame of reference to a frame of interest.
+
+    Attributes
+    ----------
+    kind
+        What it is: FRAME to VEHICLE.
+    name
+        Name of the frame, the constraint or the world frame.
+    ends
+        Name at the end that poses in the file start from. Name at the other end.
+    forward
+        Whether the path traverses it from from_end to to_end; else the pose here is the inverse of the file's.
+    pose
+        Pose of the end traversed last in that traversed first: px py pz (m), qs qx qy qz.
+    provenance
+        Provenance of its value: FIXED to DEFAULT.
+    stamp
+        Instant of the newest measurement in it, microseconds since the Unix epoch (UTC); 0 = none.
+    age
+        How old that was when the server answered, seconds; nan = none.
+    source
+        Source: header.source of a joint's newest sample, or localization; empty = none.
+    coordinates
+        Position of the joint: radians or meters.
+    position_share
+        Its part of the sum of the variances of the position, 0 to 1; nan = it states no sigma, and counts as exact.
+    rotation_share
+        Its part of the sum of the variances of the rotation, 0 to 1; nan as above.
+    warning
+        Warning in words, e.g. that a joint was silent or is beyond its limits; empty = none.
+    """
+
+    kind: str
+    name: str
+    forward: bool
+    ends: tuple[str, str]
+    pose: Pose
+    provenance: str
+    stamp: int = 0
+    age: float = NAN
+    source: str = ""
+    coordinates: tuple[float, ...] = ()
+    position_share: float = NAN
+    rotation_share: float = NAN
+    warning: str = ""
+
+
+class Explanation(NamedTuple):
+    """A pose with the edges of the path that it was computed along.
+
+    Attributes
+    ----------
+    answer
+        The pose asked for. Meaningful only when header.status is OK.
+    edges
+        The path from the frame of reference to the frame of interest.
+    """
+
+    answer: PoseAnswer
+    edges: tuple[EdgeReport, ...]
+
+
+class ExplanationReply(NamedTuple):
+    """Reply to get_explanation_request_t.
+
+    Attributes
+    ----------
+    header
+        Status of the request.
+    answer
+        None unless the status is OK.
+    """
+
+    header: ReplyHeader
+    answer: Explanation | None = None
+
+
 class Policy(IntEnum):
     """Which answer is accepted when `at` is given: INTERPOLATED, LATEST, HELD or PREDICTED."""
 
@@ -447,6 +526,51 @@ class GetHistory(NamedTuple):
     start_utime: int
     end_utime: int
     rate_hz: float
+
+
+class MotionAnswer(NamedTuple):
+    """Pose and motion of a frame relative to another one, along the axes of `expressed_in`.
+
+    Attributes
+    ----------
+    pose
+        Pose of the frame of interest in the frame of reference. Meaningful only when header.status is OK, as all below.
+    expressed_in
+        The frame along whose axes the vectors are.
+    velocity
+        Velocity of the frame of interest's origin, m/s. nan = not known, as below.
+    angular_velocity
+        Angular velocity, rad/s.
+    acceleration
+        Acceleration of the frame of interest's origin, m/s2.
+    angular_acceleration
+        Angular acceleration, rad/s2.
+    covariance
+        Covariance of velocity and rate, row-major, (m/s)2 and (rad/s)2. nan = not known.
+    """
+
+    pose: PoseAnswer
+    expressed_in: str
+    velocity: Vector3
+    angular_velocity: Vector3
+    acceleration: Vector3
+    angular_acceleration: Vector3
+    covariance: tuple[float, ...] | None = None
+
+
+class MotionReply(NamedTuple):
+    """Reply to get_motion_request_t.
+
+    Attributes
+    ----------
+    header
+        Status of the request.
+    answer
+        None unless the status is OK.
+    """
+
+    header: ReplyHeader
+    answer: MotionAnswer | None = None
 
 
 class GetMotion(NamedTuple):
@@ -718,8 +842,8 @@ class RejectedCount(NamedTuple):
 @dataclass(frozen=True, slots=True)
 class Health:
     """Health report of the service, once a second and at once when the state, the invalid reasons, the geometry, a
-    warning or the silence of a sensor changes; at most ten times a second. Counts are since the start. Rates and
-    tick latencies are of the last whole period, also in a report of a change.
+    warning or the silence of a sensor changes; at most ten times a second. Counts are since the start. Rates and tick
+    latencies are of the last whole period, also in a report of a change.
 
     Attributes
     ----------
@@ -1001,6 +1125,67 @@ class Phase(IntEnum):
     """Dead reckoning in Odom; heading alignment is not done yet."""
     ALIGNED = 2
     """Heading and position in the world are known."""
+
+
+@dataclass(frozen=True, slots=True)
+class NavigationState:
+    """State of the localization filter, for diagnostics.
+
+    Attributes
+    ----------
+    utime
+        The instant the state holds for, that of the newest measurement in it, microseconds since the Unix epoch (UTC).
+    mode
+        Which sources are used: one of the constants of localization_mode_t, FULL to DEAD_RECKONING.
+    phase
+        Phase of the alignment: LEVELING, UNALIGNED or ALIGNED.
+    stationary
+        Whether the vehicle is detected as stationary.
+    invalid
+        Why the pose may not be used, bit by bit as in pose_transform_t; 0 = it may.
+    pose_epoch
+        Discontinuities of the world pose, as in pose_transform_t.
+    latitude_deg
+        Geodetic latitude on WGS 84 of the tangent plane's origin, degrees, north positive; nan = not known.
+    longitude_deg
+        Geodetic longitude on WGS 84 of the tangent plane's origin, degrees, east positive; nan = not known.
+    height
+        Height of the tangent plane's origin above the WGS 84 ellipsoid, meters, up positive; nan = not known.
+    pose
+        Position of the rolling frame in the tangent plane (true east, true north, up at its origin), meters. Unit
+        quaternion of the rolling frame in the tangent plane (east, north, up), scalar first (w x y z).
+    linear_velocity
+        Velocity of the rolling frame relative to the ground, along its own axes, m/s.
+    angular_velocity
+        Angular velocity of the rolling frame relative to the ground, along its own axes, rad/s, right-hand rule.
+    twist_covariance
+        Covariance of linear_velocity and angular_velocity, row-major, along the rolling frame's axes, (m/s)2, (rad/s)2
+        and their product. The first number nan: not known.
+    names
+        Their names, e.g. position_east, gyro_bias_x, wheel_scale; 64 characters at most each.
+    values
+        Their estimates, each in SI units and radians; of rotations fixed-axis roll, pitch, yaw.
+    covariance
+        Covariance of the states' errors, in the squared units of the states: the lower triangle, row by row, each from
+        the first column to the diagonal. Entry (i, j), j <= i, from 0, stands at i (i + 1) / 2 + j.
+    """
+
+    utime: int
+    mode: Mode
+    phase: Phase
+    stationary: bool
+    invalid: Invalid
+    pose_epoch: int
+    latitude_deg: float
+    longitude_deg: float
+    height: float
+    pose: Pose
+    linear_velocity: Vector3
+    angular_velocity: Vector3
+    twist_covariance: tuple[float, ...]
+    names: tuple[str, ...]
+    values: tuple[float, ...]
+    covariance: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)

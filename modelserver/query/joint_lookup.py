@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from modelserver.errors import TooNewError, TooOldError
 from modelserver.geometry.joint import Coordinates
+from modelserver.geometry.joint_rules import JointDrive
 from modelserver.geometry.kinematic_path import KinematicPath
-from modelserver.geometry.mimic import JointDrive
 from modelserver.geometry.model import Model
 from modelserver.joints.history import MAX_CLOCK_LEAD_S, JointHistory
 from modelserver.joints.rotation_vector import ROTATION_VECTOR_TYPES, combine

@@ -108,17 +108,10 @@ def check_unit_quaternion(values: Sequence[float], what: str) -> Quaternion:
     return (w, x, y, z)
 
 
-def check_name(value: str, what: str) -> str:
+def check_name(value: str, what: str, most: int = MAX_NAME) -> str:
     """Return a name. Raises WireError for an endless one."""
-    if len(value) > MAX_NAME:
-        raise WireError("malformed", f"{what} {quote(value, 40)} is longer than {MAX_NAME} characters")
-    return value
-
-
-def check_frame_name(value: str, what: str) -> str:
-    """Return the full name of a frame. Raises WireError for an endless one."""
-    if len(value) > MAX_FRAME_NAME:
-        raise WireError("malformed", f"{what} {quote(value, 40)} is longer than {MAX_FRAME_NAME} characters")
+    if len(value) > most:
+        raise WireError("malformed", f"{what} {quote(value, 40)} is longer than {most} characters")
     return value
 
 
@@ -128,6 +121,13 @@ def read_enum(kind: type[E], value: int, what: str) -> E:
         return kind(value)
     except ValueError:
         raise WireError("malformed", f"{what} {value} is not one of {[int(each) for each in kind]}") from None
+
+
+def read_word(words: Sequence[str], value: int, what: str) -> str:
+    """Return the word of a number. Raises WireError for a number that has none."""
+    if not 0 <= value < len(words):
+        raise WireError("malformed", f"{what} {value} is not one of 0 to {len(words) - 1}")
+    return words[value]
 
 
 def check_utime(value: int, what: str = "utime") -> int:
@@ -193,15 +193,6 @@ def check_outgoing(count: int, most: int, what: str) -> None:
         raise ValueError(f"{what}: {count} entries in one message; at most {most} can be sent")
 
 
-def read_texts(data: bytes, at: int, count: int) -> tuple[tuple[str, ...], int]:
-    """Return `count` strings that begin at `at`, and their end. Raises WireError, struct.error."""
-    found = []
-    for _ in range(count):
-        value, at = read_text(data, at)
-        found.append(value)
-    return tuple(found), at
-
-
 def read_numbers(code: str, data: bytes, at: int, count: int) -> tuple[tuple[Any, ...], int]:
     """Return `count` numbers of a struct code that begin at `at`, and their end. Raises struct.error."""
     size = count * struct.calcsize(code)
@@ -228,16 +219,39 @@ def read_each(
     return tuple(found), at
 
 
-def pack_numbers(code: str, values: Sequence[float]) -> bytes:
-    """Return the bytes of numbers of a struct code."""
+def pack_numbers(code: str, values: Sequence[float], count: int | None = None) -> bytes:
+    """Return the bytes of numbers of a struct code. Raises ValueError where they are not `count`, if that is given."""
+    if count is not None and len(values) != count:
+        raise ValueError(f"{len(values)} numbers where there should be {count}: inconsistent")
     return struct.pack(f">{len(values)}{code}", *values)
 
 
 def pack_matrix(values: Sequence[float], n: int) -> bytes:
     """Return the bytes of an n by n matrix, row-major; nan where it is empty. Raises ValueError for another size."""
-    if values and len(values) != n * n:
+    return pack_numbers("d", values or (math.nan,) * (n * n), n * n)
+
+
+def pack_triangle(values: Sequence[float], n: int) -> bytes:
+    """Return the bytes of the lower triangle of an n by n matrix, row-major. Raises ValueError for another size."""
+    if len(values) != n * n:
         raise ValueError(f"{len(values)} numbers are no {n} by {n} matrix: inconsistent")
-    return pack_numbers("d", values or (math.nan,) * (n * n))
+    return pack_numbers("d", [value for row in range(n) for value in values[row * n : row * n + row + 1]])
+
+
+def read_triangle(packed: Sequence[float], n: int) -> tuple[float, ...]:
+    """Return the symmetric n by n matrix, row-major, of its lower triangle."""
+    return tuple(
+        packed[max(row, column) * (max(row, column) + 1) // 2 + min(row, column)]
+        for row in range(n)
+        for column in range(n)
+    )
+
+
+def skip_nothing(data: bytes, at: int, nothing: bytes) -> int:
+    """Return the end of a reply without an answer. Raises WireError where it does not end as one does."""
+    if data[at:] != nothing:
+        raise WireError("truncated" if len(data) - at < len(nothing) else "malformed", "no answer, and yet some of one")
+    return len(data)
 
 
 # --- checks of single fields and of messages ----------------------------------------------------------------

@@ -15,7 +15,9 @@ from modelserver.messages import (
     Direction,
     DriverHealth,
     DriverPhase,
+    EdgeReport,
     Envelope,
+    Explanation,
     ExplanationReply,
     FixType,
     GetBodyFrameList,
@@ -36,6 +38,7 @@ from modelserver.messages import (
     JointsSample,
     LocalizationHealth,
     Mode,
+    MotionAnswer,
     MotionReply,
     NameListReply,
     NavigationState,
@@ -67,9 +70,11 @@ from modelserver.messages import (
     WheelsSample,
     YawSource,
 )
+from modelserver.transforms.pose import Pose
 from modelserver.wire.batch import pack_get_transformations_reply, unpack_get_transformations_reply
 from modelserver.wire.fields import (
     MAX_DECISIONS,
+    MAX_FRAME_NAME,
     MAX_MESSAGE_INSTANTS,
     MAX_PAIRS,
     MAX_STATES,
@@ -81,7 +86,6 @@ from modelserver.wire.fields import (
     check_count,
     check_distance,
     check_finite,
-    check_frame_name,
     check_instants,
     check_name,
     check_not_negative,
@@ -95,6 +99,7 @@ from modelserver.wire.fields import (
     pack_matrix,
     pack_numbers,
     pack_text,
+    pack_triangle,
     read_bytes,
     read_each,
     read_enum,
@@ -102,18 +107,13 @@ from modelserver.wire.fields import (
     read_numbers,
     read_quaternion,
     read_text,
-    read_texts,
+    read_triangle,
     read_vector3,
+    read_word,
+    skip_nothing,
     verify_model_snapshot,
     verify_relative_pose,
 )
-from modelserver.wire.motion import (
-    pack_get_explanation_reply,
-    pack_get_motion_reply,
-    unpack_get_explanation_reply,
-    unpack_get_motion_reply,
-)
-from modelserver.wire.navigation import pack_navigation_state, unpack_navigation_state
 from modelserver.wire.poses import (
     NO_POSE_TRANSFORM,
     NO_POSE_VECTOR,
@@ -191,19 +191,29 @@ _S8 = struct.Struct(">iqqdddddqi")
 _S9 = struct.Struct(">qbi")
 _S10 = struct.Struct(">bqbi")
 _S11 = struct.Struct(">qqd")
-_S12 = struct.Struct(">qb")
-_S13 = struct.Struct(">bhdddddddd9d3d9dddddddd")
-_S14 = struct.Struct(">qd")
-_S15 = struct.Struct(">biiqqqiqqdddd")
-_S16 = struct.Struct(">iiqdbbbddddi")
-_S17 = struct.Struct(">3d9d3d9d3dbb4d9dd")
-_S18 = struct.Struct(">bbbdddd")
-_S19 = struct.Struct(">iii")
-_S20 = struct.Struct(">3d")
-_S21 = struct.Struct(">qq")
-_S22 = struct.Struct(">32s")
-_S23 = struct.Struct(">qdq")
-_S24 = struct.Struct(">bddddiq")
+_S12 = struct.Struct(">3d3d3d3d36d")
+_S13 = struct.Struct(">qb")
+_S14 = struct.Struct(">bhdddddddd9d3d9dddddddd")
+_S15 = struct.Struct(">qd")
+_S16 = struct.Struct(">biiqqqiqqdddd")
+_S17 = struct.Struct(">iiqdbbbddddi")
+_S18 = struct.Struct(">3d9d3d9d3dbb4d9dd")
+_S19 = struct.Struct(">bbbdddd")
+_S20 = struct.Struct(">iii")
+_S21 = struct.Struct(">qbbbiiddd3d4d3d3d36di")
+_S22 = struct.Struct(">qbbbiiddd3d4d3d3d36d")
+_S23 = struct.Struct(">b7dbqd")
+_S24 = struct.Struct(">3d")
+_S25 = struct.Struct(">qq")
+_S26 = struct.Struct(">32s")
+_S27 = struct.Struct(">qdq")
+_S28 = struct.Struct(">bddddiq")
+
+
+NO_GET_EXPLANATION_REPLY = NO_POSE_TRANSFORM + bytes(4)
+NO_GET_MOTION_REPLY = NO_POSE_TRANSFORM + pack_text("") + bytes(24) + bytes(24) + bytes(24) + bytes(24) + bytes(288)
+KIND_WORDS = ("frame", "constraint", "joint", "vehicle")
+PROVENANCE_WORDS = ("fixed", "measured", "interpolated", "held", "predicted", "default")
 
 
 def pack_absolute_pose(value: AbsolutePoseSample) -> bytes:
@@ -241,8 +251,8 @@ def unpack_absolute_pose(data: bytes, at: int) -> tuple[AbsolutePoseSample, int]
             header_device_utime,
             header_utime_sigma,
         ),
-        check_frame_name(frame_of_interest, "frame_of_interest"),
-        check_frame_name(frame_of_reference, "frame_of_reference"),
+        check_name(frame_of_interest, "frame_of_interest", MAX_FRAME_NAME),
+        check_name(frame_of_reference, "frame_of_reference", MAX_FRAME_NAME),
         None
         if (position := read_vector3((position_0, position_1, position_2))) is None
         else check_position(position, "position"),
@@ -380,7 +390,7 @@ def unpack_driver_health(data: bytes, at: int) -> tuple[DriverHealth, int]:
         _S8.unpack_from(data, at)
     )
     check_count(num_counters, "num_counters", 256)
-    counter_names, at = read_texts(data, at + 72, num_counters)
+    counter_names, at = read_each(read_text, data, at + 72, num_counters)
     counter_values, at = read_numbers("q", data, at, num_counters)
     return DriverHealth(
         check_utime(utime, "utime"),
@@ -427,6 +437,32 @@ def unpack_get_body_list_request(data: bytes, at: int) -> tuple[GetBodyList, int
     return GetBodyList(RequestHeader(header_request_id, header_reply_channel)), at
 
 
+def pack_get_explanation_reply(value: ExplanationReply) -> bytes:
+    """Return the bytes of a get_explanation_reply_t without the fingerprint."""
+    if value.answer is None:
+        return pack_reply_header(value.header) + NO_GET_EXPLANATION_REPLY
+    return b"".join(
+        (
+            pack_reply_header(value.header),
+            pack_pose_transform(value.answer.answer),
+            _S5.pack(len(value.answer.edges)),
+            *map(pack_path_edge, value.answer.edges),
+        )
+    )
+
+
+def unpack_get_explanation_reply(data: bytes, at: int) -> tuple[ExplanationReply, int]:
+    """Return the get_explanation_reply_t that begins at `at`, and its end. Raises WireError, struct.error."""
+    header, at = unpack_reply_header(data, at)
+    if header.status is not Status.OK:
+        return ExplanationReply(header), skip_nothing(data, at, NO_GET_EXPLANATION_REPLY)
+    transform, at = unpack_pose_transform(data, at)
+    (num_edges,) = _S5.unpack_from(data, at)
+    check_count(num_edges, "num_edges")
+    edges, at = read_each(unpack_path_edge, data, at + 4, num_edges)
+    return ExplanationReply(header, Explanation(transform, edges)), at
+
+
 def pack_get_explanation_request(value: GetExplanation) -> bytes:
     """Return the bytes of a get_explanation_request_t without the fingerprint."""
     return b"%b%b%b%b%b" % (
@@ -447,8 +483,8 @@ def unpack_get_explanation_request(data: bytes, at: int) -> tuple[GetExplanation
     frame_of_reference, at = read_text(data, at)
     return GetExplanation(
         RequestHeader(header_request_id, header_reply_channel),
-        check_frame_name(frame_of_interest, "frame_of_interest"),
-        check_frame_name(frame_of_reference, "frame_of_reference"),
+        check_name(frame_of_interest, "frame_of_interest", MAX_FRAME_NAME),
+        check_name(frame_of_reference, "frame_of_reference", MAX_FRAME_NAME),
         TimeQuery(
             check_utime(time_at_, "at"),
             read_enum(Policy, time_policy, "policy"),
@@ -520,6 +556,60 @@ def unpack_get_history_request(data: bytes, at: int) -> tuple[GetHistory, int]:
     ), at + 24
 
 
+def pack_get_motion_reply(value: MotionReply) -> bytes:
+    """Return the bytes of a get_motion_reply_t without the fingerprint."""
+    if value.answer is None:
+        return pack_reply_header(value.header) + NO_GET_MOTION_REPLY
+    return b"%b%b%b%b" % (
+        pack_reply_header(value.header),
+        pack_pose_transform(value.answer.pose),
+        pack_text(value.answer.expressed_in),
+        _S12.pack(
+            *value.answer.velocity,
+            *value.answer.angular_velocity,
+            *value.answer.acceleration,
+            *value.answer.angular_acceleration,
+            *(value.answer.covariance or NAN36),
+        ),
+    )
+
+
+def unpack_get_motion_reply(data: bytes, at: int) -> tuple[MotionReply, int]:
+    """Return the get_motion_reply_t that begins at `at`, and its end. Raises WireError, struct.error."""
+    header, at = unpack_reply_header(data, at)
+    if header.status is not Status.OK:
+        return MotionReply(header), skip_nothing(data, at, NO_GET_MOTION_REPLY)
+    transform, at = unpack_pose_transform(data, at)
+    expressed_in, at = read_text(data, at)
+    (
+        velocity_0,
+        velocity_1,
+        velocity_2,
+        angular_velocity_0,
+        angular_velocity_1,
+        angular_velocity_2,
+        acceleration_0,
+        acceleration_1,
+        acceleration_2,
+        angular_acceleration_0,
+        angular_acceleration_1,
+        angular_acceleration_2,
+        *covariance,
+    ) = _S12.unpack_from(data, at)
+    return MotionReply(
+        header,
+        MotionAnswer(
+            transform,
+            expressed_in,
+            (velocity_0, velocity_1, velocity_2),
+            (angular_velocity_0, angular_velocity_1, angular_velocity_2),
+            (acceleration_0, acceleration_1, acceleration_2),
+            (angular_acceleration_0, angular_acceleration_1, angular_acceleration_2),
+            None if covariance[0] != covariance[0] else tuple(covariance),
+        ),
+    ), at + 384
+
+
 def pack_get_motion_request(value: GetMotion) -> bytes:
     """Return the bytes of a get_motion_request_t without the fingerprint."""
     return b"%b%b%b%b%b%b" % (
@@ -542,9 +632,9 @@ def unpack_get_motion_request(data: bytes, at: int) -> tuple[GetMotion, int]:
     time_at_, time_policy, time_wait_ms = _S9.unpack_from(data, at)
     return GetMotion(
         RequestHeader(header_request_id, header_reply_channel),
-        check_frame_name(frame_of_interest, "frame_of_interest"),
-        check_frame_name(frame_of_reference, "frame_of_reference"),
-        check_frame_name(expressed_in, "expressed_in"),
+        check_name(frame_of_interest, "frame_of_interest", MAX_FRAME_NAME),
+        check_name(frame_of_reference, "frame_of_reference", MAX_FRAME_NAME),
+        check_name(expressed_in, "expressed_in", MAX_FRAME_NAME),
         TimeQuery(
             check_utime(time_at_, "at"),
             read_enum(Policy, time_policy, "policy"),
@@ -655,7 +745,7 @@ def pack_get_transformations_request(value: GetTransformations) -> bytes:
             _S5.pack(len(value.at)),
             pack_numbers("q", value.at),
             pack_text(value.fixed_frame),
-            _S12.pack(value.reference_at, value.with_covariance),
+            _S13.pack(value.reference_at, value.with_covariance),
         )
     )
 
@@ -666,24 +756,24 @@ def unpack_get_transformations_request(data: bytes, at: int) -> tuple[GetTransfo
     header_reply_channel, at = read_text(data, at + 8)
     (num_pairs,) = _S5.unpack_from(data, at)
     check_count(num_pairs, "num_pairs", MAX_PAIRS, 1)
-    frames_of_interest, at = read_texts(data, at + 4, num_pairs)
-    frames_of_reference, at = read_texts(data, at, num_pairs)
+    frames_of_interest, at = read_each(read_text, data, at + 4, num_pairs)
+    frames_of_reference, at = read_each(read_text, data, at, num_pairs)
     (num_instants,) = _S5.unpack_from(data, at)
     check_count(num_instants, "num_instants", MAX_MESSAGE_INSTANTS)
     at_, at = read_numbers("q", data, at + 4, num_instants)
     fixed_frame, at = read_text(data, at)
-    reference_at, with_covariance = _S12.unpack_from(data, at)
+    reference_at, with_covariance = _S13.unpack_from(data, at)
     return GetTransformations(
         RequestHeader(header_request_id, header_reply_channel),
         tuple(
             zip(
-                tuple([check_frame_name(each, "frames_of_interest") for each in frames_of_interest]),
-                tuple([check_frame_name(each, "frames_of_reference") for each in frames_of_reference]),
+                tuple([check_name(each, "frames_of_interest", MAX_FRAME_NAME) for each in frames_of_interest]),
+                tuple([check_name(each, "frames_of_reference", MAX_FRAME_NAME) for each in frames_of_reference]),
                 strict=True,
             )
         ),
         check_instants(at_, "at"),
-        check_frame_name(fixed_frame, "fixed_frame"),
+        check_name(fixed_frame, "fixed_frame", MAX_FRAME_NAME),
         check_utime(reference_at, "reference_at"),
         bool(with_covariance),
     ), at + 9
@@ -700,7 +790,7 @@ def pack_gps(value: GpsSample) -> bytes:
             value.header.seq,
         ),
         pack_text(value.header.source),
-        _S13.pack(
+        _S14.pack(
             value.fix_type,
             value.satellites,
             value.hdop,
@@ -768,7 +858,7 @@ def unpack_gps(data: bytes, at: int) -> tuple[GpsSample, int]:
         course_sigma,
         baseline_yaw,
         baseline_yaw_sigma,
-    ) = _S13.unpack_from(data, at)
+    ) = _S14.unpack_from(data, at)
     return GpsSample(
         SensorHeader(
             check_sample_utime(header_utime, "utime"),
@@ -829,11 +919,11 @@ def pack_health(value: Health) -> bytes:
     """Return the bytes of a health_t without the fingerprint."""
     return b"".join(
         (
-            _S14.pack(value.utime, value.uptime),
+            _S15.pack(value.utime, value.uptime),
             pack_text(value.version),
             pack_text(value.vehicle),
             pack_text(value.model_revision),
-            _S15.pack(
+            _S16.pack(
                 value.state,
                 value.invalid_reasons,
                 value.pose_epoch,
@@ -850,7 +940,7 @@ def pack_health(value: Health) -> bytes:
             ),
             pack_text(value.invalid_text),
             pack_text(value.host),
-            _S16.pack(
+            _S17.pack(
                 value.pid,
                 value.requests_queued,
                 value.memory,
@@ -876,7 +966,7 @@ def pack_health(value: Health) -> bytes:
 
 def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
     """Return the health_t that begins at `at`, and its end. Raises WireError, struct.error."""
-    utime, uptime = _S14.unpack_from(data, at)
+    utime, uptime = _S15.unpack_from(data, at)
     version, at = read_text(data, at + 16)
     vehicle, at = read_text(data, at)
     model_revision, at = read_text(data, at)
@@ -894,7 +984,7 @@ def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
         tick_latency_p90,
         tick_latency_p99,
         tick_latency_max,
-    ) = _S15.unpack_from(data, at)
+    ) = _S16.unpack_from(data, at)
     invalid_text, at = read_text(data, at + 85)
     host, at = read_text(data, at)
     (
@@ -910,7 +1000,7 @@ def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
         localization_seconds_to_limit,
         localization_fix_age,
         num_channels,
-    ) = _S16.unpack_from(data, at)
+    ) = _S17.unpack_from(data, at)
     check_count(num_channels, "num_channels")
     channels, at = read_each(unpack_channel_health, data, at + 63, num_channels)
     (num_rejected,) = _S5.unpack_from(data, at)
@@ -918,8 +1008,8 @@ def unpack_health(data: bytes, at: int) -> tuple[Health, int]:
     rejected, at = read_each(unpack_rejected_count, data, at + 4, num_rejected)
     (num_warnings,) = _S5.unpack_from(data, at)
     check_count(num_warnings, "num_warnings")
-    warning_subjects, at = read_texts(data, at + 4, num_warnings)
-    warning_texts, at = read_texts(data, at, num_warnings)
+    warning_subjects, at = read_each(read_text, data, at + 4, num_warnings)
+    warning_texts, at = read_each(read_text, data, at, num_warnings)
     return Health(
         utime,
         uptime,
@@ -971,7 +1061,7 @@ def pack_imu(value: ImuSample) -> bytes:
             value.header.seq,
         ),
         pack_text(value.header.source),
-        _S17.pack(
+        _S18.pack(
             *(value.angular_velocity or NAN3),
             *(value.angular_velocity_covariance or NAN9),
             *(value.specific_force or NAN3),
@@ -1034,7 +1124,7 @@ def unpack_imu(data: bytes, at: int) -> tuple[ImuSample, int]:
         orientation_covariance_7,
         orientation_covariance_8,
         temperature_celsius,
-    ) = _S17.unpack_from(data, at)
+    ) = _S18.unpack_from(data, at)
     return ImuSample(
         SensorHeader(
             check_sample_utime(header_utime, "utime"),
@@ -1121,7 +1211,7 @@ def unpack_joints(data: bytes, at: int) -> tuple[JointsSample, int]:
     header_source, at = read_text(data, at + 40)
     (num_joints,) = _S5.unpack_from(data, at)
     check_count(num_joints, "num_joints", 1024)
-    names, at = read_texts(data, at + 4, num_joints)
+    names, at = read_each(read_text, data, at + 4, num_joints)
     position, at = read_numbers("d", data, at, num_joints)
     position_sigma, at = read_numbers("d", data, at, num_joints)
     rate, at = read_numbers("d", data, at, num_joints)
@@ -1141,7 +1231,7 @@ def unpack_joints(data: bytes, at: int) -> tuple[JointsSample, int]:
 
 def pack_localization_health(value: LocalizationHealth) -> bytes:
     """Return the bytes of a localization_health_t without the fingerprint."""
-    return _S18.pack(
+    return _S19.pack(
         -1 if value.mode is None else value.mode,
         -1 if value.phase is None else value.phase,
         value.stationary,
@@ -1155,7 +1245,7 @@ def pack_localization_health(value: LocalizationHealth) -> bytes:
 def unpack_localization_health(data: bytes, at: int) -> tuple[LocalizationHealth, int]:
     """Return the localization_health_t that begins at `at`, and its end. Raises WireError, struct.error."""
     mode, phase, stationary, horizontal_protection_level, heading_protection_level, seconds_to_limit, fix_age = (
-        _S18.unpack_from(data, at)
+        _S19.unpack_from(data, at)
     )
     return LocalizationHealth(
         None if mode == -1 else read_enum(Mode, mode, "mode"),
@@ -1206,7 +1296,7 @@ def pack_model_snapshot(value: SnapshotPart) -> bytes:
     return b"%b%b%b%b" % (
         _S3.pack(value.utime),
         pack_text(value.model_revision),
-        _S19.pack(value.part, value.parts, len(value.data)),
+        _S20.pack(value.part, value.parts, len(value.data)),
         value.data,
     )
 
@@ -1215,7 +1305,7 @@ def unpack_model_snapshot(data: bytes, at: int) -> tuple[SnapshotPart, int]:
     """Return the model_snapshot_t that begins at `at`, and its end. Raises WireError, struct.error."""
     (utime,) = _S3.unpack_from(data, at)
     model_revision, at = read_text(data, at + 8)
-    part, num_parts, size = _S19.unpack_from(data, at)
+    part, num_parts, size = _S20.unpack_from(data, at)
     check_count(size, "size")
     data_, at = read_bytes(data, at + 12, size)
     return verify_model_snapshot(
@@ -1240,9 +1330,151 @@ def unpack_name_list_reply(data: bytes, at: int) -> tuple[NameListReply, int]:
     header, at = unpack_reply_header(data, at)
     (num_names,) = _S5.unpack_from(data, at)
     check_count(num_names, "num_names")
-    names, at = read_texts(data, at + 4, num_names)
-    descriptions, at = read_texts(data, at, num_names)
+    names, at = read_each(read_text, data, at + 4, num_names)
+    descriptions, at = read_each(read_text, data, at, num_names)
     return NameListReply(header, names, descriptions), at
+
+
+def pack_navigation_state(value: NavigationState) -> bytes:
+    """Return the bytes of a navigation_state_t without the fingerprint."""
+    check_outgoing(len(value.names), MAX_STATES, "n")
+    return b"".join(
+        (
+            _S21.pack(
+                value.utime,
+                value.mode,
+                value.phase,
+                value.stationary,
+                value.invalid,
+                value.pose_epoch,
+                value.latitude_deg,
+                value.longitude_deg,
+                value.height,
+                *value.pose.xyz,
+                *value.pose.wxyz,
+                *value.linear_velocity,
+                *value.angular_velocity,
+                *(value.twist_covariance or NAN36),
+                len(value.names),
+            ),
+            *map(pack_text, value.names),
+            pack_numbers("d", value.values, len(value.names)),
+            _S5.pack(len(value.names) * (len(value.names) + 1) // 2),
+            pack_triangle(value.covariance, len(value.names)),
+        )
+    )
+
+
+def unpack_navigation_state(data: bytes, at: int) -> tuple[NavigationState, int]:
+    """Return the navigation_state_t that begins at `at`, and its end. Raises WireError, struct.error."""
+    (
+        utime,
+        mode,
+        phase,
+        stationary,
+        invalid_reasons,
+        pose_epoch,
+        latitude_deg,
+        longitude_deg,
+        height,
+        position_0,
+        position_1,
+        position_2,
+        orientation_0,
+        orientation_1,
+        orientation_2,
+        orientation_3,
+        linear_velocity_0,
+        linear_velocity_1,
+        linear_velocity_2,
+        angular_velocity_0,
+        angular_velocity_1,
+        angular_velocity_2,
+        *twist_covariance,
+    ) = _S22.unpack_from(data, at)
+    (n,) = _S5.unpack_from(data, at + 435)
+    check_count(n, "n", MAX_STATES)
+    names, at = read_each(read_text, data, at + 439, n)
+    values, at = read_numbers("d", data, at, n)
+    (num_covariance,) = _S5.unpack_from(data, at)
+    check_count(num_covariance, "num_covariance", n * (n + 1) // 2, n * (n + 1) // 2)
+    covariance, at = read_numbers("d", data, at + 4, num_covariance)
+    return NavigationState(
+        check_utime(utime, "utime"),
+        read_enum(Mode, mode, "mode"),
+        read_enum(Phase, phase, "phase"),
+        bool(stationary),
+        Invalid(invalid_reasons),
+        pose_epoch,
+        latitude_deg,
+        longitude_deg,
+        height,
+        Pose(
+            check_position((position_0, position_1, position_2), "position"),
+            check_unit_quaternion((orientation_0, orientation_1, orientation_2, orientation_3), "orientation"),
+        ),
+        (linear_velocity_0, linear_velocity_1, linear_velocity_2),
+        (angular_velocity_0, angular_velocity_1, angular_velocity_2),
+        () if twist_covariance[0] != twist_covariance[0] else tuple(twist_covariance),
+        tuple([check_name(each, "names") for each in names]),
+        values,
+        read_triangle(covariance, n),
+    ), at
+
+
+def pack_path_edge(value: EdgeReport) -> bytes:
+    """Return the bytes of a path_edge_t without the fingerprint."""
+    return b"%b%b%b%b%b%b%b%b%b%b" % (
+        _S4.pack(KIND_WORDS.index(value.kind)),
+        pack_text(value.name),
+        pack_text(value.ends[0]),
+        pack_text(value.ends[1]),
+        _S23.pack(
+            value.forward,
+            *value.pose.xyz,
+            *value.pose.wxyz,
+            PROVENANCE_WORDS.index(value.provenance),
+            value.stamp,
+            value.age,
+        ),
+        pack_text(value.source),
+        _S5.pack(len(value.coordinates)),
+        pack_numbers("d", value.coordinates),
+        _S6.pack(value.position_share, value.rotation_share),
+        pack_text(value.warning),
+    )
+
+
+def unpack_path_edge(data: bytes, at: int) -> tuple[EdgeReport, int]:
+    """Return the path_edge_t that begins at `at`, and its end. Raises WireError, struct.error."""
+    (kind,) = _S4.unpack_from(data, at)
+    name, at = read_text(data, at + 1)
+    from_end, at = read_text(data, at)
+    to_end, at = read_text(data, at)
+    forward, vector_0, vector_1, vector_2, vector_3, vector_4, vector_5, vector_6, provenance, stamp, age = (
+        _S23.unpack_from(data, at)
+    )
+    source, at = read_text(data, at + 74)
+    (num_coordinates,) = _S5.unpack_from(data, at)
+    check_count(num_coordinates, "num_coordinates", 6)
+    coordinates, at = read_numbers("d", data, at + 4, num_coordinates)
+    position_share, rotation_share = _S6.unpack_from(data, at)
+    warning, at = read_text(data, at + 16)
+    return EdgeReport(
+        read_word(KIND_WORDS, kind, "kind"),
+        name,
+        bool(forward),
+        (from_end, to_end),
+        Pose((vector_0, vector_1, vector_2), (vector_3, vector_4, vector_5, vector_6)),
+        read_word(PROVENANCE_WORDS, provenance, "provenance"),
+        stamp,
+        age,
+        source,
+        coordinates,
+        position_share,
+        rotation_share,
+        warning,
+    ), at
 
 
 def pack_range(value: RangeSample) -> bytes:
@@ -1258,7 +1490,7 @@ def pack_range(value: RangeSample) -> bytes:
         pack_text(value.header.source),
         pack_text(value.frame),
         pack_text(value.beacon),
-        _S20.pack(*value.beacon_position),
+        _S24.pack(*value.beacon_position),
         pack_text(value.frame_of_reference),
         _S6.pack(value.distance, value.sigma),
     )
@@ -1270,7 +1502,7 @@ def unpack_range(data: bytes, at: int) -> tuple[RangeSample, int]:
     header_source, at = read_text(data, at + 40)
     frame, at = read_text(data, at)
     beacon, at = read_text(data, at)
-    beacon_position_0, beacon_position_1, beacon_position_2 = _S20.unpack_from(data, at)
+    beacon_position_0, beacon_position_1, beacon_position_2 = _S24.unpack_from(data, at)
     frame_of_reference, at = read_text(data, at + 24)
     distance, sigma = _S6.unpack_from(data, at)
     return RangeSample(
@@ -1282,10 +1514,10 @@ def unpack_range(data: bytes, at: int) -> tuple[RangeSample, int]:
             header_device_utime,
             header_utime_sigma,
         ),
-        check_frame_name(frame, "frame"),
+        check_name(frame, "frame", MAX_FRAME_NAME),
         check_name(beacon, "beacon"),
         check_position((beacon_position_0, beacon_position_1, beacon_position_2), "beacon_position"),
-        check_frame_name(frame_of_reference, "frame_of_reference"),
+        check_name(frame_of_reference, "frame_of_reference", MAX_FRAME_NAME),
         check_distance(distance, "distance"),
         sigma,
     ), at + 16
@@ -1340,7 +1572,7 @@ def unpack_relative_pose(data: bytes, at: int) -> tuple[RelativePoseSample, int]
                 header_device_utime,
                 header_utime_sigma,
             ),
-            check_frame_name(frame, "frame"),
+            check_name(frame, "frame", MAX_FRAME_NAME),
             since_utime,
             check_position((position_0, position_1, position_2), "position"),
             check_unit_quaternion((orientation_0, orientation_1, orientation_2, orientation_3), "orientation"),
@@ -1367,7 +1599,7 @@ def unpack_reload_model_reply(data: bytes, at: int) -> tuple[ReloadReply, int]:
     new_revision, at = read_text(data, at)
     (num_changes,) = _S5.unpack_from(data, at)
     check_count(num_changes, "num_changes")
-    changes, at = read_texts(data, at + 4, num_changes)
+    changes, at = read_each(read_text, data, at + 4, num_changes)
     return ReloadReply(header, new_revision, changes), at
 
 
@@ -1461,11 +1693,11 @@ def pack_signed(value: Envelope) -> bytes:
     return b"%b%b%b%b%b%b%b" % (
         pack_text(value.key_name),
         pack_text(value.sender),
-        _S21.pack(value.utime, value.counter),
+        _S25.pack(value.utime, value.counter),
         pack_text(value.channel),
         _S5.pack(len(value.payload)),
         value.payload,
-        _S22.pack(value.mac),
+        _S26.pack(value.mac),
     )
 
 
@@ -1473,12 +1705,12 @@ def unpack_signed(data: bytes, at: int) -> tuple[Envelope, int]:
     """Return the signed_t that begins at `at`, and its end. Raises WireError, struct.error."""
     key_name, at = read_text(data, at)
     sender, at = read_text(data, at)
-    utime, counter = _S21.unpack_from(data, at)
+    utime, counter = _S25.unpack_from(data, at)
     channel, at = read_text(data, at + 16)
     (size,) = _S5.unpack_from(data, at)
     check_count(size, "size", 4096)
     payload, at = read_bytes(data, at + 4, size)
-    (mac,) = _S22.unpack_from(data, at)
+    (mac,) = _S26.unpack_from(data, at)
     return Envelope(
         check_name(key_name, "key_name"),
         check_name(sender, "sender"),
@@ -1506,7 +1738,7 @@ def unpack_time_query(data: bytes, at: int) -> tuple[TimeQuery, int]:
 def pack_vehicle_command(value: VehicleCommand) -> bytes:
     """Return the bytes of a vehicle_command_t without the fingerprint."""
     return b"%b%b%b" % (
-        _S23.pack(value.utime, value.valid_for, value.seq),
+        _S27.pack(value.utime, value.valid_for, value.seq),
         pack_text(value.source),
         _S6.pack(value.forward_speed, value.steering_angle),
     )
@@ -1514,7 +1746,7 @@ def pack_vehicle_command(value: VehicleCommand) -> bytes:
 
 def unpack_vehicle_command(data: bytes, at: int) -> tuple[VehicleCommand, int]:
     """Return the vehicle_command_t that begins at `at`, and its end. Raises WireError, struct.error."""
-    utime, valid_for, seq = _S23.unpack_from(data, at)
+    utime, valid_for, seq = _S27.unpack_from(data, at)
     source, at = read_text(data, at + 24)
     forward_speed, steering_angle = _S6.unpack_from(data, at)
     return VehicleCommand(
@@ -1538,7 +1770,7 @@ def pack_vehicle_status(value: VehicleStatusSample) -> bytes:
             value.header.seq,
         ),
         pack_text(value.header.source),
-        _S24.pack(
+        _S28.pack(
             value.mode,
             value.forward_speed,
             value.steering_angle,
@@ -1554,7 +1786,7 @@ def unpack_vehicle_status(data: bytes, at: int) -> tuple[VehicleStatusSample, in
     """Return the vehicle_status_t that begins at `at`, and its end. Raises WireError, struct.error."""
     header_utime, header_utime_sigma, header_host_utime, header_device_utime, header_seq = _S0.unpack_from(data, at)
     header_source, at = read_text(data, at + 40)
-    mode, forward_speed, steering_angle, supply_voltage, engine_speed, fault_bits, commands_rejected = _S24.unpack_from(
+    mode, forward_speed, steering_angle, supply_voltage, engine_speed, fault_bits, commands_rejected = _S28.unpack_from(
         data, at
     )
     return VehicleStatusSample(
@@ -1606,7 +1838,7 @@ def unpack_wheels(data: bytes, at: int) -> tuple[WheelsSample, int]:
     header_source, at = read_text(data, at + 40)
     (num_wheels,) = _S5.unpack_from(data, at)
     check_count(num_wheels, "num_wheels", 1024)
-    names, at = read_texts(data, at + 4, num_wheels)
+    names, at = read_each(read_text, data, at + 4, num_wheels)
     travel, at = read_numbers("d", data, at, num_wheels)
     travel_sigma, at = read_numbers("d", data, at, num_wheels)
     speed, at = read_numbers("d", data, at, num_wheels)

@@ -22,9 +22,9 @@ from modelserver.wire.fields import (
     ROTATION_TOLERANCE,
     check_count,
     pack_text,
+    read_each,
     read_enum,
     read_text,
-    read_texts,
 )
 
 _REPLY_HEAD = struct.Struct(">qqh")
@@ -205,6 +205,6 @@ def unpack_reply_header(data: bytes, at: int) -> tuple[ReplyHeader, int]:
     message, at = read_text(data, at)
     (count,) = COUNT.unpack_from(data, at)
     check_count(count, "num_nearest")
-    nearest, at = read_texts(data, at + COUNT.size, count)
+    nearest, at = read_each(read_text, data, at + COUNT.size, count)
     revision, at = read_text(data, at)
     return ReplyHeader(request_id, utime, read_enum(Status, status, "status"), message, nearest, revision), at

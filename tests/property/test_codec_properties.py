@@ -20,7 +20,7 @@ from modelserver.transforms.pose import Pose
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire.codec import decode, encode, get_type_names
 from modelserver.wire.fields import MAX_UTIME
-from modelserver.wire.motion import EDGE_KINDS, PROVENANCES
+from modelserver.wire.generated import KIND_WORDS, PROVENANCE_WORDS
 
 int32 = st.integers(-(1 << 31), (1 << 31) - 1)
 int64 = st.integers(-(1 << 63), (1 << 63) - 1)
@@ -149,12 +149,12 @@ def states(draw: st.DrawFn) -> messages.NavigationState:
 
 edges = st.builds(
     messages.EdgeReport,
-    st.sampled_from(EDGE_KINDS),
+    st.sampled_from(KIND_WORDS),
     texts,
     st.booleans(),
     st.tuples(texts, texts),
     st.builds(Pose, places, turns),
-    st.sampled_from(PROVENANCES),
+    st.sampled_from(PROVENANCE_WORDS),
     int64,
     numbers,
     texts,
