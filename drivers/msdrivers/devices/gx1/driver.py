@@ -11,33 +11,117 @@ the device is stationary.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 
-from modelserver.messages import NAN, SensorHeader
-from msdrivers.devices.gx1.conversion import GravityCheck, find_saturated_fields, sample_from_packet
-from msdrivers.devices.gx1.discovery import (
+from modelserver.messages import NAN, ImuSample, OrientationReference, SensorHeader, YawSource
+from modelserver.transforms import so3
+from modelserver.transforms.so3 import Quaternion, Vector3
+from msdrivers.devices.gx1.script import (
     RETRY_DELAY_S,
+    Gx1Receiver,
+    Gx1Reply,
     LineState,
+    NoReplyError,
+    PauseStep,
+    RequestStep,
+    Script,
     ScriptPart,
+    ScriptRunner,
     UnusableDeviceError,
     find_device,
     read_gains,
     read_words,
 )
-from msdrivers.devices.gx1.script import (
-    Gx1Receiver,
-    Gx1Reply,
-    NoReplyError,
-    PauseStep,
-    RequestStep,
-    Script,
-    ScriptRunner,
-)
-from msdrivers.devices.gx1.settings import Gx1Settings
+from msdrivers.devices.gx1.settings import Gx1Settings, HeadingSource
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Send
-from msdrivers.protocol.gx1 import LENGTHS, MEASUREMENTS, CommandByte, EepromAddress, Gains, requests
-from msdrivers.protocol.gx1.scaling import DOCUMENTED_TIMERS, temperature_from_word, tick_from_timer_words
+from msdrivers.protocol.gx1 import LENGTHS, MEASUREMENTS, CommandByte, EepromAddress, Gains, Gx1Packet, requests
+from msdrivers.protocol.gx1.scaling import (
+    DOCUMENTED_TIMERS,
+    G0,
+    TESLA,
+    is_saturated,
+    orientation_from_euler,
+    orientation_from_quaternion,
+    temperature_from_word,
+    tick_from_timer_words,
+    vector_from_words,
+)
+
+_UP_NED: Vector3 = (0.0, 0.0, -1.0)
+"""In north, east, down."""
+
+
+def find_saturated_fields(packet: Gx1Packet) -> tuple[str, ...]:
+    """Return the names of the saturated vectors."""
+    return tuple(
+        name for name in ("field", "acceleration", "rate") if packet.has(name) and is_saturated(packet.field(name))
+    )
+
+
+def sample_from_packet(
+    packet: Gx1Packet, gains: Gains, force_sign: int, heading: HeadingSource, header: SensorHeader, celsius: float = NAN
+) -> ImuSample:
+    """Convert a measurement; missing and saturated vectors are None.
+
+    `force_sign`: of the device's acceleration as specific force. The orientation is that of the sensor's axes in
+    north, east, down.
+    """
+    missing = find_saturated_fields(packet)
+
+    def convert(name: str, gain: int, unit: float = 1.0) -> Vector3 | None:
+        return vector_from_words(packet.field(name), gain, unit) if packet.has(name) and name not in missing else None
+
+    orientation: Quaternion | None = None
+    if packet.has("euler"):
+        orientation = orientation_from_euler(packet.field("euler"))
+    elif packet.has("quaternion"):
+        orientation = orientation_from_quaternion(packet.field("quaternion"))
+    return ImuSample(
+        header,
+        angular_velocity=convert("rate", gains.gyro),
+        specific_force=convert("acceleration", gains.accelerometer, force_sign * G0),
+        magnetic_field=convert("field", gains.magnetometer, TESLA),
+        orientation=orientation,
+        orientation_reference=OrientationReference.NED if orientation else OrientationReference.NONE,
+        yaw_source=YawSource.MAGNETIC if orientation and heading is HeadingSource.MAGNETIC else YawSource.NONE,
+        temperature_celsius=celsius,
+    )
+
+
+class GravityCheck:
+    """Checks the sign of the specific force while stationary, by the device's own orientation."""
+
+    MIN_SAMPLES = 5
+    """Consecutive stationary samples."""
+    MAX_RATE = 0.1
+    """Largest angular rate of a stationary device, rad/s."""
+    MAX_FORCE_ERROR = 1.0
+    """Largest deviation of a stationary device's force from gravity, m/s2."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self.is_upward = True
+        """The specific force points up, as it must; decided once `update` has returned True."""
+
+    def update(self, sample: ImuSample) -> bool:
+        """Process a sample; return True once, when the sign is decided."""
+        force, rate, orientation = sample.specific_force, sample.angular_velocity, sample.orientation
+        if self._count >= self.MIN_SAMPLES or force is None or rate is None or orientation is None:
+            return False
+        up = so3.rotate(so3.conjugate(orientation), _UP_NED)
+        along = sum(a * b for a, b in zip(force, up, strict=True))
+        is_quiet = math.hypot(*rate) <= self.MAX_RATE and abs(math.hypot(*force) - G0) <= self.MAX_FORCE_ERROR
+        # neither up nor down: not stationary
+        if not is_quiet or abs(along) < 0.7 * G0:
+            self._count = 0
+            return False
+        upwards = along > 0.0
+        self._count = self._count + 1 if upwards == self.is_upward else 1
+        self.is_upward = upwards
+        return self._count >= self.MIN_SAMPLES
+
 
 NEVER = 1 << 62
 REPLY_TIMEOUT_NS = 500_000_000
@@ -46,8 +130,6 @@ REPLY_TIMEOUT_NS = 500_000_000
 
 class PollSchedule:
     """Commands that are polled periodically. Instants are monotonic nanoseconds."""
-
-    __slots__ = ("_next", "_pending", "_periods")
 
     def __init__(self) -> None:
         self._periods: dict[int, int] = {}
@@ -71,9 +153,8 @@ class PollSchedule:
 
     def pop_due(self, now_ns: int) -> list[int]:
         """Return the commands to poll now, except those whose reply is pending."""
-        commands = [command for command, at in self._next.items() if at <= now_ns]
         asked = []
-        for command in commands:
+        for command in [command for command, at in self._next.items() if at <= now_ns]:
             self._next[command] = max(self._next[command] + self._periods[command], now_ns + 1)
             if command not in self._pending:
                 self._pending[command] = now_ns + REPLY_TIMEOUT_NS
@@ -102,8 +183,6 @@ class TickRateCheck:
 
     The earliest reply of each window is compared, because delays vary.
     """
-
-    __slots__ = ("_agreeing_windows", "_before", "_begin_ns", "_earliest", "_measured", "_tick_s", "is_consistent")
 
     def __init__(self, tick_s: float):
         """`tick_s` is the configured tick."""
@@ -244,9 +323,8 @@ class Gx1Driver:
         while True:
             try:
                 self._device = yield from find_device(self._link, self._line_state)
-                yield EndpointStatus(
-                    EndpointPhase.CONFIGURING, f"{self._device} answers{self._line_state.at_baud_text}"
-                )
+                text = f"{self._device} answers{self._line_state.at_baud_text}"
+                yield EndpointStatus(EndpointPhase.CONFIGURING, text)
                 self._gains = yield from read_gains()
                 yield from self._read_timer()
                 if self.settings.capture_bias_at_start:
@@ -257,9 +335,8 @@ class Gx1Driver:
                 why = f"{self._device} fell silent while it was set up: {silence}; check its cable and power"
             except UnusableDeviceError as unusable:
                 why = f"{self._device} cannot be used: {unusable}"
-            yield EndpointStatus(
-                EndpointPhase.SILENT, f"{why}; nothing is published, trying again in {RETRY_DELAY_S:g} s"
-            )
+            text = f"{why}; nothing is published, trying again in {RETRY_DELAY_S:g} s"
+            yield EndpointStatus(EndpointPhase.SILENT, text)
             yield PauseStep(RETRY_DELAY_S)
 
     def _read_timer(self) -> ScriptPart[None]:
@@ -333,9 +410,8 @@ class Gx1Driver:
             self._link.reset_input()
             if not self._is_streaming:
                 self._is_streaming = True
-                outputs.append(
-                    EndpointStatus(EndpointPhase.STREAMING, f"{self._device} streams message {int(command)}")
-                )
+                text = f"{self._device} streams message {int(command)}"
+                outputs.append(EndpointStatus(EndpointPhase.STREAMING, text))
             if self._tick_check.update(count, now.monotonic_ns):
                 outputs.append(EndpointStatus(EndpointPhase.STREAMING, self._tick_check.describe()))
         device_utime = round(count * self.tick_s * 1e6) if self._tick_check.is_consistent else 0
@@ -352,9 +428,8 @@ class Gx1Driver:
         self._seq += 1
         self._celsius = NAN
         # without the device's time the way over the line is part of the delay
-        line = (
-            LENGTHS[command] * 10.0 / self._line_state.bauds[0] if self._line_state.bauds and not device_utime else 0.0
-        )
+        bauds = self._line_state.bauds
+        line = LENGTHS[command] * 10.0 / bauds[0] if bauds and not device_utime else 0.0
         return [*outputs, MeasuredSample(sample, self.settings.delay + line, self.settings.delay_sigma, self.tick_s)]
 
     def _on_gravity_known(self) -> list[Output[bytes]]:
@@ -365,13 +440,11 @@ class Gx1Driver:
         if self._gravity_check.is_upward:
             return []
         sign = self.settings.specific_force_sign
-        return [
-            EndpointStatus(
-                EndpointPhase.STREAMING,
-                "while stationary the specific force points down by the device's own orientation instead of up: this "
-                f"device gives the opposite of specific force; set specific_force_sign to {-sign} (it is {sign})",
-            )
-        ]
+        text = (
+            "while stationary the specific force points down by the device's own orientation instead of up: this "
+            f"device gives the opposite of specific force; set specific_force_sign to {-sign} (it is {sign})"
+        )
+        return [EndpointStatus(EndpointPhase.STREAMING, text)]
 
     def _silence_deadline_ns(self) -> int:
         return self._streamed_ns + round(self.settings.silence * 1e9)
@@ -380,7 +453,8 @@ class Gx1Driver:
         message = self.settings.message
         received = self._link.describe_input()
         why = f"no usable message {int(message)} for {self.settings.silence:g} s, received {received}"
-        rejected = ", ".join(f"{reason} {count}" for reason, count in sorted(self._link.rejected.items()))
+        counts = sorted((key, count) for key, count in self._link.parser.counts.items() if "." in key)
+        rejected = ", ".join(f"{key.removeprefix('rejected.')} {count}" for key, count in counts)
         return f"{why}" + (f", rejected since the start: {rejected}" if rejected else "")
 
     def _restart(self, now: HostTime, why: str) -> list[Output[bytes]]:

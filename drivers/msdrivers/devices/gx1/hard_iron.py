@@ -12,18 +12,22 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from modelserver.transforms.so3 import Vector3
-from msdrivers.devices.gx1.discovery import (
+from msdrivers.devices.gx1.script import (
     RETRY_DELAY_S,
+    Gx1Receiver,
     LineState,
+    NoReplyError,
+    PauseStep,
+    RequestStep,
+    Script,
     ScriptPart,
+    ScriptRunner,
     UnusableDeviceError,
     find_device,
     read_gains,
-    read_word,
     read_words,
     write_word,
 )
-from msdrivers.devices.gx1.script import Gx1Receiver, NoReplyError, PauseStep, RequestStep, Script, ScriptRunner
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Send
 from msdrivers.protocol.gx1 import CommandByte, EepromAddress, Gx1Packet, requests
 from msdrivers.protocol.gx1.scaling import TESLA, is_saturated, vector_from_words
@@ -121,11 +125,8 @@ class HardIronProcedure:
                 Send(requests.make_write_eeprom(address, value))
                 for address, value in zip(EepromAddress.HARD_IRON, self._before, strict=True)
             ]
-            outputs.append(
-                EndpointStatus(
-                    EndpointPhase.CONFIGURING, "hard iron: interrupted, the offsets from before are written back"
-                )
-            )
+            text = "hard iron: interrupted, the offsets from before are written back"
+            outputs.append(EndpointStatus(EndpointPhase.CONFIGURING, text))
         if self._line_state.found_stream is not None and self.result is None:
             outputs.append(Send(self._line_state.make_restore_request()))
         return outputs
@@ -139,15 +140,10 @@ class HardIronProcedure:
         while True:
             try:
                 yield from self._prepare()
-            except NoReplyError as silence:
-                why = str(silence)
-            except UnusableDeviceError as unusable:
-                why = str(unusable)
-            else:
                 break
-            yield EndpointStatus(
-                EndpointPhase.SILENT, f"hard iron: cannot begin: {why}; trying again in {RETRY_DELAY_S:g} s"
-            )
+            except (NoReplyError, UnusableDeviceError) as failure:
+                text = f"hard iron: cannot begin: {failure}; trying again in {RETRY_DELAY_S:g} s"
+            yield EndpointStatus(EndpointPhase.SILENT, text)
             yield PauseStep(RETRY_DELAY_S)
         try:
             offsets = yield from self._find_offsets()
@@ -195,10 +191,8 @@ class HardIronProcedure:
                 reported = link.now.monotonic_ns
                 done = (reported - begin) / seconds
                 spans = _format_microtesla(self._get_spans())
-                yield EndpointStatus(
-                    EndpointPhase.CONFIGURING,
-                    f"hard iron: {done:.0f} of {self.settings.duration:g} s, field spans {spans}",
-                )
+                text = f"hard iron: {done:.0f} of {self.settings.duration:g} s, field spans {spans}"
+                yield EndpointStatus(EndpointPhase.CONFIGURING, text)
             yield PauseStep(self.settings.period)
 
     def _get_spans(self) -> Vector3:
@@ -231,7 +225,7 @@ class HardIronProcedure:
                     f"extremes is {middle:g}: do the procedure again, away from iron and currents"
                 )
         for axis, address in enumerate(EepromAddress.HARD_IRON):
-            stored = yield from read_word(address)
+            (stored,) = yield from read_words((address,))
             if stored != offsets[axis] & 0xFFFF:
                 raise _FailedError(
                     f"the device gave an offset of {offsets[axis]} counts along {_AXES[axis]}, but its EEPROM (address "
@@ -242,7 +236,7 @@ class HardIronProcedure:
         try:
             for address, value in zip(EepromAddress.HARD_IRON, self._before, strict=True):
                 yield from write_word(address, value)
-                if (yield from read_word(address)) != value:
+                if (yield from read_words((address,))) != (value,):
                     raise _FailedError(f"address {address} did not take {_to_signed((value,))[0]}")
         except (NoReplyError, _FailedError) as failure:
             return (
