@@ -45,11 +45,6 @@ class SensorChannel:
     type_name: str
     latency_us: int = 0
 
-    @property
-    def has_publisher(self) -> bool:
-        """Whether the channel has one publisher, as a sensor's; any client may command a mode."""
-        return self.type_name != "localization_mode_t"
-
     def decode(self, data: bytes) -> Sample | SwitchMode:
         """Decode a sample or a mode command. Raises WireError."""
         value: Sample | SwitchMode = decode(self.type_name, data)

@@ -41,7 +41,7 @@ from modelserver.server.ingress import (
 from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.log import RateLimitedLog, escape_lines, escape_text
 from modelserver.server.requests.handler import RequestHandler
-from modelserver.server.requests.signed_commands import CommandVerifier
+from modelserver.server.requests.signed_commands import MODE_TYPE, CommandVerifier
 from modelserver.server.tick_timer import TickTimer
 from modelserver.wire.codec import encode, fingerprint_of
 from modelserver.wire.fields import MAX_DECISIONS
@@ -265,7 +265,8 @@ class Loop:
 
     def _make_sensor_handler(self, name: str, sensor: SensorChannel) -> Callable[[str, bytes], None]:
         detector = None if name in self._settings.shared_channels else PublisherConflictDetector()
-        is_monitored = sensor.has_publisher and self._conflicts.is_enabled
+        # a channel of samples has one publisher; any client may command a mode
+        is_monitored = sensor.type_name != MODE_TYPE and self._conflicts.is_enabled
         fingerprint = fingerprint_of(sensor.type_name)
 
         def handle(channel: str, data: bytes) -> None:

@@ -46,18 +46,19 @@ class SegmentStart:
 class JournalQueue:
     """Bounded queue from the loop to the writer's thread, in processing order. Before the first `begin` it drops all.
 
-    On overflow, records are dropped and counted until the next `begin`, which the writer requests (`request_state`).
+    On overflow, records are dropped and counted until the next `begin`, which the writer requests (`wants_state`).
     Lock-free: each attribute is written by one thread, and a deque is thread-safe at both ends.
     """
 
     def __init__(self) -> None:
         self.wants_state = False
-        """Whether `begin` has to be called before the next record."""
+        """Whether the writer requests a `begin` before the next record."""
         self.lost = 0
         """Records dropped since the last `begin`. Written by the loop's thread."""
         self._entries: deque[JournalEntry] = deque()
         self._warnings: deque[HealthWarning] = deque()
-        self._open = False
+        self.is_open = False
+        """Whether records are accepted; if not, the writer requests a state once there is room."""
         self._is_started = 0  # 1 from the first `begin` on: before it nothing counts as lost
         self._queued_bytes = self._popped_bytes = 0
         self._last = Instant(0, 0)
@@ -70,7 +71,7 @@ class JournalQueue:
         self._last = now
         lost, self.lost = self.lost, 0
         self._entries.append(JournalEntry(RecordKind.EVENT, now, "", b"", SegmentStart(state, lost)))
-        self._open, self._is_started = True, 1
+        self.is_open, self._is_started = True, 1
 
     def record_event(self, event: object, now: Instant, received: ReceivedMessage | None = None) -> None:
         """Record an event before the core processes it; `received` is the message it was decoded from, if any."""
@@ -94,22 +95,17 @@ class JournalQueue:
         return [self._warnings.popleft() for _ in range(len(self._warnings))]
 
     def _put(self, kind: RecordKind, now: Instant, channel: str, data: bytes, event: object = None) -> None:
-        if not self._open:
+        if not self.is_open:
             self.lost += self._is_started
             return
         self._queued_bytes += len(data)
         if len(self._entries) >= MAX_QUEUED_RECORDS or self._queued_bytes - self._popped_bytes > MAX_QUEUED_BYTES:
-            self._open = False
+            self.is_open = False
             self.lost += 1
             return
         self._entries.append(JournalEntry(kind, now, channel, data, event))
 
     # --- called by the writer's thread ---
-
-    @property
-    def is_open(self) -> bool:
-        """Whether records are accepted; if not, request a state once there is room."""
-        return self._open
 
     def pop(self, max_count: int) -> list[JournalEntry]:
         """Remove and return the oldest records."""
@@ -120,10 +116,6 @@ class JournalQueue:
 
     def __len__(self) -> int:
         return len(self._entries)
-
-    def request_state(self) -> None:
-        """Request a `begin` from the loop."""
-        self.wants_state = True
 
     def set_warning(self, text: str) -> None:
         """Set the health warning about the journal; an empty text clears it."""

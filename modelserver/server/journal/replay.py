@@ -11,7 +11,6 @@ from collections.abc import Container, Mapping
 from modelserver import core, messages
 from modelserver.core import AllOutputs, Instant
 from modelserver.errors import RecordingError, Status, WireError
-from modelserver.query.answers import DeferredAnswer
 from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus
 from modelserver.server.ingress import SensorChannel
@@ -25,15 +24,7 @@ from modelserver.wire.journal import JournalRecord, RecordKind
 
 PublishedMessage = tuple[str, bytes]
 
-PUBLISHING_OUTPUTS = (
-    messages.SendReply,
-    DeferredAnswer,
-    messages.PublishPose,
-    messages.PublishHealth,
-    messages.PublishDecisions,
-    messages.PublishNavigation,
-    messages.PublishSnapshot,
-)
+UNPUBLISHED_OUTPUTS = (messages.LoadModel, messages.PersistOrigin, messages.PersistState, messages.ReportStart)
 
 
 class _ContainsAll(Container[object]):
@@ -115,7 +106,7 @@ class ReplayLoop(Loop):
 
     def send(self, outputs: AllOutputs) -> None:
         """Publish outputs; ignore the others."""
-        super().send(tuple(each for each in outputs if isinstance(each, PUBLISHING_OUTPUTS)))
+        super().send(tuple(each for each in outputs if not isinstance(each, UNPUBLISHED_OUTPUTS)))
 
     def handle_error(self, channel: str, error: Exception, data: bytes = b"") -> None:
         """Do nothing: the error is the next record of the journal."""

@@ -93,7 +93,7 @@ def pause() -> None:
 class JournalWriter:
     """Writes the records of a queue into a ring, on a thread between `start` and `close`.
 
-    `sync_s`: period of fsync. `key`: seals the segments; None: without authentication.
+    `key`: seals the segments; None: without authentication.
     """
 
     def __init__(
@@ -102,7 +102,6 @@ class JournalWriter:
         ring: Ring,
         context: JournalContext,
         clock: Clock,
-        sync_s: float = 2.0,
         pause: Callable[[], object] = pause,
         key: Key | None = None,
     ):
@@ -115,7 +114,7 @@ class JournalWriter:
         self._ring = ring
         self._context = context
         self._clock = clock
-        self._sync_ns = round(sync_s * 1e9)
+        self._sync_ns = round(context.config.journal.sync_s * 1e9)
         self._pause = pause
         self._segment: Segment | None = None
         self._part = 0
@@ -127,7 +126,7 @@ class JournalWriter:
         self._unsynced = False
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
-        queue.request_state()
+        queue.wants_state = True
 
     def start(self) -> None:
         """Start the thread."""
@@ -169,9 +168,9 @@ class JournalWriter:
                     self._segment.sync()
                     self._unsynced = False
                 if self._segment.size >= self._ring.segment_bytes or not self._queue.is_open:
-                    self._queue.request_state()
+                    self._queue.wants_state = True
             elif now_ns >= self._retry_ns and not self._queue.wants_state:
-                self._queue.request_state()
+                self._queue.wants_state = True
         except OSError as error:
             self._fail(error)
 
@@ -357,4 +356,4 @@ def make_writer(
     files = [(str(path), read_regular(path, LARGEST_FILE)) for path in paths]
     queue = JournalQueue()
     origins = JournalContext(facts, files, config)
-    return queue, JournalWriter(queue, ring, origins, clock, config.journal.sync_s, key=key)
+    return queue, JournalWriter(queue, ring, origins, clock, key=key)

@@ -71,7 +71,8 @@ class Notifier:
         self._send, self._watchdog_ns, self._monotonic_ns = send, watchdog, monotonic_ns
         self._ping_due_ns = 0
         self._status, self._status_due_ns = "", 0
-        self._is_ready = False
+        self.is_ready = False
+        """Whether READY was sent."""
 
     @classmethod
     def from_environment(cls) -> Notifier:
@@ -83,11 +84,6 @@ class Notifier:
         """Whether there is a service manager."""
         return self._send is not None
 
-    @property
-    def is_ready(self) -> bool:
-        """Whether READY was sent."""
-        return self._is_ready
-
     def send(self, *lines: str) -> None:
         """Send lines of the protocol."""
         if self._send is not None:
@@ -95,13 +91,13 @@ class Notifier:
 
     def notify_starting(self, what: str, seconds: float = STEP_TIMEOUT_S) -> None:
         """Report a step of the start and extend its timeout; without effect after READY."""
-        if not self._is_ready:
+        if not self.is_ready:
             self._status = _truncate(what)
             self.send(f"STATUS={self._status}", f"EXTEND_TIMEOUT_USEC={round(seconds * 1e6)}")
 
     def notify_ready(self, status: str) -> None:
         """Report that the service is ready."""
-        self._is_ready = True
+        self.is_ready = True
         self._set_status(status)
         self.send("READY=1", f"STATUS={self._status}")
 
