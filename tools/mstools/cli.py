@@ -47,36 +47,24 @@ COMMANDS = {
 """Subcommands with their summary. `import-bag` is function `command` of module `mstools.commands.import_bag`; a command
 with subcommands of its own has a Typer application there instead."""
 
-COMMAND_ALIASES = {
-    "serve": "run",
-    "server": "run",
-    "start": "run",
-    "daemon": "run",
-    "validate": "check",
-    "lint": "check",
-    "play": "replay",
-    "verify": "replay",
-    "journal": "replay",
-    "import": "import-bag",
-    "switch": "mode",
-    "set": "set-pose",
-    "initialpose": "set-pose",
-    "localize": "set-pose",
-    "watch": "status",
-    "health": "status",
-    "top": "status",
-    "diagnose": "doctor",
-    "probe": "doctor",
-    "listen": "spy",
-    "echo": "spy",
-    "graph": "tree",
-    "draw": "tree",
-    "hup": "reload",
-    "setup": "install",
-    "remove": "uninstall",
-    "explain": "query",
-    "motion": "query",
+_ALIASES = {
+    "run": "serve server start daemon",
+    "check": "validate lint",
+    "replay": "play verify journal",
+    "import-bag": "import",
+    "mode": "switch",
+    "set-pose": "set initialpose localize",
+    "status": "watch health top",
+    "doctor": "diagnose probe",
+    "spy": "listen echo",
+    "tree": "graph draw",
+    "reload": "hup",
+    "install": "setup",
+    "uninstall": "remove",
+    "query": "explain motion",
 }
+
+COMMAND_ALIASES = {alias: name for name, aliases in _ALIASES.items() for alias in aliases.split()}
 """Other words for the commands."""
 
 

@@ -9,6 +9,7 @@ import typer
 
 from modelserver.errors import ModelServerError, Severity
 from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
+from modelserver.files.regular import read_start
 from modelserver.formats import FORMATS, check_file, format_of_path, save_model
 from mstools.terminal.options import Variables, choose_name, parse_variables
 from mstools.terminal.output import check_writable, describe_size, escape, format_count, print_problem, write_file
@@ -53,7 +54,9 @@ def command(
     """
     output_format = _choose_format(output_format, target)
     values = parse_variables(variables)
-    is_process = is_process_file(source)
+    is_process = (
+        os.path.isfile(source) and detect_file_kind(read_start(source, EXAMINED_BYTES)) is FileKind.MIRO_PROCESS
+    )
     if is_process and output_format != "yaml":
         raise typer.BadParameter(
             f"{source} is a Miro process configuration, which becomes a vehicle file in YAML; name it FILE.yaml",
@@ -85,14 +88,6 @@ def command(
     write_file(target, saved.text, replace=force)
     if target != "-":
         typer.echo(f"{escape(target)}: {describe_size(model)}", err=True)
-
-
-def is_process_file(file: str) -> bool:
-    """Return whether a file has the content of a Miro process configuration. Raises OSError."""
-    if not os.path.isfile(file):
-        return False
-    with open(file, "rb") as stream:
-        return detect_file_kind(stream.read(EXAMINED_BYTES)) is FileKind.MIRO_PROCESS
 
 
 def _choose_format(form: str, target: str) -> str:

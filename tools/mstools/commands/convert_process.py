@@ -35,28 +35,19 @@ if TYPE_CHECKING:
 
 Key = tuple[str, ...]
 
-SYNONYMS: Final[Mapping[str, Key]] = {
-    "geometryfile": ("geometry",),
-    "geometryfilename": ("geometry",),
-    "geometryxml": ("geometry",),
-    "vehiclegeometry": ("geometry",),
-    "modelfile": ("geometry",),
-    "vehiclename": ("vehicle",),
-    "robotname": ("vehicle",),
-    "updatemode": ("publish", "mode"),
-    "eventdriven": ("publish", "mode"),
-    "timerdriven": ("publish", "mode"),
-    "updaterate": ("publish", "rate_hz"),
-    "updateratehz": ("publish", "rate_hz"),
-    "poserate": ("publish", "rate_hz"),
-    "poseratehz": ("publish", "rate_hz"),
-    "rawmode": ("localization", "mode"),
-    "stationarytime": ("localization", "filter", "recapture_time"),
-    "biasrecapturetime": ("localization", "filter", "recapture_time"),
-    "utmorigin": ("origin", "initial_utm"),
-    "utmzone": ("origin", "zone"),
-    "utmhemisphere": ("origin", "hemisphere"),
+_SYNONYMS: Final[Mapping[Key, str]] = {
+    ("geometry",): "geometryfile geometryfilename geometryxml vehiclegeometry modelfile",
+    ("vehicle",): "vehiclename robotname",
+    ("publish", "mode"): "updatemode eventdriven timerdriven",
+    ("publish", "rate_hz"): "updaterate updateratehz poserate poseratehz",
+    ("localization", "mode"): "rawmode",
+    ("localization", "filter", "recapture_time"): "stationarytime biasrecapturetime",
+    ("origin", "initial_utm"): "utmorigin",
+    ("origin", "zone"): "utmzone",
+    ("origin", "hemisphere"): "utmhemisphere",
 }
+
+SYNONYMS: Final = {name: key for key, names in _SYNONYMS.items() for name in names.split()}
 """Names in the report, without punctuation and case, with the key of the vehicle file."""
 
 SWITCHES: Final[Mapping[str, tuple[str, str]]] = {

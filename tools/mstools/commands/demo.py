@@ -155,13 +155,11 @@ def format_usage(service: Health | None) -> list[str]:
     """
     if service is None:
         raise DemoError("no health report on MODELSERVER_HEALTH; run the demo with --verbose")
-    counts = [
-        (each.channel.removeprefix("sensor:"), each.used, each.measured) for each in service.channels if each.measured
-    ]
+    used = {each.channel.removeprefix("sensor:"): each for each in service.channels if each.measured}
     warnings = [f"{subject}: {text}" for subject, text in service.warnings if subject.startswith("sensor")]
-    if any(name == "wheels" and not used for name, used, _ in counts):
+    if "wheels" in used and not used["wheels"].used:
         raise DemoError(f"no measurement of the wheels was used: {'; '.join(warnings) or 'see --verbose'}")
-    return [f"{name}: {used} of {measured} measurements used" for name, used, measured in counts] + warnings
+    return [f"{name}: {each.used} of {each.measured} measurements used" for name, each in used.items()] + warnings
 
 
 class PoseListener(DaemonListener):
@@ -196,9 +194,8 @@ def wait_for_answer(ask: Callable[[], list[str]], children: ChildProcesses) -> l
         except NoServerError:
             children.check()
             if time.monotonic() > deadline:
-                raise DemoError(
-                    f"no reply of the daemon within {START_TIMEOUT_S:g} s; run the demo with --verbose"
-                ) from None
+                why = f"no reply of the daemon within {START_TIMEOUT_S:g} s"
+                raise DemoError(f"{why}; run the demo with --verbose") from None
 
 
 def wait_for_drivers(listener: PoseListener, lines: DemoConnections, children: ChildProcesses) -> None:

@@ -14,7 +14,7 @@ from modelserver.geometry import names
 from modelserver.messages import Decision, Invalid, PoseAnswer, PublishDecisions, Verdict
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
-from modelserver.transforms.so3 import Quaternion, Vector3
+from modelserver.transforms.so3 import Quaternion
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.listener import DaemonListener
@@ -226,22 +226,16 @@ def to_pose(target: PoseTarget, geodesy: Geodesy, current: Pose) -> Pose:
             f"the position is {away / 1e3:.0f} km from the origin (easting {east:.1f}, northing {north:.1f}, zone "
             f"{origin.zone} {side}); --utm takes absolute coordinates of that zone, --xyz meters from the origin"
         )
-    return Pose(position, _resolve_orientation(target, geodesy, position, current))
-
-
-def _resolve_orientation(target: PoseTarget, geodesy: Geodesy, position: Vector3, current: Pose) -> Quaternion:
     if target.quaternion is not None:
-        return target.quaternion
-    if target.rpy is not None:
-        return so3.from_rpy(*target.rpy)
+        return Pose(position, target.quaternion)
     roll, pitch, _ = so3.to_rpy(current.wxyz)
-    if target.yaw is not None:
-        return so3.from_rpy(roll, pitch, target.yaw)
-    east, north, up = geodesy.origin.initial_utm
-    latitude, longitude, _ = geodesy.geodetic_from_utm(east + position[0], north + position[1], up + position[2])
-    # heading counts from true north, yaw from grid east: the convergence lies between
-    yaw = math.pi / 2 - (target.heading or 0.0) + geodesy.convergence(latitude, longitude)
-    return so3.from_rpy(roll, pitch, yaw)
+    if target.heading is not None:
+        latitude, longitude, _ = geodesy.geodetic_from_utm(east + position[0], north + position[1], up + position[2])
+        # heading counts from true north, yaw from grid east: the convergence lies between
+        yaw = math.pi / 2 - target.heading + geodesy.convergence(latitude, longitude)
+    else:
+        yaw = target.yaw or 0.0
+    return Pose(position, so3.from_rpy(*(target.rpy or (roll, pitch, yaw))))
 
 
 class SetPoseListener(DaemonListener):
@@ -279,19 +273,15 @@ def describe(result: SetPoseResult) -> str:
         f"{'north' if origin.north else 'south'}; latitude {latitude:.7f}, longitude {longitude:.7f} deg",
         f"  sigma {sigma:g} m, {sigma_deg:g} deg",
     ]
-    decision = result.decision
+    decision, silent = result.decision, "LOCALIZATION_DECISIONS is silent (publish.decisions: false?)"
     if decision is not None:
-        reason = f": {escape(decision.reason)}" if decision.reason else ""
-        tested = ""
+        text = _VERDICTS[decision.verdict] + (f": {escape(decision.reason)}" if decision.reason else "")
         if math.isfinite(decision.statistic) and math.isfinite(decision.limit):
-            tested = f" (chi-square {decision.statistic:.1f} of {decision.limit:.1f} allowed, {decision.dof} numbers)"
-        lines.append(f"decision: {_VERDICTS[decision.verdict]}{reason}{tested}")
-    elif result.has_decisions:
-        lines.append("decision: accepted for localization; no decision on it was received")
+            text += f" (chi-square {decision.statistic:.1f} of {decision.limit:.1f} allowed, {decision.dof} numbers)"
     else:
-        lines.append(
-            "decision: accepted for localization; LOCALIZATION_DECISIONS is silent (publish.decisions: false?)"
-        )
+        why = "no decision on it was received" if result.has_decisions else silent
+        text = f"accepted for localization; {why}"
+    lines.append(f"decision: {text}")
     if result.after is not None:
         now = result.after.transformation
         state = "valid" if now.is_valid else f"not valid: {Invalid(now.invalid_reasons).explain()}"

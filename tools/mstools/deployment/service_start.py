@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NoReturn
 
 import typer
 
@@ -36,22 +35,20 @@ class ServiceStart:
         if not self._notifier.is_active:
             yield
             return
+        code = 1
         try:
             yield
+            return
         except (ConfigError, GeometryError) as error:
-            self._reject(error.problems, 1)
+            problems = error.problems
         except OSError as error:
             if error.filename is None or Path(error.filename) != self._config:
                 raise
-            why = f"the vehicle file cannot be read: {error.strerror}"
-            self._reject([_problem(why, self._config)], 1)
+            problems = self._make_problem(f"the vehicle file cannot be read: {error.strerror}")
         except typer.BadParameter as error:
-            self._reject([_problem(error.message, self._config)], error.exit_code)
+            problems, code = self._make_problem(error.message), error.exit_code
         except ModelServerError as error:
-            self._reject([_problem(str(error), self._config)], 1)
-
-    def _reject(self, problems: Iterable[Problem], code: int) -> NoReturn:
-        problems = tuple(problems)
+            problems = self._make_problem(str(error))
         for problem in problems:
             print_problem(problem, err=True)
         self._files.add(*(problem.file for problem in problems if problem.file))
@@ -59,6 +56,9 @@ class ServiceStart:
         self._notifier.notify_starting(format_status(problems))
         self._files.wait_for_change()
         raise typer.Exit(code)
+
+    def _make_problem(self, why: str) -> tuple[Problem, ...]:
+        return (Problem(Severity.ERROR, why, Location(str(self._config))),)
 
 
 def format_status(problems: Iterable[Problem]) -> str:
@@ -69,7 +69,3 @@ def format_status(problems: Iterable[Problem]) -> str:
     more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
     message = first.message if first is not None else "the vehicle file or its geometry is wrong"
     return f"start failed, waiting for the file to be fixed: {place}{message}{more}"
-
-
-def _problem(why: str, config: Path) -> Problem:
-    return Problem(Severity.ERROR, why, Location(str(config)))
