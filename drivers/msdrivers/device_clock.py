@@ -70,13 +70,8 @@ class SampleBlock(NamedTuple):
     device_sum: int
     offset_sum: int
 
-    @classmethod
-    def start_block(cls, point: ClockOffsetSample, clipped: int) -> SampleBlock:
-        """Start a block with one sample; `clipped` is its offset as it enters the mean."""
-        return cls(point.device, point, point, 1, point.device, clipped)
-
     def add(self, point: ClockOffsetSample, clipped: int, max_drift: float) -> SampleBlock:
-        """Return the block with one more sample."""
+        """Return the block with one more sample; `clipped` is its offset as it enters the mean."""
         return SampleBlock(
             self.start,
             point if _is_lower(point, self.lowest_falling, -max_drift) else self.lowest_falling,
@@ -85,6 +80,10 @@ class SampleBlock(NamedTuple):
             self.device_sum + point.device,
             self.offset_sum + clipped,
         )
+
+
+def _start_block(point: ClockOffsetSample, clipped: int) -> SampleBlock:
+    return SampleBlock(point.device, point, point, 1, point.device, clipped)
 
 
 def _is_lower(point: ClockOffsetSample, other: ClockOffsetSample, drift: float) -> bool:
@@ -283,7 +282,7 @@ class DeviceClock:
         return clock._estimate(device_us, excess if excess > JITTER_CLIP * usual else 0.0)
 
     def _restart(self, device_us: int, difference: int, step_us: float) -> tuple[DeviceClock, int, float]:
-        block = SampleBlock.start_block(ClockOffsetSample(device_us, difference), difference)
+        block = _start_block(ClockOffsetSample(device_us, difference), difference)
         clock = replace(
             self,
             _blocks=(block,),
@@ -301,7 +300,7 @@ class DeviceClock:
         assert self._fit is not None
         last, point = self._blocks[-1], ClockOffsetSample(device_us, difference)
         if device_us - last.start >= BLOCK_US:
-            block = SampleBlock.start_block(point, clipped)
+            block = _start_block(point, clipped)
             recent = (each for each in self._blocks if abs(device_us - each.start) < WINDOW_US)
             blocks = (*recent, block)
         else:
@@ -333,14 +332,13 @@ class DeviceClock:
             edge_us = 0.0
         if line.step >= 0.5 * edge_us:
             edge_us, edge_until_us = max(line.step, edge_us), device_us + WINDOW_US
-        return DeviceClock(
-            self.tick_us,
-            max_drift,
-            self.restarts,
-            blocks,
-            line,
-            device_us,
-            self._started_us,
+        return replace(
+            self,
+            max_drift=max_drift,
+            _blocks=blocks,
+            _fit=line,
+            _last_us=device_us,
+            _delayed_count=0,
             _step_us=step_us,
             _step_until_us=step_until_us,
             _edge_step_us=edge_us,

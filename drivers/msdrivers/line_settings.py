@@ -56,11 +56,9 @@ class CanSettings:
     bitrate: int = 0
 
     def __post_init__(self) -> None:
-        why = find_interface_problem(self.interface)
-        if why:
+        if why := find_interface_problem(self.interface):
             raise ValueError(f"interface {why}")
-        why = find_channel_problem(self.can, self.interface)
-        if why:
+        if why := find_channel_problem(self.can, self.interface):
             raise ValueError(f"can {why}")
         if not 0 <= self.bitrate <= 10_000_000:
             raise ValueError(f"bitrate is 0 (set up already) to 10000000 bits a second, got {self.bitrate}")
@@ -125,17 +123,19 @@ def find_interface_problem(interface: str) -> str:
 
 def find_channel_problem(channel: str, interface: str) -> str:
     """Return why a CAN interface cannot have a channel; empty where it can, or nothing is known of its channels."""
+    try:
+        split_group(channel)
+        why = ""
+    except ValueError as error:
+        why = str(error)
     if interface == MULTICAST:
-        try:
-            split_group(channel)
-        except ValueError as error:
-            return str(error)
-    elif interface != "socketcan":
+        return why
+    if interface != "socketcan":
         return "" if channel else "is the channel as the interface names it, got nothing"
-    elif _is_group(channel):
+    if not why:
         fix = f"add interface: {MULTICAST}, or to modelserver emulate --interface {MULTICAST}"
         return f"{quote(channel)} is a group of IP multicast; {fix}"
-    elif not 0 < len(channel) <= MAX_INTERFACE_NAME or not channel.isprintable() or set(channel) & set("/: "):
+    if not 0 < len(channel) <= MAX_INTERFACE_NAME or not channel.isprintable() or set(channel) & set("/: "):
         return f"is the name of a network interface, e.g. can0, got {quote(channel)}"
     return ""
 
@@ -155,11 +155,3 @@ def split_group(channel: str) -> tuple[str, int]:
 
 _GROUP_PORT = re.compile(r"(?:\[([^\]]+)\]|([^:\[\]]+))(?::([0-9]{1,5}))?")
 """IPv6 in brackets, or a group without a colon; an IPv6 group alone has none of either."""
-
-
-def _is_group(channel: str) -> bool:
-    try:
-        split_group(channel)
-    except ValueError:
-        return False
-    return True

@@ -183,25 +183,12 @@ _CAN_FAULTS = {**FAULT_AMOUNTS, "jump": "counts by which counters jump", "bus_of
 _BYTE_LINES: tuple[type[LineSettings], ...] = (SerialSettings, TcpSettings)
 
 _KINDS = (
-    DeviceKind(
-        "novatel",
-        "NovAtel OEM4 and heirs",
-        GpsSample,
-        _BYTE_LINES,
-        _load_gps,
-        _make_gps_emulator,
-        9600,
-        presets={"protocol": "novatel"},
-    ),
-    DeviceKind(
-        "nmea",
-        "receiver that speaks NMEA 0183",
-        GpsSample,
-        _BYTE_LINES,
-        _load_gps,
-        _make_gps_emulator,
-        4800,
-        presets={"protocol": "nmea"},
+    *(
+        DeviceKind(name, text, GpsSample, _BYTE_LINES, _load_gps, _make_gps_emulator, baud, presets={"protocol": name})
+        for name, text, baud in (
+            ("novatel", "NovAtel OEM4 and heirs", 9600),
+            ("nmea", "receiver that speaks NMEA 0183", 4800),
+        )
     ),
     DeviceKind(
         "gx1",

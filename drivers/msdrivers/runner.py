@@ -198,10 +198,7 @@ class Runner(Generic[U]):
             self.counts["commands_dropped"] += 1
             return
         now = self._time_source.now()
-        try:
-            self._execute(self._call_endpoint("on_command", lambda: call(endpoint, now)))
-        except LinkError as error:
-            self._on_link_error(error)
+        self._execute_guarded("on_command", lambda: call(endpoint, now))
 
     def run_once(self) -> None:
         """Make one pass: open the line or process its input, fire the endpoint's timer, report health."""
@@ -212,8 +209,7 @@ class Runner(Generic[U]):
                 self._transfer()
             except EndOfRecordingError as error:
                 self._close_reason = error.reason
-                self._link.close()
-                self._is_open = self._reporter.is_silent = False
+                self._close_line()
                 self.stop()
             except LinkError as error:
                 self._on_link_error(error)
@@ -236,13 +232,16 @@ class Runner(Generic[U]):
         self._received_ns = now.monotonic_ns
         self._backoff.on_open(now.monotonic_ns)
         self._set_status(DriverPhase.WAITING, f"{self._link.description} is open")
+        self._execute_guarded("on_open", lambda: self._endpoint.on_open(now))
+
+    def _execute_guarded(self, what: str, call: Callable[[], Sequence[Output[U]]]) -> None:
         try:
-            self._execute(self._call_endpoint("on_open", lambda: self._endpoint.on_open(now)))
+            self._execute(self._call_endpoint(what, call))
         except LinkError as error:
             self._on_link_error(error)
 
     def _on_link_error(self, error: LinkError) -> None:
-        self._close(str(error), lambda at_ns: self._backoff.on_lost(at_ns))
+        self._close(str(error), self._backoff.on_lost)
 
     def _reopen(self, request: Reopen) -> None:
         changes_baud = request.baud is not None and request.baud != self._link.baud
@@ -258,14 +257,17 @@ class Runner(Generic[U]):
 
     def _close(self, reason: str, wait: Callable[[int], float]) -> None:
         """Close the line and schedule its reopening after `wait(now)` seconds."""
-        self._link.close()
-        self._is_open = self._reporter.is_silent = False
+        self._close_line()
         at_ns = self._time_source.now().monotonic_ns
         self._open_ns = at_ns + round(wait(at_ns) * 1e9)
         self._reporter.set_status(
             DriverPhase.CLOSED, reason, self._time_source.now(), suffix=self._backoff.describe_failures(at_ns)
         )
         self._reporter.set_stable(False)
+
+    def _close_line(self) -> None:
+        self._link.close()
+        self._is_open = self._reporter.is_silent = False
 
     def _transfer(self) -> None:
         due = self._endpoint.get_deadline()
@@ -368,6 +370,5 @@ class Runner(Generic[U]):
                 self._execute(self._call_endpoint("on_close", lambda: self._endpoint.on_close(now)))
             except LinkError as error:
                 log.warning("%s: the device's state could not be restored: %s", self._settings.source, error)
-            self._link.close()
-            self._is_open = self._reporter.is_silent = False
+            self._close_line()
         self._set_status(DriverPhase.CLOSED, self._close_reason)
