@@ -12,7 +12,8 @@ from benchmarks.support import print_verdict
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
 from msdrivers.emulate.gx1_unit import Eeprom
 from msdrivers.endpoint import HostTime, MeasuredSample, Send
-from msdrivers.protocol.gx1 import MEASUREMENTS, CommandByte, Gx1Packet, Gx1Parser, RequestParser
+from msdrivers.protocol.gx1 import MEASUREMENTS, CommandByte, Gx1Packet, Gx1Parser
+from msdrivers.protocol.gx1.requests import RequestParser
 
 REPLIES = 50_000
 ROUNDS = 3

@@ -26,9 +26,8 @@ from msdrivers.protocol.novatel import (
     TimeStatus,
     UtmPosition,
     Velocity,
-    encode,
 )
-from msdrivers.protocol.novatel.frames import crc32
+from msdrivers.protocol.novatel.frames import crc32, encode
 
 MAX_PENDING = 1024
 ALL = (*gps_logs.NMEA, *(f"{log}{letter}" for log in gps_logs.NOVATEL for letter in "ab"))

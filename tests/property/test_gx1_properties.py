@@ -11,8 +11,8 @@ from support_gx1 import Line, RepeatingDevice, rotating_samples
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
 from msdrivers.emulate.gx1 import Gx1Emulator
 from msdrivers.endpoint import MeasuredSample
-from msdrivers.protocol.gx1 import LAYOUTS, MEASUREMENTS, Gx1Packet, Gx1Parser, RequestParser, TickUnwrapper
-from msdrivers.protocol.gx1.packets import decode_packet
+from msdrivers.protocol.gx1 import LAYOUTS, MEASUREMENTS, Gx1Packet, Gx1Parser, TickUnwrapper, decode_packet
+from msdrivers.protocol.gx1.requests import RequestParser
 
 words = st.integers(-32768, 32767)
 

@@ -11,6 +11,7 @@ from msdrivers.protocol import gps_time
 from msdrivers.protocol.nmea import encode as nmea
 from msdrivers.protocol.nmea.fields import KMH, KNOT
 from msdrivers.protocol.novatel import (
+    Body,
     HeadingLog,
     LogHeader,
     NovatelLog,
@@ -19,9 +20,8 @@ from msdrivers.protocol.novatel import (
     SolutionStatus,
     TimeStatus,
     Velocity,
-    encode,
 )
-from msdrivers.protocol.novatel.logs import Body
+from msdrivers.protocol.novatel.frames import encode
 
 _FIXES = {
     FixType.NONE: (PositionType.NONE, "0", "N"),

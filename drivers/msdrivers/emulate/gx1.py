@@ -17,7 +17,8 @@ from modelserver.transforms.so3 import Quaternion, Vector3
 from msdrivers.emulate.faults import FaultQueue, InjectedFault
 from msdrivers.emulate.gx1_unit import GAINS, Eeprom, Gx1Unit, UnitClock
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Send
-from msdrivers.protocol.gx1 import MEASUREMENTS, CommandByte, EepromAddress, Gains, Gx1Packet, Gx1Request, RequestParser
+from msdrivers.protocol.gx1 import MEASUREMENTS, CommandByte, EepromAddress, Gains, Gx1Packet
+from msdrivers.protocol.gx1.requests import Gx1Request, RequestParser
 from msdrivers.protocol.gx1.scaling import (
     G0,
     MAX_WORD,

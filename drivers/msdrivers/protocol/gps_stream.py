@@ -6,15 +6,8 @@ from typing import Any, TypeAlias
 
 from msdrivers.protocol.framing import FrameScanner
 from msdrivers.protocol.nmea import EpochAssembler, NmeaEpoch, NmeaSentence, SentenceFormat
-from msdrivers.protocol.novatel import (
-    AsciiFormat,
-    BinaryFormat,
-    CommandResponse,
-    NovatelLog,
-    Prompt,
-    PromptFormat,
-    TextFormat,
-)
+from msdrivers.protocol.novatel import CommandResponse, NovatelLog, Prompt
+from msdrivers.protocol.novatel.frames import AsciiFormat, BinaryFormat, PromptFormat, TextFormat
 
 GpsMessage: TypeAlias = NmeaEpoch | NovatelLog | CommandResponse | Prompt
 """Each has `start`: offset of its first byte in the stream, to find its receive time."""

@@ -24,9 +24,8 @@ from msdrivers.protocol.novatel import (
     Position,
     PositionType,
     TimeStatus,
-    encode,
 )
-from msdrivers.protocol.novatel.frames import crc32
+from msdrivers.protocol.novatel.frames import crc32, encode
 
 NMEA_UNIT = GpsUnit(
     saved=tuple(f"log com1 {name} ontime 0.25" for name in ("gpgga", "gpgsa", "gpgst", "gprmc")), is_answering=False

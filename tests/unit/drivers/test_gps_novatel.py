@@ -18,9 +18,8 @@ from msdrivers.protocol.novatel import (
     SolutionStatus,
     TimeStatus,
     Velocity,
-    encode,
 )
-from msdrivers.protocol.novatel.frames import crc32
+from msdrivers.protocol.novatel.frames import crc32, encode
 
 BESTPOSB = bytes.fromhex(
     "aa44121c2a0000204800000096b45608f0c7331e20000402f6b100800000000010000000d34bee8b419349405c017abff6815cc0"

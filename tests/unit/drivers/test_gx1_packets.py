@@ -14,12 +14,12 @@ from msdrivers.protocol.gx1 import (
     CommandByte,
     Gx1Packet,
     Gx1Parser,
-    Gx1Request,
-    RequestParser,
+    append_checksum,
+    compute_checksum,
     requests,
     scaling,
 )
-from msdrivers.protocol.gx1.packets import append_checksum, compute_checksum
+from msdrivers.protocol.gx1.requests import Gx1Request, RequestParser
 
 
 def only(data: bytes) -> Gx1Packet:

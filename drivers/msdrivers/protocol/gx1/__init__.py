@@ -1,21 +1,338 @@
-"""The serial protocol of the MicroStrain 3DM-GX1, from both sides. Pure."""
+"""The serial protocol of the MicroStrain 3DM-GX1, from both sides: replies, their parser, the timer's ticks. Pure.
 
-from msdrivers.protocol.gx1.packets import LAYOUTS, LENGTHS, MEASUREMENTS, CommandByte, Gx1Packet
-from msdrivers.protocol.gx1.parser import Gx1Parser
-from msdrivers.protocol.gx1.requests import Gx1Request, RequestParser
-from msdrivers.protocol.gx1.scaling import EepromAddress, Gains
-from msdrivers.protocol.gx1.ticks import TickUnwrapper
+A reply is the echo of the command byte, big-endian 16-bit words, mostly the timer ticks, and a checksum: the first byte
+plus every 16-bit word after it, modulo 65536. There is no sync byte, so random bytes pass for a reply one time in
+65,536. A reply therefore counts only if its command is streamed or expected, its checksum is right and the validator
+accepts it; else one byte is skipped and the search continues. At most 30 bytes are buffered.
 
-__all__ = [
-    "LAYOUTS",
-    "LENGTHS",
-    "MEASUREMENTS",
-    "CommandByte",
-    "EepromAddress",
-    "Gains",
-    "Gx1Packet",
-    "Gx1Parser",
-    "Gx1Request",
-    "RequestParser",
-    "TickUnwrapper",
-]
+The 16-bit ticks are unwrapped, and reject byte sequences that only look like a reply: they are plausible if they are
+ahead of the previous ones by no more than the elapsed time (plus 0.5 s). They may be ahead by less: replies that a busy
+host reads late arrive all at once. Three consecutive implausible replies that agree with each other mean that the
+counter has jumped. Source: MicroStrain, "3DM-GX1 Data Communications Protocol", and public drivers that follow it.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections import Counter
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+
+def compute_checksum(body: bytes) -> int:
+    """Return the checksum of a reply without its last word: a command byte and big-endian 16-bit words.
+
+    Raises ValueError for a body of even length.
+    """
+    if len(body) % 2 == 0:
+        raise ValueError(f"a reply is a byte and whole words before its checksum, got {len(body)} bytes")
+    words: tuple[int, ...] = struct.unpack(f">B{len(body) // 2}H", body)
+    return sum(words) & 0xFFFF
+
+
+def append_checksum(body: bytes) -> bytes:
+    """Return the reply with its checksum behind it."""
+    return body + compute_checksum(body).to_bytes(2, "big")
+
+
+class CommandByte(IntEnum):
+    """The command byte of a request, and of the reply to it."""
+
+    STABILIZED_VECTORS = 0x02
+    INSTANTANEOUS_VECTORS = 0x03
+    CAPTURE_BIAS = 0x06
+    TEMPERATURE = 0x07
+    QUATERNION_VECTORS = 0x0C
+    INSTANTANEOUS_EULER = 0x0D
+    STABILIZED_EULER = 0x0E
+    CONTINUOUS = 0x10
+    READ_EEPROM = 0x28
+    WRITE_EEPROM = 0x29
+    EULER_VECTORS = 0x31
+    HARD_IRON_START = 0x40
+    HARD_IRON_COLLECT = 0x41
+    HARD_IRON_COMPUTE = 0x42
+    FIRMWARE = 0xF0
+    SERIAL = 0xF1
+
+
+class ReplyLayout(NamedTuple):
+    """Content of a reply between the command byte and the checksum: fields with their numbers of words, ticks."""
+
+    fields: tuple[tuple[str, int], ...]
+    has_ticks: bool = True
+
+    @property
+    def words(self) -> int:
+        """Number of words in the fields."""
+        return sum(count for _, count in self.fields)
+
+    @property
+    def length(self) -> int:
+        """Length of the reply in bytes."""
+        return 1 + 2 * self.words + 2 * self.has_ticks + 2
+
+
+_VECTORS = (("field", 3), ("acceleration", 3), ("rate", 3))
+
+LAYOUTS: dict[int, ReplyLayout] = {
+    CommandByte.STABILIZED_VECTORS: ReplyLayout(_VECTORS),
+    CommandByte.INSTANTANEOUS_VECTORS: ReplyLayout(_VECTORS),
+    CommandByte.CAPTURE_BIAS: ReplyLayout(()),
+    CommandByte.TEMPERATURE: ReplyLayout((("temperature", 1),)),
+    CommandByte.QUATERNION_VECTORS: ReplyLayout((("quaternion", 4), *_VECTORS)),
+    CommandByte.INSTANTANEOUS_EULER: ReplyLayout((("euler", 3),)),
+    CommandByte.STABILIZED_EULER: ReplyLayout((("euler", 3),)),
+    # a zero byte and the streamed command; the second word is zero or the ticks, sources differ: not read as ticks
+    CommandByte.CONTINUOUS: ReplyLayout((("streamed", 1), ("unsettled", 1)), has_ticks=False),
+    CommandByte.READ_EEPROM: ReplyLayout((("value", 1),)),
+    CommandByte.WRITE_EEPROM: ReplyLayout((("value", 1),)),
+    CommandByte.EULER_VECTORS: ReplyLayout((("euler", 3), ("acceleration", 3), ("rate", 3))),
+    CommandByte.HARD_IRON_START: ReplyLayout(()),
+    CommandByte.HARD_IRON_COLLECT: ReplyLayout((("field", 3), ("minimum", 3), ("maximum", 3))),
+    CommandByte.HARD_IRON_COMPUTE: ReplyLayout((("offset", 3),)),
+    CommandByte.FIRMWARE: ReplyLayout((("version", 1),), has_ticks=False),
+    CommandByte.SERIAL: ReplyLayout((("serial", 1),), has_ticks=False),
+}
+
+LENGTHS: dict[int, int] = {command: layout.length for command, layout in LAYOUTS.items()}
+
+MEASUREMENTS = frozenset(
+    {
+        CommandByte.STABILIZED_VECTORS,
+        CommandByte.INSTANTANEOUS_VECTORS,
+        CommandByte.QUATERNION_VECTORS,
+        CommandByte.INSTANTANEOUS_EULER,
+        CommandByte.STABILIZED_EULER,
+        CommandByte.EULER_VECTORS,
+    }
+)
+"""Measurements: what may be streamed."""
+
+_SLICES: dict[int, dict[str, slice]] = {}
+for _command, _layout in LAYOUTS.items():
+    _at = 0
+    _SLICES[_command] = {}
+    for _name, _count in _layout.fields:
+        _SLICES[_command][_name] = slice(_at, _at + _count)
+        _at += _count
+
+_STRUCTS = {command: struct.Struct(f">{layout.words}h") for command, layout in LAYOUTS.items()}
+_UNSIGNED = {command: struct.Struct(f">B{(length - 3) // 2}HH") for command, length in LENGTHS.items()}
+
+
+class Gx1Packet(NamedTuple):
+    """A reply: its command, its words as signed numbers, and the timer's ticks, 0..65535, or None without."""
+
+    command: int
+    words: tuple[int, ...]
+    ticks: int | None = None
+
+    def field(self, name: str) -> tuple[int, ...]:
+        """Return the words of a field of its layout, signed; KeyError for a field that it does not have."""
+        return self.words[_SLICES[self.command][name]]
+
+    def has(self, name: str) -> bool:
+        """Return whether its layout has the field."""
+        return name in _SLICES[self.command]
+
+    @property
+    def unsigned(self) -> int:
+        """The first word as a number 0..65535: temperature, EEPROM value, version, serial number."""
+        return self.words[0] & 0xFFFF
+
+    def to_bytes(self) -> bytes:
+        """Encode the reply. Raises ValueError for words that do not match its layout."""
+        layout = LAYOUTS[self.command]
+        if len(self.words) != layout.words or (self.ticks is None) == layout.has_ticks:
+            raise ValueError(f"a reply 0x{self.command:02x} has {layout.words} words, ticks: {layout.has_ticks}")
+        words: Sequence[int] = self.words if self.ticks is None else (*self.words, self.ticks)
+        return append_checksum(struct.pack(f">B{len(words)}H", self.command, *(word & 0xFFFF for word in words)))
+
+
+def decode_packet(data: bytes | bytearray, at: int, command: int) -> Gx1Packet | None:
+    """Return the reply that begins at `at`, whose first byte is `command`; None if its checksum is wrong.
+
+    The whole reply must be there: `LENGTHS[command]` bytes.
+    """
+    unsigned = _UNSIGNED[command].unpack_from(data, at)
+    if (sum(unsigned) - 2 * unsigned[-1]) & 0xFFFF:
+        return None
+    words = _STRUCTS[command].unpack_from(data, at + 1)
+    return Gx1Packet(command, words, unsigned[-2] if LAYOUTS[command].has_ticks else None)
+
+
+class EepromAddress:
+    """Even addresses of the EEPROM's words."""
+
+    GYRO_GAIN = 130
+    HARD_IRON = (172, 174, 176)
+    ACCELEROMETER_GAIN = 230
+    MAGNETOMETER_GAIN = 232
+    GAINS = (GYRO_GAIN, ACCELEROMETER_GAIN, MAGNETOMETER_GAIN)
+    TIMER = (238, 240, 242, 246)
+
+
+class Gains(NamedTuple):
+    """The gain words of gyros, accelerometers and magnetometers."""
+
+    gyro: int
+    accelerometer: int
+    magnetometer: int
+
+
+ReplyValidator = Callable[[Gx1Packet], str]
+"""Returns the reason to reject a reply with a valid checksum; empty to accept it."""
+
+
+class Gx1Parser:
+    """Finds the expected replies in a stream of bytes; see the module."""
+
+    def __init__(self, judge: ReplyValidator = lambda _: ""):
+        self._validate = judge
+        self._buffer = bytearray()
+        self._streamed: frozenset[int] = frozenset()
+        self._expected: Counter[int] = Counter()
+        self._update_pattern()
+        self.counts: Counter[str] = Counter()
+        """`skipped` bytes outside of replies, and `rejected.<reason>`."""
+
+    def set_streamed(self, *commands: int) -> None:
+        """Set the commands whose replies are accepted without a request."""
+        self._streamed = frozenset(commands)
+        self._update_pattern()
+
+    def expect(self, command: int) -> None:
+        """Accept one more reply to a command."""
+        self._expected[command] += 1
+        self._update_pattern()
+
+    def cancel(self, command: int) -> None:
+        """Expect no more replies to a command."""
+        self._expected.pop(command, None)
+        self._update_pattern()
+
+    def clear(self) -> None:
+        """Discard buffered bytes and expectations."""
+        self.counts["skipped"] += len(self._buffer)
+        self._buffer.clear()
+        self._expected.clear()
+        self.set_streamed()
+
+    def feed(self, data: bytes) -> list[Gx1Packet]:
+        """Return the replies that `data` completes, in order."""
+        buffer = self._buffer
+        buffer += data
+        found: list[Gx1Packet] = []
+        at = 0
+        while True:
+            match = self._start_pattern.search(buffer, at)
+            begin = len(buffer) if match is None else match.start()
+            self.counts["skipped"] += begin - at
+            at = begin
+            if match is None:
+                break
+            command = buffer[at]
+            if at + LENGTHS[command] > len(buffer):
+                break
+            packet = decode_packet(buffer, at, command)
+            reason = "checksum" if packet is None else self._validate(packet)
+            if packet is None or reason:
+                self.counts[f"rejected.{reason}"] += 1
+                self.counts["skipped"] += 1
+                at += 1
+                continue
+            at += LENGTHS[command]
+            found.append(packet)
+            if command not in self._streamed:
+                self._expected -= Counter((command,))
+                self._update_pattern()
+        # a match object locks the buffer against resizing
+        del match
+        del buffer[:at]
+        return found
+
+    def _update_pattern(self) -> None:
+        """Match the first byte of a reply; nothing where none is expected."""
+        first = re.escape(bytes(sorted(self._streamed | self._expected.keys())))
+        self._start_pattern = re.compile(b"[" + first + b"]" if first else b"(?!)")
+
+
+COUNTER_RANGE = 65536
+"""Ticks until the counter wraps."""
+
+SLACK_NS = 500_000_000
+"""Tolerance: the previous reply may have been read this much late."""
+
+MIN_TICK_S = 0.005
+"""Shortest possible tick, used while its length is unknown."""
+
+MAX_POLL_LAG = 2
+"""Ticks by which a polled reply may be behind a streamed one that was sent before it."""
+
+MIN_AGREEING = 3
+"""Consecutive replies that agree with each other but not with the previous ones: the counter has jumped."""
+
+
+class TickUnwrapper:
+    """Unwraps ticks and checks their plausibility. Instants are the host's monotonic nanoseconds.
+
+    The unwrapped count starts above zero, goes back by at most `MAX_POLL_LAG`, and advances by more than
+    `COUNTER_RANGE` when the counter has jumped or `reset` was called.
+    """
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+        self._at_ns = 0
+        self._candidate: tuple[int, int] = (0, 0)
+        self._agreeing_count = 0
+        self._count = COUNTER_RANGE
+        self._ticks_per_ns = 1e-9 / MIN_TICK_S
+        self.has_jumped = False
+        """The counter has jumped since `reset`."""
+
+    def set_tick(self, tick_s: float) -> None:
+        """Set the length of a tick; the device's clock and the host's may differ by 5 %."""
+        self._ticks_per_ns = 1.05e-9 / tick_s
+
+    def reset(self) -> None:
+        """Accept any next count: the device may have restarted."""
+        self._last = None
+        self._agreeing_count = 0
+        self._count = (self._count // COUNTER_RANGE + 2) * COUNTER_RANGE
+        self.has_jumped = False
+
+    def unwrap(self, ticks: int, at_ns: int, streamed: bool) -> int | None:
+        """Return the unwrapped ticks of a reply; None if they are implausible."""
+        if self._last is None:
+            return self._restart(ticks, at_ns)
+        ahead = (ticks - self._last) % COUNTER_RANGE
+        if ahead <= self._max_advance(at_ns - self._at_ns):
+            self._count += ahead
+            self._last, self._at_ns = ticks, at_ns
+            self._agreeing_count = 0
+            return self._count
+        if not streamed and COUNTER_RANGE - ahead <= MAX_POLL_LAG:
+            return self._count - (COUNTER_RANGE - ahead)
+        return self._on_outlier(ticks, at_ns)
+
+    def _max_advance(self, elapsed_ns: int) -> float:
+        return (elapsed_ns + SLACK_NS) * self._ticks_per_ns + 1.0
+
+    def _restart(self, ticks: int, at_ns: int) -> int:
+        self._last, self._at_ns, self._agreeing_count = ticks, at_ns, 0
+        self._count = self._count // COUNTER_RANGE * COUNTER_RANGE + ticks
+        return self._count
+
+    def _on_outlier(self, ticks: int, at_ns: int) -> int | None:
+        before, since_ns = self._candidate
+        agrees = self._agreeing_count > 0 and (ticks - before) % COUNTER_RANGE <= self._max_advance(at_ns - since_ns)
+        self._agreeing_count = self._agreeing_count + 1 if agrees else 1
+        self._candidate = (ticks, at_ns)
+        if self._agreeing_count < MIN_AGREEING:
+            return None
+        self.reset()
+        self.has_jumped = True
+        return self._restart(ticks, at_ns)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from msdrivers.protocol.gx1.packets import LAYOUTS, CommandByte
+from msdrivers.protocol.gx1 import LAYOUTS, CommandByte
 
 LAST_ADDRESS = 254
 

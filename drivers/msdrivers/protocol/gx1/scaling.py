@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import NamedTuple
 
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
@@ -26,25 +25,6 @@ MIN_WORD, MAX_WORD = -32768, 32767
 
 QUARTER_TURN = 16384
 """A right angle in words of Euler angles."""
-
-
-class EepromAddress:
-    """Even addresses of the EEPROM's words."""
-
-    GYRO_GAIN = 130
-    HARD_IRON = (172, 174, 176)
-    ACCELEROMETER_GAIN = 230
-    MAGNETOMETER_GAIN = 232
-    GAINS = (GYRO_GAIN, ACCELEROMETER_GAIN, MAGNETOMETER_GAIN)
-    TIMER = (238, 240, 242, 246)
-
-
-class Gains(NamedTuple):
-    """The gain words of gyros, accelerometers and magnetometers."""
-
-    gyro: int
-    accelerometer: int
-    magnetometer: int
 
 
 def vector_from_words(words: Iterable[int], gain: int, unit: float = 1.0) -> Vector3:

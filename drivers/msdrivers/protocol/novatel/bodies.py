@@ -13,7 +13,7 @@ from operator import itemgetter
 from struct import Struct
 from typing import Any, NamedTuple
 
-from msdrivers.protocol.novatel.logs import (
+from msdrivers.protocol.novatel import (
     DATUMS,
     Body,
     HeadingLog,

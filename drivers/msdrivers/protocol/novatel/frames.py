@@ -8,12 +8,19 @@ from __future__ import annotations
 import csv
 import re
 import zlib
-from dataclasses import dataclass
 from struct import Struct
 
 from msdrivers.protocol.framing import NO_FRAME, ParsedFrame, RejectedFrame
+from msdrivers.protocol.novatel import (
+    MAX_ANTENNA,
+    MESSAGE_IDS,
+    CommandResponse,
+    LogHeader,
+    NovatelLog,
+    Prompt,
+    TimeStatus,
+)
 from msdrivers.protocol.novatel.bodies import BODIES, parse_integer
-from msdrivers.protocol.novatel.logs import MAX_ANTENNA, MESSAGE_IDS, LogHeader, NovatelLog, TimeStatus
 
 MAX_LOG_BYTES = 1024
 """Bytes of a log. Longer ones (raw observations) are not read here; a broken length must not swallow good logs."""
@@ -68,27 +75,6 @@ def encode(log: NovatelLog) -> bytes:
         f"{','.join(layout.format(body))}"
     )
     return f"#{text}*{crc32(text.encode('ascii')):08x}\r\n".encode("ascii")
-
-
-@dataclass(frozen=True, slots=True)
-class CommandResponse:
-    """Response to a command. error: its text, empty for `<OK`."""
-
-    start: int
-    error: str = ""
-
-    @property
-    def is_ok(self) -> bool:
-        """Whether the command was accepted."""
-        return not self.error
-
-
-@dataclass(frozen=True, slots=True)
-class Prompt:
-    """`[COM1]`: follows every answer, and greets after the receiver has started."""
-
-    start: int
-    port: str
 
 
 class BinaryFormat:
