@@ -296,7 +296,6 @@ class _BotFramesReader(ElementReader):
             self.add_to_model(top, blocks[0])
 
     def read_root(self, blocks: list[ParamBlock]) -> str | None:
-        """Return the name of the root frame."""
         at = self.enter(blocks[0].line, "coordinate_frames")
         named = []
         for name, value in (entry for block in blocks for entry in block.values()):
@@ -321,7 +320,6 @@ class _BotFramesReader(ElementReader):
         return not fault
 
     def read_frame(self, name: str, block: ParamBlock, top: str) -> None:
-        """Read one frame."""
         place = f"frame {label(name)}"
         at = self.enter(block.line, place)
         if (name == top and not block.entries) or not self.is_valid_name(name, at):

@@ -67,7 +67,6 @@ class _MiroReader(ElementReader):
         return NamedParameters(element, known, self.builder, self.file, place)
 
     def read_body(self, element: Element) -> None:
-        """Read a body with its frames."""
         place = f"body {label(_get_value(element, 'BodyName'))}"
         parts = self.enter(element, (*_BODY_KEYS, *self.find_misnamed_lists(element, place)), place)
         body = self.builder.add_body(
@@ -91,7 +90,6 @@ class _MiroReader(ElementReader):
         return found
 
     def read_frames(self, element: Element, body: BodyBuilder, body_place: str) -> None:
-        """Read the frames of a body's list."""
         for child in iterate_children(element):
             name = _get_value(child, "FrameName")
             parts = self.enter(child, _FRAME_KEYS, f"{body_place}, frame {label(name)}")

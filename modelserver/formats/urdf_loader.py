@@ -209,7 +209,6 @@ class _UrdfReader:
         return [*tops, *(name for name in self.links if name in by_child)]
 
     def read_link(self, at: UrdfElement, materials: dict[str, Material]) -> BodyBuilder:
-        """Read a link as a body."""
         shapes: dict[str, list[Shape]] = {"visual": [], "collision": []}
         inertia = None
         for child in at.children():

@@ -157,7 +157,6 @@ class _UrdfWriter:
         self.joints.sort(key=lambda joint: order.get(joint.name, len(order)))
 
     def add_frame_links(self, body: str) -> None:
-        """Add links for the frames of a body."""
         mounts = {
             crossing.near_frame: crossing.constraint.name
             for crossing in self.crossings.values()
@@ -184,7 +183,6 @@ class _UrdfWriter:
         return "" if self.model.frame(crossing.far_frame).pose == Pose.identity() else crossing.far_frame
 
     def add_joint(self, body: str, crossing: Crossing) -> None:
-        """Add the joint on which a body is mounted."""
         each = crossing.constraint
         parent = crossing.near_body
         mount = self.model.frame(crossing.near_frame).pose

@@ -93,7 +93,6 @@ def _format_character(value: object) -> str:
 
 
 def _explain_syntax(error: yaml.MarkedYAMLError, text: str) -> tuple[str, str, int]:
-    """Return message, fix and line of a syntax error."""
     mark = error.problem_mark or error.context_mark
     number = mark.line + 1 if mark is not None else 0
     lines = text.split("\n")
@@ -115,25 +114,18 @@ class _NodeBuilder:
         """Open containers: node, its anchor, and for a mapping the key whose value is next."""
         events: Iterator[Any] = yaml.parse(text, Loader=_LOADER)
         for event in events:
-            kind = type(event)
+            kind, line = type(event), event.start_mark.line + 1
             if kind is yaml.ScalarEvent:
-                line = event.start_mark.line + 1
-                if event.tag is not None:
-                    self.reject_tag(event.tag, line)
+                self.check(event.tag, 1, line)
                 node = YamlNode(NodeKind.SCALAR, line, event.value, not event.style)
-                self.add_size(1, line)
                 if event.anchor:
                     self.anchors[event.anchor] = node
             elif kind is yaml.MappingStartEvent or kind is yaml.SequenceStartEvent:
-                line = event.start_mark.line + 1
-                self.reject_tag(event.tag, line)
+                self.check(event.tag, 1, line)
                 if len(open_nodes) >= MAX_DEPTH:
-                    raise SyntaxProblemError(
-                        f"the file nests deeper than {MAX_DEPTH} levels",
-                        line,
-                        "no geometry needs that; look for brackets that are not closed",
-                    )
-                self.add_size(1, line)
+                    message = f"the file nests deeper than {MAX_DEPTH} levels"
+                    fix = "no geometry needs that; look for brackets that are not closed"
+                    raise SyntaxProblemError(message, line, fix)
                 container = YamlNode(NodeKind.MAPPING if kind is yaml.MappingStartEvent else NodeKind.LIST, line)
                 open_nodes.append((container, event.anchor, None))
                 continue
@@ -142,11 +134,14 @@ class _NodeBuilder:
                 if anchor:
                     self.anchors[anchor] = node
             elif kind is yaml.AliasEvent:
-                node = self.resolve_alias(event.anchor, event.start_mark.line + 1)
+                if event.anchor not in self.anchors:
+                    message = f"alias *{event.anchor} has no complete anchor &{event.anchor} before it"
+                    raise SyntaxProblemError(message, line, "write the anchor first; a value cannot hold itself")
+                node = self.anchors[event.anchor]
+                self.check(None, node.size, line)
             elif kind is yaml.DocumentStartEvent and root is not None:
-                raise SyntaxProblemError(
-                    "a second document begins here", event.start_mark.line + 1, "keep one model in a file; remove ---"
-                )
+                fix = "keep one model in a file; remove ---"
+                raise SyntaxProblemError("a second document begins here", line, fix)
             else:
                 continue
             if not open_nodes:
@@ -163,30 +158,15 @@ class _NodeBuilder:
                 open_nodes[-1] = (parent, anchor, None)
         return root or YamlNode(NodeKind.SCALAR, 1, "", is_plain=True)
 
-    def add_size(self, size: int, line: int) -> None:
-        self.total += size
-        if self.total > MAX_NODES:
-            raise SyntaxProblemError(
-                f"the file, with its aliases expanded, holds more than {MAX_NODES} values",
-                line,
-                "split it, or use a template instead of aliases within aliases",
-            )
-
-    def resolve_alias(self, anchor: str, line: int) -> YamlNode:
-        node = self.anchors.get(anchor)
-        if node is None:
-            raise SyntaxProblemError(
-                f"alias *{anchor} has no complete anchor &{anchor} before it",
-                line,
-                "write the anchor first; a value cannot hold itself",
-            )
-        self.add_size(node.size, line)
-        return node
-
-    @staticmethod
-    def reject_tag(tag: str | None, line: int) -> None:
+    def check(self, tag: str | None, size: int, line: int) -> None:
+        """Reject a tag, and the node that makes the file too large."""
         if tag not in (None, "!"):
             raise SyntaxProblemError(f"the tag {tag} has no meaning here", line, "remove it")
+        self.total += size
+        if self.total > MAX_NODES:
+            message = f"the file, with its aliases expanded, holds more than {MAX_NODES} values"
+            fix = "split it, or use a template instead of aliases within aliases"
+            raise SyntaxProblemError(message, line, fix)
 
 
 class YamlMapping(ElementReader):

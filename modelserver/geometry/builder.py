@@ -230,12 +230,10 @@ class _ModelReview:
         self.problems.append(Problem(severity, message + removed, source, fix, nearest))
 
     def add_problem(self, severity: Severity, message: str, source: Location, fix: str = "") -> None:
-        """Report a problem that leaves the model usable."""
         self.problems.append(Problem(severity, message, source, fix))
 
     @property
     def has_errors(self) -> bool:
-        """Whether there is any error so far."""
         return any(problem.severity is Severity.ERROR for problem in self.problems)
 
     def _is_new_name(
@@ -413,7 +411,6 @@ def _frame_of(bodies: dict[str, Body], name: str) -> BodyFrame:
 
 
 def _describe_misclosure(found: loops.LoopMisclosure) -> str:
-    """Return the misclosure of a loop as text."""
     if found.is_exact:
         return "it closes exactly" + (", with joints at their defaults" if found.joints else "")
     joints = ", with joints at their defaults," if found.joints else ""

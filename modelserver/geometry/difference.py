@@ -56,7 +56,6 @@ def _list_additions(what: str, was: dict[str, T], now: dict[str, T]) -> list[str
 
 
 def _pair(was: dict[str, T], now: dict[str, T]) -> Iterator[tuple[str, T, T]]:
-    """Yield name, old and new value of what both have."""
     return ((name, was[name], each) for name, each in now.items() if name in was)
 
 

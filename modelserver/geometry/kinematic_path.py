@@ -77,15 +77,30 @@ class KinematicPath:
 
     __slots__ = ("_bases", "_covariance", "_edges", "is_in_loop", "joints", "last")
 
-    joints: tuple[PathJoint, ...]
-    last: Pose
-    is_in_loop: bool
-    _bases: Sequence[Pose | None]
-    _edges: tuple[Edge, ...] | Callable[[], tuple[Edge, ...]]
-    _covariance: PathCovariance | Callable[[], PathCovariance]
+    def __init__(
+        self,
+        joints: Sequence[PathJoint],
+        last: Pose,
+        bases: Sequence[Pose | None],
+        edges: Callable[[], tuple[Edge, ...]],
+        covariance: Callable[[], PathCovariance],
+        is_in_loop: bool = False,
+    ):
+        """Create a path from its parts; `from_edges` does from the edges of any path.
 
-    def __init__(self, edges: Sequence[Edge], is_in_loop: bool = False):
-        """Fold the edges of any path."""
+        `bases` holds for each rigid segment the pose of its base in its first frame, None for the identity; `edges` and
+        `covariance` are called when first needed.
+        """
+        self.is_in_loop = is_in_loop
+        self.joints = tuple(joints)
+        self.last = last
+        self._bases = bases
+        self._edges: tuple[Edge, ...] | Callable[[], tuple[Edge, ...]] = edges
+        self._covariance: PathCovariance | Callable[[], PathCovariance] = covariance
+
+    @classmethod
+    def from_edges(cls, edges: Sequence[Edge], is_in_loop: bool = False) -> Self:
+        """Return the path of some edges, folded."""
         joints: list[PathJoint] = []
         pose = Pose.identity()
         for edge in edges:
@@ -94,35 +109,8 @@ class KinematicPath:
                 pose = Pose.identity()
             else:
                 pose = pose @ edge.step
-        self.is_in_loop = is_in_loop
-        self.joints = tuple(joints)
-        self.last = pose
-        self._edges = tuple(edges)
-        self._bases = (None,) * (len(joints) + 1)
-        self._covariance = partial(PathCovariance.from_edges, self._edges)
-
-    @classmethod
-    def assemble(
-        cls,
-        joints: Sequence[PathJoint],
-        last: Pose,
-        bases: Sequence[Pose | None],
-        edges: Callable[[], tuple[Edge, ...]],
-        covariance: Callable[[], PathCovariance],
-    ) -> Self:
-        """Return a path from parts that are known already.
-
-        `bases` holds for each rigid segment the pose of its base in its first frame, None for the identity; `edges` and
-        `covariance` are called when first needed.
-        """
-        self = cls.__new__(cls)
-        self.is_in_loop = False
-        self.joints = tuple(joints)
-        self.last = last
-        self._bases = bases
-        self._edges = edges
-        self._covariance = covariance
-        return self
+        bases = (None,) * (len(joints) + 1)
+        return cls(joints, pose, bases, lambda: tuple(edges), partial(PathCovariance.from_edges, edges), is_in_loop)
 
     @property
     def edges(self) -> tuple[Edge, ...]:
@@ -389,7 +377,7 @@ class FrameTree:
                 X_LG = _IDENTITY
                 bases.append(None)
         last = interest.X_GN if X_LG is _IDENTITY else X_LG @ interest.X_GN
-        return KinematicPath.assemble(
+        return KinematicPath(
             joints, last, bases, partial(_collect_edges, up, down), partial(_build_covariance, up, down)
         )
 

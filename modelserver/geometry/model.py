@@ -24,8 +24,8 @@ from modelserver.errors import (
 )
 from modelserver.geometry import names
 from modelserver.geometry.joint import Coordinates, Joint
+from modelserver.geometry.joint_rules import resolve_mimics
 from modelserver.geometry.kinematic_path import FrameNode, FrameTree, KinematicPath
-from modelserver.geometry.mimic import resolve_mimics
 from modelserver.geometry.names import format_names
 from modelserver.geometry.parts import Body, BodyFrame, Constraint, Sigma
 from modelserver.geometry.topology import Crossing, Edge, Neighbor, Topology, full_name, list_edges
@@ -222,7 +222,7 @@ class Model:
             if interest.assembly in self._assemblies_with_loops:
                 path = self.find_path(frame_of_interest, frame_of_reference)
                 in_loop = any(crossing.constraint.name in self._in_loops for crossing in path)
-                found = KinematicPath(self.get_edges(path, frame_of_interest, frame_of_reference), in_loop)
+                found = KinematicPath.from_edges(self.get_edges(path, frame_of_interest, frame_of_reference), in_loop)
             else:
                 found = self._tree.build_path(interest, reference)
             if len(self._paths) >= PATH_CACHE_SIZE:
@@ -276,7 +276,7 @@ class Model:
 
         Joints are at their default positions. The covariance is that of the edges' sigmas, None where one is missing.
         """
-        folded = KinematicPath(self.get_edges(path, frame_of_interest, frame_of_reference))
+        folded = KinematicPath.from_edges(self.get_edges(path, frame_of_interest, frame_of_reference))
         positions = folded.default_positions
         links = folded.build_links(positions, [self._get_joint_sigma(joint.name) for joint in folded.joints])
         return Transformation(
@@ -325,7 +325,6 @@ class Model:
         return interest, reference
 
     def _compute(self, frame_of_interest: str, frame_of_reference: str) -> Transformation:
-        """Compute and cache the transformation of a pair of frames."""
         interest, reference = self._get_end_nodes(frame_of_interest, frame_of_reference)
         if interest.group is reference.group and interest.assembly not in self._assemblies_with_loops:
             return self._compute_rigid(frame_of_interest, frame_of_reference, interest, reference)

@@ -202,7 +202,6 @@ def _climb(reached: Mapping[str, Crossing], body: str) -> list[Crossing]:
 
 
 def _tree_path(reached: Mapping[str, Crossing], start: str, target: str) -> tuple[Crossing, ...]:
-    """Return the crossings from one body to another along a spanning tree."""
     rising, falling = _climb(reached, start), _climb(reached, target)
     while rising and falling and rising[-1] is falling[-1]:
         rising.pop()

@@ -127,7 +127,7 @@ def test_given_joints_that_err_then_a_routes_covariance_is_what_moving_each_does
     route = model.get_kinematic_path(*pair)
     positions = [data.draw(positions_of(leg.joint, 1.5)) for leg in route.joints]
     exact = [edge if edge.joint is not None else edge._replace(sigma=Sigma()) for edge in route.edges]
-    route = type(route)([edge._replace(leader="") for edge in exact])
+    route = type(route).from_edges([edge._replace(leader="") for edge in exact])
     X, wanted, step = route.compute_pose(positions), np.zeros((6, 6)), 1e-5
     for number, leg in enumerate(route.joints):
         for coordinate in range(leg.joint.count):

@@ -63,7 +63,7 @@ def test_given_any_model_and_positions_of_its_joints_then_the_covariance_is_that
     links = route.build_links(positions, sigmas)
     assert_same(route.compute_covariance(positions, sigmas), links)
     # the same edges, without the tree
-    again = KinematicPath(route.edges, route.is_in_loop)
+    again = KinematicPath.from_edges(route.edges, route.is_in_loop)
     assert again.compute_pose(positions).is_close(route.compute_pose(positions), 1e-10, 1e-10)
     assert_same(again.compute_covariance(positions, sigmas), links)
     rigid = model.rigid_transformation(*pair)

@@ -9,7 +9,7 @@ import pytest
 
 from modelserver.errors import GeometryError, Location, Severity
 from modelserver.geometry import Joint, JointType, Mimic, ModelBuilder
-from modelserver.geometry.mimic import JointDrive
+from modelserver.geometry.joint_rules import JointDrive
 from modelserver.transforms import Pose
 
 X = (1.0, 0.0, 0.0)
