@@ -403,25 +403,15 @@ def _innovation_panel(data: ReplayData, kind: str, n: int, found: Sequence[Decis
 
 # --- states -------------------------------------------------------------------------------------------------
 
-KNOWN_STATES: tuple[tuple[str, tuple[str, ...], str, float], ...] = (
-    ("Gyro bias", ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z"), "deg/s", math.degrees(1.0)),
-    (
-        "Accelerometer bias",
-        ("accelerometer_bias_x", "accelerometer_bias_y", "accelerometer_bias_z"),
-        "m/s²",
-        1.0,
-    ),
-    ("Wheel scale", ("wheel_scale",), "%", 100.0),
-    ("Wheel yaw: rolling direction to the left of the geometry's x", ("wheel_yaw",), "deg", math.degrees(1.0)),
-    ("Latency of fixes", ("gps_latency",), "s", 1.0),
-    (
-        "Time-correlated GNSS error, in units of sigma",
-        ("gps_wander_east", "gps_wander_north", "gps_wander_up"),
-        "sigma",
-        1.0,
-    ),
+KNOWN_STATES = (
+    ("Gyro bias", "gyro_bias", "deg/s", math.degrees(1.0)),
+    ("Accelerometer bias", "accelerometer_bias", "m/s²", 1.0),
+    ("Wheel scale", "wheel_scale", "%", 100.0),
+    ("Wheel yaw: rolling direction to the left of the geometry's x", "wheel_yaw", "deg", math.degrees(1.0)),
+    ("Latency of fixes", "gps_latency", "s", 1.0),
+    ("Time-correlated GNSS error, in units of sigma", "gps_wander", "sigma", 1.0),
 )
-"""Title, states, unit and conversion factor; other states are drawn as they are."""
+"""Title, begin of the names of the states, unit and conversion factor; other states are drawn as they are."""
 
 
 def _render_states(data: ReplayData) -> str:
@@ -429,14 +419,13 @@ def _render_states(data: ReplayData) -> str:
     if not states:
         return f"<p>The filter had no state: {_explain_no_decisions(data)}.</p>"
     names = list(dict.fromkeys(name for each in states for name in each.values))
-    core = ("position_", "velocity_", "attitude_")
-    listed = {name for _, group, _, _ in KNOWN_STATES for name in group}
-    own = tuple((name, (name,), "", 1.0) for name in names if name not in listed and not name.startswith(core))
+    listed = ("position_", "velocity_", "attitude_", *(begin for _, begin, _, _ in KNOWN_STATES))
+    own = [(name, name, "", 1.0) for name in names if not name.startswith(listed)]
     x = _time_axis(data)
     drawn = [
         _state_panel(x, states, title, present, unit, factor)
-        for title, group, unit, factor in (*KNOWN_STATES, *own)
-        if (present := [name for name in group if name in names])
+        for title, begin, unit, factor in (*KNOWN_STATES, *own)
+        if (present := [name for name in names if name.startswith(begin)])
     ]
     return _render_figure(
         charts.render_panels("States", x, drawn, _epochs(data)),
@@ -473,20 +462,12 @@ def _render_sensors(data: ReplayData) -> str:
     for sensor in data.sensors:
         gaps = sensor.find_gaps()
         ends = [sensor.times[0], *chain.from_iterable(gaps), sensor.times[-1]]
-        rows.append(
-            StripRow(sensor.name, [(a, b, "") for a, b in zip(ends[::2], ends[1::2], strict=True)], charts.GREEN)
-        )
-        longest = max((b - a for a, b in gaps), default=0.0)
-        table.append(
-            (
-                sensor.name,
-                str(len(sensor.times)),
-                f"{1.0 / sensor.period:.1f}" if sensor.period > 0.0 else "",
-                str(len(gaps)),
-                f"{longest:.2f}" if gaps else "",
-                f"{sum(b - a for a, b in gaps):.1f}" if gaps else "",
-            )
-        )
+        present = [(a, b, "") for a, b in zip(ends[::2], ends[1::2], strict=True)]
+        rows.append(StripRow(sensor.name, present, charts.GREEN))
+        lengths = [b - a for a, b in gaps]
+        rate = f"{1.0 / sensor.period:.1f}" if sensor.period > 0.0 else ""
+        of_gaps = (f"{max(lengths):.2f}", f"{sum(lengths):.1f}") if gaps else ("", "")
+        table.append((sensor.name, str(len(sensor.times)), rate, str(len(gaps)), *of_gaps))
     if data.frozen:
         rows.append(StripRow("IMU frozen", [(a, b, "repeats one sample") for a, b in data.frozen], charts.RED))
     if not rows:
