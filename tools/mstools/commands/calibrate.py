@@ -22,21 +22,19 @@ from mstools.calibration import imu_recording as calibrate_log
 from mstools.calibration import report as calibrate_report
 from mstools.calibration.imu_recording import ImuRecording
 from mstools.calibration.report import AxisNoise, ImuNoise
-from mstools.terminal.options import JsonOption
+from mstools.terminal.options import JsonOption, argument, option
 from mstools.terminal.output import check_writable, escape, format_count, write_file
 
 MIN_STATIONARY_S = 60.0
 """Shortest stationary range with a proposal, seconds: noise at 1 s averaging is then known to 10 %."""
 
-LogArgument = Annotated[Path, typer.Argument(metavar="LOG", help="LCM event log.")]
-ChannelOption = Annotated[str, typer.Option("--channel", metavar="NAME", help="The unit's channel.")]
-FromOption = Annotated[float, typer.Option("--from", metavar="S", help="Start here, seconds into the log.")]
-ToOption = Annotated[float, typer.Option("--to", metavar="S", help="End here: seconds into the log.")]
-PlotOption = Annotated[str, typer.Option("--plot", metavar="HTML", help="Write a plot to this file, for a browser.")]
-OutOption = Annotated[
-    str, typer.Option("-o", "--output", metavar="YAML", help="Write the proposal here, - for standard output.")
-]
-ForceOption = Annotated[bool, typer.Option("--force", help="Replace files that exist.")]
+LogArgument = Annotated[Path, argument("LOG", "LCM event log.")]
+ChannelOption = Annotated[str, option("--channel NAME", "The unit's channel.")]
+FromOption = Annotated[float, option("--from S", "Start here, seconds into the log.")]
+ToOption = Annotated[float, option("--to S", "End here: seconds into the log.")]
+PlotOption = Annotated[str, option("--plot HTML", "Write a plot to this file, for a browser.")]
+OutOption = Annotated[str, option("-o --output YAML", "Write the proposal here, - for standard output.")]
+ForceOption = Annotated[bool, option("--force", "Replace files that exist.")]
 
 command = typer.Typer(
     help="""Calibrate an IMU from a recording; docs/calibration.md explains how to record.
@@ -57,9 +55,7 @@ def imu(
     channel: ChannelOption = "IMU",
     begin: FromOption = 0.0,
     end: ToOption = math.inf,
-    config: Annotated[
-        Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file, to check the IMU's mount.")
-    ] = None,
+    config: Annotated[Path | None, option("--config -c FILE", "The vehicle file, to check the IMU's mount.")] = None,
     as_json: JsonOption = False,
     plot: PlotOption = "",
     output: OutOption = "",
@@ -110,14 +106,10 @@ def imu(
 def magnetometer(
     log: LogArgument,
     channel: ChannelOption = "IMU",
-    gps_channel: Annotated[
-        str, typer.Option("--gps-channel", metavar="NAME", help="The receiver's channel, for the location.")
-    ] = "GPS",
-    place: Annotated[
-        str, typer.Option("--place", metavar="LAT,LON", help="The location in degrees, for a log without fixes.")
-    ] = "",
+    gps_channel: Annotated[str, option("--gps-channel NAME", "The receiver's channel, for the location.")] = "GPS",
+    place: Annotated[str, option("--place LAT,LON", "The location in degrees, for a log without fixes.")] = "",
     all_axes: Annotated[
-        bool, typer.Option("--all-axes", help="The IMU was turned about all axes, not only on level ground.")
+        bool, option("--all-axes", "The IMU was turned about all axes, not only on level ground.")
     ] = False,
     begin: FromOption = 0.0,
     end: ToOption = math.inf,

@@ -16,7 +16,7 @@ from modelserver.files.regular import NotRegularFileError, read_start
 from modelserver.formats import check_file
 from modelserver.geometry.model import Model
 from mstools.commands.driver import find_driver_problems
-from mstools.terminal.options import JsonOption, Variables, parse_variables
+from mstools.terminal.options import JsonOption, Variables, argument, option, parse_variables
 from mstools.terminal.output import describe_size, escape, format_count, print_problem, to_json
 from mstools.terminal.problems import find_nearest_path
 
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
 def command(
     files: Annotated[
         list[str],
-        typer.Argument(metavar="FILE", help="Geometry files (YAML, Miro XML, URDF, libbot2 frames), or vehicle files."),
+        argument("FILE", "Geometry files (YAML, Miro XML, URDF, libbot2 frames), or vehicle files."),
     ],
     variables: Variables = None,
     as_json: JsonOption = False,
-    notes: Annotated[bool, typer.Option("--notes", help="Print notes too; they do not change the exit code.")] = False,
+    notes: Annotated[bool, option("--notes", "Print notes too; they do not change the exit code.")] = False,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Reject a second constraint at a frame, as the server of 2005 did.")
+        bool, option("--strict", "Reject a second constraint at a frame, as the server of 2005 did.")
     ] = False,
 ) -> None:
     """Report every problem of a geometry or vehicle file: severity, location, problem, and fix.

@@ -11,35 +11,30 @@ from modelserver.errors import ModelServerError, Severity
 from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
 from modelserver.files.regular import read_start
 from modelserver.formats import FORMATS, check_file, format_of_path, save_model
-from mstools.terminal.options import Variables, choose_name, parse_variables
+from mstools.terminal.options import Variables, argument, choose_name, option, parse_variables
 from mstools.terminal.output import check_writable, describe_size, escape, format_count, print_problem, write_file
 
 
 def command(
     source: Annotated[
         str,
-        typer.Argument(
-            metavar="IN", help="Geometry file: YAML, Miro XML, URDF or libbot2 frames; or Miro process configuration."
-        ),
+        argument("IN", "Geometry file: YAML, Miro XML, URDF or libbot2 frames; or Miro process configuration."),
     ],
-    target: Annotated[str, typer.Argument(metavar="OUT", help="File to write, or - for standard output.")],
+    target: Annotated[str, argument("OUT", "File to write, or - for standard output.")],
     output_format: Annotated[
         str,
-        typer.Option(
-            "--to",
-            metavar="FORMAT",
-            help=f"Format to write: {', '.join(FORMATS)}. Default: by the extension of OUT, "
+        option(
+            "--to FORMAT",
+            f"Format to write: {', '.join(FORMATS)}. Default: by the extension of OUT, "
             ".yaml, .yml, .urdf; .xml is miro.",
         ),
     ] = "",
     variables: Variables = None,
     repair: Annotated[
         bool,
-        typer.Option(
-            "--repair", help="Drop malformed elements, and bodies that no constraint connects to the first one."
-        ),
+        option("--repair", "Drop malformed elements, and bodies that no constraint connects to the first one."),
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace OUT where it exists.")] = False,
+    force: Annotated[bool, option("--force", "Replace OUT where it exists.")] = False,
 ) -> None:
     """Convert a geometry file to another format; unsupported features are listed on standard error.
 

@@ -19,6 +19,7 @@ from mstools.commands.listener import DaemonListener
 from mstools.demo.connections import DemoConnections, make_connections
 from mstools.demo.processes import MODELSERVER, ChildProcesses, DemoError
 from mstools.deployment.steps import get_examples_folder
+from mstools.terminal.options import option
 
 SEED = 20050901
 LEAD_SECONDS = 1.5
@@ -34,10 +35,8 @@ SETTLING_SECONDS = 2.0
 
 
 def command(
-    seconds: Annotated[
-        float, typer.Option("--seconds", metavar="S", min=7.0, max=600.0, help="Duration of the drive.")
-    ] = 10.0,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Show the logs of all processes.")] = False,
+    seconds: Annotated[float, option("--seconds S", "Duration of the drive.", min=7.0, max=600.0)] = 10.0,
+    verbose: Annotated[bool, option("--verbose", "Show the logs of all processes.")] = False,
 ) -> None:
     """Run the whole service on emulated devices and show its answers.
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from modelserver.errors import BusError, ConfigError
-from mstools.terminal.options import JsonOption, PrefixOption, UrlOption
+from mstools.terminal.options import JsonOption, PrefixOption, UrlOption, option
 from mstools.terminal.output import escape, format_count
 from mstools.terminal.problems import find_nearest_path
 
@@ -33,9 +33,7 @@ LEVEL_NAMES = ("ok", "note", "warning", "error")
 
 
 def command(
-    config: Annotated[
-        Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file; it is checked too.")
-    ] = None,
+    config: Annotated[Path | None, option("--config -c FILE", "The vehicle file; it is checked too.")] = None,
     url: UrlOption = "",
     prefix: PrefixOption = "",
     as_json: JsonOption = False,

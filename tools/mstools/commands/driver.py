@@ -23,7 +23,7 @@ from modelserver.errors import (
 )
 from modelserver.server.log import set_up_logging
 from mstools.commands.run import LEVELS, FormatOption, check_log_options
-from mstools.terminal.options import UrlOption
+from mstools.terminal.options import UrlOption, argument, option
 from mstools.terminal.output import escape, print_problem
 
 if TYPE_CHECKING:
@@ -85,31 +85,23 @@ COMMAND_POLL_S = 0.02
 
 
 def command(
-    name: Annotated[str, typer.Argument(metavar="[NAME]", help="Name of the driver in the vehicle file.")] = "",
-    config: Annotated[Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file.")] = None,
+    name: Annotated[str, argument("[NAME]", "Name of the driver in the vehicle file.")] = "",
+    config: Annotated[Path | None, option("--config -c FILE", "The vehicle file.")] = None,
     list_ports: Annotated[
-        bool, typer.Option("--list", help="List the ports and the drivers of the vehicle file, then exit.")
+        bool, option("--list", "List the ports and the drivers of the vehicle file, then exit.")
     ] = False,
-    record_raw: Annotated[
-        Path | None, typer.Option("--record-raw", metavar="FILE", help="Record the bytes of the connection.")
-    ] = None,
-    record_limit: Annotated[
-        float, typer.Option("--record-limit", metavar="MB", min=0.001, help="Largest size of the recording.")
-    ] = 1000.0,
-    play_raw: Annotated[
-        Path | None, typer.Option("--play-raw", metavar="FILE", help="Read a recording instead of the device.")
-    ] = None,
+    record_raw: Annotated[Path | None, option("--record-raw FILE", "Record the bytes of the connection.")] = None,
+    record_limit: Annotated[float, option("--record-limit MB", "Largest size of the recording.", min=0.001)] = 1000.0,
+    play_raw: Annotated[Path | None, option("--play-raw FILE", "Read a recording instead of the device.")] = None,
     hard_iron: Annotated[
-        bool, typer.Option("--hard-iron", help="Turn the vehicle: calibrate hard iron, store it in the device, exit.")
+        bool, option("--hard-iron", "Turn the vehicle: calibrate hard iron, store it in the device, exit.")
     ] = False,
-    seconds: Annotated[
-        float, typer.Option("--seconds", metavar="N", min=1.0, help="With --hard-iron: duration of turning.")
-    ] = 60.0,
+    seconds: Annotated[float, option("--seconds N", "With --hard-iron: duration of turning.", min=1.0)] = 60.0,
     all_axes: Annotated[
-        bool, typer.Option("--all-axes", help="With --hard-iron: turned about all axes, not on level ground.")
+        bool, option("--all-axes", "With --hard-iron: turned about all axes, not on level ground.")
     ] = False,
     url: UrlOption = "",
-    log_level: Annotated[str, typer.Option("--log-level", help=f"One of {', '.join(LEVELS)}.")] = "info",
+    log_level: Annotated[str, option("--log-level", f"One of {', '.join(LEVELS)}.")] = "info",
     log_format: FormatOption = "auto",
 ) -> None:
     """Run the driver of a device: publish its samples until SIGTERM or Ctrl-C.

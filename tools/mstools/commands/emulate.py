@@ -15,7 +15,7 @@ import typer
 
 from modelserver.errors import ModelServerError, quote
 from mstools.commands.driver import channels_of, load_driver, stop_on_signal
-from mstools.terminal.options import choose_name
+from mstools.terminal.options import argument, choose_name, option
 
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
@@ -156,45 +156,30 @@ SCENARIOS = ("eight", "circle", "stand", "straight", "city")
 
 
 def command(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the driver in the vehicle file.")],
-    config: Annotated[Path, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file.")],
-    pty: Annotated[bool, typer.Option("--pty", help="Create a pseudo-terminal and print its path.")] = False,
-    link: Annotated[
-        Path | None, typer.Option("--link", metavar="PATH", help="With --pty: create a symbolic link to it here.")
-    ] = None,
-    tcp: Annotated[
-        int | None, typer.Option("--tcp", metavar="PORT", min=0, max=65535, help="Listen on loopback; 0: any port.")
-    ] = None,
-    can: Annotated[str, typer.Option("--can", metavar="CHANNEL", help="Connect to a CAN bus.")] = "",
-    interface: Annotated[
-        str, typer.Option("--interface", metavar="NAME", help="With --can: python-can's name. Default: the driver's.")
-    ] = "",
-    log: Annotated[Path | None, typer.Option("--from", metavar="LOG", help="Replay the samples of an LCM log.")] = None,
-    scenario: Annotated[
-        str, typer.Option(metavar="NAME", help=f"The simulated drive: {', '.join(SCENARIOS)}.")
-    ] = SCENARIOS[0],
+    name: Annotated[str, argument("NAME", "Name of the driver in the vehicle file.")],
+    config: Annotated[Path, option("--config -c FILE", "The vehicle file.")],
+    pty: Annotated[bool, option("--pty", "Create a pseudo-terminal and print its path.")] = False,
+    link: Annotated[Path | None, option("--link PATH", "With --pty: create a symbolic link to it here.")] = None,
+    tcp: Annotated[int | None, option("--tcp PORT", "Listen on loopback; 0: any port.", min=0, max=65535)] = None,
+    can: Annotated[str, option("--can CHANNEL", "Connect to a CAN bus.")] = "",
+    interface: Annotated[str, option("--interface NAME", "With --can: python-can's name. Default: the driver's.")] = "",
+    log: Annotated[Path | None, option("--from LOG", "Replay the samples of an LCM log.")] = None,
+    scenario: Annotated[str, option("--scenario NAME", f"The simulated drive: {', '.join(SCENARIOS)}.")] = SCENARIOS[0],
     faults: Annotated[
         list[str] | None,
-        typer.Option(
-            "--fault", metavar="KIND@SECONDS[:AMOUNT]", help="drop, corrupt, stall, restart, jump; more by device."
-        ),
+        option("--fault KIND@SECONDS[:AMOUNT]", "drop, corrupt, stall, restart, jump; more by device."),
     ] = None,
-    state: Annotated[
-        Path | None, typer.Option("--state", metavar="FILE", help="Store the device's non-volatile memory here.")
-    ] = None,
-    iron: Annotated[str, typer.Option("--iron", metavar="X,Y,Z", help="Hard iron at an IMU, microtesla.")] = "0,0,0",
-    seconds: Annotated[
-        float | None, typer.Option("--seconds", metavar="N", min=0.1, help="Exit after this time. Default: never.")
-    ] = None,
-    seed: Annotated[int, typer.Option("--seed", metavar="N", help="Seed of the simulation's noise.")] = 1,
+    state: Annotated[Path | None, option("--state FILE", "Store the device's non-volatile memory here.")] = None,
+    iron: Annotated[str, option("--iron X,Y,Z", "Hard iron at an IMU, microtesla.")] = "0,0,0",
+    seconds: Annotated[float | None, option("--seconds N", "Exit after this time. Default: never.", min=0.1)] = None,
+    seed: Annotated[int, option("--seed N", "Seed of the simulation's noise.")] = 1,
     start: Annotated[
         int | None,
-        typer.Option(
-            "--start",
-            metavar="UTIME",
-            min=0,
-            help="When the drive begins, microseconds of UTC: devices that are given one instant are on one vehicle, "
+        option(
+            "--start UTIME",
+            "When the drive begins, microseconds of UTC: devices that are given one instant are on one vehicle, "
             "and its controller is driven and not commanded. Default: now.",
+            min=0,
         ),
     ] = None,
 ) -> None:

@@ -9,12 +9,20 @@ import typer
 
 from modelserver.geometry import names
 from mstools.commands.pose_source import open_answer_source
-from mstools.terminal.options import JsonOption, ModelOption, PrefixOption, TimeoutOption, UrlOption, Variables
+from mstools.terminal.options import (
+    JsonOption,
+    ModelOption,
+    PrefixOption,
+    TimeoutOption,
+    UrlOption,
+    Variables,
+    argument,
+)
 from mstools.terminal.output import escape
 
 
 def command(
-    body: Annotated[str, typer.Argument(metavar="BODY", help="Name of the body.")],
+    body: Annotated[str, argument("BODY", "Name of the body.")],
     model: ModelOption = None,
     settings: Variables = None,
     as_json: JsonOption = False,

@@ -27,36 +27,36 @@ from mstools.recordings.bag_messages import (
     TopicKind,
 )
 from mstools.recordings.bag_reader import Bag, Topic, open_bag
-from mstools.terminal.options import JsonOption
+from mstools.terminal.options import JsonOption, argument, option
 from mstools.terminal.output import check_writable, escape
 from mstools.terminal.progress import show_progress
 
 
 def command(
-    bag: Annotated[Path, typer.Argument(metavar="BAG", help="ROS 1 file, or folder of a ROS 2 recording.")],
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="LCM event log to write.")],
+    bag: Annotated[Path, argument("BAG", "ROS 1 file, or folder of a ROS 2 recording.")],
+    log: Annotated[Path, argument("LOG", "LCM event log to write.")],
     topic: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="TOPIC=KIND",
-            help="Type of a topic: gps, imu, wheels or joints. Default: the busiest topic of each type.",
+        option(
+            "--topic TOPIC=KIND",
+            "Type of a topic: gps, imu, wheels or joints. Default: the busiest topic of each type.",
         ),
     ] = None,
     altitude: Annotated[
-        Altitude, typer.Option(help="Reference of the fixes' altitudes. ROS prescribes the ellipsoid.")
+        Altitude, option("--altitude", "Reference of the fixes' altitudes. ROS prescribes the ellipsoid.")
     ] = Altitude.ELLIPSOIDAL,
     undulation: Annotated[
-        float, typer.Option(help="Geoid's height above the ellipsoid, meters; with --altitude msl.")
+        float, option("--undulation", "Geoid's height above the ellipsoid, meters; with --altitude msl.")
     ] = math.nan,
     imu_orientation: Annotated[
         ImuOrientation,
-        typer.Option(help="Reference of the IMU's orientation, which a bag does not state. none: drop it."),
+        option("--imu-orientation", "Reference of the IMU's orientation, which a bag does not state. none: drop it."),
     ] = ImuOrientation.NONE,
     track_width: Annotated[
-        float, typer.Option(help="Distance of the two virtual wheels from odometry, meters.")
+        float, option("--track-width", "Distance of the two virtual wheels from odometry, meters.")
     ] = 0.555,
-    prefix: Annotated[str, typer.Option(help="Prefix of the channels.")] = "",
-    force: Annotated[bool, typer.Option("--force", help="Replace LOG if it exists.")] = False,
+    prefix: Annotated[str, option("--prefix", "Prefix of the channels.")] = "",
+    force: Annotated[bool, option("--force", "Replace LOG if it exists.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Convert a ROS bag to an LCM log of this project's types.

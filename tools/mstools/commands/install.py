@@ -26,31 +26,28 @@ from mstools.deployment.steps import (
     read_facts,
     read_manifest,
 )
+from mstools.terminal.options import option
 from mstools.terminal.problems import ProblemCollector
 
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
     from msdrivers.settings import DriverSettings
 
-RootOption = Annotated[
-    Path, typer.Option("--root", metavar="DIR", help="Root of another system, e.g. an image; nothing is started.")
-]
-DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Only print what would be done.")]
+RootOption = Annotated[Path, option("--root DIR", "Root of another system, e.g. an image; nothing is started.")]
+DryRunOption = Annotated[bool, option("--dry-run", "Only print what would be done.")]
 
 
 def command(
     vehicle: Annotated[
         Path | None,
-        typer.Option("--vehicle", "-c", metavar="FILE", help="The vehicle file. Default: the installed one."),
+        option("--vehicle -c FILE", "The vehicle file. Default: the installed one."),
     ] = None,
-    drivers: Annotated[
-        str, typer.Option("--drivers", metavar="NAMES", help="Drivers to start: all, none, or names with commas.")
-    ] = "all",
+    drivers: Annotated[str, option("--drivers NAMES", "Drivers to start: all, none, or names with commas.")] = "all",
     serial: Annotated[
         list[str] | None,
-        typer.Option("--serial", metavar="NAME=ID", help="A driver's device below /dev/serial/by-id. May be repeated."),
+        option("--serial NAME=ID", "A driver's device below /dev/serial/by-id. May be repeated."),
     ] = None,
-    start: Annotated[bool, typer.Option("--start/--no-start", help="Start the installed units.")] = True,
+    start: Annotated[bool, option("--start/--no-start", "Start the installed units.")] = True,
     dry_run: DryRunOption = False,
     root: RootOption = Path("/"),
 ) -> None:

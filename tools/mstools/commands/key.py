@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from mstools.terminal.options import argument, option
 from mstools.terminal.output import escape
 
 command = typer.Typer(
@@ -29,8 +30,8 @@ def _group() -> None:
 
 @command.command("new")
 def create(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to create; it must not exist.")],
-    name: Annotated[str, typer.Option("--name", metavar="TEXT", help="Name of the key.")] = "",
+    file: Annotated[Path, argument("FILE", "The file to create; it must not exist.")],
+    name: Annotated[str, option("--name TEXT", "Name of the key.")] = "",
 ) -> None:
     """Write a new key to a file that only its owner can read."""
     from modelserver.signing.key_files import generate_key, write_key

@@ -16,7 +16,7 @@ from modelserver.signing.key_files import KEY_FILE_VARIABLE
 from modelserver.wire.channels import SIGNED
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.listener import DaemonListener
-from mstools.terminal.options import KeyOption, UrlOption, choose_name
+from mstools.terminal.options import KeyOption, UrlOption, argument, choose_name, option
 
 if TYPE_CHECKING:
     import lcm
@@ -31,8 +31,8 @@ OPERATOR = "operator"
 
 
 def command(
-    mode: Annotated[str, typer.Argument(metavar="MODE", help=f"One of {', '.join(MODES)}.")],
-    config: Annotated[Path, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file.")],
+    mode: Annotated[str, argument("MODE", f"One of {', '.join(MODES)}.")],
+    config: Annotated[Path, option("--config -c FILE", "The vehicle file.")],
     url: UrlOption = "",
     key: KeyOption = None,
 ) -> None:

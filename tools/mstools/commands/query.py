@@ -24,7 +24,9 @@ from mstools.terminal.options import (
     TimeoutOption,
     UrlOption,
     Variables,
+    argument,
     choose_name,
+    option,
 )
 from mstools.terminal.output import escape, format_table, replace_unencodable, to_json
 
@@ -158,36 +160,31 @@ POLICIES = {policy.name.lower(): policy for policy in Policy}
 
 
 def command(
-    frame_of_interest: Annotated[str, typer.Argument(metavar="INTEREST", help="Frame of interest.")],
-    frame_of_reference: Annotated[str, typer.Argument(metavar="REFERENCE", help="Frame of reference.")],
+    frame_of_interest: Annotated[str, argument("INTEREST", "Frame of interest.")],
+    frame_of_reference: Annotated[str, argument("REFERENCE", "Frame of reference.")],
     model: ModelOption = None,
     settings: Variables = None,
     log: Annotated[
         Path | None,
-        typer.Option("--log", metavar="FILE", help="Query this LCM log of the service instead of the daemon."),
+        option("--log FILE", "Query this LCM log of the service instead of the daemon."),
     ] = None,
     at: Annotated[
         str,
-        typer.Option(
-            "--at",
-            metavar="TIME",
-            help="Microseconds since 1970, or 2026-11-21T08:30:00.5Z (without Z: local time); with --log also +12.5, "
+        option(
+            "--at TIME",
+            "Microseconds since 1970, or 2026-11-21T08:30:00.5Z (without Z: local time); with --log also +12.5, "
             "seconds from its start. Default: the latest.",
         ),
     ] = "",
     policy: Annotated[
-        str, typer.Option("--policy", help=f"What is accepted at that time: {', '.join(POLICIES)}.")
+        str, option("--policy", f"What is accepted at that time: {', '.join(POLICIES)}.")
     ] = "interpolated",
-    wait_ms: Annotated[
-        int, typer.Option("--wait-ms", min=0, max=60_000, help="Let the daemon wait for data that cover it.")
-    ] = 0,
-    inverse: Annotated[bool, typer.Option("--inverse", help="Exchange the two frames.")] = False,
-    matrix: Annotated[bool, typer.Option("--matrix", help="Print the 4x4 transform too.")] = False,
-    explain: Annotated[bool, typer.Option("--explain", help="Print each edge on the path, then the pose.")] = False,
-    motion: Annotated[bool, typer.Option("--motion", help="Print velocity and acceleration, then the pose.")] = False,
-    expressed_in: Annotated[
-        str, typer.Option("--expressed-in", metavar="FRAME", help="Axes of the vectors of --motion.")
-    ] = "",
+    wait_ms: Annotated[int, option("--wait-ms", "Let the daemon wait for data that cover it.", min=0, max=60_000)] = 0,
+    inverse: Annotated[bool, option("--inverse", "Exchange the two frames.")] = False,
+    matrix: Annotated[bool, option("--matrix", "Print the 4x4 transform too.")] = False,
+    explain: Annotated[bool, option("--explain", "Print each edge on the path, then the pose.")] = False,
+    motion: Annotated[bool, option("--motion", "Print velocity and acceleration, then the pose.")] = False,
+    expressed_in: Annotated[str, option("--expressed-in FRAME", "Axes of the vectors of --motion.")] = "",
     as_json: JsonOption = False,
     url: UrlOption = "",
     prefix: PrefixOption = "",

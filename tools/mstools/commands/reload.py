@@ -9,7 +9,7 @@ import typer
 
 from modelserver.errors import ForbiddenError, ModelServerError, RejectedError
 from modelserver.messages import ReloadReply
-from mstools.terminal.options import JsonOption, KeyOption, PrefixOption, TimeoutOption, UrlOption
+from mstools.terminal.options import JsonOption, KeyOption, PrefixOption, TimeoutOption, UrlOption, option
 from mstools.terminal.output import escape
 
 PERMISSION_HINT = (
@@ -18,7 +18,7 @@ PERMISSION_HINT = (
 
 
 def command(
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print what would change.")] = False,
+    dry_run: Annotated[bool, option("--dry-run", "Only print what would change.")] = False,
     as_json: JsonOption = False,
     url: UrlOption = "",
     prefix: PrefixOption = "",

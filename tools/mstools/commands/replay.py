@@ -21,7 +21,7 @@ from modelserver.files.regular import FileTooLargeError, read_regular
 from modelserver.messages import Decision, Invalid, Verdict
 from modelserver.wire.encoded import is_of_service
 from modelserver.wire.eventlog import LogEvent, LogFile
-from mstools.terminal.options import JsonOption, UrlOption
+from mstools.terminal.options import JsonOption, UrlOption, argument, option
 from mstools.terminal.output import check_writable, escape, format_count, open_atomic, to_json
 from mstools.terminal.progress import show_progress
 
@@ -36,42 +36,36 @@ TIMES_LIMIT = 64 << 20
 
 
 def command(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="LCM event log; with --verify a journal, or its folder.")],
-    config: Annotated[Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file.")] = None,
+    log: Annotated[Path, argument("LOG", "LCM event log; with --verify a journal, or its folder.")],
+    config: Annotated[Path | None, option("--config -c FILE", "The vehicle file.")] = None,
     poses: Annotated[
-        str, typer.Option(metavar="CSV", help="Replay offline, and write the poses here; - is standard output.")
+        str, option("--poses CSV", "Replay offline, and write the poses here; - is standard output.")
     ] = "",
     decisions: Annotated[
         str,
-        typer.Option(
-            metavar="JSONL", help="Offline: write the decision on each measurement here, one JSON object per line."
-        ),
+        option("--decisions JSONL", "Offline: write the decision on each measurement here, one JSON object per line."),
     ] = "",
-    report: Annotated[str, typer.Option(metavar="HTML", help="Replay offline, and write a report for a browser.")] = "",
-    frame: Annotated[str, typer.Option(metavar="BODY:FRAME", help="Frame of the poses. Default: the base frame.")] = "",
-    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Poses per second. Default: 50.")] = None,
+    report: Annotated[str, option("--report HTML", "Replay offline, and write a report for a browser.")] = "",
+    frame: Annotated[str, option("--frame BODY:FRAME", "Frame of the poses. Default: the base frame.")] = "",
+    rate: Annotated[float | None, option("--rate HZ", "Poses per second. Default: 50.")] = None,
     at_times: Annotated[
         Path | None,
-        typer.Option("--at-times", metavar="FILE", help="Poses at these times: one utime per line, ascending."),
+        option("--at-times FILE", "Poses at these times: one utime per line, ascending."),
     ] = None,
-    speed: Annotated[
-        str, typer.Option(metavar="N", help="Speed factor; max: as fast as possible. On the bus only.")
-    ] = "1",
+    speed: Annotated[str, option("--speed N", "Speed factor; max: as fast as possible. On the bus only.")] = "1",
     restamp: Annotated[
-        bool, typer.Option("--restamp", help="Shift the stamps of samples to now, as if the sensors were live.")
+        bool, option("--restamp", "Shift the stamps of samples to now, as if the sensors were live.")
     ] = False,
-    channel: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Only this channel; may be repeated.")
-    ] = None,
+    channel: Annotated[list[str] | None, option("--channel NAME", "Only this channel; may be repeated.")] = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="On the bus, also publish recorded poses, requests and replies.")
+        bool, option("--all", "On the bus, also publish recorded poses, requests and replies.")
     ] = False,
     verify: Annotated[
         bool,
-        typer.Option("--verify", help="LOG is a journal: replay it and compare all published messages bit for bit."),
+        option("--verify", "LOG is a journal: replay it and compare all published messages bit for bit."),
     ] = False,
     key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="With --verify: the vehicle's key file, to verify the seals.")
+        Path | None, option("--key FILE", "With --verify: the vehicle's key file, to verify the seals.")
     ] = None,
     url: UrlOption = "",
     as_json: JsonOption = False,

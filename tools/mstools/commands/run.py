@@ -9,19 +9,19 @@ from typing import Annotated, TypeAlias
 import typer
 
 from modelserver.server.log import FORMATS, set_up_logging
-from mstools.terminal.options import UrlOption
+from mstools.terminal.options import UrlOption, option
 
 LEVELS = ("debug", "info", "warning", "error")
 
 FormatOption: TypeAlias = Annotated[
-    str, typer.Option("--log-format", help=f"One of {', '.join(FORMATS)}; auto: journal where systemd reads the log.")
+    str, option("--log-format", f"One of {', '.join(FORMATS)}; auto: journal where systemd reads the log.")
 ]
 
 
 def command(
-    config: Annotated[Path, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file.")],
+    config: Annotated[Path, option("--config -c FILE", "The vehicle file.")],
     url: UrlOption = "",
-    log_level: Annotated[str, typer.Option("--log-level", help=f"One of {', '.join(LEVELS)}.")] = "info",
+    log_level: Annotated[str, option("--log-level", f"One of {', '.join(LEVELS)}.")] = "info",
     log_format: FormatOption = "auto",
 ) -> None:
     """Run the service for a vehicle file, until SIGTERM or Ctrl-C.
@@ -56,6 +56,6 @@ def command(
 
 def check_log_options(level: str, log_format: str) -> None:
     """Raise typer.BadParameter, a usage error, for an unknown level or format of the log."""
-    for option, given, known in (("--log-level", level, LEVELS), ("--log-format", log_format, FORMATS)):
+    for name, given, known in (("--log-level", level, LEVELS), ("--log-format", log_format, FORMATS)):
         if given not in known:
-            raise typer.BadParameter(f"{given!r} is not one of {', '.join(known)}", param_hint=option)
+            raise typer.BadParameter(f"{given!r} is not one of {', '.join(known)}", param_hint=name)

@@ -18,7 +18,7 @@ from modelserver.transforms.so3 import Quaternion
 from modelserver.transforms.transformation import Transformation
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.listener import DaemonListener
-from mstools.terminal.options import JsonOption, KeyOption, PrefixOption, TimeoutOption, UrlOption
+from mstools.terminal.options import JsonOption, KeyOption, PrefixOption, TimeoutOption, UrlOption, option
 from mstools.terminal.output import escape, to_json
 
 if TYPE_CHECKING:
@@ -60,42 +60,38 @@ class PoseTarget(NamedTuple):
 def command(
     utm: Annotated[
         Triple | None,
-        typer.Option("--utm", metavar="E N H", help="Position: grid easting, northing, ellipsoidal height, meters."),
+        option("--utm E N H", "Position: grid easting, northing, ellipsoidal height, meters."),
     ] = None,
     xyz: Annotated[
         Triple | None,
-        typer.Option("--xyz", metavar="X Y Z", help="Position: meters from the origin of World:UTM (initial_utm)."),
+        option("--xyz X Y Z", "Position: meters from the origin of World:UTM (initial_utm)."),
     ] = None,
     latlon: Annotated[
         tuple[float, float] | None,
-        typer.Option("--latlon", metavar="LAT LON", help="Position: WGS 84, degrees, north and east positive."),
+        option("--latlon LAT LON", "Position: WGS 84, degrees, north and east positive."),
     ] = None,
     height: Annotated[
         float | None,
-        typer.Option("--height", metavar="H", help="With --latlon: ellipsoidal height, meters. Default: as it is."),
+        option("--height H", "With --latlon: ellipsoidal height, meters. Default: as it is."),
     ] = None,
     yaw: Annotated[
         float | None,
-        typer.Option("--yaw", metavar="DEG", help="Degrees counterclockwise from grid east; roll and pitch stay."),
+        option("--yaw DEG", "Degrees counterclockwise from grid east; roll and pitch stay."),
     ] = None,
     heading: Annotated[
         float | None,
-        typer.Option("--heading", metavar="DEG", help="Degrees clockwise from true north; roll and pitch stay."),
+        option("--heading DEG", "Degrees clockwise from true north; roll and pitch stay."),
     ] = None,
     rpy: Annotated[
         Triple | None,
-        typer.Option("--rpy", metavar="R P Y", help="Roll, pitch and yaw, degrees, yaw from grid east."),
+        option("--rpy R P Y", "Roll, pitch and yaw, degrees, yaw from grid east."),
     ] = None,
     quaternion: Annotated[
         Quaternion | None,
-        typer.Option("--quaternion", metavar="S X Y Z", help="Orientation in World:UTM, scalar first."),
+        option("--quaternion S X Y Z", "Orientation in World:UTM, scalar first."),
     ] = None,
-    sigma: Annotated[
-        float, typer.Option("--sigma", metavar="M", help="Standard deviation of each coordinate, meters.")
-    ] = 1.0,
-    sigma_deg: Annotated[
-        float, typer.Option("--sigma-deg", metavar="DEG", help="Standard deviation about each axis, degrees.")
-    ] = 5.0,
+    sigma: Annotated[float, option("--sigma M", "Standard deviation of each coordinate, meters.")] = 1.0,
+    sigma_deg: Annotated[float, option("--sigma-deg DEG", "Standard deviation about each axis, degrees.")] = 5.0,
     as_json: JsonOption = False,
     url: UrlOption = "",
     prefix: PrefixOption = "",

@@ -18,27 +18,19 @@ import typer
 
 from modelserver.wire.channels import DEFAULT_URL
 from mstools.spy.lcm_wheel import MissingToolError, find_binary, find_java_library, find_type_files
-from mstools.terminal.options import UrlOption
+from mstools.terminal.options import UrlOption, option
 
 
 def command(
-    terminal: Annotated[
-        bool, typer.Option("--terminal", "-t", help="A table in the terminal, even with a display.")
-    ] = False,
-    window: Annotated[bool, typer.Option("--window", help="lcm-spy's window; an error if it cannot open.")] = False,
-    channel: Annotated[
-        str, typer.Option("--channel", metavar="NAME", help="In the terminal: show this channel's fields.")
-    ] = "",
-    once: Annotated[bool, typer.Option("--once", help="In the terminal: listen for 2 s, print, and exit.")] = False,
-    seconds: Annotated[
-        float, typer.Option("--seconds", metavar="N", min=0.0, max=86400.0, help="As --once, for this time.")
-    ] = 0.0,
-    config: Annotated[
-        Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file, for its bus.")
-    ] = None,
+    terminal: Annotated[bool, option("--terminal -t", "A table in the terminal, even with a display.")] = False,
+    window: Annotated[bool, option("--window", "lcm-spy's window; an error if it cannot open.")] = False,
+    channel: Annotated[str, option("--channel NAME", "In the terminal: show this channel's fields.")] = "",
+    once: Annotated[bool, option("--once", "In the terminal: listen for 2 s, print, and exit.")] = False,
+    seconds: Annotated[float, option("--seconds N", "As --once, for this time.", min=0.0, max=86400.0)] = 0.0,
+    config: Annotated[Path | None, option("--config -c FILE", "The vehicle file, for its bus.")] = None,
     url: UrlOption = "",
     build_only: Annotated[
-        bool, typer.Option("--build-only", help="Compile the types for Java, print the jar's path, and exit.")
+        bool, option("--build-only", "Compile the types for Java, print the jar's path, and exit.")
     ] = False,
 ) -> None:
     """Show all channels decoded.

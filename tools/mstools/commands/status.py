@@ -16,7 +16,7 @@ from modelserver.messages import DriverHealth, Health
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.listener import DaemonListener, handle_until
 from mstools.terminal.health_text import as_data, format_line, format_report, is_healthy
-from mstools.terminal.options import JsonOption, PrefixOption, UrlOption
+from mstools.terminal.options import JsonOption, PrefixOption, UrlOption, option
 from mstools.terminal.output import replace_unencodable
 from mstools.terminal.progress import catch_signals, open_screen
 
@@ -45,16 +45,14 @@ HEALTH = "MODELSERVER_HEALTH"
 
 
 def command(
-    config: Annotated[
-        Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file, for its bus and prefix.")
-    ] = None,
-    watch: Annotated[bool, typer.Option("--watch", "-w", help="Show each report, until Ctrl-C.")] = False,
+    config: Annotated[Path | None, option("--config -c FILE", "The vehicle file, for its bus and prefix.")] = None,
+    watch: Annotated[bool, option("--watch -w", "Show each report, until Ctrl-C.")] = False,
     as_json: JsonOption = False,
     url: UrlOption = "",
     prefix: PrefixOption = "",
     timeout: Annotated[
         float,
-        typer.Option("--timeout", metavar="SECONDS", min=0.1, max=3600.0, help="Timeout for the daemon's report."),
+        option("--timeout SECONDS", "Timeout for the daemon's report.", min=0.1, max=3600.0),
     ] = 2.5,
 ) -> None:
     """Show the health of the running daemon: pose, filter, loop, sensors, drivers, rejected messages, and warnings.

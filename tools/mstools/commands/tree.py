@@ -11,7 +11,7 @@ from modelserver.errors import NoServerError
 from modelserver.geometry.model import Model
 from mstools.commands.pose_source import load_given_model
 from mstools.terminal.model_tree import BodyNode, build_nodes, describe_crossing
-from mstools.terminal.options import PrefixOption, UrlOption, Variables, parse_variables
+from mstools.terminal.options import PrefixOption, UrlOption, Variables, argument, option, parse_variables
 from mstools.terminal.output import check_writable, describe_size, escape, format_count, replace_unencodable, write_file
 
 if TYPE_CHECKING:
@@ -22,19 +22,17 @@ TIMEOUT_S = 11.0
 
 
 def command(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="A geometry file or a vehicle file.")] = "",
-    live: Annotated[
-        bool, typer.Option("--live", help="Draw the running daemon's geometry instead of a file's.")
-    ] = False,
-    frames: Annotated[bool, typer.Option("--frames", help="Draw the frames of each body too.")] = False,
-    svg: Annotated[str, typer.Option("--svg", metavar="OUT", help="Write an SVG image instead; - for stdout.")] = "",
-    force: Annotated[bool, typer.Option("--force", help="Replace OUT where it exists.")] = False,
+    file: Annotated[str, argument("FILE", "A geometry file or a vehicle file.")] = "",
+    live: Annotated[bool, option("--live", "Draw the running daemon's geometry instead of a file's.")] = False,
+    frames: Annotated[bool, option("--frames", "Draw the frames of each body too.")] = False,
+    svg: Annotated[str, option("--svg OUT", "Write an SVG image instead; - for stdout.")] = "",
+    force: Annotated[bool, option("--force", "Replace OUT where it exists.")] = False,
     variables: Variables = None,
     url: UrlOption = "",
     prefix: PrefixOption = "",
     wait: Annotated[
         float,
-        typer.Option("--wait", metavar="SECONDS", min=0.01, max=7200.0, help="Timeout for the daemon."),
+        option("--wait SECONDS", "Timeout for the daemon.", min=0.01, max=7200.0),
     ] = TIMEOUT_S,
 ) -> None:
     """Draw the kinematic tree: constraints with their joints and limits, loop closures, orphans.

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from modelserver.errors import ModelServerError, RecordingError
-from mstools.terminal.options import JsonOption
+from mstools.terminal.options import JsonOption, argument, option
 from mstools.terminal.output import check_writable, escape, format_count, to_json, write_file
 from mstools.terminal.progress import show_progress
 from mstools.tuning.search import Parameter, Score, SearchResult, SearchStep, Settings, search
@@ -53,20 +53,14 @@ TUNABLES = (
 
 
 def command(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="LCM event log of a drive with fixes.")],
-    config: Annotated[Path | None, typer.Option("--config", "-c", metavar="FILE", help="The vehicle file.")] = None,
-    output: Annotated[
-        str, typer.Option("-o", "--output", metavar="YAML", help="Write the proposal here, - for standard output.")
-    ] = "",
-    quick: Annotated[
-        bool, typer.Option("--quick", help="One round over few settings, without GNSS gaps: a first look.")
-    ] = False,
-    rounds: Annotated[int, typer.Option(min=1, max=5, metavar="N", help="Rounds over all settings, at most.")] = 2,
-    processes: Annotated[
-        int, typer.Option(min=0, max=64, metavar="N", help="Parallel runs. 0: one per processor.")
-    ] = 0,
+    log: Annotated[Path, argument("LOG", "LCM event log of a drive with fixes.")],
+    config: Annotated[Path | None, option("--config -c FILE", "The vehicle file.")] = None,
+    output: Annotated[str, option("-o --output YAML", "Write the proposal here, - for standard output.")] = "",
+    quick: Annotated[bool, option("--quick", "One round over few settings, without GNSS gaps: a first look.")] = False,
+    rounds: Annotated[int, option("--rounds N", "Rounds over all settings, at most.", min=1, max=5)] = 2,
+    processes: Annotated[int, option("--processes N", "Parallel runs. 0: one per processor.", min=0, max=64)] = 0,
     as_json: JsonOption = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    force: Annotated[bool, option("--force", "Replace an existing file.")] = False,
 ) -> None:
     """Tune the filter's noise settings on a recording; docs/tuning.md explains how.
 

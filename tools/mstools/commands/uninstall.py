@@ -5,17 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from mstools.commands.install import DryRunOption, RootOption
 from mstools.deployment.plan import plan_uninstall
 from mstools.deployment.steps import check_root_user, execute_plan, get_command_path, read_facts
+from mstools.terminal.options import option
 
 
 def command(
-    purge: Annotated[
-        bool, typer.Option("--purge", help="Also remove edited files and the state of the service.")
-    ] = False,
+    purge: Annotated[bool, option("--purge", "Also remove edited files and the state of the service.")] = False,
     dry_run: DryRunOption = False,
     root: RootOption = Path("/"),
 ) -> None:

@@ -5,38 +5,46 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import typer
 
 from modelserver.errors import find_nearest_names, quote
 
+
+def option(declaration: str, about: str, **limits: Any) -> Any:
+    """Declare an option as its usage shows it, e.g. `--config -c FILE`; `limits`: typer's `min` and `max`."""
+    words = declaration.split()
+    names = [word for word in words if word.startswith("-")]
+    return typer.Option(*names, metavar=" ".join(words[len(names) :]) or None, help=about, **limits)
+
+
+def argument(metavar: str, about: str) -> Any:
+    """Declare an argument as its usage shows it."""
+    return typer.Argument(metavar=metavar, help=about)
+
+
 Variables: TypeAlias = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="NAME=VALUE",
-        help="Value of $NAME in a Miro frame tree, e.g. MRN=K11; overrides the environment. May be repeated.",
+    option(
+        "--set NAME=VALUE",
+        "Value of $NAME in a Miro frame tree, e.g. MRN=K11; overrides the environment. May be repeated.",
     ),
 ]
 """Annotation of a parameter whose value goes to `parse_variables`."""
 
-ModelOption = Annotated[
-    Path | None, typer.Option("--model", metavar="FILE", help="Query this geometry file instead of the daemon.")
-]
-UrlOption = Annotated[
-    str, typer.Option("--url", metavar="URL", help="LCM provider. Default: $LCM_DEFAULT_URL, else loopback.")
-]
-PrefixOption = Annotated[str, typer.Option("--prefix", metavar="TEXT", help="Channel prefix of the vehicle.")]
+ModelOption = Annotated[Path | None, option("--model FILE", "Query this geometry file instead of the daemon.")]
+UrlOption = Annotated[str, option("--url URL", "LCM provider. Default: $LCM_DEFAULT_URL, else loopback.")]
+PrefixOption = Annotated[str, option("--prefix TEXT", "Channel prefix of the vehicle.")]
 KeyOption = Annotated[
     Path | None,
-    typer.Option("--key", metavar="FILE", help="The vehicle's key file, to sign with. Default: $MODELSERVER_KEY_FILE."),
+    option("--key FILE", "The vehicle's key file, to sign with. Default: $MODELSERVER_KEY_FILE."),
 ]
 TimeoutOption = Annotated[
     float,
-    typer.Option("--timeout", metavar="SECONDS", min=0.01, max=3600.0, help="Timeout of one try."),
+    option("--timeout SECONDS", "Timeout of one try.", min=0.01, max=3600.0),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")]
+JsonOption = Annotated[bool, option("--json", "Print JSON, for scripts.")]
 
 _ASSIGNMENT = re.compile(r"(\w+)=(.*)", re.ASCII | re.DOTALL)
 
