@@ -20,22 +20,9 @@ from typing import ClassVar, NamedTuple, TypeAlias
 
 from modelserver.messages import NAN, JointSample, JointsSample, SensorHeader
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
-from msdrivers.protocol.bounded_counter import BoundedCounter
-from msdrivers.protocol.modbus.axis_map import STRICT, AxisRegisters
-from msdrivers.protocol.modbus.registers import (
-    FailureKind,
-    ModbusFailure,
-    ModbusUnit,
-    ReadRegisters,
-    RegisterMap,
-    Registers,
-    RegistersWritten,
-    RegisterTable,
-    WriteRegisters,
-    describe_request,
-    explain_exception,
-    is_reply_to,
-)
+from msdrivers.protocol.framing import BoundedCounter
+from msdrivers.protocol.modbus import registers as modbus
+from msdrivers.protocol.modbus.registers import STRICT, AxisRegisters
 
 MIN_POLL_HZ = 50.0
 
@@ -139,14 +126,14 @@ class _Step(NamedTuple):
     degrees: float | None = None
 
 
-_Steps: TypeAlias = Generator[_Step, Registers | RegistersWritten, None]
+_Steps: TypeAlias = Generator[_Step, modbus.Registers | modbus.RegistersWritten, None]
 
 
 class NodSetup:
     """The setup of a nodding motion: one step at a time, completed by `on_reply` or repeated."""
 
     def __init__(self, settings: AxisSettings):
-        self._registers: Mapping[str, RegisterMap] = settings.registers.commanded
+        self._registers: Mapping[str, modbus.RegisterMap] = settings.registers.commanded
         self._steps: _Steps | None = None
         self._step: _Step | None = None
         self.found: dict[str, tuple[int, ...]] = {}
@@ -172,16 +159,16 @@ class NodSetup:
         verb = "reading" if degrees is None else f"writing {degrees:g} to"
         return f"{verb} {name} (register {self._registers[name].address})"
 
-    def make_request(self, transaction: int) -> ReadRegisters | WriteRegisters | None:
+    def make_request(self, transaction: int) -> modbus.ReadRegisters | modbus.WriteRegisters | None:
         """Make the request of the next step; None when done."""
         if self._step is None:
             return None
         mapped, degrees = self._registers[self._step.name], self._step.degrees
         if degrees is None:
-            return ReadRegisters(mapped.address, mapped.registers, transaction=transaction)
-        return WriteRegisters(mapped.address, mapped.from_degrees(degrees), transaction)
+            return modbus.ReadRegisters(mapped.address, mapped.registers, transaction=transaction)
+        return modbus.WriteRegisters(mapped.address, mapped.from_degrees(degrees), transaction)
 
-    def on_reply(self, reply: Registers | RegistersWritten) -> str:
+    def on_reply(self, reply: modbus.Registers | modbus.RegistersWritten) -> str:
         """Complete a step; return a warning if the axis holds another value than was written, else empty."""
         self._warning = ""
         try:
@@ -190,18 +177,18 @@ class NodSetup:
             self._step = None
         return self._warning
 
-    def make_restore_requests(self) -> list[WriteRegisters]:
+    def make_restore_requests(self) -> list[modbus.WriteRegisters]:
         """Make the requests that restore the registers."""
         if not self.found or self.found.keys() != self._registers.keys():
             return []
         degrees = {name: self._registers[name].to_degrees(words) for name, words in self.found.items()}
         order = _order_writes(degrees["lower_limit"], self._current["upper_limit"])
-        return [WriteRegisters(self._registers[name].address, self.found[name]) for name in order]
+        return [modbus.WriteRegisters(self._registers[name].address, self.found[name]) for name in order]
 
     def _run(self, nod: NodSettings) -> _Steps:
         for name, mapped in self._registers.items():
             reply = yield _Step(name)
-            if isinstance(reply, Registers):
+            if isinstance(reply, modbus.Registers):
                 self._current[name] = mapped.to_degrees(reply.values)
                 self.found.setdefault(name, reply.values)
         wanted = {"lower_limit": nod.lower_deg, "upper_limit": nod.upper_deg, "nod_rate": nod.rate_deg}
@@ -211,7 +198,7 @@ class NodSetup:
             self._current[name] = wanted[name]
         for name in order:
             mapped, reply = self._registers[name], (yield _Step(name))
-            if isinstance(reply, Registers) and reply.values != mapped.from_degrees(wanted[name]):
+            if isinstance(reply, modbus.Registers) and reply.values != mapped.from_degrees(wanted[name]):
                 self._current[name] = mapped.to_degrees(reply.values)
                 actual = f"{name} is {self._current[name]:g} where {wanted[name]:g} was written"
                 self._warning = f"{actual}: the axis's own limit"
@@ -294,7 +281,7 @@ BUSY_EXCEPTIONS = (5, 6)
 class _PendingRequest(NamedTuple):
     """The request that awaits its reply."""
 
-    request: ReadRegisters | WriteRegisters
+    request: modbus.ReadRegisters | modbus.WriteRegisters
     sent_ns: int
     is_poll: bool
 
@@ -311,7 +298,7 @@ class AxisDriver:
         self.max_silence = settings.silence
         self.counts = BoundedCounter()
         """Polls, samples, unanswered requests, skipped polls, and what was rejected by reason."""
-        self._table = RegisterTable(registers.table)
+        self._table = modbus.RegisterTable(registers.table)
         self._length = max(each.address + each.registers for each in registers.measured.values()) - registers.begin
         self._readings = ReadingValidator(settings)
         self._nod_setup = NodSetup(settings)
@@ -326,7 +313,7 @@ class AxisDriver:
         self._phase = EndpointPhase.WAITING
         self._seq = 0
 
-    def on_open(self, now: HostTime) -> list[Output[ModbusUnit]]:
+    def on_open(self, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
         """Begin: set the nodding up, then read."""
         self._is_open, self._pending = True, None
         self._readings.clear()
@@ -338,30 +325,30 @@ class AxisDriver:
             self._nod_setup.start(self.settings.nod)
         return [EndpointStatus(self._phase, f"asking the axis for joint {self.settings.joint}"), *self._send_next(now)]
 
-    def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
+    def on_receive(self, unit: modbus.ModbusUnit, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
         """Process a reply or a failure."""
-        if isinstance(unit, ModbusFailure) and unit.kind is FailureKind.LINE:
+        if isinstance(unit, modbus.ModbusFailure) and unit.kind is modbus.FailureKind.LINE:
             return self._on_line_error(f"the line to the axis broke: {unit.text}")
         pending = self._pending
         if pending is None or unit.transaction != pending.request.transaction or not self._is_open:
             self.counts["rejected.stale"] += 1
             return []
-        if isinstance(unit, ModbusFailure):
-            if unit.kind is FailureKind.TIMEOUT:
+        if isinstance(unit, modbus.ModbusFailure):
+            if unit.kind is modbus.FailureKind.TIMEOUT:
                 return self._on_timeout(now)
             return self._on_exception(pending, unit, now)
         self._pending = None
         self._received_ns = now.monotonic_ns
-        if not is_reply_to(unit, pending.request):
+        if not modbus.is_reply_to(unit, pending.request):
             self.counts["rejected.length"] += 1
-            return self._warn_once(
-                "length",
-                f"the reply to {describe_request(pending.request)} has another address or length; it is not used",
-            ) + self._send_next(now)
-        if pending.is_poll and isinstance(unit, Registers):
+            text = (
+                f"the reply to {modbus.describe_request(pending.request)} has another address or length; it is not used"
+            )
+            return self._warn_once("length", text) + self._send_next(now)
+        if pending.is_poll and isinstance(unit, modbus.Registers):
             return self._publish_reading(unit, pending, now) + self._send_next(now)
-        outputs: list[Output[ModbusUnit]] = []
-        if isinstance(unit, Registers | RegistersWritten):
+        outputs: list[Output[modbus.ModbusUnit]] = []
+        if isinstance(unit, modbus.Registers | modbus.RegistersWritten):
             warning = self._nod_setup.on_reply(unit)
             if warning:
                 self.counts["readback"] += 1
@@ -370,9 +357,9 @@ class AxisDriver:
                 outputs.append(EndpointStatus(self._phase, "the nodding motion is set"))
         return outputs + self._send_next(now)
 
-    def on_timer(self, now: HostTime) -> list[Output[ModbusUnit]]:
+    def on_timer(self, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
         """Process timeouts; send the next request."""
-        outputs: list[Output[ModbusUnit]] = []
+        outputs: list[Output[modbus.ModbusUnit]] = []
         if self._pending is not None and now.monotonic_ns >= self._pending.sent_ns + self._reply_ns:
             outputs += self._on_timeout(now)
         if self._silent_ns is not None and now.monotonic_ns >= self._silent_ns:
@@ -395,7 +382,7 @@ class AxisDriver:
             next_ns = min(self._next_ns, self._step_ns) if self._nod_setup.step_text else self._next_ns
         return next_ns if self._silent_ns is None else min(next_ns, self._silent_ns)
 
-    def on_close(self, now: HostTime) -> list[Output[ModbusUnit]]:
+    def on_close(self, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
         """Write back what was found before this driver wrote."""
         self._is_open = False
         return [
@@ -403,7 +390,7 @@ class AxisDriver:
             for request in self._nod_setup.make_restore_requests()
         ]
 
-    def _send_next(self, now: HostTime) -> list[Output[ModbusUnit]]:
+    def _send_next(self, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
         """Send what is due, if nothing is under way: a reading, else a step of the nodding's set-up between two."""
         at = now.monotonic_ns
         if self._pending is not None or not self._is_open:
@@ -414,7 +401,7 @@ class AxisDriver:
         transaction = self._new_transaction()
         request = None if is_poll else self._nod_setup.make_request(transaction)
         if request is None:
-            request = ReadRegisters(self.settings.registers.begin, self._length, self._table, transaction)
+            request = modbus.ReadRegisters(self.settings.registers.begin, self._length, self._table, transaction)
             self.counts["polls"] += 1
             late = (at - self._next_ns) // self._period_ns
             self.counts["skipped"] += late
@@ -426,7 +413,9 @@ class AxisDriver:
         self._transaction = self._transaction % 0xFFFF + 1
         return self._transaction
 
-    def _publish_reading(self, unit: Registers, pending: _PendingRequest, now: HostTime) -> list[Output[ModbusUnit]]:
+    def _publish_reading(
+        self, unit: modbus.Registers, pending: _PendingRequest, now: HostTime
+    ) -> list[Output[modbus.ModbusUnit]]:
         round_trip_ns = now.monotonic_ns - pending.sent_ns
         joint, word = self._readings.validate(unit.values, pending.sent_ns + round_trip_ns // 2, round_trip_ns // 2)
         if word:
@@ -450,7 +439,7 @@ class AxisDriver:
             MeasuredSample(JointsSample(header, (joint,)), round_trip / 2.0, round_trip / math.sqrt(12.0)),
         ]
 
-    def _on_timeout(self, now: HostTime) -> list[Output[ModbusUnit]]:
+    def _on_timeout(self, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
         self.counts["unanswered"] += 1
         self._pending = None
         if now.monotonic_ns - self._received_ns < self._silence_ns:
@@ -459,8 +448,8 @@ class AxisDriver:
         return self._on_line_error(f"{why}; check its power, the network cable, address and port")
 
     def _on_exception(
-        self, pending: _PendingRequest, failure: ModbusFailure, now: HostTime
-    ) -> list[Output[ModbusUnit]]:
+        self, pending: _PendingRequest, failure: modbus.ModbusFailure, now: HostTime
+    ) -> list[Output[modbus.ModbusUnit]]:
         self.counts.add(f"rejected.exception_{failure.code}")
         self._pending = None
         self._received_ns = now.monotonic_ns
@@ -469,17 +458,19 @@ class AxisDriver:
             self._next_ns = again_ns
             if failure.code not in BUSY_EXCEPTIONS:
                 self._phase = EndpointPhase.SILENT
-            text = f"the axis rejects {describe_request(pending.request)}: {explain_exception(failure.code)}"
+            text = (
+                f"the axis rejects {modbus.describe_request(pending.request)}: {modbus.explain_exception(failure.code)}"
+            )
             retry = f"retried every {self.settings.retry_delay:g} s, nothing is published"
             return self._warn_once("rejected", f"{text}; {retry}")
-        text = f"the axis rejects {self._nod_setup.step_text}: {explain_exception(failure.code)}"
+        text = f"the axis rejects {self._nod_setup.step_text}: {modbus.explain_exception(failure.code)}"
         if failure.code in BUSY_EXCEPTIONS:
             self._step_ns = again_ns
             return [*self._warn_once("nod", f"{text}; trying again"), *self._send_next(now)]
         self._nod_setup.cancel()
         return [*self._warn_once("nod", f"{text}; its nodding motion is not changed"), *self._send_next(now)]
 
-    def _on_line_error(self, why: str) -> list[Output[ModbusUnit]]:
+    def _on_line_error(self, why: str) -> list[Output[modbus.ModbusUnit]]:
         if not self._is_open:
             return []
         self._is_open, self._pending, self._silent_ns = False, None, None
@@ -487,7 +478,7 @@ class AxisDriver:
         self.counts["line_errors"] += 1
         return [EndpointStatus(EndpointPhase.SILENT, why), Reopen(why)]
 
-    def _warn_once(self, word: str, text: str) -> list[Output[ModbusUnit]]:
+    def _warn_once(self, word: str, text: str) -> list[Output[modbus.ModbusUnit]]:
         if word in self._reported:
             return []
         self._reported.add(word)

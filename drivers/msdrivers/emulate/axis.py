@@ -11,20 +11,8 @@ from dataclasses import dataclass, replace
 
 from msdrivers.emulate.faults import FaultQueue, InjectedFault
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output
-from msdrivers.protocol.modbus.axis_map import AxisRegisters
-from msdrivers.protocol.modbus.registers import (
-    MAX_READ,
-    MAX_WRITE,
-    FailureKind,
-    ModbusFailure,
-    ModbusUnit,
-    ReadRegisters,
-    Registers,
-    RegistersWritten,
-    RegisterTable,
-    WriteRegisters,
-    explain_exception,
-)
+from msdrivers.protocol.modbus import registers as modbus
+from msdrivers.protocol.modbus.registers import AxisRegisters
 
 ILLEGAL_ADDRESS, ILLEGAL_VALUE = 2, 3
 
@@ -59,34 +47,36 @@ class AxisEmulator:
     def __init__(self, registers: AxisRegisters, unit: AxisUnit | None = None, faults: Iterable[InjectedFault] = ()):
         self.unit = unit or AxisUnit()
         self._registers = registers
-        self._faults = FaultQueue[ModbusUnit](
-            faults, lambda unit: replace(unit, values=unit.values[:-1]) if isinstance(unit, Registers) else unit
+        self._faults = FaultQueue[modbus.ModbusUnit](
+            faults, lambda unit: replace(unit, values=unit.values[:-1]) if isinstance(unit, modbus.Registers) else unit
         )
         self._started_ns: int | None = None
         self._exceptions: deque[int] = deque()
         self.counts: Counter[str] = Counter()
         self._switch_on(0)
 
-    def on_open(self, now: HostTime) -> list[Output[ModbusUnit]]:
+    def on_open(self, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
         """Power on at the first opening; later the axis has continued."""
         if self._started_ns is None:
             self._started_ns = self._updated_ns = now.monotonic_ns
             self._faults.start(now.monotonic_ns)
         return [EndpointStatus(EndpointPhase.STREAMING, "axis emulated")]
 
-    def on_receive(self, unit: ModbusUnit, now: HostTime) -> list[Output[ModbusUnit]]:
+    def on_receive(self, unit: modbus.ModbusUnit, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
         """Answer a request."""
         for fault, due in self._faults.pop_due(now.monotonic_ns):
             self._apply_fault(fault, due)
-        if self._faults.is_silent(now.monotonic_ns) or not isinstance(unit, ReadRegisters | WriteRegisters):
+        if self._faults.is_silent(now.monotonic_ns) or not isinstance(
+            unit, modbus.ReadRegisters | modbus.WriteRegisters
+        ):
             return []
         self._advance(now.monotonic_ns)
         code = self._exceptions.popleft() if self._exceptions else 0
         reply = self._make_exception(unit, code) if code else self._answer(unit)
-        self.counts["exceptions" if isinstance(reply, ModbusFailure) else "replies"] += 1
+        self.counts["exceptions" if isinstance(reply, modbus.ModbusFailure) else "replies"] += 1
         return [*self._faults.filter_units((reply,), now.monotonic_ns)]
 
-    def on_timer(self, now: HostTime) -> list[Output[ModbusUnit]]:
+    def on_timer(self, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
         """Do nothing: it only answers."""
         return []
 
@@ -94,7 +84,7 @@ class AxisEmulator:
         """Return None: it only answers."""
         return None
 
-    def on_close(self, now: HostTime) -> list[Output[ModbusUnit]]:
+    def on_close(self, now: HostTime) -> list[Output[modbus.ModbusUnit]]:
         """Send nothing."""
         return []
 
@@ -161,34 +151,34 @@ class AxisEmulator:
             self._angle = lower + (phase if phase < span else 2.0 * span - phase)
         return self._direction * rate
 
-    def _answer(self, unit: ReadRegisters | WriteRegisters) -> ModbusUnit:
-        if isinstance(unit, WriteRegisters):
+    def _answer(self, unit: modbus.ReadRegisters | modbus.WriteRegisters) -> modbus.ModbusUnit:
+        if isinstance(unit, modbus.WriteRegisters):
             return self._write(unit)
         table = self._make_table(unit.table)
         wanted = range(unit.address, unit.address + unit.count)
         # between its registers it has others, which are 0
-        if not 0 < unit.count <= MAX_READ or not table or wanted[0] < min(table) or wanted[-1] > max(table):
+        if not 0 < unit.count <= modbus.MAX_READ or not table or wanted[0] < min(table) or wanted[-1] > max(table):
             return self._make_exception(unit, ILLEGAL_ADDRESS)
-        return Registers(unit.address, tuple(table.get(address, 0) for address in wanted), unit.transaction)
+        return modbus.Registers(unit.address, tuple(table.get(address, 0) for address in wanted), unit.transaction)
 
-    def _make_table(self, table: RegisterTable) -> dict[int, int]:
+    def _make_table(self, table: modbus.RegisterTable) -> dict[int, int]:
         registers = self._registers
         words: dict[int, int] = {}
-        if table is RegisterTable(registers.table):
+        if table is modbus.RegisterTable(registers.table):
             values = {"angle": self._measured_deg, "rate": self._measured_rate}
             for name, mapped in registers.measured.items():
                 found = mapped.to_words(self._number) if name == "sequence" else mapped.from_degrees(values[name])
                 words |= {mapped.address + index: word for index, word in enumerate(found)}
-        if table is RegisterTable.HOLDING:
+        if table is modbus.RegisterTable.HOLDING:
             for name, mapped in registers.commanded.items():
                 found = mapped.from_degrees(self._commanded[name])
                 words |= {mapped.address + index: word for index, word in enumerate(found)}
         return words
 
-    def _write(self, unit: WriteRegisters) -> ModbusUnit:
+    def _write(self, unit: modbus.WriteRegisters) -> modbus.ModbusUnit:
         places = {(mapped.address, mapped.registers): name for name, mapped in self._registers.commanded.items()}
         name = places.get((unit.address, len(unit.values)))
-        if name is None or len(unit.values) > MAX_WRITE:
+        if name is None or len(unit.values) > modbus.MAX_WRITE:
             return self._make_exception(unit, ILLEGAL_ADDRESS)
         after = self._commanded | {name: self._registers.commanded[name].to_degrees(unit.values)}
         axis, rate = self.unit, after["nod_rate"]
@@ -199,7 +189,9 @@ class AxisEmulator:
         if not fits:
             return self._make_exception(unit, ILLEGAL_VALUE)
         self._commanded = after
-        return RegistersWritten(unit.address, len(unit.values), unit.transaction)
+        return modbus.RegistersWritten(unit.address, len(unit.values), unit.transaction)
 
-    def _make_exception(self, unit: ReadRegisters | WriteRegisters, code: int) -> ModbusFailure:
-        return ModbusFailure(FailureKind.EXCEPTION, explain_exception(code), code, unit.transaction)
+    def _make_exception(self, unit: modbus.ReadRegisters | modbus.WriteRegisters, code: int) -> modbus.ModbusFailure:
+        return modbus.ModbusFailure(
+            modbus.FailureKind.EXCEPTION, modbus.explain_exception(code), code, unit.transaction
+        )

@@ -17,19 +17,8 @@ from modelserver.transforms.so3 import Quaternion, Vector3
 from msdrivers.emulate.faults import FaultQueue, InjectedFault
 from msdrivers.emulate.gx1_unit import GAINS, Eeprom, Gx1Unit, UnitClock
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Send
-from msdrivers.protocol.gx1 import MEASUREMENTS, CommandByte, EepromAddress, Gains, Gx1Packet
+from msdrivers.protocol.gx1 import MEASUREMENTS, CommandByte, EepromAddress, Gains, Gx1Packet, scaling
 from msdrivers.protocol.gx1.requests import Gx1Request, RequestParser
-from msdrivers.protocol.gx1.scaling import (
-    G0,
-    MAX_WORD,
-    MIN_WORD,
-    TESLA,
-    euler_to_words,
-    quaternion_to_words,
-    temperature_to_word,
-    vector_from_words,
-    vector_to_words,
-)
 
 _ZERO: Vector3 = (0.0, 0.0, 0.0)
 _NED_FROM_ENU: Quaternion = (0.0, 0.5**0.5, 0.5**0.5, 0.0)
@@ -124,7 +113,7 @@ class Gx1Emulator:
         self._gains = GAINS
         self._bias: Vector3 = (0.0, 0.0, 0.0)
         self._capture: tuple[int, list[Vector3]] | None = None
-        self._extremes: tuple[list[int], list[int]] = ([MAX_WORD] * 3, [MIN_WORD] * 3)
+        self._extremes: tuple[list[int], list[int]] = ([scaling.MAX_WORD] * 3, [scaling.MIN_WORD] * 3)
         self._utime_offset_us = 0
         self.counts: Counter[str] = Counter()
 
@@ -211,22 +200,24 @@ class Gx1Emulator:
             return
         unit, gains = self.unit, self._gains
         words: tuple[int, ...]
-        field = self._get_field_words(instant, vector_from_words(self._get_offset_words(), gains.magnetometer, TESLA))
-        force = vector_to_words(so3.scale(unit.force_sign, instant.force), gains.accelerometer, G0)
-        rate = vector_to_words(_subtract(so3.add(instant.rate, unit.gyro_bias), self._bias), gains.gyro)
+        field = self._get_field_words(
+            instant, scaling.vector_from_words(self._get_offset_words(), gains.magnetometer, scaling.TESLA)
+        )
+        force = scaling.vector_to_words(so3.scale(unit.force_sign, instant.force), gains.accelerometer, scaling.G0)
+        rate = scaling.vector_to_words(_subtract(so3.add(instant.rate, unit.gyro_bias), self._bias), gains.gyro)
         if command == CommandByte.EULER_VECTORS:
-            words = (*euler_to_words(instant.orientation), *force, *rate)
+            words = (*scaling.euler_to_words(instant.orientation), *force, *rate)
         elif command in (CommandByte.INSTANTANEOUS_EULER, CommandByte.STABILIZED_EULER):
-            words = euler_to_words(instant.orientation)
+            words = scaling.euler_to_words(instant.orientation)
         else:
             words = (*field, *force, *rate)
             if command == CommandByte.QUATERNION_VECTORS:
-                words = (*quaternion_to_words(instant.orientation), *words)
+                words = (*scaling.quaternion_to_words(instant.orientation), *words)
         self._queue_reply(command, words, at_ns)
 
     def _get_field_words(self, instant: SensedState, offsets: Vector3) -> tuple[int, int, int]:
         field = _subtract(so3.add(instant.field, self.unit.field_offset), offsets)
-        return vector_to_words(field, self._gains.magnetometer, TESLA)
+        return scaling.vector_to_words(field, self._gains.magnetometer, scaling.TESLA)
 
     def _get_offset_words(self) -> tuple[int, ...]:
         return tuple(_to_signed(self.eeprom.read_word(address)) for address in EepromAddress.HARD_IRON)
@@ -247,7 +238,7 @@ class Gx1Emulator:
     def _on_request(self, request: Gx1Request, now: HostTime) -> None:
         command, data, at_ns = request.command, request.data, now.monotonic_ns
         constants = {
-            CommandByte.TEMPERATURE: temperature_to_word(self.unit.celsius),
+            CommandByte.TEMPERATURE: scaling.temperature_to_word(self.unit.celsius),
             CommandByte.FIRMWARE: self.unit.firmware,
             CommandByte.SERIAL: self.unit.serial,
         }
@@ -273,7 +264,7 @@ class Gx1Emulator:
 
     def _on_hard_iron(self, command: int, data: bytes, at_ns: int) -> None:
         if command == CommandByte.HARD_IRON_START:
-            self._extremes = ([MAX_WORD] * 3, [MIN_WORD] * 3)
+            self._extremes = ([scaling.MAX_WORD] * 3, [scaling.MIN_WORD] * 3)
             self._write(dict.fromkeys(EepromAddress.HARD_IRON, 0))
             self._queue_reply(command, (), at_ns)
             return

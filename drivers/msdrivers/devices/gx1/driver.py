@@ -18,35 +18,18 @@ from collections.abc import Mapping
 from modelserver.messages import NAN, ImuSample, OrientationReference, SensorHeader, YawSource
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
-from msdrivers.devices.gx1.script import (
-    RETRY_DELAY_S,
-    Gx1Receiver,
-    Gx1Reply,
-    LineState,
-    NoReplyError,
-    PauseStep,
-    RequestStep,
-    Script,
-    ScriptPart,
-    ScriptRunner,
-    UnusableDeviceError,
-    find_device,
-    read_gains,
-    read_words,
-)
+from msdrivers.devices.gx1 import script
 from msdrivers.devices.gx1.settings import Gx1Settings, HeadingSource
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Send
-from msdrivers.protocol.gx1 import LENGTHS, MEASUREMENTS, CommandByte, EepromAddress, Gains, Gx1Packet, requests
-from msdrivers.protocol.gx1.scaling import (
-    DOCUMENTED_TIMERS,
-    G0,
-    TESLA,
-    is_saturated,
-    orientation_from_euler,
-    orientation_from_quaternion,
-    temperature_from_word,
-    tick_from_timer_words,
-    vector_from_words,
+from msdrivers.protocol.gx1 import (
+    LENGTHS,
+    MEASUREMENTS,
+    CommandByte,
+    EepromAddress,
+    Gains,
+    Gx1Packet,
+    requests,
+    scaling,
 )
 
 _UP_NED: Vector3 = (0.0, 0.0, -1.0)
@@ -56,7 +39,9 @@ _UP_NED: Vector3 = (0.0, 0.0, -1.0)
 def find_saturated_fields(packet: Gx1Packet) -> tuple[str, ...]:
     """Return the names of the saturated vectors."""
     return tuple(
-        name for name in ("field", "acceleration", "rate") if packet.has(name) and is_saturated(packet.field(name))
+        name
+        for name in ("field", "acceleration", "rate")
+        if packet.has(name) and scaling.is_saturated(packet.field(name))
     )
 
 
@@ -71,18 +56,22 @@ def sample_from_packet(
     missing = find_saturated_fields(packet)
 
     def convert(name: str, gain: int, unit: float = 1.0) -> Vector3 | None:
-        return vector_from_words(packet.field(name), gain, unit) if packet.has(name) and name not in missing else None
+        return (
+            scaling.vector_from_words(packet.field(name), gain, unit)
+            if packet.has(name) and name not in missing
+            else None
+        )
 
     orientation: Quaternion | None = None
     if packet.has("euler"):
-        orientation = orientation_from_euler(packet.field("euler"))
+        orientation = scaling.orientation_from_euler(packet.field("euler"))
     elif packet.has("quaternion"):
-        orientation = orientation_from_quaternion(packet.field("quaternion"))
+        orientation = scaling.orientation_from_quaternion(packet.field("quaternion"))
     return ImuSample(
         header,
         angular_velocity=convert("rate", gains.gyro),
-        specific_force=convert("acceleration", gains.accelerometer, force_sign * G0),
-        magnetic_field=convert("field", gains.magnetometer, TESLA),
+        specific_force=convert("acceleration", gains.accelerometer, force_sign * scaling.G0),
+        magnetic_field=convert("field", gains.magnetometer, scaling.TESLA),
         orientation=orientation,
         orientation_reference=OrientationReference.NED if orientation else OrientationReference.NONE,
         yaw_source=YawSource.MAGNETIC if orientation and heading is HeadingSource.MAGNETIC else YawSource.NONE,
@@ -112,9 +101,9 @@ class GravityCheck:
             return False
         up = so3.rotate(so3.conjugate(orientation), _UP_NED)
         along = sum(a * b for a, b in zip(force, up, strict=True))
-        is_quiet = math.hypot(*rate) <= self.MAX_RATE and abs(math.hypot(*force) - G0) <= self.MAX_FORCE_ERROR
+        is_quiet = math.hypot(*rate) <= self.MAX_RATE and abs(math.hypot(*force) - scaling.G0) <= self.MAX_FORCE_ERROR
         # neither up nor down: not stationary
-        if not is_quiet or abs(along) < 0.7 * G0:
+        if not is_quiet or abs(along) < 0.7 * scaling.G0:
             self._count = 0
             return False
         upwards = along > 0.0
@@ -257,9 +246,9 @@ class Gx1Driver:
         self.settings = settings
         self.tick_s = settings.tick or 0.0
         """Seconds of a tick; 0 before that is known."""
-        self._link = Gx1Receiver()
-        self._script = ScriptRunner(self._link, self._run_setup)
-        self._line_state = LineState(list(settings.bauds))
+        self._link = script.Gx1Receiver()
+        self._script = script.ScriptRunner(self._link, self._run_setup)
+        self._line_state = script.LineState(list(settings.bauds))
         self._gains = Gains(1, 1, 1)
         self._device = "3DM-GX1"
         self._bias_pending = settings.capture_bias_at_start
@@ -319,36 +308,36 @@ class Gx1Driver:
         """Messages by kind, bytes skipped, rejected and unanswered by reason, restarts, saturated vectors."""
         return self._link.messages + self._link.parser.counts + self._counts
 
-    def _run_setup(self) -> Script:
+    def _run_setup(self) -> script.Script:
         while True:
             try:
-                self._device = yield from find_device(self._link, self._line_state)
+                self._device = yield from script.find_device(self._link, self._line_state)
                 text = f"{self._device} answers{self._line_state.at_baud_text}"
                 yield EndpointStatus(EndpointPhase.CONFIGURING, text)
-                self._gains = yield from read_gains()
+                self._gains = yield from script.read_gains()
                 yield from self._read_timer()
                 if self.settings.capture_bias_at_start:
                     yield from self._capture_bias()
                 yield from self._start_stream()
                 return
-            except NoReplyError as silence:
+            except script.NoReplyError as silence:
                 why = f"{self._device} fell silent while it was set up: {silence}; check its cable and power"
-            except UnusableDeviceError as unusable:
+            except script.UnusableDeviceError as unusable:
                 why = f"{self._device} cannot be used: {unusable}"
-            text = f"{why}; nothing is published, trying again in {RETRY_DELAY_S:g} s"
+            text = f"{why}; nothing is published, trying again in {script.RETRY_DELAY_S:g} s"
             yield EndpointStatus(EndpointPhase.SILENT, text)
-            yield PauseStep(RETRY_DELAY_S)
+            yield script.PauseStep(script.RETRY_DELAY_S)
 
-    def _read_timer(self) -> ScriptPart[None]:
+    def _read_timer(self) -> script.ScriptPart[None]:
         if self.settings.tick is None:
-            words = yield from read_words(EepromAddress.TIMER)
-            self.tick_s = tick_from_timer_words(words)
+            words = yield from script.read_words(EepromAddress.TIMER)
+            self.tick_s = scaling.tick_from_timer_words(words)
             if not 1e-3 <= self.tick_s <= 0.1:
-                raise UnusableDeviceError(
+                raise script.UnusableDeviceError(
                     f"its EEPROM gives a timer tick of {self.tick_s:g} s (words {list(words)} at addresses "
                     f"{list(EepromAddress.TIMER)}); write the defaults 16 16 256 1 to them, or set tick in the settings"
                 )
-            if words not in DOCUMENTED_TIMERS:
+            if words not in scaling.DOCUMENTED_TIMERS:
                 yield EndpointStatus(
                     EndpointPhase.CONFIGURING,
                     f"the timer words {list(words)} are not documented; a tick of {self.tick_s * 1e3:g} ms is "
@@ -357,7 +346,7 @@ class Gx1Driver:
         self._link.ticks.set_tick(self.tick_s)
         self._tick_check = TickRateCheck(self.tick_s)
 
-    def _capture_bias(self) -> ScriptPart[None]:
+    def _capture_bias(self) -> script.ScriptPart[None]:
         if not self._bias_pending:
             yield EndpointStatus(
                 EndpointPhase.CONFIGURING,
@@ -368,17 +357,19 @@ class Gx1Driver:
         yield EndpointStatus(EndpointPhase.CONFIGURING, "capturing the gyro biases: keep the vehicle still")
         self._bias_pending = False
         try:
-            yield RequestStep(requests.make_poll(CommandByte.CAPTURE_BIAS), timeout=BIAS_CAPTURE_TIMEOUT_S, attempts=1)
-        except NoReplyError:
+            yield script.RequestStep(
+                requests.make_poll(CommandByte.CAPTURE_BIAS), timeout=BIAS_CAPTURE_TIMEOUT_S, attempts=1
+            )
+        except script.NoReplyError:
             text = f"the gyro bias capture timed out after {BIAS_CAPTURE_TIMEOUT_S:g} s; using the previous biases"
         else:
             text = "the gyro biases are captured"
         yield EndpointStatus(EndpointPhase.CONFIGURING, text)
 
-    def _start_stream(self) -> ScriptPart[None]:
+    def _start_stream(self) -> script.ScriptPart[None]:
         message = self.settings.message
         self._link.set_streamed(message)
-        yield RequestStep(requests.make_stream(message), value=message)
+        yield script.RequestStep(requests.make_stream(message), value=message)
         self._link.set_streamed(message)
         now_ns = self._link.now.monotonic_ns
         self._link.reset_input()
@@ -393,7 +384,7 @@ class Gx1Driver:
         if message not in _GRAVITY_MESSAGES and self.settings.polled not in _GRAVITY_MESSAGES:
             self._polls.add(CommandByte.EULER_VECTORS, GRAVITY_POLL_PERIOD_S, now_ns)
 
-    def _on_streamed_reply(self, reply: Gx1Reply, now: HostTime) -> list[Output[bytes]]:
+    def _on_streamed_reply(self, reply: script.Gx1Reply, now: HostTime) -> list[Output[bytes]]:
         """Process a reply while the device streams."""
         if self._link.ticks.has_jumped:
             return self._restart(now, "its ticks jumped, so it has restarted or is another one")
@@ -401,7 +392,7 @@ class Gx1Driver:
         command = packet.command
         self._polls.on_reply(command)
         if command == CommandByte.TEMPERATURE:
-            self._celsius = temperature_from_word(packet.unsigned)
+            self._celsius = scaling.temperature_from_word(packet.unsigned)
         if command not in MEASUREMENTS:
             return []
         outputs: list[Output[bytes]] = []

@@ -12,22 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from modelserver.transforms.so3 import Vector3
-from msdrivers.devices.gx1.script import (
-    RETRY_DELAY_S,
-    Gx1Receiver,
-    LineState,
-    NoReplyError,
-    PauseStep,
-    RequestStep,
-    Script,
-    ScriptPart,
-    ScriptRunner,
-    UnusableDeviceError,
-    find_device,
-    read_gains,
-    read_words,
-    write_word,
-)
+from msdrivers.devices.gx1 import script
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Send
 from msdrivers.protocol.gx1 import CommandByte, EepromAddress, Gx1Packet, requests
 from msdrivers.protocol.gx1.scaling import TESLA, is_saturated, vector_from_words
@@ -88,9 +73,9 @@ class HardIronProcedure:
     def __init__(self, settings: HardIronSettings):
         self.settings = settings
         self.result: HardIronResult | None = None
-        self._link = Gx1Receiver()
-        self._script = ScriptRunner(self._link, self._run_procedure)
-        self._line_state = LineState(list(settings.bauds))
+        self._link = script.Gx1Receiver()
+        self._script = script.ScriptRunner(self._link, self._run_procedure)
+        self._line_state = script.LineState(list(settings.bauds))
         self._gain = 1
         self._before: tuple[int, ...] = ()
         self._is_started = False
@@ -136,38 +121,38 @@ class HardIronProcedure:
         """Messages by kind, bytes skipped, rejected by reason."""
         return self._link.messages + self._link.parser.counts
 
-    def _run_procedure(self) -> Script:
+    def _run_procedure(self) -> script.Script:
         while True:
             try:
                 yield from self._prepare()
                 break
-            except (NoReplyError, UnusableDeviceError) as failure:
-                text = f"hard iron: cannot begin: {failure}; trying again in {RETRY_DELAY_S:g} s"
+            except (script.NoReplyError, script.UnusableDeviceError) as failure:
+                text = f"hard iron: cannot begin: {failure}; trying again in {script.RETRY_DELAY_S:g} s"
             yield EndpointStatus(EndpointPhase.SILENT, text)
-            yield PauseStep(RETRY_DELAY_S)
+            yield script.PauseStep(script.RETRY_DELAY_S)
         try:
             offsets = yield from self._find_offsets()
             text = f"hard iron: done, offsets {_format_microtesla(offsets)} are stored and were read back"
             self.result = HardIronResult(True, text, offsets, self._get_spans())
-        except (_FailedError, NoReplyError) as failure:
+        except (_FailedError, script.NoReplyError) as failure:
             text = yield from self._restore_offsets(str(failure))
             self.result = HardIronResult(False, text, spans=self._get_spans() if self._extremes[0] else None)
         yield Send(self._line_state.make_restore_request())
         yield EndpointStatus(EndpointPhase.CONFIGURING, text)
 
-    def _prepare(self) -> ScriptPart[None]:
-        device = yield from find_device(self._link, self._line_state)
-        self._gain = (yield from read_gains()).magnetometer
+    def _prepare(self) -> script.ScriptPart[None]:
+        device = yield from script.find_device(self._link, self._line_state)
+        self._gain = (yield from script.read_gains()).magnetometer
         # after a reconnect the device has no offsets: keep those found first
         if not self._is_started:
-            self._before = yield from read_words(EepromAddress.HARD_IRON)
+            self._before = yield from script.read_words(EepromAddress.HARD_IRON)
         yield EndpointStatus(
             EndpointPhase.CONFIGURING, f"hard iron: {device}, offsets before {_to_signed(self._before)} counts"
         )
 
-    def _find_offsets(self) -> ScriptPart[Vector3]:
+    def _find_offsets(self) -> script.ScriptPart[Vector3]:
         self._is_started = True
-        yield RequestStep(requests.make_hard_iron_start())
+        yield script.RequestStep(requests.make_hard_iron_start())
         how = "on level ground through full circles" if self.settings.two_dimensional else "about all its axes"
         yield EndpointStatus(
             EndpointPhase.CONFIGURING, f"hard iron: turn the vehicle {how}, for {self.settings.duration:g} s"
@@ -175,17 +160,17 @@ class HardIronProcedure:
         yield from self._collect_extremes()
         self._check_spans()
         kind = self.settings.two_dimensional
-        (reply,) = yield RequestStep(
+        (reply,) = yield script.RequestStep(
             requests.make_hard_iron_compute(kind, self.settings.magnitude_z), timeout=COMPUTE_TIMEOUT_S, attempts=1
         )
         yield from self._check_offsets(reply)
         return vector_from_words(reply.field("offset"), self._gain, TESLA)
 
-    def _collect_extremes(self) -> ScriptPart[None]:
+    def _collect_extremes(self) -> script.ScriptPart[None]:
         link, seconds = self._link, 1e9
         begin = reported = link.now.monotonic_ns
         while link.now.monotonic_ns - begin < self.settings.duration * seconds:
-            (reply,) = yield RequestStep(requests.make_poll(CommandByte.HARD_IRON_COLLECT))
+            (reply,) = yield script.RequestStep(requests.make_poll(CommandByte.HARD_IRON_COLLECT))
             self._extremes = (reply.field("minimum"), reply.field("maximum"))
             if link.now.monotonic_ns - reported >= PROGRESS_PERIOD_S * seconds:
                 reported = link.now.monotonic_ns
@@ -193,7 +178,7 @@ class HardIronProcedure:
                 spans = _format_microtesla(self._get_spans())
                 text = f"hard iron: {done:.0f} of {self.settings.duration:g} s, field spans {spans}"
                 yield EndpointStatus(EndpointPhase.CONFIGURING, text)
-            yield PauseStep(self.settings.period)
+            yield script.PauseStep(self.settings.period)
 
     def _get_spans(self) -> Vector3:
         low, high = self._extremes
@@ -214,7 +199,7 @@ class HardIronProcedure:
                     f"{self.settings.min_span * 1e6:.1f} uT are needed: turn the vehicle further, for the whole time"
                 )
 
-    def _check_offsets(self, reply: Gx1Packet) -> ScriptPart[None]:
+    def _check_offsets(self, reply: Gx1Packet) -> script.ScriptPart[None]:
         low, high = self._extremes
         offsets = reply.field("offset")
         for axis in self._list_checked_axes():
@@ -225,20 +210,20 @@ class HardIronProcedure:
                     f"extremes is {middle:g}: do the procedure again, away from iron and currents"
                 )
         for axis, address in enumerate(EepromAddress.HARD_IRON):
-            (stored,) = yield from read_words((address,))
+            (stored,) = yield from script.read_words((address,))
             if stored != offsets[axis] & 0xFFFF:
                 raise _FailedError(
                     f"the device gave an offset of {offsets[axis]} counts along {_AXES[axis]}, but its EEPROM (address "
                     f"{address}) holds {_to_signed((stored,))[0]}: it was not stored; do the procedure again"
                 )
 
-    def _restore_offsets(self, why: str) -> ScriptPart[str]:
+    def _restore_offsets(self, why: str) -> script.ScriptPart[str]:
         try:
             for address, value in zip(EepromAddress.HARD_IRON, self._before, strict=True):
-                yield from write_word(address, value)
-                if (yield from read_words((address,))) != (value,):
+                yield from script.write_word(address, value)
+                if (yield from script.read_words((address,))) != (value,):
                     raise _FailedError(f"address {address} did not take {_to_signed((value,))[0]}")
-        except (NoReplyError, _FailedError) as failure:
+        except (script.NoReplyError, _FailedError) as failure:
             return (
                 f"hard iron: failed: {why}; and the offsets from before, {_to_signed(self._before)} counts, could not "
                 f"be restored: {failure}; repeat the procedure before the magnetometer is used"
