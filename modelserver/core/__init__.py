@@ -20,7 +20,7 @@ from typing import Any, Final, get_args
 from modelserver import messages
 from modelserver.core import commands, requests, samples
 from modelserver.core.host_clock import Instant
-from modelserver.core.requests import reply_error, reply_internal_error, reply_overloaded
+from modelserver.core.requests import is_answerable, reply_error, reply_internal_error, reply_overloaded
 from modelserver.core.state import (
     DEGRADED,
     RUNNING,
@@ -64,6 +64,7 @@ __all__ = [
     "ExpectedSensor",
     "Instant",
     "get_state_to_persist",
+    "is_answerable",
     "reply_error",
     "reply_internal_error",
     "reply_overloaded",

@@ -15,7 +15,7 @@ import numpy as np
 
 from modelserver import messages
 from modelserver.core.host_clock import Instant
-from modelserver.core.requests import reply_error
+from modelserver.core.requests import is_answerable, reply_error
 from modelserver.core.samples import COMMAND_FUTURE_LIMIT_S, switch_mode, update_localizer
 from modelserver.core.state import CoreState, StepResult, count_rejection
 from modelserver.errors import Status
@@ -85,7 +85,7 @@ def _forbid(
 ) -> StepResult | None:
     """Reject a command whose reply channel, or which itself, is not permitted; None if it is."""
     channel, settings = messages.CHANNEL_OF[type(command)], state.settings
-    if not messages.is_answerable(command.header, settings.reply_prefix):
+    if not is_answerable(command.header, settings.reply_prefix):
         return count_rejection(state, channel, "reply_channel"), ()
     name, is_permitted = "set_pose", settings.may_set_pose
     if isinstance(command, messages.ReloadModel):

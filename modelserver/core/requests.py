@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from functools import lru_cache
 from typing import Final
 
 from modelserver.core.host_clock import Instant
@@ -18,6 +20,7 @@ from modelserver.errors import Status
 from modelserver.geometry import names
 from modelserver.messages import (
     CHANNEL_OF,
+    MAX_CHANNEL_LENGTH,
     Denied,
     GetExplanation,
     GetHTransform,
@@ -28,12 +31,26 @@ from modelserver.messages import (
     Request,
     RequestHeader,
     SendReply,
-    is_answerable,
 )
 from modelserver.query.answers import DeferredAnswer, compute_replies, is_deferred, make_error_reply
 
 _TIMED: Final = (GetTransformation, GetStateVector, GetHTransform, GetMotion, GetExplanation)
 """Requests that name a time, and may wait for its data."""
+
+
+_PLAIN_NAME = re.compile(r"[A-Za-z0-9_]+")
+
+
+def is_answerable(header: RequestHeader, prefix: str) -> bool:
+    """Return whether a server may reply on the request's reply channel: within its prefix, plain, not too long."""
+    channel = header.reply_channel
+    # the length first: what is looked up is cached
+    return len(channel) <= MAX_CHANNEL_LENGTH and _is_plain(channel, prefix)
+
+
+@lru_cache(maxsize=1024)
+def _is_plain(channel: str, prefix: str) -> bool:
+    return len(channel) > len(prefix) and channel.startswith(prefix) and _PLAIN_NAME.fullmatch(channel) is not None
 
 
 def handle_request(state: CoreState, request: Request, now: Instant) -> tuple[CoreState, AllOutputs]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Final, NamedTuple, TypeAlias
 
 from modelserver.messages.answers import PoseAnswer, PoseBatch
@@ -67,21 +65,6 @@ MAX_CHANNEL_LENGTH = 63
 
 MAX_REQUEST_INSTANTS: Final = 2_000
 """In one GetTransformations, all pairs together: they take the server about a hundredth of a second."""
-
-_PLAIN_NAME = re.compile(r"[A-Za-z0-9_]+")
-
-
-def is_answerable(header: RequestHeader, prefix: str) -> bool:
-    """Return whether a server may reply on the request's reply channel: within its prefix, plain, not too long."""
-    channel = header.reply_channel
-    # the length first: what is looked up is cached
-    return len(channel) <= MAX_CHANNEL_LENGTH and _is_plain(channel, prefix)
-
-
-@lru_cache(maxsize=1024)
-def _is_plain(channel: str, prefix: str) -> bool:
-    return len(channel) > len(prefix) and channel.startswith(prefix) and _PLAIN_NAME.fullmatch(channel) is not None
-
 
 Request: TypeAlias = (
     GetTransformation

@@ -9,9 +9,8 @@ import numpy.typing as npt
 
 from modelserver.errors import Status, WireError
 from modelserver.messages import Origin, PoseBatch, PoseBatchReply
-from modelserver.wire import fields
 from modelserver.wire.fields import LENGTH, MAX_MESSAGE_INSTANTS
-from modelserver.wire.poses import pack_reply_header, unpack_reply_header
+from modelserver.wire.poses import NO_PLACE, pack_reply_header, unpack_reply_header
 
 _INT = struct.Struct(">i")
 _PLACE = struct.Struct(">iiii3dbbqi")
@@ -27,9 +26,7 @@ def pack_get_transformations_reply(reply: PoseBatchReply) -> bytes:
         reply.parts,
         reply.pair,
         reply.first,
-        *(fields.NAN3 if origin is None else origin.initial_utm),
-        0 if origin is None else origin.zone,
-        origin is not None and origin.north,
+        *(NO_PLACE if origin is None else (*origin.initial_utm, origin.zone, origin.north)),
         0 if origin is None else origin.origin_id,
         count,
     )

@@ -40,6 +40,9 @@ _VECTOR = struct.Struct(">7dd280x3dbbqibiiddd")
 PLAIN: Final = pack_text("") + LENGTH.pack(0)
 """The part of a reply's header that is the same in each reply with an answer: no message, no nearest names."""
 
+NO_PLACE: Final = (*fields.NAN3, 0, False)
+"""Of no origin: initial_utm, zone, north."""
+
 _NAN_COVARIANCE: Final = _NUMBERS.pack(*fields.NAN36)
 
 _POSE_HEAD: Final = bytes(8) + 2 * pack_text("")
@@ -121,7 +124,7 @@ def _pack_pose(pose: bytes, answer: PoseAnswer) -> bytes:
     transformation, origin, quality, horizontal_protection_level, heading_protection_level, seconds_to_limit = answer
     covariance = transformation.covariance_numbers
     invalid = transformation.invalid_reasons
-    easting, northing, height = fields.NAN3 if origin is None else origin.initial_utm
+    place = NO_PLACE if origin is None else (origin.easting, origin.northing, origin.height, origin.zone, origin.north)
     return b"%b%b%b%b%b%b%b" % (
         UTIME.pack(transformation.utime),
         pack_text(transformation.frame_of_interest),
@@ -129,11 +132,7 @@ def _pack_pose(pose: bytes, answer: PoseAnswer) -> bytes:
         pose,
         _NAN_COVARIANCE if covariance is None else _NUMBERS.pack(*covariance),
         _REST.pack(
-            easting,
-            northing,
-            height,
-            0 if origin is None else origin.zone,
-            origin is not None and origin.north,
+            *place,
             transformation.origin_id,
             transformation.pose_epoch,
             not invalid,

@@ -76,7 +76,7 @@ TERMS = {
     "state history": "modelserver/estimation/history.py",
     "interpolation": "modelserver/query/joint_lookup.py",
     "extrapolation": "modelserver/client/extrapolation.py",
-    "static transform": "modelserver/wire/reply_cache.py",
+    "static transform": "modelserver/wire/codec.py",
     "frame tree": "modelserver/geometry/kinematic_path.py",
     "forward kinematics": "modelserver/geometry/kinematic_path.py",
     "slerp": "modelserver/transforms/so3.py",

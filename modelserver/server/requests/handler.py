@@ -42,9 +42,8 @@ from modelserver.server.requests.scheduler import (
 )
 from modelserver.server.requests.signed_commands import CommandVerifier
 from modelserver.wire.channels import BY_NAME, REQUESTS, SIGNED
-from modelserver.wire.codec import decode, encode, read_request_header
+from modelserver.wire.codec import CACHED_TYPE, MAX_ENTRIES, StaticReplyCache, decode, encode, read_request_header
 from modelserver.wire.journal import RecordKind
-from modelserver.wire.reply_cache import CACHED_TYPE, MAX_ENTRIES, StaticReplyCache
 
 log = logging.getLogger(__name__)
 
@@ -393,7 +392,7 @@ class RequestHandler:
         if reply is None:
             return False
         header = messages.RequestHeader(0, client.decode("utf-8", "replace"))
-        if not messages.is_answerable(header, context.state.settings.reply_prefix):
+        if not core.is_answerable(header, context.state.settings.reply_prefix):
             return False
         self._journal.record_message(RecordKind.CACHED, (channel, data), now)
         context.publish(header.reply_channel, reply)

@@ -10,9 +10,8 @@ from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
 from modelserver.messages import GetTransformation, Policy, RequestHeader, SendReply, TimeQuery
 from modelserver.transforms.pose import Pose
-from modelserver.wire import reply_cache
-from modelserver.wire.codec import encode
-from modelserver.wire.reply_cache import StaticReplyCache
+from modelserver.wire import codec
+from modelserver.wire.codec import StaticReplyCache, encode
 
 LATER = Instant(10, 20_000_000)
 
@@ -124,7 +123,7 @@ def test_given_all_pairs_of_a_model_then_they_fit() -> None:
 
 
 def test_given_more_pairs_than_fit_then_the_least_recently_used_is_evicted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reply_cache, "MAX_ENTRIES", 3)
+    monkeypatch.setattr(codec, "MAX_ENTRIES", 3)
     model = cart()
     cache = cache_of(model)
     reply = reply_of(model, make_request())
