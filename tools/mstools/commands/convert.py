@@ -31,8 +31,7 @@ def command(
     ] = "",
     variables: Variables = None,
     repair: Annotated[
-        bool,
-        option("--repair", "Drop malformed elements, and bodies that no constraint connects to the first one."),
+        bool, option("--repair", "Drop malformed elements, and bodies that no constraint connects to the first one.")
     ] = False,
     force: Annotated[bool, option("--force", "Replace OUT where it exists.")] = False,
 ) -> None:

@@ -39,13 +39,11 @@ DryRunOption = Annotated[bool, option("--dry-run", "Only print what would be don
 
 def command(
     vehicle: Annotated[
-        Path | None,
-        option("--vehicle -c FILE", "The vehicle file. Default: the installed one."),
+        Path | None, option("--vehicle -c FILE", "The vehicle file. Default: the installed one.")
     ] = None,
     drivers: Annotated[str, option("--drivers NAMES", "Drivers to start: all, none, or names with commas.")] = "all",
     serial: Annotated[
-        list[str] | None,
-        option("--serial NAME=ID", "A driver's device below /dev/serial/by-id. May be repeated."),
+        list[str] | None, option("--serial NAME=ID", "A driver's device below /dev/serial/by-id. May be repeated.")
     ] = None,
     start: Annotated[bool, option("--start/--no-start", "Start the installed units.")] = True,
     dry_run: DryRunOption = False,

@@ -165,8 +165,7 @@ def command(
     model: ModelOption = None,
     settings: Variables = None,
     log: Annotated[
-        Path | None,
-        option("--log FILE", "Query this LCM log of the service instead of the daemon."),
+        Path | None, option("--log FILE", "Query this LCM log of the service instead of the daemon.")
     ] = None,
     at: Annotated[
         str,

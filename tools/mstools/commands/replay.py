@@ -49,8 +49,7 @@ def command(
     frame: Annotated[str, option("--frame BODY:FRAME", "Frame of the poses. Default: the base frame.")] = "",
     rate: Annotated[float | None, option("--rate HZ", "Poses per second. Default: 50.")] = None,
     at_times: Annotated[
-        Path | None,
-        option("--at-times FILE", "Poses at these times: one utime per line, ascending."),
+        Path | None, option("--at-times FILE", "Poses at these times: one utime per line, ascending.")
     ] = None,
     speed: Annotated[str, option("--speed N", "Speed factor; max: as fast as possible. On the bus only.")] = "1",
     restamp: Annotated[
@@ -61,8 +60,7 @@ def command(
         bool, option("--all", "On the bus, also publish recorded poses, requests and replies.")
     ] = False,
     verify: Annotated[
-        bool,
-        option("--verify", "LOG is a journal: replay it and compare all published messages bit for bit."),
+        bool, option("--verify", "LOG is a journal: replay it and compare all published messages bit for bit.")
     ] = False,
     key: Annotated[
         Path | None, option("--key FILE", "With --verify: the vehicle's key file, to verify the seals.")

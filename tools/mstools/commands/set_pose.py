@@ -59,36 +59,26 @@ class PoseTarget(NamedTuple):
 
 def command(
     utm: Annotated[
-        Triple | None,
-        option("--utm E N H", "Position: grid easting, northing, ellipsoidal height, meters."),
+        Triple | None, option("--utm E N H", "Position: grid easting, northing, ellipsoidal height, meters.")
     ] = None,
     xyz: Annotated[
-        Triple | None,
-        option("--xyz X Y Z", "Position: meters from the origin of World:UTM (initial_utm)."),
+        Triple | None, option("--xyz X Y Z", "Position: meters from the origin of World:UTM (initial_utm).")
     ] = None,
     latlon: Annotated[
-        tuple[float, float] | None,
-        option("--latlon LAT LON", "Position: WGS 84, degrees, north and east positive."),
+        tuple[float, float] | None, option("--latlon LAT LON", "Position: WGS 84, degrees, north and east positive.")
     ] = None,
     height: Annotated[
-        float | None,
-        option("--height H", "With --latlon: ellipsoidal height, meters. Default: as it is."),
+        float | None, option("--height H", "With --latlon: ellipsoidal height, meters. Default: as it is.")
     ] = None,
     yaw: Annotated[
-        float | None,
-        option("--yaw DEG", "Degrees counterclockwise from grid east; roll and pitch stay."),
+        float | None, option("--yaw DEG", "Degrees counterclockwise from grid east; roll and pitch stay.")
     ] = None,
     heading: Annotated[
-        float | None,
-        option("--heading DEG", "Degrees clockwise from true north; roll and pitch stay."),
+        float | None, option("--heading DEG", "Degrees clockwise from true north; roll and pitch stay.")
     ] = None,
-    rpy: Annotated[
-        Triple | None,
-        option("--rpy R P Y", "Roll, pitch and yaw, degrees, yaw from grid east."),
-    ] = None,
+    rpy: Annotated[Triple | None, option("--rpy R P Y", "Roll, pitch and yaw, degrees, yaw from grid east.")] = None,
     quaternion: Annotated[
-        Quaternion | None,
-        option("--quaternion S X Y Z", "Orientation in World:UTM, scalar first."),
+        Quaternion | None, option("--quaternion S X Y Z", "Orientation in World:UTM, scalar first.")
     ] = None,
     sigma: Annotated[float, option("--sigma M", "Standard deviation of each coordinate, meters.")] = 1.0,
     sigma_deg: Annotated[float, option("--sigma-deg DEG", "Standard deviation about each axis, degrees.")] = 5.0,

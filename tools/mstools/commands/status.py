@@ -51,8 +51,7 @@ def command(
     url: UrlOption = "",
     prefix: PrefixOption = "",
     timeout: Annotated[
-        float,
-        option("--timeout SECONDS", "Timeout for the daemon's report.", min=0.1, max=3600.0),
+        float, option("--timeout SECONDS", "Timeout for the daemon's report.", min=0.1, max=3600.0)
     ] = 2.5,
 ) -> None:
     """Show the health of the running daemon: pose, filter, loop, sensors, drivers, rejected messages, and warnings.

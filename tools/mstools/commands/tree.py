@@ -30,10 +30,7 @@ def command(
     variables: Variables = None,
     url: UrlOption = "",
     prefix: PrefixOption = "",
-    wait: Annotated[
-        float,
-        option("--wait SECONDS", "Timeout for the daemon.", min=0.01, max=7200.0),
-    ] = TIMEOUT_S,
+    wait: Annotated[float, option("--wait SECONDS", "Timeout for the daemon.", min=0.01, max=7200.0)] = TIMEOUT_S,
 ) -> None:
     """Draw the kinematic tree: constraints with their joints and limits, loop closures, orphans.
 

@@ -37,13 +37,9 @@ ModelOption = Annotated[Path | None, option("--model FILE", "Query this geometry
 UrlOption = Annotated[str, option("--url URL", "LCM provider. Default: $LCM_DEFAULT_URL, else loopback.")]
 PrefixOption = Annotated[str, option("--prefix TEXT", "Channel prefix of the vehicle.")]
 KeyOption = Annotated[
-    Path | None,
-    option("--key FILE", "The vehicle's key file, to sign with. Default: $MODELSERVER_KEY_FILE."),
+    Path | None, option("--key FILE", "The vehicle's key file, to sign with. Default: $MODELSERVER_KEY_FILE.")
 ]
-TimeoutOption = Annotated[
-    float,
-    option("--timeout SECONDS", "Timeout of one try.", min=0.01, max=3600.0),
-]
+TimeoutOption = Annotated[float, option("--timeout SECONDS", "Timeout of one try.", min=0.01, max=3600.0)]
 JsonOption = Annotated[bool, option("--json", "Print JSON, for scripts.")]
 
 _ASSIGNMENT = re.compile(r"(\w+)=(.*)", re.ASCII | re.DOTALL)
