@@ -23,8 +23,7 @@ from msdrivers.protocol.can.mapping import (
     StatusMap,
     WheelMap,
 )
-from msdrivers.protocol.modbus.axis_map import AxisRegisters
-from msdrivers.protocol.modbus.registers import RegisterMap
+from msdrivers.protocol.modbus.registers import AxisRegisters, RegisterMap
 
 START_UTIME = 1_750_000_000_000_000
 START_NS = 5_000_000_000

@@ -77,17 +77,18 @@ def make_link(settings: DriverSettings) -> Link[Any]:
         from msdrivers.links.serial_port import SerialLink
 
         return SerialLink(line.port, choose_first_baud(settings))
-    if isinstance(line, TcpSettings):
-        from msdrivers.links.tcp import TcpLink
-
-        return TcpLink(*split_address(line.address))
     if isinstance(line, CanSettings):
         from msdrivers.links.can_bus import CanLink
 
         return CanLink(line.can, line.interface, line.bitrate)
-    from msdrivers.links.modbus import make_modbus_link
+    from msdrivers.links.tcp import TcpLink
 
-    return make_modbus_link(*split_address(line.address), line.unit_id)
+    link = TcpLink(*split_address(line.address))
+    if isinstance(line, TcpSettings):
+        return link
+    from msdrivers.links.modbus import ModbusLink
+
+    return ModbusLink(link, line.unit_id)
 
 
 def choose_first_baud(settings: DriverSettings) -> int:

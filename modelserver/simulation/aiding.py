@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from modelserver.messages import AbsolutePoseSample, RangeSample, RelativePoseSample
-from modelserver.simulation import kinematics
 from modelserver.simulation.timing import Intervals, Run, Timing, is_within
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
@@ -29,7 +28,6 @@ class AbsolutePoseModel:
     ----------
     position_sigma, orientation_sigma : noise of each axis and sample
     frame_of_reference : World:ENU or World:UTM
-    has_position, has_orientation : whether they are reported; otherwise None
     outages : (begin, end) in seconds since the start without samples
     """
 
@@ -37,8 +35,6 @@ class AbsolutePoseModel:
     position_sigma: float = 0.05
     orientation_sigma: float = 0.01
     frame_of_reference: str = ENU
-    has_position: bool = True
-    has_orientation: bool = True
     outages: Intervals = ()
 
     def __post_init__(self) -> None:
@@ -71,14 +67,12 @@ class RangeModel:
     Attributes
     ----------
     sigma : noise of each distance
-    bias_sigma : standard deviation of each beacon's constant error, drawn once
     max_range : beacons farther away give no sample
     outages : (begin, end) in seconds since the start without samples
     """
 
     timing: Timing = _TIMING
     sigma: float = 0.1
-    bias_sigma: float = 0.0
     max_range: float = math.inf
     outages: Intervals = ()
 
@@ -91,14 +85,14 @@ def simulate_absolute_poses(model: AbsolutePoseModel, run: Run, frame: str, X_VF
         shift, turn = noise.vector(model.position_sigma), noise.vector(model.orientation_sigma)
         if is_within(model.outages, t):
             continue
-        true = kinematics.pose(run.drive.at(t), X_VF)
+        true = run.drive.at(t).pose_of(X_VF)
         measured = _add_error(run.geodesy.pose_in_utm(true) if model.frame_of_reference == UTM else true, shift, turn)
         yield AbsolutePoseSample(
             header,
             frame,
             model.frame_of_reference,
-            position=measured.xyz if model.has_position else None,
-            orientation=measured.wxyz if model.has_orientation else None,
+            position=measured.xyz,
+            orientation=measured.wxyz,
             covariance=covariance,
         )
 
@@ -112,7 +106,7 @@ def simulate_relative_poses(model: RelativePoseModel, run: Run, frame: str, X_VF
     before = Pose()
     for header, t in run.generate_headers(model.timing, "relative/relative_pose"):
         shift, turn = noise.vector(model.position_sigma), noise.vector(model.orientation_sigma)
-        here = kinematics.pose(run.drive.at(t), X_VF)
+        here = run.drive.at(t).pose_of(X_VF)
         if since is not None and not is_within(model.outages, t):
             step = before.inverse() @ here
             measured = _add_error(Pose(so3.scale(scale, step.xyz), step.wxyz), shift, turn)
@@ -125,14 +119,13 @@ def simulate_ranges(
 ) -> Iterator[RangeSample]:
     """Yield samples without end. `beacons` are positions in World:ENU, meters, by name; `seq` counts samples."""
     noise = run.noise("range/range").prefetch()
-    biases = {name: noise.normal(model.bias_sigma) for name in beacons}
-    sigma = max(math.hypot(model.sigma, model.bias_sigma), _MIN_SIGMA)
+    sigma = max(model.sigma, _MIN_SIGMA)
     seq = 0
     for header, t in run.generate_headers(model.timing, "range/range"):
-        errors = {name: bias + noise.normal(model.sigma) for name, bias in biases.items()}
+        errors = {name: noise.normal(model.sigma) for name in beacons}
         if is_within(model.outages, t):
             continue
-        here = kinematics.pose(run.drive.at(t), X_VF).xyz
+        here = run.drive.at(t).pose_of(X_VF).xyz
         for name, place in beacons.items():
             distance = math.dist(here, place)
             if distance <= model.max_range:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 from modelserver.earth.geodesy import LocalFrame
 from modelserver.messages import NAN, FixType, GpsSample
-from modelserver.simulation import kinematics
 from modelserver.simulation.noise import GaussMarkov, diagonal_covariance
 from modelserver.simulation.timing import Intervals, Run, Timing, is_within
 from modelserver.transforms import so3
@@ -108,7 +107,7 @@ def simulate_fixes(model: GpsModel, run: Run, X_VA: Pose, second_antenna: Vector
                 error[0] += east
                 error[1] += north
         motion = drive.at(t - model.unstated_latency)
-        x, y, z = kinematics.pose(motion, X_VA).xyz
+        x, y, z = motion.pose_of(X_VA).xyz
         latitude, longitude, height = geodesy.geodetic_from_enu((x + error[0], y + error[1], z + error[2]))
         sample = GpsSample(
             header,
@@ -128,7 +127,7 @@ def simulate_fixes(model: GpsModel, run: Run, X_VA: Pose, second_antenna: Vector
         if model.has_velocity:
             earlier = drive.at(t - model.unstated_latency - model.velocity_latency)
             de, dn, du = velocity_error
-            velocity = so3.rotate(local, kinematics.velocity(earlier, X_VA.xyz))
+            velocity = so3.rotate(local, earlier.velocity_at(X_VA.xyz))
             ve, vn, vu = so3.add(velocity, (de, dn, du * model.vertical))
             speed = math.hypot(ve, vn)
             sample = replace(
@@ -142,7 +141,7 @@ def simulate_fixes(model: GpsModel, run: Run, X_VA: Pose, second_antenna: Vector
                 course_sigma=_course_sigma(velocity_sigma, speed),
             )
         if baseline:
-            east, north, _ = so3.rotate(local, so3.rotate(kinematics.orientation(motion), baseline))
+            east, north, _ = so3.rotate(local, so3.rotate(motion.orientation(), baseline))
             sigma = max(model.baseline_sigma, 1e-4) * model.sigma_factor
             yaw = math.remainder(math.atan2(north, east) + baseline_error, math.tau)
             sample = replace(sample, baseline_yaw=yaw, baseline_yaw_sigma=sigma)

@@ -25,7 +25,6 @@ from dataclasses import dataclass, replace
 from modelserver.earth import gravity as earth
 from modelserver.earth.geodesy import rotation_about_up
 from modelserver.messages import ImuSample, OrientationReference, SensorHeader, YawSource
-from modelserver.simulation import kinematics
 from modelserver.simulation.noise import GaussMarkov, NoiseSource, diagonal_covariance
 from modelserver.simulation.timing import Intervals, Run, Timing, is_within
 from modelserver.transforms import so3
@@ -59,25 +58,14 @@ class MagnetometerModel:
     noise: float = 0.0
     disturbances: tuple[tuple[float, float, Vector3], ...] = ()
 
-
-class SimulatedMagnetometer:
-    """One simulated magnetometer."""
-
-    def __init__(self, model: MagnetometerModel, noise: NoiseSource):
-        self._model = model
-        self._noise = noise.prefetch()
-
     def ambient_field(self, t: float) -> Vector3:
         """Return the field around the vehicle along east, north, up at `t` seconds."""
-        return so3.add(
-            self._model.field, *(field for begin, end, field in self._model.disturbances if begin <= t < end)
-        )
+        return so3.add(self.field, *(field for begin, end, field in self.disturbances if begin <= t < end))
 
-    def measure(self, t: float, q_SE: Quaternion) -> Vector3:
+    def measure(self, t: float, q_SE: Quaternion, noise: NoiseSource) -> Vector3:
         """Return the sample along the sensor axes; `q_SE` rotates east, north, up to them."""
-        model = self._model
         ambient = so3.rotate(q_SE, self.ambient_field(t))
-        return so3.add(_apply(model.soft_iron, ambient), model.hard_iron, self._noise.vector(model.noise))
+        return so3.add(_apply(self.soft_iron, ambient), self.hard_iron, noise.vector(self.noise))
 
 
 def _apply(M: Rows, v: Vector3) -> Vector3:
@@ -261,21 +249,18 @@ class _SimulatedImu:
             None if triad == _IDEAL else Triad(triad, rate, run.noise(f"imu/imu/{name}"))
             for name, triad in (("gyro", model.gyro), ("accelerometer", model.accelerometer))
         )
-        self.magnetometer = (
-            None
-            if model.magnetometer is None
-            else SimulatedMagnetometer(model.magnetometer, run.noise("imu/imu/magnetometer"))
-        )
+        self.magnetometer_noise = run.noise("imu/imu/magnetometer").prefetch()
 
     def sample(self, header: SensorHeader, t: float) -> ImuSample:
         model, noise, lever, turning = self.model, self.noise, self.X_VS.xyz, self.earth_rate
+        magnetometer = model.magnetometer
         motion = self.drive.at(t)
-        q_ES = so3.multiply(kinematics.orientation(motion), self.X_VS.wxyz)
+        q_ES = so3.multiply(motion.orientation(), self.X_VS.wxyz)
         q_SE = so3.conjugate(q_ES)
         self.gyro_bias = so3.add(self.gyro_bias, noise.vector(self.walk_sigma))
-        turn = kinematics.angular_rate(motion)
+        turn = motion.angular_rate()
         rate = so3.rotate(q_SE, so3.add(turning, turn))
-        acceleration, velocity = kinematics.acceleration(motion, lever), kinematics.velocity(motion, lever)
+        acceleration, velocity = motion.acceleration_at(lever), motion.velocity_at(lever)
         force = so3.rotate(q_SE, _specific_force(acceleration, velocity, turning, self.up))
         if self.gyro is not None:
             rate = self.gyro.measure(rate, motion.speed)
@@ -293,7 +278,7 @@ class _SimulatedImu:
             header,
             angular_velocity=rate,
             specific_force=force,
-            magnetic_field=None if self.magnetometer is None else self.magnetometer.measure(t, q_SE),
+            magnetic_field=magnetometer.measure(t, q_SE, self.magnetometer_noise) if magnetometer else None,
             orientation=orientation,
             orientation_reference=model.reference,
             yaw_source=model.yaw_source,
@@ -309,8 +294,8 @@ class _SimulatedImu:
         error = self.yaw_error
         if model.yaw_source is not YawSource.NONE:
             error += self.yaw_noise.normal(model.yaw_noise)
-            if model.yaw_source is YawSource.MAGNETIC and self.magnetometer is not None:
-                east, north, _ = self.magnetometer.ambient_field(t)
+            if model.yaw_source is YawSource.MAGNETIC and model.magnetometer is not None:
+                east, north, _ = model.magnetometer.ambient_field(t)
                 # declination is clockwise from true north; yaw relative to magnetic north is larger by it
                 error += math.atan2(east, north)
         q_stated = so3.multiply(so3.multiply(rotation_about_up(error), tilted), q_ES)

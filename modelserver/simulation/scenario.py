@@ -18,7 +18,7 @@ from modelserver.messages import (
     VehicleStatusSample,
     WheelsSample,
 )
-from modelserver.simulation import aiding, gps, imu, kinematics, wheels
+from modelserver.simulation import aiding, gps, imu, wheels
 from modelserver.simulation.aiding import AbsolutePoseModel, RangeModel, RelativePoseModel
 from modelserver.simulation.gps import GpsModel
 from modelserver.simulation.ground_motion import SideSlip, Terrain, make_motion
@@ -163,9 +163,9 @@ class Simulation:
     def truth(self, utime: int) -> Truth:
         """Return the true motion of the base frame at `utime`; before and after the drive it is stationary."""
         motion = self.drive.at((utime - self.start_utime) * 1e-6)
-        enu = kinematics.pose(motion, self._X_VB)
+        enu = motion.pose_of(self._X_VB)
         latitude, longitude, height = self.geodesy.geodetic_from_enu(enu.xyz)
-        velocity = kinematics.velocity(motion, self._X_VB.xyz)
+        velocity = motion.velocity_at(self._X_VB.xyz)
         to_base = conjugate(enu.wxyz)
         return Truth(
             utime,
@@ -175,8 +175,8 @@ class Simulation:
             longitude,
             height,
             velocity,
-            kinematics.acceleration(motion, self._X_VB.xyz),
-            (rotate(to_base, velocity), rotate(to_base, kinematics.angular_rate(motion))),
+            motion.acceleration_at(self._X_VB.xyz),
+            (rotate(to_base, velocity), rotate(to_base, motion.angular_rate())),
             motion.yaw,
             motion.yaw_rate,
         )

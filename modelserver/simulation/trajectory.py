@@ -18,6 +18,8 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import polynomial
 
+from modelserver.transforms import so3
+from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Quaternion, Vector3
 
 Coefficients: TypeAlias = tuple[float, ...]
@@ -83,6 +85,50 @@ class TrajectoryMotion(NamedTuple):
     curvature: float
     lateral_speed: float = 0.0
     attitude: Attitude | None = None
+
+    def orientation(self) -> Quaternion:
+        """Return the quaternion that rotates the vehicle's axes to east, north, up."""
+        if self.attitude is not None:
+            return self.attitude.wxyz
+        half = self.yaw / 2.0
+        return (math.cos(half), 0.0, 0.0, math.sin(half))
+
+    def pose_of(self, X_VP: Pose) -> Pose:
+        """Return the pose along east, north, up of a frame at `X_VP` in the vehicle's moving frame."""
+        return Pose(self.position, self.orientation()) @ X_VP
+
+    def angular_rate(self) -> Vector3:
+        """Return the angular rate along east, north, up, rad/s."""
+        if self.attitude is not None:
+            return so3.rotate(self.attitude.wxyz, self.attitude.rate)
+        return (0.0, 0.0, self.yaw_rate)
+
+    def velocity_at(self, lever: Vector3) -> Vector3:
+        """Return the velocity of the point at `lever` in the vehicle's moving frame, m/s: v + w x r."""
+        if self.attitude is not None:
+            relative = so3.cross(self.attitude.rate, lever)
+            return so3.add(self.velocity, so3.rotate(self.attitude.wxyz, relative))
+        vx, vy, vz = self.velocity
+        x, y = _rotate_by_yaw(self.yaw, lever)
+        w = self.yaw_rate
+        return (vx - w * y, vy + w * x, vz)
+
+    def acceleration_at(self, lever: Vector3) -> Vector3:
+        """Return the acceleration of the point at `lever`, m/s2: a + dw/dt x r + w x (w x r) (Groves (2013) 2.3)."""
+        if self.attitude is not None:
+            q, rate, faster = self.attitude
+            relative = so3.add(so3.cross(faster, lever), so3.cross(rate, so3.cross(rate, lever)))
+            return so3.add(self.acceleration, so3.rotate(q, relative))
+        ax, ay, az = self.acceleration
+        x, y = _rotate_by_yaw(self.yaw, lever)
+        w, wd = self.yaw_rate, self.yaw_acceleration
+        return (ax - wd * y - w * w * x, ay + wd * x - w * w * y, az)
+
+
+def _rotate_by_yaw(yaw: float, v: Vector3) -> tuple[float, float]:
+    """Return the horizontal components, along east and north, of a vector in vehicle axes."""
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    return (v[0] * cos - v[1] * sin, v[0] * sin + v[1] * cos)
 
 
 class MotionModel(Protocol):

@@ -25,7 +25,7 @@ from pymodbus.pdu.register_message import (
 )
 
 from msdrivers.links import Link, LinkError, LinkWrapper
-from msdrivers.links.tcp import TcpLink, TcpServerLink
+from msdrivers.links.tcp import TcpServerLink
 from msdrivers.protocol.modbus.registers import (
     FailureKind,
     ModbusFailure,
@@ -227,8 +227,3 @@ def _convert_request(message: ModbusPDU | None, number: int) -> ModbusRequest | 
     if isinstance(message, WriteMultipleRegistersRequest) and len(message.registers) == message.count:
         return WriteRegisters(message.address, tuple(message.registers), number)
     return None
-
-
-def make_modbus_link(host: str, port: int, unit_id: int) -> ModbusLink:
-    """Return the driver's end of a Modbus/TCP line."""
-    return ModbusLink(TcpLink(host, port), unit_id)

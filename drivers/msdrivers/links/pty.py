@@ -9,8 +9,7 @@ import tty
 from collections.abc import Sequence
 from pathlib import Path
 
-from msdrivers.links import LinkError
-from msdrivers.links.descriptors import DescriptorLink
+from msdrivers.links import DescriptorLink, LinkError
 from msdrivers.links.serial_port import find_emulators
 
 WRONG_BAUD_TABLE = bytes(byte ^ 0x5A for byte in range(256))

@@ -18,8 +18,7 @@ import serial
 from serial.tools import list_ports
 
 from modelserver.errors import find_nearest_names
-from msdrivers.links import LinkError
-from msdrivers.links.descriptors import DescriptorLink
+from msdrivers.links import DescriptorLink, LinkError
 
 MAX_COMMAND_LENGTH = 60
 """Characters of a process's command line that are shown."""

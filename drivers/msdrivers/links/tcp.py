@@ -8,8 +8,7 @@ import select
 import socket
 from collections.abc import Sequence
 
-from msdrivers.links import LinkError
-from msdrivers.links.descriptors import DescriptorLink, make_lost_error
+from msdrivers.links import DescriptorLink, LinkError, make_lost_error
 
 CONNECT_TIMEOUT_S = 1.0
 """Connect timeout."""

@@ -11,12 +11,32 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
-
-from msdrivers.protocol.bounded_counter import BoundedCounter
+from typing import Final, Generic, Protocol, TypeVar
 
 M = TypeVar("M")
 M_co = TypeVar("M_co", covariant=True)
+
+
+MAX_NAMES: Final = 64
+"""Largest number of names; further ones are counted as `other`."""
+
+MAX_NAME_LENGTH: Final = 48
+"""Longer names are truncated."""
+
+
+class BoundedCounter(Counter[str]):
+    """Counts by name; once `MAX_NAMES` are known, a new one is counted as `other` of its kind.
+
+    The kind is the part before the first dot: `novatel.id 4711B` becomes `novatel.other`.
+    """
+
+    def add(self, name: str) -> None:
+        """Count one more of `name`."""
+        name = name[:MAX_NAME_LENGTH]
+        if name not in self and len(self) >= MAX_NAMES:
+            # one `other` for each kind; kinds are this program's own words
+            name = f"{name.partition('.')[0]}.other"
+        self[name] += 1
 
 
 @dataclass(frozen=True, slots=True)

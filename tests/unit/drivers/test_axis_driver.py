@@ -17,8 +17,8 @@ from msdrivers.emulate.axis import AxisEmulator, AxisUnit
 from msdrivers.endpoint import EndpointPhase, HostTime, MeasuredSample, Reopen, Send
 from msdrivers.fault_injection import InjectedFault
 from msdrivers.links.fake import FakeLink, FakeTimeSource
-from msdrivers.protocol.modbus.axis_map import AxisRegisters
 from msdrivers.protocol.modbus.registers import (
+    AxisRegisters,
     FailureKind,
     ModbusFailure,
     ModbusUnit,

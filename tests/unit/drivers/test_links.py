@@ -19,7 +19,7 @@ from msdrivers.links import can_bus as can_module
 from msdrivers.links import serial_port as ports
 from msdrivers.links import serial_port as serial_module
 from msdrivers.links.can_bus import CanLink
-from msdrivers.links.modbus import REPLY_TIMEOUT_S, ModbusLink, ModbusServerLink, make_modbus_link
+from msdrivers.links.modbus import REPLY_TIMEOUT_S, ModbusLink, ModbusServerLink
 from msdrivers.links.pty import PtyLink
 from msdrivers.links.serial_port import SerialLink
 from msdrivers.links.tcp import TcpLink, TcpServerLink
@@ -456,7 +456,7 @@ def test_given_a_bus_that_cannot_be_opened_then_python_can_logs_nothing(
 @pytest.fixture
 def modbus(server: TcpServerLink) -> Iterator[tuple[ModbusLink, ModbusServerLink]]:
     device = ModbusServerLink(server)
-    driver = make_modbus_link("127.0.0.1", port_of(server), 7)
+    driver = ModbusLink(TcpLink("127.0.0.1", port_of(server)), 7)
     driver.open()
     yield driver, device
     driver.close()
@@ -522,7 +522,7 @@ def test_given_a_request_that_is_not_served_then_an_exception_is_the_answer(
 def test_given_bytes_that_are_no_modbus_then_the_driver_reports_it_and_the_device_hangs_up(
     server: TcpServerLink,
 ) -> None:
-    driver = make_modbus_link("127.0.0.1", port_of(server), 1)
+    driver = ModbusLink(TcpLink("127.0.0.1", port_of(server)), 1)
     driver.open()
     driver.send(ReadRegisters(1, 1, transaction=4))
     receive(server, 12)

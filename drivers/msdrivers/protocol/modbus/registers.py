@@ -1,4 +1,4 @@
-"""Modbus requests, replies and failures as values, and numbers in registers.
+"""Modbus requests, replies and failures as values, numbers in registers, and the register map of an axis.
 
 Addresses are those of the protocol, from 0; manuals that number holding registers from 40001 mean address 0 by it.
 `transaction` ties a reply to its request, as the header of Modbus/TCP does. Source: MODBUS Application Protocol
@@ -8,10 +8,12 @@ Specification V1.1b3.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import ClassVar, TypeAlias
+from typing import ClassVar, Literal, TypeAlias
+
+STRICT: dict[str, object] = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
 
 MAX_READ = 125
 MAX_WRITE = 123
@@ -130,7 +132,7 @@ def describe_request(request: ReadRegisters | WriteRegisters) -> str:
 class RegisterMap:
     """A number in degrees or degrees a second: the registers' whole number times `scale_deg` plus `offset_deg`."""
 
-    __pydantic_config__: ClassVar[dict[str, object]] = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
+    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
 
     address: int
     """Address of the protocol, from 0: what manuals call 40001 is 0."""
@@ -193,3 +195,56 @@ class RegisterMap:
     def can_hold(self, degrees: float) -> bool:
         """Return whether the registers can hold a value."""
         return self.lowest <= round((degrees - self.offset_deg) / self.scale_deg) <= self.highest
+
+
+@dataclass(frozen=True, slots=True)
+class AxisRegisters:
+    """Registers of the axis. Angles and rates are the joint's, in its positive direction."""
+
+    __pydantic_config__: ClassVar[dict[str, object]] = STRICT
+
+    angle: RegisterMap
+    """Angle of the axis."""
+    rate: RegisterMap | None = None
+    """Rate of the axis; None: no rate is published."""
+    sequence: RegisterMap | None = None
+    """Sequence number of the measurement; an unchanged one means that nothing new was measured."""
+    table: Literal["holding", "input"] = "holding"
+    """Table of angle, rate and sequence; the others are holding registers."""
+    lower_limit: RegisterMap | None = None
+    """Lower limit of the nodding motion, written."""
+    upper_limit: RegisterMap | None = None
+    """Upper limit of the nodding motion, written."""
+    nod_rate: RegisterMap | None = None
+    """Rate of the nodding motion, written; 0: stationary."""
+
+    def __post_init__(self) -> None:
+        if self.table not in ("holding", "input"):
+            raise ValueError(f"table is holding or input, got {self.table!r}")
+        if len(self.commanded) not in (0, 3):
+            raise ValueError(
+                "lower_limit, upper_limit and nod_rate are given together or not at all: nodding needs all"
+            )
+        spread = max(each.address + each.registers for each in self.measured.values()) - self.begin
+        if spread > MAX_READ:
+            raise ValueError(
+                f"angle, rate and sequence lie {spread} registers apart; at most {MAX_READ} are read at one instant"
+            )
+
+    @property
+    def measured(self) -> Mapping[str, RegisterMap]:
+        """Registers read at each poll, by name."""
+        return self._get_given("angle", "rate", "sequence")
+
+    @property
+    def begin(self) -> int:
+        """The first address that is read at each poll."""
+        return min(each.address for each in self.measured.values())
+
+    @property
+    def commanded(self) -> Mapping[str, RegisterMap]:
+        """Registers written to set the nodding motion, by name; empty for a read-only axis."""
+        return self._get_given("lower_limit", "upper_limit", "nod_rate")
+
+    def _get_given(self, *names: str) -> dict[str, RegisterMap]:
+        return {name: each for name in names if (each := getattr(self, name)) is not None}
