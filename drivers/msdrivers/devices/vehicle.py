@@ -15,6 +15,7 @@ node has been silent for 2 s: two alternating senders would mix their commands.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, NamedTuple
 
@@ -133,67 +134,83 @@ class _ActiveCommand(NamedTuple):
     until_ns: int
 
 
-class _LastCommand(NamedTuple):
-    """Identity of the last accepted command, to reject older and repeated ones."""
+class CommandedDriver(CanDriver):
+    """Base of a driver that accepts commands and sends their frames, if the settings have any; see the module."""
 
-    source: str
-    seq: int
-    utime: int
-
-
-class CommandArbiter:
-    """Accepts commands and makes the frames to send; see the module."""
-
-    def __init__(self, settings: VehicleSettings, signals: BoundCommand, driver: CanDriver):
-        self._settings = settings
-        self._signals = signals
-        self._driver = driver
+    def __init__(self, settings: VehicleSettings, database: CanDatabase, needed: Mapping[FrameKey, str]):
+        """Bind the signals of the command. Raises ConfigError for unknown or unsuitable ones."""
+        super().__init__(settings, database, needed)
+        self.settings = settings
+        self._signals: BoundCommand | None = None
+        self._command_key: FrameKey | None = None
         self._period_ns = round(settings.command_period * 1e9)
         self._active: _ActiveCommand | None = None
-        self._last: _LastCommand | None = None
+        self._last: VehicleCommand | None = None
         self._is_transmitting = False
-        self._next_ns = 0
-        self._frame_count = 0
+        self._next_ns = self._frame_count = self._rejected = 0
         self._angle = 0.0
         self._holdoff_until_ns: int | None = None
         self._warned_until_ns: dict[str, int] = {}
-        self.rejected = 0
-        """Number of rejected commands."""
+        if settings.command is None:
+            return
+        place, limits = f"drivers.{settings.source}", settings.limits
+        self._signals = bind_command(settings.command, database, f"{place}.command")
+        self._command_key = self._signals.forward_speed.key
+        forward, backward = (
+            (limits.forward_speed, limits.steering_angle),
+            (-limits.reverse_speed, -limits.steering_angle),
+        )
+        if problem := self._signals.find_range_problem(*forward) or self._signals.find_range_problem(*backward):
+            location = Location(database.name, 0, f"{place}.limits")
+            raise ConfigError([Problem(Severity.ERROR, problem, location, "lower the limit")])
 
     def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Discard the active command and send stop instead: no command survives a reconnect."""
+        """Start; discard the active command and send stop instead: no command survives a reconnect."""
+        outputs = super().on_open(now)
         self._active = None
-        return [self._make_stop_frame(now)] if self._is_transmitting else []
+        return [*outputs, self._make_frame(now)] if self._is_transmitting else outputs
+
+    def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
+        """Process a received frame; one with the command's identifier is from another node."""
+        if unit.key == self._command_key and not unit.is_error:
+            return self._on_foreign_command(now)
+        return super().on_receive(unit, now)
 
     def on_command(self, command: VehicleCommand, now: HostTime) -> list[Output[CanFrame]]:
-        """Accept or reject a command."""
-        remaining = min(command.valid_for, self._settings.max_validity) - (now.utime - command.utime) * 1e-6
+        """Send a command periodically from now on, or reject it."""
+        if self._signals is None:
+            self.counts["rejected.no_command_mapping"] += 1
+            return []
+        remaining = min(command.valid_for, self.settings.max_validity) - (now.utime - command.utime) * 1e-6
         reason, why = self._find_reject_reason(command, remaining, now)
         limited, beyond = self._clamp(command)
-        if not reason and beyond and self._settings.limits.over_limit == "reject":
+        if not reason and beyond and self.settings.limits.over_limit == "reject":
             reason, why = "limit", beyond
         if reason:
             return self.reject_command(reason, f"command of {quote(command.source, 40)} rejected: {why}", now)
         outputs: list[Output[CanFrame]] = []
         if beyond:
-            self._driver.counts["clamped"] += 1
+            self.counts["clamped"] += 1
             outputs += self._warn("clamp", f"{beyond}; the limit is commanded", now)
-        self._driver.counts["commands"] += 1
-        self._last = _LastCommand(command.source, command.seq, command.utime)
-        self._active = _ActiveCommand(limited, now.monotonic_ns + round(min(remaining, self._settings.dead_man) * 1e9))
+        self.counts["commands"] += 1
+        self._last = command
+        self._active = _ActiveCommand(limited, now.monotonic_ns + round(min(remaining, self.settings.dead_man) * 1e9))
         self._is_transmitting = True
         self._angle = limited.steering_angle
         return [*outputs, self._make_frame(now)]
 
     def reject_command(self, reason: str, text: str, now: HostTime) -> list[Output[CanFrame]]:
         """Count a rejected command under `reason` and warn with `text`."""
-        self.rejected += 1
-        self._driver.counts[f"rejected.{reason}"] += 1
+        if self._signals is None:
+            return []
+        self._rejected += 1
+        self.counts[f"rejected.{reason}"] += 1
         return self._warn(reason, text, now)
 
-    def on_foreign_command(self, now: HostTime) -> list[Output[CanFrame]]:
+    def _on_foreign_command(self, now: HostTime) -> list[Output[CanFrame]]:
         """Stop and stay silent: another node sent a frame with the command's identifier."""
-        self._driver.counts["foreign_commands"] += 1
+        assert self._signals is not None
+        self.counts["foreign_commands"] += 1
         self._holdoff_until_ns = now.monotonic_ns + _FOREIGN_HOLDOFF_NS
         outputs = self._warn(
             "foreign",
@@ -203,40 +220,39 @@ class CommandArbiter:
         )
         if self._is_transmitting:
             self._active, self._is_transmitting = None, False
-            outputs += [] if self._driver.is_bus_off else [self._make_stop_frame(now)]
+            outputs += [] if self.is_bus_off else [self._make_frame(now)]
         return outputs
 
     def on_timer(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Send the command again, or stop if its dead-man timer has expired."""
-        outputs: list[Output[CanFrame]] = []
-        if self._driver.is_bus_off:
+        """Publish what is due; send the command again, or stop if its dead-man timer has expired."""
+        outputs = super().on_timer(now)
+        if self.is_bus_off:
             return outputs
         if self._active is not None and now.monotonic_ns >= self._active.until_ns:
             ended, self._active = self._active, None
-            self._driver.counts["dead_man"] += 1
+            self.counts["dead_man"] += 1
             source = quote(ended.command.source, 40)
-            outputs.append(
-                EndpointStatus(self._driver.phase, f"no command after number {ended.command.seq} of {source}: stop")
-            )
-            outputs.append(self._make_stop_frame(now))
+            outputs.append(EndpointStatus(self.phase, f"no command after number {ended.command.seq} of {source}: stop"))
+            outputs.append(self._make_frame(now))
         elif self._is_transmitting and now.monotonic_ns >= self._next_ns:
             outputs.append(self._make_frame(now))
         return outputs
 
     def get_deadline(self) -> int | None:
         """Return when to call `on_timer`, monotonic nanoseconds."""
-        if not self._is_transmitting or self._driver.is_bus_off:
-            return None
-        return self._next_ns if self._active is None else min(self._next_ns, self._active.until_ns)
+        is_sending = self._is_transmitting and not self.is_bus_off
+        deadlines = (super().get_deadline(), self._next_ns if is_sending else None)
+        until_ns = self._active.until_ns if self._active is not None and is_sending else None
+        return min((each for each in (*deadlines, until_ns) if each is not None), default=None)
 
     def on_close(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Send stop if the vehicle was commanded."""
+        """Stop the vehicle if it was commanded from here."""
         self._active = None
-        return [self._make_stop_frame(now)] if self._is_transmitting and not self._driver.is_bus_off else []
+        return [self._make_frame(now)] if self._is_transmitting and not self.is_bus_off else []
 
     def _find_reject_reason(self, command: VehicleCommand, remaining: float, now: HostTime) -> tuple[str, str]:
         """Return why a command is rejected, as counter name and text; empty if it is valid."""
-        settings = self._settings
+        settings = self.settings
         numbers = (command.forward_speed, command.steering_angle, command.valid_for)
         if not all(map(math.isfinite, numbers)):
             return "malformed", "it has a number that is not finite"
@@ -250,7 +266,7 @@ class CommandArbiter:
         reason, why = self._check_against_last(command, now)
         if not reason and self._holdoff_until_ns is not None and now.monotonic_ns < self._holdoff_until_ns:
             return "foreign", "another node commands the vehicle on the bus"
-        if not reason and self._driver.is_bus_off:
+        if not reason and self.is_bus_off:
             return "bus_off", "the CAN interface is bus-off; nothing can be sent"
         return reason, why
 
@@ -261,7 +277,7 @@ class CommandArbiter:
             return "", ""
         if is_active and command.source != last.source:
             return "source", f"{quote(last.source, 40)} commands the vehicle now; one source at a time"
-        if last.utime - now.utime > self._settings.clock_slack * 1e6:
+        if last.utime - now.utime > self.settings.clock_slack * 1e6:
             # the clock was set back since: older stamps cannot be compared
             return "", ""
         is_next = command.source == last.source and command.seq > last.seq
@@ -275,7 +291,7 @@ class CommandArbiter:
 
     def _clamp(self, command: VehicleCommand) -> tuple[VehicleCommand, str]:
         """Clamp a command to the limits; return it and a text about the limits that were exceeded."""
-        limits = self._settings.limits
+        limits = self.settings.limits
         speed = min(max(command.forward_speed, -limits.reverse_speed), limits.forward_speed)
         angle = min(max(command.steering_angle, -limits.steering_angle), limits.steering_angle)
         exceeded = []
@@ -287,18 +303,12 @@ class CommandArbiter:
         return replace(command, forward_speed=speed, steering_angle=angle), " and ".join(exceeded)
 
     def _make_frame(self, now: HostTime) -> Send[CanFrame]:
-        if self._active is None:
-            return self._make_stop_frame(now)
-        command = self._active.command
-        return self._schedule(
-            self._signals.make_frame(command.forward_speed, command.steering_angle, self._frame_count), now
-        )
-
-    def _make_stop_frame(self, now: HostTime) -> Send[CanFrame]:
-        self._driver.counts["stops_sent"] += 1
-        return self._schedule(self._signals.make_frame(0.0, self._angle, self._frame_count, is_stop=True), now)
-
-    def _schedule(self, frame: CanFrame, now: HostTime) -> Send[CanFrame]:
+        """Make the next frame of the active command, or of stop without one."""
+        assert self._signals is not None
+        is_stop = self._active is None
+        self.counts["stops_sent"] += is_stop
+        speed = 0.0 if self._active is None else self._active.command.forward_speed
+        frame = self._signals.make_frame(speed, self._angle, self._frame_count, is_stop=is_stop)
         self._frame_count += 1
         self._next_ns = now.monotonic_ns + self._period_ns
         return Send(frame)
@@ -307,11 +317,11 @@ class CommandArbiter:
         if now.monotonic_ns < self._warned_until_ns.get(reason, now.monotonic_ns):
             return []
         self._warned_until_ns[reason] = now.monotonic_ns + _WARNING_INTERVAL_NS
-        return [EndpointStatus(self._driver.phase, text, is_warning=True)]
+        return [EndpointStatus(self.phase, text, is_warning=True)]
 
 
-class VehicleDriver(CanDriver):
-    """An `Endpoint` of CAN frames that also accepts commands; see `VehicleSettings` and `CommandArbiter`.
+class VehicleDriver(CommandedDriver):
+    """An `Endpoint` of CAN frames that also accepts commands; see `VehicleSettings`.
 
     A status is published if its fault word and its count of rejections were received or are not mapped; missing
     numbers are nan. `commands_rejected` counts the rejections of the controller and of this driver.
@@ -319,65 +329,18 @@ class VehicleDriver(CanDriver):
 
     def __init__(self, settings: VehicleSettings, database: CanDatabase):
         """Bind the signals. Raises ConfigError for unknown or unsuitable ones."""
-        self.settings = settings
-        place = f"drivers.{settings.source}"
-        self._status = bind_status(settings.status, database, f"{place}.status") if settings.status else None
+        place = f"drivers.{settings.source}.status"
+        self._status = bind_status(settings.status, database, place) if settings.status else None
         signals = self._status.signals if self._status is not None else {}
         super().__init__(settings, database, {signal.key: signal.message for signal in signals.values()})
         self.max_silence = settings.silence if signals else math.inf
         self._has_status_words = "fault_bits" in signals or "commands_rejected" in signals
         self._mode: VehicleMode | None = None
-        self._arbiter: CommandArbiter | None = None
-        self._command_key: FrameKey | None = None
-        if settings.command is not None:
-            command = bind_command(settings.command, database, f"{place}.command")
-            limits = settings.limits
-            for speed, angle in (
-                (limits.forward_speed, limits.steering_angle),
-                (-limits.reverse_speed, -limits.steering_angle),
-            ):
-                problem = command.find_range_problem(speed, angle)
-                if problem:
-                    location = Location(database.name, 0, f"{place}.limits")
-                    raise ConfigError([Problem(Severity.ERROR, problem, location, "lower the limit")])
-            self._arbiter = CommandArbiter(settings, command, self)
-            self._command_key = command.forward_speed.key
 
     def on_open(self, now: HostTime) -> list[Output[CanFrame]]:
         """Start; no command survives a reconnect, stop is sent instead."""
         self._mode = None
-        outputs = super().on_open(now)
-        return outputs + (self._arbiter.on_open(now) if self._arbiter is not None else [])
-
-    def on_receive(self, unit: CanFrame, now: HostTime) -> list[Output[CanFrame]]:
-        """Process a received frame; one with the command's identifier is from another node."""
-        if unit.key == self._command_key and self._arbiter is not None and not unit.is_error:
-            return self._arbiter.on_foreign_command(now)
-        return super().on_receive(unit, now)
-
-    def on_command(self, command: VehicleCommand, now: HostTime) -> list[Output[CanFrame]]:
-        """Send a command periodically from now on, or reject it."""
-        if self._arbiter is None:
-            self.counts["rejected.no_command_mapping"] += 1
-            return []
-        return self._arbiter.on_command(command, now)
-
-    def reject_command(self, reason: str, text: str, now: HostTime) -> list[Output[CanFrame]]:
-        """Count and report a malformed command."""
-        return self._arbiter.reject_command(reason, text, now) if self._arbiter is not None else []
-
-    def on_timer(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Publish instants whose window has passed; report silence; send the command that is due."""
-        return super().on_timer(now) + (self._arbiter.on_timer(now) if self._arbiter is not None else [])
-
-    def get_deadline(self) -> int | None:
-        """Return when to call `on_timer`, monotonic nanoseconds."""
-        deadlines = (super().get_deadline(), self._arbiter.get_deadline() if self._arbiter is not None else None)
-        return min((each for each in deadlines if each is not None), default=None)
-
-    def on_close(self, now: HostTime) -> list[Output[CanFrame]]:
-        """Stop the vehicle if it was commanded from here."""
-        return self._arbiter.on_close(now) if self._arbiter is not None else []
+        return super().on_open(now)
 
     def _publish(self, instants: list[CanFrameSet], now: HostTime) -> list[Output[CanFrame]]:
         status = self._status
@@ -391,15 +354,11 @@ class VehicleDriver(CanDriver):
                 # these have no number for "missing"
                 self.counts["rejected.incomplete"] += 1
                 continue
-            if self._arbiter is not None:
-                rejected += self._arbiter.rejected
+            rejected += self._rejected
             numbers = {name: status.get_number(name, instant) for name in NUMERIC_FIELDS}
             mode = status.get_mode(instant)
-            if (
-                mode is VehicleMode.UNKNOWN
-                and not self._has_status_words
-                and all(value != value for value in numbers.values())
-            ):
+            is_known = mode is not VehicleMode.UNKNOWN or any(value == value for value in numbers.values())
+            if not is_known and not self._has_status_words:
                 self.counts["rejected.empty"] += 1
                 continue
             header = SensorHeader(instant.utime, self.settings.source, self._seq, instant.utime)
