@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from modelserver import messages
 from modelserver.core.host_clock import Instant
 from modelserver.core.state import (
     CHANGE_PERIOD_NS,
@@ -19,18 +20,6 @@ from modelserver.core.state import (
     Outputs,
     SourceTraffic,
     get_silence_limit,
-)
-from modelserver.messages import (
-    NAN,
-    VALID,
-    ChannelHealth,
-    Estimate,
-    Gauges,
-    Health,
-    JointsSample,
-    LocalizationHealth,
-    PublishHealth,
-    RejectedCount,
 )
 from modelserver.version import __version__
 
@@ -41,7 +30,7 @@ MIN_DROPPED = 20
 """Measurements of a source that are dropped in a row before a warning: 8 s of wheels, 2 s of a GPS receiver."""
 
 
-def report_if_due(state: CoreState, gauges: Gauges | None, now: Instant) -> tuple[CoreState, Outputs]:
+def report_if_due(state: CoreState, gauges: messages.Gauges | None, now: Instant) -> tuple[CoreState, Outputs]:
     """Return the state after a tick, and the report that is due, if any."""
     is_full = now.monotonic_ns >= state.health_due_ns
     inputs = state.health_inputs
@@ -49,7 +38,7 @@ def report_if_due(state: CoreState, gauges: Gauges | None, now: Instant) -> tupl
         return state, ()
     conditions = evaluate_conditions(state, now)
     if gauges is not None:
-        cpu_share = NAN
+        cpu_share = messages.NAN
         if inputs.gauges_ns and now.monotonic_ns > inputs.gauges_ns:
             cpu_share = (gauges.cpu_s - inputs.gauges.cpu_s) / ((now.monotonic_ns - inputs.gauges_ns) * 1e-9)
         inputs = inputs._replace(gauges=gauges, gauges_ns=now.monotonic_ns, cpu_share=cpu_share)
@@ -60,7 +49,7 @@ def report_if_due(state: CoreState, gauges: Gauges | None, now: Instant) -> tupl
         return state, ()
     if is_full:
         state = _update_rates(state, now)
-    report = PublishHealth(_make_report(state, now))
+    report = messages.PublishHealth(_make_report(state, now))
     if is_full:
         # from now, not from the due time: after a pause one report is enough
         due = now.monotonic_ns + state.settings.health_period_ns
@@ -84,7 +73,9 @@ def evaluate_conditions(state: CoreState, now: Instant) -> HealthConditions:
 
 def _list_missing(state: CoreState) -> list[str]:
     """Return the channels of the configured sensors without any message; joints count only if the geometry has some."""
-    return [each.channel for each in state.missing_sensors if each.kind is not JointsSample or state.model.joints]
+    return [
+        each.channel for each in state.missing_sensors if each.kind is not messages.JointsSample or state.model.joints
+    ]
 
 
 def _find_unusable(state: CoreState, now: Instant) -> Iterator[tuple[str, str, str]]:
@@ -115,19 +106,21 @@ def _update_rates(state: CoreState, now: Instant) -> CoreState:
 
     def start_period(each: SourceTraffic) -> SourceTraffic:
         rate = (each.count - each.reported) / elapsed if elapsed > 0 else 0.0
-        return each._replace(reported=each.count, rate=rate, delay=NAN, reported_delay=each.delay)
+        return each._replace(reported=each.count, rate=rate, delay=messages.NAN, reported_delay=each.delay)
 
     return state._replace(traffic={name: start_period(traffic) for name, traffic in state.traffic.items()})
 
 
-def _make_report(state: CoreState, now: Instant) -> Health:
+def _make_report(state: CoreState, now: Instant) -> messages.Health:
     latencies = sorted(state.tick_latencies)
     estimate = None if state.localizer is None else state.localizer.estimate(now.utime)
     gauges = state.health_inputs.gauges
     channels = [_make_channel_health(name, traffic, now) for name, traffic in state.traffic.items()]
-    channels += [ChannelHealth(channel, 0, 0.0, NAN, NAN, True) for channel in _list_missing(state)]
-    invalid = state.view.invalid | (VALID if estimate is None else estimate.invalid)
-    return Health(
+    channels += [
+        messages.ChannelHealth(channel, 0, 0.0, messages.NAN, messages.NAN, True) for channel in _list_missing(state)
+    ]
+    invalid = state.view.invalid | (messages.VALID if estimate is None else estimate.invalid)
+    return messages.Health(
         utime=now.utime,
         uptime=(now.monotonic_ns - state.started_ns) * 1e-9,
         version=__version__,
@@ -148,7 +141,7 @@ def _make_report(state: CoreState, now: Instant) -> Health:
         tick_latency_p99=percentile(latencies, 0.99),
         tick_latency_max=percentile(latencies, 1.0),
         channels=tuple(sorted(channels, key=lambda each: each.channel)),
-        rejected=tuple(RejectedCount(*key, count) for key, count in sorted(state.rejected.items())),
+        rejected=tuple(messages.RejectedCount(*key, count) for key, count in sorted(state.rejected.items())),
         warnings=tuple(
             sorted({**state.warnings, **{name: text for name, _, text in _find_unusable(state, now)}}.items())
         ),
@@ -166,24 +159,26 @@ def percentile(ordered: Sequence[float], share: float) -> float:
     return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else 0.0
 
 
-def _make_localization_health(state: CoreState, estimate: Estimate | None, now: Instant) -> LocalizationHealth:
+def _make_localization_health(
+    state: CoreState, estimate: messages.Estimate | None, now: Instant
+) -> messages.LocalizationHealth:
     if state.localizer is None or estimate is None:
-        return LocalizationHealth()
+        return messages.LocalizationHealth()
     summary = state.localizer.summary(now.utime)
-    return LocalizationHealth(
+    return messages.LocalizationHealth(
         summary.mode,
         summary.phase,
         summary.stationary,
         estimate.horizontal_protection_level,
         estimate.heading_protection_level,
         estimate.seconds_to_limit,
-        (now.utime - summary.fix_utime) * 1e-6 if summary.fix_utime else NAN,
+        (now.utime - summary.fix_utime) * 1e-6 if summary.fix_utime else messages.NAN,
     )
 
 
-def _make_channel_health(name: str, traffic: SourceTraffic, now: Instant) -> ChannelHealth:
+def _make_channel_health(name: str, traffic: SourceTraffic, now: Instant) -> messages.ChannelHealth:
     age = (now.monotonic_ns - traffic.last_received_ns) * 1e-9
-    return ChannelHealth(
+    return messages.ChannelHealth(
         name,
         traffic.count,
         traffic.rate,

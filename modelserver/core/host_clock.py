@@ -32,12 +32,6 @@ class HostClock(NamedTuple):
     offset: int = 0
     previous_offset: int = 0
 
-    @classmethod
-    def from_instant(cls, now: Instant) -> HostClock:
-        """Return the first reading."""
-        offset = now.utime - now.monotonic_ns // 1000
-        return cls(now.monotonic_ns, now.utime, offset, offset)
-
     def has_stepped_back(self, now: Instant) -> bool:
         """Return whether the time of day was set back since the last reading.
 
@@ -48,6 +42,6 @@ class HostClock(NamedTuple):
         return fell > MIN_STEP_US or (now.monotonic_ns < self.monotonic_ns and self.utime - now.utime > MIN_STEP_US)
 
     def update(self, now: Instant, set_back: bool) -> HostClock:
-        """Return the reading at `now`; after a step earlier offsets do not count."""
+        """Return the reading at `now`; after a step, as for the first reading, earlier offsets do not count."""
         offset = now.utime - now.monotonic_ns // 1000
         return HostClock(now.monotonic_ns, now.utime, offset, offset if set_back else self.offset)

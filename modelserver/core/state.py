@@ -213,7 +213,7 @@ def start(settings: CoreSettings, model: Model, localizer: Localizer | None, now
     view = PlatformView(model, settings.base_frame, localizer, history, settings.rolling_frame, joints=joints)
     check_rigid(model, view.base_frame, view.rolling_frame)
     due = now.monotonic_ns
-    clock = HostClock.from_instant(now)
+    clock = HostClock().update(now, set_back=True)
     return CoreState(
         settings, view, due, health_due_ns=due, snapshot_due_ns=due, missing_sensors=settings.sensors, host_clock=clock
     )

@@ -130,14 +130,12 @@ class Inbox(Protocol):
 
     def subscribe(self, channel: str, handler: Handler) -> None:
         """Call `handler` with every message of exactly `channel`."""
-        ...
 
     def drain(self, limit: int, seconds: float = math.inf) -> int:
         """Handle the messages that have arrived, at most `limit` and for at most `seconds`, without waiting.
 
         Returns the number of handled messages. One that is in progress when the time is up is the last.
         """
-        ...
 
 
 class Bus(Protocol):
@@ -146,20 +144,16 @@ class Bus(Protocol):
     @property
     def sensors(self) -> Inbox:
         """Received samples."""
-        ...
 
     @property
     def requests(self) -> Inbox:
         """Received requests."""
-        ...
 
     def publish(self, channel: str, data: bytes) -> None:
         """Publish a message."""
-        ...
 
     def wait(self, seconds: float, requests: bool = True) -> None:
         """Wait until a message has arrived or the time is up; without `requests` for samples only."""
-        ...
 
 
 MIN_SLEEP_S: Final = 20e-6

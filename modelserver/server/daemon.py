@@ -15,7 +15,7 @@ import socket
 from modelserver import core
 from modelserver.core import CoreState
 from modelserver.errors import quote
-from modelserver.messages import Mode, PersistOrigin, SwitchMode
+from modelserver.messages import Mode, SwitchMode
 from modelserver.server.bus import LcmBus
 from modelserver.server.clock import Clock
 from modelserver.server.diagnostics.bus_probe import DuplicateServerMonitor, probe_bus, report_findings
@@ -90,10 +90,6 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
     origin = origins.load() if origins else None
     restored = states.restore(clock.now(), warm_start.max_pose_age_s, warm_start.max_age_s) if states else None
 
-    def save_origin(output: PersistOrigin) -> None:
-        if origins is not None:
-            origins.save(output.origin)
-
     verifier = vehicle.make_command_verifier(clock.monotonic_ns(), file)
     bus = LcmBus(resolve_url(url or config.lcm.url))
     notifier.notify_starting("probing the bus")
@@ -114,7 +110,7 @@ def _serve(vehicle: Vehicle, store: PersistentStores, notifier: Notifier, url: s
         vehicle.start_core(clock.now(), origin, restored),
         settings,
         Hooks(
-            on_origin=save_origin,
+            on_origin=lambda output: origins.save(output.origin) if origins is not None else None,
             on_mode_switch=log_mode_switch,
             on_load=supervisor.wrap_load(lambda command, state: vehicle.reload_model(command, state, file)),
             snapshot=vehicle.encode_snapshot,

@@ -211,10 +211,8 @@ def lines_of(record: logging.LogRecord) -> list[str]:
 
 def get_priority(level: int) -> int:
     """Return the syslog priority of a level: 2 critical, 3 error, 4 warning, 6 info, 7 debug."""
-    for least, number in ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6)):
-        if level >= least:
-            return number
-    return 7
+    ranks = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
+    return next((number for least, number in ranks if level >= least), 7)
 
 
 def encode_journal_entry(fields: Iterable[tuple[str, str]]) -> bytes:

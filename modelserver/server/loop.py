@@ -195,7 +195,7 @@ class Loop:
         """Make one pass: samples, the tick if it is due, a slice of request work, then wait."""
         requests, timer = self._requests, self._timer
         # a deferred reply in progress rests on an older state than the one that a segment would begin with
-        if self._journal.wants_state and not requests.is_deferring:
+        if self._journal.wants_state and requests.deferred is None:
             self._journal.begin(self.state, self._clock.now())
         if self._reload_requested:
             self._reload_requested = False

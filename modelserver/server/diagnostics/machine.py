@@ -92,16 +92,13 @@ def list_interfaces() -> Iterator[NetworkInterface]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         for _, name in socket.if_nameindex():
             try:
-                flags = struct.unpack_from("16xH", _ioctl(probe, _SIOCGIFFLAGS, name))[0]
+                request = struct.pack("256s", name.encode()[:15])
+                flags = struct.unpack_from("16xH", fcntl.ioctl(probe.fileno(), _SIOCGIFFLAGS, request))[0]
             except OSError:
                 continue  # removed meanwhile
             yield NetworkInterface(
                 name, bool(flags & _IFF_UP), bool(flags & _IFF_MULTICAST), bool(flags & _IFF_LOOPBACK)
             )
-
-
-def _ioctl(probe: socket.socket, request: int, name: str) -> bytes:
-    return fcntl.ioctl(probe.fileno(), request, struct.pack("256s", name.encode()[:15]))
 
 
 def find_interface(address: UdpAddress, proc: Path = PROC) -> str | None:

@@ -154,19 +154,10 @@ def verify(
     keys: Sequence[Key] = (),
     directory: Path | None = None,
 ) -> VerificationReport:
-    """Replay a journal up to the first difference.
+    """Replay a journal, its segments `files` in order, up to the first difference.
 
-    Parameters
-    ----------
-    files: the segments, in order.
-    on_progress: called with the number of bytes done.
-    keys: keys of the vehicle, to verify the seals.
-    directory: the directory of which `files` are all segments; None: single files.
-
-    Raises
-    ------
-    RecordingError: a file is no journal.
-    OSError: a file cannot be read.
+    `on_progress` is called with the number of bytes done. `keys` of the vehicle verify the seals. `directory`: that of
+    which `files` are all segments; None: single files. Raises RecordingError if a file is no journal; OSError.
     """
     verifier = _Verifier(on_progress, keys)
     for path in files:

@@ -81,23 +81,18 @@ class RequestContext(Protocol):
 
     def step(self, event: messages.Event, now: Instant, received: tuple[str, bytes] | None = None) -> None:
         """Pass an event to the core and send its outputs; `received` is the message that it was decoded from."""
-        ...
 
     def publish(self, channel: str, data: bytes) -> None:
         """Publish a message."""
-        ...
 
     def send(self, outputs: tuple[messages.Output, ...]) -> None:
         """Send outputs of the core."""
-        ...
 
     def handle_error(self, channel: str, error: Exception, data: bytes = b"") -> None:
         """Count and log an error while handling a message."""
-        ...
 
     def execute(self, command: messages.SignedCommand, now: Instant) -> None:
         """Execute a signed command."""
-        ...
 
 
 class RequestHandler:
@@ -133,7 +128,8 @@ class RequestHandler:
         self._rejections: deque[QueuedRequest] = deque()
         self._report = ""
         self._current: QueuedRequest | None = None
-        self._deferred: DeferredReply | None = None
+        self.deferred: DeferredReply | None = None
+        """The deferred reply in progress."""
         self._stepped_ns = 0
         self._is_first = False
         self.is_flooded = False
@@ -149,12 +145,7 @@ class RequestHandler:
     def waiting(self) -> int:
         """Requests that wait for a reply, also for one about being dropped."""
         scheduler = self._scheduler
-        return scheduler.queued + scheduler.deferred + (self._deferred is not None) + len(self._rejections)
-
-    @property
-    def is_deferring(self) -> bool:
-        """Whether a deferred reply is in progress."""
-        return self._deferred is not None
+        return scheduler.queued + scheduler.deferred + (self.deferred is not None) + len(self._rejections)
 
     def pop_answered(self) -> int:
         """Return how many requests were answered from the cache since the last call."""
@@ -173,7 +164,7 @@ class RequestHandler:
         self._is_first = True
         unread = self._receive(begin + SLICE_NS // 2)
         now = clock.monotonic_ns() if scheduler.queued else begin
-        defers = self._deferred is not None or (may_defer and scheduler.deferred > 0)
+        defers = self.deferred is not None or (may_defer and scheduler.deferred > 0)
         # each kind of work gets half if both wait
         until = end - SLICE_NS // 2 if defers else end
         budget = self._per_pass - (not self._is_first)
@@ -236,11 +227,11 @@ class RequestHandler:
 
     def defer(self, answer: DeferredAnswer) -> None:
         """Begin a deferred answer; one is in progress at a time."""
-        self._deferred = DeferredReply(answer, self._current)
+        self.deferred = DeferredReply(answer, self._current)
 
     def send_deferred(self, count: int) -> None:
         """Send the next messages of the deferred reply in progress, also in a replay of the journal."""
-        deferred = self._deferred
+        deferred = self.deferred
         if deferred is None:
             return
         deferred.complete()
@@ -251,7 +242,7 @@ class RequestHandler:
 
     def drop_deferred(self) -> None:
         """Abort the deferred reply in progress."""
-        self._deferred = None
+        self.deferred = None
 
     def _receive(self, until_ns: int) -> bool:
         """Receive requests into their clients' queues; return whether more may wait in liblcm's queue."""
@@ -312,20 +303,20 @@ class RequestHandler:
     def _work_deferred(self, now_ns: int, end_ns: int, due_ns: int, may_defer: bool) -> bool:
         """Work on the deferred reply, or begin the next one; return whether the work can continue at once."""
         scheduler, monotonic_ns = self._scheduler, self._clock.monotonic_ns
-        if self._deferred is None:
+        if self.deferred is None:
             deferred = scheduler.next_deferred(now_ns) if may_defer and scheduler.may_exceed else None
             if deferred is None:
                 return False
             self._handle(deferred.queued, deferred.request)
-        while self._deferred is not None and scheduler.may_exceed:
+        while self.deferred is not None and scheduler.may_exceed:
             now = monotonic_ns()
             if due_ns - now < STEP_ROOM_NS and now - self._stepped_ns < STARVED_NS:
                 return False
             if now >= end_ns and self._stepped_ns >= now_ns:
                 return True
             self._stepped_ns = now
-            self._step_deferred(self._deferred)
-        return self._deferred is None and scheduler.deferred > 0 and may_defer
+            self._step_deferred(self.deferred)
+        return self.deferred is None and scheduler.deferred > 0 and may_defer
 
     def _step_deferred(self, deferred: DeferredReply) -> None:
         """Do one step of the deferred work, or send a portion of its messages."""
