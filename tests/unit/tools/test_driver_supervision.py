@@ -8,7 +8,7 @@ from typing import Any, cast
 from modelserver.messages import DriverPhase
 from modelserver.server.supervision.systemd import STALL_TIMEOUT_S, Notifier
 from msdrivers.runner import Runner
-from mstools.commands.driver_supervision import DriverSupervision
+from mstools.commands.driver import DriverSupervision
 
 
 class Runs:

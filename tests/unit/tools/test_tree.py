@@ -20,8 +20,7 @@ from modelserver.transforms import Pose
 from modelserver.wire.codec import encode
 from modelserver.wire.snapshot import split_snapshot
 from mstools.cli import main
-from mstools.commands.tree import draw_lines
-from mstools.terminal.model_tree import build_nodes, draw_svg
+from mstools.commands.tree import build_nodes, draw_lines, draw_svg
 from mstools.terminal.output import replace_unencodable
 
 Run = Callable[..., tuple[int, str, str]]

@@ -181,16 +181,13 @@ class CheckedVehicle:
         """Load and check a vehicle file. Raises ConfigError, GeometryError, OSError."""
         import yaml
 
-        from modelserver.config.vehicle_file import load_config
-        from msdrivers.settings import SourceMap, read_drivers
         from mstools.commands.check import check_vehicle
+        from mstools.commands.driver import load_drivers
 
         _, problems = check_vehicle(str(vehicle))
         if errors := [problem for problem in problems if problem.severity is Severity.ERROR]:
             raise ConfigError(errors)
-        config = load_config(vehicle)
-        drivers = read_drivers(config.drivers, SourceMap(str(vehicle)))[0]
-        return cls(vehicle, yaml.safe_load(vehicle.read_bytes()), config, drivers)
+        return cls(vehicle, yaml.safe_load(vehicle.read_bytes()), *load_drivers(vehicle))
 
     @property
     def key_file(self) -> str:

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import html
+import math
+import textwrap
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from modelserver.errors import NoServerError
+from modelserver.geometry import names
+from modelserver.geometry.joint import Joint, coordinate_names
+from modelserver.geometry.loop_closure import compute_misclosure
 from modelserver.geometry.model import Model
+from modelserver.geometry.parts import Constraint
+from modelserver.geometry.topology import Crossing, LoopClosure, Topology
 from mstools.commands.pose_source import load_given_model
-from mstools.terminal.model_tree import BodyNode, build_nodes, describe_crossing
+from mstools.report.charts import BLUE, ORANGE
 from mstools.terminal.options import PrefixOption, UrlOption, Variables, argument, option, parse_variables
 from mstools.terminal.output import check_writable, describe_size, escape, format_count, replace_unencodable, write_file
 
@@ -48,8 +57,6 @@ def command(
     if not svg:
         typer.echo(replace_unencodable("\n".join((escape(title), *draw_lines(assemblies, frames)))))
         return
-    from mstools.terminal.model_tree import draw_svg
-
     write_file(svg, draw_svg(title, assemblies, frames), force)
 
 
@@ -91,6 +98,172 @@ def receive_geometry(url: str, prefix: str, seconds: float) -> ModelSnapshot:
             "publish.snapshot_s in the vehicle file: use a longer --wait"
         )
     return whole[0]
+
+
+@dataclass(frozen=True, slots=True)
+class BodyNode:
+    """A body in the drawing, with the constraint to its parent and the constraints that close loops at it.
+
+    `is_last`: for each level from the second on, whether the branch there is the last one of its parent.
+    """
+
+    body: str
+    depth: int
+    is_last: tuple[bool, ...]
+    crossing: Crossing | None
+    frames: tuple[str, ...]
+    loops: tuple[str, ...]
+    parent: int = -1
+    """Index of the parent, -1 for none."""
+    has_children: bool = False
+
+
+def build_nodes(model: Model) -> list[list[BodyNode]]:
+    """Return the bodies of each assembly in drawing order; the root's assembly comes first."""
+    topology = Topology(model.bodies, model.constraints)
+    loops: dict[str, list[str]] = {}
+    for each in topology.find_loop_closures():
+        loops.setdefault(names.split(each.path[0].near_frame)[0], []).append(_describe_loop(each, model))
+    return [_build_assembly(model, topology, assembly[0], loops) for assembly in topology.assemblies]
+
+
+def _build_assembly(model: Model, topology: Topology, root: str, loops: dict[str, list[str]]) -> list[BodyNode]:
+    below: dict[str, list[Crossing]] = {}
+    for onward in topology.traverse_breadth_first(root):
+        below.setdefault(onward.near_body, []).append(onward)
+    drawn: list[BodyNode] = []
+    # no recursion: a chain may be longer than Python's stack
+    waiting: list[tuple[str, tuple[bool, ...], Crossing | None, int]] = [(root, (), None, -1)]
+    while waiting:
+        body, last, crossing, parent = waiting.pop()
+        children = below.get(body, [])
+        frames, closures = tuple(model.get_body_frame_list(body)), tuple(loops.get(body, ()))
+        drawn.append(BodyNode(body, len(last), last, crossing, frames, closures, parent, bool(children)))
+        number = len(drawn) - 1
+        for place, each in reversed(list(enumerate(children))):
+            waiting.append((names.split(each.far_frame)[0], (*last, place == len(children) - 1), each, number))
+    return drawn
+
+
+def _describe_loop(closing: LoopClosure, model: Model) -> str:
+    """Describe the constraint that closes a loop, and its misclosure."""
+    crossing = closing.path[0]
+    found = compute_misclosure(closing.path, model.frame)
+    words = f"loop: {crossing.constraint.name} ({describe_joint(crossing.constraint)}) to {crossing.far_frame}, "
+    if found.is_exact:
+        return words + "closes exactly"
+    words += f"misses by {found.meters * 1e3:.3g} mm and {math.degrees(found.radians):.3g} deg"
+    if found.sigmas is not None:
+        words += f", {found.sigmas:.1f} sigma"
+    return words + (" with joints at their defaults" if found.joints else "")
+
+
+def describe_joint(constraint: Constraint) -> str:
+    """Describe a constraint's joint: type, and limits in degrees and meters."""
+    joint = constraint.joint
+    if not joint.is_movable:
+        return "fixed"
+    words = [str(joint.type)]
+    if joint.mimic is not None:
+        shift = f" {_format_number(joint.mimic.offset, joint, 0, signed=True)}" if joint.mimic.offset else ""
+        words.append(f"follows {joint.mimic.joint} times {joint.mimic.multiplier:g}{shift}")
+    limits = list(_describe_limits(constraint.name, joint))
+    return ", ".join(words + limits)
+
+
+def _describe_limits(name: str, joint: Joint) -> Iterator[str]:
+    for number, coordinate in enumerate(coordinate_names(name, joint)):
+        low = joint.lower[number] if joint.lower else -math.inf
+        high = joint.upper[number] if joint.upper else math.inf
+        rate = joint.rate_limit[number] if joint.rate_limit else math.inf
+        which = f"{coordinate.rpartition('.')[2]} " if joint.count > 1 else ""
+        if math.isfinite(low) and math.isfinite(high):
+            yield f"{which}{_format_number(low, joint, number, unit=False)} to {_format_number(high, joint, number)}"
+        elif math.isfinite(low):
+            yield f"{which}from {_format_number(low, joint, number)}"
+        elif math.isfinite(high):
+            yield f"{which}up to {_format_number(high, joint, number)}"
+        if math.isfinite(rate):
+            yield f"{which}{_format_number(rate, joint, number)}/s at most"
+
+
+def _format_number(value: float, joint: Joint, number: int, signed: bool = False, unit: bool = True) -> str:
+    angle = joint.angle_flags[number]
+    shown = round(math.degrees(value), 9) if angle else value
+    text = f"{shown:+.6g}" if signed else f"{shown:.6g}"
+    return text + ((" deg" if angle else " m") if unit else "")
+
+
+def describe_crossing(crossing: Crossing) -> str:
+    """Describe the constraint between a body and its parent."""
+    direction = "" if crossing.forward else ", from here"
+    return f"{crossing.constraint.name}: {describe_joint(crossing.constraint)}{direction}"
+
+
+ROW, STEP, MARGIN, GAP = 24, 26, 16, 14
+"""Pixels: row height, indentation of a level, margin, and space between assemblies."""
+
+LETTER_WIDTH = 7.2
+"""Largest width of a letter, pixels: the image's width depends on it."""
+
+LINE_LENGTH = 100
+"""Letters in a line of frames."""
+
+FIXED, MOVING, LOOP = "#666666", BLUE, ORANGE
+
+
+def draw_svg(title: str, assemblies: Sequence[Sequence[BodyNode]], with_frames: bool = False) -> str:
+    """Draw the tree as SVG: movable joints in blue, loops dashed in orange, orphans below the rest."""
+    parts: list[str] = []
+    y, width = MARGIN + ROW, MARGIN * 2 + LETTER_WIDTH * len(title) * 1.2
+    for number, assembly in enumerate(assemblies):
+        if number:
+            y += GAP
+        places: list[int] = []
+        for node in assembly:
+            x = MARGIN + STEP * node.depth
+            places.append(y)
+            if node.crossing is not None:
+                branch = f"M{x - STEP + 6} {places[node.parent] + 6}V{y}H{x - 4}"
+                parts.append(f'<path d="{branch}" fill="none" stroke="{_get_color(node)}" stroke-width="1.4"/>')
+            words = "orphan" if number else "root"
+            words = words if node.crossing is None else describe_crossing(node.crossing)
+            parts.append(_draw_body(x, y, node, words))
+            width = max(width, x + LETTER_WIDTH * (len(node.body) + len(words) + 4) + MARGIN)
+            lines = [(each, LOOP) for each in node.loops]
+            if with_frames:
+                frames = textwrap.wrap(", ".join(node.frames), LINE_LENGTH, break_long_words=False)
+                lines += [(each, FIXED) for each in frames]
+            for words, color in lines:
+                y += ROW
+                text = f'<text x="{x + 18}" y="{y + 4}" fill="{color}" font-style="italic">'
+                parts.append(f"{text}{html.escape(words)}</text>")
+                width = max(width, x + 18 + LETTER_WIDTH * len(words) + MARGIN)
+            y += ROW
+    height = y + MARGIN - ROW // 2
+    name = html.escape(title)
+    head = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height}" '
+        f'viewBox="0 0 {width:.0f} {height}" role="img" aria-label="{name}" font-family="sans-serif" font-size="12">',
+        '<rect width="100%" height="100%" fill="#fff"/>',
+        f'<text x="{MARGIN}" y="{MARGIN + 4}" font-size="14" font-weight="bold">{name}</text>',
+    )
+    return "\n".join((*head, *parts, "</svg>", ""))
+
+
+def _get_color(node: BodyNode) -> str:
+    return MOVING if node.crossing is not None and node.crossing.constraint.joint.is_movable else FIXED
+
+
+def _draw_body(x: int, y: int, node: BodyNode, words: str) -> str:
+    color = _get_color(node)
+    dashed = ' stroke-dasharray="3 2"' if node.loops else ""
+    ring = LOOP if node.loops else color
+    return (
+        f'<circle cx="{x + 6}" cy="{y}" r="5" fill="#fff" stroke="{ring}" stroke-width="1.8"{dashed}/>'
+        f'<text x="{x + 18}" y="{y + 4}"><tspan font-weight="bold">{html.escape(node.body)}</tspan>'
+        f'<tspan dx="10" fill="{color}">{html.escape(words)}</tspan></text>'
+    )
 
 
 def draw_lines(assemblies: Sequence[Sequence[BodyNode]], with_frames: bool = False) -> Iterator[str]:
