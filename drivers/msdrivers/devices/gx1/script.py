@@ -14,17 +14,8 @@ from functools import partial
 from typing import NamedTuple, TypeAlias, TypeVar
 
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Reopen, Send
-from msdrivers.protocol.gx1 import (
-    LAYOUTS,
-    MEASUREMENTS,
-    CommandByte,
-    EepromAddress,
-    Gains,
-    Gx1Packet,
-    Gx1Parser,
-    TickUnwrapper,
-    requests,
-)
+from msdrivers.protocol import gx1
+from msdrivers.protocol.gx1 import requests
 from msdrivers.protocol.gx1.scaling import QUARTER_TURN, format_version, is_unit
 
 QUOTED_BYTES = 32
@@ -34,7 +25,7 @@ QUOTED_BYTES = 32
 class Gx1Reply(NamedTuple):
     """A valid reply and its unwrapped ticks; -1 without ticks."""
 
-    packet: Gx1Packet
+    packet: gx1.Gx1Packet
     ticks: int
 
 
@@ -42,8 +33,8 @@ class Gx1Receiver:
     """Parses bytes to valid replies: expected, with right checksum, plausible ticks and content."""
 
     def __init__(self) -> None:
-        self.parser = Gx1Parser(self._validate)
-        self.ticks = TickUnwrapper()
+        self.parser = gx1.Gx1Parser(self._validate)
+        self.ticks = gx1.TickUnwrapper()
         self.now = HostTime(0, 0)
         self.messages: Counter[str] = Counter()
         self._tick_counts: list[int] = []
@@ -63,7 +54,7 @@ class Gx1Receiver:
         replies = [Gx1Reply(packet, count) for packet, count in zip(packets, self._tick_counts, strict=True)]
         self._tick_counts.clear()
         for packet in packets:
-            self.messages[f"message.{CommandByte(packet.command).name.lower()}"] += 1
+            self.messages[f"message.{gx1.CommandByte(packet.command).name.lower()}"] += 1
         return replies
 
     def set_streamed(self, command: int) -> None:
@@ -92,7 +83,7 @@ class Gx1Receiver:
             return f"{self.bytes_received} bytes of text, beginning {shown.decode('ascii', 'replace')!r}"
         return f"{self.bytes_received} bytes, beginning {shown.hex(' ')}"
 
-    def _validate(self, packet: Gx1Packet) -> str:
+    def _validate(self, packet: gx1.Gx1Packet) -> str:
         if not _is_plausible(packet):
             return "content"
         if packet.ticks is None:
@@ -102,7 +93,7 @@ class Gx1Receiver:
         count = self.ticks.unwrap(packet.ticks, self.now.monotonic_ns, command == self._streamed)
         if count is None:
             return "ticks"
-        if command in MEASUREMENTS:
+        if command in gx1.MEASUREMENTS:
             if count <= self._newest.get(command, -1):
                 return "repeated"
             self._newest[command] = count
@@ -110,15 +101,15 @@ class Gx1Receiver:
         return ""
 
 
-def _is_plausible(packet: Gx1Packet) -> bool:
+def _is_plausible(packet: gx1.Gx1Packet) -> bool:
     """Return whether the content is possible: pitch within 90 degrees, a unit quaternion, a known command."""
     if packet.has("euler"):
         return abs(packet.field("euler")[1]) <= QUARTER_TURN
     if packet.has("quaternion"):
         return is_unit(packet.field("quaternion"))
-    if packet.command == CommandByte.CONTINUOUS:
+    if packet.command == gx1.CommandByte.CONTINUOUS:
         # a command byte behind a zero
-        return packet.words[0] == 0 or packet.words[0] in LAYOUTS
+        return packet.words[0] == 0 or packet.words[0] in gx1.LAYOUTS
     return True
 
 
@@ -139,7 +130,7 @@ class RequestStep:
         """The command whose reply is expected."""
         return self.request[0]
 
-    def is_answered_by(self, packet: Gx1Packet) -> bool:
+    def is_answered_by(self, packet: gx1.Gx1Packet) -> bool:
         """Return whether a reply answers the request."""
         return packet.command == self.command and (self.value is None or packet.words[0] == self.value)
 
@@ -161,7 +152,7 @@ class CollectStep:
 
 Step: TypeAlias = RequestStep | PauseStep | CollectStep | Send[bytes] | EndpointStatus | Reopen
 T = TypeVar("T")
-ScriptPart: TypeAlias = Generator[Step, tuple[Gx1Packet, ...], T]
+ScriptPart: TypeAlias = Generator[Step, tuple[gx1.Gx1Packet, ...], T]
 """A part of a script that finds a value."""
 Script: TypeAlias = ScriptPart[None]
 
@@ -171,7 +162,7 @@ class NoReplyError(Exception):
 
     def __init__(self, command: int, tries: int):
         self.command = command
-        name = CommandByte(command).name.lower().replace("_", " ")
+        name = gx1.CommandByte(command).name.lower().replace("_", " ")
         super().__init__(f"the request '{name}' was sent {tries} times and not answered")
 
 
@@ -185,7 +176,7 @@ class ScriptRunner:
         self._step: Step | None = None
         self._deadline_ns = 0
         self._attempt = 0
-        self._collected: list[Gx1Packet] = []
+        self._collected: list[gx1.Gx1Packet] = []
 
     @property
     def is_running(self) -> bool:
@@ -244,7 +235,7 @@ class ScriptRunner:
         assert self._script is not None
         return self._advance(partial(self._script.throw, NoReplyError(step.command, step.attempts)), now)
 
-    def _resume(self, packets: tuple[Gx1Packet, ...], now: HostTime) -> list[Output[bytes]]:
+    def _resume(self, packets: tuple[gx1.Gx1Packet, ...], now: HostTime) -> list[Output[bytes]]:
         assert self._script is not None
         return self._advance(partial(self._script.send, packets), now)
 
@@ -370,7 +361,7 @@ def find_device(link: Gx1Receiver, found: LineState) -> ScriptPart[str]:
 
 def _stop_stream(link: Gx1Receiver, found: LineState, flush: float) -> ScriptPart[None]:
     """Record what the device streams (two replies of one kind) and stop it, within `flush` seconds."""
-    listened = yield CollectStep(LISTEN_S, frozenset(MEASUREMENTS))
+    listened = yield CollectStep(LISTEN_S, frozenset(gx1.MEASUREMENTS))
     kinds = [packet.command for packet in listened]
     if found.found_stream is None:
         found.found_stream = next((kind for kind in kinds if kinds.count(kind) > 1), None)
@@ -386,8 +377,8 @@ def _stop_stream(link: Gx1Receiver, found: LineState, flush: float) -> ScriptPar
 
 
 def _read_identity() -> ScriptPart[str]:
-    (serial,) = yield RequestStep(requests.make_poll(CommandByte.SERIAL))
-    (firmware,) = yield RequestStep(requests.make_poll(CommandByte.FIRMWARE))
+    (serial,) = yield RequestStep(requests.make_poll(gx1.CommandByte.SERIAL))
+    (firmware,) = yield RequestStep(requests.make_poll(gx1.CommandByte.FIRMWARE))
     return f"3DM-GX1 serial {serial.unsigned}, firmware {format_version(firmware.unsigned)}"
 
 
@@ -421,25 +412,25 @@ def write_word(address: int, value: int) -> ScriptPart[None]:
     yield PauseStep(0.01)
 
 
-def read_gains() -> ScriptPart[Gains]:
+def read_gains() -> ScriptPart[gx1.Gains]:
     """Read the gains. Raises UnusableError for those that no 3DM-GX1 can have.
 
     They are read twice: a reply does not contain its address, and a delayed one would pass for the next.
     """
-    words = yield from read_words(EepromAddress.GAINS)
-    again = yield from read_words(EepromAddress.GAINS)
+    words = yield from read_words(gx1.EepromAddress.GAINS)
+    again = yield from read_words(gx1.EepromAddress.GAINS)
     if words != again:
         raise UnusableDeviceError(
             f"the gains in its EEPROM were read twice, as {list(words)} and as {list(again)}: its replies come late or "
             "are damaged; check the cable, and the device server if there is one"
         )
-    gains = Gains(*words)
+    gains = gx1.Gains(*words)
     if gains.gyro == GYRO_GAIN_3DMG:
         raise UnusableDeviceError(
-            f"the gyro gain in its EEPROM (address {EepromAddress.GYRO_GAIN}) is {gains.gyro}, that of the older 3DM-G "
-            "with other scales: connect a 3DM-GX1"
+            f"the gyro gain in its EEPROM (address {gx1.EepromAddress.GYRO_GAIN}) is {gains.gyro}, that of the older "
+            "3DM-G with other scales: connect a 3DM-GX1"
         )
-    for name, address, gain in zip(Gains._fields, EepromAddress.GAINS, gains, strict=True):
+    for name, address, gain in zip(gx1.Gains._fields, gx1.EepromAddress.GAINS, gains, strict=True):
         if not GAIN_RANGE[0] <= gain <= GAIN_RANGE[1]:
             raise UnusableDeviceError(
                 f"the {name} gain in its EEPROM (address {address}) is {gain}, and no 3DM-GX1 has one outside "
