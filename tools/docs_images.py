@@ -63,9 +63,8 @@ class Drawing:
 
     def polygon(self, points: Iterable[tuple[float, float]], fill: str, color: str = "none") -> None:
         """Draw a closed shape."""
-        self.parts.append(
-            charts.element("polygon", points=charts.format_points(points), fill=fill, stroke=color, stroke_width=1.2)
-        )
+        style = {"points": charts.format_points(points), "fill": fill, "stroke": color}
+        self.parts.append(charts.element("polygon", **style, stroke_width=1.2))
 
     def dot(self, x: float, y: float, radius: float, fill: str, color: str = "none") -> None:
         """Draw a disk, with an outline in `color`."""
@@ -275,25 +274,14 @@ def drive() -> Drawing:
                 seconds = localizer.utime * 1e-6 - 1e9
                 rows.append((seconds, x, y, math.dist((x, y), true[:2]), estimate.horizontal_protection_level))
     t, x, y, error, bound = zip(*rows, strict=True)
-    hidden = [OUTAGE[0] <= each <= OUTAGE[1] for each in t]
-    track = charts.render_map(
-        "Track",
-        "east, m",
-        "north, m",
-        [
-            charts.Series("truth", [each[0] for each in truth], [each[1] for each in truth], "#cfd8dc", 8.0),
-            charts.dots("fixes", fixes, charts.GREEN, 6.0),
-            charts.Series("estimate", x, y, charts.BLUE, 2.0),
-            charts.Series(
-                "without GPS",
-                [each if inside else math.nan for each, inside in zip(x, hidden, strict=True)],
-                y,
-                charts.AMBER,
-                2.0,
-            ),
-        ],
-        heights=(300, 300),
-    )
+    hidden = [each if OUTAGE[0] <= at <= OUTAGE[1] else math.nan for at, each in zip(t, x, strict=True)]
+    drawn = [
+        charts.Series("truth", [each[0] for each in truth], [each[1] for each in truth], "#cfd8dc", 8.0),
+        charts.dots("fixes", fixes, charts.GREEN, 6.0),
+        charts.Series("estimate", x, y, charts.BLUE, 2.0),
+        charts.Series("without GPS", hidden, y, charts.AMBER, 2.0),
+    ]
+    track = charts.render_map("Track", "east, m", "north, m", drawn, heights=(300, 300))
     top = 2.0 * math.ceil(0.5 * max(bound))
     errors = [
         charts.Series("without GPS", OUTAGE, (0.0, 0.0), charts.AMBER, shape="band", high=(top, top)),
