@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from modelserver.simulation import DrivePhase, SideSlip, Terrain, Trajectory, Wave, figure_eight, make_motion
-from modelserver.simulation import kinematics as rigid
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 
@@ -58,13 +57,13 @@ def test_each_quantity_is_the_derivative_of_the_one_before(drive):
         assert slope("yaw_rate") == pytest.approx(here.yaw_acceleration, abs=5e-6)
         assert slope("speed") == pytest.approx(here.forward_acceleration, abs=2e-6)
         # a point off the middle: its place, its velocity, its acceleration
-        place = (rigid.pose(after, X).position - rigid.pose(before, X).position) / (2 * h)
-        np.testing.assert_allclose(place, rigid.velocity(here, LEVER), atol=2e-6)
-        velocity = np.subtract(rigid.velocity(after, LEVER), rigid.velocity(before, LEVER)) / (2 * h)
-        np.testing.assert_allclose(velocity, rigid.acceleration(here, LEVER), atol=1e-5)
+        place = (after.pose_of(X).position - before.pose_of(X).position) / (2 * h)
+        np.testing.assert_allclose(place, here.velocity_at(LEVER), atol=2e-6)
+        velocity = np.subtract(after.velocity_at(LEVER), before.velocity_at(LEVER)) / (2 * h)
+        np.testing.assert_allclose(velocity, here.acceleration_at(LEVER), atol=1e-5)
         # the attitude turns by the angular rate, and the rate by its acceleration
-        turned = so3.multiply(rigid.orientation(after), so3.conjugate(rigid.orientation(before)))
-        np.testing.assert_allclose(np.array(so3.logarithm(turned)) / (2 * h), rigid.angular_rate(here), atol=1e-6)
+        turned = so3.multiply(after.orientation(), so3.conjugate(before.orientation()))
+        np.testing.assert_allclose(np.array(so3.logarithm(turned)) / (2 * h), here.angular_rate(), atol=1e-6)
         if here.attitude is not None:
             rate = np.subtract(after.attitude.rate, before.attitude.rate) / (2 * h)
             np.testing.assert_allclose(rate, here.attitude.acceleration, atol=1e-5)
@@ -73,7 +72,7 @@ def test_each_quantity_is_the_derivative_of_the_one_before(drive):
 def test_up_is_the_grounds_normal_and_forward_points_along_the_yaw(drive):
     for t in times():
         motion = drive.at(t)
-        R = np.array(so3.matrix_rows(rigid.orientation(motion)))
+        R = np.array(so3.matrix_rows(motion.orientation()))
         assert math.remainder(math.atan2(R[1, 0], R[0, 0]) - motion.yaw, math.tau) == pytest.approx(0.0, abs=1e-12)
         along, left, up = R.T @ motion.velocity
         assert along == pytest.approx(motion.speed, abs=1e-12)
@@ -99,8 +98,8 @@ def test_ground_that_is_level_is_as_without_ground():
     for t in times(50):
         one, other = level.at(t), PLAN.at(t)
         np.testing.assert_allclose(one.position + one.velocity, other.position + other.velocity, atol=1e-15)
-        np.testing.assert_allclose(rigid.orientation(one), so3.normalize(rigid.orientation(other)), atol=1e-15)
-        np.testing.assert_allclose(rigid.acceleration(one, LEVER), rigid.acceleration(other, LEVER), atol=1e-12)
+        np.testing.assert_allclose(one.orientation(), so3.normalize(other.orientation()), atol=1e-15)
+        np.testing.assert_allclose(one.acceleration_at(LEVER), other.acceleration_at(LEVER), atol=1e-12)
         assert one.speed == pytest.approx(other.speed, abs=1e-12)
 
 
