@@ -25,8 +25,7 @@ from modelserver.server.journal.writer import make_writer
 from modelserver.server.loop import Hooks, Loop, LoopSettings
 from modelserver.server.persistence.stores import SUBJECT as RESTART
 from modelserver.server.persistence.stores import PersistentStores, open_stores
-from modelserver.server.supervision.supervisor import ServiceSupervisor
-from modelserver.server.supervision.systemd import Notifier
+from modelserver.server.supervision.systemd import Notifier, ServiceSupervisor
 from modelserver.server.vehicle import Vehicle
 from modelserver.version import __version__
 from modelserver.wire.provider import resolve_url

@@ -15,8 +15,7 @@ from modelserver.server.clock import FakeClock
 from modelserver.server.fake_bus import FakeBus
 from modelserver.server.ingress import SensorChannel
 from modelserver.server.loop import Hooks, Loop, LoopSettings
-from modelserver.server.supervision.supervisor import ServiceSupervisor
-from modelserver.server.supervision.systemd import STALL_TIMEOUT_S, Notifier
+from modelserver.server.supervision.systemd import STALL_TIMEOUT_S, Notifier, ServiceSupervisor
 from modelserver.wire.codec import encode
 
 HZ = 50
