@@ -148,6 +148,12 @@ class SectionReader(SettingsReader):
             else:
                 self._report_misspelled(key, known)
 
+    def suggest_keys(self, key: str, at: Path_) -> tuple[tuple[str, ...], str]:
+        """Return what an unknown key at a path had become, or misspells, and the fix."""
+        known = list_known_keys(self.schema, at)
+        near = self._suggest((*at, key), known)
+        return near, f"write {near[0]}" if near else f"known here: {', '.join(known)}"
+
     def _suggest(self, path: Path_, known: list[str]) -> Suggestion:
         """Return the key that an unknown one at a path had become, or misspells; none that is given already."""
         given = get_value(self.section, path[:-1])
@@ -181,28 +187,14 @@ class SectionReader(SettingsReader):
         return found if len(self.problems) == known else None
 
     def explain(self, detail: Any) -> list[tuple[Path_, Problem]]:
-        """Turn one of pydantic's errors into a problem with its path; a missing line is reported otherwise."""
-        at: Path_ = tuple(detail["loc"])
-        last = str(at[-1]) if at else ""
-        fix, near = "", tuple[str, ...]()
-        if detail["type"] == "missing":
-            if not self._has_line and last in list_keys(*get_args(LineSettings)):
-                return []
-            message, fix = f"{last} is missing", f"add a line: {last}: ..."
-        elif detail["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-            known = list_known_keys(self.schema, at[:-1])
-            near = self._suggest(at, known)
-            fix = f"write {near[0]}" if near else f"known here: {', '.join(known)}"
-            message = f"unknown key {quote(last)}"
-        elif detail["type"] == "value_error":
-            # found by the section as a whole; the message begins with the key that it is about
-            message = str(detail["msg"]).removeprefix("Value error, ")
-            key = message.partition(" ")[0].rstrip(":")
-            at = (*at, key) if key in list_known_keys(self.schema, at) else at
-            message = message[:1].lower() + message[1:]
-        else:
-            message, fix, near = describe_error(detail, list_known_keys(self.schema, at))
-        return [(at, Problem(Severity.ERROR, message, self.locate(at), fix, near))]
+        """Turn one of pydantic's errors into problems; a missing line is reported otherwise."""
+        is_of_line = detail["loc"] and detail["loc"][-1] in list_keys(*get_args(LineSettings))
+        return [] if detail["type"] == "missing" and is_of_line and not self._has_line else super().explain(detail)
+
+    def explain_value(self, detail: Any) -> tuple[tuple[str, ...], str, str]:
+        """Return suggestion, fix and message for a single wrong value."""
+        message, fix, near = describe_error(detail, list_known_keys(self.schema, tuple(detail["loc"])))
+        return near, fix, message
 
 
 def _list_other_lines(kind: DeviceKind) -> dict[str, str]:

@@ -271,7 +271,7 @@ class SettingsReader:
         near: tuple[str, ...] = ()
         fix = ""
         if kind in ("unexpected_keyword_argument", "extra_forbidden"):
-            near, fix = self._suggest_keys(str(at[-1]), at[:-1])
+            near, fix = self.suggest_keys(str(at[-1]), at[:-1])
             message = f"unknown key {quote(str(at[-1]))}"
         elif kind == "missing" and isinstance(at[-1], int):
             at = at[:-1]
@@ -279,19 +279,19 @@ class SettingsReader:
         elif kind == "missing":
             fix, message = f"add a line: {at[-1]}: ...", f"{at[-1]} is missing"
         else:
-            near, fix, message = _explain_value(detail)
+            near, fix, message = self.explain_value(detail)
         return [(at, Problem(Severity.ERROR, message, self.locate(at), fix, near))]
 
     def _explain_section(self, at: Path_, text: str) -> list[tuple[Path_, Problem]]:
         """Return the problems that a section's own rules found, one per line; each begins with its key."""
         found = []
         for message in text.splitlines():
-            key = message.partition(" ")[0]
-            there = (*at, key) if (*at, key) in self.lines else at
+            key = message.partition(" ")[0].rstrip(":")
+            there = (*at, key) if key in list_known_keys(self.schema, at) else at
             found.append((there, Problem(Severity.ERROR, _shorten(message), self.locate(there))))
         return found
 
-    def _suggest_keys(self, key: str, at: Path_) -> tuple[tuple[str, ...], str]:
+    def suggest_keys(self, key: str, at: Path_) -> tuple[tuple[str, ...], str]:
         """Return the known keys nearest to an unknown one at a path, and the fix."""
         known = list_known_keys(self.schema, at)
         present = {each for each in known if (*at, each) in self.lines}
@@ -313,18 +313,17 @@ class SettingsReader:
             return deeper, f"write {deeper[0]} under {' or '.join(below[deeper[0]])}"
         return (), f"known here: {', '.join(known)}"
 
-
-def _explain_value(detail: Any) -> tuple[tuple[str, ...], str, str]:
-    """Return suggestion, fix and message for a single wrong value."""
-    near: tuple[str, ...] = ()
-    message, got = str(detail["msg"]), detail.get("input")
-    if detail["type"] in ("dataclass_type", "dict_type"):
-        message = "expected a mapping (key: value, one per line)"
-    if isinstance(got, (str, int, float, bool)):
-        message += f", got {quote(str(got))}"
-    if detail["type"] == "literal_error" and isinstance(got, str):
-        near = suggest_name(got, re.findall(r"'([^']*)'", str(detail["ctx"]["expected"])))
-    return near, f"write {near[0]}" if near else "", _shorten(message)
+    def explain_value(self, detail: Any) -> tuple[tuple[str, ...], str, str]:
+        """Return suggestion, fix and message for a single wrong value."""
+        near: tuple[str, ...] = ()
+        message, got = str(detail["msg"]), detail.get("input")
+        if detail["type"] in ("dataclass_type", "dict_type"):
+            message = "expected a mapping (key: value, one per line)"
+        if isinstance(got, (str, int, float, bool)):
+            message += f", got {quote(str(got))}"
+        if detail["type"] == "literal_error" and isinstance(got, str):
+            near = suggest_name(got, re.findall(r"'([^']*)'", str(detail["ctx"]["expected"])))
+        return near, f"write {near[0]}" if near else "", _shorten(message)
 
 
 def _shorten(message: str) -> str:
