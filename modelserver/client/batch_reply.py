@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,16 @@ import numpy.typing as npt
 from modelserver.errors import MalformedRequestError, WireError
 from modelserver.messages import PoseBatch, PoseBatchReply
 from modelserver.wire.fields import MAX_PAIRS
+
+
+class BatchQuery(NamedTuple):
+    """A query of `PlatformClient.get_transformations`, with checked pairs and times."""
+
+    pairs: tuple[tuple[str, str], ...]
+    utimes: npt.NDArray[np.int64]
+    fixed_frame: str
+    reference_at: int
+    covariance: bool
 
 
 def check_batch(

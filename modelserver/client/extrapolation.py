@@ -73,34 +73,23 @@ class OdomSample(NamedTuple):
     odom: Pose
 
 
-class PublishedEstimate:
-    """The estimate of the base frame in a POSE and POSE_ODOM of one time, computed when it is needed.
+class PublishedEstimate(NamedTuple):
+    """The estimate of the base frame in a POSE (`world`) and a POSE_ODOM of one time, computed when it is needed.
 
-    Parameters
-    ----------
-    world, odom
-        The two messages.
-    previous
-        An earlier pose in Odom to compute the velocity with; None if there is none.
-    is_random_walk
-        Whether Odom's covariance grows as a random walk.
+    `previous` is an earlier pose in Odom to compute the velocity with, None if there is none; `is_random_walk` is
+    whether Odom's covariance grows as a random walk.
     """
 
-    __slots__ = ("_is_random_walk", "_odom", "_previous", "_world", "utime")
-
     utime: int
-
-    def __init__(self, world: PoseAnswer, odom: PoseAnswer, previous: OdomSample | None, is_random_walk: bool):
-        self.utime = world.transformation.utime
-        self._world = world
-        self._odom = odom
-        self._previous = previous
-        self._is_random_walk = is_random_walk
+    world: PoseAnswer
+    odom: PoseAnswer
+    previous: OdomSample | None
+    is_random_walk: bool
 
     def resolve(self) -> Estimate:
         """Return the estimate."""
-        world, odom = self._world.transformation, self._odom.transformation
-        origin = self._world.origin
+        world, odom = self.world.transformation, self.odom.transformation
+        origin = self.world.origin
         utm = enu = None
         # without a pose in the world the server publishes the identity, with reasons and no covariance
         if origin is not None and (world.covariance is not None or world.pose != Pose.identity()):
@@ -113,14 +102,14 @@ class PublishedEstimate:
             None if world.covariance is None else tuple(world.covariance.ravel().tolist()),
             None if odom.covariance is None else tuple(odom.covariance.ravel().tolist()),
             Invalid(world.invalid_reasons),
-            self._world.quality,
+            self.world.quality,
             world.pose_epoch,
             origin,
-            self._world.horizontal_protection_level,
-            self._world.heading_protection_level,
-            self._world.seconds_to_limit,
-            None if self._previous is None else estimate_motion(self._previous, OdomSample(self.utime, odom.pose)),
-            self._is_random_walk,
+            self.world.horizontal_protection_level,
+            self.world.heading_protection_level,
+            self.world.seconds_to_limit,
+            None if self.previous is None else estimate_motion(self.previous, OdomSample(self.utime, odom.pose)),
+            self.is_random_walk,
         )
 
 

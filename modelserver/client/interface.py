@@ -14,7 +14,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from modelserver.client.batch_reply import check_batch
+from modelserver.client.batch_reply import BatchQuery, check_batch
 from modelserver.errors import WireError
 from modelserver.messages import (
     Explanation,
@@ -224,18 +224,11 @@ class PlatformClient(FrameClient):
             As `get_transformation`; MalformedRequestError also for too many pairs, non-integer times, and with
             `fixed_frame` and a `reference_at` of 0 for more times than one request to the server holds.
         """
-        return self._query_batch(*check_batch(pairs, at), fixed_frame, reference_at, covariance)
+        return self._query_batch(BatchQuery(*check_batch(pairs, at), fixed_frame, reference_at, covariance))
 
     @abstractmethod
-    def _query_batch(
-        self,
-        pairs: tuple[tuple[str, str], ...],
-        utimes: npt.NDArray[np.int64],
-        fixed_frame: str,
-        reference_at: int,
-        covariance: bool,
-    ) -> list[PoseBatch]:
-        """Answer `get_transformations`, with checked pairs and times."""
+    def _query_batch(self, query: BatchQuery) -> list[PoseBatch]:
+        """Answer `get_transformations`."""
 
 
 def require_answer(answer: A | None) -> A:

@@ -8,9 +8,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
-from modelserver.client.batch_reply import concatenate
+from modelserver.client.batch_reply import BatchQuery, concatenate
 from modelserver.client.interface import PlatformClient, R
 from modelserver.client.mirror_state import NEVER, MirrorState
 from modelserver.errors import MalformedRequestError, NoPoseError, OutOfDateError, WireError
@@ -87,14 +86,8 @@ class LocalPlatform(PlatformClient):
         assert isinstance(reply, reply_type)
         return reply
 
-    def _query_batch(
-        self,
-        pairs: tuple[tuple[str, str], ...],
-        utimes: npt.NDArray[np.int64],
-        fixed_frame: str,
-        reference_at: int,
-        covariance: bool,
-    ) -> list[PoseBatch]:
+    def _query_batch(self, query: BatchQuery) -> list[PoseBatch]:
+        pairs, utimes, fixed_frame, reference_at, covariance = query
         _check_utimes(reference_at, *((int(utimes.min()), int(utimes.max())) if len(utimes) else ()))
         time = TimeQuery() if fixed_frame and not reference_at else IN_HISTORY
         _, view, now = self._wait_until_ready(time, fixed_frame, *(frame for pair in pairs for frame in pair))

@@ -253,7 +253,7 @@ class MirrorReceiver:
             else state.extrapolator.period
         )
         is_random_walk = self._filter_received == NEVER or now - self._filter_received > FILTER_TIMEOUT_US
-        estimate = PublishedEstimate(world, odom, self._find_velocity_baseline(sample), is_random_walk)
+        estimate = PublishedEstimate(utime, world, odom, self._find_velocity_baseline(sample), is_random_walk)
         # before the first motion sample the server publishes Odom without a covariance, and answers no vehicle query
         is_known = odom.transformation.covariance is not None
         if is_known and not history.is_too_soon(utime):

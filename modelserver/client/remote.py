@@ -20,10 +20,9 @@ from typing import Any, Final
 
 import lcm
 import numpy as np
-import numpy.typing as npt
 
 from modelserver.client import commands
-from modelserver.client.batch_reply import BatchReplyAssembler, concatenate
+from modelserver.client.batch_reply import BatchQuery, BatchReplyAssembler, concatenate
 from modelserver.client.commands import Signer, load_signer
 from modelserver.client.interface import PlatformClient, R, require_answer
 from modelserver.errors import MalformedRequestError, NoServerError, Status, make_status_error
@@ -145,14 +144,8 @@ class Platform(PlatformClient):
         reply = self._exchange(self._channels[GetTransformation], request, self.timeout + wait_ms * 1e-3)
         return decode_pose_reply(reply, interest, reference)
 
-    def _query_batch(
-        self,
-        pairs: tuple[tuple[str, str], ...],
-        utimes: npt.NDArray[np.int64],
-        fixed_frame: str,
-        reference_at: int,
-        covariance: bool,
-    ) -> list[PoseBatch]:
+    def _query_batch(self, query: BatchQuery) -> list[PoseBatch]:
+        pairs, utimes, fixed_frame, reference_at, covariance = query
         most = MAX_REQUEST_INSTANTS // len(pairs)
         if fixed_frame and not reference_at and len(utimes) > most:
             raise MalformedRequestError(

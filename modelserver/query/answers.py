@@ -7,13 +7,14 @@ steps run.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from modelserver.errors import LimitError, QueryError, Status
 from modelserver.geometry import names
+from modelserver.geometry.parts import Body, BodyFrame
 from modelserver.messages import (
     MAX_REQUEST_INSTANTS,
     Acknowledgement,
@@ -86,10 +87,28 @@ def is_deferred(request: Request) -> bool:
 
 def compute_answer(view: PlatformView, request: Request, utime: int) -> list[Reply]:
     """Compute the messages of the reply to a request at `utime`; most types have one. Raises QueryError."""
-    answer = _ANSWERS.get(type(request))
-    if answer is None:
-        return complete(_answer_in_steps(view, request, utime))
-    return [answer(view, request, ReplyHeader(request.header.request_id, utime, model_revision=view.model.revision))]
+    header = ReplyHeader(request.header.request_id, utime, model_revision=view.model.revision)
+    match request:
+        case GetTransformation(_, interest, reference, time):
+            return [TransformReply(header, view.transformation(interest, reference, time, utime))]
+        case GetStateVector(_, time):
+            return [StateVectorReply(header, view.transformation(view.base_frame, names.WORLD_UTM, time, utime))]
+        case GetHTransform(_, inverse, time):
+            ends = (names.WORLD_UTM, view.base_frame) if inverse else (view.base_frame, names.WORLD_UTM)
+            return [TransformReply(header, view.transformation(*ends, time, utime))]
+        case GetMotion(_, interest, reference, expressed_in, time):
+            return [MotionReply(header, compute_motion(view, interest, reference, expressed_in, time, utime))]
+        case GetExplanation(_, interest, reference, time):
+            return [ExplanationReply(header, explain(view, interest, reference, time, utime))]
+        case GetBodyList():
+            return [_list_names(header, view.model.bodies)]
+        case GetBodyFrameList(_, body):
+            return [_list_names(header, view.model.body(body).frames)]
+    return complete(_answer_in_steps(view, request, utime))
+
+
+def _list_names(header: ReplyHeader, parts: Sequence[Body | BodyFrame]) -> NameListReply:
+    return NameListReply(header, tuple(each.name for each in parts), tuple(each.description for each in parts))
 
 
 def _answer_in_steps(view: PlatformView, request: Request, utime: int) -> Steps[list[Reply]]:
@@ -118,34 +137,9 @@ def make_error_reply(
     return _REPLY_TYPES[kind](ReplyHeader(header.request_id, utime, status, message, nearest, view.model.revision))
 
 
-def _get_transformation(view: PlatformView, request: GetTransformation, header: ReplyHeader) -> Reply:
-    interest, reference = request.frame_of_interest, request.frame_of_reference
-    return TransformReply(header, view.transformation(interest, reference, request.time, header.utime))
-
-
-def _get_h_transform(view: PlatformView, request: GetHTransform, header: ReplyHeader) -> Reply:
-    ends = (view.base_frame, names.WORLD_UTM)
-    interest, reference = reversed(ends) if request.inverse else ends
-    return TransformReply(header, view.transformation(interest, reference, request.time, header.utime))
-
-
-def _get_state_vector(view: PlatformView, request: GetStateVector, header: ReplyHeader) -> Reply:
-    return StateVectorReply(header, view.vehicle_pose(request.time, header.utime))
-
-
 def _get_history(view: PlatformView, request: GetHistory, header: ReplyHeader) -> Steps[list[Reply]]:
     span = (request.start_utime, request.end_utime, request.rate_hz)
     return [HistoryReply(header, (yield from view.vehicle_history(*span)))]
-
-
-def _get_body_list(view: PlatformView, request: GetBodyList, header: ReplyHeader) -> Reply:
-    bodies = view.model.bodies
-    return NameListReply(header, tuple(body.name for body in bodies), tuple(body.description for body in bodies))
-
-
-def _get_body_frame_list(view: PlatformView, request: GetBodyFrameList, header: ReplyHeader) -> Reply:
-    frames = view.model.body(request.body).frames
-    return NameListReply(header, tuple(frame.name for frame in frames), tuple(frame.description for frame in frames))
 
 
 def _get_transformations(view: PlatformView, request: GetTransformations, header: ReplyHeader) -> Steps[list[Reply]]:
@@ -178,16 +172,6 @@ def _get_transformations(view: PlatformView, request: GetTransformations, header
     ]
 
 
-def _get_motion(view: PlatformView, request: GetMotion, header: ReplyHeader) -> Reply:
-    _, interest, reference, expressed_in, time = request
-    return MotionReply(header, compute_motion(view, interest, reference, expressed_in, time, header.utime))
-
-
-def _get_explanation(view: PlatformView, request: GetExplanation, header: ReplyHeader) -> Reply:
-    _, interest, reference, time = request
-    return ExplanationReply(header, explain(view, interest, reference, time, header.utime))
-
-
 POSES_IN_PART: Final = 600
 COVARIANCES_IN_PART: Final = 120
 """Instants in one message of a reply without and with covariances: some 45 kB, which LCM sends as one datagram."""
@@ -200,16 +184,6 @@ EXPLANATION_EFFORT: Final = 4.0
 
 DEFERRED_EFFORT: Final = 11.0
 """Effort beyond which an answer is deferred: about a millisecond."""
-
-_ANSWERS: Final[Mapping[type, Callable[[PlatformView, Any, ReplyHeader], Reply]]] = {
-    GetTransformation: _get_transformation,
-    GetBodyList: _get_body_list,
-    GetBodyFrameList: _get_body_frame_list,
-    GetStateVector: _get_state_vector,
-    GetHTransform: _get_h_transform,
-    GetMotion: _get_motion,
-    GetExplanation: _get_explanation,
-}
 
 _DEFERRED_ANSWERS: Final[Mapping[type, Callable[[PlatformView, Any, ReplyHeader], Steps[list[Reply]]]]] = {
     GetHistory: _get_history,

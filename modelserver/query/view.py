@@ -229,10 +229,6 @@ class PlatformView:
             f"{error}. Query with a time and policy HELD, or check the driver of the joint"
         )
 
-    def vehicle_pose(self, time: TimeQuery, now: int = 0) -> PoseAnswer:
-        """Return the base frame's pose in World:UTM; as `transformation`."""
-        return self.transformation(self.base_frame, names.WORLD_UTM, time, now)
-
     def vehicle_history(self, start_utime: int, end_utime: int, rate_hz: float) -> Steps[tuple[PoseAnswer, ...]]:
         """Return in steps the base frame's poses in World:UTM at a constant rate, without times outside the history.
 
