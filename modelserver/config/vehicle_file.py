@@ -411,36 +411,16 @@ class VehicleConfig:
 
 
 def load_config(path: str | Path) -> VehicleConfig:
-    """Read a vehicle file. Its paths become absolute.
-
-    Raises
-    ------
-    ConfigError
-        The file is wrong; with every problem.
-    OSError
-        The file cannot be read.
-    """
+    """Read a vehicle file. Its paths become absolute. Raises ConfigError with every problem, OSError."""
     path = Path(path)
     return _resolve_paths(parse_config(_read_bytes(path), str(path)), path)
 
 
 def load_partly(path: str | Path, *, blank: bool = False) -> tuple[VehicleConfig | None, tuple[Problem, ...]]:
-    """Read as much of a vehicle file as is valid.
+    """Return the configuration without what is wrong, None where too little is left, and every problem.
 
-    Parameters
-    ----------
-    blank : replace a missing name, geometry or base frame by an empty text, so that the rest can be examined
-
-    Returns
-    -------
-    The configuration without what is wrong, None where too little is left, and every problem.
-
-    Raises
-    ------
-    ConfigError
-        The file is not a YAML mapping.
-    OSError
-        The file cannot be read.
+    With `blank`, a missing name, geometry or base frame is replaced by an empty text, so that the rest can be examined.
+    Raises ConfigError for a file that is not a YAML mapping, OSError.
     """
     path = Path(path)
     config, problems = parse_partly(_read_bytes(path), str(path), blank=blank)

@@ -199,14 +199,7 @@ def load_model(
 
     Returns
     -------
-    The model; its `problems` are the warnings and notes.
-
-    Raises
-    ------
-    GeometryError
-        The file is wrong; with every problem.
-    OSError
-        The file cannot be opened.
+    The model; its `problems` are the warnings and notes. Raises GeometryError with every problem, OSError.
     """
     return parse_model(read_content(path), os.fspath(path), repair=repair, variables=variables, strict=strict)
 

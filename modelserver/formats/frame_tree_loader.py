@@ -26,7 +26,7 @@ import math
 import os
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -69,27 +69,18 @@ class FramePath:
         """Whether it is a single name, which matches any frame of that name."""
         return len(self.parts) == 1 and not self.is_absolute
 
-    def matches(self, names: Sequence[str]) -> bool:
+    def matches(self, names: list[str]) -> bool:
         """Return whether the path matches a frame, given the names from its root down to its own."""
-        if ANY not in self.parts:
-            above = len(names) - len(self.parts)
-            return above >= 0 and (not self.is_absolute or above == 0) and tuple(names[above:]) == self.parts
-        parts = self.parts if self.is_absolute else (ANY, *self.parts)
-        # glob matching: on a mismatch, backtrack to the last wildcard, which takes one more level
-        at = part = 0
-        backtrack: tuple[int, int] | None = None
-        while at < len(names):
-            if part < len(parts) and parts[part] == ANY:
-                part += 1
-                backtrack = (part, at)
-            elif part < len(parts) and parts[part] == names[at]:
-                part, at = part + 1, at + 1
-            elif backtrack is not None:
-                backtrack = (backtrack[0], backtrack[1] + 1)
-                part, at = backtrack
+        # the numbers of names that the parts so far can take
+        taken = {0} if self.is_absolute else set(range(len(names) + 1))
+        for part in self.parts:
+            if part == ANY:
+                taken = set(range(min(taken), len(names) + 1))
             else:
+                taken = {number + 1 for number in taken if names[number : number + 1] == [part]}
+            if not taken:
                 return False
-        return all(each == ANY for each in parts[part:])
+        return len(names) in taken
 
 
 ROOT = FramePath((), False)
@@ -107,23 +98,23 @@ def parse_path(text: str) -> FramePath:
     return FramePath(tuple(parts), text.startswith("/"))
 
 
+@dataclass(slots=True)
 class Ancestry:
     """The names of the ancestors of frames, by `parents`: the key of each frame's parent, "" for a root.
 
     The parent of a frame that is not in `parents` is not known yet.
     """
 
-    def __init__(self, names: Mapping[str, str], parents: Mapping[str, str]):
-        self._names = names
-        self._parents = parents
-        self.steps = 0
+    names: Mapping[str, str]
+    parents: Mapping[str, str]
+    steps: int = 0
 
     @property
     def is_exhausted(self) -> bool:
         """Whether more than `MAX_STEPS` levels were visited."""
         return self.steps > MAX_STEPS
 
-    def match(self, path: FramePath, names: Sequence[str]) -> bool:
+    def match(self, path: FramePath, names: list[str]) -> bool:
         """Return whether a path matches the frame with these names; False when exhausted."""
         self.steps += len(names) * (len(path.parts) if ANY in path.parts else 1)
         return not self.is_exhausted and path.matches(names)
@@ -134,11 +125,11 @@ class Ancestry:
         seen: set[str] = set()
         while key:
             self.steps += 1
-            if key in seen or key not in self._parents or self.is_exhausted:
+            if key in seen or key not in self.parents or self.is_exhausted:
                 return None
             seen.add(key)
-            found.append(self._names[key])
-            key = self._parents[key]
+            found.append(self.names[key])
+            key = self.parents[key]
         return found[::-1]
 
 

@@ -353,7 +353,7 @@ class _ModelReview:
 
     def check_joints(self, placed: tuple[LocatedConstraint, ...]) -> tuple[LocatedConstraint, ...]:
         """Return the constraints whose joints are valid, with the defaults of mimic joints applied."""
-        known = [constraint.name for constraint, _ in self.draft.constraints]
+        known = set(self.draft.constraint_names)
         return JointRules(self.report, self.add_problem, known, self.draft.unreadable_joints, self.repair).apply(placed)
 
     def _suggest_end(self, end: str, bodies: dict[str, Body]) -> Suggestion:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from modelserver.errors import Location, Severity, quote, suggest_name
@@ -91,28 +91,20 @@ def find_mimic_chain(joint: Constraint, by_name: Mapping[str, Constraint]) -> tu
     return tuple(chain)
 
 
+@dataclass(frozen=True, slots=True)
 class JointRules:
     """Checks the joints of constraints that are well formed otherwise.
 
-    `report` and `add_problem` are those of the `ModelReview`.
-    `known` are the names of all constraints of the file: a follower of a rejected joint is not reported again.
-    `unclear` are those whose joint could not be read. With `repair` the followers of a dropped joint are dropped as
-    well, and reported.
+    `report` and `add_problem` are called for what is invalid and for warnings. `known` are the names of all constraints
+    of the file: a follower of a rejected joint is not reported again. `unclear` are those whose joint could not be
+    read. With `repair` the followers of a dropped joint are dropped as well, and reported.
     """
 
-    def __init__(
-        self,
-        report: Callable[..., None],
-        add_problem: Callable[..., None],
-        known: Iterable[str],
-        unclear: Collection[str],
-        repair: bool,
-    ):
-        self._report = report
-        self._add_problem = add_problem
-        self._known = set(known)
-        self._unclear = unclear
-        self._repair = repair
+    report: Callable[..., None]
+    add_problem: Callable[..., None]
+    known: Collection[str]
+    unclear: Collection[str]
+    repair: bool
 
     def apply(self, placed: Sequence[LocatedConstraint]) -> tuple[LocatedConstraint, ...]:
         """Return the constraints without those whose joints are invalid, with the defaults of mimic joints applied."""
@@ -129,7 +121,7 @@ class JointRules:
             clash = next((name for name in mine if name in taken), None)
             if clash is not None:
                 other, place = taken[clash]
-                self._report(
+                self.report(
                     f"constraint {quote(constraint.name)}: a coordinate of its joint is called {quote(clash)}, as is "
                     f"one of constraint {other.name}{format_first_location(place)}",
                     source,
@@ -143,7 +135,7 @@ class JointRules:
     def _find_invalid_mimics(self, placed: Sequence[LocatedConstraint]) -> set[str]:
         """Return the joints with invalid mimic chains, and report each; a cycle is reported once."""
         joints = {constraint.name: constraint for constraint, _ in placed if constraint.joint.is_movable}
-        present = {constraint.name for constraint, _ in placed if constraint.name not in self._unclear}
+        present = {constraint.name for constraint, _ in placed if constraint.name not in self.unclear}
         rejected: set[str] = set()
         valid_names: set[str] = set()
         sources = {constraint.name: source for constraint, source in placed}
@@ -154,14 +146,14 @@ class JointRules:
             label = f"constraint {quote(constraint.name)}"
             leader = joints.get(mimic.joint)
             if mimic.joint == constraint.name:
-                self._report(f"{label}: its joint follows itself", source, "name another joint, or remove mimic")
+                self.report(f"{label}: its joint follows itself", source, "name another joint, or remove mimic")
             elif mimic.joint in rejected:
                 self._report_follower(constraint, source)
             elif mimic.joint in valid_names:
                 valid_names.add(constraint.name)
                 continue
             elif leader is not None and leader.joint.count != 1:
-                self._report(
+                self.report(
                     f"{label}: its joint follows {leader.name}, a {leader.joint.type} one with "
                     f"{leader.joint.count} coordinates",
                     source,
@@ -182,7 +174,7 @@ class JointRules:
                             rejected.add(name)
                     continue
                 cycle = " follows ".join(chain[:MAX_LISTED]) + (" follows ..." if len(chain) > MAX_LISTED else "")
-                self._report(
+                self.report(
                     f"{label}: joints follow each other in a cycle: {cycle}",
                     source,
                     "remove the mimic of one of them",
@@ -190,12 +182,12 @@ class JointRules:
                 rejected.update(chain)
             elif mimic.joint in present:
                 fix = "follow a joint that moves, or remove mimic"
-                self._report(f"{label}: its joint follows {mimic.joint}, which does not move", source, fix)
-            elif mimic.joint in self._known:
+                self.report(f"{label}: its joint follows {mimic.joint}, which does not move", source, fix)
+            elif mimic.joint in self.known:
                 self._report_follower(constraint, source)
             else:
                 near = suggest_name(mimic.joint, joints)
-                self._report(
+                self.report(
                     f"{label}: its joint follows {quote(mimic.joint)}, and there is no constraint of that name",
                     source,
                     f"write {near[0]}" if near else f"joints here are: {format_names(list(joints))}",
@@ -206,12 +198,12 @@ class JointRules:
 
     def _report_follower(self, constraint: Constraint, source: Location) -> None:
         """Report a follower of a dropped joint; without `repair` nothing is dropped, and the first report is enough."""
-        if self._repair and constraint.joint.mimic is not None:
+        if self.repair and constraint.joint.mimic is not None:
             message = f"constraint {quote(constraint.name)}: its joint follows {constraint.joint.mimic.joint}"
-            self._report(f"{message}, which was removed", source, "fix that one")
+            self.report(f"{message}, which was removed", source, "fix that one")
 
     def _warn(self, constraint: Constraint, message: str, source: Location, fix: str) -> None:
-        self._add_problem(Severity.WARNING, f"constraint {quote(constraint.name)}: {message}", source, fix)
+        self.add_problem(Severity.WARNING, f"constraint {quote(constraint.name)}: {message}", source, fix)
 
     def _apply_defaults(self, placed: Sequence[LocatedConstraint]) -> tuple[LocatedConstraint, ...]:
         placed = self._drop_out_of_range(placed)
@@ -264,7 +256,7 @@ class JointRules:
                 drive = drives[constraint.name]
                 (leader_default,) = joints[drive.leader].joint.default_position
                 if not abs(drive.multiplier * leader_default + drive.offset) <= MAX_POSITION:
-                    self._report(
+                    self.report(
                         f"constraint {quote(constraint.name)}: following {constraint.joint.mimic.joint} puts its "
                         f"joint beyond {MAX_POSITION:g}",
                         source,

@@ -57,24 +57,6 @@ class Model:
     two bodies or two constraints of one name, which `ModelBuilder` reports with their locations.
     """
 
-    __slots__ = (
-        "_assemblies_with_loops",
-        "_bodies",
-        "_in_loops",
-        "_paths",
-        "_topology",
-        "_transformations",
-        "_tree",
-        "bodies",
-        "constraints",
-        "description",
-        "drives",
-        "joints",
-        "name",
-        "problems",
-        "revision",
-    )
-
     def __init__(
         self,
         bodies: tuple[Body, ...],
@@ -369,7 +351,7 @@ class Model:
         )
 
     def __setattr__(self, name: str, value: object) -> None:
-        if hasattr(self, name):
+        if hasattr(self, "_in_loops"):  # the last that __init__ sets
             raise AttributeError("a Model is immutable; build a new one")
         object.__setattr__(self, name, value)
 

@@ -58,10 +58,6 @@ class JointHistory:
 
     __slots__ = ("_coordinates", "_seconds", "tracks")
 
-    _coordinates: Mapping[str, Coordinate]
-    _seconds: float
-    tracks: Mapping[str, JointTrack]
-
     def __init__(self, constraints: Iterable[Constraint], seconds: float):
         self._coordinates = MappingProxyType(
             {
@@ -72,7 +68,7 @@ class JointHistory:
             }
         )
         self._seconds = seconds
-        self.tracks = MappingProxyType({})
+        self.tracks: Mapping[str, JointTrack] = MappingProxyType({})
 
     @property
     def names(self) -> tuple[str, ...]:

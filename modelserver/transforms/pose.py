@@ -60,17 +60,9 @@ class Pose:
         position: Iterable[float] = (0.0, 0.0, 0.0),
         quaternion: Iterable[float] = so3.IDENTITY,
     ):
-        """Create a pose.
+        """Create a pose at a position (3), meters; the quaternion (4), scalar first, is normalized, with w >= 0.
 
-        Parameters
-        ----------
-        position : 3 numbers, meters
-        quaternion : 4 numbers, scalar first, of any length but 0; normalized, with w >= 0
-
-        Raises
-        ------
-        ValueError
-            For a wrong count, a number that is not finite, or a zero quaternion.
+        Raises ValueError for a wrong count, a number that is not finite, or a zero quaternion.
         """
         p = _floats(position, "a position is 3 finite numbers in meters")
         q = _floats(quaternion, "a quaternion is 4 numbers, scalar first")
