@@ -137,8 +137,7 @@ def magnetometer(
         raise _make_error(log, f"{format_count(good.size, 'sample')} on {channel}, {why}")
     where = given or recorded.position
     field = None if where is None else _get_field(where, int(np.median(recorded.utimes)))
-    up = _estimate_up(recorded)
-    found = _fit(log, recorded.fields[good], up, field, all_axes)
+    found = _fit(log, recorded, recorded.fields[good], field, all_axes)
     if as_json:
         text = json.dumps(calibrate_report.magnetometer_to_dict(found, where, field), indent=2, allow_nan=False)
     else:
@@ -210,26 +209,20 @@ def _print_up_axis(config: Path | None, recorded: ImuRecording, as_json: bool, o
     typer.echo(json.dumps(data, indent=2) if as_json else "\n".join(lines), err=on_stderr)
 
 
-def _fit(log: Path, fields: Any, up: Vector3 | None, field: Vector3 | None, all_axes: bool) -> MagnetometerFit:
+def _fit(log: Path, recorded: ImuRecording, fields: Any, field: Vector3 | None, all_axes: bool) -> MagnetometerFit:
     horizontal = math.nan if field is None else math.hypot(field[0], field[1])
     try:
         if all_axes:
             return fit_all_axes(fields, math.nan if field is None else math.hypot(*field), horizontal)
-        if up is None:
+        forces = recorded.forces[calibrate_log.finite_rows(recorded.forces)]
+        if not len(forces):
             why = "the IMU has no specific force, so up is unknown; turn it about all axes and give --all-axes"
             raise CalibrationError(why)
-        return fit_level(fields, up, horizontal, math.nan if field is None else field[2])
+        # the median is robust against bumps, and hardly tilted in a slow turn
+        x, y, z = (float(each) for each in np.median(forces, axis=0))
+        return fit_level(fields, (x, y, z), horizontal, math.nan if field is None else field[2])
     except CalibrationError as error:
         raise _make_error(log, str(error)) from None
-
-
-def _estimate_up(recorded: ImuRecording) -> Vector3 | None:
-    """Return the median specific force: robust against bumps, and hardly tilted in a slow turn."""
-    good = calibrate_log.finite_rows(recorded.forces)
-    if not good.any():
-        return None
-    x, y, z = (float(each) for each in np.median(recorded.forces[good], axis=0))
-    return (x, y, z)
 
 
 def _get_field(place: Vector3, utime: int) -> Vector3 | None:

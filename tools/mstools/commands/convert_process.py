@@ -121,8 +121,7 @@ def convert_process(file: str, target: str, variables: Mapping[str, str] | None 
     folder = os.path.dirname(target) if target != "-" else None
     matching.values["geometry",] = os.path.relpath(geometry, folder)
     matching.complete(model)
-    problems = tuple(sorted(matching.problems, key=lambda each: each.line))
-    return Conversion(_format_vehicle_file(matching, file), problems)
+    return Conversion(_format_vehicle_file(matching, file), matching.list_problems())
 
 
 def _make_error(why: str, place: Location, fix: str) -> ConfigError:
@@ -153,8 +152,7 @@ class _KeyMatcher:
         self.values: dict[Key, Any] = {}
         self.sources: dict[Key, ProcessParameter] = {}
         self.notes: dict[Key, str] = {}
-        self.skipped: list[tuple[ProcessParameter, str]] = []
-        self.problems: list[Problem] = []
+        self.skipped: list[tuple[ProcessParameter, str, tuple[str, ...]]] = []
         self._types = dict(_iter_keys(VehicleConfig, ()))
 
     def add(self, setting: ProcessParameter) -> None:
@@ -162,31 +160,37 @@ class _KeyMatcher:
         found = self._keys_of(setting)
         if len(found) != 1:
             near = tuple(".".join(key) for key in found)
-            self.skip(setting, "its name fits several keys" if found else "no counterpart", near)
+            self.skipped.append((setting, "its name fits several keys" if found else "no counterpart", near))
             return
         (key,) = found
         if key in self.values:
-            self.skip(setting, f"{'.'.join(key)} is given already (line {self.sources[key].line})")
+            why = f"{'.'.join(key)} is given already (line {self.sources[key].line})"
+            self.skipped.append((setting, why, ()))
             return
         try:
-            value = _parse_value(setting, self._types.get(key, str))
+            self.values[key] = _parse_value(setting, self._types.get(key, str))
+            self.sources[key] = setting
         except ValueError as error:
-            self.skip(setting, f"{'.'.join(key)} {error}")
-            return
-        self.values[key], self.sources[key] = value, setting
+            self.skipped.append((setting, f"{'.'.join(key)} {error}", ()))
 
-    def skip(self, setting: ProcessParameter, why: str, nearest: tuple[str, ...] = ()) -> None:
-        """List a parameter as not converted, with a warning."""
-        self.skipped.append((setting, why))
-        fix = f"write it under {' or '.join(nearest)} if that is what it means" if nearest else ""
-        message = f"{quote(setting.label, 80)} is not converted: {why}"
-        place = Location(self.file, setting.line, setting.label)
-        self.problems.append(Problem(Severity.WARNING, message, place, fix or "see docs/vehicle-file.md", nearest))
+    def list_problems(self) -> tuple[Problem, ...]:
+        """Return a warning for each skipped parameter, and for a vehicle file without sensors, by line."""
+        problems = []
+        for setting, why, near in sorted(self.skipped, key=lambda each: each[0].line):
+            fix = f"write it under {' or '.join(near)} if that is what it means" if near else ""
+            message = f"{quote(setting.label, 80)} is not converted: {why}"
+            place = Location(self.file, setting.line, setting.label)
+            problems.append(Problem(Severity.WARNING, message, place, fix or "see docs/vehicle-file.md", near))
+        if not any(key[0] == "sensors" for key in self.values):
+            fix = "add sensors to the vehicle file: docs/vehicle-file.md has an example"
+            why = "no parameter names a sensor's channel and frame, so there will be no pose"
+            problems.insert(0, Problem(Severity.WARNING, why, Location(self.file), fix))
+        return tuple(problems)
 
     def drop(self, key: Key, why: str) -> None:
         """Remove the key of a parameter, which is skipped."""
         del self.values[key]
-        self.skip(self.sources.pop(key), why)
+        self.skipped.append((self.sources.pop(key), why, ()))
 
     def complete(self, model: Model) -> None:
         """Remove what the geometry or the vehicle file rejects, and add required keys."""
@@ -208,10 +212,6 @@ class _KeyMatcher:
             # remove wrong keys and check the rest again: a section's own rules are checked last
             if not sum(self._drop_wrong(problem) for problem in problems):
                 break
-        if not any(key[0] == "sensors" for key in self.values):
-            fix = "add sensors to the vehicle file: docs/vehicle-file.md has an example"
-            why = "no parameter names a sensor's channel and frame, so there will be no pose"
-            self.problems.append(Problem(Severity.WARNING, why, Location(self.file), fix))
 
     def _drop_wrong(self, problem: Problem) -> bool:
         """Remove the keys of a problem of the vehicle file; return whether there was one."""
@@ -305,7 +305,7 @@ def _find_geometry(matching: _KeyMatcher, file: str) -> str:
         folder = Path(file).parent
         files = [
             setting
-            for setting, _ in matching.skipped
+            for setting, *_ in matching.skipped
             if isinstance(setting.value, str)
             and setting.value.lower().endswith((".xml", ".yaml", ".yml", ".urdf"))
             and (folder / setting.value).is_file()
@@ -317,7 +317,6 @@ def _find_geometry(matching: _KeyMatcher, file: str) -> str:
             raise _make_error(why, Location(file), fix)
         (found,) = files
         matching.skipped = [each for each in matching.skipped if each[0] is not found]
-        matching.problems = [each for each in matching.problems if each.element != found.label]
         named = str(found.value)
         matching.sources[("geometry",)] = found
     path = Path(file).parent / os.path.expanduser(named)
@@ -352,7 +351,7 @@ def _format_vehicle_file(matching: _KeyMatcher, file: str) -> str:
         lines.append(f"{line} # {origin}" if origin else line)
     if matching.skipped and file:
         lines += ["", "# Not converted:"]
-        for setting, why in sorted(matching.skipped, key=lambda each: each[0].line):
+        for setting, why, _ in sorted(matching.skipped, key=lambda each: each[0].line):
             value = setting.value if isinstance(setting.value, str) else " ".join(setting.value)
             lines.append(f"#   line {setting.line}: {escape(setting.label)} = {quote(value, 80)}: {escape(why)}")
     return "\n".join(lines) + "\n"

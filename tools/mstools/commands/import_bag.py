@@ -78,18 +78,14 @@ def command(
         raise typer.BadParameter(f"a prefix consists of letters, digits and underscores, got {quote(prefix)}")
     check_writable(str(log))
     options = BagOptions(altitude, undulation, imu_orientation, track_width)
-    report = import_bag(bag, log, options, _parse_kinds(topic or ()), prefix, force)
-    typer.echo(json.dumps(dataclasses.asdict(report), indent=2) if as_json else report.to_text())
-
-
-def _parse_kinds(pairs: Iterable[str]) -> dict[str, TopicKind]:
-    wanted: dict[str, TopicKind] = {}
-    for pair in pairs:
+    kinds: dict[str, TopicKind] = {}
+    for pair in topic or ():
         name, _, kind = pair.rpartition("=")
         if not name or kind not in list(TopicKind):
             raise typer.BadParameter(f"--topic takes TOPIC=gps, imu, wheels or joints, got {quote(pair)}")
-        wanted[name] = TopicKind(kind)
-    return wanted
+        kinds[name] = TopicKind(kind)
+    report = import_bag(bag, log, options, kinds, prefix, force)
+    typer.echo(json.dumps(dataclasses.asdict(report), indent=2) if as_json else report.to_text())
 
 
 @dataclass(slots=True)

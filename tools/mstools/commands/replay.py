@@ -390,12 +390,9 @@ def _filter_channels(recording: LogFile, channels: frozenset[str]) -> Iterator[L
             found = True
             yield event
     if not found:
-        raise RecordingError(f"{recording.path}: no message on {_join_sorted(channels)}. {_suggest(channels, seen)}")
-
-
-def _suggest(wanted: Iterable[str], seen: Iterable[str]) -> str:
-    near = [name for each in sorted(wanted) for name in find_nearest_names(each, seen)]
-    return f"Nearest: {', '.join(near)}" if near else f"The log has: {_join_sorted(seen)}"
+        near = [name for each in sorted(channels) for name in find_nearest_names(each, seen)]
+        hint = f"Nearest: {', '.join(near)}" if near else f"The log has: {_join_sorted(seen)}"
+        raise RecordingError(f"{recording.path}: no message on {_join_sorted(channels)}. {hint}")
 
 
 def _join_sorted(names: Iterable[str]) -> str:

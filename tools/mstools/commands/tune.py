@@ -24,7 +24,6 @@ from mstools.tuning.search import Parameter, Score, SearchResult, SearchStep, Se
 
 if TYPE_CHECKING:
     from modelserver.server.vehicle import Vehicle
-    from mstools.report.consistency import Consistency
     from mstools.tuning.evaluation import EvaluationJob, EvaluationResult, Part
 
 
@@ -182,19 +181,17 @@ def format_result(log: str, result: TuningResult) -> list[str]:
     ]
     text += [f"{name:34}{a:10.3f}{b:10.3f}" for name, a, b in rows if math.isfinite(a)]
     later = {each.kind: each for each in result.after[0].consistency}
-    text += [_format_nis(each, later.get(each.kind)) for each in result.before[0].consistency]
+    for each in result.before[0].consistency:
+        nis, beyond = f"{each.mean:10.2f}{'':10}", f"{each.beyond:.1%}"
+        if (after := later.get(each.kind)) is not None:
+            nis, beyond = f"{each.mean:10.2f}{after.mean:10.2f}", f"{each.beyond:.1%} -> {after.beyond:.1%}"
+        text.append(f"{'NIS, ' + each.kind:34}{nis}   beyond 95 %: {beyond}")
     text += [f"{name}: {result.begin[name]:g} -> {value:g}" for name, value in found.settings.items()]
     if not found.settings:
         text.append("No step helps enough: the settings fit this recording.")
     if found.insensitive:
         text.append(f"Without effect on this recording: {', '.join(found.insensitive)}.")
     return text
-
-
-def _format_nis(before: Consistency, after: Consistency | None) -> str:
-    later = f"{after.mean:10.2f}" if after is not None else f"{'':10}"
-    beyond = f"   beyond 95 %: {before.beyond:.1%}" + (f" -> {after.beyond:.1%}" if after is not None else "")
-    return f"{'NIS, ' + before.kind:34}{before.mean:10.2f}{later}{beyond}"
 
 
 def as_data(result: TuningResult) -> dict[str, object]:
