@@ -82,10 +82,7 @@ def find_renamed_key(path: str) -> str:
 
 
 def read(raw: bytes, name: str, schema: type[S]) -> S:
-    """Return the instance of a dataclass that the bytes of the file `name` hold.
-
-    Raises ConfigError with every problem.
-    """
+    """Return the instance of a dataclass that the file `name` holds. Raises ConfigError with every problem."""
     found, problems = read_partly(raw, name, schema)
     if found is None or problems:
         raise ConfigError(problems)
@@ -95,22 +92,10 @@ def read(raw: bytes, name: str, schema: type[S]) -> S:
 def read_partly(
     raw: bytes, name: str, schema: type[S], blanks: Mapping[str, str] | None = None
 ) -> tuple[S | None, tuple[Problem, ...]]:
-    """Read as much of a file as is valid.
+    """Return the instance of a dataclass, None where too little is valid, and every problem in the order of the file.
 
-    Parameters
-    ----------
-    raw, name : the bytes, and the file's name for problems
-    schema : dataclass whose attributes are the keys
-    blanks : values for required top-level keys that are missing or wrong, so that the rest can be examined
-
-    Returns
-    -------
-    The instance, None where too little is valid, and every problem in the order of the file.
-
-    Raises
-    ------
-    ConfigError
-        The file is not a YAML mapping.
+    `blanks` are values for required top-level keys that are missing or wrong, so that the rest can be examined. Raises
+    ConfigError for a file that is not a YAML mapping.
     """
     reader, values = _compose(raw, name, schema)
     if any(at[-1:] == ("?",) for at in reader.lines):
