@@ -112,11 +112,9 @@ class CommandableEndpoint(Protocol[U]):
 
     def on_command(self, command: VehicleCommand, now: HostTime) -> Sequence[Output[U]]:
         """Process a command."""
-        ...
 
     def reject_command(self, reason: str, text: str, now: HostTime) -> Sequence[Output[U]]:
         """Count and report a malformed command; `reason` is the counter's name."""
-        ...
 
 
 @runtime_checkable
@@ -126,4 +124,3 @@ class HasMaxSilence(Protocol):
     @property
     def max_silence(self) -> float:
         """Longest normal silence in seconds; inf where no data is expected."""
-        ...

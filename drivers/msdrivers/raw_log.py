@@ -69,11 +69,9 @@ class TimeSource(Protocol):
 
     def now(self) -> HostTime:
         """Return the instant."""
-        ...
 
     def sleep(self, seconds: float) -> None:
         """Wait."""
-        ...
 
 
 @dataclass(slots=True)

@@ -100,14 +100,15 @@ class SectionReader(SettingsReader):
     def read_kind(self, kinds: Mapping[str, DeviceKind]) -> DeviceKind:
         """Return the kind of device that the section names. Raises ConfigError."""
         given = self.section.get("device")
+        if isinstance(given, str) and given in kinds:
+            return kinds[given]
         known = f"kinds: {', '.join(kinds)}"
         if given is None:
-            raise ConfigError([self._make_problem("device", "device is missing", f"add a line: device: ... ({known})")])
-        if not isinstance(given, str) or given not in kinds:
+            self.report("device", "device is missing", f"add a line: device: ... ({known})")
+        else:
             near = suggest_name(str(given), kinds)
-            fix = f"write {near[0]}" if near else known
-            raise ConfigError([self._make_problem("device", f"unknown device {quote(str(given))}", fix, near)])
-        return kinds[given]
+            self.report("device", f"unknown device {quote(str(given))}", f"write {near[0]}" if near else known, near)
+        raise ConfigError(self.problems)
 
     def read_line_type(self, kind: DeviceKind, more: list[str]) -> type[LineSettings]:
         """Return the type of line that the section names by its first key.
@@ -171,10 +172,7 @@ class SectionReader(SettingsReader):
 
     def report(self, key: str, message: str, fix: str = "", nearest: tuple[str, ...] = ()) -> None:
         """Report a problem of a key."""
-        self.problems.append(self._make_problem(key, message, fix, nearest))
-
-    def _make_problem(self, key: str, message: str, fix: str, nearest: tuple[str, ...] = ()) -> Problem:
-        return Problem(Severity.ERROR, message, self.locate((key,)), fix, nearest)
+        self.problems.append(Problem(Severity.ERROR, message, self.locate((key,)), fix, nearest))
 
     def read_values(self, kind: type, given: Mapping[str, Any] | None = None) -> Any:
         """Return the instance of `kind` that the section makes, None where something is wrong with it.

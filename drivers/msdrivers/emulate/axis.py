@@ -88,32 +88,21 @@ class AxisEmulator:
         """Send nothing."""
         return []
 
-    @property
-    def degrees(self) -> float:
-        """True angle at the last request."""
-        return self._angle
-
-    @property
-    def commanded(self) -> dict[str, float]:
-        """The limits and the rate that it nods by, degrees (a second)."""
-        return dict(self._commanded)
-
     def _switch_on(self, at_ns: int) -> None:
         unit = self.unit
-        self._commanded = {"lower_limit": unit.lower_deg, "upper_limit": unit.upper_deg, "nod_rate": unit.rate_deg}
-        self._angle = unit.angle_deg
-        self._direction = 1.0
-        self._updated_ns = at_ns
-        self._number = 0
-        self._measured_deg = self._angle
-        self._measured_rate = 0.0
+        self.commanded = {"lower_limit": unit.lower_deg, "upper_limit": unit.upper_deg, "nod_rate": unit.rate_deg}
+        """The limits and the rate that it nods by, degrees (a second)."""
+        self.degrees = self._measured_deg = unit.angle_deg
+        """True angle at the last request."""
+        self._direction, self._measured_rate = 1.0, 0.0
+        self._updated_ns, self._number = at_ns, 0
 
     def _apply_fault(self, fault: InjectedFault, at_ns: int) -> None:
         if fault.kind == "exception":
             self._exceptions.append(round(fault.amount))
         elif fault.kind == "jump":
             self._advance(at_ns)
-            self._angle += fault.amount
+            self.degrees += fault.amount
         elif fault.kind == "restart":
             self._switch_on(self._faults.silent_until_ns)
 
@@ -126,29 +115,29 @@ class AxisEmulator:
             self._number = ticks & 0xFFFF
             turned = self._rotate((measured_ns - self._updated_ns) * 1e-9)
             self._updated_ns = measured_ns
-            self._measured_deg = round(self._angle / self.unit.step_deg) * self.unit.step_deg
+            self._measured_deg = round(self.degrees / self.unit.step_deg) * self.unit.step_deg
             self._measured_rate = turned
 
     def _rotate(self, seconds: float) -> float:
         """Rotate for a time; return the signed rate at its end."""
-        lower, upper, rate = self._commanded["lower_limit"], self._commanded["upper_limit"], self._commanded["nod_rate"]
+        lower, upper, rate = self.commanded["lower_limit"], self.commanded["upper_limit"], self.commanded["nod_rate"]
         if rate == 0.0:
             return 0.0
         left = rate * seconds
-        if not lower <= self._angle <= upper:
+        if not lower <= self.degrees <= upper:
             # the limits were moved, or it was pushed: back between them first
-            near = min(max(self._angle, lower), upper)
-            self._direction = 1.0 if near > self._angle else -1.0
-            way = min(left, abs(near - self._angle))
-            self._angle += self._direction * way
+            near = min(max(self.degrees, lower), upper)
+            self._direction = 1.0 if near > self.degrees else -1.0
+            way = min(left, abs(near - self.degrees))
+            self.degrees += self._direction * way
             left -= way
         if left > 0.0:
             # unfolded, the nodding motion is periodic in twice the span
             span = upper - lower
-            phase = self._angle - lower if self._direction > 0.0 else 2.0 * span - (self._angle - lower)
+            phase = self.degrees - lower if self._direction > 0.0 else 2.0 * span - (self.degrees - lower)
             phase = (phase + left) % (2.0 * span)
             self._direction = 1.0 if phase < span else -1.0
-            self._angle = lower + (phase if phase < span else 2.0 * span - phase)
+            self.degrees = lower + (phase if phase < span else 2.0 * span - phase)
         return self._direction * rate
 
     def _answer(self, unit: modbus.ReadRegisters | modbus.WriteRegisters) -> modbus.ModbusUnit:
@@ -171,7 +160,7 @@ class AxisEmulator:
                 words |= {mapped.address + index: word for index, word in enumerate(found)}
         if table is modbus.RegisterTable.HOLDING:
             for name, mapped in registers.commanded.items():
-                found = mapped.from_degrees(self._commanded[name])
+                found = mapped.from_degrees(self.commanded[name])
                 words |= {mapped.address + index: word for index, word in enumerate(found)}
         return words
 
@@ -180,7 +169,7 @@ class AxisEmulator:
         name = places.get((unit.address, len(unit.values)))
         if name is None or len(unit.values) > modbus.MAX_WRITE:
             return self._make_exception(unit, ILLEGAL_ADDRESS)
-        after = self._commanded | {name: self._registers.commanded[name].to_degrees(unit.values)}
+        after = self.commanded | {name: self._registers.commanded[name].to_degrees(unit.values)}
         axis, rate = self.unit, after["nod_rate"]
         slack = 0.5 * axis.step_deg
         fits = axis.lowest_deg - slack <= after["lower_limit"] < after["upper_limit"] <= axis.highest_deg + slack and (
@@ -188,7 +177,7 @@ class AxisEmulator:
         )
         if not fits:
             return self._make_exception(unit, ILLEGAL_VALUE)
-        self._commanded = after
+        self.commanded = after
         return modbus.RegistersWritten(unit.address, len(unit.values), unit.transaction)
 
     def _make_exception(self, unit: modbus.ReadRegisters | modbus.WriteRegisters, code: int) -> modbus.ModbusFailure:
