@@ -11,6 +11,7 @@ import os
 import random
 import re
 import secrets
+import socket
 import struct
 import sys
 import threading
@@ -21,9 +22,7 @@ from typing import Any, Final
 import lcm
 import numpy as np
 
-from modelserver.client import commands
 from modelserver.client.batch_reply import BatchQuery, BatchReplyAssembler, concatenate
-from modelserver.client.commands import Signer, load_signer
 from modelserver.client.interface import PlatformClient, R, require_answer
 from modelserver.errors import MalformedRequestError, NoServerError, Status, make_status_error
 from modelserver.messages import (
@@ -31,6 +30,7 @@ from modelserver.messages import (
     MAX_CHANNEL_LENGTH,
     MAX_REQUEST_INSTANTS,
     Acknowledgement,
+    Envelope,
     GetTransformation,
     GetTransformations,
     Policy,
@@ -46,8 +46,10 @@ from modelserver.messages import (
     TimeQuery,
     TransformReply,
 )
+from modelserver.signing.key_files import KEY_FILE_VARIABLE, read_keys
+from modelserver.signing.signatures import Key, sign
 from modelserver.transforms.transformation import Transformation
-from modelserver.wire.channels import REPLY_PREFIX, to_subscription_pattern
+from modelserver.wire.channels import REPLY_PREFIX, SIGNED, to_subscription_pattern
 from modelserver.wire.codec import decode, encode, get_type_name, pack_get_transformation, read_answer
 from modelserver.wire.provider import handle_message, open_lcm, resolve_url
 
@@ -63,6 +65,42 @@ _MAX_WAIT_MS: Final = 60_000
 
 _REQUEST_ID: Final = slice(8, 16)
 """Bytes of the request's id in every request and reply: the first field after the fingerprint."""
+
+
+COMMANDS = (ReloadModel, SetStateVector, SetHTransform)
+"""Requests that are not retried: a lost reply does not mean that the command was not executed."""
+
+
+MAX_SENDER_LENGTH = 64
+
+
+class Signer:
+    """Sign the commands of one program to one vehicle. `clock` returns microseconds since the Unix epoch."""
+
+    def __init__(self, key: Key, prefix: str, sender: str, clock: Callable[[], int] = lambda: time.time_ns() // 1000):
+        self.channel = f"{prefix}{SIGNED}"
+        self._key = key
+        self._prefix = prefix
+        self._sender = sender[:MAX_SENDER_LENGTH]
+        self._clock = clock
+        self._counter = 0
+
+    def seal(self, channel: str, payload: bytes) -> bytes:
+        """Return an encoded envelope with the message for `channel` (without the prefix)."""
+        self._counter += 1
+        envelope = Envelope("", self._sender, self._clock(), self._counter, channel, payload)
+        return encode(sign(self._key, self._prefix, envelope))
+
+
+def load_signer(key_file: str, prefix: str, program: str) -> Signer | None:
+    """Return a signer with the first key of a file, default $MODELSERVER_KEY_FILE; None if neither is given.
+
+    Raises KeyFileError.
+    """
+    path = key_file or os.environ.get(KEY_FILE_VARIABLE, "")
+    if not path:
+        return None
+    return Signer(read_keys(path)[0], prefix, f"{program}@{socket.gethostname()}")
 
 
 class Platform(PlatformClient):
@@ -200,7 +238,7 @@ class Platform(PlatformClient):
         channel = self._channels[type(request)]
         timeout, tries = self.timeout + time.wait_ms * 1e-3, 1 + self.retries
         request_id = data[_REQUEST_ID]
-        if isinstance(request, commands.COMMANDS):
+        if isinstance(request, COMMANDS):
             timeout, tries = timeout * tries, 1
             self._signer = self._signer or load_signer(self._key_file, self._prefix, self._name)
             # without a key it is sent unsigned: the server's reply explains how to sign

@@ -89,8 +89,9 @@ def compute_answer(view: PlatformView, request: Request, utime: int) -> list[Rep
     """Compute the messages of the reply to a request at `utime`; most types have one. Raises QueryError."""
     header = ReplyHeader(request.header.request_id, utime, model_revision=view.model.revision)
     match request:
-        case GetTransformation(_, interest, reference, time):
-            return [TransformReply(header, view.transformation(interest, reference, time, utime))]
+        case GetTransformation():  # the hot path
+            interest, reference = request.frame_of_interest, request.frame_of_reference
+            return [TransformReply(header, view.transformation(interest, reference, request.time, utime))]
         case GetStateVector(_, time):
             return [StateVectorReply(header, view.transformation(view.base_frame, names.WORLD_UTM, time, utime))]
         case GetHTransform(_, inverse, time):

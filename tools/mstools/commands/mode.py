@@ -46,7 +46,7 @@ def command(
     Example: modelserver mode no_gps -c config/husky/vehicle.yaml
     """
     wanted = parse_mode(mode)
-    from modelserver.client.commands import load_signer
+    from modelserver.client.remote import load_signer
     from modelserver.config.vehicle_file import load_config
     from modelserver.wire.codec import encode
 
