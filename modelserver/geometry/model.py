@@ -23,7 +23,7 @@ from modelserver.errors import (
     quote,
 )
 from modelserver.geometry import names
-from modelserver.geometry.joint import Coordinates, Joint
+from modelserver.geometry.joint import Coordinates, Joint, Mimic
 from modelserver.geometry.joint_rules import resolve_mimics
 from modelserver.geometry.kinematic_path import FrameNode, FrameTree, KinematicPath
 from modelserver.geometry.names import format_names
@@ -378,33 +378,28 @@ def _check_unique(what: str, given: list[str]) -> None:
 
 def _revision(bodies: tuple[Body, ...], constraints: tuple[Constraint, ...]) -> str:
     """Return 16 hex digits of a SHA-256 over all that answers and lists contain; floats enter exactly."""
-
-    def sigma(value: Sigma | None) -> object:
-        return None if value is None else (value.position, value.rotation)
-
-    def pose(value: Pose | None) -> object:
-        return None if value is None else (value.xyz, value.wxyz)
-
-    def joint(value: Joint) -> object:
-        if not value.is_movable:
-            return value.type
-        numbers = (value.axis, value.lower, value.upper, value.rate_limit, value.default, value.sigma)
-        return (value.type, numbers, None if value.mimic is None else astuple(value.mimic))
-
     content = (
         [
             (
                 body.name,
                 body.description,
-                pose(body.pose),
+                body.pose,
                 body.inertia,
-                [(frame.name, pose(frame.pose), frame.description, sigma(frame.sigma)) for frame in body],
+                [(frame.name, frame.pose, frame.description, frame.sigma) for frame in body],
             )
             for body in bodies
         ],
-        [
-            (each.name, each.from_, each.to, pose(each.pose), joint(each.joint), sigma(each.sigma))
-            for each in constraints
-        ],
+        [(each.name, each.from_, each.to, each.pose, each.joint, each.sigma) for each in constraints],
     )
-    return hashlib.sha256(json.dumps(content, separators=(",", ":")).encode()).hexdigest()[:16]
+    text = json.dumps(content, separators=(",", ":"), default=_get_content)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _get_content(value: Pose | Sigma | Joint | Mimic) -> object:
+    """Return the numbers of a value in the revision."""
+    if isinstance(value, Pose):
+        return value.xyz, value.wxyz
+    if not isinstance(value, Joint):
+        return astuple(value)
+    numbers = (value.axis, value.lower, value.upper, value.rate_limit, value.default, value.sigma)
+    return (value.type, numbers, value.mimic) if value.is_movable else value.type

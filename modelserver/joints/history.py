@@ -101,11 +101,8 @@ class JointHistory:
             if joint.position != joint.position:
                 continue
             problem = self._find_problem(joint, with_suggestion=len(rejected) < MAX_SUGGESTIONS)
-            if problem:
-                rejected.append(problem)
-                continue
-            if joint.name in seen:
-                rejected.append(f"duplicate {joint.name}")
+            if problem or joint.name in seen:
+                rejected.append(problem or f"duplicate {joint.name}")
                 continue
             seen.add(joint.name)
             track = self._get_track(joint.name, self.tracks if tracks is None else tracks)
