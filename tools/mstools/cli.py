@@ -16,7 +16,7 @@ import typer
 
 from modelserver.errors import ConfigError, GeometryError, ModelServerError, QueryError, find_nearest_names, quote
 from modelserver.version import __version__
-from mstools.terminal.output import escape, print_problem
+from mstools.terminal.output import escape, print_problems
 from mstools.terminal.problems import suggest_path
 
 COMMANDS = {
@@ -75,8 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         build_app(arguments)(arguments, prog_name="modelserver")
     except (GeometryError, ConfigError) as error:
-        for problem in error.problems:
-            print_problem(problem, err=True)
+        print_problems(error.problems)
         sys.exit(1)
     except QueryError as error:
         near = f". Nearest: {', '.join(error.nearest)}" if error.nearest else ""

@@ -17,7 +17,7 @@ from modelserver.formats import check_file
 from modelserver.geometry.model import Model
 from mstools.commands.driver import find_driver_problems
 from mstools.terminal.options import JsonOption, Variables, argument, option, parse_variables
-from mstools.terminal.output import describe_size, escape, format_count, print_problem, to_json
+from mstools.terminal.output import describe_size, escape, format_count, print_problems, to_json
 from mstools.terminal.problems import find_nearest_path
 
 if TYPE_CHECKING:
@@ -134,9 +134,7 @@ def _has_findings(problems: tuple[Problem, ...]) -> bool:
 
 def _print(file: str, model: Model | None, problems: tuple[Problem, ...], notes: bool) -> None:
     count = Counter(problem.severity for problem in problems)
-    for problem in problems:
-        if notes or problem.severity is not Severity.NOTE:
-            print_problem(problem)
+    print_problems((each for each in problems if notes or each.severity is not Severity.NOTE), err=False)
     parts = [describe_size(model)] if model is not None else []
     found = [format_count(count[each], str(each)) for each in (Severity.ERROR, Severity.WARNING) if count[each]]
     parts.append(", ".join(found) or "clean")

@@ -12,7 +12,7 @@ from modelserver.files.kinds import EXAMINED_BYTES, FileKind, detect_file_kind
 from modelserver.files.regular import read_start
 from modelserver.formats import FORMATS, check_file, format_of_path, save_model
 from mstools.terminal.options import Variables, argument, choose_name, option, parse_variables
-from mstools.terminal.output import check_writable, describe_size, escape, format_count, print_problem, write_file
+from mstools.terminal.output import check_writable, describe_size, escape, format_count, print_problems, write_file
 
 
 def command(
@@ -62,17 +62,14 @@ def command(
         from mstools.commands.convert_process import convert_process
 
         text, warnings = convert_process(source, target, values)
-        for problem in warnings:
-            print_problem(problem, err=True)
+        print_problems(warnings)
         write_file(target, text, replace=force)
         if target != "-":
             seen = f"{format_count(len(warnings), 'warning')}; modelserver check {escape(target)}"
             typer.echo(f"{escape(target)}: {seen}", err=True)
         return
     model, problems = check_file(source, values, repair=repair)
-    for problem in problems:
-        if problem.severity is not Severity.NOTE:
-            print_problem(problem, err=True)
+    print_problems(problem for problem in problems if problem.severity is not Severity.NOTE)
     if model is None:
         errors = sum(problem.severity is Severity.ERROR for problem in problems)
         raise ModelServerError(f"{escape(source)} has {format_count(errors, 'error')}; nothing was written")

@@ -22,13 +22,13 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Union, get_ar
 import yaml
 
 from modelserver.config.vehicle_file import VehicleConfig, parse_partly
-from modelserver.errors import ConfigError, GeometryError, Location, Problem, QueryError, Severity, quote
+from modelserver.errors import GeometryError, Location, Problem, QueryError, Severity, quote
 from modelserver.files.kinds import EXAMINED_BYTES
 from modelserver.formats import check_file, xml_document
 from modelserver.geometry.builder import ModelBuilder
 from modelserver.geometry.model import Model
 from mstools.terminal.output import escape
-from mstools.terminal.problems import find_nearest_path
+from mstools.terminal.problems import find_nearest_path, make_error
 
 if TYPE_CHECKING:
     from lxml.etree import _Element as Element
@@ -101,7 +101,7 @@ def convert_process(file: str, target: str, variables: Mapping[str, str] | None 
         content = stream.read(EXAMINED_BYTES + 1)
     if len(content) > EXAMINED_BYTES:
         why = f"the file is larger than {EXAMINED_BYTES >> 20} MiB"
-        raise _make_error(why, Location(file), "is this the process configuration?")
+        raise make_error(why, file, "is this the process configuration?")
     builder = ModelBuilder()
     root = xml_document.parse(content, builder, file)
     if root is None:
@@ -109,7 +109,7 @@ def convert_process(file: str, target: str, variables: Mapping[str, str] | None 
     settings = list(islice(_iter_parameters(root, ()), MAX_SETTINGS + 1))
     if len(settings) > MAX_SETTINGS:
         why = f"the file has more than {MAX_SETTINGS} parameters"
-        raise _make_error(why, Location(file, settings[-1].line), "remove the sections of other processes")
+        raise make_error(why, Location(file, settings[-1].line), "remove the sections of other processes")
     matching = _KeyMatcher(file, settings)
     for setting in settings:
         matching.add(setting)
@@ -122,10 +122,6 @@ def convert_process(file: str, target: str, variables: Mapping[str, str] | None 
     matching.values["geometry",] = os.path.relpath(geometry, folder)
     matching.complete(model)
     return Conversion(_format_vehicle_file(matching, file), matching.list_problems())
-
-
-def _make_error(why: str, place: Location, fix: str) -> ConfigError:
-    return ConfigError([Problem(Severity.ERROR, why, place, fix)])
 
 
 def _iter_parameters(element: Element, path: tuple[str, ...]) -> Iterator[ProcessParameter]:
@@ -314,7 +310,7 @@ def _find_geometry(matching: _KeyMatcher, file: str) -> str:
             known = ", ".join(each.label for each in files[:5])
             why = "no parameter names the geometry file" + (f"; it may be one of {known}" if files else "")
             fix = 'add <parameter name="GeometryFile" value="geometry.xml"/> to its section'
-            raise _make_error(why, Location(file), fix)
+            raise make_error(why, file, fix)
         (found,) = files
         matching.skipped = [each for each in matching.skipped if each[0] is not found]
         named = str(found.value)
@@ -325,7 +321,7 @@ def _find_geometry(matching: _KeyMatcher, file: str) -> str:
         near = find_nearest_path(path)
         fix = f"did you mean {near}?" if near else "paths are taken relative to the process configuration; correct it"
         why = f"the geometry file {quote(named, 100)} is missing"
-        raise _make_error(why, Location(file, setting.line, setting.label), fix)
+        raise make_error(why, Location(file, setting.line, setting.label), fix)
     return str(path)
 
 

@@ -25,7 +25,7 @@ from modelserver.errors import (
 from modelserver.server.log import set_up_logging
 from mstools.commands.run import LEVELS, FormatOption, check_log_options
 from mstools.terminal.options import UrlOption, argument, option
-from mstools.terminal.output import escape, print_problem
+from mstools.terminal.output import escape, print_problems
 
 if TYPE_CHECKING:
     from modelserver.config.vehicle_file import VehicleConfig
@@ -48,8 +48,8 @@ def find_driver_problems(vehicle: VehicleConfig, file: str, constraints: Collect
     if not any(path[:1] == ("drivers",) for path in lines):
         return ()
     # imported here: a vehicle file without drivers needs none of their libraries
+    from msdrivers.factory import find_shared_lines, find_unbuildable_drivers
     from msdrivers.settings import SourceMap, read_drivers
-    from msdrivers.validation import find_shared_lines, find_unbuildable_drivers
 
     found, problems = read_drivers(vehicle.drivers, SourceMap(file, lines))
     drivers = found.values()
@@ -61,7 +61,7 @@ def find_misnamed(
     vehicle: VehicleConfig, drivers: Iterable[DriverSettings], constraints: Collection[str] | None
 ) -> Iterator[Problem]:
     """Yield the wheels and joints of drivers that the vehicle file or the geometry does not have."""
-    from msdrivers.validation import find_unknown_joint, find_unknown_wheels
+    from msdrivers.factory import find_unknown_joint, find_unknown_wheels
 
     wheels = vehicle.sensors.wheels
     for driver in drivers:
@@ -171,8 +171,7 @@ def show_drivers(config: Path) -> None:
     for name, driver in drivers.items():
         typer.echo(escape(f"{name:<16} {driver.kind.name}: {driver.kind.description}; {driver.line}"))
     problems = find_driver_problems(vehicle, str(config), constraints_of(vehicle))
-    for problem in problems:
-        print_problem(problem, err=True)
+    print_problems(problems)
     if any(problem.severity is Severity.ERROR for problem in problems):
         raise typer.Exit(1)
 

@@ -193,7 +193,7 @@ def command(
       modelserver emulate imu -c vehicle.yaml --tcp 4001 --fault stall@10:2 --fault corrupt@15:3
       modelserver emulate wheels -c vehicle.yaml --can vcan0 --from drive.lcm
     """
-    from msdrivers.fault_injection import parse_fault
+    from msdrivers.emulate.faults import parse_fault
 
     choose_name(scenario, SCENARIOS, "scenario", "--scenario")
     if (pty, tcp is not None, bool(can)).count(True) != 1:

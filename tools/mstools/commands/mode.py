@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from modelserver.errors import ConfigError, Location, ModelServerError, NoServerError, Problem, Severity
+from modelserver.errors import Location, ModelServerError, NoServerError
 from modelserver.messages import Health, Mode, NavigationState, PublishDecisions, SensorHeader, SwitchMode
 from modelserver.signing.key_files import KEY_FILE_VARIABLE
 from modelserver.wire.channels import SIGNED
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.commands.listener import DaemonListener
 from mstools.terminal.options import KeyOption, UrlOption, argument, choose_name, option
+from mstools.terminal.problems import make_error
 
 if TYPE_CHECKING:
     import lcm
@@ -54,8 +55,7 @@ def command(
     if not vehicle.localization.mode_channel:
         why = "no channel for mode commands is configured, so the daemon receives none"
         fix = "write mode_channel: LOCALIZATION_MODE under localization, and restart the daemon"
-        source = Location(str(config), element="localization.mode_channel")
-        raise ConfigError([Problem(Severity.ERROR, why, source, fix)])
+        raise make_error(why, Location(str(config), element="localization.mode_channel"), fix)
     prefix, state_hz = vehicle.lcm.channel_prefix, vehicle.publish.state_hz
     channel = f"{prefix}{vehicle.localization.mode_channel}"
     given = str(key or "") or os.environ.get(KEY_FILE_VARIABLE, "") or vehicle.commands.key_file

@@ -13,7 +13,7 @@ from modelserver.errors import ModelServerError, UnknownFrameError, find_nearest
 from modelserver.geometry import names
 from modelserver.messages import NO_FLAGS, ExplanationReply, GetExplanation, GetMotion, Policy, PoseAnswer, Quality
 from mstools.terminal.options import parse_variables
-from mstools.terminal.output import print_problem
+from mstools.terminal.output import print_problems
 
 if TYPE_CHECKING:
     from modelserver.geometry.model import Model
@@ -66,8 +66,7 @@ def load_given_model(path: str | Path, variables: Mapping[str, str]) -> Model:
     from modelserver.formats import load_model
 
     model = load_model(path, variables=variables)
-    for problem in model.problems:
-        print_problem(problem, err=True)
+    print_problems(model.problems)
     return model
 
 

@@ -9,7 +9,7 @@ from ipaddress import ip_address
 from typing import Final
 from urllib.parse import parse_qs, urlsplit
 
-from modelserver.errors import ConfigError, Location, ModelServerError, Problem, Severity, find_nearest_names, quote
+from modelserver.errors import ModelServerError, find_nearest_names, quote
 from modelserver.wire.urls import group_of
 from mstools.deployment.plan import (
     CONFIGURATION,
@@ -22,7 +22,7 @@ from mstools.deployment.plan import (
     SystemFacts,
     WriteFile,
 )
-from mstools.terminal.problems import ProblemCollector
+from mstools.terminal.problems import ProblemCollector, make_error
 
 BY_ID: Final = "/dev/serial/by-id/"
 DEVICE_FOLDER: Final = "/dev/modelserver/"
@@ -69,14 +69,14 @@ def check_visible(paths: Iterable[tuple[str, str]], fix: str, subject: str = "th
     """
     if unseen := {f"{what} is {path}": setting for path, what in paths if (setting := find_hiding_setting(path))}:
         why = " and ".join(f"{setting}=yes" for setting in dict.fromkeys(unseen.values()))
-        raise _error(f"{', '.join(unseen)}, which the hardened units cannot access ({why})", subject, fix)
+        raise make_error(f"{', '.join(unseen)}, which the hardened units cannot access ({why})", subject, fix)
 
 
 def check_program(program: str) -> None:
     """Raise ConfigError for a command path that cannot be written in a unit."""
     if not _UNIT_PATH.fullmatch(program):
         fix = "install to a folder whose path has only letters, digits and ._+@-"
-        raise _error(f"{program!r} cannot be written in a unit", "this installation", fix)
+        raise make_error(f"{program!r} cannot be written in a unit", "this installation", fix)
 
 
 def check_drivers(wanted: str, known: Iterable[str]) -> tuple[str, ...]:
@@ -108,10 +108,6 @@ def check_drivers(wanted: str, known: Iterable[str]) -> tuple[str, ...]:
             gathered.add("--drivers", why, fix)
     gathered.raise_any()
     return names
-
-
-def _error(why: str, subject: str, fix: str) -> ConfigError:
-    return ConfigError([Problem(Severity.ERROR, why, Location(subject), fix)])
 
 
 def loopback_group(url: str) -> str:

@@ -11,7 +11,7 @@ import typer
 from modelserver.errors import ConfigError, GeometryError, Location, ModelServerError, Problem, Severity
 from modelserver.server.supervision.file_watch import FileWatcher
 from modelserver.server.supervision.systemd import Notifier
-from mstools.terminal.output import print_problem
+from mstools.terminal.output import print_problems
 
 
 class ServiceStart:
@@ -49,8 +49,7 @@ class ServiceStart:
             problems, code = self._make_problem(error.message), error.exit_code
         except ModelServerError as error:
             problems = self._make_problem(str(error))
-        for problem in problems:
-            print_problem(problem, err=True)
+        print_problems(problems)
         self._files.add(*(problem.file for problem in problems if problem.file))
         # also extends the start timeout of systemd
         self._notifier.notify_starting(format_status(problems))

@@ -8,7 +8,7 @@ import math
 import os
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from enum import IntEnum
 from typing import Any, TextIO
 
@@ -25,13 +25,14 @@ def escape(text: str) -> str:
     return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
 
 
-def print_problem(problem: Problem, err: bool = False) -> None:
-    """Print a problem as `file:line: severity: message`, with element, fix and suggestions indented below."""
-    place = f"{problem.file}:{problem.line}" if problem.line else problem.file
-    typer.echo(escape(f"{place}: {problem.severity}: {problem.message}" if place else str(problem)), err=err)
-    for name, value in (("in", problem.element), ("fix", problem.fix), ("nearest", ", ".join(problem.nearest))):
-        if value:
-            typer.echo(f"    {name + ':':<9}{escape(value)}", err=err)
+def print_problems(problems: Iterable[Problem], err: bool = True) -> None:
+    """Print problems as `file:line: severity: message`, with element, fix and suggestions indented below."""
+    for each in problems:
+        place = f"{each.file}:{each.line}" if each.line else each.file
+        typer.echo(escape(f"{place}: {each.severity}: {each.message}" if place else str(each)), err=err)
+        for name, value in (("in", each.element), ("fix", each.fix), ("nearest", ", ".join(each.nearest))):
+            if value:
+                typer.echo(f"    {name + ':':<9}{escape(value)}", err=err)
 
 
 def format_count(count: int, one: str, several: str = "") -> str:

@@ -46,6 +46,11 @@ class ProblemCollector:
             raise ConfigError(dict.fromkeys(self._errors))
 
 
+def make_error(why: str, place: str | Location, fix: str) -> ConfigError:
+    """Return the error of a file or an option with one problem."""
+    return ConfigError([Problem(Severity.ERROR, why, place if isinstance(place, Location) else Location(place), fix)])
+
+
 def find_nearest_path(path: str | Path) -> str:
     """Return the existing path in the same folder with the most similar name; empty if there is none."""
     path = Path(path)
