@@ -417,13 +417,9 @@ class JointTrack:
         # copies: an array whose buffer is exported cannot grow; the window and one reading after it
         for number in range(begin, min(end + 2, len(self._blocks))):
             low = index if number == begin else 0
-            high = (
-                self._get_length(number)
-                if number < end
-                else min(stop + 2, self._get_length(number))
-                if number == end
-                else 1
-            )
+            high = self._get_length(number) if number <= end else 1
+            if number == end:
+                high = min(stop + 2, high)
             times += self._blocks[number].times[low:high]
             values += self._blocks[number].values[low * _COLUMNS : high * _COLUMNS]
         t, rows = np.frombuffer(times, dtype=np.int64), np.frombuffer(values).reshape(-1, _COLUMNS)

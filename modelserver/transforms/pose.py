@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import reprlib
 from collections.abc import Iterable
-from typing import Self, TypeGuard
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -30,14 +30,6 @@ def _floats(values: Iterable[float], expected: str) -> tuple[float, ...]:
     if isinstance(values, np.ndarray) and values.ndim != 1:
         raise ValueError(f"{expected}, got an array of shape {values.shape}")
     return found
-
-
-def _is_vector3(values: tuple[float, ...]) -> TypeGuard[Vector3]:
-    return len(values) == 3
-
-
-def _is_quaternion(values: tuple[float, ...]) -> TypeGuard[Quaternion]:
-    return len(values) == 4
 
 
 class Pose:
@@ -66,12 +58,12 @@ class Pose:
         """
         p = _floats(position, "a position is 3 finite numbers in meters")
         q = _floats(quaternion, "a quaternion is 4 numbers, scalar first")
-        if not _is_vector3(p) or not all(map(math.isfinite, p)):
+        if len(p) != 3 or not all(map(math.isfinite, p)):
             raise ValueError(f"a position is 3 finite numbers in meters, got {reprlib.repr(p)}")
-        if not _is_quaternion(q):
+        if len(q) != 4:
             raise ValueError(f"a quaternion is 4 numbers, scalar first, got {reprlib.repr(q)}")
         _put_p(self, p)
-        _put_q(self, so3.normalize(q))
+        _put_q(self, so3.normalize((q[0], q[1], q[2], q[3])))
 
     @classmethod
     def _of(cls, p: Vector3, q: Quaternion) -> Self:
@@ -189,8 +181,7 @@ class Pose:
 
     def interpolate(self, other: Pose, fraction: float) -> Pose:
         """Return the pose at `fraction` between this and `other`: position linear, rotation by slerp."""
-        p = tuple(a + (b - a) * fraction for a, b in zip(self._p, other._p, strict=True))
-        assert _is_vector3(p)
+        p = so3.to_vector3(a + (b - a) * fraction for a, b in zip(self._p, other._p, strict=True))
         return Pose._of(p, so3.slerp(self._q, other._q, fraction))
 
     def distance(self, other: Pose) -> tuple[float, float]:
