@@ -58,6 +58,11 @@ class JointHistory:
 
     __slots__ = ("_coordinates", "_seconds", "tracks")
 
+    # declared for the journal, which stores them
+    _coordinates: Mapping[str, Coordinate]
+    _seconds: float
+    tracks: Mapping[str, JointTrack]
+
     def __init__(self, constraints: Iterable[Constraint], seconds: float):
         self._coordinates = MappingProxyType(
             {
@@ -68,7 +73,7 @@ class JointHistory:
             }
         )
         self._seconds = seconds
-        self.tracks: Mapping[str, JointTrack] = MappingProxyType({})
+        self.tracks = MappingProxyType({})
 
     @property
     def names(self) -> tuple[str, ...]:

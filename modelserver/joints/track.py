@@ -131,11 +131,21 @@ class JointTrack:
 
     __slots__ = ("_blocks", "_count", "_end", "_firsts", "_horizon", "_is_continuous", "_start", "source")
 
+    # declared for the journal, which stores them
+    _blocks: tuple[_Block, ...]
+    _firsts: tuple[int, ...]
+    _start: int
+    _end: int
+    _count: int
+    _horizon: int
+    _is_continuous: bool
+    source: str
+
     def __init__(self, seconds: float, is_continuous: bool = False):
         """Create an empty track of some seconds; `is_continuous`: an angle without limits, unwrapped at full turns."""
         self._is_continuous = is_continuous
-        self._blocks: tuple[_Block, ...] = ()
-        self._firsts: tuple[int, ...] = ()
+        self._blocks = ()
+        self._firsts = ()
         self._start = 0
         """In the first block: earlier readings are dropped."""
         self._end = 0
