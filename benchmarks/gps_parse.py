@@ -9,7 +9,7 @@ import sys
 import time
 
 from modelserver.messages import FixType, GpsSample, SensorHeader
-from msdrivers.emulate import gps_logs
+from msdrivers.emulate import gps as gps_logs
 from msdrivers.protocol.gps_stream import GpsStream
 from msdrivers.protocol.novatel import NovatelLog
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from benchmarks.support import print_verdict
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
-from msdrivers.emulate.gx1_unit import Eeprom
+from msdrivers.emulate.gx1 import Eeprom
 from msdrivers.endpoint import HostTime, MeasuredSample, Send
 from msdrivers.protocol.gx1 import MEASUREMENTS, CommandByte, Gx1Packet, Gx1Parser
 from msdrivers.protocol.gx1.requests import RequestParser

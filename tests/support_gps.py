@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 
 from modelserver.messages import FixType, GpsSample, SensorHeader
 from msdrivers.devices.gps import GpsDriver
+from msdrivers.emulate.faults import FaultInjector
 from msdrivers.emulate.gps import GpsEmulator
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
-from msdrivers.fault_injection import FaultInjector
 
 START = 1_700_000_000_000_000
 SECOND = 1_000_000

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from modelserver.errors import ModelServerError, quote
 from modelserver.files.regular import read_regular
-from msdrivers.emulate.gx1_unit import Eeprom
+from msdrivers.emulate.gx1 import Eeprom
 
 MAX_EEPROM_FILE_BYTES = 1 << 16
 """The EEPROM has 128 words; a larger file is rejected."""

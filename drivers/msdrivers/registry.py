@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_name
 from modelserver.files.regular import read_regular
 from modelserver.messages import GpsSample, ImuSample, JointsSample, Sample, VehicleStatusSample, WheelsSample
+from msdrivers.emulate.faults import FAULT_AMOUNTS, InjectedFault
 from msdrivers.endpoint import Endpoint
-from msdrivers.fault_injection import FAULT_AMOUNTS, InjectedFault
 from msdrivers.line_settings import CanSettings, LineSettings, ModbusSettings, SerialSettings, TcpSettings
 
 if TYPE_CHECKING:
@@ -89,8 +89,8 @@ def _load_gps() -> DeviceModules:
 
 
 def _make_gps_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
+    from msdrivers.emulate.faults import FaultInjector
     from msdrivers.emulate.gps import GpsEmulator, GpsUnit
-    from msdrivers.fault_injection import FaultInjector
 
     unit = GpsUnit()
     if wanted.settings.protocol == "nmea":
@@ -109,8 +109,7 @@ def _load_gx1() -> DeviceModules:
 
 
 def _make_gx1_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.gx1 import Gx1Emulator
-    from msdrivers.emulate.gx1_unit import Gx1Unit
+    from msdrivers.emulate.gx1 import Gx1Emulator, Gx1Unit
     from msdrivers.gx1_eeprom_file import read_eeprom, write_eeprom
 
     unit = Gx1Unit(faults=wanted.faults)

@@ -15,8 +15,8 @@ from functools import reduce
 from operator import xor
 
 from modelserver.messages import NAN, Sample, SensorHeader, WheelSample, WheelsSample
+from msdrivers.emulate.faults import FaultInjector
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Send
-from msdrivers.fault_injection import FaultInjector
 from msdrivers.line_settings import SerialSettings, TcpSettings
 from msdrivers.links.fake import FakeLink, FakeTimeSource
 from msdrivers.protocol.framing import NO_FRAME, FrameScanner, ParsedFrame, RejectedFrame

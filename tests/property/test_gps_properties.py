@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support_gps import drive, split_randomly
 
 from modelserver.messages import GpsSample
-from msdrivers.emulate import gps_logs
+from msdrivers.emulate import gps as gps_logs
 from msdrivers.protocol.gps_stream import GpsMessage, GpsStream
 from msdrivers.protocol.nmea import NmeaEpoch
 from msdrivers.protocol.nmea.encode import format_angle

@@ -6,14 +6,192 @@ and answers and prompts as it does. With `is_answering` off and `saved` logs it 
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
-from modelserver.messages import GpsSample
-from msdrivers.emulate import gps_logs
+from modelserver.messages import FixType, GpsSample
 from msdrivers.endpoint import HostTime, Output, Send
+from msdrivers.protocol import gps_time
+from msdrivers.protocol.nmea import encode as nmea
+from msdrivers.protocol.nmea.fields import KMH, KNOT
+from msdrivers.protocol.novatel import (
+    Body,
+    HeadingLog,
+    LogHeader,
+    NovatelLog,
+    Position,
+    PositionType,
+    SolutionStatus,
+    TimeStatus,
+    Velocity,
+)
+from msdrivers.protocol.novatel.frames import encode
+
+_FIXES = {
+    FixType.NONE: (PositionType.NONE, "0", "N"),
+    FixType.FIX_2D: (PositionType.FIXEDHEIGHT, "1", "A"),
+    FixType.FIX_3D: (PositionType.SINGLE, "1", "A"),
+    FixType.DIFFERENTIAL: (PositionType.PSRDIFF, "2", "D"),
+    FixType.RTK_FLOAT: (PositionType.NARROW_FLOAT, "5", "F"),
+    FixType.RTK_FIXED: (PositionType.NARROW_INT, "4", "R"),
+    FixType.DEAD_RECKONING: (PositionType.PROPAGATED, "6", "E"),
+}
+"""Position type, quality in GGA, mode in RMC and VTG."""
+_WGS84 = 61
+
+
+def is_known(name: str) -> bool:
+    """Return whether a log or sentence is written here, e.g. "bestposb" or "gpgga"."""
+    return name in NMEA or (name[:-1] in NOVATEL and name[-1] in "ab")
+
+
+def encode_sample(name: str, sample: GpsSample, utime: int, port: str = "COM1") -> bytes:
+    """Encode a sample at `utime` as a log or sentence."""
+    if name in NMEA:
+        return NMEA[name](sample, utime)
+    week, microseconds = gps_time.gps_of(utime)
+    status, binary = TimeStatus.FINESTEERING, name[-1] == "b"
+    header = LogHeader(name[:-1].upper(), week, microseconds // 1000, status, port, 0, 0, binary)
+    return encode(NovatelLog(header, NOVATEL[name[:-1]](sample)))
+
+
+def _nan_to_zero(value: float) -> float:
+    return 0.0 if value != value else value
+
+
+def _get_height_msl(sample: GpsSample) -> float:
+    """Return the height above mean sea level; without a geoid undulation the ellipsoidal height."""
+    if sample.height_msl == sample.height_msl:
+        return sample.height_msl
+    return sample.height_ellipsoidal - _nan_to_zero(sample.undulation)
+
+
+def _get_sigmas(sample: GpsSample) -> tuple[float, float, float]:
+    """Return the standard deviations north, east, up."""
+    if sample.position_covariance is None:
+        return 0.0, 0.0, 0.0
+    east, north, up = sample.position_covariance[::4]
+    return math.sqrt(north), math.sqrt(east), math.sqrt(up)
+
+
+def _track_from_course(course: float) -> float:
+    """Return degrees clockwise from north, 0 to 360."""
+    return (90.0 - math.degrees(course)) % 360.0
+
+
+def _get_motion(sample: GpsSample) -> tuple[float, float, float]:
+    """Return speed, course and climb; nan if missing."""
+    if sample.velocity is not None:
+        east, north, up = sample.velocity
+        return math.hypot(east, north), math.atan2(north, east), up
+    return sample.speed, sample.course, math.nan
+
+
+def _make_position(sample: GpsSample) -> Position:
+    if sample.fix_type is FixType.NONE:
+        status, zeros = SolutionStatus.INSUFFICIENT_OBS, (0.0,) * 4
+        return Position(status, PositionType.NONE, *zeros, _WGS84, 0.0, 0.0, 0.0, "", 0.0, 0.0, 0, 0)
+    used, kind = max(0, sample.satellites), _FIXES[sample.fix_type][0]
+    heights = _nan_to_zero(_get_height_msl(sample)), _nan_to_zero(sample.undulation)
+    place = (sample.latitude_deg, sample.longitude_deg, *heights)
+    return Position(SolutionStatus.SOL_COMPUTED, kind, *place, _WGS84, *_get_sigmas(sample), "", 0.0, 0.0, used, used)
+
+
+def _make_velocity(sample: GpsSample) -> Velocity:
+    speed, course, climb = _get_motion(sample)
+    if sample.fix_type is FixType.NONE or speed != speed:
+        return Velocity(SolutionStatus.INSUFFICIENT_OBS, PositionType.NONE, 0.0, 0.0, 0.0, 0.0, 0.0)
+    latency, track = _nan_to_zero(sample.velocity_latency), _track_from_course(_nan_to_zero(course))
+    kind = PositionType.DOPPLER_VELOCITY
+    return Velocity(SolutionStatus.SOL_COMPUTED, kind, latency, 0.0, speed, track, _nan_to_zero(climb))
+
+
+def _make_heading(sample: GpsSample) -> HeadingLog:
+    if sample.baseline_yaw != sample.baseline_yaw:
+        return HeadingLog(SolutionStatus.INSUFFICIENT_OBS, PositionType.NONE, -1.0, 0.0, 0.0, 0.0, 0.0, "", 0, 0)
+    sigma, used = math.degrees(_nan_to_zero(sample.baseline_yaw_sigma)), max(0, sample.satellites)
+    kind, heading = PositionType.NARROW_INT, _track_from_course(sample.baseline_yaw)
+    return HeadingLog(SolutionStatus.SOL_COMPUTED, kind, 1.0, heading, 0.0, sigma, sigma, "", used, used)
+
+
+NOVATEL: dict[str, Callable[[GpsSample], Body]] = {
+    "bestpos": _make_position,
+    "psrpos": _make_position,
+    "rtkpos": _make_position,
+    "bestvel": _make_velocity,
+    "heading": _make_heading,
+    "heading2": _make_heading,
+}
+"""Log without its format's letter -> the body."""
+
+
+def _format_clock(utime: int) -> str:
+    return nmea.format_time_of_day(utime % gps_time.DAY)
+
+
+def _format_position(sample: GpsSample) -> tuple[str, str, str, str]:
+    return (*nmea.format_angle(sample.latitude_deg, "NS", 2), *nmea.format_angle(sample.longitude_deg, "EW", 3))
+
+
+def _format_gga(sample: GpsSample, utime: int) -> bytes:
+    count = str(sample.satellites) if sample.satellites >= 0 else ""
+    heights = (nmea.format_number(_get_height_msl(sample), 4), "M", nmea.format_number(sample.undulation, 4), "M")
+    quality = (_FIXES[sample.fix_type][1], count, nmea.format_number(sample.hdop, 2))
+    return nmea.encode("GP", "GGA", (_format_clock(utime), *_format_position(sample), *quality, *heights, "", ""))
+
+
+def _format_rmc(sample: GpsSample, utime: int) -> bytes:
+    speed, course, _ = _get_motion(sample)
+    status, mode = "V" if sample.fix_type is FixType.NONE else "A", _FIXES[sample.fix_type][2]
+    motion = (nmea.format_number(speed / KNOT, 4), nmea.format_number(_track_from_course(course), 4))
+    date = datetime.fromtimestamp(utime // gps_time.SECOND, UTC).strftime("%d%m%y")
+    fields = (_format_clock(utime), status, *_format_position(sample), *motion, date, "", "", mode)
+    return nmea.encode("GP", "RMC", fields)
+
+
+def _format_vtg(sample: GpsSample, utime: int) -> bytes:
+    speed, course, _ = _get_motion(sample)
+    track = nmea.format_number(_track_from_course(course), 4)
+    speeds = (nmea.format_number(speed / KNOT, 4), "N", nmea.format_number(speed / KMH, 4), "K")
+    return nmea.encode("GP", "VTG", (track, "T", "", "M", *speeds, _FIXES[sample.fix_type][2]))
+
+
+def _format_gsa(sample: GpsSample, utime: int) -> bytes:
+    dimension = {FixType.NONE: "1", FixType.FIX_2D: "2"}.get(sample.fix_type, "3")
+    dilution = (nmea.format_number(each, 2) for each in (sample.pdop, sample.hdop, sample.vdop))
+    return nmea.encode("GP", "GSA", ("A", dimension, *[""] * 12, *dilution))
+
+
+def _format_gst(sample: GpsSample, utime: int) -> bytes:
+    sigmas = _get_sigmas(sample) if sample.position_covariance else (math.nan,) * 3
+    fields = (nmea.format_number(each, 3) for each in sigmas)
+    return nmea.encode("GP", "GST", (_format_clock(utime), *[""] * 4, *fields))
+
+
+def _format_hdt(sample: GpsSample, utime: int) -> bytes:
+    return nmea.encode("GP", "HDT", (nmea.format_number(_track_from_course(sample.baseline_yaw), 4), "T"))
+
+
+def _format_zda(sample: GpsSample, utime: int) -> bytes:
+    day = datetime.fromtimestamp(utime // gps_time.SECOND, UTC)
+    return nmea.encode("GP", "ZDA", (_format_clock(utime), f"{day:%d}", f"{day:%m}", f"{day:%Y}", "00", "00"))
+
+
+NMEA: dict[str, Callable[[GpsSample, int], bytes]] = {
+    "gpgga": _format_gga,
+    "gprmc": _format_rmc,
+    "gpvtg": _format_vtg,
+    "gpgsa": _format_gsa,
+    "gpgst": _format_gst,
+    "gphdt": _format_hdt,
+    "gpzda": _format_zda,
+}
+"""Sentence -> its bytes."""
+
 
 _PORT = "COM1"
 _PROMPT = f"[{_PORT}]".encode()
@@ -123,7 +301,7 @@ class GpsEmulator:
             if wanted.last is not None and utime - wanted.last < wanted.period - 500:
                 continue
             wanted.last = utime
-            logs += gps_logs.encode_sample(name, sample, utime, _PORT)
+            logs += encode_sample(name, sample, utime, _PORT)
             self.counts[name] += 1
         return logs
 
@@ -140,7 +318,7 @@ class GpsEmulator:
             return ""
         if command not in ("log", "unlog"):
             return f"Invalid Message. Field = {command}"
-        if not fields or not gps_logs.is_known(fields[0]):
+        if not fields or not is_known(fields[0]):
             return f"Invalid Message. Field = {fields[0] if fields else ''}"
         if command == "unlog":
             self._logs.pop(fields[0], None)

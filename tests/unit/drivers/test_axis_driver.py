@@ -14,8 +14,8 @@ from support_vehicle_bus import AXIS_REGISTERS, DEG, START_UTIME, Wire, at, axis
 from modelserver.messages import DriverHealth, DriverPhase, JointsSample
 from msdrivers.devices.axis import AxisDriver, AxisSettings, NodSettings
 from msdrivers.emulate.axis import AxisEmulator, AxisUnit
+from msdrivers.emulate.faults import InjectedFault
 from msdrivers.endpoint import EndpointPhase, HostTime, MeasuredSample, Reopen, Send
-from msdrivers.fault_injection import InjectedFault
 from msdrivers.links.fake import FakeLink, FakeTimeSource
 from msdrivers.protocol.modbus.registers import (
     AxisRegisters,

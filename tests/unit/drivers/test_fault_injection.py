@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import pytest
 
+from msdrivers.emulate.faults import FAULT_AMOUNTS, FaultInjector, InjectedFault, corrupt_unit, parse_fault
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Send
-from msdrivers.fault_injection import FAULT_AMOUNTS, FaultInjector, InjectedFault, corrupt_unit, parse_fault
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.modbus.registers import ReadRegisters, Registers
 

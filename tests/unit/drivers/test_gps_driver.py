@@ -12,9 +12,9 @@ from modelserver.messages import FixType, SensorHeader
 from msdrivers.devices.gps import GpsDriver, GpsSettings
 from msdrivers.devices.gps.driver import SetupDialogue, SetupProgress
 from msdrivers.devices.gps.fixes import sample_from_novatel
+from msdrivers.emulate.faults import FaultInjector, InjectedFault
 from msdrivers.emulate.gps import GpsEmulator, GpsUnit
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Send
-from msdrivers.fault_injection import FaultInjector, InjectedFault
 from msdrivers.protocol.nmea.encode import encode as nmea
 from msdrivers.protocol.novatel import (
     CommandResponse,

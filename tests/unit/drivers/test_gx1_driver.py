@@ -13,10 +13,9 @@ from modelserver.messages import ImuSample, OrientationReference, YawSource
 from modelserver.transforms import so3
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings, HeadingSource
 from msdrivers.devices.gx1.driver import TickRateCheck
-from msdrivers.emulate.gx1 import Gx1Emulator
-from msdrivers.emulate.gx1_unit import Eeprom, Gx1Unit
+from msdrivers.emulate.faults import InjectedFault
+from msdrivers.emulate.gx1 import Eeprom, Gx1Emulator, Gx1Unit
 from msdrivers.endpoint import EndpointPhase
-from msdrivers.fault_injection import InjectedFault
 from msdrivers.protocol.gx1 import CommandByte, EepromAddress, Gains, requests
 
 

@@ -15,10 +15,9 @@ from modelserver.simulation.timing import Run
 from modelserver.transforms import so3
 from modelserver.transforms.pose import Pose
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings, HeadingSource
-from msdrivers.emulate.gx1 import Gx1Emulator, SampleInterpolator
-from msdrivers.emulate.gx1_unit import Eeprom, Gx1Unit
+from msdrivers.emulate.faults import InjectedFault
+from msdrivers.emulate.gx1 import Eeprom, Gx1Emulator, Gx1Unit, SampleInterpolator
 from msdrivers.endpoint import HostTime, Send
-from msdrivers.fault_injection import InjectedFault
 from msdrivers.protocol.gx1 import LAYOUTS, CommandByte, EepromAddress, Gx1Packet, Gx1Parser, requests
 
 S = 1_000_000_000

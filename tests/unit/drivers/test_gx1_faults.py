@@ -9,10 +9,9 @@ import pytest
 from support_gx1 import Line, RepeatingDevice, rotating_samples
 
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
-from msdrivers.emulate.gx1 import Gx1Emulator
-from msdrivers.emulate.gx1_unit import Eeprom, Gx1Unit
+from msdrivers.emulate.faults import InjectedFault
+from msdrivers.emulate.gx1 import Eeprom, Gx1Emulator, Gx1Unit
 from msdrivers.endpoint import EndpointPhase, HostTime, Send
-from msdrivers.fault_injection import InjectedFault
 from msdrivers.protocol.gx1 import CommandByte, EepromAddress, Gains, Gx1Packet, requests
 
 

@@ -11,10 +11,9 @@ from modelserver.messages import ImuSample, SensorHeader
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Vector3
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings, HardIronProcedure, HardIronSettings
-from msdrivers.emulate.gx1 import Gx1Emulator
-from msdrivers.emulate.gx1_unit import Eeprom, Gx1Unit
+from msdrivers.emulate.faults import InjectedFault
+from msdrivers.emulate.gx1 import Eeprom, Gx1Emulator, Gx1Unit
 from msdrivers.endpoint import EndpointPhase
-from msdrivers.fault_injection import InjectedFault
 from msdrivers.protocol.gx1 import CommandByte, EepromAddress, Gx1Packet
 
 IRON: Vector3 = (12e-6, -7e-6, 5e-6)

@@ -14,8 +14,7 @@ from modelserver.messages import FixType, GpsSample, ImuSample, Sample, SensorHe
 from msdrivers.devices.gps import GpsDriver, GpsSettings
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
 from msdrivers.emulate.gps import GpsEmulator, GpsUnit
-from msdrivers.emulate.gx1 import Gx1Emulator
-from msdrivers.emulate.gx1_unit import Gx1Unit
+from msdrivers.emulate.gx1 import Gx1Emulator, Gx1Unit
 from msdrivers.endpoint import Endpoint, Output, Send
 from msdrivers.links.fake import FakeTimeSource
 from msdrivers.runner import Runner, RunnerSettings

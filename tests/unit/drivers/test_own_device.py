@@ -18,8 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from modelserver.messages import DriverPhase, Sample, SensorHeader, WheelSample, WheelsSample
+from msdrivers.emulate.faults import InjectedFault
 from msdrivers.endpoint import HostTime, Send
-from msdrivers.fault_injection import InjectedFault
 from msdrivers.links.fake import FakeLink, FakeTimeSource
 from msdrivers.protocol.framing import FrameScanner
 from msdrivers.registry import KINDS, EmulatorInputs

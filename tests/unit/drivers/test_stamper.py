@@ -10,8 +10,7 @@ from support_gx1 import Line, stationary_samples
 from modelserver.messages import ImuSample, SensorHeader
 from msdrivers.device_clock import DeviceClock, Stamper
 from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
-from msdrivers.emulate.gx1 import Gx1Emulator
-from msdrivers.emulate.gx1_unit import Eeprom
+from msdrivers.emulate.gx1 import Eeprom, Gx1Emulator
 from msdrivers.endpoint import HostTime, MeasuredSample
 
 UTIME = 1_700_000_000_000_000

@@ -10,9 +10,15 @@ import pytest
 from support_vehicle_bus import DBC
 
 from modelserver.errors import ConfigError, Severity
-from msdrivers.factory import make_driver, make_emulator
+from msdrivers.factory import (
+    find_shared_lines,
+    find_unbuildable_drivers,
+    find_unknown_joint,
+    find_unknown_wheels,
+    make_driver,
+    make_emulator,
+)
 from msdrivers.settings import DriverSettings, SourceMap, read_driver
-from msdrivers.validation import find_shared_lines, find_unbuildable_drivers, find_unknown_joint, find_unknown_wheels
 
 LINES = {("drivers", "wheels"): 5, ("drivers", "wheels", "dbc"): 8, ("drivers", "wheels", "wheels", "front_left"): 10}
 PLACE = SourceMap("v.yaml", LINES)

@@ -22,9 +22,9 @@ from support_vehicle_bus import (
 from modelserver.errors import ConfigError
 from modelserver.messages import SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
 from msdrivers.devices.vehicle import CommandLimits, VehicleDriver, VehicleSettings
+from msdrivers.emulate.faults import InjectedFault
 from msdrivers.emulate.vehicle import VehicleEmulator, VehicleUnit
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Send
-from msdrivers.fault_injection import InjectedFault
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.can.mapping import SignalMap, StatusMap
 

@@ -29,9 +29,9 @@ from modelserver.errors import ConfigError
 from modelserver.messages import Direction, WheelsSample
 from modelserver.simulation import Simulation, Timing, Trajectory, WheelsModel, figure_eight
 from msdrivers.devices.wheels import WheelsDriver, WheelsSettings
+from msdrivers.emulate.faults import InjectedFault
 from msdrivers.emulate.wheels import WheelsEmulator
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Reopen, Send
-from msdrivers.fault_injection import InjectedFault
 from msdrivers.protocol.can.database import parse_dbc
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.can.mapping import CountMap, DirectionMap, SignalMap, SpeedMap, WheelMap
