@@ -13,17 +13,9 @@ from typing import Any, get_args
 
 from modelserver.config.reader import get_adapter
 from modelserver.errors import ConfigError, Problem, Severity, find_suggestion, quote, suggest_name
+from msdrivers import line_settings as lines
 from msdrivers.emulate.faults import InjectedFault
 from msdrivers.endpoint import Endpoint
-from msdrivers.line_settings import (
-    CanSettings,
-    LineSettings,
-    ModbusSettings,
-    SerialSettings,
-    TcpSettings,
-    get_line_key,
-    split_address,
-)
 from msdrivers.links import Link
 from msdrivers.protocol.can.frame import CanFrame
 from msdrivers.protocol.modbus.registers import ModbusUnit
@@ -73,27 +65,27 @@ MODBUS_CODEC = UnitCodec("modbus", _pack_modbus, _unpack_modbus)
 
 def make_codec(settings: DriverSettings) -> UnitCodec[Any]:
     """Return how the units of a driver's line are recorded."""
-    if isinstance(settings.line, CanSettings):
+    if isinstance(settings.line, lines.CanSettings):
         return CAN_CODEC
-    return MODBUS_CODEC if isinstance(settings.line, ModbusSettings) else BYTES_CODEC
+    return MODBUS_CODEC if isinstance(settings.line, lines.ModbusSettings) else BYTES_CODEC
 
 
 def make_link(settings: DriverSettings) -> Link[Any]:
     """Return a driver's line, not opened yet."""
     line = settings.line
     # each kind of line needs another library, and some of them are slow to load
-    if isinstance(line, SerialSettings):
+    if isinstance(line, lines.SerialSettings):
         from msdrivers.links.serial_port import SerialLink
 
         return SerialLink(line.port, choose_first_baud(settings))
-    if isinstance(line, CanSettings):
+    if isinstance(line, lines.CanSettings):
         from msdrivers.links.can_bus import CanLink
 
         return CanLink(line.can, line.interface, line.bitrate)
     from msdrivers.links.tcp import TcpLink
 
-    link = TcpLink(*split_address(line.address))
-    if isinstance(line, TcpSettings):
+    link = TcpLink(*lines.split_address(line.address))
+    if isinstance(line, lines.TcpSettings):
         return link
     from msdrivers.links.modbus import ModbusLink
 
@@ -103,7 +95,7 @@ def make_link(settings: DriverSettings) -> Link[Any]:
 def choose_first_baud(settings: DriverSettings) -> int:
     """Return the rate to open a serial port at: the first to be tried, the port's, or the maker's."""
     bauds = getattr(settings.device_settings, BAUDS_FIELD, ())
-    given = settings.line.baud if isinstance(settings.line, SerialSettings) else 0
+    given = settings.line.baud if isinstance(settings.line, lines.SerialSettings) else 0
     return bauds[0] if bauds else given or settings.kind.baud
 
 
@@ -149,18 +141,18 @@ def find_shared_lines(drivers: Iterable[DriverSettings]) -> Iterator[Problem]:
         owned = _exclusive_resource(driver.line)
         owner = driver.name if owned is None else owners.setdefault(owned, driver.name)
         if owner != driver.name:
-            source = driver.source_map.locate("drivers", driver.name, get_line_key(type(driver.line)))
+            source = driver.source_map.locate("drivers", driver.name, lines.get_line_key(type(driver.line)))
             message = f"drivers {owner} and {driver.name} have one line, {driver.line}: only one of them can use it"
             yield Problem(Severity.WARNING, message, source, "give each a line of its own, or start only one of them")
 
 
-def _exclusive_resource(line: LineSettings) -> Hashable | None:
-    if isinstance(line, CanSettings):
+def _exclusive_resource(line: lines.LineSettings) -> Hashable | None:
+    if isinstance(line, lines.CanSettings):
         return None
-    if isinstance(line, SerialSettings):
+    if isinstance(line, lines.SerialSettings):
         # a port has several names, e.g. below /dev/serial/by-id/
         return os.path.realpath(line.port)
-    return (line.address, line.unit_id) if isinstance(line, ModbusSettings) else line.address
+    return (line.address, line.unit_id) if isinstance(line, lines.ModbusSettings) else line.address
 
 
 def find_unknown_wheels(driver: DriverSettings, frames: Collection[str]) -> Iterator[Problem]:

@@ -241,28 +241,23 @@ class Runner(Generic[U]):
             self._on_link_error(error)
 
     def _on_link_error(self, error: LinkError) -> None:
-        self._close(str(error), self._backoff.on_lost)
+        self._close(str(error))
 
     def _reopen(self, request: Reopen) -> None:
         changes_baud = request.baud is not None and request.baud != self._link.baud
         self._baud = request.baud or self._baud
+        self._close(f"reopening: {request.reason}", is_orderly=True, changes_baud=changes_baud)
 
-        def wait(at_ns: int) -> float:
-            if not changes_baud:
-                return self._backoff.on_lost(at_ns, is_orderly=True)
-            self._backoff.on_rate_change()
-            return 0.0
-
-        self._close(f"reopening: {request.reason}", wait)
-
-    def _close(self, reason: str, wait: Callable[[int], float]) -> None:
-        """Close the line and schedule its reopening after `wait(now)` seconds."""
+    def _close(self, reason: str, *, is_orderly: bool = False, changes_baud: bool = False) -> None:
+        """Close the line and schedule its reopening: at once to change the baud rate, else when the backoff allows."""
         self._close_line()
         at_ns = self._time_source.now().monotonic_ns
-        self._open_ns = at_ns + round(wait(at_ns) * 1e9)
-        self._reporter.set_status(
-            DriverPhase.CLOSED, reason, self._time_source.now(), suffix=self._backoff.describe_failures(at_ns)
-        )
+        if changes_baud:
+            self._backoff.on_rate_change()
+        wait = 0.0 if changes_baud else self._backoff.on_lost(at_ns, is_orderly=is_orderly)
+        self._open_ns = at_ns + round(wait * 1e9)
+        suffix = self._backoff.describe_failures(at_ns)
+        self._reporter.set_status(DriverPhase.CLOSED, reason, self._time_source.now(), suffix=suffix)
         self._reporter.set_stable(False)
 
     def _close_line(self) -> None:

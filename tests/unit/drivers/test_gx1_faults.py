@@ -262,11 +262,6 @@ def test_given_the_line_reopened_after_it_was_lost_then_it_is_set_up_again():
     assert line.device.streamed == 0
 
 
-def test_given_a_fault_of_an_unknown_kind_then_it_is_rejected():
-    with pytest.raises(ValueError, match="there are drop, corrupt, stall"):
-        Gx1Unit(faults=(InjectedFault(1.0, "explode"),))
-
-
 def test_given_an_emulator_timer_before_it_is_opened_then_it_sends_nothing():
     device = Gx1Emulator(rotating_samples())
     assert device.on_timer(HostTime(0, 0)) == []
