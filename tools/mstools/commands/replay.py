@@ -155,15 +155,7 @@ def replay_to_bus(
             events = _filter_channels(recording, channels) if channels else _exclude_service_messages(recording)
         try:
             with show_progress(f"replaying {log.name}", recording.size) as show:
-                updated = 0.0
-
-                def on_event(event: LogEvent) -> None:
-                    nonlocal updated
-                    if (now := time.monotonic()) > updated + 0.1:
-                        updated = now
-                        show(event.end)
-
-                player.play(events, on_event)
+                player.play(_track_progress(events, show, set()))
         finally:
             report = {"sent": player.sent, "seconds": player.duration, "max_delay": player.max_delay}
             words = (
@@ -269,9 +261,11 @@ def _track_progress(
     events: Iterable[LogEvent], show: Callable[[float], object], channels: set[str]
 ) -> Iterator[LogEvent]:
     """Yield events, update the progress bar, and collect their channels."""
-    for number, event in enumerate(events):
+    updated = 0.0
+    for event in events:
         channels.add(event.channel)
-        if number % 1024 == 0:
+        if (now := time.monotonic()) > updated + 0.1:
+            updated = now
             show(event.end)
         yield event
 

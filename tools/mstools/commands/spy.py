@@ -94,18 +94,17 @@ def start_window(url: str, is_wanted: bool) -> None:
 def check_java() -> None:
     """Raise MissingToolError if lcm-spy cannot open its window."""
     java = shutil.which("java")
+    libraries = Path(java or "").resolve().parent.parent / "lib"
+    wrong = ""
     if java is None:
-        raise MissingToolError(
-            "lcm-spy needs Java, which is missing: sudo apt install default-jre default-jdk-headless"
-        )
-    libraries = Path(java).resolve().parent.parent / "lib"
-    if (libraries / "libjava.so").exists() and not (libraries / "libawt_xawt.so").exists():
-        raise MissingToolError("lcm-spy opens a window, but this Java is headless: sudo apt install default-jre")
-    if not os.environ.get("DISPLAY"):
-        raise MissingToolError(
-            "lcm-spy opens a window, but there is no display (DISPLAY is empty). Over ssh use ssh -X, or "
-            "modelserver spy --terminal"
-        )
+        wrong = "needs Java, which is missing: sudo apt install default-jre default-jdk-headless"
+    elif (libraries / "libjava.so").exists() and not (libraries / "libawt_xawt.so").exists():
+        wrong = "opens a window, but this Java is headless: sudo apt install default-jre"
+    elif not os.environ.get("DISPLAY"):
+        ways = "Over ssh use ssh -X, or modelserver spy --terminal"
+        wrong = f"opens a window, but there is no display (DISPLAY is empty). {ways}"
+    if wrong:
+        raise MissingToolError(f"lcm-spy {wrong}")
 
 
 def get_types_jar() -> Path:

@@ -140,9 +140,8 @@ def probe_channels(bus: lcm.LCM, seconds: float = PROBE_S) -> dict[str, bool]:
 
 def format_no_report(provider: str, prefix: str, timeout: float, channels: dict[str, bool]) -> str:
     """Format the error for a missing report: where, which channels exist instead, and what to do."""
-    channel = f"{prefix}{HEALTH}"
-    text = f"no health report on {channel} within {timeout:g} s, on {provider}. "
-    if channel in channels:
+    text = f"no health report on {prefix}{HEALTH} within {timeout:g} s, on {provider}. "
+    if f"{prefix}{HEALTH}" in channels:
         return text + "Its messages are of another version of the service: install the same version on both sides"
     others = [name.removesuffix(HEALTH) for name, is_health in channels.items() if is_health and name.endswith(HEALTH)]
     if others:
@@ -152,11 +151,9 @@ def format_no_report(provider: str, prefix: str, timeout: float, channels: dict[
         return f"{text}Other reports: {there}. Did you mean {do}?"
     if channels:
         names = ", ".join(quote(each, 64) for each in sorted(channels)[:MAX_SHOWN_NAMES])
-        more = f" and {len(channels) - MAX_SHOWN_NAMES} more" if len(channels) > MAX_SHOWN_NAMES else ""
-        return (
-            f"{text}The bus has other channels ({names}{more}): is the daemon running? modelserver run -c FILE, "
-            "or systemctl status modelserver"
-        )
+        names += f" and {len(channels) - MAX_SHOWN_NAMES} more" if len(channels) > MAX_SHOWN_NAMES else ""
+        do = "is the daemon running? modelserver run -c FILE, or systemctl status modelserver"
+        return f"{text}The bus has other channels ({names}): {do}"
     return (
         f"{text}The bus has no messages at all: is the daemon running (modelserver run -c FILE, or systemctl status "
         "modelserver), and on this bus (--url, or -c with its vehicle file)? modelserver doctor checks the bus"
