@@ -332,7 +332,7 @@ class _Values:
             given = each.options["default"]
             enumeration = each.options.get("enum", "").partition(" ")[0]
             return "NAN" if given == "nan" else f"{enumeration}.{given}" if enumeration and given.isupper() else given
-        return "None" if each.is_optional and "required" not in each.options else ""
+        return "None" if each.is_optional else ""
 
     def annotation(self, each: Field, element: bool = False) -> str:
         """Return the type of a field in Python, of one entry for an `element` of an array."""

@@ -60,7 +60,7 @@ class LocalPlatform(PlatformClient):
     # --- queries
 
     def _query_pose(self, interest: str, reference: str, at: int, policy: Policy, wait_ms: int) -> PoseAnswer:
-        time = _check_time(TimeQuery(at, policy, wait_ms))
+        time = _make_time(at, policy, wait_ms)
         state, view, now = self._wait_until_ready(time, interest, reference)
         answer = view.transformation(interest, reference, time, now)
         if _is_static(view, interest, reference) and len(state.static_transforms) < CACHE_SIZE:
@@ -75,7 +75,7 @@ class LocalPlatform(PlatformClient):
         if isinstance(request, GetHistory):
             _check_utimes(request.start_utime, request.end_utime)
         elif isinstance(request, (GetStateVector, GetHTransform, GetMotion, GetExplanation)):
-            time = _check_time(request.time)
+            time = _make_time(*request.time)
             request = request._replace(time=time)
             if isinstance(request, (GetMotion, GetExplanation)):
                 ends = (request.frame_of_interest, request.frame_of_reference)
@@ -182,9 +182,8 @@ def _is_static(view: PlatformView, interest: str, reference: str) -> bool:
     return not view.model.get_kinematic_path(interest, reference).joints
 
 
-def _check_time(time: TimeQuery) -> TimeQuery:
-    """Return a time. Raises MalformedRequestError for one that the server would reject."""
-    at, policy, wait_ms = time
+def _make_time(at: int, policy: Policy, wait_ms: int) -> TimeQuery:
+    """Return the time of a query. Raises MalformedRequestError for one that the server would reject."""
     try:
         if isinstance(at, float):
             raise MalformedRequestError(f"at must be integer microseconds since 1970, got {at!r}; write int(...)")
