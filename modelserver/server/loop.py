@@ -3,7 +3,7 @@
 `run_once` makes one pass:
 
 1. samples from the bus (`ingress`), up to the next tick and at most `MAX_SAMPLES_NS`;
-2. the tick, if it is due (`tick_timer`);
+2. the tick, if it is due (`clock.TickTimer`);
 3. a slice of request work (`requests.handler`);
 4. wait for a message or the next tick.
 
@@ -30,7 +30,7 @@ from modelserver.geometry import names
 from modelserver.geometry.model import Model
 from modelserver.query.answers import DeferredAnswer
 from modelserver.server.bus import Bus
-from modelserver.server.clock import Clock
+from modelserver.server.clock import Clock, TickTimer
 from modelserver.server.ingress import (
     PUBLISHER_CONFLICT,
     PublisherConflictMonitor,
@@ -42,7 +42,6 @@ from modelserver.server.journal.queue import JournalQueue
 from modelserver.server.log import RateLimitedLog, escape_lines, escape_text
 from modelserver.server.requests.handler import RequestHandler
 from modelserver.server.requests.signed_commands import MODE_TYPE, CommandVerifier
-from modelserver.server.tick_timer import TickTimer
 from modelserver.wire.codec import encode, fingerprint_of
 from modelserver.wire.fields import MAX_DECISIONS
 from modelserver.wire.journal import RecordKind

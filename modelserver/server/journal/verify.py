@@ -239,8 +239,7 @@ class _Verifier:
                 f"{self._path}: is a journal of format {facts.get('format')}; this build reads {journal.FORMAT}; "
                 "verify it with the build that wrote it"
             )
-        assert isinstance(part, int)
-        assert isinstance(lost, int)
+        part, lost = facts["part"], facts["lost"]
         self._chain.begin(self._path, facts)
         for each in environment.list_differences(facts):
             if each not in self.report.environment_differences:

@@ -7,7 +7,7 @@ import random
 from support_samples import START, ScriptedLocalizer
 from test_loop import PERIOD_NS, Rig
 
-from modelserver.server.tick_timer import MAX_LEAD_NS, TickLead
+from modelserver.server.clock import MAX_LEAD_NS, TickLead
 
 MS = 1_000_000
 
