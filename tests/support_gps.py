@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from modelserver.messages import FixType, GpsSample, SensorHeader
-from msdrivers.devices.gps import GpsDriver
+from msdrivers.devices.gps.driver import GpsDriver
 from msdrivers.emulate.faults import FaultInjector
 from msdrivers.emulate.gps import GpsEmulator
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send

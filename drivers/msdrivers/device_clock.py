@@ -242,18 +242,9 @@ class DeviceClock:
         return math.nan if self._fit is None else self._fit.drift
 
     def update(self, device_us: int, host_us: int) -> tuple[DeviceClock, int, float]:
-        """Process a sample and estimate when it was measured.
+        """Process a sample; return the updated clock and when it was measured: host's microseconds, sigma in seconds.
 
-        Parameters
-        ----------
-        device_us : int
-            The device's time without wraps, microseconds.
-        host_us : int
-            Receive time on the host's monotonic clock, microseconds.
-
-        Returns
-        -------
-        The updated clock, the instant on the host's clock in microseconds, and its standard deviation in seconds.
+        `device_us`: the device's time without wraps. `host_us`: receive time on the host's monotonic clock.
         """
         difference = host_us - device_us
         if self._fit is None:

@@ -83,7 +83,8 @@ class DeviceKind:
 
 
 def _load_gps() -> DeviceModules:
-    from msdrivers.devices.gps import GpsDriver, GpsSettings
+    from msdrivers.devices.gps.driver import GpsDriver
+    from msdrivers.devices.gps.settings import GpsSettings
 
     return DeviceModules(GpsSettings, lambda settings, _: GpsDriver(settings))
 
@@ -103,7 +104,8 @@ def _make_gps_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
 
 
 def _load_gx1() -> DeviceModules:
-    from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
+    from msdrivers.devices.gx1.driver import Gx1Driver
+    from msdrivers.devices.gx1.settings import Gx1Settings
 
     return DeviceModules(Gx1Settings, lambda settings, _: Gx1Driver(settings))
 

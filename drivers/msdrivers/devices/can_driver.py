@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Mapping
-from typing import Protocol
 
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, Output, Reopen
 from msdrivers.protocol.can.database import CanDatabase, CanFrameAssembler, CanFrameSet, FrameError
@@ -22,33 +21,21 @@ def get_arrival_time(frame: CanFrame, now: HostTime) -> HostTime:
     return HostTime(now.monotonic_ns - (now.utime - frame.utime) * 1000, frame.utime)
 
 
-class CanSettingsProtocol(Protocol):
-    """Settings that every driver on a CAN bus has."""
-
-    @property
-    def silence(self) -> float:
-        """Timeout for usable frames, seconds."""
-
-    @property
-    def window(self) -> float:
-        """How long to wait for the other frames of an instant, seconds."""
-
-
 class CanDriver(ABC):
     """Base of an `Endpoint` of CAN frames: decodes the needed frames and assembles those of one instant.
 
     Silence, errors and recovery are reported once per change. Without needed frames there is no silence.
     """
 
-    def __init__(self, settings: CanSettingsProtocol, database: CanDatabase, needed: Mapping[FrameKey, str]):
-        """`needed` are the kinds of frame and their names."""
+    def __init__(self, database: CanDatabase, needed: Mapping[FrameKey, str], silence: float, window: float):
+        """`needed` are the kinds of frame and their names; the others see `WheelsSettings`."""
         self.phase = EndpointPhase.WAITING
         self.is_bus_off = False
         """The interface is bus-off; nothing can be sent."""
         self.counts: Counter[str] = Counter()
         """Frames, samples, incomplete instants, silences, commands, and rejections by reason."""
-        self._database, self._needed, self._silence_s = database, needed, settings.silence
-        self._assembler = CanFrameAssembler(frozenset(needed), round(settings.window * 1e9))
+        self._database, self._needed, self._silence_s = database, needed, silence
+        self._assembler = CanFrameAssembler(frozenset(needed), round(window * 1e9))
         self._seq = 0
         self._silence_deadline_ns: int | None = None
         self._seen: dict[FrameKey, None] = {}

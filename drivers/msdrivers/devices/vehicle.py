@@ -139,7 +139,7 @@ class CommandedDriver(CanDriver):
 
     def __init__(self, settings: VehicleSettings, database: CanDatabase, needed: Mapping[FrameKey, str]):
         """Bind the signals of the command. Raises ConfigError for unknown or unsuitable ones."""
-        super().__init__(settings, database, needed)
+        super().__init__(database, needed, settings.silence, settings.window)
         self.settings = settings
         self._signals: BoundCommand | None = None
         self._command_key: FrameKey | None = None

@@ -79,7 +79,8 @@ class WheelsDriver(CanDriver):
         place = f"drivers.{settings.source}.wheels"
         self._wheels = bind_wheels(settings.wheels, database, place, settings.max_speed, settings.frame_delay)
         signals = (signal for wheel in self._wheels for signal in wheel.signals)
-        super().__init__(settings, database, {signal.key: signal.message for signal in signals})
+        needed = {signal.key: signal.message for signal in signals}
+        super().__init__(database, needed, settings.silence, settings.window)
         odometers = {
             wheel.name: wheel.make_odometer(settings.max_speed, settings.frame_delay) for wheel in self._wheels
         }

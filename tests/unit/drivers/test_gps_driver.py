@@ -9,9 +9,9 @@ import pytest
 from support_gps import SECOND, START, Line, add_noise, drive, now_at, split_in_half
 
 from modelserver.messages import FixType, SensorHeader
-from msdrivers.devices.gps import GpsDriver, GpsSettings
-from msdrivers.devices.gps.driver import SetupDialogue, SetupProgress
+from msdrivers.devices.gps.driver import GpsDriver, SetupDialogue, SetupProgress
 from msdrivers.devices.gps.fixes import sample_from_novatel
+from msdrivers.devices.gps.settings import GpsSettings
 from msdrivers.emulate.faults import FaultInjector, InjectedFault
 from msdrivers.emulate.gps import GpsEmulator, GpsUnit
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Send

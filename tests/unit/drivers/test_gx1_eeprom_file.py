@@ -8,7 +8,7 @@ import pytest
 from support_gx1 import Line, stationary_samples
 
 from modelserver.errors import ModelServerError
-from msdrivers.devices.gx1 import Gx1Settings
+from msdrivers.devices.gx1.settings import Gx1Settings
 from msdrivers.emulate.gx1 import Eeprom, Gx1Emulator
 from msdrivers.endpoint import HostTime
 from msdrivers.gx1_eeprom_file import read_eeprom, write_eeprom

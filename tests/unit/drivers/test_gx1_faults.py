@@ -8,7 +8,8 @@ import random
 import pytest
 from support_gx1 import Line, RepeatingDevice, rotating_samples
 
-from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings
+from msdrivers.devices.gx1.driver import Gx1Driver
+from msdrivers.devices.gx1.settings import Gx1Settings
 from msdrivers.emulate.faults import InjectedFault
 from msdrivers.emulate.gx1 import Eeprom, Gx1Emulator, Gx1Unit
 from msdrivers.endpoint import EndpointPhase, HostTime, Send

@@ -10,7 +10,9 @@ from support_gx1 import FIELD_NED, START_UTIME, Line, RepeatingDevice, rotating_
 from modelserver.messages import ImuSample, SensorHeader
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Vector3
-from msdrivers.devices.gx1 import Gx1Driver, Gx1Settings, HardIronProcedure, HardIronSettings
+from msdrivers.devices.gx1.driver import Gx1Driver
+from msdrivers.devices.gx1.hard_iron import HardIronProcedure, HardIronSettings
+from msdrivers.devices.gx1.settings import Gx1Settings
 from msdrivers.emulate.faults import InjectedFault
 from msdrivers.emulate.gx1 import Eeprom, Gx1Emulator, Gx1Unit
 from msdrivers.endpoint import EndpointPhase

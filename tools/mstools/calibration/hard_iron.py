@@ -20,7 +20,7 @@ def run_hard_iron(settings: DriverSettings, link: Link[Any], seconds: float, all
 
     Raises ModelServerError where the device has not stored new offsets afterwards.
     """
-    from msdrivers.devices.gx1 import HardIronProcedure, HardIronSettings
+    from msdrivers.devices.gx1.hard_iron import HardIronProcedure, HardIronSettings
     from msdrivers.runner import Runner, RunnerSettings, SystemTimeSource
 
     hard_iron = HardIronSettings(duration=seconds, two_dimensional=not all_axes, bauds=settings.device_settings.bauds)
