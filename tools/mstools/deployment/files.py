@@ -11,24 +11,14 @@ from urllib.parse import parse_qs, urlsplit
 
 from modelserver.errors import ModelServerError, find_nearest_names, quote
 from modelserver.wire.urls import group_of
-from mstools.deployment.plan import (
-    CONFIGURATION,
-    DRIVER,
-    LOOPBACK,
-    RULES,
-    SERVICE,
-    SYSCTL,
-    UNITS,
-    SystemFacts,
-    WriteFile,
-)
+from mstools.deployment import plan as planning
 from mstools.terminal.problems import ProblemCollector, make_error
 
 BY_ID: Final = "/dev/serial/by-id/"
 DEVICE_FOLDER: Final = "/dev/modelserver/"
-REALTIME: Final = f"{UNITS}/{SERVICE}.d/50-realtime.conf"
+REALTIME: Final = f"{planning.UNITS}/{planning.SERVICE}.d/50-realtime.conf"
 
-CREDENTIAL: Final = f"{UNITS}/{SERVICE}.d/60-key.conf"
+CREDENTIAL: Final = f"{planning.UNITS}/{planning.SERVICE}.d/60-key.conf"
 
 HIDDEN_FOLDERS: Final = {
     "/root": "ProtectHome",
@@ -163,7 +153,7 @@ def render_units(
     ip: str,
     drivers: bool,
     hosts: Iterable[str] = (),
-) -> list[WriteFile]:
+) -> list[planning.WriteFile]:
     """Return the units of this installation.
 
     `program` is the path of its command, `url` that of the bus; `hosts` are those of the drivers' devices.
@@ -172,18 +162,18 @@ def render_units(
     group, bus = loopback_group(url), bus_addresses(url)
     places = {"MODELSERVER": program, "GROUP": group, "IP": ip, "ADDRESSES": _join_addresses(bus)}
     places["DEVICES"] = _join_addresses((*bus, *host_addresses(hosts)))
-    wanted = {SERVICE: "the service"}
-    wanted |= {DRIVER: "one driver, by its name"} if drivers else {}
-    wanted |= {LOOPBACK: "multicast on the loopback interface"} if group else {}
+    wanted = {planning.SERVICE: "the service"}
+    wanted |= {planning.DRIVER: "one driver, by its name"} if drivers else {}
+    wanted |= {planning.LOOPBACK: "multicast on the loopback interface"} if group else {}
     writes = []
     for name, what in wanted.items():
         text = re.sub("@([A-Z]+)@", lambda place: places[place[1]], templates[name])
         summary = "\n".join(line for line in text.splitlines() if line.startswith("ExecStart="))
-        writes.append(WriteFile(f"{UNITS}/{name}", text.encode(), what, summary))
+        writes.append(planning.WriteFile(f"{planning.UNITS}/{name}", text.encode(), what, summary))
     return writes
 
 
-def list_configuration(sources: Mapping[str, bytes], secret: Container[str] = ()) -> list[WriteFile]:
+def list_configuration(sources: Mapping[str, bytes], secret: Container[str] = ()) -> list[planning.WriteFile]:
     """Return the vehicle's files. `sources` are by their paths relative to the vehicle file, which is vehicle.yaml.
 
     Those in `secret` are readable by root only.
@@ -193,20 +183,20 @@ def list_configuration(sources: Mapping[str, bytes], secret: Container[str] = ()
         what, mode = "the vehicle file" if path == "vehicle.yaml" else "of the vehicle", 0o644
         if path in secret:
             what, mode = "the key of signed commands", 0o600
-        writes.append(WriteFile(f"{CONFIGURATION}/{path}", content, what, mode=mode))
+        writes.append(planning.WriteFile(f"{planning.CONFIGURATION}/{path}", content, what, mode=mode))
     return writes
 
 
-def render_sysctl(wanted: int, facts: SystemFacts) -> list[WriteFile]:
+def render_sysctl(wanted: int, facts: planning.SystemFacts) -> list[planning.WriteFile]:
     """Return the file that raises the kernel's limit of receive buffers, nothing where it is high enough."""
-    if facts.rmem_max >= wanted and SYSCTL not in facts.files:
+    if facts.rmem_max >= wanted and planning.SYSCTL not in facts.files:
         return []
     line = f"net.core.rmem_max = {wanted}"
     text = f"# ModelServer: receive buffers for bursts on the bus.\n{line}\n"
-    return [WriteFile(SYSCTL, text.encode(), "receive buffers for bursts on the bus", line)]
+    return [planning.WriteFile(planning.SYSCTL, text.encode(), "receive buffers for bursts on the bus", line)]
 
 
-def render_realtime_drop_in(facts: SystemFacts) -> list[WriteFile]:
+def render_realtime_drop_in(facts: planning.SystemFacts) -> list[planning.WriteFile]:
     """Return the drop-in for real-time scheduling of the service's loop, nothing where that is not possible.
 
     With two busy programs on two cores, ticks were up to 20 ms late without it, whatever the nice level, and 0.1 ms
@@ -216,10 +206,10 @@ def render_realtime_drop_in(facts: SystemFacts) -> list[WriteFile]:
         return []
     lines = "CPUSchedulingPolicy=rr\nCPUSchedulingPriority=1\n"
     text = f"# Written by `modelserver install` where the machine supports it.\n[Service]\n{lines}"
-    return [WriteFile(REALTIME, text.encode(), "real-time scheduling of the loop", lines)]
+    return [planning.WriteFile(REALTIME, text.encode(), "real-time scheduling of the loop", lines)]
 
 
-def render_credential_drop_in(key_file: str) -> list[WriteFile]:
+def render_credential_drop_in(key_file: str) -> list[planning.WriteFile]:
     """Return the drop-in by which systemd passes the key file to the service, nothing for a vehicle without one.
 
     The service's user cannot read a file that is root's alone. Raises ModelServerError for a path that cannot be
@@ -234,12 +224,12 @@ def render_credential_drop_in(key_file: str) -> list[WriteFile]:
     line = f"LoadCredential={key_file.rpartition('/')[2]}:{key_file}"
     about = "# Written by `modelserver install`: the file stays root's, and systemd passes it to the service."
     text = f"{about}\n[Service]\n{line}\n"
-    return [WriteFile(CREDENTIAL, text.encode(), "the key of signed commands", line)]
+    return [planning.WriteFile(CREDENTIAL, text.encode(), "the key of signed commands", line)]
 
 
 def render_udev_rules(
-    drivers: Iterable[SerialDriver], given: Mapping[str, str], facts: SystemFacts
-) -> tuple[list[WriteFile], list[str]]:
+    drivers: Iterable[SerialDriver], given: Mapping[str, str], facts: planning.SystemFacts
+) -> tuple[list[planning.WriteFile], list[str]]:
     """Return the udev rules that give each driver's device a name of its own, and notes on them.
 
     `given` are names below /dev/serial/by-id by driver, which take precedence over the found ones. Raises
@@ -273,7 +263,7 @@ def render_udev_rules(
         return [], notes
     text = "# ModelServer: the devices of the vehicle file, by their ids.\n" + "".join(f"{line}\n" for line in lines)
     summary = "\n".join(f"{DEVICE_FOLDER}{line.rpartition('/')[2].rstrip(chr(34))}" for line in lines)
-    return [WriteFile(RULES, text.encode(), "names for the serial devices", summary)], notes
+    return [planning.WriteFile(planning.RULES, text.encode(), "names for the serial devices", summary)], notes
 
 
 def check_serial(given: Mapping[str, str], drivers: Iterable[SerialDriver]) -> None:
