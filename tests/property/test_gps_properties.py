@@ -15,8 +15,7 @@ from modelserver.messages import GpsSample
 from msdrivers.emulate import gps as gps_logs
 from msdrivers.protocol.gps_stream import GpsMessage, GpsStream
 from msdrivers.protocol.nmea import NmeaEpoch
-from msdrivers.protocol.nmea.encode import format_angle
-from msdrivers.protocol.nmea.fields import parse_angle
+from msdrivers.protocol.nmea.fields import format_angle, parse_angle
 from msdrivers.protocol.novatel import (
     LogHeader,
     NovatelLog,

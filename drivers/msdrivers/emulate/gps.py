@@ -16,8 +16,7 @@ from datetime import UTC, datetime
 from modelserver.messages import FixType, GpsSample
 from msdrivers.endpoint import HostTime, Output, Send
 from msdrivers.protocol import gps_time
-from msdrivers.protocol.nmea import encode as nmea
-from msdrivers.protocol.nmea.fields import KMH, KNOT
+from msdrivers.protocol.nmea import fields as nmea
 from msdrivers.protocol.novatel import (
     Body,
     HeadingLog,
@@ -147,7 +146,7 @@ def _format_gga(sample: GpsSample, utime: int) -> bytes:
 def _format_rmc(sample: GpsSample, utime: int) -> bytes:
     speed, course, _ = _get_motion(sample)
     status, mode = "V" if sample.fix_type is FixType.NONE else "A", _FIXES[sample.fix_type][2]
-    motion = (nmea.format_number(speed / KNOT, 4), nmea.format_number(_track_from_course(course), 4))
+    motion = (nmea.format_number(speed / nmea.KNOT, 4), nmea.format_number(_track_from_course(course), 4))
     date = datetime.fromtimestamp(utime // gps_time.SECOND, UTC).strftime("%d%m%y")
     fields = (_format_clock(utime), status, *_format_position(sample), *motion, date, "", "", mode)
     return nmea.encode("GP", "RMC", fields)
@@ -156,7 +155,7 @@ def _format_rmc(sample: GpsSample, utime: int) -> bytes:
 def _format_vtg(sample: GpsSample, utime: int) -> bytes:
     speed, course, _ = _get_motion(sample)
     track = nmea.format_number(_track_from_course(course), 4)
-    speeds = (nmea.format_number(speed / KNOT, 4), "N", nmea.format_number(speed / KMH, 4), "K")
+    speeds = (nmea.format_number(speed / nmea.KNOT, 4), "N", nmea.format_number(speed / nmea.KMH, 4), "K")
     return nmea.encode("GP", "VTG", (track, "T", "", "M", *speeds, _FIXES[sample.fix_type][2]))
 
 

@@ -117,7 +117,10 @@ class FrameScanner(Generic[M]):
             if found.start() > at:
                 self._skip(at, found.start())
                 at = found.start()
-            verdict = self._scan_at(at)
+            try:
+                verdict = self._formats[buffer[at]].scan(buffer, at, self._offset + at)
+            except Exception:
+                verdict = RejectedFrame("error")
             if verdict is None:
                 break
             if isinstance(verdict, RejectedFrame):
@@ -136,13 +139,6 @@ class FrameScanner(Generic[M]):
         self._offset += at
         del buffer[:at]
         return messages
-
-    def _scan_at(self, at: int) -> ParsedFrame[M] | RejectedFrame | None:
-        """Scan with the format of the start byte; an exception rejects this frame only."""
-        try:
-            return self._formats[self._buffer[at]].scan(self._buffer, at, self._offset + at)
-        except Exception:
-            return RejectedFrame("error")
 
     def _skip(self, begin: int, end: int) -> None:
         part = self._buffer[begin:end]

@@ -14,8 +14,7 @@ SECOND = 1_000_000
 DAY = 86_400 * SECOND
 WEEK = 7 * DAY
 ROLLOVER = 1024 * WEEK
-_EPOCH_DAYS = (date(1980, 1, 6) - date(1970, 1, 1)).days
-GPS_EPOCH = _EPOCH_DAYS * DAY
+GPS_EPOCH = (date(1980, 1, 6) - date(1970, 1, 1)).days * DAY
 """utime of the beginning of GPS time."""
 
 _LEAP_DATES = sorted(
@@ -40,7 +39,8 @@ def utime_of(week: int, microseconds: int, pivot: int) -> int:
     pivot: the host's date as utime, see `resolve_rollover`. Within an inserted leap second, which utime cannot
     distinguish from the second after it, the result is that of the second after it; see `is_in_leap_second`.
     """
-    return _to_utc(_to_gps(week, microseconds, pivot))
+    gps = _to_gps(week, microseconds, pivot)
+    return gps + GPS_EPOCH - bisect_right(_LEAP_GPS, gps) * SECOND
 
 
 def is_in_leap_second(week: int, microseconds: int, pivot: int) -> bool:
@@ -68,7 +68,3 @@ def resolve_rollover(utime: int, pivot: int) -> int:
 
 def _to_gps(week: int, microseconds: int, pivot: int) -> int:
     return resolve_rollover(week * WEEK + microseconds, pivot - GPS_EPOCH)
-
-
-def _to_utc(gps: int) -> int:
-    return gps + GPS_EPOCH - bisect_right(_LEAP_GPS, gps) * SECOND

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby
 
 import numpy as np
 import numpy.typing as npt
@@ -154,12 +154,8 @@ def _fit_white(curve: AllanCurve, taus: Array, deviations: Array) -> NoiseParame
     """Return N: the mean of sigma sqrt(tau), weighted by its errors, over the longest run with the slope -1/2."""
     slopes = _slopes(taus, deviations)
     good = np.abs(slopes + 0.5) <= SLOPE_TOLERANCE
-    best: list[int] = []
-    run: list[int] = []
-    for index, each in enumerate(good):
-        run = [*run, index] if each else []
-        if len(run) > len(best):
-            best = run
+    runs = (list(run) for is_good, run in groupby(range(len(good)), key=lambda index: bool(good[index])) if is_good)
+    best = max(runs, key=len, default=[])
     # fewer points may have the slope by chance
     if len(best) < POINTS_PER_DECADE // 3:
         return None
@@ -234,7 +230,7 @@ def _upper_limit(curve: AllanCurve, variances: Array) -> Array:
 def _slopes(taus: Array, deviations: Array) -> Array:
     """Return the logarithmic slope at each point, between its neighbors."""
     x, y = np.log(taus), np.log(deviations)
-    between = np.array([(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(zip(x, y, strict=True))])
+    between = np.diff(y) / np.diff(x)
     if between.size == 0:
         return np.zeros(1)
     return np.concatenate((between[:1], (between[1:] + between[:-1]) / 2.0, between[-1:]))

@@ -15,7 +15,7 @@ from msdrivers.devices.gps.settings import GpsSettings
 from msdrivers.emulate.faults import FaultInjector, InjectedFault
 from msdrivers.emulate.gps import GpsEmulator, GpsUnit
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, MeasuredSample, Send
-from msdrivers.protocol.nmea.encode import encode as nmea
+from msdrivers.protocol.nmea.fields import encode as nmea
 from msdrivers.protocol.novatel import (
     CommandResponse,
     HeadingLog,

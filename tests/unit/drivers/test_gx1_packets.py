@@ -15,7 +15,6 @@ from msdrivers.protocol.gx1 import (
     Gx1Packet,
     Gx1Parser,
     append_checksum,
-    compute_checksum,
     requests,
     scaling,
 )
@@ -92,7 +91,7 @@ def test_given_words_of_a_wrong_number_when_written_then_it_is_rejected():
 
 def test_given_a_body_of_half_a_word_then_it_has_no_checksum():
     with pytest.raises(ValueError, match="whole words"):
-        compute_checksum(b"\x31\x00")
+        append_checksum(b"\x31\x00")
     assert append_checksum(b"\xff\xff\xff") == b"\xff\xff\xff\x00\xfe"
 
 

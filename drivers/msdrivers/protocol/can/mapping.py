@@ -52,6 +52,14 @@ class SignalMap(Strict):
         if not math.isfinite(self.offset):
             raise ValueError(f"offset is a number, got {self.offset:g}")
 
+    def to_si(self, physical: float) -> float:
+        """Return the number in SI units of the signal's physical value."""
+        return physical * self.scale + self.offset
+
+    def from_si(self, value: float) -> float:
+        """Return the signal's physical value of a number in SI units."""
+        return (value - self.offset) / self.scale
+
 
 @dataclass(frozen=True, slots=True)
 class CountMap(Strict):

@@ -30,7 +30,7 @@ class BoundStatus:
         """Return one of `NUMERIC_FIELDS` in SI units; nan if it is missing."""
         physical = instant.physical(self.signals.get(name))
         mapped: SignalMap | None = getattr(self.map, name)
-        return NAN if physical is None or mapped is None else physical * mapped.scale + mapped.offset
+        return NAN if physical is None or mapped is None else mapped.to_si(physical)
 
     def get_word(self, name: str, instant: CanFrameSet) -> int | None:
         """Return `fault_bits` or `commands_rejected`: 0 if not mapped, None if not received."""
@@ -75,11 +75,8 @@ class BoundCommand:
     ) -> CanFrame:
         """Encode a command, m/s and radians; `number` is the frame count for the alive counter."""
         raw = dict(self.stop_bits if is_stop else self.drive_bits)
-        for signal, mapped, value in (
-            (self.forward_speed, self.map.forward_speed, forward_speed),
-            (self.steering_angle, self.map.steering_angle, steering_angle),
-        ):
-            raw[signal.name] = signal.to_bits((value - mapped.offset) / mapped.scale)
+        raw[self.forward_speed.name] = self.forward_speed.to_bits(self.map.forward_speed.from_si(forward_speed))
+        raw[self.steering_angle.name] = self.steering_angle.to_bits(self.map.steering_angle.from_si(steering_angle))
         if self.alive is not None:
             raw[self.alive.name] = number % (1 << self.alive.length)
         return self.database.encode(self.map.message, raw)
@@ -90,7 +87,7 @@ class BoundCommand:
             (self.forward_speed, self.map.forward_speed, forward_speed, "m/s"),
             (self.steering_angle, self.map.steering_angle, steering_angle, "rad"),
         ):
-            held = _round_trip(signal, (value - mapped.offset) / mapped.scale) * mapped.scale + mapped.offset
+            held = mapped.to_si(_round_trip(signal, mapped.from_si(value)))
             if abs(held - value) > 1e-9 + abs(mapped.scale * signal.scale):
                 return f"{signal.message}.{signal.name} holds {held:g} {unit} at most, {value:g} is allowed"
         return ""
@@ -105,7 +102,13 @@ def bind_command(command: CommandMap, database: CanDatabase, place: str) -> Boun
     drive_bits = _bind_constants(binder, command, "drive_signals")
     stop_bits = drive_bits | _bind_constants(binder, command, "stop_signals")
     if speed is not None:
-        _check_stop(binder, command, speed, drive_bits != stop_bits)
+        mapped = command.forward_speed
+        held = mapped.to_si(_round_trip(speed, mapped.from_si(0.0)))
+        # a stop that would be a motion: 0 rounds to another value, and no other signal means stop
+        if abs(held) > 1e-9 and drive_bits == stop_bits:
+            text = f"{speed.message}.{speed.name} cannot represent 0: stop would be sent as {held:g} m/s"
+            fix = "set a signal in `stop_signals` that differs from `drive_signals`, or correct scale and offset"
+            binder.add_problem("forward_speed", text, fix)
     if alive is not None and alive.is_signed:
         binder.add_problem("alive", f"{command.alive} is signed; a counter of frames is not", "map the counter")
     if command.message in database.messages:
@@ -119,16 +122,6 @@ def bind_command(command: CommandMap, database: CanDatabase, place: str) -> Boun
     assert speed is not None
     assert steering is not None
     return BoundCommand(command, database, speed, steering, alive, drive_bits, stop_bits)
-
-
-def _check_stop(binder: SignalBinder, command: CommandMap, speed: BoundSignal, has_stop: bool) -> None:
-    """Report a stop that would be a motion: speed 0 rounds to another value, and no other signal means stop."""
-    mapped = command.forward_speed
-    held = _round_trip(speed, -mapped.offset / mapped.scale) * mapped.scale + mapped.offset
-    if abs(held) > 1e-9 and not has_stop:
-        path = f"{speed.message}.{speed.name}"
-        fix = "set a signal in `stop_signals` that differs from `drive_signals`, or correct scale and offset"
-        binder.add_problem("forward_speed", f"{path} cannot represent 0: stop would be sent as {held:g} m/s", fix)
 
 
 def _bind_constants(binder: SignalBinder, command: CommandMap, key: str) -> dict[str, float]:

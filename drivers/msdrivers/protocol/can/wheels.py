@@ -66,7 +66,7 @@ class BoundWheel:
         if self.map.steering is None:
             return NAN if self.map.is_steered else 0.0
         physical = instant.physical(self.steering)
-        return NAN if physical is None else physical * self.map.steering.scale + self.map.steering.offset
+        return NAN if physical is None else self.map.steering.to_si(physical)
 
 
 def bind_wheels(

@@ -18,23 +18,19 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Sequence
 from enum import IntEnum
+from itertools import accumulate
 from typing import NamedTuple
 
 
-def compute_checksum(body: bytes) -> int:
-    """Return the checksum of a reply without its last word: a command byte and big-endian 16-bit words.
+def append_checksum(body: bytes) -> bytes:
+    """Return a reply, a command byte and big-endian 16-bit words, with its checksum behind it.
 
     Raises ValueError for a body of even length.
     """
     if len(body) % 2 == 0:
         raise ValueError(f"a reply is a byte and whole words before its checksum, got {len(body)} bytes")
     words: tuple[int, ...] = struct.unpack(f">B{len(body) // 2}H", body)
-    return sum(words) & 0xFFFF
-
-
-def append_checksum(body: bytes) -> bytes:
-    """Return the reply with its checksum behind it."""
-    return body + compute_checksum(body).to_bytes(2, "big")
+    return body + (sum(words) & 0xFFFF).to_bytes(2, "big")
 
 
 class CommandByte(IntEnum):
@@ -111,14 +107,13 @@ MEASUREMENTS = frozenset(
 )
 """Measurements: what may be streamed."""
 
-_SLICES: dict[int, dict[str, slice]] = {}
-for _command, _layout in LAYOUTS.items():
-    _at = 0
-    _SLICES[_command] = {}
-    for _name, _count in _layout.fields:
-        _SLICES[_command][_name] = slice(_at, _at + _count)
-        _at += _count
-
+_SLICES = {
+    command: {
+        name: slice(end - count, end)
+        for (name, count), end in zip(layout.fields, accumulate(count for _, count in layout.fields), strict=True)
+    }
+    for command, layout in LAYOUTS.items()
+}
 _STRUCTS = {command: struct.Struct(f">{layout.words}h") for command, layout in LAYOUTS.items()}
 _UNSIGNED = {command: struct.Struct(f">B{(length - 3) // 2}HH") for command, length in LENGTHS.items()}
 

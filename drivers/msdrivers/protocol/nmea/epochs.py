@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from modelserver.messages import FixType
 from modelserver.messages.flags import NAN
 from msdrivers.protocol.gps_time import DAY, SECOND
-from msdrivers.protocol.nmea.sentences import NmeaSentence
+from msdrivers.protocol.nmea.sentences import NmeaSentence, NmeaValues
 
 _QUALITY = {
     1: FixType.FIX_3D,
@@ -111,7 +111,7 @@ _MIN_STABLE_US = SECOND
 
 
 @dataclass(frozen=True, slots=True)
-class NmeaEpoch:
+class NmeaEpoch(NmeaValues):
     """Data of one instant; nan or -1 where missing.
 
     start: bytes from the beginning of the stream to the epoch's first sentence. kinds: the sentences it was made of.
@@ -125,20 +125,7 @@ class NmeaEpoch:
     utime: int
     time_of_day: int | None
     fix_type: FixType
-    latitude: float = NAN
-    longitude: float = NAN
-    height_msl: float = NAN
-    undulation: float = NAN
     satellites: int = -1
-    hdop: float = NAN
-    vdop: float = NAN
-    pdop: float = NAN
-    speed: float = NAN
-    track: float = NAN
-    heading: float = NAN
-    sigma_latitude: float = NAN
-    sigma_longitude: float = NAN
-    sigma_height: float = NAN
 
     @property
     def is_leap_second(self) -> bool:
@@ -173,7 +160,8 @@ class EpochAssembler:
         if self._is_late(sentence, timed) or len(self._sentences) >= _MAX_SENTENCES:
             self.late += 1
             return closed
-        self._note_date(sentence)
+        if sentence.day is not None and sentence.time_of_day is not None:
+            self._reference = sentence.day * DAY + sentence.time_of_day
         if not self._sentences:
             self._starts_after_silence, self._is_line_silent = self._is_line_silent, False
         elif timed and self._starts_after_silence and not self._get_instant()[0]:
@@ -248,10 +236,6 @@ class EpochAssembler:
             return False
         received = Counter(each.kind for each in self._sentences)
         return all(received[kind] >= number for kind, number in self._cycle.items())
-
-    def _note_date(self, sentence: NmeaSentence) -> None:
-        if sentence.day is not None and sentence.time_of_day is not None:
-            self._reference = sentence.day * DAY + sentence.time_of_day
 
     def _close(self, by_end: bool, is_silent: bool = False) -> list[NmeaEpoch]:
         sentences, self._sentences = self._sentences, []

@@ -1,4 +1,4 @@
-"""Parse the fields of NMEA 0183 sentences. An empty field is missing: nan or None, never zero.
+"""Parse and format the fields of NMEA 0183 sentences. An empty field is missing: nan or None, never zero.
 
 Raises ValueError with the field's text for what no receiver should write. pynmea2's own conversions are not used: they
 give 0 for a missing hemisphere, cut microseconds, reject 23:59:60 and return the text where they fail.
@@ -7,8 +7,11 @@ give 0 for a missing hemisphere, cut microseconds, reject 23:59:60 and return th
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from datetime import date
 from math import inf
+
+import pynmea2
 
 from modelserver.messages.flags import NAN
 
@@ -83,3 +86,31 @@ def parse_angle(text: str, side: str, sides: str, most: float) -> float:
     if degrees > most:
         raise ValueError(f"'{text},{side}' is over {most:g} degrees")
     return degrees if side == sides[0] else -degrees
+
+
+def encode(talker: str, kind: str, fields: Sequence[str]) -> bytes:
+    """Return a sentence with its checksum and end of line."""
+    return str(pynmea2.TalkerSentence(talker, kind, fields)).encode("ascii") + b"\r\n"
+
+
+def format_angle(degrees: float, sides: str, digits: int) -> tuple[str, str]:
+    """Return `dddmm.mmmmmmm` with as many digits of whole degrees, and the hemisphere's letter; empty for nan."""
+    if degrees != degrees:
+        return "", ""
+    # whole ten-millionths of a minute, so that no 60 minutes come out of rounding
+    whole, part = divmod(round(abs(degrees) * 60e7), 60 * 10_000_000)
+    text = f"{whole:0{digits}d}{part // 10_000_000:02d}.{part % 10_000_000:07d}"
+    return text, sides[0] if degrees >= 0.0 else sides[1]
+
+
+def format_time_of_day(microseconds: int) -> str:
+    """Return `hhmmss.sss`, up to 23:59:60.999."""
+    seconds, fraction = divmod(microseconds, 1_000_000)
+    leap = max(0, seconds - 86_399)
+    hours, rest = divmod(seconds - leap, 3600)
+    return f"{hours:02d}{rest // 60:02d}{rest % 60 + leap:02d}.{fraction // 1000:03d}"
+
+
+def format_number(value: float, digits: int) -> str:
+    """Return a decimal; empty for nan."""
+    return "" if value != value else f"{value:.{digits}f}"

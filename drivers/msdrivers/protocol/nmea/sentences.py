@@ -22,36 +22,19 @@ MAX_SENTENCE_BYTES = 164
 """Characters from '$' to the checksum. The standard allows 82 with the end of line; receivers send more."""
 
 
-@dataclass(frozen=True, slots=True)
-class NmeaSentence:
-    """Content of a sentence; nan, None or "" where missing.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NmeaValues:
+    """Measured values; nan where missing.
 
-    talker, kind: e.g. "GP" and "GGA". start: bytes from the beginning of the stream to its '$'.
-    time_of_day: microseconds of UTC's day, 86,400 s and more inside a leap second. day: days since 1970-01-01.
-    latitude, longitude: degrees on WGS 84, or the receiver's own datum. height_msl, undulation: meters.
-    quality: GGA's indicator, 0 = no fix. status: "A" or "V" of RMC and GLL. mode: letters of the mode indicator, one
-    per satellite system for GNS. dimension: 1 none, 2, 3, of GSA. satellites: the number in use, of GGA and GNS.
-    listed: how many GSA names as in use.
-    speed: m/s. track, heading: degrees clockwise from true north, of the motion and of the antenna baseline. Speed and
-    track are nan where the sentence flags them invalid.
-    sigma_*: standard deviations along latitude, longitude and height, meters.
+    latitude, longitude: degrees on WGS 84, or the receiver's own datum. height_msl, undulation: meters. speed: m/s.
+    track, heading: degrees clockwise from true north, of the motion and of the antenna baseline. Speed and track are
+    nan where the sentence flags them invalid. sigma_*: standard deviations along latitude, longitude, height, meters.
     """
 
-    talker: str
-    kind: str
-    start: int
-    time_of_day: int | None = None
-    day: int | None = None
     latitude: float = NAN
     longitude: float = NAN
     height_msl: float = NAN
     undulation: float = NAN
-    quality: int | None = None
-    status: str = ""
-    mode: str = ""
-    dimension: int | None = None
-    satellites: int | None = None
-    listed: int = 0
     hdop: float = NAN
     vdop: float = NAN
     pdop: float = NAN
@@ -61,6 +44,30 @@ class NmeaSentence:
     sigma_latitude: float = NAN
     sigma_longitude: float = NAN
     sigma_height: float = NAN
+
+
+@dataclass(frozen=True, slots=True)
+class NmeaSentence(NmeaValues):
+    """Content of a sentence; None or "" where missing.
+
+    talker, kind: e.g. "GP" and "GGA". start: bytes from the beginning of the stream to its '$'.
+    time_of_day: microseconds of UTC's day, 86,400 s and more inside a leap second. day: days since 1970-01-01.
+    quality: GGA's indicator, 0 = no fix. status: "A" or "V" of RMC and GLL. mode: letters of the mode indicator, one
+    per satellite system for GNS. dimension: 1 none, 2, 3, of GSA. satellites: the number in use, of GGA and GNS.
+    listed: how many GSA names as in use.
+    """
+
+    talker: str
+    kind: str
+    start: int
+    time_of_day: int | None = None
+    day: int | None = None
+    quality: int | None = None
+    status: str = ""
+    mode: str = ""
+    dimension: int | None = None
+    satellites: int | None = None
+    listed: int = 0
 
     @property
     def has_position(self) -> bool:

@@ -104,11 +104,11 @@ class BodyLayout:
         self.size = self._struct.size
         """Bytes of a binary body."""
 
-    def unpack(self, raw: bytes | bytearray) -> Body:
-        """Decode a binary body of `size` bytes."""
-        values = list(self._struct.unpack(raw))
+    def unpack(self, buffer: bytes | bytearray, at: int) -> Body:
+        """Decode a binary body of `size` bytes at `at`."""
+        values = self._struct.unpack_from(buffer, at)
         for n, unpack, _ in self._converted:
-            values[n] = unpack(values[n])
+            values = (*values[:n], unpack(values[n]), *values[n + 1 :])
         return self._check(values)
 
     def pack(self, body: Body) -> bytes:

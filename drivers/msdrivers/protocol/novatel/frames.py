@@ -87,34 +87,25 @@ class BinaryFormat:
         available = len(buffer) - at
         if available < 4:
             return None if b"\xaa\x44".startswith(buffer[at : at + 2]) else NO_FRAME
-        _, sync, sort, size = buffer[at : at + 4]
-        if sync != 0x44 or sort not in (0x12, 0x13):
+        sort, size = buffer[at + 2], buffer[at + 3]
+        if buffer[at + 1] != 0x44 or sort not in (0x12, 0x13):
             return NO_FRAME
-        layout = None
         if sort == 0x12:
             if size < _LONG_BYTES:
                 return RejectedFrame("novatel_header")
             if available < _LONG_BYTES:
                 return None
             ident, kind, port, length, sequence, status, week, ms, receiver = _LONG_HEADER.unpack_from(buffer, at + 4)
-            name = MESSAGE_IDS.get(ident) or f"id {ident}"
-            layout = BODIES.get(name)
-            if kind & 0x60 or (layout is not None and length != layout.size):
-                return RejectedFrame("novatel_header")
             begin, end = at + size, at + size + length
-            header = LogHeader(name, week, ms, status, str(port), sequence, receiver, True, kind & MAX_ANTENNA)
-            label = header.label
-            # an answer to a binary command has the id of the command, and another body
-            if kind & 0x80:
-                layout = None
         else:
             if available < _SHORT_BYTES:
                 return None
             ident, week, ms = _SHORT_HEADER.unpack_from(buffer, at + 4)
             begin, end = at + _SHORT_BYTES, at + _SHORT_BYTES + size
-            name = MESSAGE_IDS.get(ident) or f"id {ident}"
-            header, label = LogHeader(name, week, ms, TimeStatus.UNKNOWN, "", 0, 0, True), f"{name}SB"
-        if ms >= _WEEK_MS:
+            kind, port, sequence, status, receiver = 0, "", 0, TimeStatus.UNKNOWN, 0
+        name = MESSAGE_IDS.get(ident) or f"id {ident}"
+        layout = BODIES.get(name) if sort == 0x12 else None
+        if ms >= _WEEK_MS or kind & 0x60 or (layout is not None and end - begin != layout.size):
             return RejectedFrame("novatel_header")
         if end + 4 - at > MAX_LOG_BYTES:
             return RejectedFrame("novatel_length")
@@ -123,9 +114,12 @@ class BinaryFormat:
         if crc32(buffer[at:end]) != int.from_bytes(buffer[end : end + 4], "little"):
             return RejectedFrame("novatel_checksum")
         try:
-            body = layout.unpack(buffer[begin:end]) if layout else None
+            # an answer to a binary command has the id of the command, and another body
+            body = layout.unpack(buffer, begin) if layout is not None and not kind & 0x80 else None
         except ValueError:
             return RejectedFrame("novatel_value")
+        header = LogHeader(name, week, ms, status, str(port), sequence, receiver, True, kind & MAX_ANTENNA)
+        label = header.label if sort == 0x12 else f"{name}SB"
         return ParsedFrame(end + 4, f"novatel.{label}", NovatelLog(header, body, start))
 
 
