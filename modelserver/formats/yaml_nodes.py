@@ -178,7 +178,6 @@ class YamlMapping(ElementReader):
 
     def __init__(self, builder: ModelBuilder, file: str, node: YamlNode, place: str, known: tuple[str, ...] = ()):
         super().__init__(builder, file, node.line, place)
-        self.node = node
         self.pairs: list[tuple[str, YamlNode, YamlNode]] = []
         self.fields: dict[str, YamlNode] = {}
         if not node.is_null and node.kind is not NodeKind.MAPPING:
