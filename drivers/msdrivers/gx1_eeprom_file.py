@@ -6,6 +6,7 @@ The file is text: a word on each line, its address and its value in decimal.
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 from modelserver.errors import ModelServerError, quote
@@ -14,6 +15,8 @@ from msdrivers.emulate.gx1 import Eeprom
 
 MAX_EEPROM_FILE_BYTES = 1 << 16
 """The EEPROM has 128 words; a larger file is rejected."""
+
+_WORD_LINE = re.compile(r"\s*([0-9]{1,9})\s+([0-9]{1,9})\s*", re.ASCII)
 
 
 def read_eeprom(path: Path) -> Eeprom:
@@ -27,12 +30,13 @@ def read_eeprom(path: Path) -> Eeprom:
         return Eeprom.make_factory()
     words: dict[int, int] = {}
     for number, line in enumerate(text.splitlines(), 1):
-        fields = line.split()
-        if len(fields) != 2 or not all(field.isascii() and field.isdecimal() for field in fields):
-            raise _make_error(path, number, line)
-        address, value = map(int, fields)
+        found = _WORD_LINE.fullmatch(line)
+        address, value = map(int, found.groups()) if found else (-1, 0)
         if address % 2 or address > 254 or value > 0xFFFF:
-            raise _make_error(path, number, line)
+            raise ModelServerError(
+                f"{path}, line {number}: {quote(line, 40)} is no EEPROM word (an even address up to 254 and a value up "
+                "to 65535); give the file that an emulator has written, or one that is not there yet"
+            )
         words[address] = value
     return Eeprom().write(words)
 
@@ -42,10 +46,3 @@ def write_eeprom(path: Path, eeprom: Eeprom) -> None:
     beside = path.with_name(f"{path.name}.new")
     beside.write_text("".join(f"{2 * n} {word}\n" for n, word in enumerate(eeprom.words)), encoding="ascii")
     os.replace(beside, path)
-
-
-def _make_error(path: Path, number: int, line: str) -> ModelServerError:
-    return ModelServerError(
-        f"{path}, line {number}: {quote(line, 40)} is no EEPROM word (an even address up to 254 and a value up to "
-        "65535); give the file that an emulator has written, or one that is not there yet"
-    )

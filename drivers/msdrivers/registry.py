@@ -7,13 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from modelserver.errors import ConfigError, Location, Problem, Severity, Suggestion, quote, suggest_name
 from modelserver.files.regular import read_regular
 from modelserver.messages import GpsSample, ImuSample, JointsSample, Sample, VehicleStatusSample, WheelsSample
-from msdrivers.emulate.faults import FAULT_AMOUNTS, InjectedFault
+from msdrivers.emulate.faults import FAULT_AMOUNTS, FaultInjector, InjectedFault
 from msdrivers.endpoint import Endpoint
 from msdrivers.line_settings import CanSettings, LineSettings, ModbusSettings, SerialSettings, TcpSettings
 
@@ -82,15 +84,20 @@ class DeviceKind:
     has_hard_iron: bool = False
 
 
-def _load_gps() -> DeviceModules:
-    from msdrivers.devices.gps.driver import GpsDriver
-    from msdrivers.devices.gps.settings import GpsSettings
+def _load(settings: str, driver: str, *, has_dbc: bool = False) -> DeviceModules:
+    """Import the settings and the driver of a kind by their names below `msdrivers.devices`."""
+    kind, make = (resolve_name(f"msdrivers.devices.{name}") for name in (settings, driver))
+    return DeviceModules(kind, lambda values, folder: make(values, *([_load_dbc(values, folder)] if has_dbc else [])))
 
-    return DeviceModules(GpsSettings, lambda settings, _: GpsDriver(settings))
+
+_load_gps = partial(_load, "gps.settings:GpsSettings", "gps.driver:GpsDriver")
+_load_gx1 = partial(_load, "gx1.settings:Gx1Settings", "gx1.driver:Gx1Driver")
+_load_wheels = partial(_load, "wheels:WheelsSettings", "wheels:WheelsDriver", has_dbc=True)
+_load_vehicle = partial(_load, "vehicle:VehicleSettings", "vehicle:VehicleDriver", has_dbc=True)
+_load_axis = partial(_load, "axis:AxisSettings", "axis:AxisDriver")
 
 
 def _make_gps_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
-    from msdrivers.emulate.faults import FaultInjector
     from msdrivers.emulate.gps import GpsEmulator, GpsUnit
 
     unit = GpsUnit()
@@ -101,13 +108,6 @@ def _make_gps_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
     # one series for the receiver before and after a restart
     samples = iter(wanted.samples)
     return FaultInjector(lambda: GpsEmulator(samples, unit), wanted.faults)
-
-
-def _load_gx1() -> DeviceModules:
-    from msdrivers.devices.gx1.driver import Gx1Driver
-    from msdrivers.devices.gx1.settings import Gx1Settings
-
-    return DeviceModules(Gx1Settings, lambda settings, _: Gx1Driver(settings))
 
 
 def _make_gx1_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
@@ -121,12 +121,6 @@ def _make_gx1_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
     return Gx1Emulator(wanted.samples, read_eeprom(memory), unit, lambda eeprom: write_eeprom(memory, eeprom))
 
 
-def _load_wheels() -> DeviceModules:
-    from msdrivers.devices.wheels import WheelsDriver, WheelsSettings
-
-    return DeviceModules(WheelsSettings, lambda settings, folder: WheelsDriver(settings, _load_dbc(settings, folder)))
-
-
 def _make_wheels_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
     from msdrivers.emulate.wheels import WheelsEmulator
 
@@ -134,23 +128,11 @@ def _make_wheels_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
     return WheelsEmulator(wanted.settings.wheels, database, wanted.samples, wanted.faults)
 
 
-def _load_vehicle() -> DeviceModules:
-    from msdrivers.devices.vehicle import VehicleDriver, VehicleSettings
-
-    return DeviceModules(VehicleSettings, lambda settings, folder: VehicleDriver(settings, _load_dbc(settings, folder)))
-
-
 def _make_vehicle_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:
     from msdrivers.emulate.vehicle import VehicleEmulator
 
     settings, database = wanted.settings, _load_dbc(wanted.settings, wanted.folder)
     return VehicleEmulator(database, settings.status, settings.command, samples=wanted.samples, faults=wanted.faults)
-
-
-def _load_axis() -> DeviceModules:
-    from msdrivers.devices.axis import AxisDriver, AxisSettings
-
-    return DeviceModules(AxisSettings, lambda settings, _: AxisDriver(settings))
 
 
 def _make_axis_emulator(wanted: EmulatorInputs) -> Endpoint[Any]:

@@ -217,29 +217,26 @@ class SourceMap:
     lines: Mapping[tuple[str | int, ...], int] = field(default_factory=dict)
 
     def locate(self, *path: str | int) -> Location:
-        """Return the place of a key, or of the nearest section around it."""
-        line = next((self.lines[path[:n]] for n in range(len(path), 0, -1) if path[:n] in self.lines), 0)
-        return Location(self.file, line, ".".join(map(str, path)))
+        """Return the place of a key, or of the nearest section around it. Names in a path may have dots."""
+        lines = {".".join(map(str, each)): line for each, line in self.lines.items()}
+        key = ".".join(map(str, path))
+        parts = key.split(".")
+        around = (".".join(parts[:n]) for n in range(len(parts), 0, -1))
+        return Location(self.file, next((lines[each] for each in around if each in lines), 0), key)
 
     def locate_problems(self, name: str, problems: Iterable[Problem]) -> tuple[Problem, ...]:
         """Return problems of the driver `name` with the lines of the keys that they are about.
 
-        Those of another file, e.g. of the syntax of a DBC, stay as they are. Names in a path may have dots.
+        Those of another file, e.g. of the syntax of a DBC, stay as they are.
         """
-        lines = {".".join(map(str, path)): line for path, line in self.lines.items()}
-
-        def locate_problem(problem: Problem) -> Problem:
-            key = problem.element
-            if not key.startswith("drivers."):
-                if problem.file:
-                    return problem
-                key = f"drivers.{name}.{key}"
-            parts = key.split(".")
-            around = (".".join(parts[:n]) for n in range(len(parts), 0, -1))
-            line = next((lines[each] for each in around if each in lines), 0)
-            return dataclasses.replace(problem, source=Location(self.file, line, key))
-
-        return tuple(map(locate_problem, problems))
+        found = []
+        for problem in problems:
+            if problem.element.startswith("drivers."):
+                problem = dataclasses.replace(problem, source=self.locate(problem.element))
+            elif not problem.file:
+                problem = dataclasses.replace(problem, source=self.locate("drivers", name, problem.element))
+            found.append(problem)
+        return tuple(found)
 
 
 @dataclass(frozen=True, slots=True)
