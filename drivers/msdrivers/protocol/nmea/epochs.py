@@ -273,10 +273,9 @@ def merge_sentences(sentences: list[NmeaSentence], instant: int | None, utime: i
     """
     places = _list_places(sentences)
 
-    def select(among: Iterable[NmeaSentence], *names: str) -> dict[str, float]:
+    def select(among: Sequence[NmeaSentence], *names: str) -> dict[str, float]:
         """Return the first value of each name that is not missing."""
-        found = ((name, [getattr(each, name) for each in among]) for name in names)
-        return {name: next((value for value in values if value == value), NAN) for name, values in found}
+        return {name: next((value for each in among if (value := getattr(each, name)) == value), NAN) for name in names}
 
     return NmeaEpoch(
         start=sentences[0].start,

@@ -119,8 +119,11 @@ def parse_sentence(text: str, start: int = 0) -> NmeaSentence | None:
     if kind not in KINDS or text[6] != "," or not talker.isalnum() or talker[0] == "P":
         return None
     raw = defaultdict(str, zip(getattr(pynmea2, kind).name_to_idx, text[7:-3].split(","), strict=False))
-    known = [(text, *_FIELDS[name]) for name, text in raw.items() if name in _FIELDS]
-    values: dict[str, Any] = {name: parse(text) for text, name, parse in known}
+    values: dict[str, Any] = {}
+    for field, content in raw.items():
+        if field in _FIELDS:
+            name, parse = _FIELDS[field]
+            values[name] = parse(content)
     status, mode = values.get("status", "A"), values.get("mode", "")
     if "lat" in raw:
         try:
