@@ -312,8 +312,7 @@ class Gx1Driver:
         while True:
             try:
                 self._device = yield from script.find_device(self._link, self._line_state)
-                text = f"{self._device} answers{self._line_state.at_baud_text}"
-                yield EndpointStatus(EndpointPhase.CONFIGURING, text)
+                yield script.report(f"{self._device} answers{self._line_state.at_baud_text}")
                 self._gains = yield from script.read_gains()
                 yield from self._read_timer()
                 if self.settings.capture_bias_at_start:
@@ -338,8 +337,7 @@ class Gx1Driver:
                     f"{list(EepromAddress.TIMER)}); write the defaults 16 16 256 1 to them, or set tick in the settings"
                 )
             if words not in scaling.DOCUMENTED_TIMERS:
-                yield EndpointStatus(
-                    EndpointPhase.CONFIGURING,
+                yield script.report(
                     f"the timer words {list(words)} are not documented; a tick of {self.tick_s * 1e3:g} ms is "
                     "inferred from them and will be compared with the host's clock",
                 )
@@ -348,13 +346,12 @@ class Gx1Driver:
 
     def _capture_bias(self) -> script.ScriptPart[None]:
         if not self._bias_pending:
-            yield EndpointStatus(
-                EndpointPhase.CONFIGURING,
+            yield script.report(
                 "the gyro biases are not captured again, since the vehicle may be moving; for that restart the driver "
                 "while the vehicle is stationary",
             )
             return
-        yield EndpointStatus(EndpointPhase.CONFIGURING, "capturing the gyro biases: keep the vehicle still")
+        yield script.report("capturing the gyro biases: keep the vehicle still")
         self._bias_pending = False
         try:
             yield script.RequestStep(
@@ -364,7 +361,7 @@ class Gx1Driver:
             text = f"the gyro bias capture timed out after {BIAS_CAPTURE_TIMEOUT_S:g} s; using the previous biases"
         else:
             text = "the gyro biases are captured"
-        yield EndpointStatus(EndpointPhase.CONFIGURING, text)
+        yield script.report(text)
 
     def _start_stream(self) -> script.ScriptPart[None]:
         message = self.settings.message

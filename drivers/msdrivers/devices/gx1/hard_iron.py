@@ -95,7 +95,7 @@ class HardIronProcedure:
 
     def on_timer(self, now: HostTime) -> list[Output[bytes]]:
         """Ask for what is due."""
-        return self._script.on_timer(now) if self._script.is_running else []
+        return self._script.on_timer(now)
 
     def get_deadline(self) -> int | None:
         """Return when to call `on_timer`, monotonic nanoseconds."""
@@ -106,12 +106,9 @@ class HardIronProcedure:
         self._script.stop()
         outputs: list[Output[bytes]] = []
         if self._is_started and self.result is None:
-            outputs += [
-                Send(requests.make_write_eeprom(address, value))
-                for address, value in zip(EepromAddress.HARD_IRON, self._before, strict=True)
-            ]
-            text = "hard iron: interrupted, the offsets from before are written back"
-            outputs.append(EndpointStatus(EndpointPhase.CONFIGURING, text))
+            words = zip(EepromAddress.HARD_IRON, self._before, strict=True)
+            outputs += [Send(requests.make_write_eeprom(address, value)) for address, value in words]
+            outputs.append(script.report("hard iron: interrupted, the offsets from before are written back"))
         if self._line_state.found_stream is not None and self.result is None:
             outputs.append(Send(self._line_state.make_restore_request()))
         return outputs
@@ -138,7 +135,7 @@ class HardIronProcedure:
             text = yield from self._restore_offsets(str(failure))
             self.result = HardIronResult(False, text, spans=self._get_spans() if self._extremes[0] else None)
         yield Send(self._line_state.make_restore_request())
-        yield EndpointStatus(EndpointPhase.CONFIGURING, text)
+        yield script.report(text)
 
     def _prepare(self) -> script.ScriptPart[None]:
         device = yield from script.find_device(self._link, self._line_state)
@@ -146,23 +143,17 @@ class HardIronProcedure:
         # after a reconnect the device has no offsets: keep those found first
         if not self._is_started:
             self._before = yield from script.read_words(EepromAddress.HARD_IRON)
-        yield EndpointStatus(
-            EndpointPhase.CONFIGURING, f"hard iron: {device}, offsets before {_to_signed(self._before)} counts"
-        )
+        yield script.report(f"hard iron: {device}, offsets before {_to_signed(self._before)} counts")
 
     def _find_offsets(self) -> script.ScriptPart[Vector3]:
         self._is_started = True
         yield script.RequestStep(requests.make_hard_iron_start())
         how = "on level ground through full circles" if self.settings.two_dimensional else "about all its axes"
-        yield EndpointStatus(
-            EndpointPhase.CONFIGURING, f"hard iron: turn the vehicle {how}, for {self.settings.duration:g} s"
-        )
+        yield script.report(f"hard iron: turn the vehicle {how}, for {self.settings.duration:g} s")
         yield from self._collect_extremes()
         self._check_spans()
-        kind = self.settings.two_dimensional
-        (reply,) = yield script.RequestStep(
-            requests.make_hard_iron_compute(kind, self.settings.magnitude_z), timeout=COMPUTE_TIMEOUT_S, attempts=1
-        )
+        request = requests.make_hard_iron_compute(self.settings.two_dimensional, self.settings.magnitude_z)
+        (reply,) = yield script.RequestStep(request, timeout=COMPUTE_TIMEOUT_S, attempts=1)
         yield from self._check_offsets(reply)
         return vector_from_words(reply.field("offset"), self._gain, TESLA)
 
@@ -176,8 +167,7 @@ class HardIronProcedure:
                 reported = link.now.monotonic_ns
                 done = (reported - begin) / seconds
                 spans = _format_microtesla(self._get_spans())
-                text = f"hard iron: {done:.0f} of {self.settings.duration:g} s, field spans {spans}"
-                yield EndpointStatus(EndpointPhase.CONFIGURING, text)
+                yield script.report(f"hard iron: {done:.0f} of {self.settings.duration:g} s, field spans {spans}")
             yield script.PauseStep(self.settings.period)
 
     def _get_spans(self) -> Vector3:

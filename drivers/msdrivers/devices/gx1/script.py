@@ -166,6 +166,11 @@ class NoReplyError(Exception):
         super().__init__(f"the request '{name}' was sent {tries} times and not answered")
 
 
+def report(text: str) -> EndpointStatus:
+    """Report the progress of a script."""
+    return EndpointStatus(EndpointPhase.CONFIGURING, text)
+
+
 class ScriptRunner:
     """Executes a script step by step."""
 
