@@ -83,7 +83,7 @@ def _read_size(shape: YamlMapping, kind: ShapeKind) -> list[float] | None:
     for what in wanted:
         if what not in at.fields:
             at.error(f"{what} is missing", fix)
-        elif (value := at.read_number(at.fields[what], what, fix)) is not None:
+        elif (value := shape.read_number(at.fields[what], what, fix)) is not None:
             values.append(value)
     return values if len(values) == len(wanted) else None
 

@@ -267,6 +267,7 @@ class _ModelReview:
                     f"{label} has no frame; a body needs at least one", draft.source, "add a frame, e.g. Origin"
                 )
                 if self.repair:
+                    del self.locations[draft.name]
                     continue
             body = Body(draft.name, frames, draft.description, draft.pose, None, draft.visuals, draft.collisions)
             try:
