@@ -130,11 +130,9 @@ class Terrain:
     """Amplitude, wave numbers to east and north, phase: computed once for `evaluate`, which is in the inner loop."""
 
     def __post_init__(self) -> None:
-        waves = []
-        for wave in self.waves:
-            k = math.tau / wave.length
-            waves.append((wave.amplitude, k * math.cos(wave.direction), k * math.sin(wave.direction), wave.phase))
-        object.__setattr__(self, "_waves", tuple(waves))
+        numbers = [(each, math.tau / each.length, each.direction) for each in self.waves]
+        waves = tuple((each.amplitude, k * math.cos(a), k * math.sin(a), each.phase) for each, k, a in numbers)
+        object.__setattr__(self, "_waves", waves)
 
     @classmethod
     def hills(

@@ -72,23 +72,15 @@ def figure_eight(
     def loop(side: float) -> tuple[DrivePhase, ...]:
         return (DrivePhase(ramp, curvature=side * curvature), DrivePhase(hold), DrivePhase(ramp, curvature=0.0))
 
-    phases = [DrivePhase(stationary), DrivePhase(ramp, speed)] if stationary > 0 else [DrivePhase(ramp, speed)]
-    for _ in range(laps):
-        phases += [DrivePhase(half), *loop(1.0), DrivePhase(2.0 * half), *loop(-1.0), DrivePhase(half)]
-        if stop > 0 or reverse > 0:
-            phases += [DrivePhase(ramp, 0.0), DrivePhase(max(stop, 1.0))]
-            if reverse > 0:
-                phases += [
-                    DrivePhase(ramp, -speed / 2.0),
-                    DrivePhase(reverse),
-                    DrivePhase(ramp, 0.0),
-                    DrivePhase(max(stop, 1.0)),
-                ]
-            phases.append(DrivePhase(ramp, speed))
-    phases.append(DrivePhase(ramp, 0.0))
-    if stationary > 0:
-        phases.append(DrivePhase(stationary))
-    return tuple(phases)
+    lap = [DrivePhase(half), *loop(1.0), DrivePhase(2.0 * half), *loop(-1.0), DrivePhase(half)]
+    halt = [DrivePhase(ramp, 0.0), DrivePhase(max(stop, 1.0))]
+    if stop > 0 or reverse > 0:
+        lap += halt
+        if reverse > 0:
+            lap += [DrivePhase(ramp, -speed / 2.0), DrivePhase(reverse), *halt]
+        lap.append(DrivePhase(ramp, speed))
+    wait = [DrivePhase(stationary)] if stationary > 0 else []
+    return (*wait, DrivePhase(ramp, speed), *lap * laps, DrivePhase(ramp, 0.0), *wait)
 
 
 def there_and_back(

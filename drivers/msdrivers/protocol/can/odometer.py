@@ -35,21 +35,11 @@ class Odometer:
     suspect_ns: int = 0
 
     def update(self, raw: float, at_ns: int, direction: int | None = None) -> tuple[Odometer, float, str]:
-        """Process a count.
+        """Process a count: return the new odometer, the travel in meters, and a reason.
 
-        Parameters
-        ----------
-        raw : float
-            The counter's raw bits.
-        at_ns : int
-            Time of the count on any clock without jumps.
-        direction : int, optional
-            -1, 0 or 1 as the encoder reports, None if unknown.
-
-        Returns
-        -------
-        The new odometer, the travel in meters, and a reason. The travel is nan for the reasons `range`, `jump`, `gap`
-        and `direction`; `resumed` (after a counter reset) comes with a travel.
+        The travel is nan for the reasons `range`, `jump`, `gap` and `direction`; `resumed` (after a counter reset)
+        comes with a travel. `raw`: the counter's raw bits. `at_ns`: time of the count on any clock without jumps.
+        `direction`: -1, 0 or 1 as the encoder reports, None if unknown.
         """
         count = int(raw)
         if count < 0:

@@ -31,14 +31,13 @@ def vector_from_words(words: Iterable[int], gain: int, unit: float = 1.0) -> Vec
     """Return three words in rad/s, or in `unit` given in SI (G0, TESLA)."""
     factor = gain * unit / _FULL_SCALE
     x, y, z = words
-    return (x * factor, y * factor, z * factor)
+    return so3.scale(factor, (x, y, z))
 
 
 def vector_to_words(value: Vector3, gain: int, unit: float = 1.0) -> tuple[int, int, int]:
     """Return the words of a vector, saturated where it is too large."""
-    factor = _FULL_SCALE / (gain * unit)
-    x, y, z = value
-    return (saturate(x * factor), saturate(y * factor), saturate(z * factor))
+    x, y, z = so3.scale(_FULL_SCALE / (gain * unit), value)
+    return (saturate(x), saturate(y), saturate(z))
 
 
 def saturate(value: float) -> int:
@@ -53,8 +52,7 @@ def is_saturated(words: Iterable[int]) -> bool:
 
 def orientation_from_euler(words: Iterable[int]) -> Quaternion:
     """Return the orientation of the sensor's axes in north, east, down from the words of roll, pitch, yaw."""
-    roll, pitch, yaw = words
-    return so3.from_rpy(roll * _ANGLE_SCALE, pitch * _ANGLE_SCALE, yaw * _ANGLE_SCALE)
+    return so3.from_rpy(*(word * _ANGLE_SCALE for word in words))
 
 
 def euler_to_words(orientation: Quaternion) -> tuple[int, int, int]:
@@ -72,8 +70,8 @@ def orientation_from_quaternion(words: Iterable[int]) -> Quaternion:
 
     Raises ValueError for four zeros.
     """
-    w, x, y, z = words
-    return so3.normalize((w * _QUATERNION_SCALE, x * _QUATERNION_SCALE, y * _QUATERNION_SCALE, z * _QUATERNION_SCALE))
+    w, x, y, z = (word * _QUATERNION_SCALE for word in words)
+    return so3.normalize((w, x, y, z))
 
 
 def quaternion_to_words(orientation: Quaternion) -> tuple[int, int, int, int]:
