@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple, TypeAlias
 
 from modelserver.messages import NAN, JointSample, JointsSample, SensorHeader
+from msdrivers.devices.ranges import check_ranges
 from msdrivers.endpoint import EndpointPhase, EndpointStatus, HostTime, MeasuredSample, Output, Reopen, Send
 from msdrivers.protocol.framing import BoundedCounter
 from msdrivers.protocol.modbus import registers as modbus
@@ -81,19 +82,10 @@ class AxisSettings:
     def __post_init__(self) -> None:
         if not (0 < len(self.joint) <= 200):
             raise ValueError("joint is the name of a constraint in the geometry file, got nothing or too long a text")
-        for key, value, low, high in (
-            ("poll_hz", self.poll_hz, MIN_POLL_HZ, 1000.0),
-            ("step_deg", self.step_deg, 0.0, 10.0),
-            ("lowest_deg", self.lowest_deg, -3600.0, 3600.0),
-            ("highest_deg", self.highest_deg, -3600.0, 3600.0),
-            ("slowest_deg", self.slowest_deg, 0.0, 3600.0),
-            ("fastest_deg", self.fastest_deg, 0.01, 3600.0),
-            ("reply_timeout", self.reply_timeout, 0.005, 10.0),
-            ("retry_delay", self.retry_delay, 0.01, 60.0),
-            ("silence", self.silence, 0.05, 3600.0),
-        ):
-            if not low <= value <= high:
-                raise ValueError(f"{key} is between {low:g} and {high:g}, got {value:g}")
+        check_ranges(self, poll_hz=(MIN_POLL_HZ, 1000.0), step_deg=(0.0, 10.0))
+        check_ranges(self, lowest_deg=(-3600.0, 3600.0), highest_deg=(-3600.0, 3600.0))
+        check_ranges(self, slowest_deg=(0.0, 3600.0), fastest_deg=(0.01, 3600.0))
+        check_ranges(self, reply_timeout=(0.005, 10.0), retry_delay=(0.01, 60.0), silence=(0.05, 3600.0))
         if not self.lowest_deg < self.highest_deg:
             raise ValueError(f"lowest_deg is below highest_deg, {self.highest_deg:g}, got {self.lowest_deg:g}")
         if not self.slowest_deg <= self.fastest_deg:

@@ -22,6 +22,7 @@ from typing import ClassVar, Literal, NamedTuple
 from modelserver.errors import ConfigError, Location, Problem, Severity, quote
 from modelserver.messages import SensorHeader, VehicleCommand, VehicleMode, VehicleStatusSample
 from msdrivers.devices.can_driver import CanDriver
+from msdrivers.devices.ranges import check_ranges
 from msdrivers.endpoint import EndpointStatus, HostTime, MeasuredSample, Output, Send
 from msdrivers.protocol.can.database import CanDatabase, CanFrameSet
 from msdrivers.protocol.can.frame import CanFrame, FrameKey
@@ -45,13 +46,7 @@ class CommandLimits:
     """What happens to a command above a limit: clamp it, or reject it."""
 
     def __post_init__(self) -> None:
-        for key, value, high in (
-            ("forward_speed", self.forward_speed, 100.0),
-            ("reverse_speed", self.reverse_speed, 100.0),
-            ("steering_angle", self.steering_angle, 1.6),
-        ):
-            if not 0.0 <= value <= high:
-                raise ValueError(f"{key} is between 0 and {high:g}, got {value:g}")
+        check_ranges(self, forward_speed=(0.0, 100.0), reverse_speed=(0.0, 100.0), steering_angle=(0.0, 1.6))
         if self.over_limit not in ("clamp", "reject"):
             raise ValueError(f"over_limit is clamp or reject, got {self.over_limit!r}")
 
@@ -96,18 +91,9 @@ class VehicleSettings:
             raise ValueError("dbc is the path of a DBC file, got nothing")
         if self.status is None and self.command is None:
             raise ValueError("status or command is needed: without both there is nothing to do")
-        for key, value, low, high in (
-            ("dead_man", self.dead_man, 0.05, 5.0),
-            ("max_validity", self.max_validity, 0.05, 60.0),
-            ("command_period", self.command_period, 0.005, 1.0),
-            ("clock_slack", self.clock_slack, 0.0, 5.0),
-            ("window", self.window, 0.0, 1.0),
-            ("silence", self.silence, 0.05, 3600.0),
-            ("delay", self.delay, 0.0, 5.0),
-            ("delay_sigma", self.delay_sigma, 0.0, 5.0),
-        ):
-            if not low <= value <= high:
-                raise ValueError(f"{key} is between {low:g} and {high:g}, got {value:g}")
+        check_ranges(self, dead_man=(0.05, 5.0), max_validity=(0.05, 60.0))
+        check_ranges(self, command_period=(0.005, 1.0), clock_slack=(0.0, 5.0))
+        check_ranges(self, window=(0.0, 1.0), silence=(0.05, 3600.0), delay=(0.0, 5.0), delay_sigma=(0.0, 5.0))
         if self.max_validity < self.dead_man:
             raise ValueError(
                 f"max_validity is at least dead_man, {self.dead_man:g}, got {self.max_validity:g}: a command would end "

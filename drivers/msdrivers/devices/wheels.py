@@ -10,6 +10,7 @@ from typing import ClassVar
 from modelserver.errors import quote
 from modelserver.messages import NAN, Direction, SensorHeader, WheelSample, WheelsSample
 from msdrivers.devices.can_driver import CanDriver
+from msdrivers.devices.ranges import check_ranges
 from msdrivers.endpoint import EndpointStatus, HostTime, MeasuredSample, Output
 from msdrivers.protocol.can.database import CanDatabase, CanFrameSet
 from msdrivers.protocol.can.frame import CanFrame
@@ -52,16 +53,8 @@ class WheelsSettings:
         for name in self.wheels:
             if not (0 < len(name) <= 64 and name.isprintable()):
                 raise ValueError(f"wheels names wheels with 1 to 64 printable characters, got {quote(name)}")
-        for key, value, low, high in (
-            ("max_speed", self.max_speed, 0.1, 200.0),
-            ("frame_delay", self.frame_delay, 0.0, 10.0),
-            ("window", self.window, 0.0, 1.0),
-            ("silence", self.silence, 0.05, 3600.0),
-            ("delay", self.delay, 0.0, 5.0),
-            ("delay_sigma", self.delay_sigma, 0.0, 5.0),
-        ):
-            if not low <= value <= high:
-                raise ValueError(f"{key} is between {low:g} and {high:g}, got {value:g}")
+        check_ranges(self, max_speed=(0.1, 200.0), frame_delay=(0.0, 10.0))
+        check_ranges(self, window=(0.0, 1.0), silence=(0.05, 3600.0), delay=(0.0, 5.0), delay_sigma=(0.0, 5.0))
 
 
 class WheelsDriver(CanDriver):
